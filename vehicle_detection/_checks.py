@@ -1,0 +1,133 @@
+"""Argument checks: each message names the argument, what was expected, what came, and the remedy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vehicle_detection.errors import InvalidInputError
+
+
+def describe(value: object) -> str:
+    """Say in a few words what a value is: an array's shape and dtype, or the value itself."""
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape} and dtype {value.dtype}"
+    text = repr(value)
+    return f"{text if len(text) <= 80 else text[:77] + '...'} ({type(value).__name__})"
+
+
+def check_image(image: object, name: str = "image") -> NDArray[np.uint8]:
+    """Return `image` if it is ``(H, W, 3)`` uint8, else say how to convert it."""
+    if not isinstance(image, np.ndarray):
+        raise InvalidInputError(
+            f"{name} must be an (H, W, 3) uint8 RGB array, got {describe(image)}; "
+            "read files with vehicle_detection.read_image"
+        )
+    if image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 1):
+        remedy = "convert a grayscale image with cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)"
+    elif image.ndim == 3 and image.shape[2] == 4:
+        remedy = "drop the alpha channel with image[..., :3]"
+    elif image.ndim != 3 or image.shape[2] != 3:
+        remedy = "pass one image with three colour channels"
+    elif image.shape[0] == 0 or image.shape[1] == 0:
+        remedy = "the image is empty"
+    elif image.dtype.kind == "f":
+        remedy = "scale a 0-1 float image with (image * 255).round().astype(numpy.uint8)"
+    elif image.dtype == np.uint16:
+        remedy = "scale a 16-bit image with (image // 257).astype(numpy.uint8)"
+    elif image.dtype != np.uint8:
+        remedy = "convert it with image.astype(numpy.uint8) once its values lie in 0-255"
+    else:
+        return image
+    raise InvalidInputError(f"{name} must be an (H, W, 3) uint8 RGB array, got {describe(image)}; {remedy}")
+
+
+def check_channel(channel: object, name: str = "img") -> NDArray[np.uint8]:
+    """Return `channel` if it is ``(H, W)`` uint8."""
+    if isinstance(channel, np.ndarray) and channel.ndim == 2 and channel.dtype == np.uint8 and channel.size:
+        return channel
+    raise InvalidInputError(
+        f"{name} must be one (H, W) uint8 channel, got {describe(channel)}; pick a channel with image[..., 0]"
+    )
+
+
+def check_patches(patches: object, size: int, name: str = "patches") -> NDArray[np.uint8]:
+    """Return `patches` as an ``(N, size, size, 3)`` uint8 array; a list of such images is stacked."""
+    if isinstance(patches, (list, tuple)):
+        images = [check_image(patch, f"{name}[{index}]") for index, patch in enumerate(patches)]
+        for index, image in enumerate(images):
+            if image.shape != (size, size, 3):
+                raise InvalidInputError(
+                    f"{name}[{index}] must be {size}x{size} pixels, got {image.shape[1]}x{image.shape[0]}; "
+                    f"resize it with cv2.resize(image, ({size}, {size}))"
+                )
+        return np.stack(images) if images else np.empty((0, size, size, 3), np.uint8)
+    if (
+        not isinstance(patches, np.ndarray)
+        or patches.dtype != np.uint8
+        or patches.ndim != 4
+        or patches.shape[1:] != (size, size, 3)
+    ):
+        raise InvalidInputError(
+            f"{name} must be an (N, {size}, {size}, 3) uint8 RGB array or a list of such images, "
+            f"got {describe(patches)}; read a folder or zip with vehicle_detection.load_patches"
+        )
+    return patches
+
+
+def check_boxes(boxes: ArrayLike, name: str = "boxes") -> NDArray[Any]:
+    """Return `boxes` as an ``(N, 4)`` array of finite boxes with ``x1 <= x2`` and ``y1 <= y2``."""
+    array = np.asarray(boxes)
+    if array.size == 0:
+        return np.empty((0, 4), array.dtype if array.dtype.kind in "iuf" else np.float64)
+    if array.ndim != 2 or array.shape[1] != 4 or array.dtype.kind not in "iuf":
+        raise InvalidInputError(
+            f"{name} must be an (N, 4) number array of [x1, y1, x2, y2], got {describe(array)}; "
+            "wrap a single box in a list"
+        )
+    if not np.isfinite(array).all():
+        raise InvalidInputError(f"{name} must be finite, got NaN or infinity; drop those rows")
+    inverted = (array[:, 2] < array[:, 0]) | (array[:, 3] < array[:, 1])
+    if inverted.any():
+        row = int(np.argmax(inverted))
+        raise InvalidInputError(
+            f"{name} must be [x1, y1, x2, y2] with x1 <= x2 and y1 <= y2, got {array[row].tolist()} in row "
+            f"{row}; boxes given as [x, y, width, height] need x + width and y + height"
+        )
+    return array
+
+
+def check_number(
+    value: object, name: str, *, low: float = -math.inf, high: float = math.inf, above: float = -math.inf
+) -> float:
+    """Return `value` as a float in ``[low, high]`` and, if given, greater than `above`."""
+    number = math.nan
+    if isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool):
+        number = float(value)
+    if not (low <= number <= high and number > above):
+        bounds = [f"greater than {above:g}"] if above > -math.inf else []
+        bounds += [f"at least {low:g}"] if low > -math.inf else []
+        bounds += [f"at most {high:g}"] if high < math.inf else []
+        expected = " and ".join(bounds) or "finite"
+        raise InvalidInputError(f"{name} must be a number, {expected}; got {describe(value)}")
+    return number
+
+
+def check_integer(value: object, name: str, *, low: int, high: int | None = None) -> int:
+    """Return `value` as an int in ``[low, high]``."""
+    is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not is_integer or value < low or (high is not None and value > high):  # type: ignore[operator]
+        expected = f"at least {low}" if high is None else f"from {low} to {high}"
+        raise InvalidInputError(f"{name} must be an integer {expected}; got {describe(value)}")
+    return int(value)  # type: ignore[call-overload, no-any-return]
+
+
+def check_choice(value: object, name: str, choices: Collection[object]) -> None:
+    """Raise unless `value` is one of `choices`."""
+    if value not in choices:
+        listed = ", ".join(repr(choice) for choice in choices)
+        raise InvalidInputError(f"{name} must be one of {listed}; got {describe(value)}")

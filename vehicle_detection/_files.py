@@ -1,0 +1,45 @@
+"""Output files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from vehicle_detection.errors import InvalidInputError
+
+
+def check_target(target: str | os.PathLike[str], name: str = "target") -> Path:
+    """Return `target` as a path whose folder exists, is writable, and which is no folder itself."""
+    path = Path(target)
+    if path.is_dir():
+        raise InvalidInputError(f"{name} must be a file, got the folder {path}; add a file name to it")
+    if not path.parent.is_dir():
+        raise InvalidInputError(f"{name} needs an existing folder, {path.parent} is none; create it first")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise InvalidInputError(f"{name} needs a writable folder, {path.parent} is read-only; choose another")
+    return path
+
+
+@contextlib.contextmanager
+def written_whole(target: str | os.PathLike[str], name: str = "target") -> Iterator[Path]:
+    """Yield a temporary path beside `target`; rename it to `target` when the block ends well.
+
+    On an error or an interrupt the temporary file is removed and an earlier `target` stays as it was.
+    The temporary name keeps the suffix, as writers choose their format by it.
+    """
+    path = check_target(target, name)
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    part = Path(temporary)
+    try:
+        yield part
+        # mkstemp makes private files; an output gets the permissions any new file would have.
+        umask = os.umask(0)
+        os.umask(umask)
+        part.chmod(0o666 & ~umask)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)

@@ -1,0 +1,107 @@
+"""Image files in and out: the border where every image becomes ``(H, W, 3)`` uint8 RGB."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection._checks import check_image
+from vehicle_detection._files import written_whole
+from vehicle_detection.errors import InvalidInputError
+
+
+def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
+    """Decode the bytes of a PNG, JPEG or other image to ``(H, W, 3)`` uint8 RGB.
+
+    Gray images are spread to three channels, alpha is dropped, 16-bit values are scaled to 0-255 and
+    the EXIF rotation is applied, so that every format gives the same 0-255 values.
+
+    Parameters
+    ----------
+    data
+        The whole file's bytes.
+    name
+        The file's name, for the error message.
+
+    Raises
+    ------
+    InvalidInputError
+        If the bytes are no image, or one that is cut short.
+    """
+    image = None
+    if data:
+        try:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
+        except cv2.error:
+            image = None
+    if image is None or _is_cut(data):
+        raise InvalidInputError(f"{name} must be a whole image file (PNG, JPEG, ...); it cannot be decoded")
+    return np.asarray(image, np.uint8)
+
+
+def _is_cut(data: bytes) -> bool:
+    """Whether a JPEG or PNG lacks its end: OpenCV fills the missing part with gray and says nothing."""
+    if data.startswith(b"\xff\xd8"):
+        return b"\xff\xd9" not in data[-4096:]
+    return data.startswith(b"\x89PNG") and b"IEND" not in data[-64:]
+
+
+def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
+    """Read an image file as ``(H, W, 3)`` uint8 RGB, whatever its format.
+
+    Parameters
+    ----------
+    path
+        A PNG, JPEG, BMP, TIFF or WebP file. Gray, RGBA and 16-bit files are converted.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(H, W, 3)`` uint8 RGB, 0-255.
+
+    Raises
+    ------
+    InvalidInputError
+        If the file is missing, is a folder, or cannot be decoded as a whole.
+
+    Examples
+    --------
+    >>> read_image("missing.png")
+    Traceback (most recent call last):
+    ...
+    vehicle_detection.errors.InvalidInputError: image file missing.png does not exist; check the path
+    """
+    file = Path(path)
+    if file.is_dir():
+        raise InvalidInputError(f"image file {file} is a folder; name a file in it")
+    try:
+        data = file.read_bytes()
+    except FileNotFoundError:
+        raise InvalidInputError(f"image file {file} does not exist; check the path") from None
+    except OSError as error:
+        raise InvalidInputError(f"image file {file} cannot be read: {error.strerror}") from error
+    return decode_image(data, f"image file {file}")
+
+
+def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
+    """Write an ``(H, W, 3)`` uint8 RGB image; the suffix (``.png``, ``.jpg``, ...) sets the format.
+
+    The file appears whole or not at all.
+
+    Raises
+    ------
+    InvalidInputError
+        If the image is malformed, the folder is missing or read-only, or the suffix is unknown.
+    """
+    rgb = check_image(image)
+    if not cv2.haveImageWriter(f"image{Path(path).suffix}"):
+        raise InvalidInputError(
+            f"path must end in .png, .jpg or another image suffix, got {Path(path).name!r}"
+        )
+    with written_whole(path, "path") as part:
+        if not cv2.imwrite(str(part), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)):
+            raise InvalidInputError(f"{path} could not be written; is the disk full?")
