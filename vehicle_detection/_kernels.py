@@ -1,0 +1,394 @@
+"""The numba kernels: HOG cells, block normalisation, weight tables and correlation sums.
+
+All of them work on row-major arrays, release the GIL and are compiled once into a cache on disk.
+The images are interleaved: a row of an ``(H, W, C)`` image is seen as ``W * C`` values, and the left and
+right neighbour of a value lie `C` places away. So three channels cost no shuffling, and every inner
+loop runs over neighbouring values, which the compiler turns into vector instructions.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+_jit = numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False)
+
+# A tile of gradients and its histograms (10 rows of floats) stays in the first-level cache.
+_TILE = 768
+
+
+@_jit
+def hog_cells(image, channels, cell, cosines, sines, cells):
+    """Sum gradient magnitudes into the orientation histograms of cells.
+
+    The reference is ``skimage.feature.hog``: central differences without halving, zero at the array's
+    border, unsigned orientation, hard binning. Orientation `k` starts at ``k * 180 / orient`` degrees, so
+    an angle lies past boundary `k` where ``gy * cos_k - gx * sin_k >= 0`` (after the sign is folded to
+    ``gy >= 0``): no arctangent is needed. The sums are kept cumulative over the boundaries and are
+    differenced at the end.
+
+    Parameters
+    ----------
+    image
+        ``(H, W * channels)`` uint8, at least as large as the cells.
+    channels
+        Number of interleaved channels.
+    cell
+        Side of a cell in pixels.
+    cosines, sines
+        ``(orient,)`` float32, of the orientations' lower bounds.
+    cells
+        Output, ``(channels, orient, cell rows, cell columns)`` float32; mean over the cell's pixels.
+    """
+    height, width = image.shape
+    orient, rows, columns = cells.shape[1], cells.shape[2], cells.shape[3]
+    per_tile = max(1, _TILE // (cell * channels))
+    span = cell * channels
+    size = per_tile * span
+    gx = np.empty(size, np.float32)
+    gy = np.empty(size, np.float32)
+    magnitude = np.empty(size, np.float32)
+    sums = np.empty((orient, size), np.float32)
+    scale = np.float32(1.0 / (cell * cell))
+    zero = np.float32(0)
+    for row in range(rows):
+        for first in range(0, columns, per_tile):
+            count = min(per_tile, columns - first)
+            start = first * span
+            n = count * span
+            sums[:] = zero
+            for y in range(row * cell, (row + 1) * cell):
+                # Where the tile touches the array's border, there is no neighbour: the gradient is zero.
+                low = channels if start == 0 else 0
+                high = n - channels if start + n == width else n
+                left = image[y, start + low - channels : start + high - channels]
+                right = image[y, start + low + channels : start + high + channels]
+                gx[:low] = zero
+                gx[high:n] = zero
+                inner = gx[low:high]
+                for i in range(high - low):
+                    inner[i] = np.float32(right[i]) - np.float32(left[i])
+                if y == 0 or y == height - 1:
+                    gy[:n] = zero
+                else:
+                    above = image[y - 1, start : start + n]
+                    below = image[y + 1, start : start + n]
+                    for i in range(n):
+                        gy[i] = np.float32(below[i]) - np.float32(above[i])
+                for i in range(n):
+                    vertical = gy[i]
+                    horizontal = gx[i]
+                    magnitude[i] = np.sqrt(horizontal * horizontal + vertical * vertical)
+                    # Fold the sign so that 0 <= angle < 180: gy > 0, or gy == 0 and gx >= 0.
+                    folded = horizontal if vertical > zero else -horizontal
+                    gx[i] = folded if vertical != zero else abs(horizontal)
+                    gy[i] = abs(vertical)
+                total = sums[0]
+                for i in range(n):
+                    total[i] += magnitude[i]
+                for k in range(1, orient):
+                    cosine = cosines[k]
+                    sine = sines[k]
+                    total = sums[k]
+                    for i in range(n):
+                        past = gy[i] * cosine - gx[i] * sine >= zero
+                        total[i] += magnitude[i] if past else zero
+            # Sum each cell's columns for all values at once; those at a cell's first column are wanted.
+            reach = n - (cell - 1) * channels
+            for k in range(orient):
+                total = sums[k]
+                for i in range(reach):
+                    magnitude[i] = total[i]
+                for x in range(1, cell):
+                    shifted = total[x * channels : x * channels + reach]
+                    for i in range(reach):
+                        magnitude[i] += shifted[i]
+                for channel in range(channels):
+                    out = cells[channel, k, row, first : first + count]
+                    for column in range(count):
+                        out[column] = magnitude[column * span + channel] * scale
+            for channel in range(channels):
+                for k in range(orient - 1):
+                    for column in range(first, first + count):
+                        cells[channel, k, row, column] -= cells[channel, k + 1, row, column]
+
+
+@_jit
+def sum_orientations(gx, gy, angles, bounds, channels, cell, cells):
+    """Sum gradient magnitudes into the orientation histograms of cells, from angles that are known.
+
+    The way for square-rooted images: their gradients often lie exactly on a bound, and only the same
+    arctangent as the reference's rounds them into the same bin.
+
+    Parameters
+    ----------
+    gx, gy, angles
+        ``(H, W * channels)`` float64 gradients and their arctangents in radians.
+    bounds
+        ``(orient + 1,)`` float64, the bounds of the bins in degrees.
+    channels, cell, cells
+        As for `hog_cells`.
+    """
+    orient, rows, columns = cells.shape[1], cells.shape[2], cells.shape[3]
+    cells[:] = 0
+    for y in range(rows * cell):
+        for column in range(columns):
+            for i in range(column * cell * channels, (column + 1) * cell * channels):
+                degrees = angles[y, i] * (180.0 / np.pi)
+                if degrees < 0:
+                    degrees += 180.0
+                elif degrees >= 180.0:
+                    degrees -= 180.0
+                k = min(int(degrees * orient / 180.0), orient - 1)
+                if degrees < bounds[k]:
+                    k -= 1
+                elif degrees >= bounds[k + 1] and k < orient - 1:
+                    k += 1
+                magnitude = np.sqrt(gx[y, i] * gx[y, i] + gy[y, i] * gy[y, i])
+                cells[i % channels, k, y // cell, column] += magnitude
+    cells *= np.float32(1.0 / (cell * cell))
+
+
+@_jit
+def normalise_blocks(cells, block, blocks):
+    """Normalise overlapping blocks of cells by L2-Hys: L2, clip at 0.2, L2 again.
+
+    Dalal and Triggs, "Histograms of oriented gradients for human detection" (CVPR 2005), section 6.4, with
+    the constants of scikit-image.
+
+    Parameters
+    ----------
+    cells
+        ``(channels, orient, cell rows, cell columns)`` float32.
+    block
+        Side of a block in cells.
+    blocks
+        Output, ``(channels, block, block, orient, cell rows, cell columns)`` float32: plane
+        ``[c, i, j, k]`` holds at ``[y, x]`` the value of cell ``[y + i, x + j]`` in the block that starts
+        at cell ``[y, x]``. The last ``block - 1`` rows and columns start no block and become zero.
+    """
+    channels, orient, rows, columns = cells.shape
+    eps = np.float32(1e-10)
+    clip = np.float32(0.2)
+    one = np.float32(1)
+    width = columns - block + 1
+    energy = np.empty((rows, columns), np.float32)
+    scale = np.empty(width, np.float32)
+    clipped = np.empty(width, np.float32)
+    for channel in range(channels):
+        energy[:] = np.float32(0)
+        for k in range(orient):
+            for y in range(rows):
+                line = cells[channel, k, y]
+                sums = energy[y]
+                for x in range(columns):
+                    sums[x] += line[x] * line[x]
+        for y in range(rows - block + 1):
+            scale[:] = eps
+            for i in range(block):
+                for j in range(block):
+                    line = energy[y + i, j : j + width]
+                    for x in range(width):
+                        scale[x] += line[x]
+            for x in range(width):
+                scale[x] = one / np.sqrt(scale[x])
+            clipped[:] = eps
+            for i in range(block):
+                for j in range(block):
+                    for k in range(orient):
+                        line = cells[channel, k, y + i, j : j + width]
+                        out = blocks[channel, i, j, k, y]
+                        for x in range(width):
+                            value = min(line[x] * scale[x], clip)
+                            out[x] = value
+                            clipped[x] += value * value
+            for x in range(width):
+                clipped[x] = one / np.sqrt(clipped[x])
+            for i in range(block):
+                for j in range(block):
+                    for k in range(orient):
+                        out = blocks[channel, i, j, k, y]
+                        for x in range(width):
+                            out[x] *= clipped[x]
+                        out[width:] = np.float32(0)
+        blocks[channel, :, :, :, rows - block + 1 :] = np.float32(0)
+
+
+@_jit
+def histogram_cells(image, table, cell, cells):
+    """Sum, over each cell, the table's weights of the pixel values of all channels.
+
+    Parameters
+    ----------
+    image
+        ``(H, W, 3)`` uint8.
+    table
+        ``(3, 256)`` float32, the weight of each value.
+    cell
+        Side of a cell in pixels.
+    cells
+        Output, ``(cell rows, cell columns)`` float32.
+    """
+    rows, columns = cells.shape
+    for row in range(rows):
+        for column in range(columns):
+            cells[row, column] = 0
+        for y in range(row * cell, (row + 1) * cell):
+            line = image[y]
+            for column in range(columns):
+                first = np.float32(0)
+                second = np.float32(0)
+                third = np.float32(0)
+                for x in range(column * cell, (column + 1) * cell):
+                    first += table[0, line[x, 0]]
+                    second += table[1, line[x, 1]]
+                    third += table[2, line[x, 2]]
+                cells[row, column] += first + second + third
+
+
+@_jit
+def spatial_cells(bins, per_cell, cells):
+    """Deal the spatial bins of a band out to planes: one plane for each place of a bin in its cell.
+
+    Parameters
+    ----------
+    bins
+        ``(H, W, 3)`` uint8, the band resized to the bin grid.
+    per_cell
+        Bins along a cell's side.
+    cells
+        Output, ``(3, per_cell, per_cell, cell rows, cell columns)`` float32.
+    """
+    rows, columns = cells.shape[3], cells.shape[4]
+    for channel in range(3):
+        for i in range(per_cell):
+            for j in range(per_cell):
+                for y in range(rows):
+                    line = bins[y * per_cell + i]
+                    out = cells[channel, i, j, y]
+                    for x in range(columns):
+                        out[x] = line[x * per_cell + j, channel]
+
+
+@_jit
+def sum_shifted(products, window_rows, window_columns, bias, scores):
+    """Add up, for each window, the products that its cells have at their place in the window.
+
+    Parameters
+    ----------
+    products
+        ``(window_rows * window_columns, cell rows, cell columns)`` float32; plane ``[i * window_columns +
+        j]`` holds what a cell contributes to a window in which it is the cell of row `i`, column `j`.
+    bias
+        Added to every score.
+    scores
+        Output, ``(cell rows - window_rows + 1, cell columns - window_columns + 1)`` float32.
+    """
+    height, width = scores.shape
+    for y in range(height):
+        out = scores[y]
+        for x in range(width):
+            out[x] = bias
+        for i in range(window_rows):
+            for j in range(window_columns):
+                line = products[i * window_columns + j, y + i, j : j + width]
+                for x in range(width):
+                    out[x] += line[x]
+
+
+@_jit
+def value_counts(image, counts):
+    """Count the values of each channel: `image` ``(H, W, 3)`` uint8, `counts` ``(3, 256)`` output."""
+    counts[:] = 0
+    for y in range(image.shape[0]):
+        for x in range(image.shape[1]):
+            counts[0, image[y, x, 0]] += 1
+            counts[1, image[y, x, 1]] += 1
+            counts[2, image[y, x, 2]] += 1
+
+
+@_jit
+def arrange_blocks(planes, features):
+    """Write the block planes of one patch as a vector in scikit-image's order.
+
+    Parameters
+    ----------
+    planes
+        As `normalise_blocks` fills them.
+    features
+        Output, 1-D float32: channel, block row, block column, cell row, cell column, orientation.
+    """
+    channels, block, orient = planes.shape[0], planes.shape[1], planes.shape[3]
+    places = planes.shape[4] - block + 1
+    position = 0
+    for channel in range(channels):
+        for y in range(places):
+            for x in range(places):
+                for i in range(block):
+                    for j in range(block):
+                        for k in range(orient):
+                            features[position] = planes[channel, i, j, k, y, x]
+                            position += 1
+
+
+@_jit
+def patch_hog(patches, channels, cell, block, cosines, sines, features):
+    """HOG of each patch.
+
+    Parameters
+    ----------
+    patches
+        ``(N, side, side * channels)`` uint8.
+    channels, cell, cosines, sines
+        As for `hog_cells`.
+    block
+        Side of a block in cells.
+    features
+        Output, ``(N, channels * blocks**2 * block**2 * orient)`` float32.
+    """
+    orient = len(cosines)
+    side = patches.shape[1] // cell
+    cells = np.empty((channels, orient, side, side), np.float32)
+    planes = np.empty((channels, block, block, orient, side, side), np.float32)
+    for index in range(len(patches)):
+        hog_cells(patches[index], channels, cell, cosines, sines, cells)
+        normalise_blocks(cells, block, planes)
+        arrange_blocks(planes, features[index])
+
+
+@_jit
+def patch_hog_of_angles(gx, gy, angles, bounds, channels, cell, block, features):
+    """HOG of each patch from known gradients ``(N, side, side * channels)``; see `sum_orientations`."""
+    orient = len(bounds) - 1
+    side = gx.shape[1] // cell
+    cells = np.empty((channels, orient, side, side), np.float32)
+    planes = np.empty((channels, block, block, orient, side, side), np.float32)
+    for index in range(len(gx)):
+        sum_orientations(gx[index], gy[index], angles[index], bounds, channels, cell, cells)
+        normalise_blocks(cells, block, planes)
+        arrange_blocks(planes, features[index])
+
+
+@_jit
+def patch_histograms(patches, bin_of_value, bins, features):
+    """Colour histogram of each patch, channel by channel.
+
+    Parameters
+    ----------
+    patches
+        ``(N, side, side, 3)`` uint8.
+    bin_of_value
+        ``(256,)`` intp, the bin of each value.
+    bins
+        Number of bins.
+    features
+        Output, ``(N, 3 * bins)`` float32.
+    """
+    counts = np.empty((3, 256), np.int64)
+    for index in range(len(patches)):
+        value_counts(patches[index], counts)
+        out = features[index]
+        out[:] = 0
+        for channel in range(3):
+            for value in range(256):
+                out[channel * bins + bin_of_value[value]] += counts[channel, value]

@@ -1,0 +1,87 @@
+"""`PatchFeatures`: the features as a scikit-learn transformer."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator, TransformerMixin
+
+from vehicle_detection.features import extract_features
+from vehicle_detection.params import FeatureParams
+
+
+class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
+    """Turn 64x64 patches into feature vectors, for ``Pipeline`` and ``GridSearchCV``.
+
+    The arguments are the fields of `FeatureParams`, checked when `fit` is called, and `n_jobs` of
+    `extract_features`. The transformer learns nothing: it works without `fit`.
+
+    Examples
+    --------
+    >>> from sklearn.pipeline import make_pipeline
+    >>> from sklearn.preprocessing import StandardScaler
+    >>> pipeline = make_pipeline(PatchFeatures(color_space="LUV", spatial_feat=False), StandardScaler())
+    >>> pipeline.fit_transform(np.zeros((2, 64, 64, 3), np.uint8)).shape
+    (2, 5388)
+    """
+
+    def __init__(
+        self,
+        *,
+        color_space: str = "YCrCb",
+        spatial_feat: bool = True,
+        hist_feat: bool = True,
+        hog_feat: bool = True,
+        spatial_size: int = 16,
+        hist_bins: int = 32,
+        orient: int = 9,
+        pix_per_cell: int = 8,
+        cell_per_block: int = 2,
+        hog_channel: int | Literal["ALL", "GRAY"] = "ALL",
+        transform_sqrt: bool = False,
+        n_jobs: int | None = None,
+    ) -> None:
+        self.color_space = color_space
+        self.spatial_feat = spatial_feat
+        self.hist_feat = hist_feat
+        self.hog_feat = hog_feat
+        self.spatial_size = spatial_size
+        self.hist_bins = hist_bins
+        self.orient = orient
+        self.pix_per_cell = pix_per_cell
+        self.cell_per_block = cell_per_block
+        self.hog_channel = hog_channel
+        self.transform_sqrt = transform_sqrt
+        self.n_jobs = n_jobs
+
+    def to_params(self) -> FeatureParams:
+        """Return the arguments as checked `FeatureParams`."""
+        arguments = self.get_params(deep=False)
+        del arguments["n_jobs"]
+        return FeatureParams(**arguments)
+
+    def fit(self, X: Any, y: Any = None) -> PatchFeatures:
+        """Check the arguments; there is nothing to learn."""
+        self.to_params()
+        return self
+
+    def transform(self, X: Any) -> NDArray[np.float32]:
+        """Feature vectors ``(N, length)`` float32 of patches, as `extract_features` takes them."""
+        return extract_features(X, self.to_params(), n_jobs=self.n_jobs)
+
+    def get_feature_names_out(self, input_features: Any = None) -> NDArray[np.object_]:
+        """Names of the features: ``spatial0 ... hist0 ... hog0 ...``."""
+        params = self.to_params()
+        lengths = {"spatial": params.spatial_length, "hist": params.hist_length, "hog": params.hog_length}
+        return np.array([f"{part}{i}" for part, count in lengths.items() for i in range(count)], object)
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.input_tags.two_d_array = False
+        tags.input_tags.three_d_array = False
+        tags.no_validation = True
+        tags.requires_fit = False
+        tags.transformer_tags.preserves_dtype = []
+        return tags

@@ -1,0 +1,430 @@
+"""Train, judge, save and load the linear SVM: a scaler and one or more weight templates."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+import vehicle_detection
+from vehicle_detection._checks import check_integer, check_number, check_patches, describe
+from vehicle_detection._files import written_whole
+from vehicle_detection.errors import InvalidInputError, ModelFileError
+from vehicle_detection.features import extract_features
+from vehicle_detection.params import PATCH_SIZE, FeatureParams
+
+if TYPE_CHECKING:
+    from sklearn.pipeline import Pipeline
+
+FORMAT = "vehicle-detection-model"
+FORMAT_VERSION = "1"
+DEFAULT_C = 1e-4
+
+_TENSORS = ("mean", "scale", "coef", "intercept")
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """One linear SVM over a window of 8x8 cells and the scaler it was trained behind.
+
+    Attributes
+    ----------
+    mean, scale
+        ``(length,)`` float64: the scaler subtracts and divides by them.
+    coef
+        ``(length,)`` float64 weights of the scaled features.
+    intercept
+        Added to the weighted sum.
+    """
+
+    mean: NDArray[np.float64]
+    scale: NDArray[np.float64]
+    coef: NDArray[np.float64]
+    intercept: float
+
+    def __post_init__(self) -> None:
+        for name in ("mean", "scale", "coef"):
+            column = np.array(getattr(self, name), np.float64)
+            if column.ndim != 1 or column.shape != np.shape(self.mean):
+                raise InvalidInputError(
+                    f"{name} must be a vector as long as the features ({np.shape(self.mean)}); "
+                    f"got {describe(column)}"
+                )
+            if not np.isfinite(column).all():
+                raise InvalidInputError(f"{name} must be finite, got NaN or infinity; train again")
+            column.setflags(write=False)
+            object.__setattr__(self, name, column)
+        if not (self.scale > 0).all():
+            raise InvalidInputError("scale must be positive; a constant feature has scale 1")
+        if not np.isfinite(self.intercept):
+            raise InvalidInputError(f"intercept must be finite; got {self.intercept}")
+
+    def fold(self) -> tuple[NDArray[np.float64], float]:
+        """Scaler and SVM as one affine function ``score = weights . features + bias``."""
+        weights = self.coef / self.scale
+        return weights, float(self.intercept - weights @ self.mean)
+
+
+@dataclass(frozen=True, eq=False)
+class VehicleClassifier:
+    """A linear classifier of 64x64 patches, or of feature vectors.
+
+    Attributes
+    ----------
+    params
+        The features it is trained on.
+    templates
+        One or more `Template`; a patch's score is the best of them.
+    metadata
+        What the model file tells about itself: training, accuracy, data, versions. JSON values only.
+
+    Examples
+    --------
+    >>> from vehicle_detection import load_classifier
+    >>> classifier = load_classifier()
+    >>> classifier.predict(np.zeros((2, 64, 64, 3), np.uint8)).tolist()
+    [0, 0]
+    """
+
+    params: FeatureParams
+    templates: tuple[Template, ...]
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.templates:
+            raise InvalidInputError("templates must hold at least one template; got none")
+        for template in self.templates:
+            if template.coef.shape != (self.params.length,):
+                raise InvalidInputError(
+                    f"templates must have {self.params.length} weights, as the parameters say; "
+                    f"got {len(template.coef)}"
+                )
+
+    def decision_function(self, X: ArrayLike) -> NDArray[np.float64]:
+        """Signed distance from the separating plane; positive is a vehicle.
+
+        Parameters
+        ----------
+        X
+            ``(N, length)`` feature vectors, or ``(N, 64, 64, 3)`` uint8 RGB patches.
+
+        Returns
+        -------
+        numpy.ndarray
+            ``(N,)`` float64.
+
+        Raises
+        ------
+        InvalidInputError
+            If the vectors are of another length or hold NaN.
+        """
+        features = self._features_of(X)
+        scores = [features @ weights + bias for weights, bias in (t.fold() for t in self.templates)]
+        return np.asarray(np.max(scores, axis=0), np.float64)
+
+    def predict(self, X: ArrayLike) -> NDArray[np.int64]:
+        """1 for a vehicle and 0 for anything else, ``(N,)`` int64; arguments as `decision_function`."""
+        return (self.decision_function(X) > 0).astype(np.int64)
+
+    def score(self, X: ArrayLike, y: ArrayLike) -> float:
+        """Share of right predictions for the labels `y`, 0-1."""
+        labels = np.asarray(y)
+        predicted = self.predict(X)
+        if labels.shape != predicted.shape:
+            raise InvalidInputError(
+                f"y must be one label for each of {len(predicted)} rows; got {describe(labels)}"
+            )
+        return float(np.mean(predicted == labels))
+
+    def _features_of(self, X: ArrayLike) -> NDArray[Any]:
+        array = np.asarray(X)
+        if array.ndim == 4:
+            return extract_features(array, self.params)
+        if array.ndim != 2 or array.shape[1] != self.params.length or array.dtype.kind not in "iuf":
+            raise InvalidInputError(
+                f"X must be (N, {self.params.length}) features or (N, 64, 64, 3) patches; "
+                f"got {describe(array)}"
+            )
+        if not np.isfinite(array).all():
+            raise InvalidInputError("X must be finite, got NaN or infinity")
+        return array
+
+    @classmethod
+    def from_pipeline(
+        cls, pipeline: Pipeline, params: FeatureParams, *, metadata: Mapping[str, Any] | None = None
+    ) -> VehicleClassifier:
+        """Take over a fitted scikit-learn pipeline that ends in ``StandardScaler`` and ``LinearSVC``.
+
+        Parameters
+        ----------
+        pipeline
+            Fitted; a `PatchFeatures` step before the scaler is allowed.
+        params
+            The features that the scaler was fitted on.
+        metadata
+            Facts to keep in the model file.
+
+        Raises
+        ------
+        InvalidInputError
+            If the last two steps are others, not fitted, or of another length.
+        """
+        steps = [step for _, step in pipeline.steps]
+        names = [type(step).__name__ for step in steps]
+        if names[-2:] != ["StandardScaler", "LinearSVC"]:
+            raise InvalidInputError(f"pipeline must end in StandardScaler and LinearSVC; got {names}")
+        scaler, svm = steps[-2:]
+        if not hasattr(scaler, "scale_") or not hasattr(svm, "coef_"):
+            raise InvalidInputError("pipeline must be fitted; call its fit first")
+        if list(svm.classes_) not in ([0, 1], [False, True]):
+            raise InvalidInputError(
+                f"pipeline must be fitted on the labels 0 and 1; got {list(svm.classes_)}"
+            )
+        length = svm.coef_.shape[1]
+        mean = scaler.mean_ if scaler.with_mean else np.zeros(length)
+        scale = scaler.scale_ if scaler.with_std else np.ones(length)
+        template = Template(mean, scale, svm.coef_[0], float(np.ravel(svm.intercept_)[0]))
+        return cls(params, (template,), metadata or {})
+
+    def to_pipeline(self) -> Pipeline:
+        """Return a fitted scikit-learn pipeline: `PatchFeatures`, ``StandardScaler``, ``LinearSVC``.
+
+        Raises
+        ------
+        InvalidInputError
+            If the model has several templates: a pipeline holds one.
+        """
+        from sklearn.pipeline import Pipeline
+        from sklearn.preprocessing import StandardScaler
+        from sklearn.svm import LinearSVC
+
+        from vehicle_detection._transformer import PatchFeatures
+
+        if len(self.templates) > 1:
+            raise InvalidInputError(f"a pipeline holds one template; this model has {len(self.templates)}")
+        template = self.templates[0]
+        scaler = StandardScaler()
+        scaler.mean_, scaler.scale_ = template.mean.copy(), template.scale.copy()
+        scaler.var_ = template.scale**2
+        scaler.n_features_in_ = self.params.length
+        scaler.n_samples_seen_ = 1
+        svm = LinearSVC()
+        svm.coef_, svm.intercept_ = template.coef[None].copy(), np.array([template.intercept])
+        svm.classes_ = np.array([0, 1])
+        svm.n_features_in_ = self.params.length
+        features = PatchFeatures(**asdict(self.params))
+        return Pipeline([("features", features), ("scaler", scaler), ("svm", svm)])
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the model as a safetensors file: tensors and JSON, nothing that runs when loaded.
+
+        Raises
+        ------
+        InvalidInputError
+            If the folder is missing or read-only.
+        """
+        from safetensors.numpy import save
+
+        tensors = {
+            f"{index}.{name}": np.atleast_1d(np.asarray(getattr(template, name), np.float64))
+            for index, template in enumerate(self.templates)
+            for name in _TENSORS
+        }
+        header = {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "params": json.dumps(asdict(self.params), sort_keys=True),
+            "metadata": json.dumps(dict(self.metadata), sort_keys=True),
+        }
+        header["sha256"] = _checksum(header, tensors)
+        with written_whole(path, "path") as part:
+            part.write_bytes(save(tensors, metadata=header))
+
+
+def _checksum(header: Mapping[str, str], tensors: Mapping[str, NDArray[Any]]) -> str:
+    """Hash everything a model file says, so that an edited one is noticed."""
+    digest = hashlib.sha256()
+    for key in sorted(header):
+        if key != "sha256":
+            digest.update(f"{key}={header[key]}\n".encode())
+    for name in sorted(tensors):
+        digest.update(f"{name} {tensors[name].shape} {tensors[name].dtype}\n".encode())
+        digest.update(np.ascontiguousarray(tensors[name]).tobytes())
+    return digest.hexdigest()
+
+
+def load_classifier(path: str | os.PathLike[str] | None = None) -> VehicleClassifier:
+    """Load a model file, or the model that the package ships.
+
+    Parameters
+    ----------
+    path
+        A ``.safetensors`` file written by `VehicleClassifier.save`; None loads the shipped default.
+
+    Raises
+    ------
+    ModelFileError
+        If the file is missing, cut, edited, of another version, holds NaN, or does not fit its own
+        parameters.
+
+    Examples
+    --------
+    >>> load_classifier().params.color_space
+    'YCrCb'
+    """
+    if path is None:
+        resource = resources.files("vehicle_detection") / "models" / "default.safetensors"
+        return _parse_model(resource.read_bytes(), "the shipped model")
+    file = Path(path)
+    try:
+        data = file.read_bytes()
+    except FileNotFoundError:
+        raise ModelFileError(f"model file {file} does not exist; check the path") from None
+    except IsADirectoryError:
+        raise ModelFileError(f"model file {file} is a folder; name a file in it") from None
+    except OSError as error:
+        raise ModelFileError(f"model file {file} cannot be read: {error.strerror}") from error
+    return _parse_model(data, f"model file {file}")
+
+
+def _parse_model(data: bytes, name: str) -> VehicleClassifier:
+    """Check and build a classifier from the bytes of a model file."""
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    try:
+        tensors = load(data)
+        length = int.from_bytes(data[:8], "little")
+        header = json.loads(data[8 : 8 + length])["__metadata__"]
+    except (SafetensorError, ValueError, KeyError) as error:
+        raise ModelFileError(
+            f"{name} is no whole safetensors model ({error}); get it again or train"
+        ) from error
+    if header.get("format") != FORMAT:
+        raise ModelFileError(f"{name} is a safetensors file, but no model of this library; train one")
+    if header.get("format_version") != FORMAT_VERSION:
+        raise ModelFileError(
+            f"{name} has format version {header.get('format_version')}, this release reads "
+            f"{FORMAT_VERSION}; train again or install the release that wrote it"
+        )
+    if header.get("sha256") != _checksum(header, tensors):
+        raise ModelFileError(f"{name} was changed after it was written (checksum differs); get it again")
+    try:
+        params = FeatureParams(**json.loads(header["params"]))
+        count = len({key.split(".")[0] for key in tensors})
+        templates = tuple(
+            Template(
+                tensors[f"{index}.mean"],
+                tensors[f"{index}.scale"],
+                tensors[f"{index}.coef"],
+                float(tensors[f"{index}.intercept"].reshape(())),
+            )
+            for index in range(count)
+        )
+        return VehicleClassifier(params, templates, json.loads(header["metadata"]))
+    except (InvalidInputError, KeyError, TypeError, ValueError) as error:
+        raise ModelFileError(f"{name} does not fit its own parameters: {error}") from error
+
+
+def train_classifier(
+    patches: NDArray[np.uint8],
+    labels: ArrayLike,
+    *,
+    params: FeatureParams | None = None,
+    C: float = DEFAULT_C,
+    mirror: bool = True,
+    random_state: int = 0,
+    n_jobs: int | None = None,
+    metadata: Mapping[str, Any] | None = None,
+) -> VehicleClassifier:
+    """Fit a scaler and a linear SVM on patches.
+
+    Parameters
+    ----------
+    patches
+        ``(N, 64, 64, 3)`` uint8 RGB: the training part only; nothing else is seen.
+    labels
+        ``(N,)``, 1 (or True) for a vehicle, 0 for anything else.
+    params
+        Features; the default is ``FeatureParams()``.
+    C
+        Inverse strength of the regularisation. Small values generalise better to other sequences.
+    mirror
+        Add each patch mirrored left to right.
+    random_state
+        Seed of the solver.
+    n_jobs
+        Threads of the feature extraction.
+    metadata
+        Facts to keep in the model file.
+
+    Returns
+    -------
+    VehicleClassifier
+        With one template. The same input and seed give the same model.
+
+    Raises
+    ------
+    InvalidInputError
+        If a patch is malformed, the labels do not fit or hold one class only.
+    """
+    from sklearn.pipeline import Pipeline
+    from sklearn.preprocessing import StandardScaler
+    from sklearn.svm import LinearSVC
+
+    params = params or FeatureParams()
+    images = check_patches(patches, PATCH_SIZE)
+    targets = check_labels(labels, len(images))
+    check_number(C, "C", above=0, high=1e12)
+    check_integer(random_state, "random_state", low=0, high=2**32 - 1)
+    copies = [images, np.ascontiguousarray(images[:, :, ::-1])] if mirror else [images]
+    features = np.concatenate([extract_features(copy, params, n_jobs=n_jobs) for copy in copies])
+    # The features are ours alone: scaling them in place halves the memory.
+    pipeline = Pipeline(
+        [
+            ("scaler", StandardScaler(copy=False)),
+            ("svm", LinearSVC(C=C, random_state=random_state, max_iter=20_000)),
+        ]
+    )
+    pipeline.fit(features, np.tile(targets, len(copies)))
+    versions = {"vehicle_detection": vehicle_detection.__version__, **_library_versions()}
+    facts = {
+        "training": {
+            "C": C,
+            "mirror": mirror,
+            "random_state": random_state,
+            "vehicles": int(targets.sum()),
+            "non_vehicles": int(len(targets) - targets.sum()),
+        },
+        "versions": versions,
+        **(metadata or {}),
+    }
+    return VehicleClassifier.from_pipeline(pipeline, params, metadata=facts)
+
+
+def _library_versions() -> dict[str, str]:
+    from importlib.metadata import version
+
+    return {name: version(name) for name in ("numpy", "opencv-python-headless", "scikit-learn")}
+
+
+def check_labels(labels: ArrayLike, count: int) -> NDArray[np.int64]:
+    """Return `labels` as `count` zeros and ones with both classes present."""
+    array = np.asarray(labels)
+    if array.shape != (count,) or array.dtype.kind not in "biuf":
+        raise InvalidInputError(
+            f"labels must be one number for each of {count} patches; got {describe(array)}"
+        )
+    if not np.isin(array, (0, 1)).all():
+        raise InvalidInputError(f"labels must be 0 or 1; got {np.unique(array)[:5].tolist()}")
+    if count == 0 or array.min() == array.max():
+        raise InvalidInputError("labels must hold both classes: vehicles (1) and non-vehicles (0)")
+    return array.astype(np.int64)

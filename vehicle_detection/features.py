@@ -1,0 +1,483 @@
+"""A 64x64 patch, or a batch of them, to feature vectors ``[spatial | histogram | HOG]``.
+
+The functions the course knows are the readable reference: scikit-image's HOG, ``cv2.resize`` and
+``numpy.histogram``. `extract_features` computes the same numbers with kernels, many patches at once.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection import _kernels
+from vehicle_detection._checks import (
+    check_channel,
+    check_choice,
+    check_image,
+    check_integer,
+    check_patches,
+    describe,
+)
+from vehicle_detection._jobs import resolve_jobs
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.images import read_image
+from vehicle_detection.params import COLOR_SPACES, PATCH_SIZE, FeatureParams
+
+if TYPE_CHECKING:
+    from vehicle_detection._transformer import PatchFeatures
+
+_CODES = {
+    "HSV": cv2.COLOR_RGB2HSV,
+    "LUV": cv2.COLOR_RGB2LUV,
+    "HLS": cv2.COLOR_RGB2HLS,
+    "YUV": cv2.COLOR_RGB2YUV,
+    "YCrCb": cv2.COLOR_RGB2YCrCb,
+    "LAB": cv2.COLOR_RGB2LAB,
+}
+
+_CHUNK = 256
+
+
+def __getattr__(name: str) -> Any:
+    # The transformer needs scikit-learn, which takes a second to import: only those who ask for it wait.
+    if name == "PatchFeatures":
+        from vehicle_detection._transformer import PatchFeatures
+
+        return PatchFeatures
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def convert_color(
+    image: NDArray[np.uint8], color_space: str = "YCrCb", *, out: NDArray[np.uint8] | None = None
+) -> NDArray[np.uint8]:
+    """Convert an RGB image to another colour space, by OpenCV's 8-bit conventions.
+
+    Parameters
+    ----------
+    image
+        ``(H, W, 3)`` uint8 RGB.
+    color_space
+        ``"RGB"``, ``"HSV"`` (hue 0-179), ``"LUV"``, ``"HLS"``, ``"YUV"``, ``"YCrCb"`` or ``"LAB"``; the
+        course's spelling ``"RGB2YCrCb"`` is understood too.
+    out
+        Array of the image's shape to write into; a new one if None.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(H, W, 3)`` uint8; a copy, also for ``"RGB"``.
+
+    Raises
+    ------
+    InvalidInputError
+        If the image is not uint8 RGB or the colour space is unknown.
+
+    Examples
+    --------
+    >>> convert_color(np.full((1, 1, 3), 200, np.uint8), "YCrCb").tolist()
+    [[[200, 128, 128]]]
+    """
+    check_image(image)
+    space = str(color_space).removeprefix("RGB2")
+    check_choice(space, "color_space", COLOR_SPACES)
+    if space != "RGB":
+        return np.asarray(cv2.cvtColor(image, _CODES[space], dst=out), np.uint8)
+    if out is None:
+        return image.copy()
+    out[:] = image
+    return out
+
+
+def hog_blocks(
+    img: NDArray[np.uint8],
+    orient: int = 9,
+    pix_per_cell: int = 8,
+    cell_per_block: int = 2,
+    *,
+    transform_sqrt: bool = False,
+) -> NDArray[np.float64]:
+    """HOG of one channel by scikit-image (L2-Hys), a vector for each block position.
+
+    Parameters
+    ----------
+    img
+        ``(H, W)`` uint8, one channel.
+    orient
+        Orientations over 0-180 degrees.
+    pix_per_cell, cell_per_block
+        Side of a cell in pixels and of a block in cells.
+    transform_sqrt
+        Take the square root of the values first.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(block rows, block columns, cell_per_block, cell_per_block, orient)`` float64 in [0, 1].
+
+    Raises
+    ------
+    InvalidInputError
+        If the image is not one uint8 channel or smaller than a block.
+    """
+    from skimage.feature import hog
+
+    check_channel(img)
+    check_integer(orient, "orient", low=1)
+    side = check_integer(pix_per_cell, "pix_per_cell", low=1) * check_integer(
+        cell_per_block, "cell_per_block", low=1
+    )
+    if min(img.shape) < side:
+        raise InvalidInputError(
+            f"img must be at least one block large ({side}x{side} pixels); got {img.shape[1]}x{img.shape[0]}"
+        )
+    return np.asarray(
+        hog(
+            img,
+            orientations=orient,
+            pixels_per_cell=(pix_per_cell, pix_per_cell),
+            cells_per_block=(cell_per_block, cell_per_block),
+            block_norm="L2-Hys",
+            transform_sqrt=transform_sqrt,
+            feature_vector=False,
+        ),
+        np.float64,
+    )
+
+
+def get_hog_features(
+    img: NDArray[np.uint8],
+    orient: int = 9,
+    pix_per_cell: int = 8,
+    cell_per_block: int = 2,
+    *,
+    transform_sqrt: bool = False,
+) -> NDArray[np.float64]:
+    """HOG of one channel as a vector; see `hog_blocks` for the parameters and `hog_picture` for a picture.
+
+    Dalal and Triggs, "Histograms of oriented gradients for human detection" (CVPR 2005).
+
+    Returns
+    -------
+    numpy.ndarray
+        1-D float64: block row, block column, cell row, cell column, orientation.
+
+    Raises
+    ------
+    InvalidInputError
+        If the image is not one uint8 channel or smaller than a block.
+
+    Examples
+    --------
+    >>> get_hog_features(np.zeros((64, 64), np.uint8)).shape
+    (1764,)
+    """
+    return hog_blocks(img, orient, pix_per_cell, cell_per_block, transform_sqrt=transform_sqrt).ravel()
+
+
+def hog_picture(
+    img: NDArray[np.uint8],
+    orient: int = 9,
+    pix_per_cell: int = 8,
+    *,
+    transform_sqrt: bool = False,
+) -> NDArray[np.float64]:
+    """Draw the orientation histograms of one channel as little stars of edges.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(H, W)`` float64, for ``plt.imshow``.
+    """
+    from skimage.feature import hog
+
+    check_channel(img)
+    _, picture = hog(
+        img,
+        orientations=orient,
+        pixels_per_cell=(pix_per_cell, pix_per_cell),
+        cells_per_block=(1, 1),
+        transform_sqrt=transform_sqrt,
+        visualize=True,
+    )
+    return np.asarray(picture, np.float64)
+
+
+def bin_spatial(img: NDArray[np.uint8], size: int | tuple[int, int] = (32, 32)) -> NDArray[np.uint8]:
+    """Colour values of a shrunken image, channel by channel.
+
+    Parameters
+    ----------
+    img
+        ``(H, W, 3)`` uint8 in any colour space.
+    size
+        Width and height to shrink to.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(width * height * 3,)`` uint8.
+
+    Examples
+    --------
+    >>> bin_spatial(np.zeros((64, 64, 3), np.uint8), 16).shape
+    (768,)
+    """
+    check_image(img, "img")
+    width, height = (size, size) if isinstance(size, int) else size
+    check_integer(width, "size", low=1)
+    check_integer(height, "size", low=1)
+    small = cv2.resize(img, (width, height))
+    return np.ascontiguousarray(small.transpose(2, 0, 1), np.uint8).ravel()
+
+
+def color_hist(img: NDArray[np.uint8], nbins: int = 32) -> NDArray[np.int64]:
+    """Histogram of each channel over 0-255, one after the other.
+
+    Parameters
+    ----------
+    img
+        ``(H, W, 3)`` uint8 in any colour space.
+    nbins
+        Bins of each channel.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(3 * nbins,)`` int64 counts.
+
+    Examples
+    --------
+    >>> color_hist(np.zeros((2, 2, 3), np.uint8), 4).tolist()
+    [4, 0, 0, 0, 4, 0, 0, 0, 4, 0, 0, 0]
+    """
+    check_image(img, "img")
+    check_integer(nbins, "nbins", low=1, high=256)
+    channels = [np.histogram(img[..., c], bins=nbins, range=(0, 256))[0] for c in range(3)]
+    return np.concatenate(channels)
+
+
+def hog_source(image: NDArray[np.uint8], params: FeatureParams) -> NDArray[np.uint8]:
+    """Channels that HOG sees: ``(H, W, hog_channels)`` uint8 of an ``(H, W, 3)`` RGB image."""
+    if params.hog_channel == "GRAY":
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)[..., None]
+    return pick_hog_channels(convert_color(image, params.color_space), params)
+
+
+def pick_hog_channels(converted: NDArray[np.uint8], params: FeatureParams) -> NDArray[np.uint8]:
+    """Channels that HOG sees, of an image that is already in the colour space; not for ``"GRAY"``."""
+    if params.hog_channel == "ALL":
+        return converted
+    return np.ascontiguousarray(converted[..., int(params.hog_channel), None])
+
+
+def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None = None) -> NDArray[np.float64]:
+    """Feature vector of one 64x64 patch by the reference functions.
+
+    Parameters
+    ----------
+    image
+        ``(64, 64, 3)`` uint8 RGB.
+    params
+        What to compute; the default is ``FeatureParams()``.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(params.length,)`` float64, ``[spatial | histogram | HOG]``, each channel by channel.
+
+    Raises
+    ------
+    InvalidInputError
+        If the image is not uint8 RGB of 64x64 pixels.
+
+    Examples
+    --------
+    >>> single_img_features(np.zeros((64, 64, 3), np.uint8), FeatureParams.preset("luv-2384")).shape
+    (2384,)
+    """
+    params = params or FeatureParams()
+    check_patches([image], PATCH_SIZE, "image")
+    converted = convert_color(image, params.color_space)
+    parts: list[NDArray[Any]] = []
+    if params.spatial_feat:
+        parts.append(bin_spatial(converted, params.spatial_size))
+    if params.hist_feat:
+        parts.append(color_hist(converted, params.hist_bins))
+    if params.hog_feat:
+        source = hog_source(image, params)
+        parts += [
+            get_hog_features(
+                source[..., channel],
+                params.orient,
+                params.pix_per_cell,
+                params.cell_per_block,
+                transform_sqrt=params.transform_sqrt,
+            )
+            for channel in range(params.hog_channels)
+        ]
+    return np.concatenate(parts).astype(np.float64)
+
+
+def extract_features(
+    source: NDArray[np.uint8] | Sequence[NDArray[np.uint8]] | Iterable[str | os.PathLike[str]],
+    params: FeatureParams | None = None,
+    *,
+    n_jobs: int | None = None,
+    progress: bool = False,
+) -> NDArray[np.float32]:
+    """Feature vectors of many patches, by kernels that equal `single_img_features`.
+
+    Parameters
+    ----------
+    source
+        ``(N, 64, 64, 3)`` uint8 RGB, a list of such patches, or paths of image files.
+    params
+        What to compute; the default is ``FeatureParams()``.
+    n_jobs
+        Threads; None takes the environment's ``VEHICLE_DETECTION_JOBS`` or all cores. The result is
+        the same for any number.
+    progress
+        Show a bar on standard error.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, params.length)`` float32.
+
+    Raises
+    ------
+    InvalidInputError
+        If a patch is not 64x64 uint8 RGB, or a file is missing or unreadable.
+
+    Examples
+    --------
+    >>> extract_features(np.zeros((5, 64, 64, 3), np.uint8)).shape
+    (5, 6156)
+    """
+    params = params or FeatureParams()
+    patches = check_patches(_read_all(source), PATCH_SIZE, "source")
+    features = np.empty((len(patches), params.length), np.float32)
+    extract = _batch_extractor(params)
+
+    def run(start: int) -> int:
+        stop = min(start + _CHUNK, len(patches))
+        extract(patches[start:stop], features[start:stop])
+        return stop - start
+
+    with ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
+        done = pool.map(run, range(0, len(patches), _CHUNK))
+        if progress:
+            from tqdm.auto import tqdm
+
+            with tqdm(total=len(patches), unit="patch", desc="features") as bar:
+                for count in done:
+                    bar.update(count)
+        else:
+            list(done)
+    return features
+
+
+def _read_all(source: Any) -> Any:
+    """Read the patches of a list of paths; hand anything else on."""
+    if isinstance(source, (str, os.PathLike)):
+        raise InvalidInputError(
+            f"source must be patches or a list of paths, got {describe(source)}; "
+            "read a folder or zip with vehicle_detection.load_patches"
+        )
+    if isinstance(source, np.ndarray):
+        return source
+    items = list(source)
+    return [read_image(item) if isinstance(item, (str, os.PathLike)) else item for item in items]
+
+
+def orientation_bounds(orient: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Cosine and sine of the lower bound of each orientation bin."""
+    angles = np.arange(orient) * (np.pi / orient)
+    # Rounding makes the bound at 90 degrees exact, so that a vertical edge falls where it should.
+    return np.cos(angles).round(15).astype(np.float32), np.sin(angles).round(15).astype(np.float32)
+
+
+def sqrt_gradients(source: NDArray[np.uint8]) -> tuple[NDArray[np.float64], ...]:
+    """Gradients of the square root of images, and their arctangent, as scikit-image computes them.
+
+    Parameters
+    ----------
+    source
+        ``(..., H, W, C)`` uint8.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        ``gx``, ``gy`` and ``arctan2(gy, gx)``, each ``(..., H, W * C)`` float64.
+    """
+    root = np.sqrt(np.arange(256.0))[source]
+    gx, gy = np.zeros_like(root), np.zeros_like(root)
+    np.subtract(root[..., :, 2:, :], root[..., :, :-2, :], out=gx[..., :, 1:-1, :])
+    np.subtract(root[..., 2:, :, :], root[..., :-2, :, :], out=gy[..., 1:-1, :, :])
+    shape = (*root.shape[:-2], -1)
+    return gx.reshape(shape), gy.reshape(shape), np.arctan2(gy, gx).reshape(shape)
+
+
+def degree_bounds(orient: int) -> NDArray[np.float64]:
+    """Bounds of the orientation bins in degrees, ``(orient + 1,)``, as scikit-image rounds them."""
+    return np.asarray((180.0 / orient) * np.arange(orient + 1), np.float64)
+
+
+def bin_of_value(bins: int) -> NDArray[np.intp]:
+    """Histogram bin of each value 0-255 when `bins` bins cover ``[0, 256)``; ``(256,)`` intp."""
+    return np.arange(256, dtype=np.intp) * bins // 256
+
+
+def _batch_extractor(params: FeatureParams) -> Callable[[NDArray[np.uint8], NDArray[np.float32]], None]:
+    """Build the function that fills the features of a batch of patches."""
+    channels, cell, block = params.hog_channels, params.pix_per_cell, params.cell_per_block
+    cosines, sines = orientation_bounds(params.orient)
+    bounds = degree_bounds(params.orient)
+    bins = bin_of_value(params.hist_bins)
+    size = params.spatial_size
+    spatial_stop = params.spatial_length
+    hist_stop = spatial_stop + params.hist_length
+
+    def extract(patches: NDArray[np.uint8], features: NDArray[np.float32]) -> None:
+        n = len(patches)
+        # Colour conversion is pixel by pixel: the batch is converted as one tall image.
+        tall = np.ascontiguousarray(patches).reshape(n * PATCH_SIZE, PATCH_SIZE, 3)
+        converted = convert_color(tall, params.color_space).reshape(patches.shape)
+        if params.spatial_feat:
+            for index, patch in enumerate(converted):
+                small = cv2.resize(patch, (size, size))
+                features[index, :spatial_stop].reshape(3, size, size)[:] = small.transpose(2, 0, 1)
+        if params.hist_feat:
+            _kernels.patch_histograms(converted, bins, params.hist_bins, features[:, spatial_stop:hist_stop])
+        if params.hog_feat:
+            gray = params.hog_channel == "GRAY"
+            source = hog_source(tall, params) if gray else pick_hog_channels(converted, params)
+            source = source.reshape(n, PATCH_SIZE, PATCH_SIZE, channels)
+            hog = features[:, hist_stop:]
+            if params.transform_sqrt:
+                gradients = sqrt_gradients(source)
+                _kernels.patch_hog_of_angles(*gradients, bounds, channels, cell, block, hog)
+            else:
+                flat = source.reshape(n, PATCH_SIZE, PATCH_SIZE * channels)
+                _kernels.patch_hog(flat, channels, cell, block, cosines, sines, hog)
+
+    return extract
+
+
+__all__ = [
+    "PatchFeatures",
+    "bin_spatial",
+    "color_hist",
+    "convert_color",
+    "extract_features",
+    "get_hog_features",
+    "hog_blocks",
+    "hog_picture",
+    "single_img_features",
+]

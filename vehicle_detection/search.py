@@ -1,0 +1,319 @@
+"""The fast search: features shared by all windows of a band, the SVM as a filter over them.
+
+Scaler and SVM fold into one affine function of the feature vector (`Template.fold`). A band of the frame is
+resized once so that a window is 64x64; then each part of the vector is a set of planes over the band's
+cells, and each part of the weights is a filter over an 8x8 neighbourhood of cells:
+
+- HOG: a plane for each channel, place in the block and orientation, normalised once for all windows.
+- Spatial bins: a plane for each channel and place of a bin in its cell.
+- Colour histogram: the weight of a pixel's value is looked up, so the histogram's share of the score is one
+  plane of sums over cells. No histogram is built.
+
+One matrix product gives what every cell contributes at every place in a window, and 64 shifted sums make
+the scores of all windows. Dalal and Triggs (CVPR 2005) for HOG; Felzenszwalb et al. (PAMI 2010), section 3,
+for linear templates as filters over a feature map.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection import _kernels
+from vehicle_detection._checks import check_image, check_number
+from vehicle_detection._jobs import resolve_jobs, single_threaded_blas
+from vehicle_detection.boxes import Detections
+from vehicle_detection.classifier import Template, VehicleClassifier
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.features import (
+    bin_of_value,
+    convert_color,
+    degree_bounds,
+    hog_source,
+    orientation_bounds,
+    pick_hog_channels,
+    sqrt_gradients,
+)
+from vehicle_detection.params import PATCH_SIZE, FeatureParams, PixelBand, SearchParams
+
+
+def find_cars(
+    image: NDArray[np.uint8],
+    classifier: VehicleClassifier,
+    search: SearchParams | None = None,
+    *,
+    n_jobs: int | None = None,
+) -> Detections:
+    """Find the windows of a frame that look like vehicles.
+
+    Scores equal those of `search_windows` with ``border="image"`` on each resized band, to 1e-4.
+
+    Parameters
+    ----------
+    image
+        ``(H, W, 3)`` uint8 RGB.
+    classifier
+        The trained model.
+    search
+        Bands and least score; the default is ``SearchParams.preset("default")``. Steps between windows
+        are rounded to whole cells, at least one.
+    n_jobs
+        Threads, each works on a band; the result is the same for any number.
+
+    Returns
+    -------
+    Detections
+        Float boxes in pixels of the image and scores, band by band, row by row.
+
+    Raises
+    ------
+    InvalidInputError
+        If the image is malformed or smaller than a window, or the features cannot be shared by windows.
+
+    Examples
+    --------
+    >>> from vehicle_detection import load_classifier
+    >>> len(find_cars(np.zeros((720, 1280, 3), np.uint8), load_classifier()))
+    0
+    """
+    search = search or SearchParams.preset()
+    with BandSearch(classifier, n_jobs=n_jobs) as bands:
+        return bands.find(image, search)
+
+
+class BandSearch:
+    """The search with its weights laid out and its buffers kept from frame to frame.
+
+    Thread-safe: buffers belong to the thread that uses them.
+
+    Parameters
+    ----------
+    classifier
+        The trained model.
+    n_jobs
+        Threads that share the bands of a frame.
+    """
+
+    def __init__(self, classifier: VehicleClassifier, *, n_jobs: int | None = None) -> None:
+        self._filters = _Filters(classifier)
+        self._jobs = resolve_jobs(n_jobs)
+        self._pool: ThreadPoolExecutor | None = None
+        self._local = threading.local()
+
+    def __enter__(self) -> BandSearch:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the threads."""
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+
+    def find(self, image: NDArray[np.uint8], search: SearchParams) -> Detections:
+        """Windows of all bands that score above ``search.min_score``."""
+        check_image(image)
+        bands = search.place(image.shape)
+        least = check_number(search.min_score, "min_score")
+        parts = self._map(lambda band: _hits(self.score_map(image, band), band, self._filters, least), bands)
+        return Detections(np.concatenate([p.boxes for p in parts]), np.concatenate([p.scores for p in parts]))
+
+    def score_map(self, image: NDArray[np.uint8], band: PixelBand) -> NDArray[np.float32]:
+        """Score of every window of a band at a step of one cell.
+
+        Returns
+        -------
+        numpy.ndarray
+            ``(rows, columns)`` float32: entry ``[i, j]`` is the window whose first cell is row `i`, column
+            `j` of the resized band. With several templates, the best of them.
+        """
+        buffers = self._local.__dict__.setdefault("buffers", _Buffers())
+        return self._filters.score_map(resize_band(image, band, buffers.take), buffers.take)
+
+    def _map(
+        self, function: Callable[[PixelBand], Detections], bands: tuple[PixelBand, ...]
+    ) -> list[Detections]:
+        """Apply `function` to the bands, the costly ones first so that the threads end together."""
+        if self._jobs == 1 or len(bands) == 1:
+            with single_threaded_blas():
+                return [function(band) for band in bands]
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(self._jobs, thread_name_prefix="search")
+        order = sorted(range(len(bands)), key=lambda i: -_cost(bands[i]))
+        with single_threaded_blas():
+            found = list(self._pool.map(function, [bands[i] for i in order]))
+        return [part for _, part in sorted(zip(order, found), key=lambda pair: pair[0])]
+
+
+def resized_shape(band: PixelBand) -> tuple[int, int]:
+    """Height and width of a band once its windows are 64x64."""
+    width = round((band.x2 - band.x1) * PATCH_SIZE / band.window[0])
+    height = round((band.y2 - band.y1) * PATCH_SIZE / band.window[1])
+    return max(height, PATCH_SIZE), max(width, PATCH_SIZE)
+
+
+Take = Callable[..., NDArray[Any]]
+
+
+def resize_band(image: NDArray[np.uint8], band: PixelBand, take: Take = np.empty) -> NDArray[np.uint8]:
+    """Cut a band out and resize it so that a window is 64x64; `take` hands out the memory."""
+    height, width = resized_shape(band)
+    strip = image[band.y1 : band.y2, band.x1 : band.x2]
+    if strip.shape[:2] == (height, width):
+        return strip
+    return np.asarray(cv2.resize(strip, (width, height), dst=take((height, width, 3), np.uint8)), np.uint8)
+
+
+def _cost(band: PixelBand) -> float:
+    height, width = resized_shape(band)
+    return float(height * width)
+
+
+def _hits(scores: NDArray[np.float32], band: PixelBand, filters: _Filters, least: float) -> Detections:
+    """Boxes, in pixels of the frame, of the windows of a score map above `least`."""
+    height, width = resized_shape(band)
+    scale = np.array([(band.x2 - band.x1) / width, (band.y2 - band.y1) / height])
+    cell = filters.params.pix_per_cell
+    # Steps in pixels of the frame become whole cells of the resized band.
+    steps = [max(1, round(step / (cell * factor))) for step, factor in zip(band.step, scale)]
+    grid = scores[:: steps[1], :: steps[0]]
+    rows, columns = np.nonzero(grid > least)
+    corner = np.stack([columns * steps[0], rows * steps[1]], axis=1) * cell * scale + (band.x1, band.y1)
+    boxes = np.concatenate([corner, corner + scale * PATCH_SIZE], axis=1)
+    return Detections(boxes, grid[rows, columns].astype(np.float64))
+
+
+class _Buffers:
+    """Arrays that are used again by the next band: fresh memory costs as much as the work in it."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[tuple[Any, ...], NDArray[Any]] = {}
+
+    def take(self, shape: tuple[int, ...], dtype: Any, name: str = "") -> NDArray[Any]:
+        """Hand out an array of `shape` with whatever was in it; one for each name, shape and dtype."""
+        key = (name, shape, np.dtype(dtype))
+        array = self._arrays.get(key)
+        if array is None:
+            array = self._arrays[key] = np.empty(shape, dtype)
+        return array
+
+
+class _Filters:
+    """The folded weights of a classifier, laid out as filters over planes of cells."""
+
+    def __init__(self, classifier: VehicleClassifier) -> None:
+        self.params = params = classifier.params
+        _check_shareable(params)
+        self.cells = params.cells
+        self.block = params.cell_per_block
+        self.per_cell = params.spatial_size // params.cells
+        self.hog_planes = params.hog_channels * self.block**2 * params.orient if params.hog_feat else 0
+        self.spatial_planes = 3 * self.per_cell**2 if params.spatial_feat else 0
+        self.planes = self.hog_planes + self.spatial_planes + int(params.hist_feat)
+        self.cosines, self.sines = orientation_bounds(params.orient)
+        self.bounds = degree_bounds(params.orient)
+        laid_out = [self._lay_out(template) for template in classifier.templates]
+        self.biases = [np.float32(bias) for _, _, bias in laid_out]
+        # Each template with a histogram has a weight table, and so a plane, of its own.
+        self.tables = [table for _, table, _ in laid_out]
+        self.weights = [weights for weights, _, _ in laid_out]
+
+    def _lay_out(self, template: Template) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
+        """Lay out a template as filters ``(cells**2, planes)``, value table ``(3, 256)`` and bias."""
+        params, cells = self.params, self.cells
+        weights, bias = template.fold()
+        filters = np.zeros((cells, cells, self.planes))
+        if params.spatial_feat:
+            part = weights[: params.spatial_length].reshape(3, cells, self.per_cell, cells, self.per_cell)
+            planes = part.transpose(1, 3, 0, 2, 4).reshape(cells, cells, -1)
+            filters[..., self.hog_planes : self.hog_planes + self.spatial_planes] = planes
+        table = np.zeros((3, 256), np.float32)
+        if params.hist_feat:
+            start = params.spatial_length
+            part = weights[start : start + params.hist_length].reshape(3, params.hist_bins)
+            table[:] = part[:, bin_of_value(params.hist_bins)]
+            filters[..., -1] = 1
+        if params.hog_feat:
+            blocks = params.blocks
+            part = weights[params.length - params.hog_length :]
+            part = part.reshape(params.hog_channels, blocks, blocks, -1)
+            planes = part.transpose(1, 2, 0, 3).reshape(blocks, blocks, -1)
+            filters[:blocks, :blocks, : self.hog_planes] = planes
+        return filters.reshape(cells * cells, -1).astype(np.float32), table, bias
+
+    def score_map(self, band: NDArray[np.uint8], take: Take) -> NDArray[np.float32]:
+        """Scores of all windows of a resized band, ``(rows, columns)`` float32, as a new array."""
+        cell = self.params.pix_per_cell
+        rows, columns = band.shape[0] // cell, band.shape[1] // cell
+        planes = take((self.planes, rows, columns), np.float32, "planes")
+        converted = self._fill_planes(band, planes, take)
+        best: NDArray[np.float32] | None = None
+        for weights, table, bias in zip(self.weights, self.tables, self.biases):
+            if self.params.hist_feat:
+                _kernels.histogram_cells(converted, table, cell, planes[-1])
+            products = take((len(weights), rows * columns), np.float32, "products")
+            np.dot(weights, planes.reshape(self.planes, -1), out=products)
+            scores = np.empty((rows - self.cells + 1, columns - self.cells + 1), np.float32)
+            stacked = products.reshape(-1, rows, columns)
+            _kernels.sum_shifted(stacked, self.cells, self.cells, bias, scores)
+            best = scores if best is None else np.maximum(best, scores, out=best)
+        assert best is not None
+        return best
+
+    def _fill_planes(
+        self, band: NDArray[np.uint8], planes: NDArray[np.float32], take: Take
+    ) -> NDArray[np.uint8]:
+        """Fill the HOG and spatial planes; return the band in the features' colour space."""
+        params = self.params
+        rows, columns = planes.shape[1:]
+        cell = params.pix_per_cell
+        converted = _convert(band, params, take)
+        if params.hog_feat:
+            gray = params.hog_channel == "GRAY"
+            source = hog_source(band, params) if gray else pick_hog_channels(converted, params)
+            channels = params.hog_channels
+            cells = take((channels, params.orient, rows, columns), np.float32, "cells")
+            if params.transform_sqrt:
+                _kernels.sum_orientations(*sqrt_gradients(source), self.bounds, channels, cell, cells)
+            else:
+                flat = np.ascontiguousarray(source).reshape(source.shape[0], -1)
+                _kernels.hog_cells(flat, channels, cell, self.cosines, self.sines, cells)
+            shape = (channels, self.block, self.block, params.orient, rows, columns)
+            _kernels.normalise_blocks(cells, self.block, planes[: self.hog_planes].reshape(shape))
+        if params.spatial_feat:
+            size = (columns * self.per_cell, rows * self.per_cell)
+            whole = converted[: rows * cell, : columns * cell]
+            bins = cv2.resize(whole, size, dst=take((size[1], size[0], 3), np.uint8, "bins"))
+            part = planes[self.hog_planes : self.hog_planes + self.spatial_planes]
+            part = part.reshape(3, self.per_cell, self.per_cell, rows, columns)
+            _kernels.spatial_cells(bins, self.per_cell, part)
+        return converted
+
+
+def _convert(band: NDArray[np.uint8], params: FeatureParams, take: Take) -> NDArray[np.uint8]:
+    """Convert a resized band to the features' colour space."""
+    return convert_color(band, params.color_space, out=take(band.shape, np.uint8, "converted"))
+
+
+def _check_shareable(params: FeatureParams) -> None:
+    """Refuse features that windows cannot share exactly, and name the search that takes them."""
+    remedy = "use search_windows, the reference search, or other parameters"
+    if params.cells * params.pix_per_cell != PATCH_SIZE:
+        raise InvalidInputError(
+            f"find_cars needs whole HOG cells in a {PATCH_SIZE} pixel window; pix_per_cell="
+            f"{params.pix_per_cell} leaves a rest; {remedy}"
+        )
+    size = params.spatial_size
+    if params.spatial_feat and (size % params.cells or PATCH_SIZE % size):
+        raise InvalidInputError(
+            f"find_cars needs whole spatial bins in a cell of {params.pix_per_cell} pixels; "
+            f"spatial_size={size} has none; {remedy}"
+        )

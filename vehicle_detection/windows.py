@@ -1,0 +1,206 @@
+"""The reference search: one window after the other, readable and slow."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vehicle_detection._checks import (
+    check_boxes,
+    check_choice,
+    check_image,
+    check_integer,
+    check_number,
+    describe,
+)
+from vehicle_detection.boxes import Detections
+from vehicle_detection.classifier import VehicleClassifier
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.features import (
+    bin_spatial,
+    color_hist,
+    convert_color,
+    extract_features,
+    hog_blocks,
+    hog_source,
+)
+from vehicle_detection.params import PATCH_SIZE, PixelBand
+
+Range = tuple[int | None, int | None]
+
+
+def slide_window(
+    image: NDArray[np.uint8],
+    *,
+    x_start_stop: Range = (None, None),
+    y_start_stop: Range = (None, None),
+    xy_window: tuple[int, int] = (64, 64),
+    xy_overlap: tuple[float, float] = (0.5, 0.5),
+) -> NDArray[np.int64]:
+    """List the windows of one size over a region of the image.
+
+    Parameters
+    ----------
+    image
+        ``(H, W, 3)`` uint8 RGB; only its shape counts.
+    x_start_stop, y_start_stop
+        Half-open pixel range of the region; None stands for the image's border.
+    xy_window
+        Width and height of a window.
+    xy_overlap
+        Horizontal and vertical share that neighbours have in common, in [0, 1).
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, 4)`` int64 ``[x1, y1, x2, y2]``, row by row. Every window of the grid that fits into the
+        region is there, the last one included.
+
+    Raises
+    ------
+    InvalidInputError
+        If the region leaves the image, or the window or overlap make no sense.
+
+    Examples
+    --------
+    >>> slide_window(np.zeros((64, 128, 3), np.uint8), xy_window=(64, 64)).tolist()
+    [[0, 0, 64, 64], [32, 0, 96, 64], [64, 0, 128, 64]]
+    """
+    height, width = check_image(image).shape[:2]
+    x1, x2 = _check_range(x_start_stop, width, "x_start_stop")
+    y1, y2 = _check_range(y_start_stop, height, "y_start_stop")
+    if len(xy_window) != 2 or len(xy_overlap) != 2:
+        raise InvalidInputError(f"xy_window and xy_overlap must be pairs; got {xy_window} and {xy_overlap}")
+    steps = []
+    for index, side in enumerate(xy_window):
+        check_integer(side, f"xy_window[{index}]", low=1)
+        overlap = check_number(xy_overlap[index], f"xy_overlap[{index}]", low=0, high=0.999)
+        # The course truncates the step; the tiny term keeps 64 * (1 - 0.9) from losing a pixel to rounding.
+        steps.append(max(1, int(side * (1 - overlap) + 1e-9)))
+    band = PixelBand(x1, y1, x2, y2, (int(xy_window[0]), int(xy_window[1])), (steps[0], steps[1]))
+    return band_windows(band)
+
+
+def band_windows(band: PixelBand) -> NDArray[np.int64]:
+    """List all windows of a placed band, ``(N, 4)`` int64, row by row."""
+    width, height = band.window
+    xs = np.arange(band.x1, band.x2 - width + 1, band.step[0])
+    ys = np.arange(band.y1, band.y2 - height + 1, band.step[1])
+    left, top = (grid.ravel() for grid in np.meshgrid(xs, ys))
+    return np.stack([left, top, left + width, top + height], axis=1).astype(np.int64)
+
+
+def _check_range(limits: Range, size: int, name: str) -> tuple[int, int]:
+    """Replace None by the image's border and check that the range lies inside."""
+    if len(limits) != 2:
+        raise InvalidInputError(f"{name} must be (start, stop); got {describe(limits)}")
+    start = 0 if limits[0] is None else int(limits[0])
+    stop = size if limits[1] is None else int(limits[1])
+    if not 0 <= start < stop <= size:
+        raise InvalidInputError(f"{name} must satisfy 0 <= start < stop <= {size}; got {(start, stop)}")
+    return start, stop
+
+
+def search_windows(
+    image: NDArray[np.uint8],
+    windows: ArrayLike,
+    classifier: VehicleClassifier,
+    *,
+    border: Literal["window", "image"] = "window",
+    min_score: float | None = 0.0,
+    n_jobs: int | None = None,
+) -> Detections:
+    """Classify each window of a list, any size, by its own patch.
+
+    Parameters
+    ----------
+    image
+        ``(H, W, 3)`` uint8 RGB.
+    windows
+        ``(N, 4)`` whole-pixel boxes inside the image, from `slide_window` or elsewhere.
+    classifier
+        Gives the score of a window that is cut out and resized to 64x64.
+    border
+        Where gradients are zero: ``"window"``, at the window's own border, as on a training patch;
+        ``"image"``, at the image's border only, as in a search that shares HOG between windows. The
+        latter is the reference for `find_cars`; its windows must be 64x64 and lie on the cell grid.
+    min_score
+        Windows with a score above this are returned; None returns all.
+    n_jobs
+        Threads.
+
+    Returns
+    -------
+    Detections
+        Boxes as they came in, with scores, in the same order.
+
+    Raises
+    ------
+    InvalidInputError
+        If a window leaves the image, is empty, or does not lie on the grid that `border` asks for.
+    """
+    check_image(image)
+    check_choice(border, "border", ("window", "image"))
+    boxes = check_boxes(windows, "windows").astype(np.int64)
+    height, width = image.shape[:2]
+    inside = (boxes[:, :2] >= 0).all(1) & (boxes[:, 2] <= width) & (boxes[:, 3] <= height)
+    filled = (boxes[:, 2:] > boxes[:, :2]).all(1)
+    if not (inside & filled).all():
+        row = int(np.argmin(inside & filled))
+        raise InvalidInputError(
+            f"windows must be filled boxes inside the {width}x{height} image; got {boxes[row].tolist()} in "
+            f"row {row}; use slide_window, or clip_boxes and drop the empty ones"
+        )
+    if border == "window":
+        patches = np.empty((len(boxes), PATCH_SIZE, PATCH_SIZE, 3), np.uint8)
+        for patch, (x1, y1, x2, y2) in zip(patches, boxes):
+            cv2.resize(image[y1:y2, x1:x2], (PATCH_SIZE, PATCH_SIZE), dst=patch)
+        features: NDArray[Any] = extract_features(patches, classifier.params, n_jobs=n_jobs)
+    else:
+        features = _shared_hog_features(image, boxes, classifier)
+    scores = classifier.decision_function(features)
+    found = Detections(boxes, scores)
+    return found if min_score is None else found[scores > min_score]
+
+
+def _shared_hog_features(
+    image: NDArray[np.uint8], boxes: NDArray[np.int64], classifier: VehicleClassifier
+) -> NDArray[np.float64]:
+    """Features of 64x64 windows on the cell grid, with one scikit-image HOG of the whole image.
+
+    Colours are converted before the windows are cut, as `find_cars` does; it makes no difference.
+    """
+    params = classifier.params
+    cell, blocks = params.pix_per_cell, params.blocks
+    sizes = boxes[:, 2:] - boxes[:, :2]
+    if (sizes != PATCH_SIZE).any() or (boxes[:, :2] % cell).any():
+        raise InvalidInputError(
+            f'border="image" needs {PATCH_SIZE}x{PATCH_SIZE} windows at multiples of {cell} pixels; '
+            "resize the image so that the window is 64x64"
+        )
+    converted = convert_color(image, params.color_space)
+    hog = []
+    if params.hog_feat:
+        source = hog_source(image, params)
+        hog = [
+            hog_blocks(
+                source[..., channel],
+                params.orient,
+                cell,
+                params.cell_per_block,
+                transform_sqrt=params.transform_sqrt,
+            )
+            for channel in range(params.hog_channels)
+        ]
+    features = np.empty((len(boxes), params.length))
+    for row, (x1, y1, x2, y2) in enumerate(boxes):
+        patch = np.ascontiguousarray(converted[y1:y2, x1:x2])
+        parts: list[NDArray[Any]] = [bin_spatial(patch, params.spatial_size)] if params.spatial_feat else []
+        parts += [color_hist(patch, params.hist_bins)] if params.hist_feat else []
+        top, left = y1 // cell, x1 // cell
+        parts += [part[top : top + blocks, left : left + blocks].ravel() for part in hog]
+        features[row] = np.concatenate(parts)
+    return features
