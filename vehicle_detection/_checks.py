@@ -16,7 +16,7 @@ def describe(value: object) -> str:
     """Say in a few words what a value is: an array's shape and dtype, or the value itself."""
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape} and dtype {value.dtype}"
-    text = repr(value)
+    text = " ".join(repr(value).split())
     return f"{text if len(text) <= 80 else text[:77] + '...'} ({type(value).__name__})"
 
 
@@ -81,12 +81,15 @@ def check_patches(patches: object, size: int, name: str = "patches") -> NDArray[
 
 def check_boxes(boxes: ArrayLike, name: str = "boxes") -> NDArray[Any]:
     """Return `boxes` as an ``(N, 4)`` array of finite boxes with ``x1 <= x2`` and ``y1 <= y2``."""
-    array = np.asarray(boxes)
+    try:
+        array = np.asarray(boxes)
+    except ValueError:  # rows of different lengths
+        array = np.array(None)
     if array.size == 0:
         return np.empty((0, 4), array.dtype if array.dtype.kind in "iuf" else np.float64)
     if array.ndim != 2 or array.shape[1] != 4 or array.dtype.kind not in "iuf":
         raise InvalidInputError(
-            f"{name} must be an (N, 4) number array of [x1, y1, x2, y2], got {describe(array)}; "
+            f"{name} must be an (N, 4) number array of [x1, y1, x2, y2], got {describe(boxes)}; "
             "wrap a single box in a list"
         )
     if not np.isfinite(array).all():
@@ -104,11 +107,11 @@ def check_boxes(boxes: ArrayLike, name: str = "boxes") -> NDArray[Any]:
 def check_number(
     value: object, name: str, *, low: float = -math.inf, high: float = math.inf, above: float = -math.inf
 ) -> float:
-    """Return `value` as a float in ``[low, high]`` and, if given, greater than `above`."""
+    """Return `value` as a finite float in ``[low, high]`` and, if given, greater than `above`."""
     number = math.nan
     if isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool):
         number = float(value)
-    if not (low <= number <= high and number > above):
+    if not (math.isfinite(number) and low <= number <= high and number > above):
         bounds = [f"greater than {above:g}"] if above > -math.inf else []
         bounds += [f"at least {low:g}"] if low > -math.inf else []
         bounds += [f"at most {high:g}"] if high < math.inf else []
@@ -128,6 +131,6 @@ def check_integer(value: object, name: str, *, low: int, high: int | None = None
 
 def check_choice(value: object, name: str, choices: Collection[object]) -> None:
     """Raise unless `value` is one of `choices`."""
-    if value not in choices:
+    if not (value is None or isinstance(value, (str, int, np.integer))) or value not in choices:
         listed = ", ".join(repr(choice) for choice in choices)
         raise InvalidInputError(f"{name} must be one of {listed}; got {describe(value)}")

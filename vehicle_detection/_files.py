@@ -31,7 +31,8 @@ def written_whole(target: str | os.PathLike[str], name: str = "target") -> Itera
     The temporary name keeps the suffix, as writers choose their format by it.
     """
     path = check_target(target, name)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+    # A part of the name will do: all of it and more may be longer than a file name can be.
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.stem[:32]}.", suffix=path.suffix, dir=path.parent)
     os.close(handle)
     part = Path(temporary)
     try:

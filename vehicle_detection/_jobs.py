@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from vehicle_detection._checks import check_integer
@@ -28,7 +29,7 @@ def resolve_jobs(n_jobs: int | None = None) -> int:
     text = os.environ.get(JOBS_VARIABLE, "")
     if not text:
         return available_cores()
-    if not text.isdigit() or int(text) < 1:
+    if not text.isdecimal() or int(text) < 1:
         raise InvalidInputError(f"{JOBS_VARIABLE} must be a whole number of threads from 1; got {text!r}")
     return int(text)
 
@@ -39,29 +40,48 @@ class _SingleThreadedBlas:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._inside = 0
-        self._limits: contextlib.AbstractContextManager[object] | None = None
         self._controller: Any = None
+        self._limits: Any = None
+        self._keeper: ThreadPoolExecutor | None = None
 
     @contextlib.contextmanager
     def __call__(self) -> Iterator[None]:
         with self._lock:
             if self._inside == 0:
-                self._enter()
+                self._keep(self._limit)
             self._inside += 1
         try:
             yield
         finally:
             with self._lock:
                 self._inside -= 1
-                if self._inside == 0 and self._limits is not None:
-                    self._limits.__exit__(None, None, None)
+                if self._inside == 0:
+                    self._keep(self._lift)
 
-    def _enter(self) -> None:
+    def _keep(self, function: Callable[[], None]) -> None:
+        """Call `function` on a thread of our own: only the thread that set a limit can lift it."""
+        self._keeper = self._keeper or ThreadPoolExecutor(1, thread_name_prefix="blas")
+        try:
+            job = self._keeper.submit(function)
+        except RuntimeError:  # The interpreter is ending: limits do not matter any more.
+            return
+        job.result()
+
+    def _limit(self) -> None:
         from threadpoolctl import ThreadpoolController
 
         # Looking for the loaded BLAS libraries takes a millisecond: once is enough.
         self._controller = self._controller or ThreadpoolController()
-        self._limits = self._controller.limit(limits=1, user_api="blas")
+        # An interrupt may have kept an earlier limit from being lifted.
+        self._limits = self._limits or self._controller.limit(limits=1, user_api="blas").__enter__()
+
+    def _lift(self) -> None:
+        if self._limits is not None:
+            self._limits.__exit__(None, None, None)
+            self._limits = None
 
 
 single_threaded_blas = _SingleThreadedBlas()
+if hasattr(os, "register_at_fork"):
+    # Threads do not survive a fork: the child needs a keeper of its own.
+    os.register_at_fork(after_in_child=single_threaded_blas.__init__)  # type: ignore[misc]

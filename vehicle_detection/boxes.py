@@ -83,7 +83,8 @@ def clip_boxes(boxes: ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
     if len(shape) < 2 or shape[0] < 1 or shape[1] < 1:
         raise InvalidInputError(f"shape must be (height, width, ...) of an image, got {describe(shape)}")
     height, width = shape[:2]
-    return np.asarray(np.clip(array, 0, np.array([width, height, width, height], array.dtype)))
+    limits = np.array([width, height, width, height])
+    return np.asarray(np.clip(array, 0, limits), array.dtype)
 
 
 def non_max_suppression(boxes: ArrayLike, scores: ArrayLike, *, threshold: float = 0.5) -> NDArray[np.intp]:

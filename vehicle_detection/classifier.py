@@ -28,6 +28,8 @@ FORMAT = "vehicle-detection-model"
 FORMAT_VERSION = "1"
 DEFAULT_C = 1e-4
 
+_CHUNK = 1024
+
 _TENSORS = ("mean", "scale", "coef", "intercept")
 
 
@@ -127,8 +129,14 @@ class VehicleClassifier:
             If the vectors are of another length or hold NaN.
         """
         features = self._features_of(X)
-        scores = [features @ weights + bias for weights, bias in (t.fold() for t in self.templates)]
-        return np.asarray(np.max(scores, axis=0), np.float64)
+        folded = [template.fold() for template in self.templates]
+        scores = np.empty((len(folded), len(features)))
+        for start in range(0, len(features), _CHUNK):
+            # Float64 copies of a chunk, not of features that may fill half the memory.
+            rows = features[start : start + _CHUNK].astype(np.float64)
+            for row, (weights, bias) in zip(scores, folded):
+                row[start : start + _CHUNK] = rows @ weights + bias
+        return np.asarray(scores.max(axis=0), np.float64)
 
     def predict(self, X: ArrayLike) -> NDArray[np.int64]:
         """1 for a vehicle and 0 for anything else, ``(N,)`` int64; arguments as `decision_function`."""
@@ -138,16 +146,16 @@ class VehicleClassifier:
         """Share of right predictions for the labels `y`, 0-1."""
         labels = np.asarray(y)
         predicted = self.predict(X)
-        if labels.shape != predicted.shape:
+        if labels.shape != predicted.shape or not labels.size:
             raise InvalidInputError(
-                f"y must be one label for each of {len(predicted)} rows; got {describe(labels)}"
+                f"y must be one label for each of {len(predicted)} rows, at least one; got {describe(labels)}"
             )
         return float(np.mean(predicted == labels))
 
     def _features_of(self, X: ArrayLike) -> NDArray[Any]:
         array = np.asarray(X)
         if array.ndim == 4:
-            return extract_features(array, self.params)
+            return extract_features(check_patches(array, PATCH_SIZE, "X"), self.params)
         if array.ndim != 2 or array.shape[1] != self.params.length or array.dtype.kind not in "iuf":
             raise InvalidInputError(
                 f"X must be (N, {self.params.length}) features or (N, 64, 64, 3) patches; "
@@ -229,7 +237,7 @@ class VehicleClassifier:
         Raises
         ------
         InvalidInputError
-            If the folder is missing or read-only.
+            If the folder is missing or read-only, or the metadata holds more than JSON values.
         """
         from safetensors.numpy import save
 
@@ -238,15 +246,29 @@ class VehicleClassifier:
             for index, template in enumerate(self.templates)
             for name in _TENSORS
         }
+        try:
+            facts = json.dumps(dict(self.metadata), sort_keys=True)
+        except (TypeError, ValueError) as error:
+            raise InvalidInputError(
+                f"metadata must hold JSON values only: {error}; convert numbers of numpy with .item()"
+            ) from error
         header = {
             "format": FORMAT,
             "format_version": FORMAT_VERSION,
             "params": json.dumps(asdict(self.params), sort_keys=True),
-            "metadata": json.dumps(dict(self.metadata), sort_keys=True),
+            "metadata": facts,
         }
         header["sha256"] = _checksum(header, tensors)
         with written_whole(path, "path") as part:
-            part.write_bytes(save(tensors, metadata=header))
+            part.write_bytes(_with_sorted_header(save(tensors, metadata=header)))
+
+
+def _with_sorted_header(data: bytes) -> bytes:
+    """Sort the header's keys: safetensors writes the metadata in an order that is never the same."""
+    stop = 8 + int.from_bytes(data[:8], "little")
+    header = json.dumps(json.loads(data[8:stop]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)
+    return len(header).to_bytes(8, "little") + header + data[stop:]
 
 
 def _checksum(header: Mapping[str, str], tensors: Mapping[str, NDArray[Any]]) -> str:
@@ -278,7 +300,7 @@ def load_classifier(path: str | os.PathLike[str] | None = None) -> VehicleClassi
     Examples
     --------
     >>> load_classifier().params.color_space
-    'YCrCb'
+    'LAB'
     """
     if path is None:
         resource = resources.files("vehicle_detection") / "models" / "default.safetensors"

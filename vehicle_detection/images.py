@@ -46,8 +46,9 @@ def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
 def _is_cut(data: bytes) -> bool:
     """Whether a JPEG or PNG lacks its end: OpenCV fills the missing part with gray and says nothing."""
     if data.startswith(b"\xff\xd8"):
-        return b"\xff\xd9" not in data[-4096:]
-    return data.startswith(b"\x89PNG") and b"IEND" not in data[-64:]
+        # The end marker comes after the last scan; one before it belongs to a thumbnail in the header.
+        return data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
+    return data.startswith(b"\x89PNG") and b"IEND" not in data
 
 
 def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 from vehicle_detection._checks import check_choice, check_integer, check_number, describe
@@ -17,6 +18,9 @@ REFERENCE_WIDTH = 1280
 
 COLOR_SPACES = ("RGB", "HSV", "LUV", "HLS", "YUV", "YCrCb", "LAB")
 HOG_CHANNELS: tuple[int | str, ...] = (0, 1, 2, "ALL", "GRAY")
+
+# A window of fewer pixels, blown up to a patch, is a blur.
+_LEAST_WINDOW = 16
 
 Pair = tuple[float, float]
 
@@ -83,6 +87,7 @@ class FeatureParams:
         },
         "ycrcb-6156": {},
         "ycrcb-8460": {"spatial_size": 32},
+        "lab-8460": {"color_space": "LAB", "spatial_size": 32},
     }
 
     def __post_init__(self) -> None:
@@ -92,17 +97,26 @@ class FeatureParams:
                 raise InvalidInputError(f"{name} must be True or False; got {describe(getattr(self, name))}")
         if not (self.spatial_feat or self.hist_feat or self.hog_feat):
             raise InvalidInputError("spatial_feat, hist_feat and hog_feat are all False; switch one on")
-        check_integer(self.spatial_size, "spatial_size", low=1, high=PATCH_SIZE)
-        check_integer(self.hist_bins, "hist_bins", low=1, high=256)
-        check_integer(self.orient, "orient", low=1, high=180)
-        check_integer(self.pix_per_cell, "pix_per_cell", low=2, high=PATCH_SIZE)
-        most = PATCH_SIZE // self.pix_per_cell
-        check_integer(self.cell_per_block, "cell_per_block", low=1, high=most)
+        self._check_integer("spatial_size", 1, PATCH_SIZE)
+        self._check_integer("hist_bins", 1, 256)
+        self._check_integer("orient", 1, 180)
+        self._check_integer("pix_per_cell", 2, PATCH_SIZE)
+        self._check_integer("cell_per_block", 1, PATCH_SIZE // self.pix_per_cell)
         check_choice(self.hog_channel, "hog_channel", HOG_CHANNELS)
+        if not isinstance(self.hog_channel, str):
+            self._check_integer("hog_channel", 0, 2)
+
+    def _check_integer(self, name: str, low: int, high: int) -> None:
+        # A plain int replaces one of numpy, which the JSON of a model file does not take.
+        object.__setattr__(self, name, check_integer(getattr(self, name), name, low=low, high=high))
 
     @classmethod
     def preset(cls, name: str) -> FeatureParams:
-        """Parameters of a course system: ``"luv-2384"``, ``"ycrcb-6156"`` or ``"ycrcb-8460"``."""
+        """Parameters of a course system or of the shipped model.
+
+        ``"luv-2384"``, ``"ycrcb-6156"`` and ``"ycrcb-8460"`` are the three systems' of the course;
+        ``"lab-8460"`` is the shipped model's.
+        """
         check_choice(name, "preset", cls.PRESETS)
         return cls(**cls.PRESETS[name])
 
@@ -150,7 +164,7 @@ class PixelBand:
     Attributes
     ----------
     x1, y1, x2, y2
-        The band's half-open rectangle, inside the frame.
+        The band's half-open rectangle. It lies inside the frame, but for an overhang at the sides.
     window
         Width and height of its windows.
     step
@@ -197,15 +211,18 @@ class SearchBand:
                     f"{name} must be (start, stop) with start < stop; got {(start, stop)}"
                 )
 
-    def place(self, shape: tuple[int, ...], horizon: float) -> PixelBand | None:
+    def place(self, shape: tuple[int, ...], horizon: float, overhang: float = 0.0) -> PixelBand | None:
         """Place the band on a frame of `shape` (height, width); None where no window fits."""
         height, width = shape[:2]
         scale = max(height, width) / REFERENCE_WIDTH
-        window_w, window_h = (max(8, round(side * scale)) for side in self.window)
+        window_w, window_h = (round(side * scale) for side in self.window)
         y1, y2 = (min(max(round(horizon * height + side * scale), 0), height) for side in self.y)
         x1, x2 = round(self.x[0] * width), round(self.x[1] * width)
-        if x2 - x1 < window_w or y2 - y1 < window_h:
+        if min(window_w, window_h) < _LEAST_WINDOW or x2 - x1 < window_w or y2 - y1 < window_h:
             return None
+        beyond = round(overhang * window_w)
+        x1 -= beyond if x1 == 0 else 0
+        x2 += beyond if x2 == width else 0
         step = (
             max(1, int(window_w * (1 - self.overlap[0]) + 1e-9)),
             max(1, int(window_h * (1 - self.overlap[1]) + 1e-9)),
@@ -244,6 +261,9 @@ class SearchParams:
         Height of the horizon as a share of the frame's height, 0 at the top.
     min_score
         Windows with a score above this count as hits.
+    overhang
+        Share of a window that may lie beyond the frame's left and right edge, where the outermost column
+        is repeated: vehicles that are half in the picture are found.
 
     Examples
     --------
@@ -253,14 +273,20 @@ class SearchParams:
     """
 
     bands: tuple[SearchBand, ...]
-    horizon: float = 0.56
+    horizon: float = 0.58
     min_score: float = 0.0
+    overhang: float = 0.0
 
     def __post_init__(self) -> None:
-        if not self.bands or not all(isinstance(band, SearchBand) for band in self.bands):
-            raise InvalidInputError(f"bands must be a tuple of SearchBand; got {describe(self.bands)}")
+        bands: object = self.bands
+        if not isinstance(bands, (tuple, list)) or not all(isinstance(band, SearchBand) for band in bands):
+            raise InvalidInputError(f"bands must be a tuple of SearchBand; got {describe(bands)}")
+        if not bands:
+            raise InvalidInputError("bands must be a tuple of SearchBand, at least one; got none")
+        object.__setattr__(self, "bands", tuple(bands))
         check_number(self.horizon, "horizon", low=0, high=1)
         check_number(self.min_score, "min_score", low=-1e6, high=1e6)
+        check_number(self.overhang, "overhang", low=0, high=0.9)
 
     @classmethod
     def preset(cls, name: str = "default") -> SearchParams:
@@ -285,19 +311,31 @@ class SearchParams:
         InvalidInputError
             If not one window fits into the frame.
         """
-        placed = tuple(band for band in (b.place(shape, self.horizon) for b in self.bands) if band)
+        placed = tuple(band for band in self._place_each(shape) if band)
         if not placed:
             raise InvalidInputError(
                 f"image of {shape[1]}x{shape[0]} pixels holds no search window below the horizon at "
-                f"{self.horizon:g} of its height; pass a larger image, another horizon or smaller bands"
+                f"{self.horizon:g} of its height; pass a larger image, another horizon or other bands"
             )
         return placed
 
+    def _place_each(self, shape: tuple[int, ...]) -> Iterator[PixelBand | None]:
+        return (band.place(shape, self.horizon, self.overhang) for band in self.bands)
+
 
 def _default_search() -> dict[str, Any]:
-    sizes = (64.0, 80.0, 100.0, 125.0, 156.0, 195.0, 244.0)
-    bands = tuple(SearchBand(window=(side, side), y=(-0.35 * side, 1.05 * side)) for side in sizes)
-    return {"bands": bands, "horizon": 0.56}
+    """Windows from 64 px up in even steps of scale, wherever a vehicle on a flat road may stand.
+
+    With the camera `c` metres above the road, the foot of a vehicle whose face fills 0.84 of a window of
+    side `s` is ``0.84 * s * c / 1.8`` below the horizon. For cameras from 0.9 to 2 m high that puts the
+    window between -0.35 and 0.95 `s`; the margin allows for hills and for a horizon that is not exact.
+    """
+    margin = 16.0
+    sides = [64.0 * 1.25**step for step in range(8)]
+    bands = tuple(
+        SearchBand(window=(side, side), y=(-0.35 * side - margin, 0.95 * side + margin)) for side in sides
+    )
+    return {"bands": bands, "horizon": 0.58, "min_score": 0.0, "overhang": 0.5}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -329,7 +367,157 @@ class HeatParams:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackParams:
-    """How regions become vehicles; times are in seconds of the video."""
+class RegionParams:
+    """How agreeing windows become the boxes of vehicles; lengths are shares of a window's side.
 
-    field_placeholder: float = field(default=0.0, repr=False)
+    Attributes
+    ----------
+    min_peak
+        Best score that a group of windows needs.
+    min_evidence
+        Sum of positive scores that it needs.
+    overlap
+        Windows that overlap the best one by more than this (IoU) join its group.
+    power
+        A window counts in the mean with this power of its score.
+    reach
+        Windows with a centre this near to a group's are used up by it.
+    face_width, face_height
+        Part of the window that a vehicle's face fills, on the training patches and their like.
+    drop
+        How far the face's middle lies below the window's.
+    flank_length_m
+        Length of a vehicle's flank in metres, as far as it shows.
+    covered
+        A group whose face lies inside the box of a better one by more than this share is no vehicle.
+    flank_peak
+        Such a group goes even before a weaker one, if it only lies on its flank and the other has more than
+        this share of its peak.
+    flank_shift
+        Share of the visible flank by which the box's middle moves towards the vanishing point.
+    """
+
+    min_peak: float = 0.6
+    min_evidence: float = 1.5
+    overlap: float = 0.5
+    power: float = 2.0
+    reach: float = 0.6
+    face_width: float = 0.84
+    face_height: float = 0.79
+    drop: float = -0.04
+    flank_length_m: float = 6.0
+    flank_shift: float = 0.27
+    covered: float = 0.5
+    flank_peak: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name in ("min_peak", "min_evidence"):
+            check_number(getattr(self, name), name, low=0, high=1e9)
+        check_number(self.overlap, "overlap", low=0, high=1)
+        check_number(self.covered, "covered", low=0, high=1)
+        check_number(self.flank_peak, "flank_peak", low=0, high=1)
+        check_number(self.power, "power", low=0, high=20)
+        for name in ("reach", "face_width", "face_height", "flank_shift"):
+            check_number(getattr(self, name), name, above=0, high=2)
+        check_number(self.drop, "drop", low=-1, high=1)
+        check_number(self.flank_length_m, "flank_length_m", low=0, high=100)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackParams:
+    """How regions become vehicles; times are in seconds of the video, sizes in shares of a box's own size.
+
+    Attributes
+    ----------
+    smoother
+        ``"kalman"``: constant velocity; ``"history"``: weighted mean of the last boxes (the course's second
+        system); ``"nearest"``: the box moves a share of the way to the new one (its first system).
+    memory
+        Time constant in which the running mean of a track's scores forgets.
+    birth_score
+        Detections below this score keep a track alive but start none.
+    confirm_score
+        Running mean of the scores at which a track is believed. A vehicle of score `s` reaches it after
+        ``memory * log(s / (s - confirm_score))`` seconds, one that scores less never does.
+    confirm_hits, confirm_seconds
+        A track is believed after this many detections at the earliest, and this long after the first.
+    start_score
+        In the first frame, and the first after a cut, a detection of this score is believed at once: there
+        is no earlier frame that could have told.
+    tentative_coast
+        A track that is not yet believed ends once it is unseen for longer than this.
+    show_coast
+        A believed track is drawn this long without a detection, and less if it was seen for less than twice
+        as long; while other vehicles hide it, up to `max_coast`.
+    max_coast
+        A believed track ends once it is unseen for longer than this.
+    max_gap
+        A longer gap between two frames ends all tracks.
+    gate
+        Farthest that a detection's centre may lie from the predicted one, in box widths and heights.
+    max_overlap, max_cover
+        A second box on one vehicle: IoU with a track, and share of the smaller of the two boxes that both
+        cover, above which a detection starts no track of its own.
+    box_noise
+        Standard error of a detection's edges.
+    box_noise_seconds
+        Time over which that error stays alike, so that twice the frames are not twice the evidence.
+    agility, growth
+        Process noise of the centre and of the size: their speeds wander by this share of the size a second,
+        in a second.
+    history
+        Length of the mean of the smoother ``"history"``.
+    nearest_share
+        Share of the way that the smoother ``"nearest"`` moves in 0.04 seconds, in (0, 1].
+
+    Examples
+    --------
+    >>> TrackParams(max_coast=0.5).show_coast
+    0.3
+    >>> TrackParams(confirm_hits=0)
+    Traceback (most recent call last):
+    ...
+    vehicle_detection.errors.InvalidInputError: confirm_hits must be an integer from 1 to 10000; got 0 (int)
+    """
+
+    smoother: Literal["kalman", "history", "nearest"] = "kalman"
+    memory: float = 0.3
+    birth_score: float = 0.0
+    confirm_score: float = 0.35
+    confirm_hits: int = 4
+    confirm_seconds: float = 0.12
+    start_score: float = 1.3
+    tentative_coast: float = 0.1
+    show_coast: float = 0.3
+    max_coast: float = 1.0
+    max_gap: float = 1.0
+    gate: float = 0.7
+    max_overlap: float = 0.3
+    max_cover: float = 0.7
+    box_noise: float = 0.07
+    box_noise_seconds: float = 0.04
+    agility: float = 0.18
+    growth: float = 0.1
+    history: float = 0.4
+    nearest_share: float = 0.3
+
+    def __post_init__(self) -> None:
+        check_choice(self.smoother, "smoother", ("kalman", "history", "nearest"))
+        for name in ("memory", "max_gap", "history"):
+            check_number(getattr(self, name), name, above=0, high=3600)
+        for name in ("confirm_seconds", "tentative_coast", "show_coast", "max_coast", "box_noise_seconds"):
+            check_number(getattr(self, name), name, low=0, high=3600)
+        for name in ("birth_score", "confirm_score", "start_score"):
+            check_number(getattr(self, name), name, low=-1e6, high=1e6)
+        for name in ("gate", "agility", "growth"):
+            check_number(getattr(self, name), name, above=0, high=100)
+        for name in ("max_overlap", "max_cover"):
+            check_number(getattr(self, name), name, low=0, high=1)
+        check_integer(self.confirm_hits, "confirm_hits", low=1, high=10_000)
+        check_number(self.box_noise, "box_noise", above=0, high=1)
+        check_number(self.nearest_share, "nearest_share", above=0, high=1)
+        if self.show_coast > self.max_coast:
+            raise InvalidInputError(
+                f"show_coast must be at most max_coast, as a track that ended is not drawn; "
+                f"got {self.show_coast:g} and {self.max_coast:g}; change both"
+            )

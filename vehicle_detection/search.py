@@ -166,9 +166,13 @@ Take = Callable[..., NDArray[Any]]
 def resize_band(image: NDArray[np.uint8], band: PixelBand, take: Take = np.empty) -> NDArray[np.uint8]:
     """Cut a band out and resize it so that a window is 64x64; `take` hands out the memory."""
     height, width = resized_shape(band)
-    strip = image[band.y1 : band.y2, band.x1 : band.x2]
+    left, right = max(0, -band.x1), max(0, band.x2 - image.shape[1])
+    strip = image[band.y1 : band.y2, max(0, band.x1) : band.x2]
+    if left or right:
+        # Beyond the frame the outermost column goes on: no gradient is made up there.
+        strip = cv2.copyMakeBorder(strip, 0, 0, left, right, cv2.BORDER_REPLICATE)
     if strip.shape[:2] == (height, width):
-        return strip
+        return np.asarray(strip, np.uint8)
     return np.asarray(cv2.resize(strip, (width, height), dst=take((height, width, 3), np.uint8)), np.uint8)
 
 

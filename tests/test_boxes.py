@@ -1,0 +1,201 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from vehicle_detection.boxes import (
+    Detections,
+    box_areas,
+    clip_boxes,
+    intersection_matrix,
+    iou_matrix,
+    non_max_suppression,
+)
+from vehicle_detection.errors import InvalidInputError
+
+
+def corners_to_boxes(array):
+    return np.concatenate([np.minimum(array[:, :2], array[:, 2:]), np.maximum(array[:, :2], array[:, 2:])], 1)
+
+
+def boxes_of(elements, dtype, most=8):
+    shapes = st.tuples(st.integers(0, most), st.just(4))
+    return shapes.flatmap(lambda shape: hnp.arrays(dtype, shape, elements=elements)).map(corners_to_boxes)
+
+
+integer_boxes = boxes_of(st.integers(-20, 30), np.int64)
+float_boxes = boxes_of(st.floats(-1e4, 1e4, width=32), np.float64)
+any_boxes = st.one_of(integer_boxes, float_boxes)
+
+
+@st.composite
+def detections(draw):
+    boxes = draw(any_boxes)
+    # Few different scores make ties likely.
+    scores = draw(hnp.arrays(np.float64, len(boxes), elements=st.integers(-3, 3).map(float)))
+    return Detections(boxes, scores)
+
+
+def pixels(box):
+    x1, y1, x2, y2 = (int(value) for value in box)
+    return {(x, y) for x in range(x1, x2) for y in range(y1, y2)}
+
+
+@given(integer_boxes, integer_boxes)
+def test_areas_and_overlaps_count_pixels(first, second):
+    inner = [[len(pixels(a) & pixels(b)) for b in second] for a in first]
+    outer = [[len(pixels(a) | pixels(b)) for b in second] for a in first]
+    shape = (len(first), len(second))
+    assert box_areas(first).tolist() == [len(pixels(a)) for a in first]
+    np.testing.assert_array_equal(intersection_matrix(first, second), np.reshape(inner, shape))
+    expected = [[i / u if u else 0 for i, u in zip(*row)] for row in zip(inner, outer)]
+    np.testing.assert_allclose(iou_matrix(first, second), np.reshape(expected, shape), rtol=1e-12)
+
+
+@given(any_boxes, any_boxes)
+def test_iou_is_symmetric_and_a_share(first, second):
+    overlap = iou_matrix(first, second)
+    assert overlap.shape == (len(first), len(second))
+    assert overlap.dtype == np.float64
+    assert ((overlap >= 0) & (overlap <= 1)).all()
+    np.testing.assert_array_equal(overlap, iou_matrix(second, first).T)
+
+
+@given(any_boxes)
+def test_a_box_covers_itself_unless_it_has_no_area(boxes):
+    own = np.diag(iou_matrix(boxes, boxes))
+    np.testing.assert_array_equal(own, (box_areas(boxes) > 0).astype(float))
+
+
+def test_iou_of_small_integer_types_does_not_wrap():
+    boxes = np.array([[0, 0, 200, 200], [100, 100, 250, 250]], np.uint8)
+    np.testing.assert_array_equal(iou_matrix(boxes, boxes), iou_matrix(boxes.astype(int), boxes.astype(int)))
+
+
+def test_iou_names_the_argument():
+    with pytest.raises(InvalidInputError, match="second must be an"):
+        iou_matrix([[0, 0, 1, 1]], [0, 0, 1, 1])
+
+
+@given(any_boxes, st.tuples(st.integers(1, 40), st.integers(1, 40)))
+def test_clipped_boxes_lie_in_the_image(boxes, shape):
+    before = boxes.copy()
+    clipped = clip_boxes(boxes, shape)
+    height, width = shape
+    assert ((clipped >= 0) & (clipped <= (width, height, width, height))).all()
+    assert (clipped[:, 2:] >= clipped[:, :2]).all()
+    assert clipped.dtype == boxes.dtype
+    np.testing.assert_array_equal(clip_boxes(clipped, shape), clipped)
+    # Clipping is the intersection with the image.
+    image = np.array([[0, 0, width, height]], boxes.dtype)
+    np.testing.assert_allclose(box_areas(clipped), intersection_matrix(boxes, image)[:, 0], atol=1e-6)
+    np.testing.assert_array_equal(boxes, before)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.uint32, np.float32])
+def test_clipping_keeps_the_type(dtype):
+    clipped = clip_boxes(np.array([[0, 0, 200, 100]], dtype), (720, 1280))
+    assert clipped.dtype == dtype
+    assert clipped.tolist() == [[0, 0, 200, 100]]
+
+
+@pytest.mark.parametrize("shape", [(10,), (0, 10), (10, 0), ()])
+def test_clipping_wants_the_shape_of_an_image(shape):
+    with pytest.raises(InvalidInputError, match=r"shape must be \(height, width, ...\) of an image, got"):
+        clip_boxes([[0, 0, 1, 1]], shape)
+
+
+def suppressed_one_by_one(boxes, scores, threshold):
+    kept = []
+    for row in sorted(range(len(boxes)), key=lambda row: -scores[row]):
+        if all(iou_matrix(boxes[[row]], boxes[[other]])[0, 0] <= threshold for other in kept):
+            kept.append(row)
+    return kept
+
+
+@given(detections(), st.floats(0, 1))
+def test_suppression_equals_its_definition(found, threshold):
+    kept = non_max_suppression(found.boxes, found.scores, threshold=threshold)
+    assert kept.tolist() == suppressed_one_by_one(found.boxes, found.scores, threshold)
+
+
+@given(detections(), st.floats(0, 1))
+def test_suppression_is_idempotent(found, threshold):
+    once = found[non_max_suppression(found.boxes, found.scores, threshold=threshold)]
+    twice = non_max_suppression(once.boxes, once.scores, threshold=threshold)
+    assert twice.tolist() == list(range(len(once)))
+
+
+@given(detections(), st.floats(0, 1))
+def test_what_is_kept_does_not_overlap_and_what_is_not_does(found, threshold):
+    kept = non_max_suppression(found.boxes, found.scores, threshold=threshold)
+    overlap = iou_matrix(found.boxes, found.boxes)
+    among = overlap[np.ix_(kept, kept)]
+    np.fill_diagonal(among, 0)
+    assert (among <= threshold).all()
+    assert (np.diff(found.scores[kept]) <= 0).all()
+    for row in set(range(len(found))) - set(kept.tolist()):
+        better = [k for k in kept if found.scores[k] >= found.scores[row]]
+        assert (overlap[row, better] > threshold).any()
+
+
+def test_suppression_of_nothing():
+    assert non_max_suppression([], []).shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([[0, 0, 1, 1]], [1, 2]), "scores must be one number for each of the 1 boxes"),
+        (([[0, 0, 1, 1]], []), "scores must be one number for each of the 1 boxes"),
+        (([[0, 0, 1, 1]], [np.nan]), "scores must be finite"),
+        (([[0, 0, 1, np.inf]], [1]), "boxes must be finite"),
+        (([[0, 0, 1, 1]], ["a"]), "scores must be one number"),
+    ],
+)
+def test_suppression_refuses(arguments, message):
+    with pytest.raises(InvalidInputError, match=message):
+        non_max_suppression(*arguments)
+
+
+@pytest.mark.parametrize("threshold", [-0.1, 1.1, np.nan, None])
+def test_suppression_refuses_a_threshold(threshold):
+    with pytest.raises(InvalidInputError, match="threshold must be a number, at least 0 and at most 1"):
+        non_max_suppression([[0, 0, 1, 1]], [1], threshold=threshold)
+
+
+def test_detections_are_columns():
+    found = Detections([[0, 0, 10, 10], [5, 5, 9, 9]], [1, 2])
+    assert len(found) == 2
+    assert found.scores.dtype == np.float64
+    assert [(box.tolist(), score) for box, score in found] == [([0, 0, 10, 10], 1.0), ([5, 5, 9, 9], 2.0)]
+    assert found[1:].scores.tolist() == [2]
+    assert found[found.scores < 2].boxes.tolist() == [[0, 0, 10, 10]]
+    assert found[[1, 0]].scores.tolist() == [2, 1]
+    assert len(found[[]]) == 0
+    with pytest.raises(InvalidInputError, match="wrap a single box"):
+        found[0]
+
+
+def test_no_detections():
+    for found in (Detections.empty(), Detections([], []), Detections(np.empty((0, 4)), np.empty((0, 1)))):
+        assert len(found) == 0
+        assert found.boxes.shape == (0, 4)
+        assert found.scores.shape == (0,)
+        assert list(found) == []
+
+
+@pytest.mark.parametrize(
+    ("boxes", "scores", "message"),
+    [
+        ([[0, 0, 1, 1]], [[1]], r"scores must be one number for each of the 1 boxes, got .*\(1, 1\)"),
+        ([], [1], "scores must be one number for each of the 0 boxes"),
+        ([[0, 0, 1, 1]], [True], "scores must be one number"),
+        ([[0, 0, 1, 1]], [np.inf], "scores must be finite, got NaN or infinity"),
+        ([[1, 0, 0, 1]], [1], "boxes must be .* x1 <= x2"),
+    ],
+)
+def test_detections_refuse(boxes, scores, message):
+    with pytest.raises(InvalidInputError, match=message):
+        Detections(boxes, scores)

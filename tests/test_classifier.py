@@ -1,0 +1,526 @@
+import json
+import re
+import struct
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+from sklearn.svm import LinearSVC
+
+from vehicle_detection.classifier import (
+    FORMAT,
+    FORMAT_VERSION,
+    Template,
+    VehicleClassifier,
+    _checksum,
+    load_classifier,
+    train_classifier,
+)
+from vehicle_detection.errors import InvalidInputError, ModelFileError
+from vehicle_detection.features import PatchFeatures, extract_features
+from vehicle_detection.params import FeatureParams
+
+SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
+
+
+def random_template(params, seed=0, *, bias=0.0):
+    """A template whose scores are of the order of one, on features of the usual sizes."""
+    rng = np.random.default_rng(seed)
+    parts = ((params.spatial_length, 128, 60), (params.hist_length, 128, 100), (params.hog_length, 0.1, 0.1))
+    mean = np.concatenate([np.full(count, mean) for count, mean, _ in parts])
+    scale = np.concatenate([scale * rng.uniform(0.5, 2, count) for count, _, scale in parts])
+    coef = rng.normal(0, params.length**-0.5, params.length)
+    return Template(mean, scale, coef, bias)
+
+
+def random_classifier(params, seed=0, *, templates=1, bias=0.0):
+    """A classifier that was never trained: its scores are as good as any for comparing two searches."""
+    return VehicleClassifier(
+        params, tuple(random_template(params, seed + index, bias=bias) for index in range(templates))
+    )
+
+
+@pytest.fixture(scope="module")
+def patches():
+    """40 bright patches with an edge, and 40 dark noisy ones."""
+    rng = np.random.default_rng(1)
+    bright = rng.integers(120, 250, (40, 64, 64, 3), dtype=np.uint8)
+    bright[:, 30:, :] //= 2
+    dark = rng.integers(0, 140, (40, 64, 64, 3), dtype=np.uint8)
+    return np.concatenate([bright, dark])
+
+
+@pytest.fixture(scope="module")
+def labels():
+    return np.repeat([1, 0], 40)
+
+
+@pytest.fixture(scope="module")
+def trained(patches, labels):
+    return train_classifier(patches, labels, params=SMALL, metadata={"accuracy": 1.0})
+
+
+def test_a_trained_classifier_tells_its_patches_apart(trained, patches, labels):
+    scores = trained.decision_function(patches)
+    assert scores.shape == (80,)
+    assert scores.dtype == np.float64
+    predicted = trained.predict(patches)
+    assert predicted.dtype == np.int64
+    np.testing.assert_array_equal(predicted, scores > 0)
+    np.testing.assert_array_equal(predicted, labels)
+    assert trained.score(patches, labels) == 1.0
+    assert trained.score(patches, 1 - labels) == 0.0
+
+
+def test_patches_and_their_features_score_alike(trained, patches):
+    features = extract_features(patches, SMALL)
+    np.testing.assert_array_equal(trained.decision_function(features), trained.decision_function(patches))
+    np.testing.assert_allclose(
+        trained.decision_function(list(patches[:3])), trained.decision_function(patches)[:3], rtol=1e-6
+    )
+    assert trained.decision_function(features[:0]).shape == (0,)
+
+
+def test_training_tells_what_it_did(trained):
+    training = trained.metadata["training"]
+    assert (training["vehicles"], training["non_vehicles"]) == (40, 40)
+    assert training["random_state"] == 0
+    assert {"vehicle_detection", "numpy", "scikit-learn"} <= trained.metadata["versions"].keys()
+    assert trained.metadata["accuracy"] == 1.0
+    json.dumps(trained.metadata)
+
+
+def test_the_same_seed_gives_the_same_model(trained, patches, labels, tmp_path):
+    before = patches.copy()
+    again = train_classifier(patches, labels, params=SMALL, metadata={"accuracy": 1.0}, n_jobs=1)
+    np.testing.assert_array_equal(patches, before)
+    trained.save(tmp_path / "a.safetensors")
+    again.save(tmp_path / "b.safetensors")
+    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
+
+
+def test_mirrored_patches_make_a_mirror_symmetric_scaler(patches, labels):
+    params = FeatureParams(hog_feat=False, hist_feat=False, spatial_size=8)
+    both = train_classifier(patches[:, ::-1], labels, params=params)
+    mean = both.templates[0].mean.reshape(3, 8, 8)
+    np.testing.assert_allclose(mean, mean[..., ::-1], rtol=1e-6)
+    alone = train_classifier(patches, labels, params=params, mirror=False)
+    assert not np.allclose(alone.templates[0].mean, both.templates[0].mean)
+
+
+@pytest.mark.parametrize("kind", [int, float, bool, np.uint8, list])
+def test_labels_of_any_number_type(patches, labels, trained, kind):
+    some = slice(30, 50)
+    given = labels[some].tolist() if kind is list else labels[some].astype(kind)
+    expected = train_classifier(patches[some], labels[some], params=SMALL)
+    found = train_classifier(patches[some], given, params=SMALL)
+    np.testing.assert_array_equal(found.templates[0].coef, expected.templates[0].coef)
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        (np.ones(80), r"labels must hold both classes: vehicles \(1\) and non-vehicles \(0\)"),
+        (np.zeros(80, int), "labels must hold both classes"),
+        (np.repeat([1, np.nan], 40), r"labels must be 0 or 1; got \[1.0, nan\]"),
+        (np.repeat([1, -1], 40), r"labels must be 0 or 1; got \[-1, 1\]"),
+        (np.repeat([1, 2], 40), "labels must be 0 or 1"),
+        (np.repeat([0.5, 1], 40), "labels must be 0 or 1"),
+        (np.repeat([1, 0], 39), "labels must be one number for each of 80 patches; got an array of shape"),
+        (np.repeat([1, 0], 40)[:, None], "labels must be one number for each of 80 patches"),
+        (np.repeat(["car", "road"], 40), "labels must be one number for each of 80 patches"),
+        (None, "labels must be one number for each of 80 patches"),
+    ],
+)
+def test_bad_labels(patches, bad, message):
+    with pytest.raises(InvalidInputError, match=message):
+        train_classifier(patches, bad, params=SMALL)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda p: p[:, :32, :32], r"patches must be an \(N, 64, 64, 3\) uint8 RGB array"),
+        (lambda p: p / 255, r"patches must be an \(N, 64, 64, 3\) uint8 RGB array .* dtype float64"),
+        (lambda p: p[..., 0], r"patches must be an \(N, 64, 64, 3\) uint8 RGB array"),
+        (lambda p: [*p[:-1], p[-1, :32, :32]], r"patches\[79\] must be 64x64 pixels, got 32x32"),
+        (lambda p: [*p[:-1], p[-1] / 255], r"patches\[79\] must be an \(H, W, 3\) uint8 RGB array"),
+    ],
+)
+def test_bad_patches(patches, labels, change, message):
+    with pytest.raises(InvalidInputError, match=message):
+        train_classifier(change(patches), labels, params=SMALL)
+
+
+def test_no_patches():
+    with pytest.raises(InvalidInputError, match="labels must hold both classes"):
+        train_classifier(np.empty((0, 64, 64, 3), np.uint8), [])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"C": 0}, "C must be a number, greater than 0"),
+        ({"C": np.nan}, "C must be a number"),
+        ({"random_state": -1}, "random_state must be an integer from 0"),
+        ({"random_state": None}, "random_state must be an integer from 0"),
+        ({"n_jobs": 0}, "n_jobs must be an integer from 1"),
+    ],
+)
+def test_bad_options(patches, labels, arguments, message):
+    with pytest.raises(InvalidInputError, match=message):
+        train_classifier(patches, labels, params=SMALL, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("X", "message"),
+    [
+        (np.zeros((2, 5)), r"X must be \(N, \d+\) features or \(N, 64, 64, 3\) patches; got .*\(2, 5\)"),
+        (np.zeros(SMALL.length), r"X must be \(N, \d+\) features"),
+        (np.zeros((1, SMALL.length), complex), "X must be"),
+        (np.full((1, SMALL.length), np.nan), "X must be finite, got NaN or infinity"),
+        (np.full((1, SMALL.length), np.inf), "X must be finite, got NaN or infinity"),
+        (np.zeros((2, 32, 32, 3), np.uint8), r"X must be an \(N, 64, 64, 3\) uint8 RGB array"),
+        (np.zeros((2, 64, 64, 3)), r"X must be an \(N, 64, 64, 3\) uint8 RGB array .*float64"),
+        ("patches", "X must be"),
+    ],
+)
+def test_bad_rows(trained, X, message):
+    with pytest.raises(InvalidInputError, match=message):
+        trained.decision_function(X)
+
+
+@pytest.mark.parametrize("y", [[1], np.ones((80, 1)), 1, np.ones(79)])
+def test_score_wants_a_label_for_each_row(trained, patches, y):
+    with pytest.raises(InvalidInputError, match="y must be one label for each of 80 rows"):
+        trained.score(patches, y)
+
+
+def test_score_of_nothing_is_refused(trained):
+    with pytest.raises(InvalidInputError, match="y must be one label for each of 0 rows, at least one"):
+        trained.score(np.empty((0, SMALL.length)), [])
+
+
+def test_folding_is_the_scaler_and_the_svm():
+    template = random_template(SMALL, 3, bias=0.7)
+    x = np.random.default_rng(0).uniform(0, 200, (5, SMALL.length))
+    weights, bias = template.fold()
+    expected = ((x - template.mean) / template.scale) @ template.coef + template.intercept
+    np.testing.assert_allclose(x @ weights + bias, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_several_templates_give_the_best_score():
+    many = random_classifier(SMALL, 5, templates=3)
+    rows = np.random.default_rng(0).normal(
+        many.templates[0].mean, many.templates[0].scale, (50, SMALL.length)
+    )
+    each = [VehicleClassifier(SMALL, (template,)).decision_function(rows) for template in many.templates]
+    np.testing.assert_array_equal(many.decision_function(rows), np.max(each, axis=0))
+    assert len({int(np.argmax(column)) for column in np.transpose(each)}) > 1
+    with pytest.raises(InvalidInputError, match="a pipeline holds one template; this model has 3"):
+        many.to_pipeline()
+
+
+def test_a_template_is_a_copy_that_cannot_be_written():
+    mean = np.zeros(4)
+    template = Template(mean, np.ones(4), np.ones(4), 0.0)
+    mean[0] = 5
+    assert template.mean[0] == 0
+    with pytest.raises(ValueError, match="read-only"):
+        template.coef[0] = 2
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ((np.zeros(4), np.ones(3), np.ones(4), 0.0), "scale must be a vector as long as the features"),
+        ((np.zeros((2, 2)), np.ones(4), np.ones(4), 0.0), "mean must be a vector"),
+        ((np.zeros(4), np.ones(4), np.full(4, np.nan), 0.0), "coef must be finite, got NaN or infinity"),
+        ((np.zeros(4), np.zeros(4), np.ones(4), 0.0), "scale must be positive"),
+        ((np.zeros(4), -np.ones(4), np.ones(4), 0.0), "scale must be positive"),
+        ((np.zeros(4), np.ones(4), np.ones(4), np.inf), "intercept must be finite; got inf"),
+    ],
+)
+def test_a_bad_template(columns, message):
+    with pytest.raises(InvalidInputError, match=message):
+        Template(*columns)
+
+
+def test_a_classifier_whose_parts_do_not_fit():
+    with pytest.raises(InvalidInputError, match="templates must hold at least one template; got none"):
+        VehicleClassifier(SMALL, ())
+    with pytest.raises(InvalidInputError, match=rf"templates must have {SMALL.length} weights, .* got 4"):
+        VehicleClassifier(SMALL, (Template(np.zeros(4), np.ones(4), np.ones(4), 0.0),))
+
+
+def test_it_scores_as_its_pipeline_does(trained, patches):
+    pipeline = trained.to_pipeline()
+    # The pipeline scales in float32, as the features are.
+    np.testing.assert_allclose(
+        pipeline.decision_function(patches), trained.decision_function(patches), rtol=1e-4, atol=1e-4
+    )
+    np.testing.assert_array_equal(pipeline.predict(patches), trained.predict(patches))
+
+
+def test_from_pipeline_and_back(trained, patches):
+    again = VehicleClassifier.from_pipeline(trained.to_pipeline(), SMALL, metadata=trained.metadata)
+    np.testing.assert_array_equal(again.decision_function(patches), trained.decision_function(patches))
+    assert again.params == trained.params
+    assert again.metadata == trained.metadata
+
+
+def test_from_a_pipeline_of_ones_own(patches, labels):
+    features = PatchFeatures(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
+    pipeline = make_pipeline(features, StandardScaler(), LinearSVC(C=0.01, random_state=0))
+    pipeline.fit(patches, labels.astype(bool))
+    classifier = VehicleClassifier.from_pipeline(pipeline, SMALL)
+    np.testing.assert_allclose(
+        classifier.decision_function(patches), pipeline.decision_function(patches), rtol=1e-4, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("options", [{"with_mean": False}, {"with_std": False}])
+def test_from_a_pipeline_with_half_a_scaler(patches, labels, options):
+    rows = extract_features(patches, SMALL)
+    pipeline = make_pipeline(StandardScaler(**options), LinearSVC(C=1e-3, random_state=0, max_iter=20_000))
+    pipeline.fit(rows, labels)
+    classifier = VehicleClassifier.from_pipeline(pipeline, SMALL)
+    np.testing.assert_allclose(
+        classifier.decision_function(rows), pipeline.decision_function(rows), rtol=1e-4, atol=1e-4
+    )
+
+
+def test_pipelines_that_cannot_be_taken_over(patches, labels):
+    rows = extract_features(patches, SMALL)
+
+    def take(pipeline):
+        return VehicleClassifier.from_pipeline(pipeline, SMALL)
+
+    with pytest.raises(InvalidInputError, match=r"must end in StandardScaler and LinearSVC; got \['LinearS"):
+        take(make_pipeline(LinearSVC()))
+    with pytest.raises(InvalidInputError, match="pipeline must be fitted; call its fit first"):
+        take(make_pipeline(StandardScaler(), LinearSVC()))
+    many = make_pipeline(StandardScaler(), LinearSVC()).fit(rows, np.arange(80) % 3)
+    with pytest.raises(InvalidInputError, match=r"fitted on the labels 0 and 1; got \[.*0.*1.*2.*\]"):
+        take(many)
+    other = make_pipeline(StandardScaler(), LinearSVC()).fit(rows, np.repeat(["car", "road"], 40))
+    with pytest.raises(InvalidInputError, match="fitted on the labels 0 and 1"):
+        take(other)
+    short = make_pipeline(StandardScaler(), LinearSVC()).fit(rows[:, :5], labels)
+    with pytest.raises(InvalidInputError, match=rf"templates must have {SMALL.length} weights"):
+        take(short)
+
+
+@pytest.mark.parametrize("templates", [1, 3])
+@pytest.mark.parametrize("params", [SMALL, FeatureParams.preset("luv-2384")], ids=["small", "luv"])
+def test_saving_and_loading_keeps_every_bit(tmp_path, params, templates):
+    path = tmp_path / "model.safetensors"
+    model = VehicleClassifier(
+        params, random_classifier(params, templates=templates).templates, {"a": [1, {"b": None}], "ü": 0.1}
+    )
+    model.save(path)
+    loaded = load_classifier(str(path))
+    assert loaded.params == model.params
+    assert loaded.metadata == model.metadata
+    for one, other in zip(model.templates, loaded.templates, strict=True):
+        for name in ("mean", "scale", "coef"):
+            assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
+        assert one.intercept == other.intercept
+    first = path.read_bytes()
+    loaded.save(path)
+    assert path.read_bytes() == first
+
+
+def test_metadata_that_is_no_json_is_refused(tmp_path):
+    model = VehicleClassifier(SMALL, random_classifier(SMALL).templates, {"when": object()})
+    with pytest.raises(InvalidInputError, match="metadata must hold JSON values only"):
+        model.save(tmp_path / "model.safetensors")
+    assert not list(tmp_path.iterdir())
+
+
+def test_saving_needs_a_folder(tmp_path, trained):
+    with pytest.raises(InvalidInputError, match="path needs an existing folder"):
+        trained.save(tmp_path / "nowhere" / "model.safetensors")
+    with pytest.raises(InvalidInputError, match="path must be a file, got the folder"):
+        trained.save(tmp_path)
+
+
+def write_model(path, tensors=None, **changes):
+    """Write a model file as `save` does, but with whatever tensors and header; the checksum fits."""
+    from safetensors.numpy import save
+
+    model = random_classifier(SMALL)
+    template = model.templates[0]
+    whole = {
+        "0.mean": template.mean,
+        "0.scale": template.scale,
+        "0.coef": template.coef,
+        "0.intercept": np.zeros(1),
+        **(tensors or {}),
+    }
+    whole = {name: np.array(tensor) for name, tensor in whole.items() if tensor is not None}
+    header = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "params": json.dumps(
+            {"spatial_size": 8, "hist_bins": 8, "orient": 4, "pix_per_cell": 16, "hog_channel": 0}
+        ),
+        "metadata": "{}",
+        **changes,
+    }
+    header = {name: text for name, text in header.items() if text is not None}
+    header.setdefault("sha256", _checksum(header, whole))
+    path.write_bytes(save(whole, metadata=header))
+    return path
+
+
+def test_the_model_file_of_these_tests_is_sound(tmp_path):
+    assert load_classifier(write_model(tmp_path / "m.safetensors")).params == SMALL
+
+
+@pytest.mark.parametrize(
+    ("tensors", "message"),
+    [
+        ({"0.coef": np.full(SMALL.length, np.nan)}, "coef must be finite, got NaN"),
+        ({"0.mean": np.full(SMALL.length, np.inf)}, "mean must be finite"),
+        ({"0.scale": np.zeros(SMALL.length)}, "scale must be positive"),
+        ({"0.intercept": np.array([np.nan])}, "intercept must be finite"),
+        ({"0.coef": np.ones(5)}, "coef must be a vector as long as the features"),
+        ({"0.coef": np.ones((2, SMALL.length))}, "coef must be a vector"),
+        ({"0.intercept": np.zeros(2)}, "cannot reshape"),
+        (
+            {"0.mean": np.zeros(5), "0.scale": np.ones(5), "0.coef": np.ones(5)},
+            f"templates must have {SMALL.length} weights, as the parameters say; got 5",
+        ),
+        ({"0.mean": None}, "'0.mean'"),
+        ({"0.intercept": None}, "'0.intercept'"),
+        ({"1.mean": np.zeros(SMALL.length)}, "'1.scale'"),
+        ({"extra": np.zeros(3)}, "'1.mean'"),
+        (dict.fromkeys(("0.mean", "0.scale", "0.coef", "0.intercept")), "at least one template"),
+    ],
+)
+def test_tensors_that_do_not_fit(tmp_path, tensors, message):
+    path = write_model(tmp_path / "m.safetensors", tensors)
+    with pytest.raises(ModelFileError, match=rf"model file .* does not fit its own parameters: .*{message}"):
+        load_classifier(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"format": "other"}, "is a safetensors file, but no model of this library"),
+        ({"format": None}, "is a safetensors file, but no model of this library"),
+        ({"format_version": "99"}, f"has format version 99, this release reads {FORMAT_VERSION}; train"),
+        ({"format_version": None}, "has format version None"),
+        ({"sha256": "0" * 64}, r"was changed after it was written \(checksum differs\)"),
+        ({"params": '{"orient": 0}'}, "does not fit its own parameters: orient must be an integer"),
+        ({"params": '{"colour": 1}'}, "does not fit its own parameters"),
+        ({"params": "[]"}, "does not fit its own parameters"),
+        ({"params": "{"}, "does not fit its own parameters"),
+        ({"params": None}, "does not fit its own parameters: 'params'"),
+        ({"metadata": None}, "does not fit its own parameters: 'metadata'"),
+        ({"metadata": "nonsense"}, "does not fit its own parameters"),
+        ({"params": '{"spatial_size": 16}'}, "does not fit its own parameters: templates must have 6156"),
+    ],
+)
+def test_headers_that_do_not_fit(tmp_path, changes, message):
+    path = write_model(tmp_path / "m.safetensors", **changes)
+    with pytest.raises(ModelFileError, match=message):
+        load_classifier(path)
+
+
+def test_a_safetensors_file_without_metadata(tmp_path):
+    from safetensors.numpy import save
+
+    (tmp_path / "m.safetensors").write_bytes(save({"a": np.zeros(3)}))
+    with pytest.raises(ModelFileError, match="is no whole safetensors model"):
+        load_classifier(tmp_path / "m.safetensors")
+
+
+def test_a_tensor_of_a_type_that_numpy_lacks(tmp_path):
+    header = json.dumps(
+        {"__metadata__": {"format": FORMAT}, "a": {"dtype": "BF16", "shape": [1], "data_offsets": [0, 2]}}
+    ).encode()
+    (tmp_path / "m.safetensors").write_bytes(struct.pack("<Q", len(header)) + header + bytes(2))
+    with pytest.raises(ModelFileError, match=r"model file .*(no whole safetensors model|changed after)"):
+        load_classifier(tmp_path / "m.safetensors")
+
+
+def test_a_cut_model_file(tmp_path):
+    path = write_model(tmp_path / "m.safetensors")
+    data = path.read_bytes()
+    for size in (0, 4, 8, 100, len(data) // 2, len(data) - 1):
+        path.write_bytes(data[:size])
+        with pytest.raises(ModelFileError, match=r"is no whole safetensors model .* get it again or train"):
+            load_classifier(path)
+    path.write_bytes(data + b"x")
+    with pytest.raises(ModelFileError, match="is no whole safetensors model"):
+        load_classifier(path)
+
+
+def test_a_flipped_byte_in_a_tensor(tmp_path):
+    path = write_model(tmp_path / "m.safetensors")
+    data = bytearray(path.read_bytes())
+    start = 8 + struct.unpack("<Q", data[:8])[0]
+    for place in (start, (start + len(data)) // 2, len(data) - 1):
+        damaged = data.copy()
+        damaged[place] ^= 1
+        path.write_bytes(damaged)
+        with pytest.raises(ModelFileError, match="was changed after it was written"):
+            load_classifier(path)
+
+
+def test_a_flipped_byte_in_the_header(tmp_path):
+    path = write_model(tmp_path / "m.safetensors")
+    data = path.read_bytes()
+    start = 8 + struct.unpack("<Q", data[:8])[0]
+    spaces = re.search(rb" *$", data[:start]).start()  # the header is filled up with spaces
+    for place in range(0, spaces, 7):
+        damaged = bytearray(data)
+        damaged[place] ^= 1
+        path.write_bytes(damaged)
+        with pytest.raises(ModelFileError, match=r"model file .*m\.safetensors"):
+            load_classifier(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"\x80\x04\x95", b"PK\x03\x04 zip", b"\xff" * 100, bytes(64)])
+def test_another_kind_of_file(tmp_path, content):
+    path = tmp_path / "svc.pickle"
+    path.write_bytes(content)
+    with pytest.raises(ModelFileError, match=r"svc.pickle is no whole safetensors model"):
+        load_classifier(path)
+
+
+def test_a_missing_model_file(tmp_path, monkeypatch):
+    with pytest.raises(ModelFileError, match=r"model file .*nothing does not exist; check the path"):
+        load_classifier(tmp_path / "nothing")
+    with pytest.raises(ModelFileError, match=r"model file .* is a folder; name a file in it"):
+        load_classifier(tmp_path)
+
+    def refuse(self):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    with pytest.raises(ModelFileError, match=r"model file .* cannot be read: Permission denied"):
+        load_classifier(tmp_path / "locked")
+
+
+def test_the_shipped_model_is_sound():
+    model = load_classifier()
+    assert all(template.coef.any() for template in model.templates)
+    gray = np.full((1, 64, 64, 3), 100, np.uint8)
+    assert model.predict(gray).tolist() == [0]
+    assert {"training", "versions"} <= model.metadata.keys()
+
+
+def test_scoring_many_rows_needs_no_wider_copy_of_them():
+    model = random_classifier(SMALL)
+    rows = np.zeros((8000, SMALL.length), np.float32)
+    tracemalloc.start()
+    model.decision_function(rows)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < rows.nbytes

@@ -1,0 +1,209 @@
+import io
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.images import decode_image, read_image, write_image
+
+LOSSLESS = [".png", ".bmp", ".tiff"]
+LOSSY = [".jpg", ".webp"]
+
+
+@pytest.fixture(scope="module")
+def picture():
+    """Smooth colours with a red top left corner, 40 rows of 60."""
+    noise = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    image = cv2.GaussianBlur(noise, (0, 0), 4)
+    image[:10, :20] = (250, 10, 10)
+    return image
+
+
+def encoded(suffix, array):
+    """Encode an array in OpenCV's channel order."""
+    return cv2.imencode(suffix, array)[1].tobytes()
+
+
+def bgr(image):
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+@pytest.mark.parametrize("suffix", LOSSLESS)
+def test_lossless_formats_come_back_as_they_went(tmp_path, picture, suffix):
+    write_image(tmp_path / f"a{suffix}", picture)
+    image = read_image(tmp_path / f"a{suffix}")
+    np.testing.assert_array_equal(image, picture)
+    assert image.dtype == np.uint8
+    assert image.flags.c_contiguous
+    assert image.flags.writeable
+
+
+@pytest.mark.parametrize("suffix", LOSSY)
+def test_lossy_formats_come_back_nearly(tmp_path, picture, suffix):
+    write_image(str(tmp_path / f"a{suffix.upper()}"), picture)
+    image = read_image(str(tmp_path / f"a{suffix.upper()}"))
+    assert image.shape == picture.shape
+    assert np.abs(image.astype(int) - picture).mean() < 3
+
+
+def test_every_format_has_the_same_range(tmp_path):
+    ramp = np.tile(np.arange(256, dtype=np.uint8)[None, :, None], (16, 1, 3))
+    for suffix in LOSSLESS + LOSSY:
+        write_image(tmp_path / f"a{suffix}", ramp)
+        image = read_image(tmp_path / f"a{suffix}")
+        assert np.abs(image.astype(int) - ramp).max() <= 4
+        assert image.min() <= 4
+        assert image.max() >= 251
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tiff"])
+def test_gray_becomes_three_equal_channels(picture, suffix):
+    gray = picture[..., 1]
+    image = decode_image(encoded(suffix, gray), "gray")
+    assert image.shape == (40, 60, 3)
+    assert (image == image[..., :1]).all()
+    if suffix != ".jpg":
+        np.testing.assert_array_equal(image[..., 0], gray)
+
+
+def test_alpha_is_dropped(picture):
+    with_alpha = np.dstack([bgr(picture), np.full((40, 60), 30, np.uint8)])
+    np.testing.assert_array_equal(decode_image(encoded(".png", with_alpha), "rgba"), picture)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_sixteen_bits_are_scaled_to_eight(suffix, channels):
+    ramp = np.arange(65536, dtype=np.uint16).reshape(256, 256)
+    array = ramp if channels == 1 else np.dstack([ramp] * 3)
+    image = decode_image(encoded(suffix, array), "deep")
+    assert image.shape == (256, 256, 3)
+    assert image.dtype == np.uint8
+    # Libraries differ in how they round.
+    assert np.abs(image.astype(float) - ramp[..., None] / 257).max() < 1
+    assert (image.min(), image.max()) == (0, 255)
+
+
+def test_a_palette_is_looked_up(picture):
+    buffer = io.BytesIO()
+    indexed = Image.fromarray(picture).quantize(16)
+    indexed.save(buffer, "PNG")
+    expected = np.array(indexed.convert("RGB"))
+    np.testing.assert_array_equal(decode_image(buffer.getvalue(), "indexed"), expected)
+
+
+@pytest.mark.parametrize(("orientation", "turns"), [(1, 0), (3, 2), (6, 3), (8, 1)])
+def test_exif_rotation_is_applied(picture, orientation, turns):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, "JPEG", quality=95, exif=exif)
+    image = decode_image(buffer.getvalue(), "turned")
+    upright = np.rot90(picture, turns)
+    assert image.shape == upright.shape
+    assert np.abs(image.astype(int) - upright).mean() < 3
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".webp"])
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.7, 0.99])
+def test_a_cut_file_is_refused(tmp_path, picture, suffix, share):
+    data = encoded(suffix, bgr(picture))
+    file = tmp_path / f"cut{suffix}"
+    file.write_bytes(data[: int(len(data) * share)])
+    with pytest.raises(InvalidInputError, match=r"image file .*cut.* must be a whole image file .*decoded"):
+        read_image(file)
+
+
+def test_a_jpeg_without_its_last_byte_is_refused(picture):
+    with pytest.raises(InvalidInputError, match="whole image file"):
+        decode_image(encoded(".jpg", bgr(picture))[:-1], "cut.jpg")
+
+
+def test_a_cut_jpeg_with_a_whole_thumbnail_is_refused(picture):
+    thumbnail = encoded(".jpg", bgr(picture[::4, ::4]))
+    whole = encoded(".jpg", bgr(picture))
+    # The thumbnail, with its own end marker, lies in a segment of the header.
+    segment = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
+    with_thumbnail = whole[:2] + segment + whole[2:]
+    assert decode_image(with_thumbnail, "a.jpg").shape == picture.shape
+    with pytest.raises(InvalidInputError, match="whole image file"):
+        decode_image(with_thumbnail[: -len(whole) // 3], "a.jpg")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_bytes_after_the_image_do_no_harm(picture, suffix):
+    # Phones append previews and maker's notes.
+    data = encoded(suffix, bgr(picture))
+    np.testing.assert_array_equal(decode_image(data + bytes(10_000), "a"), decode_image(data, "a"))
+
+
+def test_a_damaged_png_is_refused(picture):
+    data = bytearray(encoded(".png", bgr(picture)))
+    data[len(data) // 2] ^= 0x10
+    with pytest.raises(InvalidInputError, match="cannot be decoded"):
+        decode_image(bytes(data), "damaged.png")
+
+
+@pytest.mark.parametrize("content", [b"", b"not an image", b"\x89PNG\r\n\x1a\n", b"\xff\xd8", bytes(1000)])
+def test_what_is_no_image_is_refused(tmp_path, content):
+    file = tmp_path / "a.png"
+    file.write_bytes(content)
+    with pytest.raises(InvalidInputError, match=r"a.png must be a whole image file"):
+        read_image(file)
+
+
+def test_missing_file_and_folder(tmp_path):
+    with pytest.raises(InvalidInputError, match=r"image file .*nothing.png does not exist; check the path"):
+        read_image(tmp_path / "nothing.png")
+    with pytest.raises(InvalidInputError, match=r"image file .* is a folder; name a file in it"):
+        read_image(tmp_path)
+
+
+def test_an_unreadable_file(tmp_path, monkeypatch):
+    def refuse(self):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    with pytest.raises(InvalidInputError, match=r"a.png cannot be read: Permission denied"):
+        read_image(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("name", ["a.xyz", "a", "a.", ".png", "a.txt"])
+def test_an_unknown_suffix_is_refused(tmp_path, picture, name):
+    with pytest.raises(InvalidInputError, match=r"path must end in .png, .jpg or another image suffix, got"):
+        write_image(tmp_path / name, picture)
+    assert not list(tmp_path.iterdir())
+
+
+def test_writing_needs_a_folder_and_an_image(tmp_path, picture, monkeypatch):
+    with pytest.raises(InvalidInputError, match="path needs an existing folder"):
+        write_image(tmp_path / "nowhere" / "a.png", picture)
+    with pytest.raises(InvalidInputError, match="image must be an"):
+        write_image(tmp_path / "a.png", picture[..., 0])
+    with pytest.raises(InvalidInputError, match="path must be a file, got the folder"):
+        (tmp_path / "folder.png").mkdir()
+        write_image(tmp_path / "folder.png", picture)
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(InvalidInputError, match="path needs a writable folder"):
+        write_image(tmp_path / "a.png", picture)
+
+
+def test_a_failed_write_keeps_the_earlier_file(tmp_path, picture, monkeypatch):
+    write_image(tmp_path / "a.png", picture)
+    monkeypatch.setattr(cv2, "imwrite", lambda *_: False)
+    with pytest.raises(InvalidInputError, match=r"a.png could not be written; is the disk full"):
+        write_image(tmp_path / "a.png", 255 - picture)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), picture)
+
+
+def test_writing_does_not_change_the_image(tmp_path, picture):
+    before = picture.copy()
+    write_image(tmp_path / "a.png", picture)
+    write_image(tmp_path / "b.png", picture[::2, ::2])
+    np.testing.assert_array_equal(picture, before)
+    np.testing.assert_array_equal(read_image(tmp_path / "b.png"), picture[::2, ::2])

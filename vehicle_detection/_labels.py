@@ -1,0 +1,619 @@
+"""Boxes in frames as columns, and the label and prediction files they come from.
+
+``evaluation`` shows `Labels` and `read_labels` to the users. Every reader turns its file into rows that
+know where they stand; one place checks them all, so that every format refuses the same faults.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vehicle_detection._checks import check_boxes, check_choice, describe
+from vehicle_detection.boxes import Detections, clip_boxes
+from vehicle_detection.errors import DatasetError, InvalidInputError
+
+FrameKey = int | str
+
+NO_TRACK = -1
+"""Track of a box without identity; a row to ignore with this track is a region, not a vehicle's box."""
+
+LABEL_COLUMNS = ("frame", "track", "x1", "y1", "x2", "y2", "occluded", "truncated", "ignore")
+PREDICTION_COLUMNS = ("frame", "track_id", "x1", "y1", "x2", "y2", "score")
+
+VEHICLE_CLASSES = ("car", "van", "truck", "bus", "vehicle")
+LOOKALIKE_CLASSES = ("tram", "train", "misc", "trailer", "caravan", "autorickshaw", "vehicle fallback")
+PERSON_CLASSES = ("pedestrian", "person_sitting", "cyclist")
+
+# What the project's own labels leave unscored: largely hidden, cut off, too small.
+HIDDEN, CUT_OFF, NARROW = 2, 0.7, 40.0
+
+
+def check_keys(values: object, name: str) -> tuple[FrameKey, ...]:
+    """Return frame keys as Python ints or strs, one kind throughout."""
+    if isinstance(values, (str, bytes)) or not isinstance(values, (Iterable, np.ndarray)):
+        raise InvalidInputError(
+            f"{name} must be a sequence of frame keys (int or str), got {describe(values)}"
+        )
+    keys = tuple(key.item() if isinstance(key, np.generic) else key for key in values)
+    kinds = {type(key) for key in keys}
+    if kinds - {int} and kinds - {str}:
+        listed = ", ".join(sorted(kind.__name__ for kind in kinds))
+        raise InvalidInputError(f"{name} must be all int or all str, got {listed}; convert them to one kind")
+    return keys
+
+
+def frame_order(key: FrameKey) -> tuple[tuple[int, str], ...]:
+    """Sort key under which frame 2 comes before frame 10, in file names too."""
+    if isinstance(key, int):
+        return ((key, ""),)
+    parts = re.split(r"([0-9]+)", key)
+    return tuple((int(part), "") if index % 2 else (-1, part) for index, part in enumerate(parts))
+
+
+def _column(values: ArrayLike | None, name: str, rows: int, kinds: str, default: Any) -> NDArray[Any]:
+    """One value a row, of one of the dtype `kinds`, as the dtype of `default`."""
+    dtype = np.asarray(default).dtype
+    column = np.full(rows, default) if values is None else np.asarray(values)
+    if column.size == 0:
+        column = column.reshape(-1).astype(dtype)
+    if column.shape != (rows,) or column.dtype.kind not in kinds:
+        raise InvalidInputError(
+            f"{name} must be one value for each of the {rows} boxes, got {describe(column)}"
+        )
+    return column.astype(dtype)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Labels:
+    """Boxes in frames, true or predicted, as columns that are checked on construction.
+
+    Attributes
+    ----------
+    frames
+        Key of each row's frame: all int (counted from 0) or all str (the image's file name).
+    tracks
+        ``(N,)`` int, the vehicle's number within the clip, -1 for none; None where no box has one.
+    boxes
+        ``(N, 4)`` float64 ``[x1, y1, x2, y2]``, half-open pixels.
+    occluded
+        ``(N,)`` int, 0 visible (the default), 1 partly, 2 largely hidden.
+    truncated
+        ``(N,)`` float64, share outside the image, 0-1; default 0.
+    ignore
+        ``(N,)`` bool, rows that are not scored; with track -1 the row is a region. Default False.
+    scores
+        ``(N,)`` float64 score of a prediction, or None.
+    distance_m, speed_mps
+        ``(N,)`` float64, NaN where unknown, or None.
+    frame_keys
+        All frames in order, those without a box too; those of the rows are added by themselves.
+
+    Raises
+    ------
+    InvalidInputError
+        If columns differ in length, hold values they must not, or a track comes twice in a frame.
+
+    Examples
+    --------
+    >>> labels = Labels([0, 0, 2], [1, 2, 1], [[0, 0, 50, 40], [90, 0, 140, 40], [5, 0, 55, 40]])
+    >>> labels, labels.frame_keys, labels.frame(2).boxes
+    (Labels(3 boxes in 2 frames), (0, 2), array([[ 5.,  0., 55., 40.]]))
+    """
+
+    frames: Sequence[FrameKey]
+    tracks: NDArray[np.int64]
+    boxes: NDArray[np.float64]
+    _: KW_ONLY
+    occluded: NDArray[np.int64] = None  # type: ignore[assignment]
+    truncated: NDArray[np.float64] = None  # type: ignore[assignment]
+    ignore: NDArray[np.bool_] = None  # type: ignore[assignment]
+    scores: NDArray[np.float64] | None = None
+    distance_m: NDArray[np.float64] | None = None
+    speed_mps: NDArray[np.float64] | None = None
+    frame_keys: Sequence[FrameKey] = ()
+    _rows: dict[FrameKey, NDArray[np.intp]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        frames = check_keys(self.frames, "frames")
+        boxes = check_boxes(self.boxes).astype(np.float64)
+        count = len(boxes)
+        if len(frames) != count:
+            raise InvalidInputError(
+                f"frames must be one key for each of the {count} boxes, got {len(frames)} keys"
+            )
+        columns: dict[str, Any] = {
+            "frames": frames,
+            "boxes": boxes,
+            "tracks": _column(self.tracks, "tracks", count, "iu", np.int64(NO_TRACK)),
+            "occluded": _column(self.occluded, "occluded", count, "iub", np.int64(0)),
+            "truncated": _column(self.truncated, "truncated", count, "iufb", 0.0),
+            "ignore": _column(self.ignore, "ignore", count, "b", False),
+        }
+        for name in ("scores", "distance_m", "speed_mps"):
+            values = getattr(self, name)
+            columns[name] = None if values is None else _column(values, name, count, "iuf", 0.0)
+        if columns["scores"] is not None and not np.isfinite(columns["scores"]).all():
+            raise InvalidInputError("scores must be finite, got NaN or infinity; drop those rows")
+        if (columns["tracks"] < NO_TRACK).any():
+            lowest = columns["tracks"].min()
+            raise InvalidInputError(f"tracks must be numbers from 0, or -1 for none; got {lowest}")
+        if not (columns["occluded"] >= 0).all():
+            raise InvalidInputError(
+                "occluded must be 0 (visible), 1 (partly) or 2 (largely); got less than 0"
+            )
+        if not ((columns["truncated"] >= 0) & (columns["truncated"] <= 1)).all():
+            raise InvalidInputError("truncated must be a share from 0 to 1; got a value outside")
+        seen: set[tuple[FrameKey, int]] = set()
+        for key, track in zip(frames, columns["tracks"].tolist()):
+            if track != NO_TRACK and (key, track) in seen:
+                raise InvalidInputError(
+                    f"frame {key!r} holds track {track} twice; give each vehicle its number"
+                )
+            seen.add((key, track))
+        keys = check_keys((*check_keys(self.frame_keys, "frame_keys"), *frames), "frame_keys")
+        columns["frame_keys"] = tuple(sorted(set(keys), key=frame_order))
+        rows: dict[FrameKey, list[int]] = {}
+        for row, key in enumerate(frames):
+            rows.setdefault(key, []).append(row)
+        columns["_rows"] = {key: np.array(found, np.intp) for key, found in rows.items()}
+        for name, column in columns.items():
+            object.__setattr__(self, name, column)
+
+    @classmethod
+    def from_detections(cls, found: Mapping[FrameKey, Detections]) -> Labels:
+        """Predictions out of the detections of each frame; frames without any still count as frames.
+
+        Examples
+        --------
+        >>> Labels.from_detections({0: Detections([[0, 0, 50, 40]], [1.5]), 1: Detections.empty()})
+        Labels(1 box in 2 frames)
+        """
+        parts = [np.empty((0, 4)), *(detections.boxes for detections in found.values())]
+        return cls(
+            [key for key, detections in found.items() for _ in range(len(detections))],
+            None,  # type: ignore[arg-type]
+            np.concatenate(parts),
+            scores=np.concatenate([np.empty(0), *(detections.scores for detections in found.values())]),
+            frame_keys=tuple(found),
+        )
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+    def __repr__(self) -> str:
+        boxes, frames = len(self), len(self.frame_keys)
+        return f"Labels({boxes} box{'es' * (boxes != 1)} in {frames} frame{'s' * (frames != 1)})"
+
+    def __getitem__(self, rows: slice | NDArray[Any] | list[int]) -> Labels:
+        """Take rows by a slice, a mask or a list of indices; all frames stay frames."""
+        return self._take(np.arange(len(self))[rows], self.frame_keys)
+
+    def rows(self, key: FrameKey) -> NDArray[np.intp]:
+        """Row numbers of a frame's boxes; none for a frame without boxes."""
+        return self._rows.get(key, np.empty(0, np.intp))
+
+    def frame(self, key: FrameKey) -> Labels:
+        """Take the boxes of one frame; none for a frame without boxes."""
+        return self._take(self.rows(key), (key,))
+
+    def renamed(self, rename: Callable[[Any], FrameKey]) -> Labels:
+        """Give every frame another key.
+
+        Examples
+        --------
+        >>> Labels(["000007"], None, [[0, 0, 50, 40]]).renamed(lambda key: key + ".png").frame_keys
+        ('000007.png',)
+        """
+        frames = [rename(key) for key in self.frames]
+        return self._take(np.arange(len(self)), tuple(rename(key) for key in self.frame_keys), frames)
+
+    def _take(
+        self, rows: NDArray[np.intp], keys: Sequence[FrameKey], frames: Sequence[FrameKey] | None = None
+    ) -> Labels:
+        frames = self.frames if frames is None else frames
+
+        def optional(column: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+            return None if column is None else column[rows]
+
+        return Labels(
+            [frames[row] for row in rows.tolist()],
+            self.tracks[rows],
+            self.boxes[rows],
+            occluded=self.occluded[rows],
+            truncated=self.truncated[rows],
+            ignore=self.ignore[rows],
+            scores=optional(self.scores),
+            distance_m=optional(self.distance_m),
+            speed_mps=optional(self.speed_mps),
+            frame_keys=keys,
+        )
+
+
+class _Row(NamedTuple):
+    """One box as a reader found it; `where` names its file and line."""
+
+    where: str
+    frame: FrameKey
+    track: int
+    box: tuple[float, float, float, float]
+    occluded: int = 0
+    truncated: float = 0.0
+    ignore: bool = False
+    score: float | None = None
+    distance_m: float = math.nan
+    speed_mps: float = math.nan
+
+
+_Found = tuple[list[_Row], list[FrameKey]]
+
+
+def read_labels(
+    path: str | os.PathLike[str],
+    *,
+    format: str | None = None,  # noqa: A002
+    classes: Collection[str] | None = None,
+    shape: tuple[int, ...] | None = None,
+) -> Labels:
+    """Read labelled or predicted boxes from a file or folder.
+
+    Parameters
+    ----------
+    path
+        A CSV file (``frame,track,x1,y1,x2,y2,occluded,truncated,ignore`` or, for predictions,
+        ``frame,track_id,x1,y1,x2,y2,score[,distance_m,speed_mps]``; more columns may follow, the
+        separator is a comma, semicolon or tab), a KITTI ``label_2`` folder, a MOTChallenge text file or
+        a COCO JSON file.
+    format
+        ``"csv"``, ``"kitti"``, ``"mot"`` or ``"coco"``; None tells by suffix and content.
+    classes
+        KITTI types, COCO category names or MOT class numbers that are vehicles, in any case. None takes
+        car, van, truck, bus and vehicle, and every row of a MOT file.
+    shape
+        ``(height, width, ...)`` of the frames: boxes are clipped to it. None leaves them as they are.
+
+    Returns
+    -------
+    Labels
+        Boxes in half-open pixels. CSV frames are int where all of them are whole numbers, else str.
+        KITTI frames are the files' names without ``.txt``, COCO frames the images' ``file_name``, and
+        MOT frames, 1-based in the file, are counted from 0.
+
+    Raises
+    ------
+    DatasetError
+        If the file is missing, is of none of these layouts, or holds a faulty row; the message names the
+        line: no finite number, a box without area, a track twice in a frame, a box outside `shape`.
+    InvalidInputError
+        If `format` or `shape` is none of the values above.
+
+    Notes
+    -----
+    KITTI's ``DontCare`` and COCO's crowds become regions to ignore; trams, trailers and the like become
+    boxes to ignore, as do KITTI's vehicles that are largely hidden, cut off by more than 0.7 or under
+    40 px wide: the rule of the project's own labels. Persons and all else are left out. A MOT file with
+    nine columns is ground truth, whose rows with flag 0 are ignored; in others column seven is the score.
+
+    Examples
+    --------
+    >>> read_labels("labels/missing.csv")
+    Traceback (most recent call last):
+    ...
+    vehicle_detection.errors.DatasetError: labels/missing.csv does not exist; check the path
+    """
+    source = Path(path)
+    if format is not None:
+        check_choice(format, "format", tuple(_READERS))
+    if not source.exists():
+        raise DatasetError(f"{source} does not exist; check the path")
+    kind = format or _guess_format(source)
+    if source.is_dir() and kind != "kitti":
+        raise DatasetError(f"{source} is a folder, and {kind} labels are one file; name the file in it")
+    chosen = None if classes is None else frozenset(str(name).lower() for name in classes)
+    rows, keys = _READERS[kind](source, chosen)
+    return _assemble(rows, keys, shape)
+
+
+def _assemble(rows: list[_Row], keys: list[FrameKey], shape: tuple[int, ...] | None) -> Labels:
+    """Check the rows of any format and make them columns."""
+    boxes = np.array([row.box for row in rows], np.float64).reshape(-1, 4)
+    scored = [row.score is not None for row in rows]
+    first: dict[tuple[FrameKey, int], str] = {}
+    for row, has_score in zip(rows, scored):
+        x1, y1, x2, y2 = row.box
+        if not all(map(math.isfinite, row.box)):
+            raise DatasetError(f"{row.where}: a box needs finite corners, got {list(row.box)}")
+        # A prediction cut at the border may have no area left; a label without area is a slip of the hand.
+        if x2 < x1 or y2 < y1 or (not has_score and (x2 == x1 or y2 == y1)):
+            raise DatasetError(f"{row.where}: a box needs x1 < x2 and y1 < y2, got {list(row.box)}")
+        if row.track != NO_TRACK:
+            before = first.setdefault((row.frame, row.track), row.where)
+            if before != row.where:
+                raise DatasetError(
+                    f"{row.where}: track {row.track} comes twice in frame {row.frame!r}, first at {before}"
+                )
+        if has_score != scored[0]:
+            raise DatasetError(f"{row.where}: some boxes have a score and some have none; give all or none")
+    if shape is not None:
+        boxes = clip_boxes(boxes, shape)
+        for row, box, has_score in zip(rows, boxes.tolist(), scored):
+            if not has_score and (box[0] == box[2] or box[1] == box[3]):
+                raise DatasetError(
+                    f"{row.where}: box {list(row.box)} lies outside the {shape[1]}x{shape[0]} image; "
+                    "check that shape is (height, width) of these frames"
+                )
+    distance, speed = (np.array([getattr(row, name) for row in rows]) for name in ("distance_m", "speed_mps"))
+    return Labels(
+        [row.frame for row in rows],
+        np.array([row.track for row in rows], np.int64),
+        boxes,
+        occluded=np.array([row.occluded for row in rows], np.int64),
+        truncated=np.array([row.truncated for row in rows], np.float64),
+        ignore=np.array([row.ignore for row in rows], np.bool_),
+        scores=np.array([row.score for row in rows], np.float64) if rows and scored[0] else None,
+        distance_m=None if np.isnan(distance).all() else distance,
+        speed_mps=None if np.isnan(speed).all() else speed,
+        frame_keys=keys,
+    )
+
+
+def _guess_format(source: Path) -> str:
+    """Tell a layout by its suffix, and where that says nothing by its first line."""
+    if source.is_dir():
+        return "kitti"
+    by_suffix = {".json": "coco", ".csv": "csv", ".tsv": "csv"}.get(source.suffix.lower())
+    if by_suffix:
+        return by_suffix
+    start = _read_text(source).lstrip()[:4096]
+    words = _split(start.splitlines()[0]) if start else [""]
+    if start.startswith(("{", "[")):
+        return "coco"
+    if re.fullmatch(r"[0-9]+(\.0*)?", words[0]):
+        return "mot"
+    return "kitti" if not start or (len(words) >= 15 and "frame" not in words) else "csv"
+
+
+def _read_text(file: Path) -> str:
+    try:
+        return file.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise DatasetError(f"{file} is no UTF-8 text; save it as UTF-8") from None
+    except OSError as error:
+        raise DatasetError(f"{file} cannot be read: {error.strerror}") from error
+
+
+def _split(line: str) -> list[str]:
+    return re.split(r"\s*,\s*|\s+", line.strip())
+
+
+def _number(text: str, name: str, where: str, *, low: float = -math.inf, high: float = math.inf) -> float:
+    """One finite number in ``[low, high]``."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        hint = "; write decimals with a point" if re.fullmatch(r"\s*-?\d+,\d+\s*", text) else ""
+        raise DatasetError(f"{where}: {name} must be a finite number, got {text!r}{hint}")
+    if not low <= value <= high:
+        bound = f"at least {low:g}" if value < low else f"at most {high:g}"
+        raise DatasetError(f"{where}: {name} must be {bound}, got {text!r}")
+    return value
+
+
+def _whole(text: str, name: str, where: str, *, low: int) -> int:
+    value = _number(text, name, where, low=low, high=2.0**53)
+    if value != int(value):
+        raise DatasetError(f"{where}: {name} must be a whole number, got {text!r}")
+    return int(value)
+
+
+def _read_csv(source: Path, classes: Collection[str] | None) -> _Found:
+    del classes  # The columns hold vehicles only.
+    text = _read_text(source)
+    header = text.split("\n", 1)[0]
+    separator = max(",;\t", key=header.count)
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
+    try:
+        lines = [(reader.line_num, line) for line in reader]
+    except csv.Error as error:
+        raise DatasetError(f"{source} line {reader.line_num}: no CSV text ({error})") from None
+    names = [" ".join(name.split()).lower() for name in lines[0][1]] if lines else []
+    predicted = "track_id" in names or ("score" in names and "track" not in names)
+    expected = PREDICTION_COLUMNS if predicted else LABEL_COLUMNS
+    missing = [name for name in expected if name not in names]
+    if missing:
+        raise DatasetError(
+            f"{source} lacks the columns {', '.join(missing)}; found {', '.join(names) or 'an empty file'}; "
+            f"labels have {','.join(LABEL_COLUMNS)}, predictions {','.join(PREDICTION_COLUMNS)}"
+        )
+    twice = sorted({name for name in expected if names.count(name) > 1})
+    if twice:
+        raise DatasetError(f"{source} has the column {', '.join(twice)} more than once; keep one of each")
+    records: list[tuple[str, dict[str, str]]] = []
+    for number, line in lines[1:]:
+        where = f"{source} line {number}"
+        if not any(cell.strip() for cell in line):
+            continue
+        if len(line) != len(names):
+            raise DatasetError(f"{where}: {len(names)} columns are expected, found {len(line)}")
+        records.append((where, dict(zip(names, (cell.strip() for cell in line)))))
+    # A number with leading zeros is a name; one with a sign or a decimal point is a number, checked below.
+    counted = all(re.fullmatch(r"-?(0|[1-9][0-9]*)(\.0*)?", record["frame"]) for _, record in records)
+    return [_csv_row(where, record, predicted, counted) for where, record in records], []
+
+
+def _csv_row(where: str, record: dict[str, str], predicted: bool, counted: bool) -> _Row:
+    if not record["frame"]:
+        raise DatasetError(f"{where}: frame is empty; give its number from 0 or its file name")
+    frame: FrameKey = _whole(record["frame"], "frame", where, low=0) if counted else record["frame"]
+    x1, y1, x2, y2 = (_number(record[name], name, where) for name in ("x1", "y1", "x2", "y2"))
+    if predicted:
+        track = record["track_id"]
+        optional = [record.get(name, "") for name in ("distance_m", "speed_mps")]
+        distance, speed = (
+            math.nan if text.lower() in ("", "nan") else _number(text, name, where)
+            for name, text in zip(("distance_m", "speed_mps"), optional)
+        )
+        return _Row(
+            where,
+            frame,
+            _whole(track, "track_id", where, low=NO_TRACK) if track else NO_TRACK,
+            (x1, y1, x2, y2),
+            score=_number(record["score"], "score", where),
+            distance_m=distance,
+            speed_mps=speed,
+        )
+    flag = {"0": False, "1": True, "false": False, "true": True}.get(record["ignore"].lower())
+    if flag is None:
+        raise DatasetError(f"{where}: ignore must be 0 or 1, got {record['ignore']!r}")
+    return _Row(
+        where,
+        frame,
+        _whole(record["track"], "track", where, low=NO_TRACK),
+        (x1, y1, x2, y2),
+        _whole(record["occluded"], "occluded", where, low=0),
+        _number(record["truncated"], "truncated", where, low=0, high=1),
+        flag,
+    )
+
+
+def _read_kitti(source: Path, classes: Collection[str] | None) -> _Found:
+    files = (
+        sorted(source.glob("*.txt"), key=lambda file: frame_order(file.name)) if source.is_dir() else [source]
+    )
+    if not files:
+        raise DatasetError(f"{source} holds no .txt file; name a KITTI label_2 folder or a label file")
+    rows: list[_Row] = []
+    for file in files:
+        for number, line in enumerate(_read_text(file).splitlines(), 1):
+            if line.strip():
+                row = _kitti_row(f"{file} line {number}", file.stem, len(rows), line.split(), classes)
+                rows += [row] if row else []
+    return rows, [file.stem for file in files]
+
+
+def _kitti_row(
+    where: str, frame: str, number: int, words: list[str], classes: Collection[str] | None
+) -> _Row | None:
+    """One KITTI object; None for a person. KITTI's stills have no tracks: every box gets its own number."""
+    if len(words) not in (15, 16):
+        raise DatasetError(f"{where}: a KITTI object has 15 values (16 with a score), found {len(words)}")
+    name = words[0].lower()
+    x1, y1, x2, y2 = (
+        _number(word, corner, where) for word, corner in zip(words[4:8], ("x1", "y1", "x2", "y2"))
+    )
+    score = _number(words[15], "score", where) if len(words) == 16 else None
+    if name == "dontcare":
+        return _Row(where, frame, NO_TRACK, (x1, y1, x2, y2), ignore=True, score=score)
+    wanted = name in (VEHICLE_CLASSES if classes is None else classes)
+    if not wanted and name in PERSON_CLASSES:
+        return None
+    # Results carry -1 for what a detector does not know; 3 is KITTI's "unknown".
+    truncated = min(max(_number(words[1], "truncated", where), 0.0), 1.0)
+    occluded = min(max(int(_number(words[2], "occluded", where)), 0), HIDDEN)
+    unfit = occluded >= HIDDEN or truncated > CUT_OFF or x2 - x1 < NARROW
+    ignore = not wanted or (unfit and score is None)
+    return _Row(where, frame, number, (x1, y1, x2, y2), occluded, truncated, ignore, score)
+
+
+def _read_mot(source: Path, classes: Collection[str] | None) -> _Found:
+    rows: list[_Row] = []
+    for number, line in enumerate(_read_text(source).splitlines(), 1):
+        words, where = _split(line.strip().rstrip(",")), f"{source} line {number}"
+        if words == [""]:
+            continue
+        if len(words) < 6:
+            raise DatasetError(
+                f"{where}: frame, id, x, y, width, height are expected, found {len(words)} values"
+            )
+        frame = _whole(words[0], "frame (counted from 1)", where, low=1) - 1
+        track = _whole(words[1], "id", where, low=NO_TRACK)
+        x, y, width, height = (
+            _number(word, name, where) for word, name in zip(words[2:6], ("x", "y", "width", "height"))
+        )
+        box = (x, y, x + width, y + height)
+        # Nine columns are ground truth: flag, class, visibility. Results have -1 for class, or ten columns.
+        if len(words) == 9 and words[7] != "-1":
+            if classes is None or words[7] in classes:
+                rows.append(_Row(where, frame, track, box, ignore=_number(words[6], "flag", where) == 0))
+        else:
+            score = _number(words[6], "score", where) if len(words) > 6 else None
+            rows.append(_Row(where, frame, track, box, score=score))
+    return rows, []
+
+
+def _read_coco(source: Path, classes: Collection[str] | None) -> _Found:
+    try:
+        data = json.loads(_read_text(source))
+    except json.JSONDecodeError as error:
+        raise DatasetError(f"{source} line {error.lineno}: no JSON text ({error.msg})") from None
+    parts = data if isinstance(data, dict) else {}
+    missing = [
+        name for name in ("images", "annotations", "categories") if not isinstance(parts.get(name), list)
+    ]
+    if missing:
+        raise DatasetError(f"{source} is no COCO file: it lacks the lists {', '.join(missing)}")
+    try:
+        images = {image["id"]: image.get("file_name", image["id"]) for image in data["images"]}
+        names = {entry["id"]: str(entry["name"]).lower() for entry in data["categories"]}
+    except (KeyError, TypeError, AttributeError):
+        raise DatasetError(
+            f"{source}: every image and category needs an id, and a category its name"
+        ) from None
+    if {*map(type, images.values())} not in (set(), {int}, {str}):
+        raise DatasetError(f"{source}: give every image its file_name, or none and an integer id")
+    if len(set(images.values())) < len(data["images"]):
+        raise DatasetError(f"{source}: two images share an id or a file_name; give each its own")
+    wanted = VEHICLE_CLASSES if classes is None else classes
+    if data["annotations"] and not set(names.values()) & set(wanted):
+        raise DatasetError(
+            f"{source} has no category among {', '.join(wanted)}; found "
+            f"{', '.join(map(repr, names.values())) or 'none'}; name those that are vehicles with classes="
+        )
+    rows: list[_Row] = []
+    for number, entry in enumerate(data["annotations"]):
+        where = f"{source} annotation {number}"
+        try:
+            x, y, width, height = (_number(str(side), "bbox", where) for side in entry["bbox"])
+            frame, name = images[entry["image_id"]], names[entry["category_id"]]
+        except (KeyError, TypeError, ValueError) as error:
+            raise DatasetError(
+                f"{where}: it needs bbox [x, y, width, height] and the image_id and category_id of an image "
+                f"and a category in the file ({error})"
+            ) from None
+        if name not in wanted and name not in LOOKALIKE_CLASSES:
+            continue
+        score = entry.get("score")
+        track = entry.get("track_id", number if score is None else NO_TRACK)
+        crowd = bool(entry.get("iscrowd"))
+        rows.append(
+            _Row(
+                where,
+                frame,
+                NO_TRACK if crowd or track is None else _whole(str(track), "track_id", where, low=NO_TRACK),
+                (x, y, x + width, y + height),
+                ignore=crowd or bool(entry.get("ignore")) or name not in wanted,
+                score=None if score is None else _number(str(score), "score", where),
+            )
+        )
+    return rows, list(images.values())
+
+
+_READERS: dict[str, Callable[[Path, Collection[str] | None], _Found]] = {
+    "csv": _read_csv,
+    "kitti": _read_kitti,
+    "mot": _read_mot,
+    "coco": _read_coco,
+}

@@ -1,0 +1,298 @@
+"""Distances from one camera: a box's foot on a flat road and its width, each with a standard error.
+
+Both follow from the pinhole camera (Hartley and Zisserman, *Multiple View Geometry*, chapter 6) over a flat
+road, as in Stein, Mano and Shashua, *Vision-based ACC with a single camera* (IV 2003): a point on the road
+that is seen `d` pixels below the horizon lies ``focal * height / d`` ahead, and a vehicle of a known width
+that is seen `w` pixels wide ``focal * width / w``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vehicle_detection._checks import check_boxes, check_integer, check_number, describe
+from vehicle_detection.errors import InvalidInputError
+
+Floats = NDArray[np.float64]
+
+REFERENCE_FOCAL = 0.9 * 1280
+"""Pixel errors are given for a 1280x720 dash-cam of this focal length, and grow with the focal length."""
+
+BORDER_PX, BORDER_SHARE = 1.5, 0.04
+"""A box that ends this near to the frame's border, or within this share of its size, may go on beyond."""
+
+
+class Distance(NamedTuple):
+    """Distances ahead of the camera and their standard errors, arrays of one shape.
+
+    Attributes
+    ----------
+    metres
+        Distance along the road in metres; NaN where it is unknown.
+    error
+        Standard error in metres; infinite where the distance is unknown.
+    """
+
+    metres: Floats
+    error: Floats
+
+
+def check_shape(shape: object, name: str = "shape") -> tuple[int, int]:
+    """Return height and width of ``image.shape``, a tuple of two or more positive integers."""
+    if not isinstance(shape, tuple) or len(shape) < 2:
+        raise InvalidInputError(
+            f"{name} must be (height, width, ...), got {describe(shape)}; pass image.shape"
+        )
+    return check_integer(shape[0], f"{name}[0]", low=1), check_integer(shape[1], f"{name}[1]", low=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """A forward-looking camera over a flat road, and how well it is known.
+
+    Attributes
+    ----------
+    focal_px
+        Focal length in pixels: the frame's width over ``2 * tan(half the horizontal field of view)``.
+    horizon_px
+        Row of the horizon.
+    height_m
+        Height of the lens above the road.
+    vehicle_width_m, vehicle_width_error_m
+        Width of a vehicle that is not known any better, and its spread.
+    foot_error_px, horizon_error_px
+        Standard errors of a box's lower edge and of the horizon (pitch, hills), in pixels of a camera with
+        a focal length of ``REFERENCE_FOCAL``. The horizon's stays alike for seconds.
+    box_error
+        Standard error of a box's edges as a share of its size, on top of `foot_error_px`.
+    focal_error, height_error_m
+        Standard errors of the focal length, as a share, and of the camera's height; they scale all distances.
+
+    Examples
+    --------
+    >>> camera = Camera.for_frame((720, 1280), horizon=0.5, focal_error=0.0, height_error_m=0.0)
+    >>> round(camera.focal_px), camera.horizon_px
+    (1155, 360.0)
+    >>> near = distance_from_foot([460.0, 360.0], camera)
+    >>> near.metres.round(1), near.error.round(1)
+    (array([15., nan]), array([0.6, inf]))
+    """
+
+    focal_px: float
+    horizon_px: float
+    height_m: float = 1.3
+    vehicle_width_m: float = 1.8
+    vehicle_width_error_m: float = 0.25
+    foot_error_px: float = 2.5
+    horizon_error_px: float = 3.0
+    box_error: float = 0.04
+    focal_error: float = 0.08
+    height_error_m: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("focal_px", "height_m", "vehicle_width_m"):
+            check_number(getattr(self, name), name, above=0, high=1e6)
+        check_number(self.horizon_px, "horizon_px", low=-1e6, high=1e6)
+        errors = ("vehicle_width_error_m", "foot_error_px", "horizon_error_px", "box_error", "focal_error")
+        for name in (*errors, "height_error_m"):
+            check_number(getattr(self, name), name, low=0, high=1e6)
+
+    @classmethod
+    def for_frame(
+        cls,
+        shape: tuple[int, ...],
+        *,
+        horizon: float = 0.56,
+        field_of_view: float = 58.0,
+        height_m: float = 1.3,
+        **known: float,
+    ) -> Camera:
+        """Guess the camera of a dash-cam frame; what is known better goes in by name.
+
+        Parameters
+        ----------
+        shape
+            ``(height, width, ...)``, as ``image.shape``.
+        horizon
+            Row of the horizon as a share of the height, 0 at the top.
+        field_of_view
+            Angle in degrees that the frame's longer side sees.
+        height_m
+            Height of the lens above the road in metres.
+        **known
+            Other attributes of the class, such as ``focal_error=0.01`` for a calibrated lens.
+
+        Raises
+        ------
+        InvalidInputError
+            If a value is out of range or no attribute has that name.
+        """
+        height, width = check_shape(shape)
+        share = check_number(horizon, "horizon", low=-10, high=10)
+        angle = check_number(field_of_view, "field_of_view", low=1, high=170)
+        unknown = sorted(known.keys() - cls.__dataclass_fields__.keys() | known.keys() & {"focal_px"})
+        if unknown:
+            raise InvalidInputError(
+                f"{unknown[0]} is no argument of Camera.for_frame; pass field_of_view, or build Camera(...)"
+            )
+        focal = max(height, width) / (2 * math.tan(math.radians(angle) / 2))
+        return cls(focal_px=focal, horizon_px=share * height, height_m=height_m, **known)
+
+    @property
+    def pixel_scale(self) -> float:
+        """Size of this camera's pixel errors in those of the reference camera."""
+        return self.focal_px / REFERENCE_FOCAL
+
+    @property
+    def foot_scale_error(self) -> float:
+        """Standard error, as a share, that all distances from the foot have in common."""
+        return math.hypot(self.focal_error, self.height_error_m / self.height_m)
+
+
+def distance_from_foot(
+    y_foot: ArrayLike, camera: Camera, *, foot_error_px: ArrayLike | None = None
+) -> Distance:
+    """Distance of points on the road from their rows: ``focal * height / (row - horizon)``.
+
+    Parameters
+    ----------
+    y_foot
+        Rows in pixels, any shape: the lower edges of boxes.
+    camera
+        The camera.
+    foot_error_px
+        Standard error of the rows in pixels; by default the camera's own.
+
+    Returns
+    -------
+    Distance
+        Unknown (NaN, infinite error) where the row is at or above the horizon, or below it by less than the
+        row's and the horizon's error: the road is out of sight there.
+    """
+    rows = np.asarray(y_foot, np.float64)
+    own = camera.foot_error_px * camera.pixel_scale if foot_error_px is None else foot_error_px
+    row_error = np.hypot(own, camera.horizon_error_px * camera.pixel_scale)
+    below = rows - camera.horizon_px
+    known = below > row_error
+    drop = np.where(known, below, 1.0)
+    metres = np.where(known, camera.focal_px * camera.height_m / drop, np.nan)
+    error = np.where(known, metres * np.hypot(row_error / drop, camera.foot_scale_error), np.inf)
+    return Distance(metres, error)
+
+
+def distance_from_width(
+    width: ArrayLike, camera: Camera, *, width_error_px: ArrayLike | None = None
+) -> Distance:
+    """Distance of vehicles from the width of their boxes: ``focal * vehicle width / width``.
+
+    Parameters
+    ----------
+    width
+        Widths in pixels, any shape.
+    camera
+        The camera, with the width of a vehicle and its spread.
+    width_error_px
+        Standard error of the widths in pixels; by default the camera's, for two edges.
+
+    Returns
+    -------
+    Distance
+        Unknown where the width is less than a pixel.
+    """
+    widths = np.asarray(width, np.float64)
+    known = widths >= 1
+    seen = np.where(known, widths, 1.0)
+    own = camera.foot_error_px * camera.pixel_scale
+    edge = np.hypot(own, camera.box_error * seen) * math.sqrt(2)
+    width_error = edge if width_error_px is None else np.asarray(width_error_px, np.float64)
+    spread = math.hypot(camera.vehicle_width_error_m / camera.vehicle_width_m, camera.focal_error)
+    metres = np.where(known, camera.focal_px * camera.vehicle_width_m / seen, np.nan)
+    error = np.where(known, metres * np.hypot(width_error / seen, spread), np.inf)
+    return Distance(metres, error)
+
+
+def join_distances(first: Distance, second: Distance) -> Distance:
+    """Join two independent measurements, each weighted by the inverse of its variance.
+
+    Where they differ by more than their errors allow, the joint error grows by as much (the Birge ratio of
+    the Particle Data Group's averages): one of the two is wrong there, and nobody knows which.
+
+    Examples
+    --------
+    >>> one, two = (Distance(np.array([z]), np.array([e])) for z, e in ((20.0, 1.0), (23.0, 2.0)))
+    >>> joined = join_distances(one, two)
+    >>> joined.metres.round(2), joined.error.round(2)
+    (array([20.6]), array([1.2]))
+    """
+    weights = [
+        np.where(np.isfinite(d.error), 1 / np.square(np.maximum(d.error, 1e-9)), 0.0) for d in (first, second)
+    ]
+    values = [np.where(np.isfinite(d.error), d.metres, 0.0) for d in (first, second)]
+    total = weights[0] + weights[1]
+    known = total > 0
+    safe = np.where(known, total, 1.0)
+    metres = (weights[0] * values[0] + weights[1] * values[1]) / safe
+    chi_square = sum(w * np.square(v - metres) for w, v in zip(weights, values))
+    error = np.sqrt(np.maximum(chi_square, 1.0) / safe)
+    return Distance(np.where(known, metres, np.nan), np.where(known, error, np.inf))
+
+
+def estimate_distance(boxes: ArrayLike, camera: Camera, shape: tuple[int, ...]) -> Distance:
+    """Distance of each box from its foot and its width together.
+
+    Parameters
+    ----------
+    boxes
+        ``(N, 4)`` boxes ``[x1, y1, x2, y2]``.
+    camera
+        The camera.
+    shape
+        ``(height, width, ...)`` of the frame: an edge at the frame's border tells nothing.
+
+    Returns
+    -------
+    Distance
+        ``(N,)`` metres and errors; unknown where neither foot nor width is to be had.
+
+    Raises
+    ------
+    InvalidInputError
+        If boxes or shape are malformed.
+
+    Examples
+    --------
+    >>> camera = Camera.for_frame((720, 1280))
+    >>> estimate_distance([[600, 400, 700, 490], [0, 300, 90, 719]], camera, (720, 1280)).metres.round(1)
+    array([18.1,  nan])
+    """
+    array = check_boxes(boxes).astype(np.float64)
+    cut = cut_edges(array, check_shape(shape))
+    # Foot and width share the focal length: its error is left out of their weights and added at the end.
+    exact = dataclasses.replace(camera, focal_error=0.0)
+    height_error = camera.box_error * (array[:, 3] - array[:, 1])
+    foot = distance_from_foot(
+        np.where(cut[:, 3], -np.inf, array[:, 3]),
+        exact,
+        foot_error_px=np.hypot(camera.foot_error_px * camera.pixel_scale, height_error),
+    )
+    width = distance_from_width(np.where(cut[:, 0] | cut[:, 2], 0.0, array[:, 2] - array[:, 0]), exact)
+    metres, error = join_distances(foot, width)
+    shared = np.where(np.isfinite(error), camera.focal_error * metres, 0.0)
+    return Distance(metres, np.hypot(error, shared))
+
+
+def cut_edges(boxes: NDArray[Any], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Which edges of ``(N, 4)`` boxes end at the frame's border, as a bool each: there may be more beyond.
+
+    A search ends up to a step short of the border, so "at" grows with the box.
+    """
+    sides = boxes[:, 2:] - boxes[:, :2]
+    margin = np.maximum(BORDER_SHARE * sides, BORDER_PX)
+    limit = np.array([shape[1], shape[0]], np.float64)
+    return np.concatenate((boxes[:, :2] <= margin, boxes[:, 2:] >= limit - margin), axis=1)
