@@ -21,6 +21,7 @@ from vehicle_detection.datasets import (
     load_frames,
     load_patches,
     load_training_patches,
+    split_groups,
     split_leakage,
     split_random,
     split_sequences,
@@ -509,6 +510,94 @@ def test_a_split_is_checked_on_construction(train, test, message):
         Split(train, test)
 
 
+# Splits by groups of near-copies
+
+
+def copies_of(seeds, folders=None):
+    """Patches of noise: equal seeds are near-copies, other seeds are alike by chance, up to about 0.3."""
+    rng = np.random.default_rng(1)
+    noise = [rng.normal(0, 3, (16, 16, 3)) for _ in seeds]
+    patches = [np.clip(patch_image(seed, 16) + noise, 0, 255) for seed, noise in zip(seeds, noise)]
+    folders = folders or ["vehicles/GTI"] * len(seeds)
+    names = [f"{folder}/{row}.png" for row, folder in enumerate(folders)]
+    return PatchSet(np.array(patches, np.uint8), [name.startswith("vehicles") for name in names], names)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 15), st.sampled_from(FOLDERS)), min_size=2, max_size=60),
+    shares,
+    st.integers(0, 2**32 - 1),
+)
+def test_a_split_by_groups_keeps_near_copies_on_one_side(entries, share, seed):
+    seeds, folders = map(np.array, zip(*entries))
+    patches = copies_of(seeds.tolist(), folders.tolist())
+    try:
+        split = split_groups(patches, test_size=share, random_state=seed)
+    except InvalidInputError as error:
+        assert "no group of near-copies that fits" in str(error)  # noqa: PT017
+        return
+    assert_covers(split, len(entries))
+    assert not set(seeds[split.train]) & set(seeds[split.test])
+    assert split_leakage(patches, split, threshold=0.9) == 0
+    for folder in set(folders):
+        count, tested = np.sum(folders == folder), np.sum(folders[split.test] == folder)
+        assert tested <= min(max(round(count * share), 1), count - 1)
+    again = split_groups(patches, test_size=share, random_state=seed)
+    np.testing.assert_array_equal(split.test, again.test)
+
+
+def test_a_split_by_groups_without_copies_has_the_share_of_each_folder_and_class():
+    folders = [folder for folder in FOLDERS for _ in range(10)]
+    patches = copies_of(list(range(40)), folders)
+    splits = [split_groups(patches, test_size=0.3, random_state=seed) for seed in (0, 1)]
+    assert [patches[split.test].counts() for split in splits] == [dict.fromkeys(patches.counts(), 3)] * 2
+    assert splits[0].test.tolist() != splits[1].test.tolist()
+    np.testing.assert_array_equal(split_groups(patches, test_size=0.3).test, splits[0].test)
+    loose = PatchSet(patches.patches, patches.labels, [f"{row}.png" for row in range(40)])
+    assert loose[split_groups(loose, test_size=0.3).test].balance == 0.5
+
+
+def test_copies_of_copies_are_one_group():
+    # Each thumbnail is alike to the next only: 0.95 from one to the next, 0.81 over two.
+    steps = np.arange(8) * np.arccos(0.95)
+    rng = np.random.default_rng(0)
+    axes = np.linalg.qr(np.column_stack([np.ones(256), rng.normal(size=(256, 2))]))[0][:, 1:]
+    waves = 128 + 400 * np.column_stack([np.cos(steps), np.sin(steps)]) @ axes.T
+    chain = np.repeat(waves.round().astype(np.uint8).reshape(8, 16, 16, 1), 3, axis=3)
+    alone = np.stack([patch_image(seed, 16) for seed in range(4)])
+    rows = np.random.default_rng(0).permutation(12)
+    patches = PatchSet(np.concatenate([chain, alone])[rows], [1] * 12, [f"{row}.png" for row in range(12)])
+    for seed in range(5):
+        split = split_groups(patches, test_size=0.3, random_state=seed)
+        assert sorted(rows[split.test]) == [8, 9, 10, 11]
+    assert len(find_near_duplicates(patches, threshold=0.9)) == 8
+
+
+def test_groups_are_found_across_chunks():
+    seeds = [*range(1098), 3, 700]
+    split = split_groups(copies_of(seeds), test_size=0.5)
+    sides = {row: side for side, rows in enumerate(split) for row in rows.tolist()}
+    assert (sides[1098], sides[1099]) == (sides[3], sides[700])
+    assert len(split.test) == 550
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"test_size": 1}, r"test_size must be a share in \(0, 1\), got 1"),
+        ({"threshold": 0}, "threshold must be a number, greater than 0 .*at most 1; got 0"),
+        ({"random_state": None}, "random_state must be an integer"),
+        ({}, r"no group of near-copies that fits into test_size=0.2 .*raise test_size or threshold"),
+    ],
+)
+def test_an_impossible_split_by_groups_is_refused(options, message):
+    patches = copies_of([1] * 10)
+    with pytest.raises(InvalidInputError, match=message):
+        split_groups(patches, **options)
+    with pytest.raises(InvalidInputError, match=message):
+        split_groups(patches[[]], **options)
+
+
 # Near-copies
 
 
@@ -893,6 +982,14 @@ def test_the_real_splits_leak_as_documented(real_patches):
     for source, low, high in (("GTI_", 0, 0.01), ("KITTI", 0.4, 0.5)):
         test = sequences.test[np.char.startswith(real_patches.sources[sequences.test], source)]
         assert low <= split_leakage(real_patches, Split(sequences.train, test)) <= high
+
+
+@pytest.mark.realdata
+def test_the_real_groups_do_not_leak(real_patches):
+    split = split_groups(real_patches)
+    assert_covers(split, 17760)
+    assert split_leakage(real_patches, split, threshold=0.9) == 0
+    assert real_patches[split.test].counts() == real_patches[split_sequences(real_patches).test].counts()
 
 
 @pytest.mark.realdata

@@ -184,8 +184,8 @@ def test_writing_needs_a_folder_and_an_image(tmp_path, picture, monkeypatch):
         write_image(tmp_path / "nowhere" / "a.png", picture)
     with pytest.raises(InvalidInputError, match="image must be an"):
         write_image(tmp_path / "a.png", picture[..., 0])
+    (tmp_path / "folder.png").mkdir()
     with pytest.raises(InvalidInputError, match="path must be a file, got the folder"):
-        (tmp_path / "folder.png").mkdir()
         write_image(tmp_path / "folder.png", picture)
     monkeypatch.setattr(os, "access", lambda *_: False)
     with pytest.raises(InvalidInputError, match="path needs a writable folder"):

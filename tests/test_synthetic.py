@@ -118,7 +118,7 @@ class TestScene:
         assert scene.image.std() > 3
 
     @given(vehicles=st.lists(cars, max_size=4), horizon=st.floats(0.2, 0.8), seed=st.integers(0, 3))
-    @settings(max_examples=30)
+    @settings(max_examples=20)
     def test_truth_invariants(self, vehicles, horizon, seed):
         scene = render_scene(shape=SMALL, vehicles=vehicles, horizon=horizon, random_state=seed)
         check_invariants(scene)
@@ -135,7 +135,7 @@ class TestScene:
         focal=st.floats(900.0, 1400.0),
         kind=st.sampled_from(["hatchback", "sedan", "suv", "van", "truck"]),
     )
-    @settings(max_examples=20)
+    @settings(max_examples=12)
     def test_distance_follows_from_the_foot_row(self, distance, lateral, horizon, height, focal, kind):
         car = SceneVehicle(distance_m=distance, lateral_m=lateral, kind=kind)
         scene = render_scene(
@@ -145,7 +145,7 @@ class TestScene:
         assert scene.camera.foot_row(distance) == pytest.approx(horizon * 720 + focal * height / distance)
         below = foot - scene.camera.horizon_px
         # 1% of the distance, and the rounding of the box to whole pixels.
-        assert below == pytest.approx(focal * height / distance, rel=0.01, abs=1.0)
+        assert below == pytest.approx(focal * height / distance, abs=0.01 * focal * height / distance + 1.0)
         if scene.truth[0].box[3] < 720:
             assert scene.camera.distance(foot) == pytest.approx(distance, rel=0.01 + 1.0 / below)
 
@@ -265,13 +265,13 @@ class TestDrive:
     @pytest.mark.parametrize("scenario", ["highway", "overtaking", "crossing", "occlusion", "empty"])
     def test_frames_do_not_depend_on_each_other(self, scenario):
         first, second = (
-            render_drive(frames=30, shape=SMALL, scenario=scenario, random_state=3) for _ in range(2)
+            render_drive(frames=20, shape=SMALL, scenario=scenario, random_state=3) for _ in range(2)
         )
-        late = first[20]
+        late = first[14]
         frames = list(second)
-        assert len(frames) == len(second) == 30
-        assert late.image.tobytes() == frames[20].image.tobytes()
-        assert first[-1].image.tobytes() == frames[29].image.tobytes()
+        assert len(frames) == len(second) == 20
+        assert late.image.tobytes() == frames[14].image.tobytes()
+        assert first[-1].image.tobytes() == frames[19].image.tobytes()
         assert (first.fps, first.shape, first.scenario) == (25.0, SMALL, scenario)
         for frame in frames[::7]:
             check_invariants(frame)
@@ -299,7 +299,7 @@ class TestDrive:
 
     def test_vehicles_of_a_highway_do_not_overlap(self):
         for seed in range(5):
-            drive = render_drive(frames=500, fps=25, shape=(90, 160), random_state=seed)
+            drive = render_drive(frames=500, shape=(90, 160), random_state=seed)
             for time in range(0, 20, 2):
                 spots = [(m.lateral(time), m.distance(time)) for m in drive._movers if not m.oncoming]
                 for index, (x, z) in enumerate(spots):
@@ -331,26 +331,25 @@ class TestDrive:
     @pytest.mark.parametrize("scenario", ["crossing", "occlusion"])
     def test_two_cars_swap_sides(self, scenario):
         for seed in range(2):
-            drive = render_drive(frames=150, shape=SMALL, scenario=scenario, random_state=seed)
+            drive = render_drive(frames=60, fps=10, shape=SMALL, scenario=scenario, random_state=seed)
             tracks = paths(drive)
-            apart = [middle(tracks[1][f]) - middle(tracks[2][f]) for f in range(150) if f in tracks[2]]
+            apart = [middle(tracks[1][f]) - middle(tracks[2][f]) for f in range(60) if f in tracks[2]]
             assert apart[0] * apart[-1] < 0
             overlaps = [
                 tracks[1][f].box[0] < tracks[2][f].box[2] and tracks[2][f].box[0] < tracks[1][f].box[2]
-                for f in range(150)
+                for f in range(60)
             ]
             assert any(overlaps)
             assert not overlaps[0]
             assert not overlaps[-1]
 
-    @pytest.mark.parametrize("frames", [50, 100])
-    def test_occlusion_hides_a_car_for_a_second(self, frames):
-        for seed in range(3):
-            drive = render_drive(frames=frames, shape=(360, 640), scenario="occlusion", random_state=seed)
-            hidden = [rows[1].occluded == 2 for rows in drive.truth]
-            assert 0.8 <= sum(hidden) / drive.fps <= 2.5
-            first = hidden.index(True)
-            assert all(hidden[first : first + sum(hidden)])
+    @pytest.mark.parametrize(("frames", "seed"), [(50, 0), (75, 1), (100, 2)])
+    def test_occlusion_hides_a_car_for_a_second(self, frames, seed):
+        drive = render_drive(frames=frames, shape=SMALL, scenario="occlusion", random_state=seed)
+        hidden = [rows[1].occluded == 2 for rows in drive.truth]
+        assert 0.8 <= sum(hidden) / drive.fps <= 2.5
+        first = hidden.index(True)
+        assert all(hidden[first : first + sum(hidden)])
 
     def test_empty(self):
         drive = render_drive(frames=5, shape=SMALL, scenario="empty")

@@ -56,7 +56,7 @@ class Ground:
         across, ahead = self._across, self._ahead
         tone = rng.uniform(70, 118)
         asphalt = np.array([tone, tone, tone * rng.uniform(0.97, 1.05)], np.float32)
-        grass = np.array([92, 98, 58] if dry < 0.5 else [138, 121, 88], np.float32)
+        grass = np.array([84, 90, 62] if dry < 0.5 else [138, 121, 88], np.float32)
         blur = ahead / camera.focal_px * 1.2
         paved = _ramp(across, road.barrier - 2.2 - 3 * LANE, blur) - _ramp(
             across, road.right + road.shoulder, blur
@@ -114,11 +114,14 @@ def _ramp(values: Floats, edge: float, width: ArrayLike) -> Floats:
 def _draw_tile(light: Light, road: Road, rng: np.random.Generator) -> Floats:
     """Gain of the road's brightness over one period, seamless along the road."""
     size = (round(_PERIOD / _ALONG), round(2 * _HALF / _ACROSS))
-    tile = (
-        1
-        + 0.035 * wrapped_noise(rng, size, falloff=1.1, stretch=0.5)
-        + 0.035 * wrapped_noise(rng, size, falloff=0.2)
+    coarse, fine = wrapped_noise(rng, size, falloff=1.1, stretch=0.5), wrapped_noise(rng, size, falloff=0.2)
+    # Grass grows in tufts, far less even than asphalt.
+    rough = np.full(size[1], 0.16, np.float32)
+    left, right = (
+        int((x + _HALF) / _ACROSS) for x in (road.barrier - 2.2 - 3 * LANE, road.right + road.shoulder)
     )
+    rough[max(left, 0) : right] = 0.035
+    tile = 1 + rough * (coarse + fine)
     # Mended asphalt, seams and cracks, on the camera's side of the barrier.
     first, last = (int((x + _HALF) / _ACROSS) for x in (road.barrier, road.right + road.shoulder))
     paved = tile[:, first:last]

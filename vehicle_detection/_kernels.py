@@ -8,10 +8,22 @@ loop runs over neighbouring values, which the compiler turns into vector instruc
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+
 import numba
 import numpy as np
 
-_jit = numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False)
+
+def _jit(function: Callable[..., None]) -> Callable[..., None]:
+    """Compile a kernel when it is first called, into a cache on disk wherever one can be kept."""
+    compiler = functools.partial(numba.njit, nogil=True, error_model="numpy", boundscheck=False)
+    try:
+        return compiler(cache=True)(function)  # type: ignore[no-any-return]
+    except RuntimeError:
+        # Neither the package's folder nor the user's cache can be written: compile in every process.
+        return compiler()(function)  # type: ignore[no-any-return]
+
 
 # A tile of gradients and its histograms (10 rows of floats) stays in the first-level cache.
 _TILE = 768

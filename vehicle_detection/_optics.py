@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,7 @@ Floats = NDArray[np.float32]
 Color = tuple[float, float, float]
 
 _NOISE_SIDE = 512
-_CONTRAST = 1.4
+_CONTRAST = 1.3
 _MIDDLE = 0.38
 _FRINGE = 0.0005
 
@@ -196,13 +197,19 @@ def wrapped_noise(
     Its amplitude falls with frequency to the power `falloff` (0 is white, 2 is smooth clouds);
     `stretch` above 1 draws it out along the rows.
     """
+    spectrum = np.fft.rfft2(rng.standard_normal(shape, dtype=np.float32)) * _spectrum(shape, falloff, stretch)
+    field = np.fft.irfft2(spectrum, s=shape)
+    return np.asarray(field / field.std(), np.float32)
+
+
+@functools.cache
+def _spectrum(shape: tuple[int, int], falloff: float, stretch: float) -> Floats:
+    """Amplitude by frequency; a handful of shapes is used over and over."""
     fy = np.fft.fftfreq(shape[0])[:, None] * shape[0]
     fx = np.fft.rfftfreq(shape[1])[None, :] * shape[1] * stretch
     radius = np.hypot(fy, fx)
     radius[0, 0] = np.inf
-    spectrum = np.fft.rfft2(rng.standard_normal(shape, dtype=np.float32)) / radius**falloff
-    field = np.fft.irfft2(spectrum, s=shape)
-    return np.asarray(field / field.std(), np.float32)
+    return np.asarray(radius**-falloff, np.float32)
 
 
 def _tone_curve() -> NDArray[np.uint8]:
@@ -234,7 +241,7 @@ class Sensor:
         self._gain = np.clip(tinted, 0, 255).astype(np.uint8)
         self._sigma = 0.42 * max(1.0, max(shape) / 1280) + 0.35 * rain
         luma = wrapped_noise(rng, (_NOISE_SIDE, _NOISE_SIDE), falloff=0.25)
-        chroma = rng.standard_normal((_NOISE_SIDE, _NOISE_SIDE, 3), dtype=np.float32)
+        chroma = np.tile(rng.standard_normal((_NOISE_SIDE // 2, _NOISE_SIDE // 2, 3), np.float32), (2, 2, 1))
         grain = light.noise * (0.85 * luma[..., None] + 0.35 * cv2.GaussianBlur(chroma, (3, 3), 0.8) * 2)
         tile = np.clip(np.rint(grain), -127, 127).astype(np.int16)
         # One tile more than the frame on each axis, so that any offset is a plain slice.

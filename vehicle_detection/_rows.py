@@ -105,8 +105,10 @@ def _file_name(value: Any, number: int) -> str:
 
 
 def _is_missing(value: Any) -> bool:
-    """Whether a value is unknown: None, or the NaN that pandas makes of it."""
-    return value is None or value != value or str(value) == "<NA>"
+    """Whether a value is unknown: None, or what pandas makes of it."""
+    if isinstance(value, (float, np.floating)):
+        return math.isnan(value)
+    return value is None or str(value) == "<NA>"
 
 
 def _whole_number(value: Any, number: int, name: str, *, low: float = -math.inf) -> int:

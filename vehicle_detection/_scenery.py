@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._backdrop import draw_backdrop
 from vehicle_detection._ground import Ground
+from vehicle_detection._hedge import Hedge
 from vehicle_detection._optics import Floats, Light, Pinhole
 from vehicle_detection._road import LANE, Road
 from vehicle_detection._trees import paint_sign, paint_tree
@@ -21,7 +22,7 @@ from vehicle_detection._trees import paint_sign, paint_tree
 _DASH, _DASH_PERIOD = 3.6, 12.0
 _PROP_PERIOD = 240.0
 _FAR = 400.0
-_RAIL_BANDS = ((0.46, 0.54, 118), (0.54, 0.6, 168), (0.6, 0.64, 104), (0.64, 0.71, 150), (0.71, 0.76, 196))
+_RAIL_BANDS = ((0.46, 0.54, 108), (0.54, 0.6, 136), (0.6, 0.64, 100), (0.64, 0.71, 128), (0.71, 0.76, 150))
 _WALL_BANDS = ((0.0, 0.07, 74), (0.07, 0.3, 150), (0.3, 0.55, 136), (0.55, 0.8, 142), (0.8, 0.85, 186))
 
 
@@ -61,11 +62,12 @@ class Scenery:
         rng = np.random.default_rng([seed, 3])
         dry = float(rng.random())
         self._concrete = bool(rng.random() < 0.65)
-        self._rail = bool(rng.random() < 0.6)
+        self._rail = bool(rng.random() < 0.4)
         self._worn = float(rng.uniform(0.8, 1.0))
         self._yellow = bool(rng.random() < 0.5)
         self._backdrop = draw_backdrop(shape, camera, light, dry, rng)
         self._ground = Ground(shape, camera, light, road, dry, rng)
+        self._hedges = self._grow(dry, rng)
         self._props = self._plant(dry, rng)
 
     def render(self, travel: float) -> NDArray[np.uint8]:
@@ -76,6 +78,8 @@ class Scenery:
             ground[:] = self._ground.color
             self._draw_lines(Canvas(self.camera, image), travel)
             self._ground.wear(ground, travel)
+        for hedge in self._hedges:
+            hedge.draw(image, travel)
         places = [((prop.ahead - travel) % _PROP_PERIOD, prop) for prop in self._props]
         for ahead, prop in sorted(places, key=lambda place: -place[0]):
             if ahead > 4.0:
@@ -163,6 +167,19 @@ class Scenery:
         self._posts(canvas, x + 0.1, travel, every=4.0, top=0.72, width=0.12, color=(92, 92, 92))
         for low, high, tone in _RAIL_BANDS:
             self._wall(canvas, x, low, high, (tone, tone, tone + 2))
+
+    def _grow(self, dry: float, rng: np.random.Generator) -> list[Hedge]:
+        """Rows of shrubs on both sides, low ones before tall ones."""
+        right = self.road.right + self.road.shoulder
+        left = self.road.barrier - 3 * LANE - 5.0
+        rows = [
+            (right + 11.0, 1.5, 6.5),
+            (left - 7.0, 1.5, 6.5),
+            (right + float(rng.uniform(4, 7)), -1.2, 1.8),
+        ]
+        return [
+            Hedge(self.shape, self.camera, self.light, *row, dry, rng) for row in rows if rng.random() < 0.65
+        ]
 
     def _plant(self, dry: float, rng: np.random.Generator) -> list[_Prop]:
         """Trees and bushes on both sides, signs on the right."""

@@ -26,7 +26,7 @@ def paint_tree(rng: np.random.Generator, dry: float, light: Light) -> tuple[Floa
     hue = rng.uniform(0, 1)
     green = np.array([74, 88, 50]) * (1 - hue) + np.array([102, 98, 62]) * hue
     green = (green * (1 - 0.3 * dry) + np.array([116, 104, 74]) * 0.3 * dry).astype(np.float32)
-    gain = light.ambient * 0.62 + light.sun * 0.55 * np.clip(shade, 0, 1.2) - 0.14 * np.clip(-shade, 0, 1)
+    gain = light.ambient * 0.78 + light.sun * 0.55 * np.clip(shade, 0, 1.2) - 0.14 * np.clip(-shade, 0, 1)
     tone = np.clip(gain * (1 + 0.42 * leaves + 0.12 * twigs), 0.08, 1.6) * (0.35 if light.dark else 1.0)
     bark = np.array([70, 60, 50], np.float32) * (light.ambient * (0.4 if light.dark else 0.8))
     color = green * (tone * cover)[..., None] + bark * trunk[..., None]

@@ -257,9 +257,8 @@ class VehicleDetector:
         """
         began = clock.perf_counter()
         if self._tracker is None:
-            self._tracker = Tracker(
-                self.track_params, fps=self._fps, camera=self.camera or self._camera_of(found.shape)
-            )
+            self._tracker = Tracker(self.track_params, fps=self._fps)
+        self._tracker.set_camera(self._camera_of(found.shape))
         if self._is_cut(found):
             self._history.clear()
             self._tracker.cut()
@@ -295,6 +294,13 @@ class VehicleDetector:
     def __call__(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Process the next frame and return it annotated: ``clip.image_transform(detector)`` in moviepy."""
         return self.annotate(frame, self.process(frame))
+
+    def warm_up(self, shape: tuple[int, int] = (720, 1280)) -> None:
+        """Compile the kernels and set up the buffers for frames of `shape`, so that no frame waits for it.
+
+        Compiled kernels are kept on disk: only the first use after an installation takes seconds.
+        """
+        self.detect(np.zeros((*shape, 3), np.uint8))
 
     def close(self) -> None:
         """End the search's threads; the detector starts them again when it is used."""

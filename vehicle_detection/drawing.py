@@ -31,6 +31,9 @@ TRACK_COLORS: tuple[Color, ...] = (
 )
 """RGB colours that stay apart for colour-blind eyes (Okabe and Ito, *Color Universal Design*, 2008)."""
 
+_VAGUE_SPEED = 3.0
+"""A speed with a greater standard error, in metres a second, is not worth showing."""
+
 FIELDS = ("id", "score", "distance", "speed", "errors")
 """What a track's label can show; ``"errors"`` adds standard errors to distance and speed."""
 
@@ -200,8 +203,8 @@ def track_text(track: Track, show: Collection[str]) -> str:
         parts.append(f"{track.score:.1f}")
     if "distance" in show and track.distance_m is not None and track.distance_error_m is not None:
         parts.append(f"{track.distance_m:.0f}{f' +-{track.distance_error_m:.0f}' if errors else ''} m")
-    if "speed" in show and track.speed_mps is not None and track.speed_error_mps is not None:
-        parts.append(f"{track.speed_mps:+.1f}{f' +-{track.speed_error_mps:.1f}' if errors else ''} m/s")
+    if "speed" in show and track.speed_mps is not None and (track.speed_error_mps or 0) <= _VAGUE_SPEED:
+        parts.append(f"{track.speed_mps:+.1f}{f' +-{track.speed_error_mps or 0:.1f}' if errors else ''} m/s")
     return "  ".join(parts)
 
 

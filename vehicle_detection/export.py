@@ -58,9 +58,9 @@ def write_tracks(
     path
         File to write.
     format
-        ``"csv"``, ``"jsonl"`` (a JSON object in each line), ``"parquet"`` (needs pyarrow), ``"mot"`` (the text
-        of the MOT challenge) or ``"coco"`` (JSON). None: by the suffix .csv, .jsonl, .ndjson, .parquet, .txt or
-        .json.
+        ``"csv"``, ``"jsonl"`` (a JSON object in each line), ``"parquet"`` (needs pyarrow), ``"mot"`` (the
+        text of the MOT challenge) or ``"coco"`` (JSON). None: by the suffix .csv, .jsonl, .ndjson, .parquet,
+        .txt or .json.
     shape
         ``(height, width, ...)`` of a frame, which COCO viewers ask for.
 
@@ -215,9 +215,11 @@ class TrackWriter:
         self.rows = 0
 
     def __enter__(self) -> TrackWriter:
-        part = self._stack.enter_context(written_whole(self._path, "path"))
-        file = self._stack.enter_context(_open_text(part))
-        self._put = _text_writer(file, self._kind, TRACK_COLUMNS)
+        with contextlib.ExitStack() as stack:
+            part = stack.enter_context(written_whole(self._path, "path"))
+            file = stack.enter_context(_open_text(part))
+            self._put = _text_writer(file, self._kind, TRACK_COLUMNS)
+            self._stack = stack.pop_all()
         self.rows = 0
         return self
 
@@ -231,7 +233,8 @@ class TrackWriter:
         """
         if self._put is None:
             raise InvalidInputError(
-                "TrackWriter writes inside its with block alone: with TrackWriter(path) as write"
+                "TrackWriter must be inside its with block to write, got a call outside; use "
+                "with TrackWriter(path) as write: ..."
             )
         for row in rows_of(result, self.rows):
             self._put(row)

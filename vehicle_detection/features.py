@@ -127,15 +127,7 @@ def hog_blocks(
     """
     from skimage.feature import hog
 
-    check_channel(img)
-    check_integer(orient, "orient", low=1)
-    side = check_integer(pix_per_cell, "pix_per_cell", low=1) * check_integer(
-        cell_per_block, "cell_per_block", low=1
-    )
-    if min(img.shape) < side:
-        raise InvalidInputError(
-            f"img must be at least one block large ({side}x{side} pixels); got {img.shape[1]}x{img.shape[0]}"
-        )
+    _check_hog(img, orient, pix_per_cell, cell_per_block)
     return np.asarray(
         hog(
             img,
@@ -148,6 +140,18 @@ def hog_blocks(
         ),
         np.float64,
     )
+
+
+def _check_hog(img: NDArray[np.uint8], orient: int, pix_per_cell: int, cell_per_block: int) -> None:
+    check_channel(img)
+    check_integer(orient, "orient", low=1)
+    side = check_integer(pix_per_cell, "pix_per_cell", low=1) * check_integer(
+        cell_per_block, "cell_per_block", low=1
+    )
+    if min(img.shape) < side:
+        raise InvalidInputError(
+            f"img must be at least one block large ({side}x{side} pixels); got {img.shape[1]}x{img.shape[0]}"
+        )
 
 
 def get_hog_features(
@@ -193,10 +197,15 @@ def hog_picture(
     -------
     numpy.ndarray
         ``(H, W)`` float64, for ``plt.imshow``.
+
+    Raises
+    ------
+    InvalidInputError
+        If the image is not one uint8 channel or smaller than a cell.
     """
     from skimage.feature import hog
 
-    check_channel(img)
+    _check_hog(img, orient, pix_per_cell, 1)
     _, picture = hog(
         img,
         orientations=orient,
@@ -229,9 +238,10 @@ def bin_spatial(img: NDArray[np.uint8], size: int | tuple[int, int] = (32, 32)) 
     (768,)
     """
     check_image(img, "img")
-    width, height = (size, size) if isinstance(size, int) else size
-    check_integer(width, "size", low=1)
-    check_integer(height, "size", low=1)
+    pair = size if isinstance(size, tuple) else (size, size)
+    if len(pair) != 2:
+        raise InvalidInputError(f"size must be an integer or (width, height); got {describe(size)}")
+    width, height = (check_integer(side, "size", low=1) for side in pair)
     small = cv2.resize(img, (width, height))
     return np.ascontiguousarray(small.transpose(2, 0, 1), np.uint8).ravel()
 
@@ -385,7 +395,7 @@ def extract_features(
 
 def _read_all(source: Any) -> Any:
     """Read the patches of a list of paths; hand anything else on."""
-    if isinstance(source, (str, os.PathLike)):
+    if isinstance(source, (str, os.PathLike)) or not isinstance(source, Iterable):
         raise InvalidInputError(
             f"source must be patches or a list of paths, got {describe(source)}; "
             "read a folder or zip with vehicle_detection.load_patches"

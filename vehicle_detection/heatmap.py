@@ -61,7 +61,7 @@ def add_heat(
     height, width = heat.shape
     windows = check_boxes(boxes)
     weights = np.ones(len(windows)) if scores is None else Detections(windows, np.asarray(scores)).scores
-    x1, y1, x2, y2 = clip_boxes(np.rint(windows).astype(np.int64), heat.shape).T
+    x1, y1, x2, y2 = clip_boxes(np.rint(windows), heat.shape).astype(np.int64).T
     corners = np.zeros((height + 1, width + 1))
     for rows, columns, sign in ((y1, x1, 1), (y1, x2, -1), (y2, x1, -1), (y2, x2, 1)):
         np.add.at(corners, (rows, columns), sign * weights)
@@ -149,7 +149,8 @@ def _components(mask: NDArray[np.bool_]) -> list[tuple[int, int, tuple[slice, sl
         x, y, width, height = (int(value) for value in stats[index, :4])
         region = (slice(y, y + height), slice(x, x + width))
         found.append((x, y, region, labels[region] == index))
-    return found
+    # OpenCV counts by blocks of two rows and columns.
+    return sorted(found, key=lambda component: component[1::-1])
 
 
 def bounding_boxes(

@@ -45,9 +45,9 @@ class WindowGroups:
 def group_windows(windows: Detections, params: RegionParams | None = None) -> WindowGroups:
     """Group windows around the best ones, greedily, and average each group.
 
-    The weight of a window is a power of its score: a mean shift with one step from the peak, in the plane
-    of positions and logarithmic sizes (Dalal, "Finding People in Images and Videos", 2006, chapter 5, fuses
-    detections the same way).
+    The weight of a window is a power of its score times its area: a mean shift with one step from the
+    peak, in the plane of positions and logarithmic sizes (Dalal, "Finding People in Images and Videos",
+    2006, chapter 5, fuses detections the same way).
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def group_windows(windows: Detections, params: RegionParams | None = None) -> Wi
     [[1, 0, 11, 10], [50, 0, 60, 10]]
     """
     params = params or RegionParams()
-    left = windows[windows.scores > 0]
+    left = windows[(windows.scores > 0) & (box_areas(windows.boxes) > 0)]
     boxes, peaks, evidence = [], [], []
     while len(left):
         best = int(left.scores.argmax())
@@ -78,7 +78,9 @@ def group_windows(windows: Detections, params: RegionParams | None = None) -> Wi
             break
         joined = iou_matrix(left.boxes[[best]], left.boxes)[0] > params.overlap
         joined[best] = True
-        box = _mean_box(left.boxes[joined], left.scores[joined] ** params.power)
+        # Small windows lie closer together: weighed by its area, every size has the same say.
+        weights = (left.scores[joined] / peak) ** params.power * box_areas(left.boxes[joined])
+        box = _mean_box(left.boxes[joined], weights)
         total = float(left.scores[joined].sum())
         if total >= params.min_evidence:
             boxes.append(box)
@@ -140,7 +142,7 @@ def fit_boxes(
     boxes = np.concatenate([centre + shift - half, centre + shift + half], axis=1)
     boxes = clip_boxes(boxes, shape)
     faces = clip_boxes(np.concatenate([centre - face / 2, centre + face / 2], axis=1), shape)
-    kept = ~_on_other_vehicles(faces, boxes, groups.peaks, params)
+    kept = ~_on_other_vehicles(faces, boxes, groups.peaks, params) & (box_areas(boxes) > 0)
     return Detections(boxes[kept], groups.peaks[kept])
 
 
@@ -159,7 +161,9 @@ def _on_other_vehicles(
     shared = intersection_matrix(faces, boxes)
     lies_on = shared > params.covered * areas[:, None]
     np.fill_diagonal(lies_on, False)
-    better = peaks[None, :] > peaks[:, None]
+    # Of equals the first is the better one.
+    order = np.lexsort((np.arange(len(peaks)), -peaks)).argsort()
+    better = order[None, :] < order[:, None]
     stronger = peaks[None, :] > params.flank_peak * peaks[:, None]
     gone = lies_on & (better | (stronger & ~lies_on.T))
     return np.asarray(gone.any(axis=1) | (areas == 0))

@@ -16,6 +16,7 @@ for linear templates as filters over a feature map.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -104,6 +105,7 @@ class BandSearch:
         self._filters = _Filters(classifier)
         self._jobs = resolve_jobs(n_jobs)
         self._pool: ThreadPoolExecutor | None = None
+        self._opening = threading.Lock()
         self._local = threading.local()
 
     def __enter__(self) -> BandSearch:
@@ -145,11 +147,11 @@ class BandSearch:
         if self._jobs == 1 or len(bands) == 1:
             with single_threaded_blas():
                 return [function(band) for band in bands]
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(self._jobs, thread_name_prefix="search")
+        with self._opening:
+            pool = self._pool = self._pool or ThreadPoolExecutor(self._jobs, thread_name_prefix="search")
         order = sorted(range(len(bands)), key=lambda i: -_cost(bands[i]))
         with single_threaded_blas():
-            found = list(self._pool.map(function, [bands[i] for i in order]))
+            found = list(pool.map(function, [bands[i] for i in order]))
         return [part for _, part in sorted(zip(order, found), key=lambda pair: pair[0])]
 
 
@@ -163,17 +165,31 @@ def resized_shape(band: PixelBand) -> tuple[int, int]:
 Take = Callable[..., NDArray[Any]]
 
 
-def resize_band(image: NDArray[np.uint8], band: PixelBand, take: Take = np.empty) -> NDArray[np.uint8]:
+def _new_array(shape: tuple[int, ...], dtype: Any, _name: str = "") -> NDArray[Any]:
+    return np.empty(shape, dtype)
+
+
+def resize_band(image: NDArray[np.uint8], band: PixelBand, take: Take = _new_array) -> NDArray[np.uint8]:
     """Cut a band out and resize it so that a window is 64x64; `take` hands out the memory."""
     height, width = resized_shape(band)
-    left, right = max(0, -band.x1), max(0, band.x2 - image.shape[1])
+    scale = PATCH_SIZE / band.window[0]
+    left, right = (round(beyond * scale) for beyond in _overhang(image, band))
     strip = image[band.y1 : band.y2, max(0, band.x1) : band.x2]
-    if left or right:
-        # Beyond the frame the outermost column goes on: no gradient is made up there.
-        strip = cv2.copyMakeBorder(strip, 0, 0, left, right, cv2.BORDER_REPLICATE)
-    if strip.shape[:2] == (height, width):
-        return np.asarray(strip, np.uint8)
-    return np.asarray(cv2.resize(strip, (width, height), dst=take((height, width, 3), np.uint8)), np.uint8)
+    size = (width - left - right, height)
+    if size != (strip.shape[1], strip.shape[0]):
+        memory = take((size[1], size[0], 3), np.uint8, "strip")
+        strip = np.asarray(cv2.resize(strip, size, dst=memory), np.uint8)
+    if not left and not right:
+        return strip
+    # Beyond the frame the outermost column goes on: no gradient is made up there.
+    memory = take((height, width, 3), np.uint8, "band")
+    padded = cv2.copyMakeBorder(strip, 0, 0, left, right, cv2.BORDER_REPLICATE, dst=memory)
+    return np.asarray(padded, np.uint8)
+
+
+def _overhang(image: NDArray[np.uint8], band: PixelBand) -> tuple[int, int]:
+    """Pixels by which a band reaches beyond the frame's left and right edge."""
+    return max(0, -band.x1), max(0, band.x2 - image.shape[1])
 
 
 def _cost(band: PixelBand) -> float:
@@ -202,12 +218,12 @@ class _Buffers:
         self._arrays: dict[tuple[Any, ...], NDArray[Any]] = {}
 
     def take(self, shape: tuple[int, ...], dtype: Any, name: str = "") -> NDArray[Any]:
-        """Hand out an array of `shape` with whatever was in it; one for each name, shape and dtype."""
-        key = (name, shape, np.dtype(dtype))
-        array = self._arrays.get(key)
-        if array is None:
-            array = self._arrays[key] = np.empty(shape, dtype)
-        return array
+        """Hand out an array of `shape` with whatever was in it, of the same memory for the same name."""
+        size = math.prod(shape)
+        array = self._arrays.get((name, dtype))
+        if array is None or array.size < size:
+            array = self._arrays[name, dtype] = np.empty(size, dtype)
+        return array[:size].reshape(shape)
 
 
 class _Filters:

@@ -147,6 +147,10 @@ class Tracker:
         self._next_id = 1
         self.cut()
 
+    def set_camera(self, camera: Camera) -> None:
+        """Look through another camera from the next frame on, as where frames of another size follow."""
+        self._fixed_camera = self._camera = camera
+
     def cut(self) -> None:
         """End all tracks, as the picture jumps to another scene; ids and time go on."""
         self._vehicles: list[Vehicle] = []

@@ -72,7 +72,7 @@ def slide_window(
     height, width = check_image(image).shape[:2]
     x1, x2 = _check_range(x_start_stop, width, "x_start_stop")
     y1, y2 = _check_range(y_start_stop, height, "y_start_stop")
-    if len(xy_window) != 2 or len(xy_overlap) != 2:
+    if np.shape(xy_window) != (2,) or np.shape(xy_overlap) != (2,):
         raise InvalidInputError(f"xy_window and xy_overlap must be pairs; got {xy_window} and {xy_overlap}")
     steps = []
     for index, side in enumerate(xy_window):
@@ -95,8 +95,10 @@ def band_windows(band: PixelBand) -> NDArray[np.int64]:
 
 def _check_range(limits: Range, size: int, name: str) -> tuple[int, int]:
     """Replace None by the image's border and check that the range lies inside."""
-    if len(limits) != 2:
-        raise InvalidInputError(f"{name} must be (start, stop); got {describe(limits)}")
+    pair: Any = limits
+    numbers = (int, np.integer, type(None))
+    if np.shape(pair) != (2,) or not all(isinstance(limit, numbers) for limit in pair):
+        raise InvalidInputError(f"{name} must be (start, stop), whole pixels or None; got {describe(limits)}")
     start = 0 if limits[0] is None else int(limits[0])
     stop = size if limits[1] is None else int(limits[1])
     if not 0 <= start < stop <= size:
@@ -144,7 +146,15 @@ def search_windows(
     """
     check_image(image)
     check_choice(border, "border", ("window", "image"))
-    boxes = check_boxes(windows, "windows").astype(np.int64)
+    given = check_boxes(windows, "windows")
+    boxes = given.astype(np.int64)
+    if (boxes != given).any():
+        row = int(np.argmax((boxes != given).any(1)))
+        raise InvalidInputError(
+            f"windows must be whole pixels; got {given[row].tolist()} in row {row}; round them first"
+        )
+    if min_score is not None:
+        check_number(min_score, "min_score")
     height, width = image.shape[:2]
     inside = (boxes[:, :2] >= 0).all(1) & (boxes[:, 2] <= width) & (boxes[:, 3] <= height)
     filled = (boxes[:, 2:] > boxes[:, :2]).all(1)

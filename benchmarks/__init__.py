@@ -1,0 +1,1 @@
+"""The measurements behind the performance table: ``python -m benchmarks``."""

@@ -1,0 +1,56 @@
+"""``python -m benchmarks [NAME...]``: measure, print the table, write the JSON."""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from benchmarks import _accuracy, _features, _frames, _memory, _scaling, _search, _startup, _video
+from benchmarks._material import DATA_VARIABLE, Context, is_real
+from benchmarks._report import Row, print_table, write_json
+
+BENCHMARKS: dict[str, Callable[[Context], list[Row]]] = {
+    "search": _search.run,
+    "video": _video.run,
+    "memory": _memory.run,
+    "features": _features.run,
+    "startup": _startup.run,
+    "accuracy": _accuracy.run,
+    "frames": _frames.run,
+    "scaling": _scaling.run,
+}
+
+OUTPUT = Path(__file__).with_name("results.json")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the benchmarks that the arguments name, all of them by default."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHMARKS))
+    parser.add_argument("--long", action="store_true", help="memory: a run of 3,000 frames too")
+    parser.add_argument("--plots", type=Path, metavar="DIR", help="scaling: draw scaling.png in this folder")
+    parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FILE", help="the JSON file to write")
+    options = parser.parse_args(arguments)
+    unknown = sorted(set(options.names) - set(BENCHMARKS))
+    if unknown:
+        parser.error(f"no benchmark {unknown[0]!r}; choose from {', '.join(BENCHMARKS)}")
+
+    console = Console()
+    if not is_real():
+        console.print(f"{DATA_VARIABLE} names no data: drawn pictures instead, and no verdict on quality")
+    results = {}
+    with tempfile.TemporaryDirectory(prefix="benchmarks") as work:
+        context = Context(Path(work), plots=options.plots, long=options.long)
+        for name in options.names or BENCHMARKS:
+            console.print(f"measuring {name} ...", highlight=False)
+            results[name] = BENCHMARKS[name](context)
+    print_table(results, console)
+    write_json(results, options.output)
+
+
+if __name__ == "__main__":
+    main()

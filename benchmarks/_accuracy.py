@@ -1,0 +1,64 @@
+"""Accuracy on patches that the classifier has not seen, trained as the shipped model is."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks._material import Context, if_real, is_real, patches
+from benchmarks._report import Row, at_least
+from vehicle_detection import (
+    load_classifier,
+    split_leakage,
+    split_random,
+    split_sequences,
+    split_sources,
+    train_classifier,
+)
+from vehicle_detection.datasets import PatchSet, Split
+
+SEEDS = range(5)
+
+
+def run(context: Context) -> list[Row]:
+    """Train and test on random splits, on the sequence split and across sources."""
+    found, material = patches()
+    rows = [
+        Row(what="patches", value=len(found), material=f"{material}, parameters of the shipped model"),
+    ]
+    random = [split_random(found, random_state=seed) for seed in SEEDS]
+    accuracies = [accuracy_of(found, split) for split in random]
+    rows += [
+        Row(
+            what=f"accuracy, random 80/20 split, mean of {len(SEEDS)} seeds",
+            value=float(np.mean(accuracies)),
+            target=if_real(at_least(0.997)),
+            details={"accuracies": [round(value, 5) for value in accuracies]},
+        ),
+        Row(what="the worst of the seeds", value=min(accuracies)),
+        Row(what="near-copies of training patches in its test part", value=split_leakage(found, random[0])),
+    ]
+    sequences = split_sequences(found)
+    rows += [
+        Row(
+            what="accuracy, sequence split",
+            value=accuracy_of(found, sequences),
+            target=if_real(at_least(0.995)),
+        ),
+        Row(what="near-copies of training patches in its test part", value=split_leakage(found, sequences)),
+    ]
+    if is_real():
+        for train, test in ((("GTI",), ("KITTI", "Extras")), (("KITTI", "Extras"), ("GTI",))):
+            split = split_sources(found, train=train, test=test)
+            what = f"accuracy, trained on {' and '.join(train)}, tested on {' and '.join(test)}"
+            rows.append(Row(what=what, value=accuracy_of(found, split)))
+    return rows
+
+
+def accuracy_of(found: PatchSet, split: Split) -> float:
+    """Train on one side as the shipped model was trained, and judge by the other."""
+    shipped = load_classifier()
+    training = shipped.metadata.get("training", {})
+    options = {name: training[name] for name in ("C", "mirror") if name in training}
+    train, test = found[split.train], found[split.test]
+    classifier = train_classifier(train.patches, train.labels, params=shipped.params, **options)
+    return classifier.score(test.patches, test.labels)

@@ -1,0 +1,100 @@
+"""Labelled frames: how many vehicles are found, how well the boxes fit, who stays who."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks._material import CLIP, Context, clip, data_folder
+from benchmarks._report import Row, Target, at_least, at_most
+from vehicle_detection import (
+    FrameResult,
+    VehicleDetector,
+    evaluate_detections,
+    evaluate_tracks,
+    load_frames,
+    read_frames,
+    read_labels,
+    render_drive,
+)
+from vehicle_detection.evaluation import Labels, TrackScores
+
+DRAWN = 60
+
+
+def run(context: Context) -> list[Row]:
+    """Score stills by `detect` and clips by `process`; a drawn drive where the real frames are missing."""
+    folder = data_folder()
+    if folder is None:
+        source, material = clip(context.work, frames=DRAWN)
+        truth = context.work / "drive.csv"
+        render_drive(frames=DRAWN, random_state=1).write_labels(truth)
+        return _clip_rows("drive", source, truth, material=material, judged=False)
+    labels = folder / "labels"
+    note = "IoU 0.5; the training patches hold crops of this road, which flatters the two clips"
+    return [
+        *_still_rows(folder / "test_images", labels / "test_images.csv", note),
+        *_clip_rows("test_video", folder / "videos" / "test_video.mp4", labels / "test_video.csv", least=1.0),
+        *_clip_rows(CLIP, folder / "videos" / f"{CLIP}.mp4", labels / f"{CLIP}.csv", least=0.99),
+    ]
+
+
+def _still_rows(folder: Path, labels: Path, material: str) -> list[Row]:
+    with VehicleDetector() as detector:
+        found = Labels.from_detections({name: detector.detect(image) for name, image in load_frames(folder)})
+    scores = evaluate_detections(found, read_labels(labels))
+    return [
+        Row(
+            what="test_images: F1",
+            value=scores.f1,
+            target=at_least(1.0),
+            material=material,
+            details=scores.to_dict(),
+        ),
+        Row(what="test_images: mean IoU", value=scores.mean_iou, target=at_least(0.80)),
+    ]
+
+
+def _clip_rows(
+    name: str, source: Path, labels: Path, *, least: float = 1.0, material: str = "", judged: bool = True
+) -> list[Row]:
+    scores = track_scores(source, labels)
+    values: list[tuple[str, float, str, Target]] = [
+        ("F1", scores.f1, "", at_least(least)),
+        ("mean IoU", scores.mean_iou, "", at_least(0.80)),
+        ("jitter", scores.jitter, "px a frame", at_most(1.5)),
+        ("identity switches", scores.id_switches, "", Target("=", 0)),
+        ("longest false run", scores.longest_false_positive_run, "frames", at_most(3)),
+    ]
+    return [
+        Row(
+            what=f"{name}: {what}",
+            value=value,
+            unit=unit,
+            target=target if judged else None,
+            material=material,
+            details=scores.to_dict() if what == "F1" else {},
+        )
+        for what, value, unit, target in values
+    ]
+
+
+def track_scores(source: Path, labels: Path) -> TrackScores:
+    """Follow the vehicles of a clip and score what would be drawn."""
+    with VehicleDetector() as detector, read_frames(source) as frames:
+        detector.reset(fps=float(frames.info.fps))
+        results = [detector.process(frame, time) for _, time, frame in frames]
+    return evaluate_tracks(shown_boxes(results), read_labels(labels), frames=range(len(results)))
+
+
+def shown_boxes(results: Iterable[FrameResult]) -> Labels:
+    """Boxes of the tracks that are drawn, as predictions."""
+    rows = [(result.index, track) for result in results for track in result.shown]
+    return Labels(
+        [index for index, _ in rows],
+        np.array([track.id for _, track in rows], np.int64),
+        np.array([track.box for _, track in rows], np.float64).reshape(-1, 4),
+        scores=np.array([track.score for _, track in rows], np.float64),
+    )

@@ -1,0 +1,118 @@
+"""What has to be measured in a process of its own; started by the benchmarks, prints one line of JSON.
+
+``python -m benchmarks._probe startup FRAME.npy [--kernels]`` and ``... memory VIDEO TARGET``. Nothing but the
+standard library is imported before the clock runs.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def run_probe(*arguments: str, **environment: str) -> dict[str, Any]:
+    """Run this module in a fresh interpreter and return what it printed."""
+    command = [sys.executable, "-m", "benchmarks._probe", *arguments]
+    done = subprocess.run(
+        command, cwd=ROOT, env={**os.environ, **environment}, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise RuntimeError(f"the measuring process failed:\n{done.stderr}")
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+def startup(frame: str, *, kernels: bool = False) -> dict[str, Any]:
+    """Import the package and detect on a first frame."""
+    began = time.perf_counter()
+    import vehicle_detection
+
+    imported = time.perf_counter()
+    import numpy as np
+
+    record = None
+    if kernels:
+        from numba.core import event
+
+        recorder = event.install_recorder("numba:compile")
+        record = recorder.__enter__()
+    vehicle_detection.VehicleDetector().detect(np.load(frame))
+    first = time.perf_counter()
+    return {
+        "import": imported - began,
+        "first_frame": first - imported,
+        "kernels": _compile_seconds(record) if record is not None else {},
+    }
+
+
+def _compile_seconds(record: Any) -> dict[str, float]:
+    """Seconds of each kernel's compilation; those of kernels called by it are its own as well."""
+    begun: dict[str, float] = {}
+    seconds: dict[str, float] = {}
+    for moment, occurrence in record.buffer:
+        name = occurrence.data["dispatcher"].py_func.__name__
+        if occurrence.is_start:
+            begun.setdefault(name, moment)
+        else:
+            seconds[name] = moment - begun[name]
+    return seconds
+
+
+def memory(source: str, target: str) -> dict[str, Any]:
+    """Process a whole video and tell the most memory that this process, without ffmpeg's, ever had."""
+    import vehicle_detection
+
+    moments: list[float] = []
+    held: list[int] = []
+
+    def note(result: Any) -> None:
+        moments.append(time.perf_counter())
+        if len(moments) % 100 == 0:
+            held.append(current_memory())
+
+    with vehicle_detection.VehicleDetector() as detector:
+        vehicle_detection.process_video(source, target, detector, progress=False, on_result=note)
+    return {"frames": len(moments), "peak": peak_memory(), "held": held, "moments": moments}
+
+
+def peak_memory() -> int:
+    """Most bytes this process has had in memory.
+
+    ``getrusage`` would do, but on Linux its maximum survives ``exec``: a child of a large parent, before its
+    first own byte, has the parent's peak. ``VmHWM`` starts anew.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        for line in status.read_text(encoding="ascii").splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def current_memory() -> int:
+    """Bytes this process has in memory now; 0 where the system does not tell."""
+    status = Path("/proc/self/statm")
+    if not status.exists():
+        return 0
+    return int(status.read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def main(arguments: list[str]) -> None:
+    """Run the probe that the arguments name."""
+    kind, *rest = arguments
+    found = startup(rest[0], kernels="--kernels" in rest) if kind == "startup" else memory(*rest)
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

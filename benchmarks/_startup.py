@@ -1,0 +1,62 @@
+"""Time to import the package and to the first frame, each in a fresh interpreter."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks._material import Context, searched_frame
+from benchmarks._probe import run_probe
+from benchmarks._report import Row, at_most
+from benchmarks._timing import median_of
+
+WARM, COLD = 5, 3
+
+
+def run(context: Context) -> list[Row]:
+    """Measure with an empty kernel cache, then with the cache that those runs left."""
+    image, material = searched_frame()
+    frame = context.work / "frame.npy"
+    np.save(frame, image)
+    cache = context.work / "kernels"
+    cold = []
+    for _ in range(COLD):
+        shutil.rmtree(cache, ignore_errors=True)
+        cold.append(_start(frame, cache))
+    warm = [_start(frame, cache) for _ in range(WARM)]
+    kernels = _kernel_seconds(frame, context.work / "kernels for the profile")
+    return [
+        Row(
+            what="import vehicle_detection",
+            value=median_of(start["import"] for start in warm),
+            unit="s",
+            target=at_most(0.5),
+            material=f"medians of {WARM} warm and {COLD} cold starts, {material}",
+        ),
+        Row(
+            what="first frame after the import, kernels in the cache",
+            value=median_of(start["first_frame"] for start in warm),
+            unit="s",
+            target=at_most(2.0),
+        ),
+        Row(
+            what="first frame after the import, no kernel in the cache",
+            value=median_of(start["first_frame"] for start in cold),
+            unit="s",
+            target=at_most(6.0),
+        ),
+        *(Row(what=f"compile {name}", value=seconds, unit="s") for name, seconds in kernels.items()),
+    ]
+
+
+def _start(frame: Path, cache: Path, *options: str) -> dict[str, Any]:
+    return run_probe("startup", str(frame), *options, NUMBA_CACHE_DIR=str(cache))
+
+
+def _kernel_seconds(frame: Path, cache: Path) -> dict[str, float]:
+    """Compilation time of each kernel of the first frame, the longest first."""
+    seconds: dict[str, float] = _start(frame, cache, "--kernels")["kernels"]
+    return dict(sorted(seconds.items(), key=lambda pair: -pair[1]))

@@ -1,0 +1,161 @@
+"""The cheap part of the benchmarks, on small drawn material."""
+
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from benchmarks import _report
+from benchmarks._course import search_course
+from benchmarks._report import Row, Target, at_least, at_most
+from benchmarks._scaling import stage_seconds
+from benchmarks._search import check_agreement, compare_searches
+from vehicle_detection import FeatureParams, SearchBand, SearchParams, VehicleClassifier, render_scene
+from vehicle_detection.classifier import Template
+from vehicle_detection.search import BandSearch
+
+SEARCH = SearchParams(
+    bands=(
+        SearchBand(window=(192, 192), y=(0, 256), x=(0, 0.5)),
+        SearchBand(window=(128, 128), y=(0, 192), x=(0, 0.5)),
+    ),
+    horizon=0.5,
+)
+
+
+@pytest.fixture(scope="module")
+def frame():
+    return render_scene(shape=(360, 640), vehicles=3, random_state=2).image
+
+
+@pytest.fixture(scope="module")
+def classifier():
+    """Random weights on scaled features: about half of the windows score above zero."""
+    params = FeatureParams.preset("ycrcb-8460")
+    rng = np.random.default_rng(0)
+    mean = np.repeat([100.0, 128.0, 0.1], (params.spatial_length, params.hist_length, params.hog_length))
+    scale = np.repeat([50.0, 100.0, 0.1], (params.spatial_length, params.hist_length, params.hog_length))
+    return VehicleClassifier(params, (Template(mean, scale, rng.normal(0, 0.01, params.length), 0.0),))
+
+
+def course(frame, classifier):
+    scaler, svc = (step for _, step in classifier.to_pipeline().steps[-2:])
+    return search_course(frame, SEARCH.place(frame.shape), scaler, svc)
+
+
+def test_yardstick_and_search_agree(frame, classifier):
+    theirs = course(frame, classifier)
+    assert 0 < (theirs.scores > 0).sum() < len(theirs.scores)
+    with BandSearch(classifier, n_jobs=1) as ours:
+        agreement = check_agreement(frame, ours, SEARCH, theirs)
+    assert agreement.windows == len(theirs.boxes) > 200
+    assert agreement.difference < 1e-4
+    assert agreement.shared > 0
+    assert agreement.disputed == 0
+
+
+def test_agreement_notices_a_wrong_hit_and_a_wrong_box(frame, classifier):
+    theirs = course(frame, classifier)
+    best = int(theirs.scores.argmax())
+    with BandSearch(classifier, n_jobs=1) as ours:
+        theirs.scores[best] -= 2 * theirs.scores[best]
+        assert check_agreement(frame, ours, SEARCH, theirs).disputed == 1
+        theirs.boxes[best] += 1
+        with pytest.raises(AssertionError, match="windows are not the course's"):
+            check_agreement(frame, ours, SEARCH, theirs)
+
+
+def test_search_rows(frame, classifier):
+    rows = {row.what: row for row in compare_searches(frame, classifier, SEARCH, "drawn", rounds=1, calls=2)}
+    assert rows["windows searched"].value > 200
+    assert rows["faster than course method, two cores"].value > 1
+    assert rows["faster than HOG alone, two cores"].target == at_least(90)
+    assert rows["largest difference of a score"].verdict == "met"
+
+
+def test_stages_are_measured_and_the_search_is_put_back(frame, classifier):
+    from vehicle_detection import search
+
+    before = dict(vars(search))
+    stages = stage_seconds(frame, classifier, SEARCH, calls=2)
+    assert vars(search) == before
+    known = {
+        "resize",
+        "colour",
+        "HOG cells",
+        "blocks",
+        "spatial bins",
+        "histogram",
+        "product",
+        "sums",
+        "hits",
+    }
+    assert known | {"rest"} == set(stages)
+    assert all(seconds > 0 for seconds in stages.values())
+
+
+@pytest.mark.parametrize(
+    ("target", "met", "missed"),
+    [
+        (at_most(2), 2.0, 2.1),
+        (at_least(2), 2.0, 1.9),
+        (Target("=", 0), 0, 1),
+        (Target("about", 10), 10.9, 11.1),
+    ],
+)
+def test_verdicts(target, met, missed):
+    assert Row(what="a", value=met, target=target).verdict == "met"
+    assert Row(what="a", value=missed, target=target).verdict == "missed"
+    assert Row(what="a", value=missed).verdict == ""
+
+
+def test_report_writes_json_and_keeps_other_benchmarks(tmp_path):
+    file = tmp_path / "results.json"
+    row = Row(what="time", value=1.25, unit="s", target=at_most(1), material="drawn", details={"n": 3})
+    _report.write_json({"first": [row]}, file)
+    _report.write_json({"second": [Row(what="count", value=4)]}, file)
+    found = json.loads(file.read_text(encoding="utf-8"))
+    assert found["benchmarks"]["first"] == [
+        {
+            "what": "time",
+            "measured": 1.25,
+            "unit": "s",
+            "target": "<= 1",
+            "verdict": "missed",
+            "material": "drawn",
+            "details": {"n": 3},
+        }
+    ]
+    assert found["benchmarks"]["second"][0]["verdict"] is None
+    assert found["machine"]["cores"] >= 1
+    assert {"numpy", "numba"} <= set(found["machine"]["libraries"])
+    # Nothing else: no name of the machine, no path.
+    assert set(found["machine"]) == {"cores", "processor", "system", "python", "jobs_variable", "libraries"}
+
+
+def test_report_starts_anew_on_another_machine_or_a_damaged_file(tmp_path, monkeypatch):
+    file = tmp_path / "results.json"
+    _report.write_json({"first": [Row(what="count", value=4)]}, file)
+    monkeypatch.setattr(_report, "machine_facts", lambda: {"cores": 128})
+    _report.write_json({"second": [Row(what="count", value=4)]}, file)
+    assert list(json.loads(file.read_text(encoding="utf-8"))["benchmarks"]) == ["second"]
+    file.write_text("{", encoding="utf-8")
+    _report.write_json({"third": [Row(what="count", value=4)]}, file)
+    assert list(json.loads(file.read_text(encoding="utf-8"))["benchmarks"]) == ["third"]
+
+
+def test_table_shows_measured_target_and_verdict():
+    console = Console(width=120)
+    rows = [
+        Row(what="memory", value=12.34, unit="MB", target=at_most(20), material="drawn"),
+        Row(what="windows", value=11580),
+        Row(what="F1", value=0.98765, target=at_least(1)),
+    ]
+    with console.capture() as capture:
+        _report.print_table({"things": rows}, console)
+    lines = [" ".join(line.replace("│", " ").split()) for line in capture.get().splitlines()]
+    assert "memory 12.3 MB ≤ 20 MB met" in lines
+    assert "windows 11,580" in lines
+    assert "F1 0.9877 ≥ 1 missed" in lines
+    assert "things (drawn)" in lines

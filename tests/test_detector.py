@@ -1,0 +1,408 @@
+import dataclasses
+import random
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from vehicle_detection.boxes import iou_matrix
+from vehicle_detection.camera import Camera
+from vehicle_detection.classifier import Template, VehicleClassifier, load_classifier
+from vehicle_detection.detector import FrameResult, VehicleDetector
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.params import FeatureParams, HeatParams, RegionParams, SearchBand, SearchParams
+
+HEIGHT, WIDTH = 180, 320
+SIDES = (160, 200, 250)  # of windows in a 1280 wide frame: 40, 50 and 62 pixels in these
+SEARCH = SearchParams(
+    bands=tuple(SearchBand(window=(side, side), y=(-100, 300)) for side in SIDES), horizon=0.5, overhang=0.3
+)
+# No flanks: the red squares are flat.
+FIT = RegionParams(face_width=0.78, face_height=0.78, drop=0.0, flank_length_m=0.0)
+HEAT = HeatParams(frames=3, threshold=3.0, share=0.5)
+MODES = [("shared", "fitted"), ("shared", "heat"), ("windows", "fitted"), ("windows", "heat")]
+
+
+def red_detector():
+    """A classifier by hand: 5 for a red square of three quarters of the window, -3 for gray."""
+    params = FeatureParams(color_space="RGB", spatial_size=8, hist_feat=False, hog_feat=False)
+    inner = np.zeros((8, 8))
+    inner[1:7, 1:7] = 1
+    place = 8 * (inner / 36 - (1 - inner) / 28) / 255
+    weights = np.stack([place, -place / 2, -place / 2]).ravel()
+    return VehicleClassifier(params, (Template(np.zeros(192), np.ones(192), weights, -3.0),))
+
+
+CLASSIFIER = red_detector()
+
+
+def frame_with(*boxes, light=100, height=HEIGHT, width=WIDTH):
+    frame = np.full((height, width, 3), light, np.uint8)
+    frame += np.random.default_rng(0).integers(0, 6, frame.shape, dtype=np.uint8)
+    for x1, y1, x2, y2 in boxes:
+        frame[y1:y2, x1:x2] = (240, 15, 15)
+    return frame
+
+
+CAR = [140, 90, 180, 130]
+OTHER = [220, 92, 258, 130]
+
+
+def moved(box, x, y=0):
+    return [box[0] + x, box[1] + y, box[2] + x, box[3] + y]
+
+
+def make(**options):
+    options = {"search": SEARCH, "fit": FIT, "heat": HEAT, "n_jobs": 1, **options}
+    return VehicleDetector(CLASSIFIER, **options)
+
+
+def drive(frames=12):
+    """A car that drifts to the right, and one that comes and goes."""
+    return [
+        frame_with(moved(CAR, 2 * index), *([OTHER] if 4 <= index < 9 else [])) for index in range(frames)
+    ]
+
+
+def ids_of(result):
+    return [track.id for track in result.tracks if track.id]
+
+
+def assert_same(one, other):
+    assert one.index == other.index
+    assert one.time == other.time
+    for name in ("windows", "regions"):
+        np.testing.assert_array_equal(getattr(one, name).boxes, getattr(other, name).boxes)
+        np.testing.assert_array_equal(getattr(one, name).scores, getattr(other, name).scores)
+    assert len(one.tracks) == len(other.tracks)
+    for a, b in zip(one.tracks, other.tracks):
+        assert (a.id, a.state, a.shown, a.score, a.distance_m) == (
+            b.id,
+            b.state,
+            b.shown,
+            b.score,
+            b.distance_m,
+        )
+        np.testing.assert_array_equal(a.box, b.box)
+
+
+def assert_same_drive(one, other):
+    assert len(one) == len(other)
+    for a, b in zip(one, other):
+        assert_same(a, b)
+
+
+@pytest.mark.parametrize(("method", "regions"), MODES)
+def test_a_still_shows_its_vehicles(method, regions):
+    detector = make(method=method, regions=regions)
+    for boxes in ([CAR], [moved(CAR, -60, 5), OTHER]):
+        found = detector.detect(frame_with(*boxes))
+        assert len(found) == len(boxes)
+        assert iou_matrix(boxes, found.boxes).max(axis=1).min() > 0.5
+        assert (found.scores > 0.5).all()
+    assert len(detector.detect(frame_with())) == 0
+
+
+@pytest.mark.parametrize(("method", "regions"), MODES)
+def test_a_still_neither_uses_nor_changes_the_video(method, regions):
+    frames = drive(6)
+    plain, interrupted = make(method=method, regions=regions), make(method=method, regions=regions)
+    stills = frame_with(OTHER), frame_with(light=200), frame_with(CAR, height=120, width=200)
+    first = [interrupted.detect(still).boxes for still in stills]
+    expected = [plain.process(frame) for frame in frames]
+    results = []
+    for index, frame in enumerate(frames):
+        results.append(interrupted.process(frame))
+        np.testing.assert_array_equal(interrupted.detect(stills[index % 3]).boxes, first[index % 3])
+    assert_same_drive(results, expected)
+
+
+@pytest.mark.parametrize(("method", "regions"), MODES)
+def test_a_vehicle_is_followed(method, regions):
+    detector = make(method=method, regions=regions)
+    results = [detector.process(frame) for frame in drive()]
+    assert [result.index for result in results] == list(range(12))
+    for index, result in enumerate(results[6:], 6):
+        (first, *_) = result.shown
+        assert first.id == 1
+        assert iou_matrix([first.box], [moved(CAR, 2 * index)])[0, 0] > 0.45
+    assert {track.id for result in results for track in result.shown} <= {1, 2}
+
+
+def test_a_result_tells_what_was_found():
+    detector = make()
+    results = [detector.process(frame_with(CAR), time=0.04 * index) for index in range(8)]
+    last = results[-1]
+    assert isinstance(last, FrameResult)
+    assert (last.index, last.time) == (7, 0.28)
+    assert len(last.windows) > len(last.regions) == 1
+    assert (last.windows.scores > SEARCH.min_score).all()
+    assert last.shown == tuple(track for track in last.tracks if track.shown)
+    assert last.shown[0].age == pytest.approx(0.28)
+    assert set(last.seconds) == {"search", "regions", "track"}
+    assert all(seconds >= 0 for seconds in last.seconds.values())
+    assert detector.process(frame_with(CAR)).time is None
+
+
+@pytest.mark.parametrize("regions", ["fitted", "heat"])
+def test_search_in_any_order_and_follow_in_order_is_process(regions):
+    frames = drive()
+    expected = [make(regions=regions).process(frame) for frame in frames[:1]]
+    straight = make(regions=regions)
+    expected = [straight.process(frame, time=index / 30) for index, frame in enumerate(frames)]
+    order = list(range(len(frames)))
+    random.Random(0).shuffle(order)
+    with make(regions=regions, n_jobs=2) as split, ThreadPoolExecutor(4) as pool:
+        found = dict(zip(order, pool.map(lambda index: split.search(frames[index]), order)))
+        results = [
+            split.follow(found[index], frames[index].shape, time=index / 30) for index in range(len(frames))
+        ]
+    assert_same_drive(results, expected)
+
+
+@pytest.mark.parametrize(("method", "regions"), MODES)
+def test_threads_do_not_change_anything(method, regions):
+    frames = drive(7)
+    drives = []
+    for n_jobs in (1, 2, 3):
+        with make(method=method, regions=regions, n_jobs=n_jobs) as detector:
+            drives.append([detector.process(frame) for frame in frames])
+    assert_same_drive(drives[0], drives[1])
+    assert_same_drive(drives[0], drives[2])
+
+
+@pytest.mark.parametrize("regions", ["fitted", "heat"])
+def test_reset_forgets_everything(regions):
+    detector = make(regions=regions)
+    first = [detector.process(frame) for frame in drive()]
+    detector.reset()
+    again = [detector.process(frame) for frame in drive()]
+    assert_same_drive(first, again)
+
+
+def test_reset_takes_the_frame_rate():
+    slow, fast = make(), make()
+    slow.reset(fps=5)
+    for detector, frames in ((slow, 4), (fast, 4)):
+        results = [detector.process(frame_with(CAR)) for _ in range(frames)]
+        assert results[-1].tracks[0].age == pytest.approx(3 / (5 if detector is slow else 25))
+    for fps in (0, -25, np.nan, None, "25"):
+        with pytest.raises(InvalidInputError, match="fps must be a number, greater than 0"):
+            slow.reset(fps=fps)
+
+
+@pytest.mark.parametrize("regions", ["fitted", "heat"])
+def test_a_cut_ends_the_tracks(regions):
+    detector = make(regions=regions)
+    before = [detector.process(frame_with(CAR)) for _ in range(10)][-1]
+    assert [track.id for track in before.shown] == [1]
+    # Another scene with a vehicle at the same place: it is another vehicle.
+    after = detector.process(frame_with(CAR, light=200))
+    assert 1 not in ids_of(after)
+    assert after.index == 10
+    later = [detector.process(frame_with(CAR, light=200)) for _ in range(10)][-1]
+    assert [track.id for track in later.shown] == [2]
+
+
+def test_a_cut_to_an_empty_road_leaves_no_heat():
+    detector = make(regions="heat")
+    for _ in range(5):
+        detector.process(frame_with(CAR))
+    assert len(detector.process(frame_with(light=200)).regions) == 0
+
+
+def test_a_change_of_light_is_no_cut():
+    detector = make()
+    lights = [100, 100, 100, 100, 100, 110, 130, 120, 100, 90]
+    results = [detector.process(frame_with(CAR, light=light)) for light in lights]
+    assert [track.id for track in results[-1].shown] == [1]
+
+
+def test_a_time_that_goes_back_ends_the_tracks():
+    detector = make()
+    for index in range(10):
+        detector.process(frame_with(CAR), time=10 + index / 25)
+    assert 1 not in ids_of(detector.process(frame_with(CAR), time=3.0))
+
+
+def test_heat_is_the_mean_of_the_last_frames():
+    detector = make(regions="heat")
+    single = make(regions="heat").process(frame_with(CAR)).regions.scores[0]
+    peaks = []
+    for boxes in ([CAR], [CAR], [], [], []):
+        regions = detector.process(frame_with(*boxes)).regions
+        peaks.append(regions.scores[0] if len(regions) else 0.0)
+    expected = [single, single, single * 2 / 3, single / 3, 0]
+    expected = [peak if peak > HEAT.threshold else 0.0 for peak in expected]
+    np.testing.assert_allclose(peaks, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("regions", ["fitted", "heat"])
+def test_frames_of_another_size_are_another_video(regions):
+    detector = make(regions=regions)
+    for _ in range(10):
+        detector.process(frame_with(CAR))
+    double = frame_with([2 * value for value in CAR], height=2 * HEIGHT, width=2 * WIDTH)
+    result = detector.process(double)
+    assert 1 not in ids_of(result)
+    for _ in range(9):
+        result = detector.process(double)
+    (track,) = result.shown
+    assert track.id == 2
+    assert iou_matrix([track.box], [[2 * value for value in CAR]])[0, 0] > 0.5
+
+
+def test_distances_after_another_size_are_those_of_that_size():
+    double = frame_with([2 * value for value in CAR], height=2 * HEIGHT, width=2 * WIDTH)
+    fresh, used = make(), make()
+    used.process(frame_with(CAR))
+    for _ in range(8):
+        expected, found = fresh.process(double), used.process(double)
+    assert found.shown[0].distance_m == pytest.approx(expected.shown[0].distance_m)
+
+
+def test_the_camera_gives_the_distance():
+    # The same picture through a lens of twice the focal length: twice as far.
+    distances = []
+    for factor in (1, 2):
+        camera = Camera(focal_px=280.0 * factor, horizon_px=90.0)
+        detector = make(camera=camera)
+        result = [detector.process(frame_with(CAR)) for _ in range(8)][-1]
+        distances.append(result.shown[0].distance_m)
+    assert distances[1] == pytest.approx(2 * distances[0], rel=0.2)
+
+
+def test_the_horizon_overrides_the_searchs():
+    assert make(horizon=0.3).search_params == dataclasses.replace(SEARCH, horizon=0.3)
+    assert make().search_params is SEARCH
+    low = make(horizon=0.9)
+    assert len(low.detect(frame_with([140, 20, 180, 60]))) == 0
+
+
+def test_both_methods_find_the_same_vehicles():
+    frame = frame_with(CAR, OTHER)
+    shared = make(method="shared").detect(frame)
+    windows = make(method="windows").detect(frame)
+    assert iou_matrix(shared.boxes, windows.boxes).max(axis=1).min() > 0.8
+
+
+@pytest.mark.parametrize("method", ["shared", "windows"])
+def test_half_a_vehicle_at_the_edge(method):
+    frame = frame_with([0, 90, 32, 130])
+    found = make(method=method).detect(frame)
+    assert ((found.boxes >= 0) & (found.boxes <= (WIDTH, HEIGHT, WIDTH, HEIGHT))).all()
+    if method == "shared":
+        # Windows reach beyond the frame: what is half in the picture is found.
+        assert iou_matrix(found.boxes, [[0, 90, 32, 130]]).max(initial=0) > 0.5
+
+
+def test_frames_are_left_as_they_were():
+    detector = make()
+    frame = frame_with(CAR)
+    before = frame.copy()
+    for _ in range(6):
+        picture = detector(frame)
+    np.testing.assert_array_equal(frame, before)
+    assert picture.shape == frame.shape
+    assert picture.dtype == np.uint8
+    assert (picture != frame).any()
+    assert not np.shares_memory(picture, frame)
+
+
+def test_calling_it_processes_and_annotates():
+    one, other = make(), make()
+    for frame in drive(8):
+        result = one.process(frame)
+        np.testing.assert_array_equal(other(frame), one.annotate(frame, result))
+
+
+def test_a_frame_that_cannot_be_written_is_fine():
+    frame = frame_with(CAR)
+    frame.setflags(write=False)
+    detector = make()
+    for _ in range(6):
+        detector(frame)
+    assert len(detector.detect(frame)) == 1
+
+
+def test_a_closed_detector_starts_again():
+    with make(n_jobs=2) as detector:
+        first = detector.detect(frame_with(CAR))
+    again = detector.detect(frame_with(CAR))
+    detector.close()
+    detector.close()
+    np.testing.assert_array_equal(again.boxes, first.boxes)
+    make(method="windows").close()
+
+
+GOOD = frame_with(CAR)
+
+
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        (GOOD[..., 0], "COLOR_GRAY2RGB"),
+        (np.dstack([GOOD, GOOD[..., 0]]), "drop the alpha channel"),
+        (GOOD / 255, r"scale a 0-1 float image"),
+        (GOOD.astype(np.uint16) * 257, "scale a 16-bit image"),
+        (GOOD[:0], "the image is empty"),
+        (GOOD[None], "pass one image"),
+        (None, "read files with vehicle_detection.read_image"),
+        ("frame.png", "read files with vehicle_detection.read_image"),
+    ],
+)
+@pytest.mark.parametrize("method", ["shared", "windows"])
+def test_bad_frames_are_refused_and_change_nothing(frame, message, method):
+    detector, plain = make(method=method), make(method=method)
+    detector.process(GOOD)
+    plain.process(GOOD)
+    for take in (detector.detect, detector.process, detector.search, detector):
+        with pytest.raises(InvalidInputError, match=f"^frame must be an .*{message}"):
+            take(frame)
+    assert_same(detector.process(GOOD), plain.process(GOOD))
+
+
+@pytest.mark.parametrize("method", ["shared", "windows"])
+def test_a_frame_too_small_for_a_window_is_refused(method):
+    with pytest.raises(InvalidInputError, match="image of 40x40 pixels holds no search window"):
+        VehicleDetector(CLASSIFIER, method=method).detect(GOOD[:40, :40])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": "fast"}, "method must be one of 'shared', 'windows'; got 'fast'"),
+        ({"regions": "boxes"}, "regions must be one of 'fitted', 'heat'; got 'boxes'"),
+        ({"horizon": 1.5}, "horizon must be a number, at least 0 and at most 1"),
+        ({"horizon": 400}, "horizon must be a number, at least 0 and at most 1"),
+        ({"n_jobs": 0}, "n_jobs must be an integer from 1"),
+    ],
+)
+def test_bad_options_are_refused(options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        make(**options)
+
+
+def test_features_that_cannot_be_shared_are_searched_window_by_window():
+    params = FeatureParams(color_space="RGB", spatial_size=6, hist_feat=False, hog_feat=False)
+    odd = VehicleClassifier(params, (Template(np.zeros(108), np.ones(108), np.ones(108), 0.0),))
+    with pytest.raises(InvalidInputError, match="spatial_size=6 has none; use search_windows"):
+        VehicleDetector(odd, search=SEARCH)
+    detector = VehicleDetector(odd, method="windows", search=SEARCH)
+    assert len(detector.search(GOOD).windows) > 0
+
+
+def test_the_default_is_the_shipped_model():
+    detector = VehicleDetector()
+    assert detector.classifier.params == load_classifier().params
+    gray = np.full((720, 1280, 3), 90, np.uint8)
+    assert len(detector.detect(gray)) == 0
+    assert detector.process(gray).tracks == ()
+
+
+@pytest.mark.parametrize("shape", [(540, 960), (375, 1242), (360, 480)])
+def test_the_default_takes_frames_of_other_cameras(shape):
+    noise = np.random.default_rng(0).integers(0, 256, (*shape, 3), dtype=np.uint8)
+    found = VehicleDetector(horizon=0.45).detect(noise)
+    height, width = shape
+    assert ((found.boxes >= 0) & (found.boxes <= (width, height, width, height))).all()

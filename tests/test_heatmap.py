@@ -1,0 +1,232 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy import ndimage
+
+from vehicle_detection.boxes import Detections
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.heatmap import (
+    HeatHistory,
+    add_heat,
+    apply_threshold,
+    bounding_boxes,
+    frame_heat,
+    label_boxes,
+)
+from vehicle_detection.params import HeatParams
+
+SHAPE = (12, 17)
+EIGHT = np.ones((3, 3))
+
+
+@st.composite
+def windows(draw, elements):
+    corners = draw(hnp.arrays(np.float64, (draw(st.integers(0, 7)), 4), elements=elements))
+    low, high = np.minimum(corners[:, :2], corners[:, 2:]), np.maximum(corners[:, :2], corners[:, 2:])
+    boxes = np.concatenate([low, high], axis=1)
+    scores = draw(hnp.arrays(np.float64, len(boxes), elements=st.floats(-5, 5, width=16)))
+    return Detections(boxes, scores)
+
+
+heats = hnp.arrays(np.float32, SHAPE, elements=st.integers(0, 6).map(float))
+
+
+def added_one_by_one(heat, boxes, weights):
+    total = heat.astype(float)
+    height, width = heat.shape
+    for (x1, y1, x2, y2), weight in zip(np.rint(boxes).astype(int), weights):
+        total[max(y1, 0) : max(min(y2, height), 0), max(x1, 0) : max(min(x2, width), 0)] += weight
+    return total
+
+
+@given(heats, windows(st.one_of(st.integers(-6, 24), st.floats(-30, 60, width=32))))
+def test_heat_is_added_where_windows_are(heat, found):
+    before, boxes = heat.copy(), found.boxes.copy()
+    counted = add_heat(heat, found.boxes)
+    weighed = add_heat(heat, found.boxes, scores=found.scores)
+    np.testing.assert_array_equal(counted, added_one_by_one(heat, found.boxes, np.ones(len(found))))
+    np.testing.assert_allclose(weighed, added_one_by_one(heat, found.boxes, found.scores), atol=1e-4)
+    assert counted.dtype == weighed.dtype == np.float32
+    assert not np.shares_memory(counted, heat)
+    np.testing.assert_array_equal(heat, before)
+    np.testing.assert_array_equal(found.boxes, boxes)
+
+
+def test_no_dust_is_left_where_no_window_is():
+    boxes = [[0, 0, 5, 5], [3, 3, 9, 9], [1, 1, 4, 8]]
+    heat = add_heat(np.zeros(SHAPE), boxes, scores=[0.1, 0.2, 0.7])
+    covered = added_one_by_one(np.zeros(SHAPE), np.array(boxes), np.ones(3)) > 0
+    np.testing.assert_array_equal(heat != 0, covered)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int64, np.float32, np.float64])
+def test_a_map_of_any_number_type(dtype):
+    heat = add_heat(np.ones(SHAPE, dtype), [[0, 0, 1, 1]])
+    assert heat.dtype == np.float32
+    assert heat[0, 0] == 2
+    assert heat.sum() == np.prod(SHAPE) + 1
+
+
+def test_windows_far_outside():
+    far = [[1e19, 1e19, 2e19, 2e19], [-50, -50, -40, -40], [-1e19, -1e19, 1e19, 1e19]]
+    np.testing.assert_array_equal(add_heat(np.zeros(SHAPE), far), np.ones(SHAPE))
+    np.testing.assert_array_equal(add_heat(np.zeros(SHAPE), []), np.zeros(SHAPE))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((np.zeros((3, 4, 3)), []), r"heatmap must be an \(H, W\) number array, got .*numpy.zeros\(image"),
+        (([[0.0]], []), "heatmap must be an"),
+        ((np.zeros((3, 3), bool), []), "heatmap must be an"),
+        ((np.zeros((3, 3)), [0, 0, 1, 1]), "boxes must be an"),
+        ((np.zeros((3, 3)), [[2, 0, 1, 1]]), "boxes must be .* x1 <= x2"),
+    ],
+)
+def test_add_heat_refuses(arguments, message):
+    with pytest.raises(InvalidInputError, match=message):
+        add_heat(*arguments)
+
+
+@pytest.mark.parametrize("scores", [[1.0], [1.0, np.nan], [[1.0, 2.0]], "ab"])
+def test_add_heat_refuses_scores_that_do_not_fit(scores):
+    with pytest.raises(InvalidInputError, match="scores must be"):
+        add_heat(np.zeros((3, 3)), [[0, 0, 1, 1]] * 2, scores=scores)
+
+
+@given(heats, st.floats(0, 6))
+def test_threshold_is_exclusive_and_leaves_the_argument(heat, threshold):
+    before = heat.copy()
+    hot = apply_threshold(heat, threshold)
+    np.testing.assert_array_equal(hot, np.where(heat > np.float32(threshold), heat, 0))
+    assert not np.shares_memory(hot, heat)
+    np.testing.assert_array_equal(heat, before)
+    np.testing.assert_array_equal(apply_threshold(hot, threshold), hot)
+
+
+def test_threshold_refuses():
+    with pytest.raises(InvalidInputError, match="threshold must be a number"):
+        apply_threshold(np.zeros((3, 3)), np.nan)
+    with pytest.raises(InvalidInputError, match="heatmap must be an"):
+        apply_threshold(np.zeros(3), 1)
+
+
+@given(heats, st.integers(0, 4))
+def test_regions_are_those_of_scipy(heat, threshold):
+    before = heat.copy()
+    found = label_boxes(heat, threshold=threshold)
+    labels, count = ndimage.label(heat > threshold, EIGHT)
+    regions = ndimage.find_objects(labels)
+    expected = sorted(
+        (rows.start, columns.start, columns.stop, rows.stop, heat[labels == index + 1].max())
+        for index, (rows, columns) in enumerate(regions)
+    )
+    assert len(found) == count
+    assert found.boxes.dtype == np.int64
+    rows = [(y1, x1, x2, y2, peak) for (x1, y1, x2, y2), peak in found]
+    assert sorted(rows) == expected
+    # From top to bottom.
+    assert [row[:2] for row in rows] == sorted(row[:2] for row in rows)
+    np.testing.assert_array_equal(heat, before)
+
+
+def part_around_the_peak(heat, labels, index, share):
+    own = np.where(labels == index, heat, 0)
+    parts, _ = ndimage.label(own >= share * own.max(), EIGHT)
+    rows, columns = np.nonzero(parts == parts[np.unravel_index(own.argmax(), own.shape)])
+    return [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+
+
+@given(heats, st.integers(0, 2), st.floats(0.05, 0.99))
+def test_a_share_of_the_peak_shrinks_the_box_around_it(heat, threshold, share):
+    whole = label_boxes(heat, threshold=threshold)
+    core = label_boxes(heat, threshold=threshold, share=share)
+    np.testing.assert_array_equal(core.scores, whole.scores)
+    assert (core.boxes[:, :2] >= whole.boxes[:, :2]).all()
+    assert (core.boxes[:, 2:] <= whole.boxes[:, 2:]).all()
+    labels, count = ndimage.label(heat > threshold, EIGHT)
+    expected = [part_around_the_peak(heat, labels, index, share) for index in range(1, count + 1)]
+    assert sorted(core.boxes.tolist()) == sorted(map(list, expected))
+    smaller = label_boxes(heat, threshold=threshold, share=min(0.99, share * 1.5))
+    assert (smaller.boxes[:, :2] >= core.boxes[:, :2]).all()
+    assert (smaller.boxes[:, 2:] <= core.boxes[:, 2:]).all()
+
+
+def test_regions_that_touch_at_a_corner_are_one():
+    heat = np.zeros((4, 4))
+    heat[1, 1] = heat[2, 2] = 1
+    assert label_boxes(heat).boxes.tolist() == [[1, 1, 3, 3]]
+
+
+def test_no_heat_has_no_regions():
+    found = label_boxes(np.zeros(SHAPE), share=0.5)
+    assert found.boxes.shape == (0, 4)
+    assert len(label_boxes(np.ones(SHAPE), threshold=1.0)) == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"threshold": -1}, "threshold must be a number, at least 0"),
+        ({"threshold": np.nan}, "threshold must be a number"),
+        ({"share": 1.0}, "share must be a number, at least 0 and at most 0.99"),
+        ({"share": -0.1}, "share must be a number"),
+    ],
+)
+def test_label_boxes_refuses(options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        label_boxes(np.ones((3, 3)), **options)
+    with pytest.raises(InvalidInputError, match="heatmap must be an"):
+        label_boxes(np.ones((3, 3, 3)))
+
+
+@given(windows(st.integers(-6, 24)))
+def test_bounding_boxes_is_the_three_in_one(found):
+    counted = HeatParams(weighting="count", threshold=1, share=0)
+    expected = label_boxes(apply_threshold(add_heat(np.zeros(SHAPE), found.boxes), 1))
+    result = bounding_boxes((*SHAPE, 3), found, params=counted)
+    np.testing.assert_array_equal(result.boxes, expected.boxes)
+    np.testing.assert_array_equal(result.scores, expected.scores)
+
+
+def test_windows_weigh_what_they_score():
+    found = Detections([[0, 0, 5, 5], [10, 0, 15, 5], [5, 8, 9, 12]], [3.0, 1.0, -2.0])
+    heat = frame_heat((*SHAPE, 3), found, HeatParams())
+    assert (heat[0, 0], heat[0, 10], heat[9, 6]) == (3, 1, 0)
+    result = bounding_boxes(SHAPE, found, params=HeatParams(threshold=2, share=0))
+    assert result.boxes.tolist() == [[0, 0, 5, 5]]
+    assert result.scores.tolist() == [3]
+    counted = bounding_boxes(SHAPE, found, params=HeatParams(weighting="count", threshold=0, share=0))
+    assert len(counted) == 3
+    assert len(bounding_boxes(SHAPE, Detections.empty())) == 0
+
+
+@given(st.lists(heats, min_size=1, max_size=7), st.integers(1, 4))
+def test_history_is_the_mean_of_the_last_frames(maps, frames):
+    history = HeatHistory(frames)
+    for index, heat in enumerate(maps):
+        given_map = heat.copy()
+        mean = history.add(given_map)
+        given_map[:] = 99  # what is remembered is a copy
+        last = maps[max(0, index + 1 - frames) : index + 1]
+        np.testing.assert_allclose(mean, np.mean(last, axis=0), rtol=1e-6)
+        assert mean.dtype == np.float32
+        mean[:] = 99
+
+
+def test_history_starts_anew_with_another_size_and_when_cleared():
+    history = HeatHistory(3)
+    history.add(np.full((2, 2), 8.0))
+    assert history.add(np.full((3, 2), 1.0)).tolist() == np.ones((3, 2)).tolist()
+    history.clear()
+    assert history.add(np.full((3, 2), 5.0)).max() == 5
+
+
+def test_history_refuses():
+    for frames in (0, 1.5, None):
+        with pytest.raises(InvalidInputError, match="frames must be an integer at least 1"):
+            HeatHistory(frames)
+    with pytest.raises(InvalidInputError, match="heatmap must be an"):
+        HeatHistory().add(np.zeros((2, 2, 3)))

@@ -1,0 +1,282 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vehicle_detection.boxes import Detections, iou_matrix
+from vehicle_detection.camera import Camera
+from vehicle_detection.params import RegionParams
+from vehicle_detection.regions import WindowGroups, find_vehicles, fit_boxes, group_windows
+
+SHAPE = (720, 1280)
+CAMERA = Camera.for_frame(SHAPE)
+# Behaviour is tested here; the numbers may be tuned.
+PLAIN = RegionParams(
+    min_peak=0.5,
+    min_evidence=0.5,
+    overlap=0.4,
+    reach=0.6,
+    face_width=0.8,
+    face_height=0.75,
+    drop=0.05,
+    flank_length_m=4.0,
+    flank_shift=0.25,
+    covered=0.5,
+    flank_peak=0.5,
+)
+
+
+def around(centre, side, *, step=8, spread=2, peak=2.0):
+    """Windows as the search leaves them around a vehicle: the nearer to it, the better."""
+    offsets = np.arange(-spread, spread + 1) * step
+    shifts = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
+    corners = np.array(centre) + shifts - side / 2
+    boxes = np.concatenate([corners, corners + side], axis=1)
+    scores = peak - 0.03 * np.abs(shifts).sum(axis=1)
+    return Detections(boxes, scores)
+
+
+def together(*parts):
+    return Detections(np.concatenate([p.boxes for p in parts]), np.concatenate([p.scores for p in parts]))
+
+
+def groups_of(boxes, peaks=None):
+    boxes = np.array(boxes, float).reshape(-1, 4)
+    peaks = np.full(len(boxes), 2.0) if peaks is None else np.array(peaks, float)
+    return WindowGroups(boxes, peaks, peaks * 3)
+
+
+def window(x, side=100, y=450):
+    return [x - side / 2, y - side / 2, x + side / 2, y + side / 2]
+
+
+@st.composite
+def any_windows(draw):
+    count = draw(st.integers(0, 25))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    side = rng.uniform(0, 300, (count, 1)) * rng.integers(0, 8, (count, 1)).clip(0, 1)
+    corner = rng.uniform(-200, 1300, (count, 2)) * (1, 0.6)
+    boxes = np.concatenate([corner, corner + side * rng.uniform(0.7, 1.4, (count, 2))], axis=1)
+    return Detections(boxes, rng.uniform(-1, 4, count))
+
+
+def test_windows_around_a_vehicle_are_one_group_at_its_place():
+    groups = group_windows(around((640.0, 420.0), 96), PLAIN)
+    assert len(groups) == 1
+    np.testing.assert_allclose(groups.boxes[0], [592, 372, 688, 468], atol=1e-6)
+    assert groups.peaks.tolist() == [2.0]
+
+
+def test_the_mean_is_finer_than_the_step():
+    # The vehicle stands between two positions of the search.
+    windows = around((640.0, 420.0), 96)
+    middle = np.array([642.5, 420.0])
+    centres = (windows.boxes[:, :2] + windows.boxes[:, 2:]) / 2
+    scores = 2 - 0.03 * np.abs(centres - middle).sum(axis=1)
+    box = group_windows(Detections(windows.boxes, scores), PLAIN).boxes[0]
+    assert 640.2 < (box[0] + box[2]) / 2 < 644
+    assert (box[1] + box[3]) / 2 == pytest.approx(420)
+
+
+def test_windows_of_other_sizes_join_at_the_mean_of_the_logarithms():
+    small, large = window(640, 80), window(640, 100)
+    groups = group_windows(Detections([small, large], [1.0, 1.0]), dataclasses.replace(PLAIN, power=0))
+    side = groups.boxes[0, 2] - groups.boxes[0, 0]
+    assert 80 < side < 100
+    # A group holds no size that none of its windows has.
+    same = group_windows(Detections([small, small], [1.0, 0.5]), PLAIN)
+    np.testing.assert_allclose(same.boxes[0], small)
+
+
+def test_two_vehicles_are_two_groups_the_better_one_first():
+    found = together(around((400.0, 430.0), 90, peak=1.5), around((700.0, 430.0), 120, peak=2.5))
+    groups = group_windows(found, PLAIN)
+    assert len(groups) == 2
+    assert (groups.boxes[:, 0] < 500).tolist() == [False, True]
+    assert groups.peaks.tolist() == [2.5, 1.5]
+
+
+def test_weak_and_lonely_windows_found_no_group():
+    strict = dataclasses.replace(PLAIN, min_peak=1.0, min_evidence=2.0)
+    assert len(group_windows(Detections([window(300), window(302)], [0.9, 0.9]), strict)) == 0
+    assert len(group_windows(Detections([window(300)], [1.5]), strict)) == 0
+    assert len(group_windows(Detections([window(300), window(302)], [1.5, 0.9]), strict)) == 1
+
+
+def test_windows_at_or_below_zero_count_for_nothing():
+    good = around((640.0, 420.0), 96)
+    bad = Detections(good.boxes + 20, -np.abs(good.scores))
+    with_bad = group_windows(together(bad, good), PLAIN)
+    alone = group_windows(good, PLAIN)
+    np.testing.assert_array_equal(with_bad.boxes, alone.boxes)
+    np.testing.assert_array_equal(with_bad.evidence, alone.evidence)
+
+
+def test_windows_without_area_count_for_nothing():
+    flat = Detections([[10, 10, 10, 50], [10, 10, 50, 10], [5, 5, 5, 5]], [3.0, 3.0, 3.0])
+    assert len(group_windows(flat, PLAIN)) == 0
+    assert len(group_windows(together(flat, around((640.0, 420.0), 96)), PLAIN)) == 1
+
+
+def test_nothing_groups_to_nothing():
+    groups = group_windows(Detections.empty())
+    assert groups.boxes.shape == (0, 4)
+    assert len(groups) == len(groups.peaks) == len(groups.evidence) == 0
+    assert len(fit_boxes(groups, CAMERA, SHAPE)) == 0
+    assert len(find_vehicles(Detections.empty(), CAMERA, SHAPE)) == 0
+
+
+@given(any_windows())
+def test_groups_keep_what_the_parameters_promise(found):
+    before = found.boxes.copy(), found.scores.copy()
+    groups = group_windows(found, PLAIN)
+    assert (groups.peaks >= PLAIN.min_peak).all()
+    assert (groups.evidence >= PLAIN.min_evidence).all()
+    assert (groups.evidence >= groups.peaks - 1e-9).all()
+    assert (np.diff(groups.peaks) <= 0).all()
+    assert np.isfinite(groups.boxes).all()
+    assert (groups.boxes[:, 2:] > groups.boxes[:, :2]).all()
+    assert np.isin(groups.peaks, found.scores).all()
+    assert groups.evidence.sum() <= found.scores.clip(0).sum() + 1e-9
+    np.testing.assert_array_equal(found.boxes, before[0])
+    np.testing.assert_array_equal(found.scores, before[1])
+
+
+@given(any_windows(), st.floats(0.5, 4), st.floats(-500, 500))
+def test_groups_move_and_grow_with_their_windows(found, factor, shift):
+    groups = group_windows(found, PLAIN)
+    moved = group_windows(Detections(found.boxes * factor + shift, found.scores), PLAIN)
+    # Rounding may turn an overlap that lies on the bound: leave those out.
+    if len(moved) == len(groups):
+        np.testing.assert_allclose(moved.boxes, groups.boxes * factor + shift, rtol=1e-6, atol=1e-3)
+    else:
+        assert abs(len(moved) - len(groups)) <= 1
+
+
+@given(any_windows(), st.floats(1e-3, 1e3))
+def test_the_mean_does_not_depend_on_the_unit_of_the_scores(found, unit):
+    loose = dataclasses.replace(PLAIN, min_peak=0.0, min_evidence=0.0)
+    groups = group_windows(found, loose)
+    scaled = group_windows(Detections(found.boxes, found.scores * unit), loose)
+    np.testing.assert_allclose(scaled.boxes, groups.boxes, rtol=1e-6, atol=1e-6)
+
+
+def test_huge_and_tiny_scores_do_not_overflow():
+    for unit in (1e-300, 1e300):
+        scores = around((640.0, 420.0), 96).scores / 25 * unit
+        steep = dataclasses.replace(PLAIN, min_peak=0.0, min_evidence=0.0, power=20.0)
+        groups = group_windows(Detections(around((640.0, 420.0), 96).boxes, scores), steep)
+        np.testing.assert_allclose(groups.boxes[0], [592, 372, 688, 468], atol=1e-6)
+
+
+def test_a_vehicle_ahead_is_its_face():
+    found = fit_boxes(groups_of([window(640, 100, 450)]), CAMERA, SHAPE, PLAIN)
+    np.testing.assert_allclose(found.boxes, [[600, 417.5, 680, 492.5]])
+    assert found.scores.tolist() == [2.0]
+
+
+def test_a_vehicle_aside_shows_its_flank_towards_the_middle():
+    sides = [640, 760, 900, 1050]
+    found = [fit_boxes(groups_of([window(x)]), CAMERA, SHAPE, PLAIN).boxes[0] for x in sides]
+    widths = [box[2] - box[0] for box in found]
+    assert widths == sorted(widths)
+    assert widths[0] == pytest.approx(80)
+    assert widths[-1] > 90
+    for x, box in zip(sides[1:], found[1:]):
+        # The middle of the whole vehicle is nearer to the vanishing point than that of its face.
+        assert (box[0] + box[2]) / 2 < x
+        assert box[0] < x - 40
+    heights = {round(box[3] - box[1], 6) for box in found}
+    assert heights == {75}
+
+
+def test_a_nearer_vehicle_shows_more_of_its_flank():
+    shares = []
+    for side in (60, 120, 240):
+        # The same place beside the camera: the nearer, the farther out in the picture.
+        x = 640 + 1.5 * side
+        box = fit_boxes(groups_of([window(x, side)]), CAMERA, SHAPE, PLAIN).boxes[0]
+        shares.append((box[2] - box[0]) / side)
+    assert shares == sorted(shares)
+    assert shares[0] < shares[-1]
+
+
+def test_without_a_flank_every_vehicle_is_its_face():
+    flat = dataclasses.replace(PLAIN, flank_length_m=0.0)
+    box = fit_boxes(groups_of([window(1000)]), CAMERA, SHAPE, flat).boxes[0]
+    np.testing.assert_allclose(box[[0, 2]], [960, 1040])
+
+
+@given(any_windows())
+def test_left_and_right_are_alike(found):
+    groups = group_windows(found, PLAIN)
+    mirrored = groups.boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1) + (1280, 0, 1280, 0)
+    boxes = fit_boxes(groups, CAMERA, SHAPE, PLAIN)
+    other = fit_boxes(WindowGroups(mirrored, groups.peaks, groups.evidence), CAMERA, SHAPE, PLAIN)
+    expected = other.boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1) + (1280, 0, 1280, 0)
+    np.testing.assert_allclose(boxes.boxes, expected, atol=1e-6)
+
+
+@given(any_windows(), st.sampled_from([PLAIN, RegionParams(), dataclasses.replace(PLAIN, drop=-0.5)]))
+def test_a_box_never_leaves_the_frame(found, params):
+    boxes = find_vehicles(found, CAMERA, SHAPE, params)
+    height, width = SHAPE
+    assert ((boxes.boxes >= 0) & (boxes.boxes <= (width, height, width, height))).all()
+    assert (boxes.boxes[:, 2:] > boxes.boxes[:, :2]).all()
+    assert (boxes.scores >= params.min_peak).all()
+
+
+def test_half_a_vehicle_at_the_edge_is_cut_at_the_edge():
+    for x, edge, place in ((0, 0, 0), (1280, 1280, 2)):
+        (box,) = fit_boxes(groups_of([window(x, 120)]), CAMERA, SHAPE, PLAIN).boxes
+        assert box[place] == edge
+        assert box[2] - box[0] >= 40
+
+
+def test_a_face_outside_the_frame_is_no_vehicle():
+    outside = groups_of([window(-80), window(1400), window(640, 100, -70), window(640, 100, 800)])
+    assert len(fit_boxes(outside, CAMERA, SHAPE, PLAIN)) == 0
+
+
+def test_of_two_on_each_other_the_better_one_stays():
+    near = groups_of([window(640), window(650)], [2.0, 1.5])
+    assert fit_boxes(near, CAMERA, SHAPE, PLAIN).scores.tolist() == [2.0]
+    turned = groups_of([window(650), window(640)], [1.5, 2.0])
+    assert fit_boxes(turned, CAMERA, SHAPE, PLAIN).scores.tolist() == [2.0]
+
+
+def test_of_two_equals_on_each_other_one_stays():
+    equal = groups_of([window(640), window(650)], [2.0, 2.0])
+    assert len(fit_boxes(equal, CAMERA, SHAPE, PLAIN)) == 1
+    same = groups_of([window(640)] * 3, [2.0] * 3)
+    assert len(fit_boxes(same, CAMERA, SHAPE, PLAIN)) == 1
+
+
+def test_vehicles_side_by_side_both_stay():
+    apart = groups_of([window(540), window(640), window(740)], [2.0, 1.0, 1.5])
+    assert len(fit_boxes(apart, CAMERA, SHAPE, PLAIN)) == 3
+
+
+def test_what_lies_on_a_flank_goes():
+    # A near vehicle far to the right: its flank reaches a third of a window towards the middle.
+    vehicle = window(1000, 240)
+    (box,) = fit_boxes(groups_of([vehicle]), CAMERA, SHAPE, PLAIN).boxes
+    flank = window(box[0] + 18, 40)
+    face = [1000 - 96, 0, 1000 + 96, 0]
+    assert iou_matrix([flank], [[face[0], 354, face[2], 546]])[0, 0] < 0.2
+    # Even a better one goes, as long as the vehicle is not much weaker.
+    for peaks, left in (([2.0, 1.0], [2.0]), ([1.5, 2.0], [1.5]), ([0.9, 2.0], [2.0, 0.9])):
+        found = fit_boxes(groups_of([vehicle, flank], peaks), CAMERA, SHAPE, PLAIN)
+        assert sorted(found.scores, reverse=True) == left
+
+
+def test_find_vehicles_is_both_steps():
+    found = together(around((400.0, 430.0), 90, peak=1.5), around((900.0, 430.0), 120, peak=2.5))
+    both = find_vehicles(found, CAMERA, SHAPE, PLAIN)
+    steps = fit_boxes(group_windows(found, PLAIN), CAMERA, SHAPE, PLAIN)
+    np.testing.assert_array_equal(both.boxes, steps.boxes)
+    np.testing.assert_array_equal(both.scores, steps.scores)
+    default = find_vehicles(found, CAMERA, SHAPE)
+    np.testing.assert_array_equal(default.boxes, find_vehicles(found, CAMERA, SHAPE, RegionParams()).boxes)

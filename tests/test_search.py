@@ -1,0 +1,449 @@
+import dataclasses
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.test_classifier import random_classifier
+from vehicle_detection.classifier import VehicleClassifier
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.params import COLOR_SPACES, FeatureParams, PixelBand, SearchBand, SearchParams
+from vehicle_detection.search import BandSearch, _Buffers, find_cars, resize_band, resized_shape
+from vehicle_detection.windows import search_windows, slide_window
+
+PRESETS = sorted(FeatureParams.PRESETS)
+TOLERANCE = 1e-4
+SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=6, pix_per_cell=16, hog_channel=0)
+
+
+def textured(height, width, seed=0):
+    """Blobs, hard edges and grain, dark and light: the gradients of every kind of road."""
+    rng = np.random.default_rng(seed)
+    image = np.full((height, width, 3), 110, float)
+    for _ in range(40):
+        x, y = rng.integers(0, width), rng.integers(0, height)
+        w, h = rng.integers(4, max(5, width // 3)), rng.integers(4, max(5, height // 3))
+        image[y : y + h, x : x + w] = rng.integers(0, 256, 3)
+    image += cv2.resize(rng.normal(0, 30, (height // 8 + 1, width // 8 + 1, 3)), (width, height))
+    image += rng.normal(0, 8, image.shape)
+    return image.clip(0, 255).astype(np.uint8)
+
+
+IMAGE = textured(220, 330)
+
+
+def reference_map(image, band, classifier):
+    """Scores of all windows of a band at a step of one cell, by the reference search."""
+    resized = resize_band(image, band)
+    cell = classifier.params.pix_per_cell
+    windows = slide_window(resized, xy_overlap=(1 - cell / 64,) * 2)
+    found = search_windows(resized, windows, classifier, border="image", min_score=None)
+    height, width = resized.shape[:2]
+    return found.scores.reshape(height // cell - 64 // cell + 1, width // cell - 64 // cell + 1)
+
+
+def assert_equals_the_reference(image, band, classifier):
+    with BandSearch(classifier, n_jobs=1) as search:
+        scores = search.score_map(image, band)
+    expected = reference_map(image, band, classifier)
+    assert scores.dtype == np.float32
+    assert scores.shape == expected.shape
+    assert scores.size == 1 or expected.std() > 0
+    np.testing.assert_allclose(scores, expected, rtol=0, atol=TOLERANCE)
+
+
+def band_of(window, *, x=(0, 330), y=(20, 220), step=(8, 8)):
+    return PixelBand(x[0], y[0], x[1], y[1], window, step)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("window", [(96, 96), (64, 64), (51, 51)])
+def test_the_presets_equal_the_reference_at_the_courses_scales(preset, window):
+    # Smaller windows make larger bands: fewer rows keep the reference quick.
+    band = band_of(window, x=(10, 250), y=(30, 30 + 2 * window[1]))
+    assert_equals_the_reference(IMAGE, band, random_classifier(FeatureParams.preset(preset)))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"pix_per_cell": 16},
+        {"pix_per_cell": 16, "cell_per_block": 1},
+        {"pix_per_cell": 16, "cell_per_block": 3, "spatial_size": 8},
+        {"pix_per_cell": 32, "spatial_size": 2},
+        {"pix_per_cell": 64, "cell_per_block": 1, "spatial_size": 1},
+        {"pix_per_cell": 4, "cell_per_block": 4, "orient": 4, "hog_channel": 1},
+        {"cell_per_block": 1},
+        {"cell_per_block": 3},
+        {"cell_per_block": 8, "orient": 3, "hog_channel": 0},
+        {"hog_channel": "GRAY"},
+        {"hog_channel": "GRAY", "transform_sqrt": True, "color_space": "HSV"},
+        {"hog_channel": 0},
+        {"hog_channel": 1},
+        {"hog_channel": 2},
+        {"transform_sqrt": True},
+        {"transform_sqrt": True, "pix_per_cell": 16},
+        {"orient": 4},
+        {"orient": 12},
+        {"orient": 1},
+        {"spatial_feat": False},
+        {"hist_feat": False},
+        {"hog_feat": False},
+        {"hog_feat": False, "pix_per_cell": 16},
+        {"spatial_feat": False, "hist_feat": False},
+        {"spatial_feat": False, "hog_feat": False},
+        {"hist_feat": False, "hog_feat": False},
+        {"hist_bins": 20},
+        {"hist_bins": 1},
+        {"hist_bins": 256},
+        {"spatial_size": 8},
+        {"spatial_size": 32},
+        {"spatial_size": 64},
+        {"spatial_feat": False, "spatial_size": 20},
+        *({"color_space": space} for space in COLOR_SPACES),
+    ],
+    ids=str,
+)
+def test_other_parameters_equal_the_reference(changes):
+    classifier = random_classifier(dataclasses.replace(FeatureParams(), **changes))
+    assert_equals_the_reference(IMAGE, band_of((80, 80), x=(5, 213), y=(40, 152)), classifier)
+
+
+@pytest.mark.parametrize("window", [(96, 64), (48, 96), (110, 145), (40, 33)])
+@pytest.mark.parametrize("preset", ["ycrcb-6156", "luv-2384"])
+def test_windows_that_are_not_square(window, preset):
+    band = band_of(window, x=(0, 330), y=(20, 20 + round(1.4 * window[1])))
+    assert_equals_the_reference(IMAGE, band, random_classifier(FeatureParams.preset(preset)))
+
+
+@pytest.mark.parametrize("height", range(64, 74))
+def test_bands_of_any_height(height):
+    # What is left below the last whole cell still gives the cell above it its gradients.
+    band = band_of((64, 64), x=(3, 3 + height + 17), y=(11, 11 + height))
+    assert_equals_the_reference(IMAGE, band, random_classifier(FeatureParams(hog_channel=0)))
+
+
+def test_a_wide_band():
+    # Wider than the tiles that the kernel works in.
+    image = textured(80, 1300, 4)
+    band = PixelBand(0, 0, 1300, 70, (64, 64), (8, 8))
+    assert_equals_the_reference(image, band, random_classifier(FeatureParams.preset("ycrcb-6156")))
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_an_overhang_repeats_the_outermost_column(preset):
+    classifier = random_classifier(FeatureParams.preset(preset))
+    band = PixelBand(-32, 50, 330 + 32, 130, (64, 64), (8, 8))
+    assert_equals_the_reference(IMAGE, band, classifier)
+    padded = np.concatenate(
+        [IMAGE[:, :1].repeat(32, axis=1), IMAGE, IMAGE[:, -1:].repeat(32, axis=1)], axis=1
+    )
+    np.testing.assert_array_equal(resize_band(IMAGE, band), padded[50:130])
+
+
+@given(
+    st.tuples(st.integers(30, 120), st.integers(30, 120)),
+    st.tuples(st.integers(-40, 150), st.integers(0, 80)),
+    st.tuples(st.integers(0, 60), st.integers(0, 30)),
+    st.integers(0, 5),
+)
+@settings(max_examples=20)
+def test_any_band_equals_the_reference(window, corner, more, seed):
+    x1, y1 = corner
+    x2, y2 = x1 + window[0] + more[0], min(y1 + window[1] + more[1], 220)
+    band = PixelBand(x1, y1, x2, y2, window, (8, 8))
+    classifier = random_classifier(FeatureParams(hog_channel=0, spatial_size=8), seed)
+    if y2 - y1 >= window[1]:
+        assert_equals_the_reference(IMAGE, band, classifier)
+
+
+@pytest.mark.parametrize("preset", ["ycrcb-6156", "luv-2384"])
+def test_two_templates_give_the_better_score(preset):
+    params = FeatureParams.preset(preset)
+    both = random_classifier(params, 3, templates=2, bias=0.3)
+    band = band_of((80, 80), x=(0, 250), y=(30, 140))
+    assert_equals_the_reference(IMAGE, band, both)
+    alone = []
+    for template in both.templates:
+        with BandSearch(VehicleClassifier(params, (template,)), n_jobs=1) as search:
+            alone.append(search.score_map(IMAGE, band))
+    with BandSearch(both, n_jobs=1) as search:
+        np.testing.assert_allclose(search.score_map(IMAGE, band), np.maximum(*alone), atol=1e-6)
+    assert (alone[0] > alone[1]).any()
+    assert (alone[0] < alone[1]).any()
+
+
+def test_flat_and_extreme_images():
+    classifier = random_classifier(FeatureParams())
+    for image in (np.zeros_like(IMAGE), np.full_like(IMAGE, 255), np.full_like(IMAGE, (250, 3, 128))):
+        with BandSearch(classifier, n_jobs=1) as search:
+            band = band_of((64, 64), x=(0, 120), y=(0, 90))
+            np.testing.assert_allclose(
+                search.score_map(image, band), reference_map(image, band, classifier), atol=TOLERANCE
+            )
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"pix_per_cell": 7}, "find_cars needs whole HOG cells in a 64 pixel window; pix_per_cell=7 leaves"),
+        ({"pix_per_cell": 24}, "pix_per_cell=24 leaves a rest; use search_windows, the reference search"),
+        ({"spatial_size": 20}, "find_cars needs whole spatial bins in a cell of 8 pixels; spatial_size=20"),
+        ({"spatial_size": 4}, "spatial_size=4 has none; use search_windows, the reference search"),
+        ({"spatial_size": 24}, "spatial_size=24"),
+        ({"spatial_size": 8, "pix_per_cell": 4}, "spatial bins in a cell of 4 pixels; spatial_size=8"),
+    ],
+)
+def test_parameters_that_windows_cannot_share_are_refused(changes, message):
+    classifier = random_classifier(dataclasses.replace(FeatureParams(), **changes))
+    search = SearchParams.preset("three-scales")
+    with pytest.raises(InvalidInputError, match=message):
+        find_cars(np.zeros((720, 1280, 3), np.uint8), classifier, search)
+    # The search that the message names takes them.
+    assert len(search_windows(IMAGE, [[0, 0, 64, 64]], classifier, min_score=None)) == 1
+
+
+def small_search(**changes):
+    """Three bands for a frame of 330x220, with windows of 64, 42 and 96 pixels."""
+    bands = tuple(
+        SearchBand(window=(side * 1280 / 330,) * 2, y=(-400, 400), overlap=(0.8, 0.8))
+        for side in (64, 42, 96)
+    )
+    return SearchParams(bands=bands, horizon=0.5, **changes)
+
+
+@pytest.mark.parametrize("params", [SMALL, FeatureParams.preset("ycrcb-8460")], ids=["small", "8460"])
+@pytest.mark.parametrize("templates", [1, 2])
+def test_threads_do_not_change_the_result(params, templates):
+    classifier = random_classifier(params, 2, templates=templates)
+    search = small_search(overhang=0.3)
+    one = find_cars(IMAGE, classifier, search, n_jobs=1)
+    assert len(one) > 10
+    for n_jobs in (2, 3):
+        found = find_cars(IMAGE, classifier, search, n_jobs=n_jobs)
+        np.testing.assert_array_equal(found.boxes, one.boxes)
+        np.testing.assert_array_equal(found.scores, one.scores)
+
+
+def test_a_search_is_used_again_and_again():
+    classifier = random_classifier(SMALL)
+    search = small_search()
+    images = [textured(220, 330, seed) for seed in range(3)] + [textured(110, 165, 9)]
+    fresh = [find_cars(image, classifier, search, n_jobs=1) for image in images]
+    with BandSearch(classifier, n_jobs=2) as bands:
+        for image, expected in zip(images * 2, fresh * 2):
+            found = bands.find(image, search)
+            np.testing.assert_array_equal(found.boxes, expected.boxes)
+            np.testing.assert_array_equal(found.scores, expected.scores)
+        bands.close()
+        # A closed search starts its threads again.
+        assert len(bands.find(images[0], search)) == len(fresh[0])
+
+
+def test_a_score_map_is_the_callers_own():
+    band = band_of((64, 64))
+    with BandSearch(random_classifier(SMALL), n_jobs=1) as search:
+        first = search.score_map(IMAGE, band)
+        kept = first.copy()
+        search.score_map(255 - IMAGE, band)
+        np.testing.assert_array_equal(first, kept)
+
+
+def test_many_threads_share_one_search(monkeypatch):
+    opened = []
+
+    class SlowToOpen(ThreadPoolExecutor):
+        def __init__(self, *arguments, **options):
+            opened.append(self)
+            time.sleep(0.02)
+            super().__init__(*arguments, **options)
+
+    monkeypatch.setattr("vehicle_detection.search.ThreadPoolExecutor", SlowToOpen)
+    classifier = random_classifier(SMALL)
+    search = small_search()
+    images = [textured(220, 330, seed) for seed in range(8)]
+    fresh = [find_cars(image, classifier, search, n_jobs=1) for image in images]
+    with BandSearch(classifier, n_jobs=2) as bands, ThreadPoolExecutor(8) as callers:
+        together = threading.Barrier(8)
+
+        def find(image):
+            together.wait(10)
+            return bands.find(image, search)
+
+        for found, expected in zip(callers.map(find, images), fresh):
+            np.testing.assert_array_equal(found.scores, expected.scores)
+            np.testing.assert_array_equal(found.boxes, expected.boxes)
+    assert len(opened) == 1
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("search")]
+
+
+def test_searching_changes_nothing():
+    before = IMAGE.copy()
+    find_cars(IMAGE, random_classifier(SMALL), small_search(overhang=0.5))
+    np.testing.assert_array_equal(IMAGE, before)
+
+
+def test_boxes_map_back_to_the_frame():
+    classifier = random_classifier(SMALL)
+    search = SearchParams(
+        bands=(SearchBand(window=(128, 96), y=(-100, 284), overlap=(0.5, 0.75)),), min_score=-1e6
+    )
+    frame = textured(720, 1280, 2)
+    (band,) = search.place(frame.shape)
+    found = find_cars(frame, classifier, search, n_jobs=1)
+    # 1280 / 128 and 384 / 96 are whole: so are the windows, and a cell is a quarter of each side.
+    np.testing.assert_array_equal(
+        found.boxes[:, 2:] - found.boxes[:, :2], np.full((len(found), 2), (128, 96))
+    )
+    expected = [
+        [x, y, x + 128, y + 96]
+        for y in range(band.y1, band.y2 - 96 + 1, 24)
+        for x in range(0, 1280 - 128 + 1, 64)
+    ]
+    np.testing.assert_array_equal(found.boxes, expected)
+    # The pixels inside a box are those that were scored.
+    alone = search_windows(
+        resize_band(frame, PixelBand(0, band.y1, 1280, band.y2, (128, 96), (1, 1))),
+        [[32, 16, 96, 80]],
+        classifier,
+        border="image",
+        min_score=None,
+    )
+    row = np.flatnonzero((found.boxes == [64, band.y1 + 24, 192, band.y1 + 120]).all(axis=1))
+    np.testing.assert_allclose(found.scores[row], alone.scores, atol=TOLERANCE)
+
+
+@given(
+    st.tuples(st.integers(120, 500), st.integers(120, 900)),
+    st.tuples(st.floats(64, 300), st.floats(64, 300)),
+    st.tuples(st.floats(0, 0.95), st.floats(0, 0.95)),
+    st.floats(0, 0.5),
+)
+@settings(max_examples=30)
+def test_windows_lie_in_the_band_and_keep_their_size(shape, window, overlap, overhang):
+    band = SearchBand(window=window, y=(-300, 300), overlap=overlap)
+    search = SearchParams(bands=(band,), horizon=0.5, min_score=-1e6, overhang=overhang)
+    try:
+        (placed,) = search.place(shape)
+    except InvalidInputError:
+        return
+    classifier = random_classifier(FeatureParams(hog_feat=False, hist_feat=False, spatial_size=8))
+    found = find_cars(np.zeros((*shape, 3), np.uint8), classifier, search, n_jobs=1)
+    assert len(found) >= 1
+    slack = 1e-9 * max(shape)
+    assert (found.boxes[:, :2] >= (placed.x1 - slack, placed.y1 - slack)).all()
+    assert (found.boxes[:, 2:] <= (placed.x2 + slack, placed.y2 + slack)).all()
+    assert found.boxes[0, :2].tolist() == [placed.x1, placed.y1]
+    # The band is resized to whole pixels: a window is off by the share of half a pixel.
+    height, width = resized_shape(placed)
+    off = np.abs(found.boxes[:, 2:] - found.boxes[:, :2] - placed.window) / placed.window
+    assert (off <= (0.51 / width, 0.51 / height)).all() or min(height, width) == 64
+    # Steps are whole cells, the nearest to the step asked for and at least one.
+    for axis in (0, 1):
+        starts = np.unique(found.boxes[:, axis])
+        if len(starts) > 1:
+            cell = 8 * ((placed.x2 - placed.x1) / width if axis == 0 else (placed.y2 - placed.y1) / height)
+            cells = np.diff(starts) / cell
+            expected = max(1, round(placed.step[axis] / cell))
+            np.testing.assert_allclose(cells, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("overlap", "cells"), [(0.99, 1), (0.875, 1), (0.82, 1), (0.8, 2), (0.75, 2), (0.6, 3), (0.5, 4), (0, 8)]
+)
+def test_a_step_is_rounded_to_whole_cells(overlap, cells):
+    search = SearchParams(
+        bands=(SearchBand(window=(64, 64), y=(0, 64), overlap=(overlap, 0)),), min_score=-1e6
+    )
+    classifier = random_classifier(FeatureParams(hog_feat=False, spatial_feat=False))
+    found = find_cars(np.zeros((720, 1280, 3), np.uint8), classifier, search, n_jobs=1)
+    assert np.unique(np.diff(found.boxes[:, 0])).tolist() == [8.0 * cells]
+
+
+def test_the_third_systems_search_has_11580_windows():
+    search = dataclasses.replace(SearchParams.preset("three-scales"), min_score=-1e6)
+    classifier = random_classifier(FeatureParams(hog_feat=False, hist_feat=False, spatial_size=8))
+    found = find_cars(np.zeros((720, 1280, 3), np.uint8), classifier, search)
+    assert len(found) == 11_580
+    # Band by band, row by row.
+    sizes = (found.boxes[:, 2] - found.boxes[:, 0]).round()
+    assert [int((sizes == side).sum()) for side in (96, 64, 51)] == [1386, 3825, 6369]
+    first = found.boxes[:1386]
+    assert (np.lexsort((first[:, 0], first[:, 1])) == np.arange(1386)).all()
+
+
+def test_windows_above_the_least_score_are_found():
+    classifier = random_classifier(SMALL)
+    every = find_cars(IMAGE, classifier, small_search(min_score=-1e6))
+    least = float(np.quantile(every.scores, 0.9))
+    some = find_cars(IMAGE, classifier, small_search(min_score=least))
+    np.testing.assert_array_equal(some.boxes, every.boxes[every.scores > least])
+    np.testing.assert_array_equal(some.scores, every.scores[every.scores > least])
+    assert len(find_cars(IMAGE, classifier, small_search(min_score=1e6))) == 0
+
+
+def test_the_default_search_is_the_preset():
+    frame = textured(360, 480)
+    classifier = random_classifier(FeatureParams(hog_feat=False, hist_feat=False, spatial_size=8))
+    default = find_cars(frame, classifier)
+    preset = find_cars(frame, classifier, SearchParams.preset("default"))
+    np.testing.assert_array_equal(default.boxes, preset.boxes)
+
+
+@pytest.mark.parametrize("shape", [(720, 1280), (540, 960), (375, 1242), (360, 480), (1280, 720)])
+def test_the_default_search_runs_on_the_usual_frames(shape):
+    search = dataclasses.replace(SearchParams.preset(), min_score=-1e6)
+    classifier = random_classifier(FeatureParams(hog_feat=False, hist_feat=False, spatial_size=8))
+    found = find_cars(np.zeros((*shape, 3), np.uint8), classifier, search)
+    assert len(found) > 100
+    assert (found.boxes[:, 1] >= 0).all()
+    assert (found.boxes[:, 3] <= shape[0] + 1e-9).all()
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (IMAGE[..., 0], "image must be an .*COLOR_GRAY2RGB"),
+        (IMAGE / 255, "image must be an .*dtype float64"),
+        (IMAGE[:40, :40], "image of 40x40 pixels holds no search window .*; pass a larger image"),
+        ("road.png", "image must be an .*read_image"),
+    ],
+)
+def test_find_cars_refuses(image, message):
+    with pytest.raises(InvalidInputError, match=message):
+        find_cars(image, random_classifier(SMALL))
+
+
+def test_find_cars_refuses_a_number_of_threads():
+    with pytest.raises(InvalidInputError, match="n_jobs must be an integer from 1"):
+        find_cars(IMAGE, random_classifier(SMALL), small_search(), n_jobs=0)
+
+
+def test_a_strided_frame_gives_the_same():
+    classifier = random_classifier(FeatureParams())
+    turned = np.ascontiguousarray(IMAGE[:, ::-1])[:, ::-1]
+    swapped = np.ascontiguousarray(IMAGE.transpose(1, 0, 2)).transpose(1, 0, 2)
+    expected = find_cars(IMAGE, classifier, small_search())
+    for view in (turned, swapped):
+        assert not view.flags.c_contiguous
+        found = find_cars(view, classifier, small_search())
+        np.testing.assert_array_equal(found.scores, expected.scores)
+
+
+def test_frames_of_many_sizes_share_the_memory_of_the_largest():
+    buffers = _Buffers()
+    large = buffers.take((40, 60, 3), np.uint8, "band")
+    large[:] = 7
+    for side in range(10, 40):
+        small = buffers.take((side, side, 3), np.uint8, "band")
+        assert small.shape == (side, side, 3)
+        assert small.flags.c_contiguous
+        assert np.shares_memory(small, large)
+    assert not np.shares_memory(buffers.take((40, 60, 3), np.uint8, "strip"), large)
+    assert not np.shares_memory(buffers.take((40, 60, 3), np.float32, "band"), large)
+    assert buffers.take((80, 60, 3), np.uint8, "band").shape == (80, 60, 3)

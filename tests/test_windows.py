@@ -1,0 +1,242 @@
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.test_classifier import random_classifier
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.features import extract_features, single_img_features
+from vehicle_detection.params import FeatureParams, PixelBand, SearchParams
+from vehicle_detection.windows import band_windows, search_windows, slide_window
+
+SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
+CLASSIFIER = random_classifier(SMALL)
+
+
+def image_of(height, width, seed=0):
+    noise = np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    return cv2.GaussianBlur(noise, (0, 0), 2)
+
+
+IMAGE = image_of(120, 200)
+
+
+def windows_one_by_one(region, window, overlap):
+    """All windows of a grid that fit into a region, by their definition."""
+    x1, y1, x2, y2 = region
+    steps = [max(1, int(side * (1 - share) + 1e-9)) for side, share in zip(window, overlap)]
+    return [
+        [x, y, x + window[0], y + window[1]]
+        for y in range(y1, y2 + 1, steps[1])
+        for x in range(x1, x2 + 1, steps[0])
+        if x + window[0] <= x2 and y + window[1] <= y2
+    ]
+
+
+@st.composite
+def ranges(draw, size):
+    start = draw(st.one_of(st.none(), st.integers(0, size - 1)))
+    stop = draw(st.one_of(st.none(), st.integers((start or 0) + 1, size)))
+    return start, stop
+
+
+@given(ranges(90), ranges(60), st.tuples(*[st.integers(1, 70)] * 2), st.tuples(*[st.floats(0, 0.99)] * 2))
+def test_every_window_that_fits_is_there(x_range, y_range, window, overlap):
+    image = np.zeros((60, 90, 3), np.uint8)
+    found = slide_window(
+        image, x_start_stop=x_range, y_start_stop=y_range, xy_window=window, xy_overlap=overlap
+    )
+    region = [x_range[0] or 0, y_range[0] or 0, x_range[1] or 90, y_range[1] or 60]
+    assert found.dtype == np.int64
+    assert found.shape == (len(found), 4)
+    assert found.tolist() == windows_one_by_one(region, window, overlap)
+    assert (found[:, :2] >= region[:2]).all()
+    assert (found[:, 2:] <= region[2:]).all()
+    assert ((found[:, 2:] - found[:, :2]) == window).all()
+
+
+def test_the_arguments_are_left_as_they_were():
+    x, y, window, overlap = [None, 100], [20, None], [32, 16], [0.5, 0.75]
+    before = IMAGE.copy()
+    slide_window(IMAGE, x_start_stop=x, y_start_stop=y, xy_window=window, xy_overlap=overlap)
+    # The course's version put the numbers into the caller's list.
+    assert (x, y, window, overlap) == ([None, 100], [20, None], [32, 16], [0.5, 0.75])
+    np.testing.assert_array_equal(IMAGE, before)
+
+
+def test_the_exact_fit():
+    assert slide_window(image_of(64, 64)).tolist() == [[0, 0, 64, 64]]
+    assert slide_window(image_of(64, 63)).shape == (0, 4)
+    assert slide_window(image_of(63, 64)).shape == (0, 4)
+
+
+def test_a_step_is_not_lost_to_rounding():
+    # 110 * (1 - 0.7) is 33.000000000000004, 64 * (1 - 0.9) is 6.399999999999999, 50 * (1 - 0.9) is 4.99...
+    for side, overlap, step in [(110, 0.7, 33), (64, 0.9, 6), (50, 0.9, 5), (8, 0.99, 1), (64, 0.875, 8)]:
+        found = slide_window(
+            np.zeros((side, 400, 3), np.uint8), xy_window=(side, side), xy_overlap=(overlap, 0)
+        )
+        assert found[1, 0] - found[0, 0] == step
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"x_start_stop": (-5, 100)}, r"x_start_stop must satisfy 0 <= start < stop <= 200; got \(-5, 100\)"),
+        ({"x_start_stop": (0, 201)}, r"x_start_stop must satisfy 0 <= start < stop <= 200"),
+        ({"y_start_stop": (60, 60)}, r"y_start_stop must satisfy 0 <= start < stop <= 120"),
+        ({"y_start_stop": (400, None)}, r"y_start_stop must satisfy .*got \(400, 120\)"),
+        ({"x_start_stop": (0, 1, 2)}, r"x_start_stop must be \(start, stop\), whole pixels or None"),
+        ({"x_start_stop": None}, r"x_start_stop must be \(start, stop\), whole pixels or None; got None"),
+        ({"x_start_stop": (0.5, 100)}, r"x_start_stop must be \(start, stop\), whole pixels or None"),
+        ({"x_start_stop": ("0", 100)}, r"x_start_stop must be \(start, stop\), whole pixels or None"),
+        ({"xy_window": 64}, "xy_window and xy_overlap must be pairs; got 64 and"),
+        ({"xy_window": (64, 64, 64)}, "xy_window and xy_overlap must be pairs"),
+        ({"xy_overlap": 0.5}, "xy_window and xy_overlap must be pairs"),
+        ({"xy_window": (64.0, 64)}, r"xy_window\[0\] must be an integer at least 1"),
+        ({"xy_window": (64, 0)}, r"xy_window\[1\] must be an integer at least 1"),
+        ({"xy_overlap": (0.5, 1.0)}, r"xy_overlap\[1\] must be a number, at least 0 and at most 0.999"),
+        ({"xy_overlap": (-0.1, 0.5)}, r"xy_overlap\[0\] must be a number"),
+        ({"image": IMAGE[..., 0]}, "image must be an"),
+    ],
+)
+def test_slide_window_refuses(arguments, message):
+    arguments = {"image": IMAGE, **arguments}
+    with pytest.raises(InvalidInputError, match=message):
+        slide_window(arguments.pop("image"), **arguments)
+
+
+def test_a_placed_band_lists_its_windows():
+    band = PixelBand(-10, 5, 50, 45, (20, 30), (15, 7))
+    assert band_windows(band).tolist() == [
+        [x, y, x + 20, y + 30] for y in (5, 12) for x in (-10, 5, 20) if x + 20 <= 50
+    ]
+
+
+def test_the_window_list_of_the_first_system():
+    image = np.zeros((720, 1280, 3), np.uint8)
+    lists = [
+        slide_window(image, x_start_stop=(650, None), y_start_stop=rows, xy_window=window, xy_overlap=overlap)
+        for rows, window, overlap in [
+            ((395, 530), (96, 96), (0.9, 0.5)),
+            ((380, 590), (110, 145), (0.7, 0.6)),
+            ((370, 590), (155, 165), (0.6, 0.5)),
+            ((400, 700), (170, 200), (0.6, 0.5)),
+        ]
+    ]
+    bands = SearchParams.preset("130-windows").place(image.shape)
+    for found, band in zip(lists, bands, strict=True):
+        np.testing.assert_array_equal(found, band_windows(band))
+    assert sum(map(len, lists)) == 114
+
+
+def test_scores_are_those_of_the_cut_out_patches():
+    windows = slide_window(IMAGE, xy_window=(50, 40), xy_overlap=(0.5, 0.5))
+    found = search_windows(IMAGE, windows, CLASSIFIER, min_score=None)
+    patches = [cv2.resize(IMAGE[y1:y2, x1:x2], (64, 64)) for x1, y1, x2, y2 in windows]
+    np.testing.assert_array_equal(found.boxes, windows)
+    np.testing.assert_array_equal(found.scores, CLASSIFIER.decision_function(np.stack(patches)))
+
+
+def test_windows_above_the_least_score_are_returned():
+    windows = slide_window(IMAGE, xy_window=(40, 40))
+    every = search_windows(IMAGE, windows, CLASSIFIER, min_score=None)
+    least = float(np.median(every.scores))
+    some = search_windows(IMAGE, windows, CLASSIFIER, min_score=least)
+    np.testing.assert_array_equal(some.boxes, windows[every.scores > least])
+    default = search_windows(IMAGE, windows, CLASSIFIER)
+    np.testing.assert_array_equal(default.boxes, windows[every.scores > 0])
+
+
+@pytest.mark.parametrize("border", ["window", "image"])
+def test_no_windows(border):
+    found = search_windows(IMAGE, np.empty((0, 4)), CLASSIFIER, border=border, min_score=None)
+    assert found.boxes.shape == (0, 4)
+
+
+def test_threads_and_order_do_not_change_scores():
+    windows = slide_window(IMAGE, xy_window=(30, 30), xy_overlap=(0.8, 0.8))
+    one = search_windows(IMAGE, windows, CLASSIFIER, min_score=None, n_jobs=1)
+    two = search_windows(IMAGE, windows, CLASSIFIER, min_score=None, n_jobs=2)
+    np.testing.assert_array_equal(one.scores, two.scores)
+    turned = search_windows(IMAGE, windows[::-1], CLASSIFIER, min_score=None)
+    np.testing.assert_allclose(turned.scores[::-1], one.scores, rtol=1e-9, atol=1e-9)
+
+
+def test_whole_numbers_in_a_float_array_are_pixels():
+    whole = search_windows(IMAGE, [[0.0, 0.0, 64.0, 64.0]], CLASSIFIER, min_score=None)
+    assert whole.boxes.tolist() == [[0, 0, 64, 64]]
+
+
+def test_the_borders_differ_only_where_the_gradients_do():
+    params = FeatureParams(pix_per_cell=8, hog_channel="ALL", spatial_size=16)
+    classifier = random_classifier(params)
+    image = image_of(64, 64, 5)
+    # In an image that is one window, the window's border is the image's.
+    window = [[0, 0, 64, 64]]
+    own = search_windows(image, window, classifier, min_score=None)
+    shared = search_windows(image, window, classifier, border="image", min_score=None)
+    np.testing.assert_allclose(shared.scores, own.scores, atol=1e-5)
+    np.testing.assert_allclose(
+        own.scores, classifier.decision_function(single_img_features(image, params)[None]), atol=1e-5
+    )
+    wide = image_of(80, 96, 5)
+    window = [[16, 8, 80, 72]]
+    own = search_windows(wide, window, classifier, min_score=None)
+    shared = search_windows(wide, window, classifier, border="image", min_score=None)
+    assert np.abs(own.scores - shared.scores).max() > 1e-4
+
+
+def test_without_hog_the_borders_give_the_same():
+    classifier = random_classifier(FeatureParams(hog_feat=False))
+    windows = slide_window(IMAGE, xy_overlap=(0.875, 0.875))
+    own = search_windows(IMAGE, windows, classifier, min_score=None)
+    shared = search_windows(IMAGE, windows, classifier, border="image", min_score=None)
+    np.testing.assert_allclose(shared.scores, own.scores, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("windows", "message"),
+    [
+        ([[0, 0, 64, 64], [150, 0, 214, 64]], r"inside the 200x120 image; got \[150, 0, 214, 64\] in row 1"),
+        ([[-1, 0, 63, 64]], "in row 0; use slide_window, or clip_boxes"),
+        ([[0, 80, 64, 144]], "inside the 200x120 image"),
+        ([[10, 10, 10, 20]], "windows must be filled boxes"),
+        ([[0, 0, 64.5, 64]], "windows must be whole pixels; got .* in row 0; round them first"),
+        ([0, 0, 64, 64], "windows must be an"),
+        ([[0, 0, np.nan, 64]], "windows must be finite"),
+    ],
+)
+def test_search_windows_refuses(windows, message):
+    with pytest.raises(InvalidInputError, match=message):
+        search_windows(IMAGE, windows, CLASSIFIER)
+
+
+def test_search_windows_refuses_other_arguments():
+    window = [[0, 0, 64, 64]]
+    with pytest.raises(InvalidInputError, match="border must be one of 'window', 'image'; got 'none'"):
+        search_windows(IMAGE, window, CLASSIFIER, border="none")
+    with pytest.raises(InvalidInputError, match="image must be an"):
+        search_windows(IMAGE / 255, window, CLASSIFIER)
+    with pytest.raises(InvalidInputError, match="min_score must be a number"):
+        search_windows(IMAGE, window, CLASSIFIER, min_score=np.nan)
+    for off_grid in ([[3, 0, 67, 64]], [[0, 0, 48, 48]]):
+        with pytest.raises(InvalidInputError, match='border="image" needs 64x64 windows at multiples of 16'):
+            search_windows(IMAGE, off_grid, CLASSIFIER, border="image")
+
+
+def test_searching_changes_nothing():
+    windows = slide_window(IMAGE)
+    image, boxes = IMAGE.copy(), windows.copy()
+    search_windows(image, boxes, CLASSIFIER)
+    search_windows(image, boxes, CLASSIFIER, border="image")
+    np.testing.assert_array_equal(image, IMAGE)
+    np.testing.assert_array_equal(boxes, windows)
+
+
+def test_the_patches_of_windows_have_the_features_of_patches():
+    image = image_of(64, 128, 9)
+    found = search_windows(image, [[64, 0, 128, 64]], CLASSIFIER, min_score=None)
+    features = extract_features([image[:, 64:]], SMALL)
+    np.testing.assert_array_equal(found.scores, CLASSIFIER.decision_function(features))

@@ -1,0 +1,99 @@
+"""Near-copies among patches: the frames of a drive show the same car again and again."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection._checks import check_number, check_patches
+from vehicle_detection._patch_set import PatchSet
+from vehicle_detection.params import PATCH_SIZE
+
+_CHUNK = 512  # Rows compared with all others at a time: the table of products stays small.
+
+
+def find_near_duplicates(
+    patches: PatchSet | NDArray[np.uint8], *, threshold: float = 0.95
+) -> NDArray[np.intp]:
+    """Find the patches that have a near-copy among the others.
+
+    Patches are compared by the correlation of their 16x16 gray thumbnails, so that brightness and contrast
+    do not count; a patch of one plain colour is a copy of nothing. Labels do not count either.
+
+    Parameters
+    ----------
+    patches
+        A set, or ``(N, 64, 64, 3)`` uint8 RGB.
+    threshold
+        Correlation, in (0, 1], from which two patches are near-copies.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(M, 2)`` row numbers: each patch that has a near-copy, ascending, and the patch most like it.
+
+    Raises
+    ------
+    InvalidInputError
+        If `patches` are of another kind, or `threshold` is out of range.
+
+    Examples
+    --------
+    >>> patches = np.random.default_rng(0).integers(0, 256, (4, 64, 64, 3), np.uint8)
+    >>> patches[3] = patches[1] // 2
+    >>> find_near_duplicates(patches)
+    array([[1, 3],
+           [3, 1]])
+    """
+    limit = check_number(threshold, "threshold", above=0, high=1)
+    thumbnails = make_thumbnails(patches)
+    nearest, correlation = find_nearest(thumbnails, thumbnails, same=True)
+    rows = np.flatnonzero(correlation >= limit)
+    return np.stack([rows, nearest[rows]], axis=1)
+
+
+def make_thumbnails(patches: PatchSet | NDArray[np.uint8]) -> NDArray[np.float32]:
+    """16x16 gray of each patch, without mean and of length one: products are correlations."""
+    images = patches.patches if isinstance(patches, PatchSet) else check_patches(patches, PATCH_SIZE)
+    vectors = np.empty((len(images), 16 * 16), np.float32)
+    for row, image in enumerate(images):
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+        vectors[row] = cv2.resize(gray, (16, 16), interpolation=cv2.INTER_AREA).ravel()
+    vectors -= vectors.mean(axis=1, keepdims=True)
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    # A plain patch has only rounding errors left to compare.
+    return np.asarray(np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0.01))
+
+
+def find_nearest(
+    queries: NDArray[np.float32], pool: NDArray[np.float32], *, same: bool
+) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """Row in `pool` most like each query, and their correlation; with `same`, other than itself."""
+    nearest = np.zeros(len(queries), np.intp)
+    correlation = np.full(len(queries), -np.inf, np.float32)
+    for start in range(0, len(queries), _CHUNK):
+        products = queries[start : start + _CHUNK] @ pool.T
+        rows = np.arange(len(products))
+        if same:
+            products[rows, start + rows] = -np.inf
+        best = products.argmax(axis=1)
+        nearest[start : start + _CHUNK] = best
+        correlation[start : start + _CHUNK] = products[rows, best]
+    return nearest, correlation
+
+
+def group_copies(thumbnails: NDArray[np.float32], limit: float) -> NDArray[np.int32]:
+    """Return the number of each patch's group: near-copies, and near-copies of those, are in one."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(thumbnails)
+    groups = np.arange(count, dtype=np.int32)
+    for start in range(0, count, _CHUNK):
+        alike = thumbnails[start : start + _CHUNK] @ thumbnails[start:].T >= limit
+        rows, others = groups[start + np.array(alike.nonzero())]
+        # The pairs of this chunk join the groups found so far: all pairs at once may not fit into memory.
+        edges = coo_array((np.ones(len(rows), np.bool_), (rows, others)), shape=(count, count))
+        groups = connected_components(edges, directed=False)[1][groups]
+    return groups
