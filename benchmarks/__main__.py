@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -39,7 +40,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if unknown:
         parser.error(f"no benchmark {unknown[0]!r}; choose from {', '.join(BENCHMARKS)}")
 
-    console = Console()
+    # A file or a pipe has no width: the longest rows fit in this one.
+    console = Console(width=None if sys.stdout.isatty() else 112)
     if not is_real():
         console.print(f"{DATA_VARIABLE} names no data: drawn pictures instead, and no verdict on quality")
     results = {}

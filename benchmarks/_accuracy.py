@@ -34,8 +34,8 @@ def run(context: Context) -> list[Row]:
             target=if_real(at_least(0.997)),
             details={"accuracies": [round(value, 5) for value in accuracies]},
         ),
-        Row(what="the worst of the seeds", value=min(accuracies)),
-        Row(what="near-copies of training patches in its test part", value=split_leakage(found, random[0])),
+        Row(what="random split: the worst of the seeds", value=min(accuracies)),
+        Row(what="random split: near-copies among the test patches", value=split_leakage(found, random[0])),
     ]
     sequences = split_sequences(found)
     rows += [
@@ -44,7 +44,7 @@ def run(context: Context) -> list[Row]:
             value=accuracy_of(found, sequences),
             target=if_real(at_least(0.995)),
         ),
-        Row(what="near-copies of training patches in its test part", value=split_leakage(found, sequences)),
+        Row(what="sequence split: near-copies among the test patches", value=split_leakage(found, sequences)),
     ]
     if is_real():
         for train, test in ((("GTI",), ("KITTI", "Extras")), (("KITTI", "Extras"), ("GTI",))):

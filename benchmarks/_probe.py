@@ -53,15 +53,17 @@ def startup(frame: str, *, kernels: bool = False) -> dict[str, Any]:
 
 
 def _compile_seconds(record: Any) -> dict[str, float]:
-    """Seconds of each kernel's compilation; those of kernels called by it are its own as well."""
-    begun: dict[str, float] = {}
+    """Seconds that each kernel takes to compile, with what is compiled for it on the way."""
     seconds: dict[str, float] = {}
+    begun: list[float] = []
     for moment, occurrence in record.buffer:
-        name = occurrence.data["dispatcher"].py_func.__name__
         if occurrence.is_start:
-            begun.setdefault(name, moment)
-        else:
-            seconds[name] = moment - begun[name]
+            begun.append(moment)
+            continue
+        began = begun.pop()
+        if not begun:
+            name = occurrence.data["dispatcher"].py_func.__name__
+            seconds[name] = seconds.get(name, 0.0) + moment - began
     return seconds
 
 

@@ -116,11 +116,11 @@ def _processor() -> str:
 
 
 def format_value(value: float, unit: str = "") -> str:
-    """Format a number to about four digits, with its unit."""
+    """Format a number to three digits or so, with its unit."""
     if value == int(value) and abs(value) < 1e6:
         text = f"{int(value):,}"
-    elif 0.5 <= abs(value) <= 1:
-        text = f"{value:.4f}"
+    elif not unit and 0.5 <= abs(value) <= 1:
+        text = f"{value:.4f}".rstrip("0")  # A share of 1: its last digits are what counts.
     else:
         text = f"{value:.3g}" if abs(value) < 100 else f"{value:,.0f}"
     return f"{text} {unit}".rstrip()

@@ -49,11 +49,10 @@ def run(context: Context) -> list[Row]:
     return [
         *(
             Row(
-                what=f"default search of a {width}x{height} frame, all cores",
+                what=f"default search of a {width}x{height} frame ({count:,} windows), all cores",
                 value=cost,
                 unit="ms",
                 material=f"{source}; windows, cores and stages: {model}",
-                details={"windows": count},
             )
             for (width, height), (cost, count) in sizes.items()
         ),
@@ -61,7 +60,10 @@ def run(context: Context) -> list[Row]:
             Row(what=f"search of {count:,} windows, one core", value=cost, unit="ms")
             for count, cost in windows.items()
         ),
-        *(Row(what=f"three scales, {n} of the cores", value=cost, unit="ms") for n, cost in cores.items()),
+        *(
+            Row(what=f"three scales, {n} core{'s' * (n > 1)}", value=cost, unit="ms")
+            for n, cost in cores.items()
+        ),
         *(
             Row(what=f"three scales, one core: {name}", value=seconds * 1e3, unit="ms")
             for name, seconds in stages.items()
@@ -193,11 +195,11 @@ def _plot(
     pixels = [width * height / 1e6 for width, height in sizes]
     by_size.plot(pixels, [cost for cost, _ in sizes.values()], "o-")
     by_size.set_xticks(pixels, [f"{width}x{height}" for width, height in sizes], rotation=20)
-    by_size.set(title="default search, all cores", xlabel="frame")
+    by_size.set(title="default search, all cores; its windows grow with the frame", xlabel="frame")
     by_windows.plot([count / 1000 for count in windows], list(windows.values()), "o-")
-    by_windows.set(title="64 px windows at more and more scales, one core", xlabel="thousand windows")
+    by_windows.set(title="1280x720 at more and more scales, one core", xlabel="thousand windows")
     by_cores.plot(list(cores), list(cores.values()), "o-", label="measured")
-    by_cores.plot(list(cores), [cores[1] / n for n in cores], "--", color="gray", label="one core's share")
+    by_cores.plot(list(cores), [cores[1] / n for n in cores], "--", color="gray", label="shared evenly")
     by_cores.set(title="three scales, 11,580 windows of 1280x720", xlabel="cores", xticks=list(cores))
     by_cores.legend()
     bars = by_stage.barh(list(stages), [seconds * 1e3 for seconds in stages.values()])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,8 +60,9 @@ def compare_searches(
             course_seconds.append(seconds_of(course_method))
             assert course is not None
             hog_seconds.append(course.hog_seconds)
-            for jobs, ready in searches.items():
-                ours[jobs] += [seconds_of(lambda r=ready: r.find(frame, search)) for _ in range(calls)]  # type: ignore[misc]
+            for _ in range(calls):
+                for jobs, ready in searches.items():
+                    ours[jobs].append(seconds_of(functools.partial(ready.find, frame, search)))
         assert course is not None
         agreement = check_agreement(frame, one, search, course)
         assert_same(one.find(frame, search), two.find(frame, search))

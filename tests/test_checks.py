@@ -12,6 +12,7 @@ from vehicle_detection._checks import (
     check_integer,
     check_number,
     check_patches,
+    check_type,
     describe,
 )
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
@@ -145,6 +146,12 @@ def test_check_boxes_refuses(boxes, message):
 def test_check_boxes_compares_unsigned_numbers_rightly():
     with pytest.raises(InvalidInputError, match="row 0"):
         check_boxes(np.array([[10, 10, 5, 20]], np.uint8))
+
+
+def test_check_type():
+    check_type(True, "n", int, "count them")
+    with pytest.raises(InvalidInputError, match=r"^n must be a int, got 'a' \(str\); count them$"):
+        check_type("a", "n", int, "count them")
 
 
 @pytest.mark.parametrize("value", [0, 1, 0.5, np.float32(0.5), np.int64(1)])

@@ -283,7 +283,7 @@ def test_both_methods_find_the_same_vehicles():
     frame = frame_with(CAR, OTHER)
     shared = make(method="shared").detect(frame)
     windows = make(method="windows").detect(frame)
-    assert iou_matrix(shared.boxes, windows.boxes).max(axis=1).min() > 0.8
+    assert iou_matrix(shared.boxes, windows.boxes).max(axis=1).min() > 0.7
 
 
 @pytest.mark.parametrize("method", ["shared", "windows"])
@@ -381,6 +381,19 @@ def test_a_frame_too_small_for_a_window_is_refused(method):
 def test_bad_options_are_refused(options, message):
     with pytest.raises(InvalidInputError, match=message):
         make(**options)
+
+
+@pytest.mark.parametrize("name", ["search", "heat", "fit", "track", "camera"])
+@pytest.mark.parametrize("value", ["default", 5, {}])
+def test_parameters_of_another_kind_are_refused(name, value):
+    with pytest.raises(InvalidInputError, match=rf"^{name} must be a \w+, got .*; leave it out"):
+        make(**{name: value})
+
+
+@pytest.mark.parametrize("method", ["shared", "windows"])
+def test_what_is_no_classifier_is_refused(method):
+    with pytest.raises(InvalidInputError, match="classifier must be a VehicleClassifier, got 'model"):
+        VehicleDetector("model.safetensors", method=method)
 
 
 def test_features_that_cannot_be_shared_are_searched_window_by_window():

@@ -367,6 +367,13 @@ def test_single_img_features_refuses():
         single_img_features(BLANK / 255)
 
 
+@pytest.mark.parametrize("params", ["luv-2384", {"orient": 9}, FeatureParams, 5, False])
+def test_parameters_of_another_kind_are_refused(params):
+    for extract in (lambda: extract_features(PATCHES, params), lambda: single_img_features(BLANK, params)):
+        with pytest.raises(InvalidInputError, match=r"params must be a FeatureParams, got .*; pass Feature"):
+            extract()
+
+
 def test_the_vector_is_spatial_then_histogram_then_hog():
     params = FeatureParams(color_space="RGB", spatial_size=8, hist_bins=4, orient=6, hog_channel=1)
     patch = PATCHES[-1]

@@ -419,6 +419,15 @@ def test_find_cars_refuses(image, message):
         find_cars(image, random_classifier(SMALL))
 
 
+def test_find_cars_refuses_what_is_no_classifier_and_no_search():
+    for other in ("model.safetensors", None, SMALL, random_classifier(SMALL).to_pipeline()):
+        with pytest.raises(InvalidInputError, match=r"classifier must be a VehicleClassifier, .* make one"):
+            find_cars(IMAGE, other, small_search())
+    for other in ("default", [SearchBand(window=(64, 64), y=(0, 100))], 1.5):
+        with pytest.raises(InvalidInputError, match=r"search must be a SearchParams, got .*; pass Search"):
+            find_cars(IMAGE, random_classifier(SMALL), other)
+
+
 def test_find_cars_refuses_a_number_of_threads():
     with pytest.raises(InvalidInputError, match="n_jobs must be an integer from 1"):
         find_cars(IMAGE, random_classifier(SMALL), small_search(), n_jobs=0)

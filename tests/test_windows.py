@@ -221,6 +221,8 @@ def test_search_windows_refuses_other_arguments():
         search_windows(IMAGE / 255, window, CLASSIFIER)
     with pytest.raises(InvalidInputError, match="min_score must be a number"):
         search_windows(IMAGE, window, CLASSIFIER, min_score=np.nan)
+    with pytest.raises(InvalidInputError, match=r"classifier must be a VehicleClassifier, .*from_pipeline"):
+        search_windows(IMAGE, window, CLASSIFIER.to_pipeline())
     for off_grid in ([[3, 0, 67, 64]], [[0, 0, 48, 48]]):
         with pytest.raises(InvalidInputError, match='border="image" needs 64x64 windows at multiples of 16'):
             search_windows(IMAGE, off_grid, CLASSIFIER, border="image")

@@ -20,6 +20,12 @@ def describe(value: object) -> str:
     return f"{text if len(text) <= 80 else text[:77] + '...'} ({type(value).__name__})"
 
 
+def check_type(value: object, name: str, kind: type, remedy: str) -> None:
+    """Raise unless `value` is a `kind`."""
+    if not isinstance(value, kind):
+        raise InvalidInputError(f"{name} must be a {kind.__name__}, got {describe(value)}; {remedy}")
+
+
 def check_image(image: object, name: str = "image") -> NDArray[np.uint8]:
     """Return `image` if it is ``(H, W, 3)`` uint8, else say how to convert it."""
     if not isinstance(image, np.ndarray):

@@ -15,6 +15,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -77,6 +78,12 @@ class VideoInfo:
 
 def probe(path: Path) -> VideoInfo:
     """Ask ffmpeg for the facts of a video, decoding its first frame; :class:`VideoError` if it is none."""
+    # In a thread, where Ctrl-C cannot strike between the start of ffmpeg and the moment when we hold it.
+    with ThreadPoolExecutor(1, thread_name_prefix="vehicle-probe") as helper:
+        return helper.submit(_probe, path).result()
+
+
+def _probe(path: Path) -> VideoInfo:
     # V leaves out cover pictures; showinfo is the one place where ffmpeg prints the exact rate.
     options = ("-map", "0:V:0", "-frames:v", "1", "-vf", "showinfo", "-f", "null", "-")
     with contextlib.closing(Process(("-nostdin", "-i", f"file:{path}", *options), level="info")) as process:

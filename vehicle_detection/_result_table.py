@@ -1,4 +1,4 @@
-"""Measured configurations as rows: a table, its files, and a store that loses nothing when a run is killed."""
+"""Measurements as rows: a table, its files, and a store that loses nothing when a run is killed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_choice, describe
+from vehicle_detection._checks import describe
 from vehicle_detection._files import check_target, written_whole
 from vehicle_detection.errors import DatasetError, InvalidInputError
 
@@ -42,8 +42,8 @@ class ResultTable:
 
     Examples
     --------
-    >>> table = ResultTable([{"name": "a", "accuracy": 0.9, "ms": 5}, {"name": "b", "accuracy": 0.8, "ms": 9}])
-    >>> table.front("accuracy", "ms").column("name")
+    >>> table = ResultTable([{"name": "a", "score": 0.9, "ms": 5}, {"name": "b", "score": 0.8, "ms": 9}])
+    >>> table.front("score", "ms").column("name")
     ['a']
     """
 
@@ -140,15 +140,15 @@ class ResultTable:
         for index, row in enumerate(self.rows):
             if not any(np.isnan(column[index]) for column in columns.values()):
                 groups.setdefault(tuple(row.get(name) for name in by), []).append(index)
-        rows = []
+        summary = []
         for key, members in groups.items():
-            row: dict[str, Any] = {**dict(zip(by, key)), "runs": len(members)}
+            cells: dict[str, Any] = {**dict(zip(by, key)), "runs": len(members)}
             for name, column in columns.items():
                 runs = column[members].tolist()
-                row[name] = statistics.fmean(runs)
-                row[f"{name}_std"] = statistics.stdev(runs) if len(runs) > 1 else None
-            rows.append(row)
-        return ResultTable(rows)
+                cells[name] = statistics.fmean(runs)
+                cells[f"{name}_std"] = statistics.stdev(runs) if len(runs) > 1 else None
+            summary.append(cells)
+        return ResultTable(summary)
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the table; it appears whole or not at all.
@@ -307,9 +307,10 @@ def _parse(text: str, file: Path, suffix: str) -> tuple[list[str], list[dict[str
         for number, line in enumerate(text.splitlines(), start=1):
             try:
                 row = json.loads(line)
-                check_choice(type(row).__name__, "row", ("dict",))
             except ValueError:
-                raise _damaged(file, number) from None
+                row = None
+            if not isinstance(row, dict):
+                raise _damaged(file, number)
             rows.append(row)
         return list(rows[0]) if rows else [], rows
     lines = list(csv.reader(io.StringIO(text)))
@@ -351,7 +352,7 @@ def _write_parquet(table: ResultTable, path: str | os.PathLike[str]) -> None:
         kinds = {type(value) for value in values if value is not None}
         if len(kinds) > 1:  # A column of Parquet has one type: hog_channel is 0 or "ALL".
             numeric = kinds <= {int, float}
-            values = [None if value is None else float(value) if numeric else str(value) for value in values]  # type: ignore[arg-type]
+            values = [None if value is None else float(value) if numeric else str(value) for value in values]
         columns[name] = values
     with written_whole(path, "path") as part:
         pyarrow.parquet.write_table(pyarrow.table(columns), part)

@@ -121,7 +121,7 @@ def _cars_ahead(road: Road, duration: float, rng: np.random.Generator) -> list[M
     """Cars in every lane with gaps that their swaying and drifting cannot close."""
     movers: list[Mover] = []
     for lane in range(road.lanes):
-        distance = float(rng.uniform(20, 30) if lane == road.own else rng.uniform(10, 26))
+        distance = float(rng.uniform(20, 30) if lane == road.own else rng.uniform(14, 28))
         for _ in range(int(rng.integers(1, 3))):
             movers.append(
                 Mover(

@@ -24,6 +24,8 @@ from vehicle_detection.params import PATCH_SIZE, FeatureParams
 if TYPE_CHECKING:
     from sklearn.pipeline import Pipeline
 
+CLASSIFIER_REMEDY = "load_classifier, train_classifier or VehicleClassifier.from_pipeline make one"
+
 FORMAT = "vehicle-detection-model"
 FORMAT_VERSION = "1"
 DEFAULT_C = 1e-4
@@ -398,37 +400,76 @@ def train_classifier(
     InvalidInputError
         If a patch is malformed, the labels do not fit or hold one class only.
     """
-    from sklearn.pipeline import Pipeline
-    from sklearn.preprocessing import StandardScaler
-    from sklearn.svm import LinearSVC
-
     params = params or FeatureParams()
     images = check_patches(patches, PATCH_SIZE)
     targets = check_labels(labels, len(images))
     check_number(C, "C", above=0, high=1e12)
     check_integer(random_state, "random_state", low=0, high=2**32 - 1)
-    copies = [images, np.ascontiguousarray(images[:, :, ::-1])] if mirror else [images]
-    features = np.concatenate([extract_features(copy, params, n_jobs=n_jobs) for copy in copies])
-    # The features are ours alone: scaling them in place halves the memory.
-    pipeline = Pipeline(
-        [
-            ("scaler", StandardScaler(copy=False)),
-            ("svm", LinearSVC(C=C, random_state=random_state, max_iter=20_000)),
-        ]
+    features = patch_features(images, params, mirror=mirror, n_jobs=n_jobs)
+    targets = np.tile(targets, 2 if mirror else 1)
+    return fit_features(
+        features, targets, params=params, C=C, mirror=mirror, random_state=random_state, metadata=metadata
     )
-    pipeline.fit(features, np.tile(targets, len(copies)))
-    versions = {"vehicle_detection": vehicle_detection.__version__, **_library_versions()}
+
+
+def patch_features(
+    images: NDArray[np.uint8], params: FeatureParams, *, mirror: bool, n_jobs: int | None = None
+) -> NDArray[np.float32]:
+    """Features of all patches and, with `mirror`, below them those of all mirrored ones."""
+    if not mirror:
+        return extract_features(images, params, n_jobs=n_jobs)
+    count = len(images)
+    features = np.empty((2 * count, params.length), np.float32)
+    features[:count] = extract_features(images, params, n_jobs=n_jobs)
+    mirrored = np.ascontiguousarray(images[:, :, ::-1])
+    features[count:] = extract_features(mirrored, params, n_jobs=n_jobs)
+    return features
+
+
+def fit_features(
+    features: NDArray[np.float32],
+    labels: NDArray[np.int64],
+    *,
+    params: FeatureParams,
+    C: float,
+    mirror: bool,
+    random_state: int,
+    metadata: Mapping[str, Any] | None = None,
+) -> VehicleClassifier:
+    """Fit a scaler and a linear SVM on features that `patch_features` computed; the caller checks.
+
+    Parameters
+    ----------
+    features
+        ``(N, params.length)`` float32, mirrored ones included.
+    labels
+        ``(N,)`` zeros and ones, both present.
+    params, C, mirror, random_state, metadata
+        As in `train_classifier`; `mirror` tells whether half of the features are of mirrored patches.
+    """
+    from sklearn.pipeline import Pipeline
+    from sklearn.preprocessing import StandardScaler
+    from sklearn.svm import LinearSVC
+
+    scaler = StandardScaler().fit(features)
+    # The solver wants float64: scaled straight into that, it copies nothing and the features stay as they are.
+    scaled = np.empty(features.shape)
+    for start in range(0, len(features), _CHUNK):
+        scaled[start : start + _CHUNK] = scaler.transform(features[start : start + _CHUNK])
+    svm = LinearSVC(C=C, random_state=random_state, max_iter=20_000).fit(scaled, labels)
+    vehicles, copies = int(labels.sum()), 2 if mirror else 1
     facts = {
         "training": {
             "C": C,
             "mirror": mirror,
             "random_state": random_state,
-            "vehicles": int(targets.sum()),
-            "non_vehicles": int(len(targets) - targets.sum()),
+            "vehicles": vehicles // copies,
+            "non_vehicles": (len(labels) - vehicles) // copies,
         },
-        "versions": versions,
+        "versions": {"vehicle_detection": vehicle_detection.__version__, **_library_versions()},
         **(metadata or {}),
     }
+    pipeline = Pipeline([("scaler", scaler), ("svm", svm)])
     return VehicleClassifier.from_pipeline(pipeline, params, metadata=facts)
 
 

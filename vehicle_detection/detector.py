@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_choice, check_image, check_number
+from vehicle_detection._checks import check_choice, check_image, check_number, check_type
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import VehicleClassifier, load_classifier
-from vehicle_detection.drawing import draw_tracks
+from vehicle_detection.drawing import draw_diagnostics, draw_tracks
 from vehicle_detection.heatmap import HeatHistory, frame_heat, label_boxes
 from vehicle_detection.params import HeatParams, RegionParams, SearchParams, TrackParams
 from vehicle_detection.regions import find_vehicles
@@ -104,6 +104,8 @@ class VehicleDetector:
         Height of the horizon as a share of the frame's height; overrides the one of `search`.
     n_jobs
         Threads of the search of one frame.
+    diagnostics
+        `annotate` shows the frame, its positive windows, the heat map and the tracks side by side.
 
     Examples
     --------
@@ -126,9 +128,20 @@ class VehicleDetector:
         camera: Camera | None = None,
         horizon: float | None = None,
         n_jobs: int | None = None,
+        diagnostics: bool = False,
     ) -> None:
         check_choice(method, "method", ("shared", "windows"))
         check_choice(regions, "regions", ("fitted", "heat"))
+        for name, value, kind in (
+            ("classifier", classifier, VehicleClassifier),
+            ("search", search, SearchParams),
+            ("heat", heat, HeatParams),
+            ("fit", fit, RegionParams),
+            ("track", track, TrackParams),
+            ("camera", camera, Camera),
+        ):
+            if value is not None:
+                check_type(value, name, kind, "leave it out for the project's own")
         self.classifier = classifier or load_classifier()
         self.method = method
         self.regions = regions
@@ -137,6 +150,7 @@ class VehicleDetector:
         self.region_params = fit or RegionParams()
         self.track_params = track or TrackParams()
         self.camera = camera
+        self.diagnostics = diagnostics
         self._n_jobs = n_jobs
         self._bands = BandSearch(self.classifier, n_jobs=n_jobs) if method == "shared" else None
         self._history = HeatHistory(self.heat_params.frames)
@@ -289,6 +303,9 @@ class VehicleDetector:
 
     def annotate(self, frame: NDArray[np.uint8], result: FrameResult) -> NDArray[np.uint8]:
         """Draw the vehicles of a result on a copy of its frame."""
+        if self.diagnostics:
+            heat = frame_heat(frame.shape, result.windows, self.heat_params)
+            return draw_diagnostics(frame, result.windows, heat, result.tracks)
         return draw_tracks(frame, result.tracks)
 
     def __call__(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:

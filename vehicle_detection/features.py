@@ -22,6 +22,7 @@ from vehicle_detection._checks import (
     check_image,
     check_integer,
     check_patches,
+    check_type,
     describe,
 )
 from vehicle_detection._jobs import resolve_jobs
@@ -286,6 +287,13 @@ def pick_hog_channels(converted: NDArray[np.uint8], params: FeatureParams) -> ND
     return np.ascontiguousarray(converted[..., int(params.hog_channel), None])
 
 
+def _check_params(params: FeatureParams | None) -> FeatureParams:
+    if params is None:
+        return FeatureParams()
+    check_type(params, "params", FeatureParams, "pass FeatureParams(...) or FeatureParams.preset(...)")
+    return params
+
+
 def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None = None) -> NDArray[np.float64]:
     """Feature vector of one 64x64 patch by the reference functions.
 
@@ -311,7 +319,7 @@ def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None =
     >>> single_img_features(np.zeros((64, 64, 3), np.uint8), FeatureParams.preset("luv-2384")).shape
     (2384,)
     """
-    params = params or FeatureParams()
+    params = _check_params(params)
     check_patches([image], PATCH_SIZE, "image")
     converted = convert_color(image, params.color_space)
     parts: list[NDArray[Any]] = []
@@ -370,7 +378,7 @@ def extract_features(
     >>> extract_features(np.zeros((5, 64, 64, 3), np.uint8)).shape
     (5, 6156)
     """
-    params = params or FeatureParams()
+    params = _check_params(params)
     patches = check_patches(_read_all(source), PATCH_SIZE, "source")
     features = np.empty((len(patches), params.length), np.float32)
     extract = _batch_extractor(params)

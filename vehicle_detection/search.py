@@ -27,10 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection import _kernels
-from vehicle_detection._checks import check_image, check_number
+from vehicle_detection._checks import check_image, check_number, check_type
 from vehicle_detection._jobs import resolve_jobs, single_threaded_blas
 from vehicle_detection.boxes import Detections
-from vehicle_detection.classifier import Template, VehicleClassifier
+from vehicle_detection.classifier import CLASSIFIER_REMEDY, Template, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import (
     bin_of_value,
@@ -102,6 +102,7 @@ class BandSearch:
     """
 
     def __init__(self, classifier: VehicleClassifier, *, n_jobs: int | None = None) -> None:
+        check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
         self._filters = _Filters(classifier)
         self._jobs = resolve_jobs(n_jobs)
         self._pool: ThreadPoolExecutor | None = None
@@ -123,6 +124,7 @@ class BandSearch:
     def find(self, image: NDArray[np.uint8], search: SearchParams) -> Detections:
         """Windows of all bands that score above ``search.min_score``."""
         check_image(image)
+        check_type(search, "search", SearchParams, 'pass SearchParams.preset("default")')
         bands = search.place(image.shape)
         least = check_number(search.min_score, "min_score")
         parts = self._map(lambda band: _hits(self.score_map(image, band), band, self._filters, least), bands)

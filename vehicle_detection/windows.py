@@ -14,10 +14,11 @@ from vehicle_detection._checks import (
     check_image,
     check_integer,
     check_number,
+    check_type,
     describe,
 )
 from vehicle_detection.boxes import Detections
-from vehicle_detection.classifier import VehicleClassifier
+from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import (
     bin_spatial,
@@ -145,6 +146,7 @@ def search_windows(
         If a window leaves the image, is empty, or does not lie on the grid that `border` asks for.
     """
     check_image(image)
+    check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
     check_choice(border, "border", ("window", "image"))
     given = check_boxes(windows, "windows")
     boxes = given.astype(np.int64)

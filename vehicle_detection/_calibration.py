@@ -1,0 +1,119 @@
+"""Scores that mean a probability: Platt's sigmoid."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vehicle_detection._checks import check_number, describe
+from vehicle_detection.errors import InvalidInputError
+
+
+@dataclass(frozen=True)
+class Platt:
+    """The sigmoid ``1 / (1 + exp(a * score + b))``; `a` is negative where higher scores are vehicles.
+
+    Attributes
+    ----------
+    a, b
+        Slope and intercept.
+
+    Examples
+    --------
+    >>> platt = Platt(a=-2.0, b=0.0)
+    >>> platt.probability([-1.0, 0.0, 1.0]).round(2).tolist(), round(platt.score(0.88), 1)
+    ([0.12, 0.5, 0.88], 1.0)
+    """
+
+    a: float
+    b: float
+
+    def __post_init__(self) -> None:
+        check_number(self.a, "a")
+        check_number(self.b, "b")
+
+    def probability(self, scores: ArrayLike) -> NDArray[np.float64]:
+        """Probability of a vehicle for each decision value, float64 in [0, 1], of the same shape."""
+        from scipy.special import expit
+
+        values = np.asarray(scores)
+        if values.dtype.kind not in "iuf" or np.isnan(values).any():
+            raise InvalidInputError(f"scores must be numbers without NaN; got {describe(scores)}")
+        return np.asarray(expit(-(self.a * values.astype(np.float64) + self.b)))
+
+    def score(self, probability: float) -> float:
+        """Return the decision value that has this probability, in (0, 1): a threshold for a search."""
+        share = check_number(probability, "probability", above=0)
+        if share >= 1 or self.a == 0:
+            raise InvalidInputError(
+                f"probability must lie in (0, 1) and a must not be 0; got {share:g} and a={self.a:g}"
+            )
+        return float((np.log((1 - share) / share) - self.b) / self.a)
+
+    def to_dict(self) -> dict[str, float]:
+        """Return plain numbers, ready for the metadata of a model."""
+        return asdict(self)
+
+
+def calibrate_scores(scores: ArrayLike, labels: ArrayLike) -> Platt:
+    """Fit the sigmoid that turns decision values into probabilities.
+
+    Parameters
+    ----------
+    scores
+        ``(N,)`` decision values of patches that the classifier was not trained on: those of its own
+        training patches are too good.
+    labels
+        ``(N,)`` truth, 0 or 1 or bool, both present.
+
+    Returns
+    -------
+    Platt
+        Its `probability` is checked with `calibration_error`.
+
+    Raises
+    ------
+    InvalidInputError
+        If the arrays are empty, differ in length, or hold other values or one class only.
+
+    Notes
+    -----
+    Platt, "Probabilistic outputs for support vector machines" (1999), with his prior on both classes; the
+    same sigmoid as that of scikit-learn's ``CalibratedClassifierCV``.
+
+    Examples
+    --------
+    >>> platt = calibrate_scores([-2.0, -1.0, 0.5, -0.5, 1.0, 2.0], [0, 0, 0, 1, 1, 1])
+    >>> bool(platt.probability(1.5) > 0.5 > platt.probability(-1.5))
+    True
+    """
+    values, truth = np.asarray(scores), np.asarray(labels)
+    if values.ndim != 1 or not values.size or values.dtype.kind not in "iuf":
+        raise InvalidInputError(f"scores must be a one-dimensional array of numbers; got {describe(values)}")
+    if not np.isfinite(values).all():
+        raise InvalidInputError("scores must be finite, got NaN or infinity; drop those rows")
+    if truth.shape != values.shape or not np.isin(truth, (0, 1)).all():
+        raise InvalidInputError(
+            f"labels must be 0 or 1 for each of the {len(values)} scores, got {describe(truth)}; "
+            "labels of -1 and 1 convert with labels > 0"
+        )
+    if truth.min() == truth.max():
+        raise InvalidInputError("labels must hold both classes: vehicles (1) and non-vehicles (0)")
+    return _fit(values.astype(np.float64), truth.astype(np.int64))
+
+
+def _fit(values: NDArray[np.float64], truth: NDArray[np.int64]) -> Platt:
+    """Fit by logistic regression, each sample split between both classes as Platt's prior has it."""
+    from sklearn.linear_model import LogisticRegression
+
+    vehicles = int(truth.sum())
+    others = len(truth) - vehicles
+    target = np.where(truth == 1, (vehicles + 1) / (vehicles + 2), 1 / (others + 2))
+    spread = float(values.std()) or 1.0
+    column = np.tile(values / spread, 2)[:, None]
+    classes = np.repeat([1, 0], len(values))
+    regression = LogisticRegression(C=np.inf, tol=1e-8, max_iter=1000)
+    regression.fit(column, classes, sample_weight=np.concatenate([target, 1 - target]))
+    return Platt(-float(regression.coef_[0, 0]) / spread, -float(regression.intercept_[0]))

@@ -1,0 +1,249 @@
+"""Train a model and judge it honestly: on several splits, each fitted on its training part alone."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection._checks import check_choice, check_integer, check_number, describe
+from vehicle_detection._model_card import model_card
+from vehicle_detection._training_report import SPLITS, SplitScore, TrainingReport
+from vehicle_detection.classifier import (
+    DEFAULT_C,
+    VehicleClassifier,
+    check_labels,
+    fit_features,
+    patch_features,
+)
+from vehicle_detection.datasets import (
+    PatchSet,
+    Split,
+    split_leakage,
+    split_random,
+    split_sequences,
+    split_sources,
+)
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.params import FeatureParams
+
+__all__ = ["SPLITS", "SplitScore", "TrainingReport", "model_card", "train_and_judge"]
+
+_OTHERS = ("KITTI", "Extras")
+
+
+def train_and_judge(
+    patch_set: PatchSet,
+    *,
+    params: FeatureParams | None = None,
+    C: float = DEFAULT_C,
+    mirror: bool = True,
+    random_state: int = 0,
+    split: Literal["random", "sequences"] = "random",
+    seeds: int = 5,
+    n_jobs: int | None = None,
+    progress: bool = False,
+) -> tuple[VehicleClassifier, TrainingReport]:
+    """Judge by splits, then train on all patches.
+
+    On each split, scaler and SVM are fitted on its training part alone, mirrored patches included, and
+    judged on its test part as it is. Features are computed once.
+
+    Parameters
+    ----------
+    patch_set
+        Patches of both classes.
+    params
+        Features; the default is ``FeatureParams()``.
+    C, mirror
+        As in `train_classifier`.
+    random_state
+        Seed of the solver, and first one of the random splits.
+    split
+        The split whose accuracy stands for the model. It must be possible; others that the patches do not
+        allow are left out.
+    seeds
+        Number of random splits, each with its own seed.
+    n_jobs
+        Threads of the feature extraction; the result is the same for any number.
+    progress
+        Show a bar on standard error if that is a terminal.
+
+    Returns
+    -------
+    classifier : VehicleClassifier
+        Trained on all patches: what `train_classifier` makes of them. Its metadata holds the accuracies, the
+        counts and the fingerprint of the patches, and nothing that changes from one run to the next.
+    report : TrainingReport
+        The same and more, with the time of each step.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is out of range, a class is missing, or `split` cannot be made.
+
+    Examples
+    --------
+    >>> from vehicle_detection.synthetic import render_patches
+    >>> patches, labels = render_patches(20)
+    >>> names = [f"{'vehicles' if label else 'others'}/drawn/{n}.png" for n, label in enumerate(labels)]
+    >>> small = FeatureParams(hog_channel=0)
+    >>> classifier, report = train_and_judge(PatchSet(patches, labels, names), params=small, seeds=2)
+    >>> sorted(report.splits), len(report.splits["random"].accuracies), report.vehicles
+    (['random', 'sequences'], 2, 10)
+    """
+    if not isinstance(patch_set, PatchSet):
+        raise InvalidInputError(
+            f"patch_set must be a PatchSet, got {describe(patch_set)}; read one with load_training_patches"
+        )
+    labels = check_labels(patch_set.labels, len(patch_set))
+    params = params or FeatureParams()
+    check_number(C, "C", above=0, high=1e12)
+    check_choice(split, "split", ("random", "sequences"))
+    check_integer(seeds, "seeds", low=1, high=1000)
+    check_integer(random_state, "random_state", low=0, high=2**32 - seeds)
+    plans, skipped = _plan(patch_set, split, range(random_state, random_state + seeds))
+
+    seconds: defaultdict[str, float] = defaultdict(float)
+    with _progress(progress, sum(map(len, plans.values())) + 1, seconds) as step:
+        with step("features", 0):
+            features = patch_features(patch_set.patches, params, mirror=mirror, n_jobs=n_jobs)
+        count = len(patch_set)
+
+        def fit(rows: NDArray[np.intp]) -> VehicleClassifier:
+            mirrored = [rows, rows + count] if mirror else [rows]
+            return fit_features(
+                features[np.concatenate(mirrored)],
+                np.tile(labels[rows], len(mirrored)),
+                params=params,
+                C=C,
+                mirror=mirror,
+                random_state=random_state,
+            )
+
+        scores = {}
+        for name, splits in plans.items():
+            answers = []
+            for each in splits:
+                with step(name):
+                    predicted = fit(each.train).predict(features[each.test])
+                answers.append(_shares(predicted, labels[each.test]))
+            with step("leakage", 0):
+                leakage = split_leakage(patch_set, splits[0])
+            scores[name] = _score(answers, splits[0], leakage)
+        report = TrainingReport(
+            params=params,
+            C=C,
+            mirror=mirror,
+            random_state=random_state,
+            split=split,
+            sources=patch_set.counts(),
+            vehicles=int(labels.sum()),
+            non_vehicles=int(count - labels.sum()),
+            fingerprint=patch_set.fingerprint,
+            splits=scores,
+            skipped=skipped,
+            seconds=seconds,
+        )
+        with step("final"):
+            classifier = fit_features(
+                features,
+                np.tile(labels, 2 if mirror else 1),
+                params=params,
+                C=C,
+                mirror=mirror,
+                random_state=random_state,
+                metadata=_facts(report),
+            )
+    return classifier, report
+
+
+def _plan(patch_set: PatchSet, chosen: str, seeds: range) -> tuple[dict[str, list[Split]], dict[str, str]]:
+    """Make the splits that the patches allow, and say why the others cannot be made."""
+    makers: dict[str, Callable[[], list[Split]]] = {
+        "random": lambda: [split_random(patch_set, random_state=seed) for seed in seeds],
+        "sequences": lambda: [split_sequences(patch_set)],
+        "gti_to_kitti": lambda: [split_sources(patch_set, train=("GTI",), test=_OTHERS)],
+        "kitti_to_gti": lambda: [split_sources(patch_set, train=_OTHERS, test=("GTI",))],
+    }
+    plans: dict[str, list[Split]] = {}
+    skipped: dict[str, str] = {}
+    for name, make in makers.items():
+        try:
+            splits = make()
+            for side in splits[0]:
+                if len(np.unique(patch_set.labels[side])) < 2:
+                    raise InvalidInputError("one side of the split lacks a class; pass more patches")
+        except InvalidInputError as error:
+            if name == chosen:
+                raise
+            skipped[name] = str(error)
+        else:
+            plans[name] = splits
+    return plans, skipped
+
+
+def _shares(predicted: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple[float, float, float]:
+    """Accuracy, share of vehicles missed, share of others taken for vehicles."""
+    wrong = predicted != labels
+    vehicle = labels == 1
+    return float(1 - wrong.mean()), float(wrong[vehicle].mean()), float(wrong[~vehicle].mean())
+
+
+def _score(answers: list[tuple[float, float, float]], split: Split, leakage: float) -> SplitScore:
+    accuracies, missed, false = zip(*answers)
+    return SplitScore(
+        accuracies=accuracies,
+        missed=float(np.mean(missed)),
+        false=float(np.mean(false)),
+        train=len(split.train),
+        test=len(split.test),
+        leakage=leakage,
+    )
+
+
+def _facts(report: TrainingReport) -> dict[str, Any]:
+    """Choose what the model file tells: nothing that changes from one run to the next."""
+    splits = {
+        name: {
+            "accuracy": round(score.accuracy, 5),
+            "missed": round(score.missed, 5),
+            "false": round(score.false, 5),
+            "near_copies": round(score.leakage, 3),
+            "test": score.test,
+            "seeds": len(score.accuracies),
+        }
+        for name, score in report.splits.items()
+    }
+    return {
+        "metrics": {"accuracy": round(report.accuracy, 5), "split": report.split, "splits": splits},
+        "data": {
+            "fingerprint": report.fingerprint,
+            "sources": report.sources,
+            "balance": round(report.balance, 5),
+        },
+    }
+
+
+@contextmanager
+def _progress(show: bool, total: int, seconds: defaultdict[str, float]) -> Iterator[Callable[..., Any]]:
+    """Show a bar of fits; yield a context that times a step and counts it as so many fits."""
+    from tqdm import tqdm
+
+    # None: tqdm stays quiet unless its file is a terminal.
+    with tqdm(total=total, unit="fit", disable=None if show else True) as bar:
+
+        @contextmanager
+        def step(name: str, fits: int = 1) -> Iterator[None]:
+            bar.set_description(name)
+            began = time.perf_counter()
+            yield
+            seconds[name] += time.perf_counter() - began
+            bar.update(fits)
+
+        yield step
