@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks._material import CLIP, Context, clip, data_folder
+from benchmarks._material import CLIP, Context, clip, data_folder, drawn_drive
 from benchmarks._report import Row, Target, at_least, at_most
 from vehicle_detection import (
     FrameResult,
@@ -17,20 +17,17 @@ from vehicle_detection import (
     load_frames,
     read_frames,
     read_labels,
-    render_drive,
 )
 from vehicle_detection.evaluation import Labels, TrackScores
-
-DRAWN = 60
 
 
 def run(context: Context) -> list[Row]:
     """Score stills by `detect` and clips by `process`; a drawn drive where the real frames are missing."""
     folder = data_folder()
     if folder is None:
-        source, material = clip(context.work, frames=DRAWN)
+        source, material = clip(context.work)
         truth = context.work / "drive.csv"
-        render_drive(frames=DRAWN, random_state=1).write_labels(truth)
+        drawn_drive().write_labels(truth)
         return _clip_rows("drive", source, truth, material=material, judged=False)
     labels = folder / "labels"
     note = "IoU 0.5; the training patches hold crops of this road, which flatters the two clips"

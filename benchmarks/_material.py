@@ -27,12 +27,15 @@ from vehicle_detection import (
     train_classifier,
 )
 from vehicle_detection.datasets import PatchSet
+from vehicle_detection.synthetic import Drive
 
 DATA_VARIABLE = "VEHICLE_DETECTION_DATA"
 
 CLIP = "project_clip"
 SEARCHED_FRAME = 300
 """Frame of the clip that is searched: two cars, on a road with shadows."""
+
+DRAWN_FRAMES = 60
 
 _EVERY = 6
 """The search's classifier is trained on every sixth patch: its speed does not depend on its weights."""
@@ -66,15 +69,20 @@ def if_real(target: Target) -> Target | None:
     return target if is_real() else None
 
 
-def clip(work: Path, *, frames: int = 60) -> tuple[Path, str]:
-    """Video of 1280x720: the project clip, or a drive of `frames` frames drawn for the purpose."""
+def drawn_drive() -> Drive:
+    """Return the drive that stands in for the project clip."""
+    return render_drive(frames=DRAWN_FRAMES, random_state=1)
+
+
+def clip(work: Path) -> tuple[Path, str]:
+    """Video of 1280x720: the project clip, or the drawn drive."""
     folder = data_folder()
     if folder is not None:
         return folder / "videos" / f"{CLIP}.mp4", CLIP
     target = work / "drive.mp4"
     if not target.exists():
-        write_video(target, (scene.image for scene in render_drive(frames=frames, random_state=1)))
-    return target, f"synthetic drive of {frames} frames"
+        write_video(target, (scene.image for scene in drawn_drive()))
+    return target, "synthetic drive"
 
 
 def looped(source: Path, frames: int, work: Path) -> Path:
@@ -112,7 +120,7 @@ def searched_frame() -> tuple[NDArray[np.uint8], str]:
     """One 1280x720 frame with vehicles."""
     folder = data_folder()
     if folder is None:
-        return render_drive(frames=1, random_state=1)[0].image, "synthetic frame"
+        return drawn_drive()[0].image, "synthetic frame"
     source = folder / "videos" / f"{CLIP}.mp4"
     with read_frames(source, start=SEARCHED_FRAME / 25) as frames:
         return next(iter(frames))[2], f"frame {SEARCHED_FRAME} of {CLIP}"

@@ -209,7 +209,7 @@ def _plot(
     by_stage.margins(x=0.12)
     for axes in (by_size, by_windows, by_cores):
         axes.set_ylabel("ms a frame")
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0, 1.08 * axes.get_ylim()[1])
         axes.grid(alpha=0.3)
     folder.mkdir(parents=True, exist_ok=True)
     figure.savefig(folder / "scaling.png", dpi=120)

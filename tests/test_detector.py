@@ -316,6 +316,26 @@ def test_calling_it_processes_and_annotates():
         np.testing.assert_array_equal(other(frame), one.annotate(frame, result))
 
 
+def test_diagnostics_are_another_picture_of_the_same_result():
+    plain, detailed = make(), make(diagnostics=True)
+    for frame in drive(6):
+        result, other = plain.process(frame), detailed.process(frame)
+    assert_same(result, other)
+    picture = detailed.annotate(frame, other)
+    assert picture.dtype == np.uint8
+    assert picture.ndim == 3
+    assert picture.shape != frame.shape or (picture != plain.annotate(frame, result)).any()
+
+
+def test_warming_up_leaves_no_trace():
+    warm, cold = make(), make()
+    warm.process(GOOD)
+    cold.process(GOOD)
+    warm.warm_up()
+    warm.warm_up((HEIGHT, WIDTH))
+    assert_same(warm.process(GOOD), cold.process(GOOD))
+
+
 def test_a_frame_that_cannot_be_written_is_fine():
     frame = frame_with(CAR)
     frame.setflags(write=False)

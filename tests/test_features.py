@@ -33,6 +33,7 @@ from vehicle_detection.features import (
 )
 from vehicle_detection.images import decode_image, write_image
 from vehicle_detection.params import COLOR_SPACES, HOG_CHANNELS, FeatureParams
+from vehicle_detection.synthetic import render_patches
 
 PRESETS = sorted(FeatureParams.PRESETS)
 BLANK = np.zeros((64, 64, 3), np.uint8)
@@ -160,6 +161,12 @@ def test_any_parameters_equal_the_reference(params, row, seed):
     assert_equals_the_reference(np.stack([PATCHES[row], noise]), params)
 
 
+def test_drawn_patches_equal_the_reference():
+    patches, _ = render_patches(12, random_state=3)
+    for preset in PRESETS:
+        assert_equals_the_reference(patches, FeatureParams.preset(preset))
+
+
 def sample_of_real_patches(folder, each):
     for name in ("vehicles.zip", "non-vehicles.zip"):
         with zipfile.ZipFile(folder / name) as archive:
@@ -172,8 +179,10 @@ def sample_of_real_patches(folder, each):
 def test_real_patches_equal_the_reference(real_data):
     patches = np.stack(list(sample_of_real_patches(real_data, 160)))
     assert len(patches) >= 300
-    for preset in PRESETS:
+    for preset in ("luv-2384", "ycrcb-6156"):
         assert_equals_the_reference(patches, FeatureParams.preset(preset))
+    for preset in PRESETS:
+        assert_equals_the_reference(patches[::8], FeatureParams.preset(preset))
 
 
 def all_gradients():

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import ndimage
@@ -203,7 +203,8 @@ def test_windows_weigh_what_they_score():
     assert len(bounding_boxes(SHAPE, Detections.empty())) == 0
 
 
-@given(st.lists(heats, min_size=1, max_size=7), st.integers(1, 4))
+@given(st.lists(heats, min_size=1, max_size=5), st.integers(1, 4))
+@settings(max_examples=20)
 def test_history_is_the_mean_of_the_last_frames(maps, frames):
     history = HeatHistory(frames)
     for index, heat in enumerate(maps):

@@ -1,5 +1,6 @@
 import io
 import os
+import zlib
 from pathlib import Path
 
 import cv2
@@ -146,6 +147,15 @@ def test_a_damaged_png_is_refused(picture):
     data[len(data) // 2] ^= 0x10
     with pytest.raises(InvalidInputError, match="cannot be decoded"):
         decode_image(bytes(data), "damaged.png")
+
+
+def test_an_image_of_absurd_size_is_refused(picture):
+    # A header that asks for gigapixels: OpenCV raises instead of returning nothing.
+    data = bytearray(encoded(".png", bgr(picture)))
+    data[16:24] = (2**30).to_bytes(4, "big") * 2
+    data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
+    with pytest.raises(InvalidInputError, match="cannot be decoded"):
+        decode_image(bytes(data), "huge.png")
 
 
 @pytest.mark.parametrize("content", [b"", b"not an image", b"\x89PNG\r\n\x1a\n", b"\xff\xd8", bytes(1000)])

@@ -1,5 +1,7 @@
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from functools import partial
@@ -134,6 +136,22 @@ def test_an_interrupted_hold_does_not_last(monkeypatch):
     with single_threaded_blas():
         assert blas_threads() == {1}
     assert blas_threads() == {2}
+
+
+def test_a_thread_that_outlives_the_main_one_may_still_search():
+    # At the interpreter's end no new work is taken by the thread that holds the limit.
+    code = (
+        "import threading, time\n"
+        "from vehicle_detection._jobs import single_threaded_blas\n"
+        "def work():\n"
+        "    with single_threaded_blas():\n"
+        "        threading.main_thread().join()\n"
+        "        time.sleep(0.2)\n"
+        "    print('done')\n"
+        "threading.Thread(target=work).start()\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert (run.stdout, run.stderr) == ("done\n", "")
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")

@@ -142,6 +142,11 @@ def test_search_params_refuse_and_normalise_bands():
     assert SearchParams(bands=[BAND], horizon=0.5) == SEARCH
 
 
+def test_what_is_drawn_is_a_track():
+    with pytest.raises(InvalidInputError, match=r"show_coast must be at most max_coast, .*got 2 and 1"):
+        TrackParams(show_coast=2, max_coast=1)
+
+
 def test_with_horizon():
     assert SEARCH.with_horizon(None) is SEARCH
     assert SEARCH.with_horizon(0.3) == dataclasses.replace(SEARCH, horizon=0.3)
@@ -163,6 +168,12 @@ def test_a_band_scales_with_the_frame():
     assert half == PixelBand(
         *(value // 2 for value in (full.x1, full.y1, full.x2, full.y2)), (32, 32), (4, 4)
     )
+
+
+def test_a_step_is_not_lost_to_rounding():
+    # 50 * (1 - 0.9) is 4.999999999999999.
+    band = SearchBand(window=(50, 50), y=(0, 100), overlap=(0.9, 0.9))
+    assert SearchParams(bands=(band,)).place((720, 1280))[0].step == (5, 5)
 
 
 def test_an_upright_frame_scales_by_its_longer_side():

@@ -90,6 +90,16 @@ def test_windows_of_other_sizes_join_at_the_mean_of_the_logarithms():
     np.testing.assert_allclose(same.boxes[0], small)
 
 
+def test_windows_that_overlap_too_little_do_not_join():
+    # Half a window aside: an overlap of a third. It is within reach, and so founds no group either.
+    found = Detections([window(640), window(690), window(690)], [2.0, 1.9, 1.9])
+    groups = group_windows(found, PLAIN)
+    np.testing.assert_allclose(groups.boxes, [window(640)])
+    assert groups.evidence.tolist() == [2.0]
+    near = dataclasses.replace(PLAIN, reach=0.3)
+    assert len(group_windows(found, near)) == 2
+
+
 def test_two_vehicles_are_two_groups_the_better_one_first():
     found = together(around((400.0, 430.0), 90, peak=1.5), around((700.0, 430.0), 120, peak=2.5))
     groups = group_windows(found, PLAIN)

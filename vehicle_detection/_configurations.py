@@ -56,7 +56,23 @@ def read_configurations(
 
 
 def expand_grid(grid: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
-    """List all combinations of a grid's values, the last name varying fastest."""
+    """List all combinations of a grid's values, the last name varying fastest.
+
+    Parameters
+    ----------
+    grid
+        Lists of values by name: fields of `FeatureParams`, ``C``, ``mirror`` and ``vehicle_weight``.
+
+    Raises
+    ------
+    InvalidInputError
+        If a name is no option, or a list is none, is empty, or makes more than 100,000 combinations.
+
+    Examples
+    --------
+    >>> expand_grid({"orient": [8, 9], "C": [1e-4]})
+    [{'orient': 8, 'C': 0.0001}, {'orient': 9, 'C': 0.0001}]
+    """
     given: object = grid
     if not isinstance(given, Mapping) or not given:
         raise InvalidInputError(

@@ -57,6 +57,12 @@ class FeatureCache:
     ------
     InvalidInputError
         If the patches are malformed, or `folder` is a file or cannot be written.
+
+    Examples
+    --------
+    >>> cache = FeatureCache(np.zeros((3, 64, 64, 3), np.uint8))
+    >>> cache.all(FeatureParams()) is cache.all(FeatureParams())
+    True
     """
 
     def __init__(

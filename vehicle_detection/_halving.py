@@ -1,4 +1,7 @@
-"""Successive halving over recipes by scikit-learn, on folds that do not leak."""
+"""Successive halving over recipes by scikit-learn, on folds that do not leak.
+
+`tuning` imports this module when it is needed: scikit-learn takes a second.
+"""
 
 from __future__ import annotations
 
@@ -10,105 +13,77 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, ClassifierMixin
+from sklearn.experimental import enable_halving_search_cv  # noqa: F401 - switches the next two on
+from sklearn.model_selection import HalvingGridSearchCV, HalvingRandomSearchCV, PredefinedSplit
 
 from vehicle_detection._configurations import describe_params
-from vehicle_detection._download import natural_key, parent_folder
 from vehicle_detection._ledger import Ledger
-from vehicle_detection._near_copies import group_copies, make_thumbnails
-from vehicle_detection._patch_set import PatchSet
 from vehicle_detection._trials import Recipe
-from vehicle_detection.datasets import Split
+from vehicle_detection.datasets import PatchSet, Split, split_groups, split_random, split_sequences
 from vehicle_detection.errors import InvalidInputError
 
 _FEWEST_PATCHES = 300  # With fewer, chance decides who stays.
-_ALIKE = 0.95  # As in split_groups.
-
-
-class Trial(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
-    """A recipe as an estimator over row numbers; it is trained when it is scored.
-
-    Only then both sides of the trial are known, and a ledger can tell whether it was run before.
-    """
-
-    def __init__(
-        self,
-        *,
-        ledger: Ledger | None = None,
-        recipe: Recipe | None = None,
-        folds: NDArray[np.intp] | None = None,
-        split: str = "",
-        seed: int = 0,
-    ) -> None:
-        self.ledger = ledger
-        self.recipe = recipe
-        self.folds = folds
-        self.split = split
-        self.seed = seed
-
-    def fit(self, X: NDArray[np.intp], y: NDArray[np.int64]) -> Trial:
-        """Take note of the rows."""
-        self.classes_ = np.unique(y)
-        self.rows_ = X[:, 0]
-        return self
-
-    def score(self, X: NDArray[np.intp], y: NDArray[np.int64], sample_weight: None = None) -> float:
-        """Train on the rows of `fit` and judge on these; NaN where that is impossible."""
-        assert self.ledger is not None
-        assert self.recipe is not None
-        assert self.folds is not None
-        row = self.ledger.run(
-            self.recipe,
-            Split(np.sort(self.rows_), np.sort(X[:, 0])),
-            self.seed,
-            name=describe_params(self.recipe.params),
-            split_name=f"{self.split}, fold {self.folds[X[0, 0]] + 1} of {self.folds.max() + 1}",
-            stage="halving",
-            on_frames=False,
-        )
-        return math.nan if row["accuracy"] is None else float(row["accuracy"])
 
 
 def make_folds(patch_set: PatchSet, split: str, folds: int, seed: int) -> NDArray[np.intp]:
-    """Fold of each patch, 0 to ``folds - 1``, so that what belongs together is in one.
+    """Fold of each patch, 0 to ``folds - 1``: each fold is what the split tests on, out of the rest.
 
-    ``"sequences"`` cuts each folder into runs of file numbers, ``"groups"`` keeps near-copies together,
-    and ``"random"`` does neither.
+    So ``"sequences"`` cuts each folder into runs of file numbers, and ``"groups"`` keeps near-copies
+    together; groups too large for a fold come into the last one.
     """
-    if split == "sequences":
-        return _sequence_folds(patch_set, folds)
-    from sklearn.model_selection import StratifiedGroupKFold, StratifiedKFold
-
-    copies = group_copies(make_thumbnails(patch_set), _ALIKE) if split == "groups" else None
-    kind = StratifiedGroupKFold if split == "groups" else StratifiedKFold
-    fold_of = np.zeros(len(patch_set), np.intp)
+    fold_of = np.full(len(patch_set), folds - 1, np.intp)
+    rest = np.arange(len(patch_set))
     try:
-        parts = list(
-            kind(folds, shuffle=True, random_state=seed).split(patch_set.labels, patch_set.labels, copies)
-        )
-    except ValueError as error:
-        raise InvalidInputError(
-            f"patch_set cannot be cut into folds={folds}: {error}; use fewer folds"
-        ) from error
-    for number, (_, rows) in enumerate(parts):
-        fold_of[rows] = number
+        for fold in range(folds - 1):
+            share = 1 / (folds - fold)
+            if split == "sequences":
+                parts = split_sequences(patch_set[rest], test_size=share)
+            elif split == "groups":
+                parts = split_groups(patch_set[rest], test_size=share, random_state=seed)
+            else:
+                parts = split_random(patch_set[rest], test_size=share, random_state=seed)
+            fold_of[rest[parts.test]] = fold
+            rest = rest[parts.train]
+    except InvalidInputError as error:
+        raise InvalidInputError(f"patch_set is too small for folds={folds}: {error}") from error
+    for fold in range(folds):
+        if any(len(np.unique(patch_set.labels[side])) < 2 for side in (fold_of == fold, fold_of != fold)):
+            raise InvalidInputError(
+                f"patch_set lacks vehicles or others in or beside fold {fold + 1} of folds={folds}; "
+                "use fewer folds or another split"
+            )
     return fold_of
 
 
-def _sequence_folds(patch_set: PatchSet, folds: int) -> NDArray[np.intp]:
-    folders: dict[str, list[int]] = {}
-    for row, name in enumerate(patch_set.names):
-        folders.setdefault(parent_folder(name), []).append(row)
-    fold_of = np.zeros(len(patch_set), np.intp)
-    for rows in folders.values():
-        rows.sort(key=lambda row: natural_key(patch_set.names[row]))
-        fold_of[rows] = np.arange(len(rows)) * folds // len(rows)
-    for number in range(folds):
-        for side, mask in (("on", fold_of == number), ("outside", fold_of != number)):
-            if len(np.unique(patch_set.labels[mask])) < 2:
-                raise InvalidInputError(
-                    f"patch_set lacks a class {side} fold {number + 1} of folds={folds}; use fewer folds"
-                )
-    return fold_of
+def _make_estimator(ledger: Ledger, fold_of: NDArray[np.intp], split: str, seed: int) -> Any:
+    """Build an estimator over row numbers that is a recipe, trained when it is scored.
+
+    Only then both sides of the trial are known, and the ledger can tell whether it was run before.
+    """
+
+    class Trial(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
+        def __init__(self, recipe: Recipe | None = None) -> None:
+            self.recipe = recipe
+
+        def fit(self, X: NDArray[np.intp], y: NDArray[np.int64]) -> Trial:
+            self.classes_ = np.unique(y)
+            self.rows_ = X[:, 0]
+            return self
+
+        def score(self, X: NDArray[np.intp], y: NDArray[np.int64]) -> float:
+            assert self.recipe is not None
+            row = ledger.run(
+                self.recipe,
+                Split(np.sort(self.rows_), np.sort(X[:, 0])),
+                seed,
+                name=describe_params(self.recipe.params),
+                split_name=f"{split}, fold {fold_of[X[0, 0]] + 1} of {fold_of.max() + 1}",
+                stage="halving",
+                on_frames=False,
+            )
+            return math.nan if row["accuracy"] is None else float(row["accuracy"])
+
+    return Trial()
 
 
 def halve(
@@ -122,17 +97,13 @@ def halve(
     seed: int,
 ) -> list[Recipe]:
     """Drop the worse recipes round by round, on ever more patches; return them best first."""
-    # The halving searches of scikit-learn must be switched on by this import.
-    from sklearn.experimental import enable_halving_search_cv  # noqa: F401
-    from sklearn.model_selection import HalvingGridSearchCV, HalvingRandomSearchCV, PredefinedSplit
-
     # A recipe is one value, so that only the possible combinations of a grid are candidates.
     values: dict[str, Any] = {"recipe": list(recipes)}
     count = min(candidates or len(recipes), len(recipes))
     rounds = int(math.log(count, factor) + 1e-9)
     patches = len(fold_of)
     options: dict[str, Any] = {
-        "estimator": Trial(ledger=ledger, folds=fold_of, split=split, seed=seed),
+        "estimator": _make_estimator(ledger, fold_of, split, seed),
         "factor": factor,
         "min_resources": min(patches, max(patches // factor**rounds, _FEWEST_PATCHES)),
         "cv": PredefinedSplit(fold_of),

@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._checks import check_image, check_integer, check_number, describe
-from vehicle_detection._labels import FrameKey, Labels
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import Labels
+
+FrameKey = int | str
 
 Frames = Mapping[FrameKey, NDArray[np.uint8]] | FrameSet | Sequence[NDArray[np.uint8]]
 

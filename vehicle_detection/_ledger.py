@@ -34,9 +34,6 @@ class Ledger:
         self._store = store
         self._bar = bar
 
-    def __sklearn_clone__(self) -> Ledger:
-        return self  # scikit-learn copies the parameters of its estimators; the results are shared.
-
     def table(self) -> ResultTable:
         """Return the rows so far, in the order they were asked for."""
         return ResultTable(self.rows)

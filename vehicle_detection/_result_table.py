@@ -202,6 +202,14 @@ def read_results(path: str | os.PathLike[str]) -> ResultTable:
         If the file is missing, or a line in it is damaged.
     InvalidInputError
         If the suffix is another.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     ResultTable([{"configuration": "a", "accuracy": 0.98}]).write(f"{folder}/table.csv")
+    ...     read_results(f"{folder}/table.csv").column("accuracy")
+    [0.98]
     """
     suffix = _check_suffix(path, (".csv", ".jsonl"), "path")
     file = Path(path)

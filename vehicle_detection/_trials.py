@@ -17,13 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from vehicle_detection._checks import check_number
 from vehicle_detection._feature_cache import FeatureCache, digest_of
 from vehicle_detection._labelled_frames import LabelledFrames
-from vehicle_detection._labels import Labels
-from vehicle_detection._patch_set import PatchSet
 from vehicle_detection.classifier import DEFAULT_C, VehicleClassifier, check_labels
-from vehicle_detection.datasets import Split
+from vehicle_detection.datasets import PatchSet, Split
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import evaluate_detections, precision_recall_curve
+from vehicle_detection.evaluation import Labels, evaluate_detections, precision_recall_curve
 from vehicle_detection.params import FeatureParams, RegionParams, SearchParams
 from vehicle_detection.search import BandSearch
 
@@ -41,7 +39,7 @@ COLUMNS = (
 """Columns of a measured row."""
 
 _TIMED_SHAPE = (720, 1280)
-_TIMED_RUNS = 5
+_TIMED_RUNS = 15
 _MOST_ITERATIONS = 20_000
 
 
@@ -120,9 +118,6 @@ class Bench:
             used["frames"] = [_digest_frames(each) for each in self.frames]
         self._measured = digest_of(used, time_search)
 
-    def __sklearn_clone__(self) -> Bench:
-        return self  # scikit-learn copies the parameters of its estimators; the features are shared.
-
     def trial(self, recipe: Recipe, split: Split, seed: int, *, on_frames: bool = True) -> str:
         """Name a trial by all that its result depends on."""
         return digest_of(
@@ -189,12 +184,9 @@ class Bench:
         with VehicleDetector(classifier, horizon=frames.horizon, **options) as detector:
             found = Labels.from_detections({key: detector.detect(image) for key, image in frames})
         scores = evaluate_detections(found, frames.labels, frames=frames.keys)
-        precision, recall, _ = precision_recall_curve(found, frames.labels)
-        total = precision + recall
-        curve = np.divide(2 * precision * recall, total, out=np.zeros_like(total), where=total > 0)
         return {
             "frame_f1": scores.f1,
-            "frame_best_f1": float(curve.max(initial=0)),
+            "frame_best_f1": best_f1(found, frames.labels),
             "frame_average_precision": scores.average_precision,
             "frame_iou": scores.mean_iou,
         }
@@ -212,6 +204,14 @@ class Bench:
                     seconds.append(time.perf_counter() - began)
             self._milliseconds[classifier.params] = round(min(seconds) * 1000, 3)
         return self._milliseconds[classifier.params]
+
+
+def best_f1(found: Labels, labels: Labels) -> float:
+    """F1 at the threshold on the score that makes it best; NaN where no vehicle is labelled."""
+    precision, recall, _ = precision_recall_curve(found, labels)
+    total = precision + recall
+    curve = np.divide(2 * precision * recall, total, out=np.zeros_like(total), where=total > 0)
+    return float(curve.max(initial=0))
 
 
 def fit_features(

@@ -452,7 +452,7 @@ def fit_features(
     from sklearn.svm import LinearSVC
 
     scaler = StandardScaler().fit(features)
-    # The solver wants float64: scaled straight into that, it copies nothing and the features stay as they are.
+    # The solver wants float64: scaled straight into that, it copies nothing, and the features stay intact.
     scaled = np.empty(features.shape)
     for start in range(0, len(features), _CHUNK):
         scaled[start : start + _CHUNK] = scaler.transform(features[start : start + _CHUNK])

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vehicle_detection._result_table import ResultTable
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.tuning import ResultTable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -66,7 +66,7 @@ def plot_tradeoff(
     if label is not None:
         for row in front:
             place = (row[cost], row[quality])
-            axes.annotate(str(row.get(label)), place, (5, -9), textcoords="offset points", fontsize=8)
+            axes.annotate(str(row.get(label)), place, (4, 6), textcoords="offset points", fontsize=8)
     axes.set_xlabel(cost.replace("_", " "))
     axes.set_ylabel(quality.replace("_", " "))
     axes.margins(0.12)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 import time
-from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Literal
@@ -109,31 +109,21 @@ def train_and_judge(
     check_integer(random_state, "random_state", low=0, high=2**32 - seeds)
     plans, skipped = _plan(patch_set, split, range(random_state, random_state + seeds))
 
-    seconds: defaultdict[str, float] = defaultdict(float)
+    train = functools.partial(fit_features, params=params, C=C, mirror=mirror, random_state=random_state)
+    count, copies = len(patch_set), 2 if mirror else 1
+    seconds: dict[str, float] = {}
     with _progress(progress, sum(map(len, plans.values())) + 1, seconds) as step:
-        with step("features", 0):
+        with step("features", fits=0):
             features = patch_features(patch_set.patches, params, mirror=mirror, n_jobs=n_jobs)
-        count = len(patch_set)
-
-        def fit(rows: NDArray[np.intp]) -> VehicleClassifier:
-            mirrored = [rows, rows + count] if mirror else [rows]
-            return fit_features(
-                features[np.concatenate(mirrored)],
-                np.tile(labels[rows], len(mirrored)),
-                params=params,
-                C=C,
-                mirror=mirror,
-                random_state=random_state,
-            )
-
         scores = {}
         for name, splits in plans.items():
             answers = []
-            for each in splits:
+            for rows, tested in splits:
                 with step(name):
-                    predicted = fit(each.train).predict(features[each.test])
-                answers.append(_shares(predicted, labels[each.test]))
-            with step("leakage", 0):
+                    both = np.concatenate([rows + copy * count for copy in range(copies)])
+                    predicted = train(features[both], np.tile(labels[rows], copies)).predict(features[tested])
+                answers.append(_shares(predicted, labels[tested]))
+            with step("leakage", fits=0):
                 leakage = split_leakage(patch_set, splits[0])
             scores[name] = _score(answers, splits[0], leakage)
         report = TrainingReport(
@@ -151,15 +141,7 @@ def train_and_judge(
             seconds=seconds,
         )
         with step("final"):
-            classifier = fit_features(
-                features,
-                np.tile(labels, 2 if mirror else 1),
-                params=params,
-                C=C,
-                mirror=mirror,
-                random_state=random_state,
-                metadata=_facts(report),
-            )
+            classifier = train(features, np.tile(labels, copies), metadata=_facts(report))
     return classifier, report
 
 
@@ -231,7 +213,7 @@ def _facts(report: TrainingReport) -> dict[str, Any]:
 
 
 @contextmanager
-def _progress(show: bool, total: int, seconds: defaultdict[str, float]) -> Iterator[Callable[..., Any]]:
+def _progress(show: bool, total: int, seconds: dict[str, float]) -> Iterator[Callable[..., Any]]:
     """Show a bar of fits; yield a context that times a step and counts it as so many fits."""
     from tqdm import tqdm
 
@@ -243,7 +225,7 @@ def _progress(show: bool, total: int, seconds: defaultdict[str, float]) -> Itera
             bar.set_description(name)
             began = time.perf_counter()
             yield
-            seconds[name] += time.perf_counter() - began
+            seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - began
             bar.update(fits)
 
         yield step

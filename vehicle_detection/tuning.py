@@ -23,11 +23,17 @@ from vehicle_detection._feature_cache import FeatureCache
 from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection._ledger import Ledger
 from vehicle_detection._mining import mine_negatives
-from vehicle_detection._patch_set import PatchSet
 from vehicle_detection._result_table import ResultTable, RowStore, read_results
 from vehicle_detection._trials import COLUMNS, Bench
 from vehicle_detection.classifier import DEFAULT_C
-from vehicle_detection.datasets import Split, split_groups, split_random, split_sequences, split_sources
+from vehicle_detection.datasets import (
+    PatchSet,
+    Split,
+    split_groups,
+    split_random,
+    split_sequences,
+    split_sources,
+)
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import RegionParams, SearchParams
 
@@ -147,10 +153,10 @@ def compare_configurations(
         )
         if number == 0 or "C" not in candidate.options
     ]
-    trials = list(_plan_splits(patch_set, splits, chosen))
     bench = _make_bench(
         patch_set, cache, n_jobs, frames=frames, search=search, fit=fit, time_search=time_search
     )
+    trials = list(_plan_splits(patch_set, splits, chosen))
     rows = RowStore(store, COLUMNS)
     # Same features one after the other: a cache that holds one set computes each once.
     order = {name: place for place, name in enumerate(dict.fromkeys(each.name for each in candidates))}

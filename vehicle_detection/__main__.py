@@ -1,0 +1,6 @@
+"""``python -m vehicle_detection``: the command line."""
+
+from vehicle_detection.cli import main
+
+if __name__ == "__main__":
+    main()

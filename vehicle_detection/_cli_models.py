@@ -1,0 +1,148 @@
+"""The commands around models: train one, fetch the patches for it, tell what one is."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from vehicle_detection._cli_output import check_apart, interruptible, print_facts, print_table
+
+if TYPE_CHECKING:
+    from vehicle_detection.training import TrainingReport
+
+
+def train(
+    vehicles: Annotated[Path, typer.Option(metavar="PATH", help="Folder or zip of patches with a vehicle.")],
+    non_vehicles: Annotated[Path, typer.Option(metavar="PATH", help="Folder or zip of patches without one.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Model file to write.")],
+    features: Annotated[
+        str, typer.Option(metavar="PRESET", help="lab-8460, ycrcb-8460, ycrcb-6156 or luv-2384.")
+    ] = "lab-8460",
+    split: Annotated[
+        str, typer.Option(metavar="random|sequences", help="The split whose accuracy stands for the model.")
+    ] = "random",
+    C: Annotated[
+        float, typer.Option("--C", metavar="F", help="Inverse strength of the regularisation.")
+    ] = 1e-4,
+    seed: Annotated[int, typer.Option(metavar="N", help="Seed of the solver and of the first split.")] = 0,
+    no_mirror: Annotated[bool, typer.Option("--no-mirror", help="Leave out the mirrored patches.")] = False,
+    report: Annotated[
+        Path | None, typer.Option(metavar="FILE.json", help="Accuracy on every split, counts, timings.")
+    ] = None,
+    card: Annotated[Path | None, typer.Option(metavar="FILE.md", help="Model card to write.")] = None,
+    compare: Annotated[
+        list[str] | None,
+        typer.Option(metavar="PRESET", help="Judge these features too, for the card; may be repeated."),
+    ] = None,
+) -> None:
+    """Train a model, and judge it on splits of its patches."""
+    from vehicle_detection._files import check_target, written_whole
+    from vehicle_detection.datasets import load_training_patches
+    from vehicle_detection.params import FeatureParams
+    from vehicle_detection.training import model_card, train_and_judge
+
+    named = {"-o": output, "--report": report, "--card": card}
+    targets = {name: check_target(path, name) for name, path in named.items() if path is not None}
+    check_apart(targets, {"--vehicles": vehicles, "--non-vehicles": non_vehicles})
+    presets = [FeatureParams.preset(name) for name in (features, *(compare or ()))]
+    options: dict[str, Any] = {"C": C, "mirror": not no_mirror, "random_state": seed, "split": split}
+
+    def work() -> list[Any]:
+        patches = load_training_patches(vehicles, non_vehicles, progress=sys.stderr.isatty())
+        return [train_and_judge(patches, params=params, progress=True, **options) for params in presets]
+
+    (classifier, judged), *rest = interruptible(work)
+    others = [other for _, other in rest]
+    for each in (judged, *others):
+        _show(each)
+    classifier.save(output)
+    if report is not None:
+        plain = judged.to_dict() | {"others": [other.to_dict() for other in others]}
+        with written_whole(report) as part:
+            part.write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
+    if card is not None:
+        words = ["--vehicles", vehicles.name, "--non-vehicles", non_vehicles.name, "--features", features]
+        words += ["--split", split, "--C", f"{C:g}", "--seed", str(seed)] + ["--no-mirror"] * no_mirror
+        words += [word for name in compare or () for word in ("--compare", name)]
+        words += ["-o", output.name, "--card", card.name]
+        text = model_card(
+            classifier, judged, others=others, command=shlex.join(["vehicle-detection", "train", *words])
+        )
+        with written_whole(card) as part:
+            part.write_text(text, encoding="utf-8")
+    typer.echo(f"wrote {', '.join(map(str, targets.values()))}")
+
+
+def _show(report: TrainingReport) -> None:
+    """Print what a training found."""
+    from vehicle_detection.training import SPLITS
+
+    print_table(
+        f"{report.features}: {report.vehicles:,} vehicles, {report.non_vehicles:,} others, accuracy "
+        f"{report.accuracy:.4f} on the split {report.split!r}",
+        ("tested on", "trained", "tested", "accuracy", "missed vehicles", "false vehicles", "near-copies"),
+        [
+            (
+                SPLITS[name],
+                f"{score.train:,}",
+                f"{score.test:,}",
+                f"{score.accuracy:.4f}",
+                f"{score.missed:.2%}",
+                f"{score.false:.2%}",
+                f"{score.leakage:.1%}",
+            )
+            for name, score in report.splits.items()
+        ],
+    )
+    for name, reason in report.skipped.items():
+        typer.echo(f"left out {SPLITS[name]!r}: {reason}")
+    typer.echo(", ".join(f"{name} {seconds:.1f} s" for name, seconds in report.seconds.items()))
+
+
+def fetch(
+    to: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder to write to; the user's cache if none is given."),
+    ] = None,
+) -> None:
+    """Download the course's training patches (110 MB), once."""
+    from vehicle_detection.datasets import fetch_patches
+
+    for path in fetch_patches(to, progress=sys.stderr.isatty()):
+        typer.echo(str(path))
+
+
+def info(
+    model: Annotated[
+        Path | None, typer.Argument(metavar="[MODEL]", help="Model file; the shipped one if none is given.")
+    ] = None,
+) -> None:
+    """Show what a model is: parameters, accuracy, data, versions."""
+    from vehicle_detection.classifier import load_classifier
+    from vehicle_detection.training import SPLITS
+
+    classifier = load_classifier(model)
+    facts = dict(classifier.metadata)
+    metrics = facts.pop("metrics", {})
+    params = classifier.params
+    count = len(classifier.templates)
+    print_facts(
+        f"{model or 'shipped model'}: {params.length} features, {count} template{'s' * (count > 1)}",
+        dataclasses.asdict(params),
+    )
+    if metrics.get("splits"):
+        names = [name for name in SPLITS if name in metrics["splits"]]
+        columns = ("accuracy", "missed", "false", "near_copies", "test")
+        rows = [
+            (SPLITS[name], *(str(metrics["splits"][name].get(column, "")) for column in columns))
+            for name in names
+        ]
+        print_table("metrics", ("tested on", *(column.replace("_", " ") for column in columns)), rows)
+    for name, values in facts.items():
+        print_facts(name, values if isinstance(values, dict) else {"": values})

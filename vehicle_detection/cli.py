@@ -1,0 +1,275 @@
+"""The command line: ``vehicle-detection ...``.
+
+Heavy imports stand in the commands, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from vehicle_detection import __version__
+from vehicle_detection._cli_models import fetch, info, train
+from vehicle_detection._cli_output import check_apart, complain, output_folder, print_facts
+from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
+
+if TYPE_CHECKING:
+    from vehicle_detection.boxes import Detections
+    from vehicle_detection.detector import VehicleDetector
+
+BAD_INPUT, INTERRUPTED = 2, 130
+
+
+class _Commands(TyperGroup):
+    """Commands whose expected errors end in one line on standard error."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except VehicleDetectionError as error:
+            complain(f"error: {error}")
+            raise typer.Exit(BAD_INPUT) from None
+        except OSError as error:  # the disk is full, a name is too long
+            if error.errno == errno.EPIPE:
+                raise
+            complain(f"error: {error}")
+            raise typer.Exit(1) from None
+        except KeyboardInterrupt:
+            complain("interrupted")
+            raise typer.Exit(INTERRUPTED) from None
+
+
+app = typer.Typer(
+    cls=_Commands,
+    help="Find and follow vehicles in dash-cam images and video.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+def main() -> None:
+    """Run the command line."""
+    try:
+        app(prog_name="vehicle-detection")
+    except KeyboardInterrupt:  # before or after a command
+        complain("interrupted")
+        sys.exit(INTERRUPTED)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _start(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+Model = Annotated[
+    Path | None, typer.Option("--model", metavar="FILE", help="Model file; the shipped one if none is given.")
+]
+Horizon = Annotated[
+    float | None,
+    typer.Option(
+        metavar="F", help="Height of the horizon as a share of the frame's height, 0 at the top; 0.58."
+    ),
+]
+
+
+@app.command()
+def demo(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to write to.")] = Path(
+        "demo"
+    ),
+    frames: Annotated[int, typer.Option(metavar="N", help="Length of the drive.")] = 120,
+    seed: Annotated[int, typer.Option(metavar="N", help="Seed of the drive.")] = 0,
+) -> None:
+    """Draw a drive, annotate it with the shipped model and score it against the truth."""
+    from vehicle_detection._demo import FILES, run_demo
+    from vehicle_detection.detector import VehicleDetector
+
+    with output_folder(output, "-o"), VehicleDetector() as detector:
+        result = run_demo(output, detector, frames=frames, random_state=seed, progress=True)
+    scores = result.scores
+    print_facts(
+        f"{scores.frames} drawn frames of 1280x720, {scores.vehicles} vehicles, {scores.tracks} tracks",
+        {
+            "F1": f"{scores.f1:.3f}",
+            "mean IoU": f"{scores.mean_iou:.3f}",
+            "MOTA": f"{scores.mota:.3f}",
+            "identity switches": scores.id_switches,
+            "speed": f"{result.report.frames_per_second:.1f} frames/s",
+        },
+    )
+    typer.echo(f"wrote {', '.join(FILES)} in {output}")
+
+
+@app.command()
+def detect(
+    images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="Image files.")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder for annotated images.")
+    ] = None,
+    boxes: Annotated[
+        Path | None, typer.Option(metavar="FILE.csv", help="Table of all boxes, by file name.")
+    ] = None,
+    model: Model = None,
+    horizon: Horizon = None,
+) -> None:
+    """Find the vehicles of images."""
+    from vehicle_detection.classifier import load_classifier
+    from vehicle_detection.detector import VehicleDetector
+    from vehicle_detection.export import write_boxes
+
+    _check_images(images, output, boxes)
+    with VehicleDetector(load_classifier(model), horizon=horizon) as detector, output_folder(output, "-o"):
+        found = _detect_each(images, detector, output)
+        if boxes is None:
+            for _ in found:
+                pass
+        else:
+            rows = write_boxes(found, boxes)
+            typer.echo(f"wrote {rows} boxes to {boxes}")
+
+
+def _check_images(images: list[Path], output: Path | None, boxes: Path | None) -> None:
+    """Refuse what would fail, or overwrite something, after a part of the work is done."""
+    for image in images:
+        if image.is_dir():
+            raise InvalidInputError(
+                f"IMAGE {image} is a folder; name the files in it, such as {image / '*.jpg'}"
+            )
+        if not image.exists():
+            raise InvalidInputError(f"IMAGE {image} does not exist; check the path")
+        if boxes is not None and boxes.exists() and boxes.samefile(image):
+            raise InvalidInputError(f"--boxes {boxes} is one of the images; choose another name")
+        if output is not None and output.exists() and output.samefile(image.parent):
+            raise InvalidInputError(
+                f"-o {output} is the folder of {image.name}, which would be overwritten; choose another"
+            )
+    by_name: dict[str, Path] = {}
+    for image in images:
+        other = by_name.setdefault(image.name, image)
+        if other != image and (output is not None or boxes is not None):
+            raise InvalidInputError(
+                f"IMAGE {other} and {image} have the same name, by which results go; take a folder at a time"
+            )
+
+
+def _detect_each(
+    images: list[Path], detector: VehicleDetector, output: Path | None
+) -> Iterator[tuple[str, Detections]]:
+    """Search one image after the other, print what is found, and write the annotated image."""
+    import cv2
+
+    from vehicle_detection.drawing import draw_boxes
+    from vehicle_detection.images import read_image, write_image
+
+    for path in images:
+        image = read_image(path)
+        found = detector.detect(image)
+        listed = "".join(
+            f"  [{' '.join(f'{side:.0f}' for side in box)}] {score:.2f}"
+            for box, score in zip(found.boxes.tolist(), found.scores.tolist())
+        )
+        typer.echo(f"{path}: {len(found)} vehicle{'s' * (len(found) != 1)}{listed}")
+        if output is not None:
+            thickness = max(2, round(max(image.shape) / 320))
+            suffix = path.suffix if cv2.haveImageWriter(f"image{path.suffix}") else f"{path.suffix}.png"
+            drawn = draw_boxes(image, found.boxes, color=(230, 159, 0), thickness=thickness)
+            write_image(output / (path.stem + suffix), drawn)
+        yield path.name, found
+
+
+@app.command()
+def video(
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Video to read.")],
+    target: Annotated[
+        Path, typer.Argument(metavar="TARGET", help="Video to write: .mp4, .m4v, .mov or .mkv.")
+    ],
+    tracks: Annotated[
+        Path | None, typer.Option(metavar="FILE.csv", help="Table of all tracks: .csv, .jsonl or .txt (MOT).")
+    ] = None,
+    model: Model = None,
+    start: Annotated[float | None, typer.Option(metavar="S", help="Second to start at.")] = None,
+    end: Annotated[float | None, typer.Option(metavar="S", help="Second to end at.")] = None,
+    preset: Annotated[
+        str, typer.Option(metavar="P", help="Speed of the H.264 encoder, ultrafast to placebo.")
+    ] = "veryfast",
+    horizon: Horizon = None,
+    no_audio: Annotated[bool, typer.Option("--no-audio", help="Leave out the sound.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors.")] = False,
+    profile: Annotated[bool, typer.Option("--profile", help="Show the time of each stage.")] = False,
+) -> None:
+    """Follow the vehicles of a video and write it again with their boxes."""
+    from vehicle_detection.classifier import load_classifier
+    from vehicle_detection.detector import VehicleDetector
+    from vehicle_detection.export import TrackWriter
+    from vehicle_detection.video import process_video
+
+    with contextlib.ExitStack() as stack:
+        write = None
+        if tracks is not None:
+            check_apart({"--tracks": tracks}, {"SOURCE": source, "TARGET": target})
+            write = stack.enter_context(TrackWriter(tracks))
+        detector = stack.enter_context(VehicleDetector(load_classifier(model), horizon=horizon))
+        report = process_video(
+            source,
+            target,
+            detector,
+            start=start,
+            end=end,
+            audio=not no_audio,
+            preset=preset,
+            progress=not quiet,
+            on_result=write,
+        )
+    if not quiet or profile:
+        lines = str(report).splitlines()
+        typer.echo("\n".join(lines if profile else lines[:1]))
+    if not quiet:
+        typer.echo(f"wrote {target}" + (f" and {tracks}" if tracks is not None else ""))
+
+
+@app.command()
+def evaluate(
+    predictions: Annotated[Path, typer.Argument(metavar="PREDICTIONS.csv", help="Boxes or tracks.")],
+    labels: Annotated[Path, typer.Argument(metavar="LABELS.csv", help="True boxes.")],
+    iou: Annotated[float, typer.Option(metavar="F", help="Overlap from which a box is right.")] = 0.5,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="File for all scores.")] = None,
+) -> None:
+    """Score boxes, and tracks where there are any, against labels."""
+    from json import dumps
+
+    from vehicle_detection._files import check_target, written_whole
+    from vehicle_detection.evaluation import evaluate_detections, evaluate_tracks, read_labels
+
+    if json is not None:
+        check_apart({"--json": check_target(json, "--json")}, {"PREDICTIONS": predictions, "LABELS": labels})
+    found, true = read_labels(predictions), read_labels(labels)
+    scores: dict[str, Any] = {"detections": evaluate_detections(found, true, iou=iou)}
+    if (found.tracks >= 0).any() and (true.tracks >= 0).any():
+        scores["tracks"] = evaluate_tracks(found, true, iou=iou)
+    typer.echo("\n\n".join(each.summary() for each in scores.values()))
+    if json is not None:
+        with written_whole(json) as part:
+            plain = {name: each.to_dict() for name, each in scores.items()}
+            part.write_text(dumps(plain, indent=2) + "\n", encoding="utf-8")
+
+
+for _command in (train, fetch, info):
+    app.command()(_command)
