@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ from vehicle_detection.synthetic import render_scene
 from vehicle_detection.tuning import FeatureCache, ResultTable, compare_configurations
 
 SEEDS = range(5)
+_TIMED_RUNS = 15
 COURSE_C, OUR_C = 1.0, 1e-4
 
 FIRST, SECOND, THIRD = (FeatureParams.preset(name) for name in ("luv-2384", "ycrcb-6156", "ycrcb-8460"))
@@ -110,52 +111,52 @@ class Runs:
         self._extra = RowStore(folder / "extra_rows.csv", _EXTRA_COLUMNS)
         # One set of features at a time: the next configuration needs the room.
         self.cache = FeatureCache(patch_set.patches, memory_mb=0)
-        self.fixed = {
-            "sequences": split_sequences(patch_set),
-            "groups": split_groups(patch_set),
-            "GTI to KITTI": split_sources(patch_set),
-            "KITTI to GTI": split_sources(patch_set, train=("KITTI", "Extras"), test=("GTI",)),
+        self._splits = {
+            "random": [split_random(patch_set, random_state=seed) for seed in SEEDS],
+            "sequences": [split_sequences(patch_set)],
+            "groups": [split_groups(patch_set, random_state=seed) for seed in SEEDS],
+            "GTI to KITTI": [split_sources(patch_set)],
+            "KITTI to GTI": [split_sources(patch_set, train=("KITTI", "Extras"), test=("GTI",))],
         }
 
     def parts(self, splits: Sequence[str]) -> Iterator[tuple[str, int, Split]]:
-        """Name, seed and rows of each split; the random one once for each seed."""
+        """Name, seed and rows of each split; a random one once for each seed."""
         for name in splits:
-            if name == "random":
-                for seed in SEEDS:
-                    yield name, seed, split_random(self.patch_set, random_state=seed)
-            else:
-                yield name, 0, self.fixed[name]
+            for seed, split in zip(SEEDS, self._splits[name]):
+                yield name, seed, split
 
     def compare(self, plan: Plan) -> ResultTable:
         """All trials of linear SVMs that a plan asks for."""
         options: dict[str, Any] = {"C": plan.C, "mirror": False, "cache": self.cache}
         options |= {"store": self._svm_rows, "time_search": False}
-        rows: list[Mapping[str, Any]] = []
-        for name, params in plan.configurations.items():
-            for splits in ("random", {name: self.fixed[name] for name in plan.splits if name != "random"}):
-                table = compare_configurations(
-                    self.patch_set, {name: params}, splits=splits, seeds=SEEDS, **options
-                )
-                rows += table.rows
-        return ResultTable(rows)
+        tables = [
+            compare_configurations(
+                self.patch_set, {name: params}, splits={part: split}, seeds=[seed], **options
+            )
+            for name, params in plan.configurations.items()
+            for part, seed, split in self.parts(plan.splits)
+        ]
+        return ResultTable([row for table in tables for row in table])
 
-    def search_times(self, plan: Plan, runs: int = 15) -> dict[str, float]:
+    @cached_property
+    def search_times(self) -> dict[FeatureParams, float]:
         """Milliseconds of the fast search of a 1280x720 frame, one core: the fastest of a few runs.
 
         The configurations take turns, so that a load on the machine meets all of them.
         """
         frame = render_scene(random_state=0).image
         search = SearchParams.preset()
+        listed = {params for plan in PLANS.values() for params in plan.configurations.values()}
         with ExitStack() as stack:
             searches = {
-                name: stack.enter_context(BandSearch(_any_classifier(params), n_jobs=1))
-                for name, params in plan.configurations.items()
+                params: stack.enter_context(BandSearch(_any_classifier(params), n_jobs=1))
+                for params in listed
             }
-            seconds = [
-                {name: _seconds(partial(each.find, frame, search)) for name, each in searches.items()}
-                for _ in range(runs + 1)
+            turns = [
+                {params: _seconds(partial(each.find, frame, search)) for params, each in searches.items()}
+                for _ in range(_TIMED_RUNS + 1)  # The first one compiles kernels.
             ]
-        return {name: min(turn[name] for turn in seconds[1:]) * 1000 for name in searches}
+        return {params: min(turn[params] for turn in turns[1:]) * 1000 for params in listed}
 
     def bayes(self) -> ResultTable:
         """Gaussian naive Bayes on the second system's features."""
@@ -176,7 +177,7 @@ class Runs:
 
     def first_answers(self, count: int = 15) -> ResultTable:
         """What the first test samples of the first random split are, and what both classifiers say."""
-        split = split_random(self.patch_set, random_state=0)
+        split = self._splits["random"][0]
         chosen = np.random.default_rng(0).permutation(split.test)[:count]
         trial = digest_of(self.cache.digest, "answers", split.train, chosen)
         models = ("truth", "naive Bayes", "linear SVM")
@@ -194,7 +195,7 @@ class Runs:
 
     def prediction_times(self) -> ResultTable:
         """Milliseconds that the first system takes for the test samples of a random split, run by run."""
-        split = split_random(self.patch_set, random_state=0)
+        split = self._splits["random"][0]
         trial = digest_of(self.cache.digest, "prediction", split.train, split.test)
         names = (
             "scikit-learn, features scaled already",

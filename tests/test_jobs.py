@@ -6,11 +6,12 @@ import threading
 import time
 from functools import partial
 
+import cv2
 import numpy as np
 import pytest
 from threadpoolctl import ThreadpoolController
 
-from vehicle_detection._jobs import JOBS_VARIABLE, available_cores, resolve_jobs, single_threaded_blas
+from vehicle_detection._jobs import JOBS_VARIABLE, available_cores, resolve_jobs, single_threaded_libraries
 from vehicle_detection.errors import InvalidInputError
 
 
@@ -72,17 +73,28 @@ def test_a_bad_argument_is_named(n_jobs):
 @pytest.mark.usefixtures("two_blas_threads")
 def test_blas_is_held_and_let_go():
     assert blas_threads() == {2}
-    with single_threaded_blas():
+    with single_threaded_libraries():
         assert blas_threads() == {1}
-        with single_threaded_blas():
+        with single_threaded_libraries():
             assert blas_threads() == {1}
         assert blas_threads() == {1}
     assert blas_threads() == {2}
 
 
+def test_opencv_is_held_and_let_go():
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(3)
+    try:
+        with single_threaded_libraries():
+            assert cv2.getNumThreads() == 1
+        assert cv2.getNumThreads() == 3
+    finally:
+        cv2.setNumThreads(before)
+
+
 @pytest.mark.usefixtures("two_blas_threads")
 def test_blas_is_let_go_after_an_error():
-    with pytest.raises(KeyError, match="oops"), single_threaded_blas():
+    with pytest.raises(KeyError, match="oops"), single_threaded_libraries():
         raise KeyError("oops")
     assert blas_threads() == {2}
 
@@ -92,12 +104,12 @@ def test_blas_is_held_until_the_last_thread_leaves():
     inside, leave = threading.Event(), threading.Event()
 
     def other():
-        with single_threaded_blas():
+        with single_threaded_libraries():
             inside.set()
             leave.wait(10)
 
     thread = threading.Thread(target=other)
-    with single_threaded_blas():
+    with single_threaded_libraries():
         thread.start()
         assert inside.wait(10)
     # The first to enter has left; the other is still at work.
@@ -112,7 +124,7 @@ def test_blas_is_held_until_the_last_thread_leaves():
 def test_blas_is_restored_after_many_threads_come_and_go():
     def work():
         for _ in range(50):
-            with single_threaded_blas():
+            with single_threaded_libraries():
                 pass
 
     threads = [threading.Thread(target=work) for _ in range(8)]
@@ -128,12 +140,12 @@ def test_an_interrupted_hold_does_not_last(monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    keep = single_threaded_blas._keep
-    monkeypatch.setattr(single_threaded_blas, "_keep", lambda function: (keep(function), interrupt()))
-    with pytest.raises(KeyboardInterrupt), single_threaded_blas():
+    keep = single_threaded_libraries._keep
+    monkeypatch.setattr(single_threaded_libraries, "_keep", lambda function: (keep(function), interrupt()))
+    with pytest.raises(KeyboardInterrupt), single_threaded_libraries():
         pass
     monkeypatch.undo()
-    with single_threaded_blas():
+    with single_threaded_libraries():
         assert blas_threads() == {1}
     assert blas_threads() == {2}
 
@@ -142,9 +154,9 @@ def test_a_thread_that_outlives_the_main_one_may_still_search():
     # At the interpreter's end no new work is taken by the thread that holds the limit.
     code = (
         "import threading, time\n"
-        "from vehicle_detection._jobs import single_threaded_blas\n"
+        "from vehicle_detection._jobs import single_threaded_libraries\n"
         "def work():\n"
-        "    with single_threaded_blas():\n"
+        "    with single_threaded_libraries():\n"
         "        threading.main_thread().join()\n"
         "        time.sleep(0.2)\n"
         "    print('done')\n"
@@ -157,11 +169,11 @@ def test_a_thread_that_outlives_the_main_one_may_still_search():
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_a_forked_child_can_hold_blas_too():
-    with single_threaded_blas():
+    with single_threaded_libraries():
         pass
     child = os.fork()
     if child == 0:  # No test framework in the child: it ends here.
-        with single_threaded_blas():
+        with single_threaded_libraries():
             os._exit(0 if blas_threads() <= {1} else 1)
     for _ in range(100):
         done, status = os.waitpid(child, os.WNOHANG)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vehicle_detection._cli_output import check_apart, interruptible, print_facts, print_table
+from vehicle_detection._cli_output import check_apart, codec_messages, interruptible, output_folder, print_facts, print_table
 
 if TYPE_CHECKING:
     from vehicle_detection.training import TrainingReport
@@ -49,12 +49,14 @@ def train(
 
     named = {"-o": output, "--report": report, "--card": card}
     targets = {name: check_target(path, name) for name, path in named.items() if path is not None}
-    check_apart(targets, {"--vehicles": vehicles, "--non-vehicles": non_vehicles})
+    check_apart({"--non-vehicles": non_vehicles, **targets}, {"--vehicles": vehicles})
     presets = [FeatureParams.preset(name) for name in (features, *(compare or ()))]
     options: dict[str, Any] = {"C": C, "mirror": not no_mirror, "random_state": seed, "split": split}
 
+    with codec_messages():
+        patches = load_training_patches(vehicles, non_vehicles)
+
     def work() -> list[Any]:
-        patches = load_training_patches(vehicles, non_vehicles, progress=sys.stderr.isatty())
         return [train_and_judge(patches, params=params, progress=True, **options) for params in presets]
 
     (classifier, judged), *rest = interruptible(work)
@@ -114,7 +116,9 @@ def fetch(
     """Download the course's training patches (110 MB), once."""
     from vehicle_detection.datasets import fetch_patches
 
-    for path in fetch_patches(to, progress=sys.stderr.isatty()):
+    with output_folder(to, "--to"):
+        paths = fetch_patches(to, progress=sys.stderr.isatty())
+    for path in paths:
         typer.echo(str(path))
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
@@ -41,18 +43,13 @@ def print_table(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]])
 
 
 def print_facts(title: str, facts: Mapping[str, Any]) -> None:
-    """Print names and values as a table without a head."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table.grid(padding=(0, 2))
+    """Print a title, and under it names and values in two columns."""
+    typer.secho(title, bold=True)
+    width = max(map(len, facts), default=0)
     for name, value in facts.items():
         nested = isinstance(value, Mapping)
         text = ", ".join(f"{key} {entry}" for key, entry in value.items()) if nested else str(value)
-        table.add_row(f"  {name}", text)
-    console = Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH, highlight=False, markup=False)
-    console.print(title, style="bold")
-    console.print(table)
+        typer.echo(f"  {name:<{width}}  {text}")
 
 
 def check_apart(targets: Mapping[str, Path], sources: Mapping[str, Path]) -> None:
@@ -62,6 +59,25 @@ def check_apart(targets: Mapping[str, Path], sources: Mapping[str, Path]) -> Non
         other = seen.setdefault(path.resolve(), f"{name} {path}")
         if other != f"{name} {path}":
             raise InvalidInputError(f"{name} {path} is {other} as well; choose another name")
+
+
+@contextlib.contextmanager
+def codec_messages() -> Iterator[list[str]]:
+    """Collect what image codecs, being no Python, write to standard error; the list is filled at the end."""
+    lines: list[str] = []
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with tempfile.TemporaryFile() as file:
+            os.dup2(file.fileno(), 2)
+            try:
+                yield lines
+            finally:
+                os.dup2(kept, 2)
+            file.seek(0)
+            lines += file.read().decode("utf-8", "replace").splitlines()
+    finally:
+        os.close(kept)
 
 
 @contextlib.contextmanager

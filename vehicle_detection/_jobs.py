@@ -1,4 +1,4 @@
-"""How many threads work, and how BLAS is kept from starting its own beside them."""
+"""How many threads work, and how BLAS and OpenCV are kept from starting their own beside them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
+
+import cv2
 
 from vehicle_detection._checks import check_integer
 from vehicle_detection.errors import InvalidInputError
@@ -34,14 +36,15 @@ def resolve_jobs(n_jobs: int | None = None) -> int:
     return int(text)
 
 
-class _SingleThreadedBlas:
-    """Holds BLAS at one thread while anybody is inside, whichever threads come and go."""
+class _SingleThreadedLibraries:
+    """Holds BLAS and OpenCV at one thread while anybody is inside, whichever threads come and go."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._inside = 0
         self._controller: Any = None
         self._limits: Any = None
+        self._opencv_threads = 0
         self._keeper: ThreadPoolExecutor | None = None
 
     @contextlib.contextmanager
@@ -73,15 +76,19 @@ class _SingleThreadedBlas:
         # Looking for the loaded BLAS libraries takes a millisecond: once is enough.
         self._controller = self._controller or ThreadpoolController()
         # An interrupt may have kept an earlier limit from being lifted.
-        self._limits = self._limits or self._controller.limit(limits=1, user_api="blas").__enter__()
+        if self._limits is None:
+            self._limits = self._controller.limit(limits=1, user_api="blas").__enter__()
+            self._opencv_threads = cv2.getNumThreads()
+            cv2.setNumThreads(1)
 
     def _lift(self) -> None:
         if self._limits is not None:
             self._limits.__exit__(None, None, None)
             self._limits = None
+            cv2.setNumThreads(self._opencv_threads)
 
 
-single_threaded_blas = _SingleThreadedBlas()
+single_threaded_libraries = _SingleThreadedLibraries()
 if hasattr(os, "register_at_fork"):
     # Threads do not survive a fork: the child needs a keeper of its own.
-    os.register_at_fork(after_in_child=single_threaded_blas.__init__)  # type: ignore[misc]
+    os.register_at_fork(after_in_child=single_threaded_libraries.__init__)  # type: ignore[misc]

@@ -17,7 +17,8 @@ from typer.core import TyperGroup
 
 from vehicle_detection import __version__
 from vehicle_detection._cli_models import fetch, info, train
-from vehicle_detection._cli_output import check_apart, complain, output_folder, print_facts
+from vehicle_detection._cli_output import check_apart, codec_messages, complain, output_folder, print_facts
+from vehicle_detection._cli_tuning import tune
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
 
 if TYPE_CHECKING:
@@ -180,7 +181,10 @@ def _detect_each(
     from vehicle_detection.images import read_image, write_image
 
     for path in images:
-        image = read_image(path)
+        with codec_messages() as messages:
+            image = read_image(path)
+        for message in messages:
+            complain(f"warning: {path}: {message}")
         found = detector.detect(image)
         listed = "".join(
             f"  [{' '.join(f'{side:.0f}' for side in box)}] {score:.2f}"
@@ -271,5 +275,5 @@ def evaluate(
             part.write_text(dumps(plain, indent=2) + "\n", encoding="utf-8")
 
 
-for _command in (train, fetch, info):
+for _command in (train, tune, fetch, info):
     app.command()(_command)

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection import _kernels
 from vehicle_detection._checks import check_image, check_number, check_type
-from vehicle_detection._jobs import resolve_jobs, single_threaded_blas
+from vehicle_detection._jobs import resolve_jobs, single_threaded_libraries
 from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import CLASSIFIER_REMEDY, Template, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
@@ -147,12 +147,12 @@ class BandSearch:
     ) -> list[Detections]:
         """Apply `function` to the bands, the costly ones first so that the threads end together."""
         if self._jobs == 1 or len(bands) == 1:
-            with single_threaded_blas():
+            with single_threaded_libraries():
                 return [function(band) for band in bands]
         with self._opening:
             pool = self._pool = self._pool or ThreadPoolExecutor(self._jobs, thread_name_prefix="search")
         order = sorted(range(len(bands)), key=lambda i: -_cost(bands[i]))
-        with single_threaded_blas():
+        with single_threaded_libraries():
             found = list(pool.map(function, [bands[i] for i in order]))
         return [part for _, part in sorted(zip(order, found), key=lambda pair: pair[0])]
 

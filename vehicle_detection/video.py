@@ -22,6 +22,7 @@ from typing import Any
 from vehicle_detection._checks import check_choice, check_integer, check_number, describe
 from vehicle_detection._ffmpeg import VideoInfo, probe
 from vehicle_detection._files import check_target, written_whole
+from vehicle_detection._jobs import single_threaded_libraries
 from vehicle_detection._pipeline import Line, SupportsFrames
 from vehicle_detection._streams import CONTAINERS, AudioSource, FrameReader, FrameWriter
 from vehicle_detection.errors import InvalidInputError
@@ -272,7 +273,12 @@ def process_video(
     )
     frames, vehicles = 0, set[int]()
     total = count or max(info.frames - first, 0) or None
-    with _progress_bar(progress, total) as bar, contextlib.closing(line.run()) as results:
+    # The line's own threads keep the cores busy: more of them would only get into each other's way.
+    with (
+        single_threaded_libraries(),
+        _progress_bar(progress, total) as bar,
+        contextlib.closing(line.run()) as results,
+    ):
         for result in results:
             frames += 1
             vehicles.update(track.id for track in result.tracks if getattr(track, "shown", True))

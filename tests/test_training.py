@@ -1,0 +1,274 @@
+import dataclasses
+import io
+import json
+
+import numpy as np
+import pytest
+
+from vehicle_detection import training
+from vehicle_detection.classifier import fit_features, load_classifier, patch_features, train_classifier
+from vehicle_detection.datasets import (
+    PatchSet,
+    load_training_patches,
+    split_leakage,
+    split_random,
+    split_sequences,
+    split_sources,
+)
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.features import extract_features
+from vehicle_detection.params import FeatureParams
+from vehicle_detection.synthetic import render_patches
+from vehicle_detection.training import SPLITS, model_card, train_and_judge
+
+SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=6, pix_per_cell=16, hog_channel=0)
+SOURCES = {True: ("GTI_Far", "KITTI_extracted"), False: ("GTI", "Extras")}
+
+
+def named(patches, labels, sources):
+    """Give patches names as those of the course have, the sources of each class in turn."""
+    names = [
+        f"{'vehicles' if label else 'non-vehicles'}/{sources[bool(label)][number % 2]}/{number}.png"
+        for number, label in enumerate(labels)
+    ]
+    return PatchSet(patches, labels, names)
+
+
+@pytest.fixture(scope="module")
+def patch_set():
+    return named(*render_patches(160, random_state=7), SOURCES)
+
+
+@pytest.fixture(scope="module")
+def judged(patch_set):
+    return train_and_judge(patch_set, params=SMALL, random_state=3, seeds=2)
+
+
+def test_every_split_is_judged(judged, patch_set):
+    _, report = judged
+    assert list(report.splits) == list(SPLITS)
+    assert report.skipped == {}
+    assert (report.vehicles, report.non_vehicles, report.balance) == (80, 80, 0.5)
+    assert report.sources == {"Extras": 40, "GTI": 40, "GTI_Far": 40, "KITTI_extracted": 40}
+    assert report.fingerprint == patch_set.fingerprint
+    assert [len(score.accuracies) for score in report.splits.values()] == [2, 1, 1, 1]
+    for score in report.splits.values():
+        assert score.train + score.test == 160
+        assert 0.5 < score.accuracy <= 1
+        wrong = (score.missed + score.false) / 2
+        assert 1 - score.accuracy == pytest.approx(wrong, abs=0.1)
+    assert set(report.seconds) == {"features", *SPLITS, "leakage", "final"}
+    assert report.accuracy == report.splits["random"].accuracy
+    assert (report.split, report.features) == ("random", f"{SMALL.length} features")
+
+
+@pytest.mark.parametrize("mirror", [True, False])
+def test_the_scores_are_those_of_a_classifier_that_saw_the_training_part_alone(patch_set, mirror):
+    _, report = train_and_judge(patch_set, params=SMALL, random_state=3, seeds=2, mirror=mirror)
+    splits = {
+        "random": [split_random(patch_set, random_state=seed) for seed in (3, 4)],
+        "sequences": [split_sequences(patch_set)],
+        "gti_to_kitti": [split_sources(patch_set)],
+        "kitti_to_gti": [split_sources(patch_set, train=("KITTI", "Extras"), test=("GTI",))],
+    }
+    for name, each in splits.items():
+        score = report.splits[name]
+        for (train, test), accuracy in zip(each, score.accuracies):
+            alone = train_classifier(
+                patch_set.patches[train],
+                patch_set.labels[train],
+                params=SMALL,
+                mirror=mirror,
+                random_state=3,
+            )
+            assert alone.score(patch_set.patches[test], patch_set.labels[test]) == accuracy
+        assert score.leakage == split_leakage(patch_set, each[0])
+        assert (score.train, score.test) == (len(each[0].train), len(each[0].test))
+
+
+def test_shares_of_wrong_answers():
+    predicted, labels = np.array([1, 0, 0, 1, 0, 1]), np.array([1, 1, 1, 0, 0, 0])
+    accuracy, missed, false = training._shares(predicted, labels)
+    assert (accuracy, missed, false) == pytest.approx((0.5 - 1 / 6, 2 / 3, 2 / 3))
+
+
+def test_the_model_is_that_of_all_patches(judged, patch_set):
+    classifier, report = judged
+    plain = train_classifier(patch_set.patches, patch_set.labels, params=SMALL, random_state=3)
+    for name in ("mean", "scale", "coef", "intercept"):
+        np.testing.assert_array_equal(
+            getattr(classifier.templates[0], name), getattr(plain.templates[0], name)
+        )
+    facts = dict(classifier.metadata)
+    assert facts["training"] == plain.metadata["training"]
+    assert facts["versions"] == plain.metadata["versions"]
+    assert facts["data"] == {
+        "fingerprint": patch_set.fingerprint,
+        "sources": report.sources,
+        "balance": 0.5,
+    }
+    assert facts["metrics"]["accuracy"] == round(report.accuracy, 5)
+    assert set(facts["metrics"]["splits"]) == set(SPLITS)
+
+
+@pytest.mark.parametrize("split", ["random", "sequences"])
+def test_again_it_is_the_same_file(patch_set, tmp_path, split):
+    before = patch_set.patches.copy()
+    for name, jobs in (("a", 1), ("b", 3)):
+        classifier, report = train_and_judge(
+            patch_set, params=SMALL, split=split, seeds=1, n_jobs=jobs, random_state=5
+        )
+        classifier.save(tmp_path / name)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    np.testing.assert_array_equal(patch_set.patches, before)
+    assert load_classifier(tmp_path / "a").metadata["metrics"]["split"] == split
+    assert report.accuracy == report.splits[split].accuracy
+
+
+def test_features_are_fitted_as_they_are(patch_set):
+    features = patch_features(patch_set.patches, SMALL, mirror=True)
+    assert (features.shape, features.dtype) == ((320, SMALL.length), np.float32)
+    np.testing.assert_array_equal(features[:160], extract_features(patch_set.patches, SMALL))
+    mirrored = np.ascontiguousarray(patch_set.patches[:, :, ::-1])
+    np.testing.assert_array_equal(features[160:], extract_features(mirrored, SMALL))
+    before = features.copy()
+    labels = np.tile(patch_set.labels.astype(np.int64), 2)
+    fitted = fit_features(features, labels, params=SMALL, C=1e-4, mirror=True, random_state=0)
+    np.testing.assert_array_equal(features, before)
+    assert fitted.metadata["training"]["vehicles"] == 80
+
+
+def test_splits_that_the_patches_do_not_allow_are_left_out():
+    patches, labels = render_patches(24)
+    own = named(patches, labels, {True: ("mine", "mine"), False: ("other", "other")})
+    _, report = train_and_judge(own, params=SMALL, seeds=1)
+    assert set(report.splits) == {"random", "sequences"}
+    assert "GTI" in report.skipped["gti_to_kitti"]
+    # Each patch in a folder of its own: there is no sequence.
+    single = PatchSet(patches, labels, [f"{number}/1.png" for number in range(24)])
+    _, report = train_and_judge(single, params=SMALL, seeds=1)
+    assert set(report.splits) == {"random"}
+    assert "folder of two or more patches" in report.skipped["sequences"]
+    with pytest.raises(InvalidInputError, match="folder of two or more patches; use split_random"):
+        train_and_judge(single, params=SMALL, split="sequences")
+
+
+def test_a_split_without_one_of_the_classes_is_left_out():
+    patches, labels = render_patches(24)
+    # All vehicles are alone in their folders: the split by sequences tests on the others only.
+    names = [f"{number}/1.png" if label else f"others/{number}.png" for number, label in enumerate(labels)]
+    _, report = train_and_judge(PatchSet(patches, labels, names), params=SMALL, seeds=1)
+    assert report.skipped["sequences"] == "one side of the split lacks a class; pass more patches"
+
+
+def test_reports_are_json(judged):
+    _, report = judged
+    plain = json.loads(json.dumps(report.to_dict()))
+    assert plain["accuracy"] == report.accuracy
+    assert plain["params"] == dataclasses.asdict(SMALL)
+    assert plain["splits"]["random"]["accuracies"] == list(report.splits["random"].accuracies)
+    assert plain["splits"]["sequences"]["accuracy"] == report.splits["sequences"].accuracy
+    assert (plain["features"], plain["balance"]) == (report.features, 0.5)
+    assert dataclasses.replace(report, params=FeatureParams.preset("lab-8460")).features == "lab-8460"
+
+
+def test_a_bar_shows_on_a_terminal_alone(patch_set, monkeypatch, capsys):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    train_and_judge(patch_set[::4], params=SMALL, seeds=1, progress=True)
+    assert capsys.readouterr().err == ""
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stderr", terminal)
+    train_and_judge(patch_set[::4], params=SMALL, seeds=1)
+    assert terminal.getvalue() == ""
+    train_and_judge(patch_set[::4], params=SMALL, seeds=1, progress=True)
+    assert "3/3" in terminal.getvalue()  # the two splits that these allow, and the model
+
+
+# --- the card ---
+
+
+def test_the_card_tells_data_licence_accuracy_and_limits(judged):
+    classifier, report = judged
+    other = dataclasses.replace(report, params=FeatureParams.preset("luv-2384"))
+    text = model_card(classifier, report, others=(other,), command="vehicle-detection train ...")
+    assert "```bash\nvehicle-detection train ...\n```" in text
+    assert "80 patches of vehicles and 80 of anything else (50.0% vehicles)" in text
+    assert "| KITTI_extracted | 40 |" in text
+    assert report.fingerprint in text
+    assert "CC BY-NC-SA 3.0" in text
+    assert "non-commercial" in text
+    for name, title in SPLITS.items():
+        score = report.splits[name]
+        assert f"| {title} | {score.train} | {score.test} | {score.accuracy:.4f} |" in text
+    assert "mean of 2 seeds" in text
+    assert "| luv-2384 | 2384 |" in text
+    assert "`Extras` holds crops of the road of the course's project video" in text
+    assert "`KITTI_extracted` are shuffled" in text
+    assert max(len(line) for line in text.splitlines() if not line.startswith("|")) <= 110
+    for version in classifier.metadata["versions"].values():
+        assert version in text
+
+
+def test_the_card_of_own_patches_says_nothing_of_the_course():
+    own = named(*render_patches(24), {True: ("mine", "mine"), False: ("other", "other")})
+    classifier, report = train_and_judge(own, params=SMALL, seeds=1, mirror=False)
+    text = model_card(classifier, report)
+    for word in ("GTI", "KITTI", "Extras", "CC BY", "```", "Other features"):
+        assert word not in text
+    assert "inherits the terms of the patches" in text
+    assert "without mirrored patches" in text
+    assert "mean of 1 seed." in text
+
+
+# --- bad input ---
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"C": 0}, "C must be a number, greater than 0"),
+        ({"split": "half"}, "split must be one of 'random', 'sequences'; got 'half'"),
+        ({"seeds": 0}, "seeds must be an integer from 1 to 1000; got 0"),
+        ({"random_state": -1}, "random_state must be an integer from 0"),
+        ({"random_state": 2**32 - 1}, "random_state must be an integer from 0 to 4294967291"),
+        ({"n_jobs": 0}, "n_jobs must be an integer from 1"),
+    ],
+)
+def test_bad_options_are_refused(patch_set, options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        train_and_judge(patch_set, params=SMALL, **options)
+
+
+def test_bad_patches_are_refused(patch_set):
+    with pytest.raises(
+        InvalidInputError, match=r"patch_set must be a PatchSet, got an array .* read one with"
+    ):
+        train_and_judge(patch_set.patches)
+    with pytest.raises(InvalidInputError, match="labels must hold both classes"):
+        train_and_judge(patch_set[patch_set.labels])
+    with pytest.raises(InvalidInputError, match="1 vehicles and 80 others are too few"):
+        train_and_judge(patch_set[79:])
+    tiny = PatchSet(np.zeros((12, 32, 32, 3), np.uint8), [1, 0] * 6, [f"{n}.png" for n in range(12)])
+    with pytest.raises(InvalidInputError, match=r"source must be an \(N, 64, 64, 3\) uint8 RGB array"):
+        train_and_judge(tiny, seeds=1)
+
+
+# --- the real patches ---
+
+
+@pytest.mark.realdata
+def test_a_part_of_the_course_patches(real_data):
+    everything = load_training_patches(real_data / "vehicles.zip", real_data / "non-vehicles.zip")
+    classifier, report = train_and_judge(
+        everything[::20], params=FeatureParams.preset("luv-2384"), seeds=2, split="sequences"
+    )
+    assert list(report.splits) == list(SPLITS)
+    assert report.vehicles + report.non_vehicles == 888
+    assert 0.90 < report.splits["random"].accuracy < 1
+    assert 0.90 < report.accuracy < 1
+    assert report.splits["gti_to_kitti"].accuracy > 0.7
+    # The patches that were left out, near-copies of those that were not.
+    assert classifier.score(everything.patches[7::40], everything.labels[7::40]) > 0.9

@@ -1,0 +1,140 @@
+"""The command that tries parameters: ``vehicle-detection tune``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from vehicle_detection._cli_output import check_apart, interruptible, print_table
+from vehicle_detection.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from vehicle_detection.tuning import LabelledFrames, ResultTable
+
+_FIGURES = (".png", ".svg", ".pdf")
+_SHOWN = 15
+
+
+def tune(
+    vehicles: Annotated[Path, typer.Option(metavar="PATH", help="Folder or zip of patches with a vehicle.")],
+    non_vehicles: Annotated[Path, typer.Option(metavar="PATH", help="Folder or zip of patches without one.")],
+    grid: Annotated[
+        str, typer.Option(metavar="GRID", help="Values to try: 'orient=8,9 color_space=YCrCb,LAB C=1e-4,1'.")
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="FILE.csv",
+            help="Table (.csv, .jsonl, .parquet). Rows are kept as they come: the same command goes on.",
+        ),
+    ],
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="Figure of accuracy against search time.")
+    ] = None,
+    split: Annotated[
+        str, typer.Option(metavar="sequences|groups|random", help="How patches are held back.")
+    ] = "sequences",
+    halving: Annotated[
+        bool, typer.Option("--halving", help="Drop the worse on few patches; measure the best in full.")
+    ] = False,
+    finalists: Annotated[int, typer.Option(metavar="N", help="How many of --halving.")] = 3,
+    frames: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Labelled frames to score each model on.")
+    ] = None,
+    labels: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="True boxes of --frames.")] = None,
+    horizon: Annotated[
+        float | None,
+        typer.Option(metavar="F", help="Height of the frames' horizon as a share, 0 at the top."),
+    ] = None,
+    seed: Annotated[int, typer.Option(metavar="N", help="Seed of splits and training.")] = 0,
+    cache: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder that keeps features for the next run.")
+    ] = None,
+) -> None:
+    """Try all combinations of a grid, and show which are best."""
+    from vehicle_detection._checks import check_choice
+    from vehicle_detection._files import check_target
+    from vehicle_detection.datasets import load_training_patches
+    from vehicle_detection.tuning import compare_configurations, expand_grid, parse_grid, search_parameters
+
+    values = parse_grid(grid)
+    check_choice(split, "--split", ("sequences", "groups", "random"))
+    targets = {"--out": check_target(out, "--out")}
+    if plot is not None:
+        targets["--plot"] = check_target(plot, "--plot")
+    for name, path, known in (("--out", out, (".csv", ".jsonl", ".parquet")), ("--plot", plot, _FIGURES)):
+        if path is not None and path.suffix.lower() not in known:
+            raise InvalidInputError(f"{name} must end in {' or '.join(known)}; got {path.name!r}")
+    check_apart(targets, {"--vehicles": vehicles, "--non-vehicles": non_vehicles})
+    labelled = _read_frames(frames, labels, horizon)
+    whole = out.suffix.lower() == ".parquet"  # Parquet takes no single rows: they are kept beside it.
+    options: dict[str, Any] = {"store": out.with_suffix(".jsonl") if whole else out}
+    options |= {"frames": labelled, "cache": cache, "progress": True}
+
+    def work() -> ResultTable:
+        patches = load_training_patches(vehicles, non_vehicles, progress=sys.stderr.isatty())
+        if halving:
+            return search_parameters(
+                patches, values, split=split, finalists=finalists, random_state=seed, **options
+            )
+        return compare_configurations(patches, expand_grid(values), splits=split, seeds=(seed,), **options)
+
+    table = interruptible(work)
+    if whole:
+        table.write(out)
+    final = table.where(stage="final" if halving else "compare")
+    _show(final, table)
+    if plot is not None:
+        _draw(final, plot)
+    typer.echo(f"wrote {', '.join(map(str, targets.values()))}")
+
+
+def _read_frames(frames: Path | None, labels: Path | None, horizon: float | None) -> LabelledFrames | None:
+    if frames is None and labels is None:
+        return None
+    if frames is None or labels is None:
+        raise InvalidInputError("--frames and --labels go together; name both")
+    from vehicle_detection.datasets import load_frames
+    from vehicle_detection.evaluation import read_labels
+    from vehicle_detection.tuning import LabelledFrames
+
+    return LabelledFrames(frames.name or "frames", load_frames(frames), read_labels(labels), horizon)
+
+
+def _show(final: ResultTable, table: ResultTable) -> None:
+    """Print the best rows, those of the best front with a star, and what could not be tried."""
+    measured = [row for row in final.sort("accuracy") if row["accuracy"] is not None] if len(final) else []
+    front = {row["trial"] for row in final.front()}
+    heads = ["", "configuration", "C", "accuracy", "training", "search ms"]
+    scored = any(row["frame_f1"] is not None for row in measured)
+    rows = []
+    for row in measured[:_SHOWN]:
+        cells = ["*" * (row["trial"] in front), row["configuration"], f"{row['C']:g}"]
+        cells += [_text(row[name], 4) for name in ("accuracy", "train_accuracy")]
+        cells += [_text(row["search_ms"], 1)]
+        rows.append(cells + ([_text(row["frame_f1"], 3), _text(row["frame_best_f1"], 3)] if scored else []))
+    heads += ["frames F1", "at best"] if scored else []
+    title = f"{len(measured)} measured; * nothing is both more accurate and faster"
+    print_table(title, heads, rows)
+    faults = {row["configuration"]: f"{row['status']}: {row['message']}" for row in table if row["message"]}
+    for name, fault in faults.items():
+        typer.echo(f"{name} {fault}")
+
+
+def _text(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
+
+
+def _draw(table: ResultTable, path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    from vehicle_detection._files import written_whole
+    from vehicle_detection.plotting import plot_tradeoff
+
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    plot_tradeoff(table, ax=figure.subplots())
+    with written_whole(path) as part:
+        figure.savefig(part)
