@@ -23,7 +23,7 @@ from vehicle_detection._demo import FILES, SHEET, draw_clip
 from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import VehicleClassifier, load_classifier
 from vehicle_detection.cli import app
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.synthetic import render_drive, render_patches
 from vehicle_detection.video import probe_video
@@ -627,7 +627,16 @@ def test_fetch_tells_where_the_patches_are(monkeypatch, tmp_path):
 
 
 def test_fetch_refuses_a_file_as_its_folder(picture):
-    assert re.search(r"to must be a folder|needs an existing folder", refuse("fetch", "--to", picture))
+    assert "--to must be a folder" in refuse("fetch", "--to", picture)
+
+
+def test_fetch_that_fails_leaves_no_folder(monkeypatch, tmp_path):
+    def fail(to, progress):
+        raise DatasetError("the server cannot\nbe reached")
+
+    monkeypatch.setattr(datasets, "fetch_patches", fail)
+    assert refuse("fetch", "--to", tmp_path / "new") == "error: the server cannot be reached\n"
+    assert contents(tmp_path) == []
 
 
 def test_info_of_the_shipped_model():
@@ -636,6 +645,12 @@ def test_info_of_the_shipped_model():
     assert out.startswith(f"shipped model: {model.params.length} features, 1 template\n")
     assert re.search(rf"color_space +{model.params.color_space}\s", out)
     assert re.search(r"numpy +\d", out)
+
+
+def test_info_of_a_model_with_other_metadata(tmp_path):
+    model, path = load_classifier(), tmp_path / "m.safetensors"
+    VehicleClassifier(model.params, model.templates, {"metrics": 0.5, "by": "hand", "n": {"a": 1}}).save(path)
+    assert succeed("info", path).endswith("by\n    hand\nmetrics\n    0.5\nn\n  a  1\n")
 
 
 # --- helpers ---

@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vehicle_detection._cli_output import check_apart, codec_messages, interruptible, output_folder, print_facts, print_table
+from vehicle_detection._cli_output import (
+    check_apart,
+    codec_messages,
+    interruptible,
+    output_folder,
+    print_facts,
+    print_table,
+)
 
 if TYPE_CHECKING:
     from vehicle_detection.training import TrainingReport
@@ -132,21 +139,20 @@ def info(
     from vehicle_detection.training import SPLITS
 
     classifier = load_classifier(model)
-    facts = dict(classifier.metadata)
-    metrics = facts.pop("metrics", {})
-    params = classifier.params
-    count = len(classifier.templates)
+    params, count = classifier.params, len(classifier.templates)
     print_facts(
         f"{model or 'shipped model'}: {params.length} features, {count} template{'s' * (count > 1)}",
         dataclasses.asdict(params),
     )
-    if metrics.get("splits"):
-        names = [name for name in SPLITS if name in metrics["splits"]]
-        columns = ("accuracy", "missed", "false", "near_copies", "test")
-        rows = [
-            (SPLITS[name], *(str(metrics["splits"][name].get(column, "")) for column in columns))
-            for name in names
-        ]
-        print_table("metrics", ("tested on", *(column.replace("_", " ") for column in columns)), rows)
-    for name, values in facts.items():
-        print_facts(name, values if isinstance(values, dict) else {"": values})
+    for name, values in classifier.metadata.items():
+        scores = values.get("splits") if isinstance(values, dict) else None
+        if name == "metrics" and isinstance(scores, dict) and scores.keys() <= SPLITS.keys():
+            columns = ("accuracy", "missed", "false", "near_copies", "test")
+            rows = [
+                (title, *(str(scores[split].get(column, "")) for column in columns))
+                for split, title in SPLITS.items()
+                if split in scores
+            ]
+            print_table(name, ("tested on", *(column.replace("_", " ") for column in columns)), rows)
+        else:  # a model that was not trained by this command line tells what it likes
+            print_facts(name, values if isinstance(values, dict) else {"": values})
