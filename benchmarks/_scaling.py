@@ -142,9 +142,10 @@ _KERNELS = {
     "normalise_blocks": "blocks",
     "histogram_cells": "histogram",
     "spatial_cells": "spatial bins",
+    "multiply": "product",
     "sum_shifted": "sums",
 }
-_MODULES = {"cv2": {"resize": "spatial bins"}, "np": {"dot": "product", "matmul": "product"}}
+_MODULES = {"cv2": {"resize": "spatial bins"}}
 _FUNCTIONS = {"resize_band": "resize", "_convert": "colour", "_hits": "hits"}
 
 

@@ -1,13 +1,11 @@
-"""How many threads work, and how BLAS and OpenCV are kept from starting their own beside them."""
+"""How many threads work, and how OpenCV is kept from starting its own beside them."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from collections.abc import Iterator
 
 import cv2
 
@@ -36,22 +34,20 @@ def resolve_jobs(n_jobs: int | None = None) -> int:
     return int(text)
 
 
-class _SingleThreadedLibraries:
-    """Holds BLAS and OpenCV at one thread while anybody is inside, whichever threads come and go."""
+class _SingleThreadedOpenCV:
+    """Holds OpenCV at one thread while anybody is inside, whichever threads come and go."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._inside = 0
-        self._controller: Any = None
-        self._limits: Any = None
-        self._opencv_threads = 0
-        self._keeper: ThreadPoolExecutor | None = None
+        self._threads = 1
 
     @contextlib.contextmanager
     def __call__(self) -> Iterator[None]:
         with self._lock:
             if self._inside == 0:
-                self._keep(self._limit)
+                self._threads = cv2.getNumThreads()
+                cv2.setNumThreads(1)
             self._inside += 1
         try:
             yield
@@ -59,36 +55,10 @@ class _SingleThreadedLibraries:
             with self._lock:
                 self._inside -= 1
                 if self._inside == 0:
-                    self._keep(self._lift)
-
-    def _keep(self, function: Callable[[], None]) -> None:
-        """Call `function` on a thread of our own: only the thread that set a limit can lift it."""
-        self._keeper = self._keeper or ThreadPoolExecutor(1, thread_name_prefix="blas")
-        try:
-            job = self._keeper.submit(function)
-        except RuntimeError:  # The interpreter is ending: limits do not matter any more.
-            return
-        job.result()
-
-    def _limit(self) -> None:
-        from threadpoolctl import ThreadpoolController
-
-        # Looking for the loaded BLAS libraries takes a millisecond: once is enough.
-        self._controller = self._controller or ThreadpoolController()
-        # An interrupt may have kept an earlier limit from being lifted.
-        if self._limits is None:
-            self._limits = self._controller.limit(limits=1, user_api="blas").__enter__()
-            self._opencv_threads = cv2.getNumThreads()
-            cv2.setNumThreads(1)
-
-    def _lift(self) -> None:
-        if self._limits is not None:
-            self._limits.__exit__(None, None, None)
-            self._limits = None
-            cv2.setNumThreads(self._opencv_threads)
+                    cv2.setNumThreads(self._threads)
 
 
-single_threaded_libraries = _SingleThreadedLibraries()
+single_threaded_opencv = _SingleThreadedOpenCV()
 if hasattr(os, "register_at_fork"):
-    # Threads do not survive a fork: the child needs a keeper of its own.
-    os.register_at_fork(after_in_child=single_threaded_libraries.__init__)  # type: ignore[misc]
+    # Threads do not survive a fork: nobody is inside in the child.
+    os.register_at_fork(after_in_child=single_threaded_opencv.__init__)  # type: ignore[misc]

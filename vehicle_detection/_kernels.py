@@ -28,6 +28,9 @@ def _jit(function: Callable[..., None]) -> Callable[..., None]:
 # A tile of gradients and its histograms (10 rows of floats) stays in the first-level cache.
 _TILE = 768
 
+# Four rows of planes and of products, this many columns of them, stay in it too.
+_PRODUCT_TILE = 512
+
 
 @_jit
 def hog_cells(image, channels, cell, cosines, sines, cells):
@@ -280,6 +283,48 @@ def spatial_cells(bins, per_cell, cells):
                     out = cells[channel, i, j, y]
                     for x in range(columns):
                         out[x] = line[x * per_cell + j, channel]
+
+
+@_jit
+def multiply(weights, planes, products):
+    """Multiply matrices: ``products = weights @ planes``, as fast as BLAS and without its threads.
+
+    Four rows of either side are worked on at once, so that a value that is loaded is used four times.
+
+    Parameters
+    ----------
+    weights
+        ``(P, K)`` float32, `P` and `K` multiples of four.
+    planes
+        ``(K, N)`` float32.
+    products
+        Output, ``(P, N)`` float32.
+    """
+    rows, depth = weights.shape
+    for start in range(0, planes.shape[1], _PRODUCT_TILE):
+        stop = min(start + _PRODUCT_TILE, planes.shape[1])
+        for p in range(0, rows, 4):
+            w = weights[p : p + 4]
+            a0 = products[p, start:stop]
+            a1 = products[p + 1, start:stop]
+            a2 = products[p + 2, start:stop]
+            a3 = products[p + 3, start:stop]
+            products[p : p + 4, start:stop] = np.float32(0)
+            for k in range(0, depth, 4):
+                b0 = planes[k, start:stop]
+                b1 = planes[k + 1, start:stop]
+                b2 = planes[k + 2, start:stop]
+                b3 = planes[k + 3, start:stop]
+                w00, w01, w02, w03 = w[0, k], w[0, k + 1], w[0, k + 2], w[0, k + 3]
+                w10, w11, w12, w13 = w[1, k], w[1, k + 1], w[1, k + 2], w[1, k + 3]
+                w20, w21, w22, w23 = w[2, k], w[2, k + 1], w[2, k + 2], w[2, k + 3]
+                w30, w31, w32, w33 = w[3, k], w[3, k + 1], w[3, k + 2], w[3, k + 3]
+                for i in range(stop - start):
+                    x0, x1, x2, x3 = b0[i], b1[i], b2[i], b3[i]
+                    a0[i] += w00 * x0 + w01 * x1 + w02 * x2 + w03 * x3
+                    a1[i] += w10 * x0 + w11 * x1 + w12 * x2 + w13 * x3
+                    a2[i] += w20 * x0 + w21 * x1 + w22 * x2 + w23 * x3
+                    a3[i] += w30 * x0 + w31 * x1 + w32 * x2 + w33 * x3
 
 
 @_jit

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection import _kernels
 from vehicle_detection._checks import check_image, check_number, check_type
-from vehicle_detection._jobs import resolve_jobs, single_threaded_libraries
+from vehicle_detection._jobs import resolve_jobs, single_threaded_opencv
 from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import CLASSIFIER_REMEDY, Template, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
@@ -147,12 +147,12 @@ class BandSearch:
     ) -> list[Detections]:
         """Apply `function` to the bands, the costly ones first so that the threads end together."""
         if self._jobs == 1 or len(bands) == 1:
-            with single_threaded_libraries():
+            with single_threaded_opencv():
                 return [function(band) for band in bands]
         with self._opening:
             pool = self._pool = self._pool or ThreadPoolExecutor(self._jobs, thread_name_prefix="search")
         order = sorted(range(len(bands)), key=lambda i: -_cost(bands[i]))
-        with single_threaded_libraries():
+        with single_threaded_opencv():
             found = list(pool.map(function, [bands[i] for i in order]))
         return [part for _, part in sorted(zip(order, found), key=lambda pair: pair[0])]
 
@@ -228,6 +228,11 @@ class _Buffers:
         return array[:size].reshape(shape)
 
 
+def _padded(count: int) -> int:
+    """Round up to a multiple of four, as `multiply` asks for."""
+    return -(-count // 4) * 4
+
+
 class _Filters:
     """The folded weights of a classifier, laid out as filters over planes of cells."""
 
@@ -239,7 +244,8 @@ class _Filters:
         self.per_cell = params.spatial_size // params.cells
         self.hog_planes = params.hog_channels * self.block**2 * params.orient if params.hog_feat else 0
         self.spatial_planes = 3 * self.per_cell**2 if params.spatial_feat else 0
-        self.planes = self.hog_planes + self.spatial_planes + int(params.hist_feat)
+        self.used = self.hog_planes + self.spatial_planes + int(params.hist_feat)
+        self.planes = _padded(self.used)
         self.cosines, self.sines = orientation_bounds(params.orient)
         self.bounds = degree_bounds(params.orient)
         laid_out = [self._lay_out(template) for template in classifier.templates]
@@ -262,27 +268,30 @@ class _Filters:
             start = params.spatial_length
             part = weights[start : start + params.hist_length].reshape(3, params.hist_bins)
             table[:] = part[:, bin_of_value(params.hist_bins)]
-            filters[..., -1] = 1
+            filters[..., self.used - 1] = 1
         if params.hog_feat:
             blocks = params.blocks
             part = weights[params.length - params.hog_length :]
             part = part.reshape(params.hog_channels, blocks, blocks, -1)
             planes = part.transpose(1, 2, 0, 3).reshape(blocks, blocks, -1)
             filters[:blocks, :blocks, : self.hog_planes] = planes
-        return filters.reshape(cells * cells, -1).astype(np.float32), table, bias
+        rows = np.zeros((_padded(cells * cells), self.planes), np.float32)
+        rows[: cells * cells] = filters.reshape(cells * cells, -1)
+        return rows, table, bias
 
     def score_map(self, band: NDArray[np.uint8], take: Take) -> NDArray[np.float32]:
         """Scores of all windows of a resized band, ``(rows, columns)`` float32, as a new array."""
         cell = self.params.pix_per_cell
         rows, columns = band.shape[0] // cell, band.shape[1] // cell
         planes = take((self.planes, rows, columns), np.float32, "planes")
+        planes[self.used :] = 0
         converted = self._fill_planes(band, planes, take)
         best: NDArray[np.float32] | None = None
         for weights, table, bias in zip(self.weights, self.tables, self.biases):
             if self.params.hist_feat:
-                _kernels.histogram_cells(converted, table, cell, planes[-1])
+                _kernels.histogram_cells(converted, table, cell, planes[self.used - 1])
             products = take((len(weights), rows * columns), np.float32, "products")
-            np.dot(weights, planes.reshape(self.planes, -1), out=products)
+            _kernels.multiply(weights, planes.reshape(self.planes, -1), products)
             scores = np.empty((rows - self.cells + 1, columns - self.cells + 1), np.float32)
             stacked = products.reshape(-1, rows, columns)
             _kernels.sum_shifted(stacked, self.cells, self.cells, bias, scores)

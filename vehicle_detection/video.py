@@ -22,7 +22,7 @@ from typing import Any
 from vehicle_detection._checks import check_choice, check_integer, check_number, describe
 from vehicle_detection._ffmpeg import VideoInfo, probe
 from vehicle_detection._files import check_target, written_whole
-from vehicle_detection._jobs import single_threaded_libraries
+from vehicle_detection._jobs import single_threaded_opencv
 from vehicle_detection._pipeline import Line, SupportsFrames
 from vehicle_detection._streams import CONTAINERS, AudioSource, FrameReader, FrameWriter
 from vehicle_detection.errors import InvalidInputError
@@ -275,7 +275,7 @@ def process_video(
     total = count or max(info.frames - first, 0) or None
     # The line's own threads keep the cores busy: more of them would only get into each other's way.
     with (
-        single_threaded_libraries(),
+        single_threaded_opencv(),
         _progress_bar(progress, total) as bar,
         contextlib.closing(line.run()) as results,
     ):
