@@ -73,9 +73,12 @@ def hog_cells(image, channels, cell, cosines, sines, cells):
             n = count * span
             sums[:] = zero
             for y in range(row * cell, (row + 1) * cell):
-                # Where the tile touches the array's border, there is no neighbour: the gradient is zero.
+                # At the array's border there is no neighbour on one side: the gradient is zero.
                 low = channels if start == 0 else 0
                 high = n - channels if start + n == width else n
+                inside = 0 < y < height - 1
+                above = image[y - 1 if inside else y, start : start + n]
+                below = image[y + 1 if inside else y, start : start + n]
                 left = image[y, start + low - channels : start + high - channels]
                 right = image[y, start + low + channels : start + high + channels]
                 gx[:low] = zero
@@ -83,16 +86,9 @@ def hog_cells(image, channels, cell, cosines, sines, cells):
                 inner = gx[low:high]
                 for i in range(high - low):
                     inner[i] = np.float32(right[i]) - np.float32(left[i])
-                if y == 0 or y == height - 1:
-                    gy[:n] = zero
-                else:
-                    above = image[y - 1, start : start + n]
-                    below = image[y + 1, start : start + n]
-                    for i in range(n):
-                        gy[i] = np.float32(below[i]) - np.float32(above[i])
                 for i in range(n):
-                    vertical = gy[i]
                     horizontal = gx[i]
+                    vertical = np.float32(below[i]) - np.float32(above[i])
                     magnitude[i] = np.sqrt(horizontal * horizontal + vertical * vertical)
                     # Fold the sign so that 0 <= angle < 180: gy > 0, or gy == 0 and gx >= 0.
                     folded = horizontal if vertical > zero else -horizontal
@@ -101,13 +97,22 @@ def hog_cells(image, channels, cell, cosines, sines, cells):
                 total = sums[0]
                 for i in range(n):
                     total[i] += magnitude[i]
-                for k in range(1, orient):
-                    cosine = cosines[k]
-                    sine = sines[k]
-                    total = sums[k]
+                # Four bounds at a time: a gradient that is loaded is compared four times.
+                single = 1 + (orient - 1) // 4 * 4
+                for k in range(1, single, 4):
+                    c0, c1, c2, c3 = cosines[k], cosines[k + 1], cosines[k + 2], cosines[k + 3]
+                    s0, s1, s2, s3 = sines[k], sines[k + 1], sines[k + 2], sines[k + 3]
+                    t0, t1, t2, t3 = sums[k], sums[k + 1], sums[k + 2], sums[k + 3]
                     for i in range(n):
-                        past = gy[i] * cosine - gx[i] * sine >= zero
-                        total[i] += magnitude[i] if past else zero
+                        x, v, m = gx[i], gy[i], magnitude[i]
+                        t0[i] += m if v * c0 - x * s0 >= zero else zero
+                        t1[i] += m if v * c1 - x * s1 >= zero else zero
+                        t2[i] += m if v * c2 - x * s2 >= zero else zero
+                        t3[i] += m if v * c3 - x * s3 >= zero else zero
+                for k in range(single, orient):
+                    c0, s0, t0 = cosines[k], sines[k], sums[k]
+                    for i in range(n):
+                        t0[i] += magnitude[i] if gy[i] * c0 - gx[i] * s0 >= zero else zero
             # Sum each cell's columns for all values at once; those at a cell's first column are wanted.
             reach = n - (cell - 1) * channels
             for k in range(orient):
