@@ -28,7 +28,7 @@ from vehicle_detection.images import read_image, write_image
 from vehicle_detection.synthetic import render_drive, render_patches
 from vehicle_detection.video import probe_video
 
-COMMANDS = ("demo", "detect", "video", "evaluate", "train", "fetch", "info")
+COMMANDS = ("demo", "detect", "video", "evaluate", "train", "tune", "fetch", "info")
 ROOT = Path(__file__).parents[1]
 HEADER = "frame,track_id,x1,y1,x2,y2,score"
 

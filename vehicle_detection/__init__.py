@@ -64,10 +64,21 @@ if TYPE_CHECKING:
         SearchParams,
         TrackParams,
     )
+    from vehicle_detection.plotting import plot_tradeoff
     from vehicle_detection.regions import find_vehicles, fit_boxes, group_windows
     from vehicle_detection.search import find_cars
     from vehicle_detection.synthetic import render_drive, render_patches, render_scene
     from vehicle_detection.tracking import Track, Tracker
+    from vehicle_detection.training import train_and_judge
+    from vehicle_detection.tuning import (
+        LabelledFrames,
+        ResultTable,
+        calibrate_scores,
+        compare_configurations,
+        mine_negatives,
+        read_results,
+        search_parameters,
+    )
     from vehicle_detection.video import VideoReport, probe_video, process_video, read_frames
     from vehicle_detection.windows import search_windows, slide_window
 
@@ -80,9 +91,11 @@ __all__ = [
     "HeatHistory",
     "HeatParams",
     "InvalidInputError",
+    "LabelledFrames",
     "ModelFileError",
     "PatchFeatures",
     "RegionParams",
+    "ResultTable",
     "SearchBand",
     "SearchParams",
     "Track",
@@ -98,9 +111,11 @@ __all__ = [
     "apply_threshold",
     "bin_spatial",
     "bounding_boxes",
+    "calibrate_scores",
     "calibration_error",
     "clip_boxes",
     "color_hist",
+    "compare_configurations",
     "convert_color",
     "draw_boxes",
     "draw_diagnostics",
@@ -124,16 +139,20 @@ __all__ = [
     "load_frames",
     "load_patches",
     "load_training_patches",
+    "mine_negatives",
     "non_max_suppression",
+    "plot_tradeoff",
     "precision_recall_curve",
     "probe_video",
     "process_video",
     "read_frames",
     "read_image",
     "read_labels",
+    "read_results",
     "render_drive",
     "render_patches",
     "render_scene",
+    "search_parameters",
     "search_windows",
     "single_img_features",
     "slide_window",
@@ -142,6 +161,7 @@ __all__ = [
     "split_random",
     "split_sequences",
     "split_sources",
+    "train_and_judge",
     "train_classifier",
     "write_boxes",
     "write_image",
@@ -149,6 +169,17 @@ __all__ = [
 ]
 
 _ROOMS = {
+    "tuning": (
+        "LabelledFrames",
+        "ResultTable",
+        "calibrate_scores",
+        "compare_configurations",
+        "mine_negatives",
+        "read_results",
+        "search_parameters",
+    ),
+    "plotting": ("plot_tradeoff",),
+    "training": ("train_and_judge",),
     "errors": ("DatasetError", "InvalidInputError", "ModelFileError", "VehicleDetectionError", "VideoError"),
     "params": (
         "FeatureParams",
