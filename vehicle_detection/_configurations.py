@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from vehicle_detection._checks import describe
+from vehicle_detection._result_table import number_or_text
 from vehicle_detection._trials import FEATURE_FIELDS, TRAINING_FIELDS, Recipe
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import FeatureParams
@@ -125,12 +126,7 @@ def parse_grid(text: str) -> dict[str, list[Any]]:
 def _parse_value(text: str) -> Any:
     if text.lower() in _WORDS:
         return _WORDS[text.lower()]
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            pass
-    return text
+    return number_or_text(text)
 
 
 def _check_names(options: Mapping[str, Any], name: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
@@ -338,12 +339,15 @@ def _parse_cell(name: str, cell: str) -> Cell:
         return cell or None
     if cell in _WORDS:
         return _WORDS[cell]
+    return number_or_text(cell)
+
+
+def number_or_text(text: str) -> int | float | str:
+    """Read a text as a whole number, else as a number, else leave it as it is."""
     for kind in (int, float):
-        try:
-            return kind(cell)
-        except ValueError:
-            pass
-    return cell
+        with contextlib.suppress(ValueError):
+            return kind(text)
+    return text
 
 
 def _write_parquet(table: ResultTable, path: str | os.PathLike[str]) -> None:
