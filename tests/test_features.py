@@ -27,7 +27,7 @@ from vehicle_detection.features import (
     get_hog_features,
     hog_blocks,
     hog_picture,
-    orientation_bounds,
+    orientation_cotangents,
     single_img_features,
     sqrt_gradients,
 )
@@ -213,12 +213,13 @@ def test_every_uint8_gradient_falls_into_the_references_bin(orient):
     some = (gx != 0) | (gy != 0)
     gx, gy = gx[some], gy[some]
     expected = reference_bins(gx, gy, orient)
-    folded = np.where(gy > 0, gx, np.where(gy < 0, -gx, np.abs(gx))).astype(np.float32)
-    vertical = np.abs(gy).astype(np.float32)
-    cosines, sines = orientation_bounds(orient)
+    horizontal, vertical = gx.astype(np.float32), gy.astype(np.float32)
+    infinite = np.full(gx.shape, np.inf, np.float32)
+    quotient = np.divide(horizontal, vertical, out=infinite, where=vertical != 0)
+    cotangents = orientation_cotangents(orient)
     found = np.zeros(gx.shape, int)
     for k in range(1, orient):
-        past = vertical * cosines[k] - folded * sines[k] >= np.float32(0)
+        past = quotient <= cotangents[k]
         found[past] = k
         # The kernel's sums are cumulative: what is past a bound is past those before it as well.
         assert not (past & (expected < k)).any()
@@ -231,11 +232,11 @@ def test_the_kernel_puts_every_uint8_gradient_into_the_references_bin(orient):
     image, gx, gy = all_gradients()
     expected = reference_bins(gx, gy, orient)
     length = np.hypot(gx, gy)
-    cosines, sines = orientation_bounds(orient)
+    cotangents = orientation_cotangents(orient)
     for start in range(0, 511, 73):
         tiles = np.ascontiguousarray(image[start : start + 73].reshape(73 * 3, 511 * 3))
         cells = np.empty((1, orient, *tiles.shape), np.float32)
-        _kernels.hog_cells(tiles, 1, 1, cosines, sines, cells)
+        _kernels.hog_cells(tiles, 1, 1, cotangents, cells)
         middles = cells[0, :, 1::3, 1::3]
         rows = slice(start, start + 73)
         np.testing.assert_allclose(middles.sum(axis=0), length[rows], rtol=1e-6)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vehicle_detection._jobs import JOBS_VARIABLE, available_cores, resolve_jobs, single_threaded_opencv
+from vehicle_detection._jobs import JOBS_VARIABLE, Crew, available_cores, resolve_jobs, single_threaded_opencv
 from vehicle_detection.errors import InvalidInputError
 
 
@@ -99,3 +99,70 @@ def test_opencv_is_restored_after_many_threads_come_and_go():
     for thread in threads:
         thread.join()
     assert cv2.getNumThreads() == 3
+
+
+# --- sharing work ---
+
+
+@pytest.mark.parametrize("jobs", [1, 2, 5])
+@pytest.mark.parametrize("count", [0, 1, 2, 17])
+def test_a_crew_returns_results_in_the_items_order(jobs, count):
+    crew = Crew(jobs, name="crew")
+    try:
+        assert crew.map(lambda item: item * 10, range(count), cost=float) == [10 * n for n in range(count)]
+    finally:
+        crew.close()
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("crew")]
+
+
+def test_a_crew_takes_the_costly_items_first():
+    taken = []
+    Crew(1, name="crew").map(taken.append, [3, 9, 1, 5], cost=float)
+    assert taken == [9, 5, 3, 1]
+
+
+def test_a_crew_works_on_all_threads():
+    together = threading.Barrier(3)
+    crew = Crew(3, name="crew")
+    names = crew.map(lambda _: (together.wait(10), threading.current_thread().name)[1], range(3), cost=float)
+    crew.close()
+    assert len(set(names)) == 3
+    assert threading.current_thread().name in names
+
+
+@pytest.mark.parametrize("failing", [0, 3, 6])
+def test_an_error_of_one_item_is_the_crews(failing):
+    crew = Crew(2, name="crew")
+
+    def work(item):
+        if item == failing:
+            raise ZeroDivisionError(item)
+        return item
+
+    with pytest.raises(ZeroDivisionError, match=str(failing)):
+        crew.map(work, range(7), cost=float)
+    assert crew.map(abs, [-1, -2], cost=float) == [1, 2]
+    crew.close()
+
+
+def test_callers_beside_each_other_work_alone():
+    crew = Crew(2, name="crew")
+    inside = threading.Barrier(2)
+    names = {}
+
+    def call(caller):
+        def work(item):
+            if item == 0:
+                inside.wait(10)  # both callers are at work
+            return threading.current_thread().name
+
+        # The first item is the costly one: whoever came second has no helper.
+        names[caller] = crew.map(work, range(4), cost=lambda item: -item)
+
+    callers = [threading.Thread(target=call, args=(n,), name=f"caller-{n}") for n in range(2)]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join()
+    crew.close()
+    assert any(set(names[n]) == {f"caller-{n}"} for n in range(2))

@@ -263,7 +263,7 @@ def test_many_threads_share_one_search(monkeypatch):
             time.sleep(0.02)
             super().__init__(*arguments, **options)
 
-    monkeypatch.setattr("vehicle_detection.search.ThreadPoolExecutor", SlowToOpen)
+    monkeypatch.setattr("vehicle_detection._jobs.ThreadPoolExecutor", SlowToOpen)
     classifier = random_classifier(SMALL)
     search = small_search()
     images = [textured(220, 330, seed) for seed in range(8)]

@@ -22,7 +22,6 @@ from moviepy import VideoFileClip
 from moviepy.config import FFMPEG_BINARY
 
 from vehicle_detection import _ffmpeg, video
-from vehicle_detection._streams import _to_planes
 from vehicle_detection.errors import InvalidInputError, VideoError
 from vehicle_detection.video import VideoReport, probe_video, process_video, read_frames
 
@@ -210,7 +209,7 @@ def test_anamorphic_pixels_are_kept(folder):
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # moviepy leaves pipes open
-def test_frames_equal_those_of_moviepy(folder):
+def test_frames_equal_those_of_moviepy_but_for_its_rounding(folder):
     path = folder / "pattern.mp4"
     ffmpeg("-f", "lavfi", "-i", "testsrc2=s=160x90:r=25", "-frames:v", 12, "-pix_fmt", "yuv420p", path)
     with VideoFileClip(str(path), audio=False) as moviepy_clip, read_frames(path) as frames:
@@ -218,7 +217,10 @@ def test_frames_equal_those_of_moviepy(folder):
             assert seconds == index / 25
             assert frame.flags.owndata
             assert frame.flags.writeable
-            np.testing.assert_array_equal(frame, reference)
+            # moviepy's ffmpeg rounds down, and a step in luma and two in chroma add up.
+            difference = frame.astype(int) - reference
+            assert np.abs(difference).max() <= 4
+            assert -1 <= difference.mean() <= 2
 
 
 @settings(max_examples=12)
@@ -379,6 +381,32 @@ def test_odd_sizes_grow_by_one_pixel(tmp_path, width, height):
     assert np.abs(frame[8:, -1].astype(int) - (200, 120, 40)).max() < 10
 
 
+@pytest.mark.parametrize(
+    ("pixels", "space", "range_"),
+    [
+        ("yuv420p", "bt709", "tv"),
+        ("yuv420p", "smpte170m", "tv"),
+        ("yuv420p", "bt2020nc", "tv"),
+        ("yuvj420p", "bt709", "pc"),
+        ("yuv444p", "bt709", "tv"),
+        ("yuv420p", "smpte240m", "tv"),
+    ],
+)
+def test_frames_have_the_colours_that_ffmpeg_sees(tmp_path, pixels, space, range_):
+    # Smooth, so that a chroma value that is spread in another way changes nothing.
+    y, x = np.mgrid[:96, :128]
+    picture = np.stack([60 + x, 40 + 2 * y, 250 - x - y // 2], axis=2).astype(np.uint8)
+    matrix = f"scale=out_color_matrix={space}:out_range={range_},format={pixels}"
+    tags = ["-pix_fmt", pixels, "-colorspace", space, "-color_range", range_]
+    source = write_clip(tmp_path / "in.mp4", [picture] * 2, options=["-vf", matrix, *tags])
+    with read_frames(source) as frames:
+        found = [frame for _, _, frame in frames]
+    decoded = ffmpeg("-i", source, "-frames:v", 1, "-pix_fmt", "rgb24", "-f", "rawvideo", "-")
+    expected = np.frombuffer(decoded, np.uint8).reshape(picture.shape)
+    assert np.abs(found[0].astype(int) - expected).max() <= 4
+    assert np.abs(found[0].astype(int) - picture).mean() < 3
+
+
 def test_colours_survive(tmp_path):
     # Another matrix than the one that the file names would be off by 15 and more.
     colours = [(220, 40, 40), (40, 200, 40), (40, 40, 220), (230, 230, 30), (128, 128, 128)]
@@ -462,31 +490,6 @@ def test_a_report_without_frames_divides_by_nothing():
     )
     assert report.shares == {"draw": 0.0}
     assert "1 vehicle" in str(report)
-
-
-@given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 255), st.integers(0, 255), st.integers(0, 255))
-def test_planes_hold_the_colour_of_video(half_height, half_width, red, green, blue):
-    planes = np.empty((half_height * 3, half_width * 2), np.uint8)
-    _to_planes(np.full((half_height * 2, half_width * 2, 3), (red, green, blue), np.uint8), planes)
-    luma = 0.299 * red + 0.587 * green + 0.114 * blue
-    expected = (
-        16 + 219 / 255 * luma,
-        128 + 224 / 255 * (blue - luma) / 1.772,
-        128 + 224 / 255 * (red - luma) / 1.402,
-    )
-    count = half_height * half_width
-    values = planes.reshape(-1)
-    for plane, level in zip(np.split(values, [4 * count, 5 * count]), expected, strict=True):
-        assert np.abs(plane - level).max() <= 1.5  # two roundings
-
-
-def test_thin_lines_keep_their_colour(tmp_path):
-    # OpenCV's own conversion would see either red or black in every other column.
-    lines = np.zeros((16, 16, 3), np.uint8)
-    lines[:, 1::2] = (255, 0, 0)
-    planes = np.empty((24, 16), np.uint8)
-    _to_planes(lines, planes)
-    assert planes[16:].reshape(2, 8, 8)[1].mean() == pytest.approx(128 + 112 / 2, abs=1.5)
 
 
 # --- errors on the way ---

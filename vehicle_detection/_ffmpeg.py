@@ -16,11 +16,12 @@ import threading
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import IO, Any
 
+from vehicle_detection._planes import Coding
 from vehicle_detection.errors import VideoError
 
 PIPE_SIZE = 1 << 18
@@ -49,6 +50,10 @@ class VideoInfo:
         Second at which the first frame is shown, where the sound starts earlier; else 0.0.
     pixel_aspect
         Width over height of a pixel; 1 but for anamorphic video.
+    pixel_format
+        ffmpeg's name of how pixels are stored, as ``"yuv420p"``; empty where it is not known.
+    coding
+        How the numbers of a pixel mean colours.
     audio_track, audio_codec
         Number among the audio tracks, and codec (``"aac"``), of the first that can be decoded; else None.
     """
@@ -62,6 +67,8 @@ class VideoInfo:
     constant_rate: bool = True
     first_time: float = 0.0
     pixel_aspect: Fraction = Fraction(1)
+    pixel_format: str = ""
+    coding: Coding = field(default_factory=Coding)
     audio_track: int | None = None
     audio_codec: str | None = None
 
@@ -101,6 +108,8 @@ def _probe(path: Path) -> VideoInfo:
         raise VideoError(f"{path} has no frame that can be decoded ({last_line(log)}); copy it again")
     first_time, width, height = frame[1], int(frame[4]), int(frame[5])
     pixel = int(frame[2]), int(frame[3])
+    pixels = re.search(r"n: *0 .*? fmt:(\w+)", decoded)
+    colours = re.search(r"color_range:(\w+) color_space:(\w+)", decoded)
     number = re.search(r"Stream #0:(\d+)", decoded)
     stream = _stream_lines(header, int(number[1]) if number else 0)
     fps, constant = _frame_rate(decoded, stream)
@@ -122,6 +131,8 @@ def _probe(path: Path) -> VideoInfo:
         # The frames of a varying rate are filled up from 0 on.
         first_time=float(first_time) if constant and first_time[-1].isdigit() else 0.0,
         pixel_aspect=Fraction(*pixel) if all(pixel) else Fraction(1),
+        pixel_format=pixels[1] if pixels else "",
+        coding=Coding(colours[2], colours[1] == "pc") if colours else Coding(),
         audio_track=track,
         audio_codec=None if track is None else codecs[track],
     )

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 
-def _jit(function: Callable[..., None]) -> Callable[..., None]:
+def jit(function: Callable[..., None]) -> Callable[..., None]:
     """Compile a kernel when it is first called, into a cache on disk wherever one can be kept."""
     compiler = functools.partial(numba.njit, nogil=True, error_model="numpy", boundscheck=False)
     try:
@@ -32,14 +32,15 @@ _TILE = 768
 _PRODUCT_TILE = 512
 
 
-@_jit
-def hog_cells(image, channels, cell, cosines, sines, cells):
+@jit
+def hog_cells(image, channels, cell, cotangents, cells):
     """Sum gradient magnitudes into the orientation histograms of cells.
 
     The reference is ``skimage.feature.hog``: central differences without halving, zero at the array's
-    border, unsigned orientation, hard binning. Orientation `k` starts at ``k * 180 / orient`` degrees, so
-    an angle lies past boundary `k` where ``gy * cos_k - gx * sin_k >= 0`` (after the sign is folded to
-    ``gy >= 0``): no arctangent is needed. The sums are kept cumulative over the boundaries and are
+    border, unsigned orientation, hard binning. Orientation `k` starts at ``k * 180 / orient`` degrees, and an
+    angle in (0, 180) lies past that bound where ``gx / gy`` is at most its cotangent: one division and no
+    arctangent, and a gradient and its opposite are one. The quotients of whole numbers up to 255 are too far
+    from the cotangents for rounding to matter. The sums are kept cumulative over the bounds and are
     differenced at the end.
 
     Parameters
@@ -50,8 +51,8 @@ def hog_cells(image, channels, cell, cosines, sines, cells):
         Number of interleaved channels.
     cell
         Side of a cell in pixels.
-    cosines, sines
-        ``(orient,)`` float32, of the orientations' lower bounds.
+    cotangents
+        ``(orient,)`` float32, of the orientations' lower bounds, infinite for the first.
     cells
         Output, ``(channels, orient, cell rows, cell columns)`` float32; mean over the cell's pixels.
     """
@@ -60,12 +61,13 @@ def hog_cells(image, channels, cell, cosines, sines, cells):
     per_tile = max(1, _TILE // (cell * channels))
     span = cell * channels
     size = per_tile * span
-    gx = np.empty(size, np.float32)
-    gy = np.empty(size, np.float32)
+    quotient = np.empty(size, np.float32)
     magnitude = np.empty(size, np.float32)
+    fours = np.empty(size, np.float32)
     sums = np.empty((orient, size), np.float32)
     scale = np.float32(1.0 / (cell * cell))
     zero = np.float32(0)
+    infinite = np.float32(np.inf)
     for row in range(rows):
         for first in range(0, columns, per_tile):
             count = min(per_tile, columns - first)
@@ -81,59 +83,65 @@ def hog_cells(image, channels, cell, cosines, sines, cells):
                 below = image[y + 1 if inside else y, start : start + n]
                 left = image[y, start + low - channels : start + high - channels]
                 right = image[y, start + low + channels : start + high + channels]
-                gx[:low] = zero
-                gx[high:n] = zero
-                inner = gx[low:high]
+                quotient[:low] = zero
+                quotient[high:n] = zero
+                inner = quotient[low:high]
                 for i in range(high - low):
                     inner[i] = np.float32(right[i]) - np.float32(left[i])
                 for i in range(n):
-                    horizontal = gx[i]
-                    vertical = np.float32(below[i]) - np.float32(above[i])
-                    magnitude[i] = np.sqrt(horizontal * horizontal + vertical * vertical)
-                    # Fold the sign so that 0 <= angle < 180: gy > 0, or gy == 0 and gx >= 0.
-                    folded = horizontal if vertical > zero else -horizontal
-                    gx[i] = folded if vertical != zero else abs(horizontal)
-                    gy[i] = abs(vertical)
+                    gx = quotient[i]
+                    gy = np.float32(below[i]) - np.float32(above[i])
+                    magnitude[i] = np.sqrt(gx * gx + gy * gy)
+                    # A gradient along the row has angle 0, whichever way it points.
+                    quotient[i] = gx / gy if gy != zero else infinite
                 total = sums[0]
                 for i in range(n):
                     total[i] += magnitude[i]
-                # Four bounds at a time: a gradient that is loaded is compared four times.
+                # Four bounds at a time: a quotient that is loaded is compared four times.
                 single = 1 + (orient - 1) // 4 * 4
                 for k in range(1, single, 4):
-                    c0, c1, c2, c3 = cosines[k], cosines[k + 1], cosines[k + 2], cosines[k + 3]
-                    s0, s1, s2, s3 = sines[k], sines[k + 1], sines[k + 2], sines[k + 3]
+                    c0, c1 = cotangents[k], cotangents[k + 1]
+                    c2, c3 = cotangents[k + 2], cotangents[k + 3]
                     t0, t1, t2, t3 = sums[k], sums[k + 1], sums[k + 2], sums[k + 3]
                     for i in range(n):
-                        x, v, m = gx[i], gy[i], magnitude[i]
-                        t0[i] += m if v * c0 - x * s0 >= zero else zero
-                        t1[i] += m if v * c1 - x * s1 >= zero else zero
-                        t2[i] += m if v * c2 - x * s2 >= zero else zero
-                        t3[i] += m if v * c3 - x * s3 >= zero else zero
+                        q, m = quotient[i], magnitude[i]
+                        t0[i] += m if q <= c0 else zero
+                        t1[i] += m if q <= c1 else zero
+                        t2[i] += m if q <= c2 else zero
+                        t3[i] += m if q <= c3 else zero
                 for k in range(single, orient):
-                    c0, s0, t0 = cosines[k], sines[k], sums[k]
+                    c0, t0 = cotangents[k], sums[k]
                     for i in range(n):
-                        t0[i] += magnitude[i] if gy[i] * c0 - gx[i] * s0 >= zero else zero
-            # Sum each cell's columns for all values at once; those at a cell's first column are wanted.
-            reach = n - (cell - 1) * channels
+                        t0[i] += magnitude[i] if quotient[i] <= c0 else zero
+            # A cell's columns: sums of four for all values at once, of which those at its columns are wanted.
+            reach = max(0, n - 3 * channels)
+            grouped = cell // 4 * 4
             for k in range(orient):
                 total = sums[k]
+                s0, s1 = total[:reach], total[channels : channels + reach]
+                s2, s3 = (
+                    total[2 * channels : 2 * channels + reach],
+                    total[3 * channels : 3 * channels + reach],
+                )
                 for i in range(reach):
-                    magnitude[i] = total[i]
-                for x in range(1, cell):
-                    shifted = total[x * channels : x * channels + reach]
-                    for i in range(reach):
-                        magnitude[i] += shifted[i]
+                    fours[i] = (s0[i] + s1[i]) + (s2[i] + s3[i])
                 for channel in range(channels):
                     out = cells[channel, k, row, first : first + count]
                     for column in range(count):
-                        out[column] = magnitude[column * span + channel] * scale
+                        at = column * span + channel
+                        value = zero
+                        for x in range(0, grouped, 4):
+                            value += fours[at + x * channels]
+                        for x in range(grouped, cell):
+                            value += total[at + x * channels]
+                        out[column] = value * scale
             for channel in range(channels):
                 for k in range(orient - 1):
                     for column in range(first, first + count):
                         cells[channel, k, row, column] -= cells[channel, k + 1, row, column]
 
 
-@_jit
+@jit
 def sum_orientations(gx, gy, angles, bounds, channels, cell, cells):
     """Sum gradient magnitudes into the orientation histograms of cells, from angles that are known.
 
@@ -169,7 +177,7 @@ def sum_orientations(gx, gy, angles, bounds, channels, cell, cells):
     cells *= np.float32(1.0 / (cell * cell))
 
 
-@_jit
+@jit
 def normalise_blocks(cells, block, blocks):
     """Normalise overlapping blocks of cells by L2-Hys: L2, clip at 0.2, L2 again.
 
@@ -234,7 +242,7 @@ def normalise_blocks(cells, block, blocks):
         blocks[channel, :, :, :, rows - block + 1 :] = np.float32(0)
 
 
-@_jit
+@jit
 def histogram_cells(image, table, cell, cells):
     """Sum, over each cell, the table's weights of the pixel values of all channels.
 
@@ -266,7 +274,7 @@ def histogram_cells(image, table, cell, cells):
                 cells[row, column] += first + second + third
 
 
-@_jit
+@jit
 def spatial_cells(bins, per_cell, cells):
     """Deal the spatial bins of a band out to planes: one plane for each place of a bin in its cell.
 
@@ -290,7 +298,7 @@ def spatial_cells(bins, per_cell, cells):
                         out[x] = line[x * per_cell + j, channel]
 
 
-@_jit
+@jit
 def multiply(weights, planes, products):
     """Multiply matrices: ``products = weights @ planes``, as fast as BLAS and without its threads.
 
@@ -332,7 +340,7 @@ def multiply(weights, planes, products):
                     a3[i] += w30 * x0 + w31 * x1 + w32 * x2 + w33 * x3
 
 
-@_jit
+@jit
 def sum_shifted(products, window_rows, window_columns, bias, scores):
     """Add up, for each window, the products that its cells have at their place in the window.
 
@@ -358,7 +366,7 @@ def sum_shifted(products, window_rows, window_columns, bias, scores):
                     out[x] += line[x]
 
 
-@_jit
+@jit
 def value_counts(image, counts):
     """Count the values of each channel: `image` ``(H, W, 3)`` uint8, `counts` ``(3, 256)`` output."""
     counts[:] = 0
@@ -369,7 +377,7 @@ def value_counts(image, counts):
             counts[2, image[y, x, 2]] += 1
 
 
-@_jit
+@jit
 def arrange_blocks(planes, features):
     """Write the block planes of one patch as a vector in scikit-image's order.
 
@@ -393,32 +401,32 @@ def arrange_blocks(planes, features):
                             position += 1
 
 
-@_jit
-def patch_hog(patches, channels, cell, block, cosines, sines, features):
+@jit
+def patch_hog(patches, channels, cell, block, cotangents, features):
     """HOG of each patch.
 
     Parameters
     ----------
     patches
         ``(N, side, side * channels)`` uint8.
-    channels, cell, cosines, sines
+    channels, cell, cotangents
         As for `hog_cells`.
     block
         Side of a block in cells.
     features
         Output, ``(N, channels * blocks**2 * block**2 * orient)`` float32.
     """
-    orient = len(cosines)
+    orient = len(cotangents)
     side = patches.shape[1] // cell
     cells = np.empty((channels, orient, side, side), np.float32)
     planes = np.empty((channels, block, block, orient, side, side), np.float32)
     for index in range(len(patches)):
-        hog_cells(patches[index], channels, cell, cosines, sines, cells)
+        hog_cells(patches[index], channels, cell, cotangents, cells)
         normalise_blocks(cells, block, planes)
         arrange_blocks(planes, features[index])
 
 
-@_jit
+@jit
 def patch_hog_of_angles(gx, gy, angles, bounds, channels, cell, block, features):
     """HOG of each patch from known gradients ``(N, side, side * channels)``; see `sum_orientations`."""
     orient = len(bounds) - 1
@@ -431,7 +439,7 @@ def patch_hog_of_angles(gx, gy, angles, bounds, channels, cell, block, features)
         arrange_blocks(planes, features[index])
 
 
-@_jit
+@jit
 def patch_histograms(patches, bin_of_value, bins, features):
     """Colour histogram of each patch, channel by channel.
 

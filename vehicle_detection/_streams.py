@@ -12,11 +12,11 @@ from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._ffmpeg import Process, VideoInfo, last_line
+from vehicle_detection._planes import FORMATS, planes_from_rgb, rgb_from_planes
 from vehicle_detection.errors import VideoError
 
 CONTAINERS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
@@ -56,7 +56,14 @@ class FrameReader:
         if count is not None:
             options += ["-frames:v", str(count)]
         options += ["-fps_mode", "passthrough"]
-        options += ["-pix_fmt", "rgb24", "-f", "rawvideo", "pipe:1"]
+        height, width = info.shape[:2]
+        # Planes are read as they are stored, in half the time, and become frames here.
+        self._in_planes = info.pixel_format in FORMATS and info.coding.known and not (height % 2 or width % 2)
+        pixels = info.pixel_format if self._in_planes else "rgb24"
+        shape = (height * 3 // 2, width) if self._in_planes else info.shape
+        self._stored = np.empty(shape, np.uint8)
+        self._channels = np.empty((3, height, width), np.uint8)
+        options += ["-pix_fmt", pixels, "-f", "rawvideo", "pipe:1"]
         self._process = Process(("-nostdin", *options), stdout=True)
 
     def __iter__(self) -> FrameReader:
@@ -65,8 +72,7 @@ class FrameReader:
     def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
         if self._process.stdout.closed:
             raise StopIteration
-        frame = np.empty(self.info.shape, np.uint8)
-        view = frame.data.cast("B")
+        view = self._stored.data.cast("B")
         done = 0
         while done < len(view):
             got = self._process.stdout.readinto(view[done:])  # type: ignore[attr-defined]
@@ -74,6 +80,10 @@ class FrameReader:
                 self._end()
                 raise StopIteration
             done += got
+        if self._in_planes:
+            frame = rgb_from_planes(self._stored, self.info.coding, self._channels)
+        else:
+            frame = self._stored.copy()
         index = self._first + self.frames_read
         self.frames_read += 1
         return index, float(index / self.info.fps), frame
@@ -147,6 +157,7 @@ class FrameWriter:
         container = CONTAINERS[path.suffix.lower()]
         width, height = info.width + info.width % 2, info.height + info.height % 2
         self._planes = np.empty((height * 3 // 2, width), np.uint8)
+        self._channels = np.empty((3, height, width), np.uint8)
         picture = ["-f", "rawvideo", "-pixel_format", "yuv420p", "-video_size", f"{width}x{height}"]
         picture += ["-framerate", str(info.fps)]
         sound: list[str] = []
@@ -173,7 +184,7 @@ class FrameWriter:
 
     def write(self, frame: NDArray[np.uint8]) -> None:
         """Hand one frame to ffmpeg."""
-        _to_planes(frame, self._planes)
+        planes_from_rgb(frame, self._planes, self._channels)
         view = self._planes.data.cast("B")
         done = 0
         try:
@@ -213,24 +224,3 @@ class FrameWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _to_planes(frame: NDArray[np.uint8], planes: NDArray[np.uint8]) -> None:
-    """Convert an RGB frame to yuv420p, by BT.601 in the range 16-235, in `planes` of ``(H * 3 / 2, W)``.
-
-    Half as much goes through the pipe, and OpenCV needs half of ffmpeg's time. OpenCV alone takes the colour
-    of a 2x2 block from its first pixel, which frays thin lines: here it is the mean.
-    """
-    height, width = planes.shape[0] * 2 // 3, planes.shape[1]
-    if frame.shape[:2] != (height, width):
-        grown = height - frame.shape[0], width - frame.shape[1]
-        frame = np.asarray(
-            cv2.copyMakeBorder(frame, 0, grown[0], 0, grown[1], cv2.BORDER_REPLICATE), np.uint8
-        )
-    cv2.cvtColor(frame, cv2.COLOR_RGB2YUV_I420, dst=planes)
-    half = cv2.resize(frame, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-    share = 224 / 255  # of the full range, as video has it
-    colour = cv2.cvtColor(half, cv2.COLOR_RGB2YCrCb)
-    colour = cv2.convertScaleAbs(colour, alpha=share, beta=128 * (1 - share))
-    blue, red = planes[height:].reshape(2, height // 2, width // 2)
-    cv2.mixChannels([colour], [blue, red], [2, 0, 1, 1])

@@ -414,11 +414,14 @@ def _read_all(source: Any) -> Any:
     return [read_image(item) if isinstance(item, (str, os.PathLike)) else item for item in items]
 
 
-def orientation_bounds(orient: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Cosine and sine of the lower bound of each orientation bin."""
+def orientation_cotangents(orient: int) -> NDArray[np.float32]:
+    """Cotangent of the lower bound of each orientation bin, infinite for the first."""
     angles = np.arange(orient) * (np.pi / orient)
     # Rounding makes the bound at 90 degrees exact, so that a vertical edge falls where it should.
-    return np.cos(angles).round(15).astype(np.float32), np.sin(angles).round(15).astype(np.float32)
+    cosines, sines = np.cos(angles).round(15), np.sin(angles)
+    cotangents = np.full(orient, np.inf)
+    np.divide(cosines, sines, out=cotangents, where=sines > 0)
+    return cotangents.astype(np.float32)
 
 
 def sqrt_gradients(source: NDArray[np.uint8]) -> tuple[NDArray[np.float64], ...]:
@@ -455,7 +458,7 @@ def bin_of_value(bins: int) -> NDArray[np.intp]:
 def _batch_extractor(params: FeatureParams) -> Callable[[NDArray[np.uint8], NDArray[np.float32]], None]:
     """Build the function that fills the features of a batch of patches."""
     channels, cell, block = params.hog_channels, params.pix_per_cell, params.cell_per_block
-    cosines, sines = orientation_bounds(params.orient)
+    cotangents = orientation_cotangents(params.orient)
     bounds = degree_bounds(params.orient)
     bins = bin_of_value(params.hist_bins)
     size = params.spatial_size
@@ -483,7 +486,7 @@ def _batch_extractor(params: FeatureParams) -> Callable[[NDArray[np.uint8], NDAr
                 _kernels.patch_hog_of_angles(*gradients, bounds, channels, cell, block, hog)
             else:
                 flat = source.reshape(n, PATCH_SIZE, PATCH_SIZE * channels)
-                _kernels.patch_hog(flat, channels, cell, block, cosines, sines, hog)
+                _kernels.patch_hog(flat, channels, cell, block, cotangents, hog)
 
     return extract
 

@@ -19,7 +19,6 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import cv2
@@ -28,7 +27,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection import _kernels
 from vehicle_detection._checks import check_image, check_number, check_type
-from vehicle_detection._jobs import resolve_jobs, single_threaded_opencv
+from vehicle_detection._jobs import Crew, single_threaded_opencv
 from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import CLASSIFIER_REMEDY, Template, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
@@ -37,7 +36,7 @@ from vehicle_detection.features import (
     convert_color,
     degree_bounds,
     hog_source,
-    orientation_bounds,
+    orientation_cotangents,
     pick_hog_channels,
     sqrt_gradients,
 )
@@ -104,9 +103,7 @@ class BandSearch:
     def __init__(self, classifier: VehicleClassifier, *, n_jobs: int | None = None) -> None:
         check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
         self._filters = _Filters(classifier)
-        self._jobs = resolve_jobs(n_jobs)
-        self._pool: ThreadPoolExecutor | None = None
-        self._opening = threading.Lock()
+        self._crew = Crew(n_jobs, name="search")
         self._local = threading.local()
 
     def __enter__(self) -> BandSearch:
@@ -117,9 +114,7 @@ class BandSearch:
 
     def close(self) -> None:
         """End the threads."""
-        if self._pool is not None:
-            self._pool.shutdown()
-            self._pool = None
+        self._crew.close()
 
     def find(self, image: NDArray[np.uint8], search: SearchParams) -> Detections:
         """Windows of all bands that score above ``search.min_score``."""
@@ -127,7 +122,10 @@ class BandSearch:
         check_type(search, "search", SearchParams, 'pass SearchParams.preset("default")')
         bands = search.place(image.shape)
         least = check_number(search.min_score, "min_score")
-        parts = self._map(lambda band: _hits(self.score_map(image, band), band, self._filters, least), bands)
+        with single_threaded_opencv():
+            parts = self._crew.map(
+                lambda band: _hits(self.score_map(image, band), band, self._filters, least), bands, cost=_cost
+            )
         return Detections(np.concatenate([p.boxes for p in parts]), np.concatenate([p.scores for p in parts]))
 
     def score_map(self, image: NDArray[np.uint8], band: PixelBand) -> NDArray[np.float32]:
@@ -141,20 +139,6 @@ class BandSearch:
         """
         buffers = self._local.__dict__.setdefault("buffers", _Buffers())
         return self._filters.score_map(resize_band(image, band, buffers.take), buffers.take)
-
-    def _map(
-        self, function: Callable[[PixelBand], Detections], bands: tuple[PixelBand, ...]
-    ) -> list[Detections]:
-        """Apply `function` to the bands, the costly ones first so that the threads end together."""
-        if self._jobs == 1 or len(bands) == 1:
-            with single_threaded_opencv():
-                return [function(band) for band in bands]
-        with self._opening:
-            pool = self._pool = self._pool or ThreadPoolExecutor(self._jobs, thread_name_prefix="search")
-        order = sorted(range(len(bands)), key=lambda i: -_cost(bands[i]))
-        with single_threaded_opencv():
-            found = list(pool.map(function, [bands[i] for i in order]))
-        return [part for _, part in sorted(zip(order, found), key=lambda pair: pair[0])]
 
 
 def resized_shape(band: PixelBand) -> tuple[int, int]:
@@ -207,7 +191,7 @@ def _hits(scores: NDArray[np.float32], band: PixelBand, filters: _Filters, least
     # Steps in pixels of the frame become whole cells of the resized band.
     steps = [max(1, round(step / (cell * factor))) for step, factor in zip(band.step, scale)]
     grid = scores[:: steps[1], :: steps[0]]
-    rows, columns = np.nonzero(grid > least)
+    rows, columns = np.divmod(np.flatnonzero(grid > least), grid.shape[1])
     corner = np.stack([columns * steps[0], rows * steps[1]], axis=1) * cell * scale + (band.x1, band.y1)
     boxes = np.concatenate([corner, corner + scale * PATCH_SIZE], axis=1)
     return Detections(boxes, grid[rows, columns].astype(np.float64))
@@ -246,7 +230,7 @@ class _Filters:
         self.spatial_planes = 3 * self.per_cell**2 if params.spatial_feat else 0
         self.used = self.hog_planes + self.spatial_planes + int(params.hist_feat)
         self.planes = _padded(self.used)
-        self.cosines, self.sines = orientation_bounds(params.orient)
+        self.cotangents = orientation_cotangents(params.orient)
         self.bounds = degree_bounds(params.orient)
         laid_out = [self._lay_out(template) for template in classifier.templates]
         self.biases = [np.float32(bias) for _, _, bias in laid_out]
@@ -316,7 +300,7 @@ class _Filters:
                 _kernels.sum_orientations(*sqrt_gradients(source), self.bounds, channels, cell, cells)
             else:
                 flat = np.ascontiguousarray(source).reshape(source.shape[0], -1)
-                _kernels.hog_cells(flat, channels, cell, self.cosines, self.sines, cells)
+                _kernels.hog_cells(flat, channels, cell, self.cotangents, cells)
             shape = (channels, self.block, self.block, params.orient, rows, columns)
             _kernels.normalise_blocks(cells, self.block, planes[: self.hog_planes].reshape(shape))
         if params.spatial_feat:
