@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks import _accuracy, _features, _frames, _memory, _scaling, _search, _startup, _video
+from benchmarks import _accuracy, _drives, _features, _frames, _memory, _scaling, _search, _startup, _video
 from benchmarks._material import DATA_VARIABLE, Context, is_real
 from benchmarks._report import Row, print_table, write_json
 
@@ -22,6 +22,7 @@ BENCHMARKS: dict[str, Callable[[Context], list[Row]]] = {
     "startup": _startup.run,
     "accuracy": _accuracy.run,
     "frames": _frames.run,
+    "drives": _drives.run,
     "scaling": _scaling.run,
 }
 

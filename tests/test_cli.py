@@ -26,7 +26,7 @@ from vehicle_detection.cli import app
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.synthetic import render_drive, render_patches
-from vehicle_detection.video import probe_video
+from vehicle_detection.video import probe_video, read_frames
 
 COMMANDS = ("demo", "detect", "video", "evaluate", "train", "tune", "fetch", "info")
 ROOT = Path(__file__).parents[1]
@@ -385,6 +385,20 @@ def test_video_writes_an_annotated_copy_and_tracks(clip, tmp_path):
     assert contents(tmp_path) == ["out.mp4", "tracks.csv"]
 
 
+def test_video_writes_a_page_and_diagnostics(clip, tmp_path):
+    target, tracks, page = tmp_path / "out.mp4", tmp_path / "tracks.csv", tmp_path / "page.html"
+    words = ["--report", page, "--tracks", tracks, "--diagnostics", "--preset", "ultrafast"]
+    out = succeed("video", clip, target, *words)
+    assert out.splitlines()[-1] == f"wrote {target} and {tracks} and {page}"
+    text = page.read_text(encoding="utf-8")
+    assert "data:video/mp4;base64," in text
+    assert clip.name in text
+    with read_frames(target) as frames:
+        mosaic = next(frames)[2]
+    # The heat map of an empty corner of the road is black, which no frame of the clip is.
+    assert mosaic[-8:, :8].max() < 40
+
+
 def test_video_can_be_quiet_and_take_a_part(clip, tmp_path):
     target = tmp_path / "out.mov"
     words = ["--start", 0.08, "--end", 0.2, "--horizon", 0.56, "--no-audio", "--quiet"]
@@ -423,6 +437,8 @@ def bad_videos(material, tmp):
         r"horizon must be a number": [clip, target, "--horizon", -0.5],
         r"path must end in .csv, .*got 'tracks.doc'": [clip, target, "--tracks", tmp / "tracks.doc"],
         r"path needs an existing folder": [clip, target, "--tracks", tmp / "none" / "tracks.csv"],
+        r"path must end in .html, .*got 'page.pdf'": [clip, target, "--report", tmp / "page.pdf"],
+        r"--report \S+ is TARGET \S+ as well": [clip, target, "--report", target],
         r"--tracks \S+ is SOURCE \S+ as well": [tmp / "a.csv", target, "--tracks", tmp / "a.csv"],
     }
 

@@ -43,6 +43,7 @@ ROWS = [
     "evaluation",
     "tuning",
     "export",
+    "report",
     "plotting",
     "batch",
     "cli",

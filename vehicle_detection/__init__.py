@@ -66,6 +66,7 @@ if TYPE_CHECKING:
     )
     from vehicle_detection.plotting import plot_tradeoff
     from vehicle_detection.regions import find_vehicles, fit_boxes, group_windows
+    from vehicle_detection.report import ReportWriter
     from vehicle_detection.search import find_cars
     from vehicle_detection.synthetic import render_drive, render_patches, render_scene
     from vehicle_detection.tracking import Track, Tracker
@@ -95,6 +96,7 @@ __all__ = [
     "ModelFileError",
     "PatchFeatures",
     "RegionParams",
+    "ReportWriter",
     "ResultTable",
     "SearchBand",
     "SearchParams",
@@ -233,6 +235,7 @@ _ROOMS = {
         "read_labels",
     ),
     "export": ("TrackWriter", "write_boxes", "write_tracks"),
+    "report": ("ReportWriter",),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -208,6 +208,14 @@ def video(
     tracks: Annotated[
         Path | None, typer.Option(metavar="FILE.csv", help="Table of all tracks: .csv, .jsonl or .txt (MOT).")
     ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.html", help="Page with the video and its tracks over time, in one file."),
+    ] = None,
+    diagnostics: Annotated[
+        bool,
+        typer.Option("--diagnostics", help="Show frame, positive windows, heat map and tracks side by side."),
+    ] = False,
     model: Model = None,
     start: Annotated[float | None, typer.Option(metavar="S", help="Second to start at.")] = None,
     end: Annotated[float | None, typer.Option(metavar="S", help="Second to end at.")] = None,
@@ -223,15 +231,24 @@ def video(
     from vehicle_detection.classifier import load_classifier
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.export import TrackWriter
+    from vehicle_detection.report import ReportWriter
     from vehicle_detection.video import process_video
 
+    named = {"--tracks": tracks, "--report": report}
+    outputs = {name: path for name, path in named.items() if path is not None}
+    check_apart(outputs, {"SOURCE": source, "TARGET": target})
     with contextlib.ExitStack() as stack:
-        write = None
+        writers: list[Callable[[Any], object]] = []
         if tracks is not None:
-            check_apart({"--tracks": tracks}, {"SOURCE": source, "TARGET": target})
-            write = stack.enter_context(TrackWriter(tracks))
-        detector = stack.enter_context(VehicleDetector(load_classifier(model), horizon=horizon))
-        report = process_video(
+            writers.append(stack.enter_context(TrackWriter(tracks)))
+        detector = stack.enter_context(
+            VehicleDetector(load_classifier(model), horizon=horizon, diagnostics=diagnostics)
+        )
+        page = None
+        if report is not None:
+            page = ReportWriter(report, video=target, source=source, detector=detector)
+            writers.append(page)
+        done = process_video(
             source,
             target,
             detector,
@@ -240,13 +257,15 @@ def video(
             audio=not no_audio,
             preset=preset,
             progress=not quiet,
-            on_result=write,
+            on_result=lambda result: [write(result) for write in writers],
         )
+    if page is not None:
+        page.finish(done)
     if not quiet or profile:
-        lines = str(report).splitlines()
+        lines = str(done).splitlines()
         typer.echo("\n".join(lines if profile else lines[:1]))
     if not quiet:
-        typer.echo(f"wrote {target}" + (f" and {tracks}" if tracks is not None else ""))
+        typer.echo(f"wrote {' and '.join(map(str, (target, *outputs.values())))}")
 
 
 @app.command()

@@ -227,7 +227,7 @@ def draw_diagnostics(
     Returns
     -------
     numpy.ndarray
-        The frame's height and width, made even: a video encoder takes it as it is.
+        ``(H, W, 3)`` uint8 RGB, of the frame's shape: an odd side has a black line at its end.
 
     Raises
     ------
@@ -251,7 +251,7 @@ def draw_diagnostics(
         ("heat", np.asarray(cv2.resize(_heat_picture(heat), (width, height)), np.uint8)),
         ("tracks", draw_tracks(small, followed, show=("id", "distance"))),
     ]
-    mosaic = np.empty((2 * height, 2 * width, 3), np.uint8)
+    mosaic = np.zeros_like(picture)
     for index, (title, panel) in enumerate(panels):
         top, left = index // 2 * height, index % 2 * width
         view = mosaic[top : top + height, left : left + width]

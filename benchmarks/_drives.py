@@ -1,0 +1,115 @@
+"""Drawn drives with exact truth: who is followed through what, how far away and how fast."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks._frames import shown_boxes
+from benchmarks._material import Context
+from benchmarks._report import Row, Target, at_least, at_most
+from vehicle_detection import (
+    FrameResult,
+    VehicleDetector,
+    evaluate_tracks,
+    iou_matrix,
+    read_labels,
+    render_drive,
+)
+from vehicle_detection.synthetic import Drive
+
+FRAMES = 200
+
+CASES: dict[str, dict[str, Any]] = {
+    "highway": {},
+    "overtaking": {"scenario": "overtaking"},
+    "crossing": {"scenario": "crossing"},
+    "occlusion": {"scenario": "occlusion"},
+    "rain": {"rain": 0.6},
+    "night": {"light": "night"},
+    "960x540": {"shape": (540, 960)},
+    "1920x1080": {"shape": (1080, 1920)},
+}
+"""Options of `render_drive` for each drive."""
+
+SEED = 7
+NEAR_M, FAR_M = 10.0, 60.0
+"""Distances, in metres, between which distance and speed are judged."""
+
+
+def run(context: Context) -> list[Row]:
+    """Follow the vehicles of every drive with the settings shipped as default."""
+    rows: list[Row] = []
+    with VehicleDetector() as detector:
+        for name, options in CASES.items():
+            rows += drive_rows(
+                name, render_drive(frames=FRAMES, random_state=SEED, **options), detector, context
+            )
+    return rows
+
+
+def drive_rows(name: str, drive: Drive, detector: VehicleDetector, context: Context) -> list[Row]:
+    """Score one drive."""
+    detector.reset(fps=drive.fps)
+    results = [detector.process(scene.image, index / drive.fps) for index, scene in enumerate(drive)]
+    labels = context.work / f"{name}.csv"
+    drive.write_labels(labels)
+    scores = evaluate_tracks(shown_boxes(results), read_labels(labels), frames=range(len(results)))
+    errors = range_errors(drive, results)
+    values: list[tuple[str, float, str, Target]] = [
+        ("MOTA", scores.mota, "", at_least(0.95)),
+        ("IDF1", scores.idf1, "", at_least(0.95)),
+        ("median error of the distance", errors.distance, "%", at_most(15)),
+        ("median error of the speed", errors.speed, "m/s", at_most(1.5)),
+    ]
+    return [
+        Row(
+            what=f"{name}: {what}",
+            value=value,
+            unit=unit,
+            target=target,
+            material=f"{FRAMES} frames each, drawn by the project",
+            details=scores.to_dict() if what == "MOTA" else {},
+        )
+        for what, value, unit, target in values
+    ]
+
+
+@dataclass(frozen=True)
+class RangeErrors:
+    """Median errors of what is told about vehicles 10 to 60 m away: percent, and metres a second."""
+
+    distance: float
+    speed: float
+
+
+def range_errors(drive: Drive, results: list[FrameResult]) -> RangeErrors:
+    """Compare the distances and speeds that are told with the true ones."""
+    pairs = np.array(list(_ranges(drive, results))).reshape(-1, 4)
+    distance = np.abs(pairs[:, 0] - pairs[:, 1]) / pairs[:, 1] * 100
+    speed = np.abs(pairs[:, 2] - pairs[:, 3])
+    return RangeErrors(_median(distance), _median(speed))
+
+
+def _median(values: NDArray[np.float64]) -> float:
+    known = values[~np.isnan(values)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+def _ranges(drive: Drive, results: list[FrameResult]) -> Iterator[tuple[float, float, float, float]]:
+    """Distance told and true, speed told and true, of each pair of a shown track and a vehicle."""
+    for truth, result in zip(drive.truth, results):
+        near = [row for row in truth if not row.ignore and NEAR_M <= row.distance_m <= FAR_M]
+        if not near or not result.shown:
+            continue
+        overlap = iou_matrix([track.box for track in result.shown], [row.box for row in near])
+        for track, shared in zip(result.shown, overlap):
+            row = near[int(shared.argmax())]
+            if shared.max() >= 0.5:
+                told = (track.distance_m, track.speed_mps)
+                distance, speed = (np.nan if value is None else value for value in told)
+                yield distance, row.distance_m, speed, row.speed_mps
