@@ -45,6 +45,7 @@ ROWS = [
     "export",
     "report",
     "plotting",
+    "explorer",
     "batch",
     "cli",
 ]
@@ -60,6 +61,8 @@ HEAVY = {
     "distributed",
     "pyarrow",
     "motmetrics",
+    "ipywidgets",
+    "IPython",
 }
 # All about scikit-learn: these modules are imported inside functions only.
 HEAVY_MODULES = {"_halving": {"sklearn"}, "_transformer": {"sklearn"}}

@@ -1,84 +1,50 @@
-"""Figures with matplotlib; every function takes ``ax=None`` and returns the Axes it drew on."""
+"""Figures with matplotlib, of what the other rooms hand out; the drawing itself is done in ``_plot_*``.
+
+A function that draws one panel takes ``ax=None`` and returns the Axes; None makes a figure of pyplot's, which
+``plt.show()`` and a notebook's cell show. A function that draws several takes ``figure=None``, a Figure or
+SubFigure, and returns it; None makes a figure that pyplot does not keep: a notebook shows it as the value of
+its cell, and ``savefig`` writes it. Nothing else is kept from one call to the next.
+
+The colours are Okabe and Ito's, which stay apart for colour-blind eyes, and matplotlib's perceptually
+uniform maps.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from vehicle_detection._plot_features import plot_channels, plot_features, plot_hog
+from vehicle_detection._plot_heat import plot_heatmap
+from vehicle_detection._plot_images import ImageFacts, describe_image, plot_methods, show_images
+from vehicle_detection._plot_patches import plot_balance, plot_near_copies, plot_patches
+from vehicle_detection._plot_quality import plot_errors, plot_f1, plot_precision_recall
+from vehicle_detection._plot_search import plot_bands, plot_comparison, plot_speedups, plot_windows
+from vehicle_detection._plot_tracks import plot_stage_times, plot_tracks
+from vehicle_detection._plot_training import plot_scores, plot_split_scores, plot_weights
+from vehicle_detection._plot_tuning import plot_parameter, plot_tradeoff
 
-import numpy as np
-
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.tuning import ResultTable
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-__all__ = ["plot_tradeoff"]
-
-
-def plot_tradeoff(
-    table: ResultTable,
-    *,
-    quality: str = "accuracy",
-    cost: str = "search_ms",
-    label: str | None = "configuration",
-    ax: Axes | None = None,
-) -> Axes:
-    """Plot what each configuration reaches against what it costs, and mark the best front.
-
-    Parameters
-    ----------
-    table
-        Rows of `compare_configurations` or `search_parameters`; those without either value are left out.
-    quality
-        Column of the y axis; more is better.
-    cost
-        Column of the x axis; less is better.
-    label
-        Column written beside the points of the front; None writes nothing.
-    ax
-        Where to draw; None makes a new figure.
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        Its first collection holds all points; its first line is the front, cheapest first: no other point
-        is better in one of the two without being worse in the other.
-
-    Raises
-    ------
-    InvalidInputError
-        If no row has both values, or a column does not exist.
-
-    Examples
-    --------
-    >>> table = ResultTable([{"accuracy": 0.98, "search_ms": 4.0}, {"accuracy": 0.99, "search_ms": 9.0}])
-    >>> plot_tradeoff(table, label=None).get_xlabel()
-    'search ms'
-    """
-    front = table.front(quality, cost)
-    if not len(front):
-        raise InvalidInputError(f"table has no row with both {quality} and {cost}; measure them first")
-    axes: Axes = _axes(ax)
-    x, y = table.numbers(cost), table.numbers(quality)
-    shown = ~np.isnan(x) & ~np.isnan(y)
-    axes.scatter(x[shown], y[shown], s=24, color="0.6", label="measured", zorder=2)
-    axes.plot(front.numbers(cost), front.numbers(quality), "o-", color="C0", label="best front", zorder=3)
-    if label is not None:
-        for row in front:
-            place = (row[cost], row[quality])
-            axes.annotate(str(row.get(label)), place, (4, 6), textcoords="offset points", fontsize=8)
-    axes.set_xlabel(cost.replace("_", " "))
-    axes.set_ylabel(quality.replace("_", " "))
-    axes.margins(0.12)
-    axes.grid(alpha=0.3)
-    axes.legend(loc="lower right")
-    return axes
-
-
-def _axes(ax: Any) -> Any:
-    """Return the given Axes, or those of a new figure."""
-    if ax is not None:
-        return ax
-    import matplotlib.pyplot as plt
-
-    return plt.subplots(figsize=(7, 4.5), layout="constrained")[1]
+__all__ = [
+    "ImageFacts",
+    "describe_image",
+    "plot_balance",
+    "plot_bands",
+    "plot_channels",
+    "plot_comparison",
+    "plot_errors",
+    "plot_f1",
+    "plot_features",
+    "plot_heatmap",
+    "plot_hog",
+    "plot_methods",
+    "plot_near_copies",
+    "plot_parameter",
+    "plot_patches",
+    "plot_precision_recall",
+    "plot_scores",
+    "plot_speedups",
+    "plot_split_scores",
+    "plot_stage_times",
+    "plot_tracks",
+    "plot_tradeoff",
+    "plot_weights",
+    "plot_windows",
+    "show_images",
+]
