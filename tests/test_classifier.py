@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import re
 import struct
@@ -10,12 +11,12 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 
+from vehicle_detection._model_file import FORMAT, FORMAT_VERSION, _checksum
+from vehicle_detection._variants import mirror_patches
 from vehicle_detection.classifier import (
-    FORMAT,
-    FORMAT_VERSION,
+    KIND,
     Template,
     VehicleClassifier,
-    _checksum,
     load_classifier,
     train_classifier,
 )
@@ -29,7 +30,8 @@ SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, ho
 def random_template(params, seed=0, *, bias=0.0):
     """A template whose scores are of the order of one, on features of the usual sizes."""
     rng = np.random.default_rng(seed)
-    parts = ((params.spatial_length, 128, 60), (params.hist_length, 128, 100), (params.hog_length, 0.1, 0.1))
+    hist = (params.hist_length, 8, 8) if params.hist_sqrt else (params.hist_length, 128, 100)
+    parts = ((params.spatial_length, 128, 60), hist, (params.hog_length, 0.1, 0.1))
     mean = np.concatenate([np.full(count, mean) for count, mean, _ in parts])
     scale = np.concatenate([scale * rng.uniform(0.5, 2, count) for count, _, scale in parts])
     coef = rng.normal(0, params.length**-0.5, params.length)
@@ -73,6 +75,59 @@ def test_a_trained_classifier_tells_its_patches_apart(trained, patches, labels):
     np.testing.assert_array_equal(predicted, labels)
     assert trained.score(patches, labels) == 1.0
     assert trained.score(patches, 1 - labels) == 0.0
+
+
+def test_gains_are_those_of_scaled_features(patches, labels):
+    params = dataclasses.replace(SMALL, coarse_hog=True, cell_per_block=1, hist_sqrt=True)
+    gained = dataclasses.replace(params, hist_gain=3.0, coarse_gain=0.5)
+    trained = train_classifier(patches, labels, params=gained, mirror=False, C=0.01)
+    plain = train_classifier(patches, labels, params=params, mirror=False, C=0.01)
+    features = extract_features(patches, params)
+    np.testing.assert_array_equal(extract_features(patches, gained), features)
+    scaled = StandardScaler().fit_transform(features.astype(float)) * gained.gains
+    svm = LinearSVC(C=0.01, random_state=0, max_iter=20_000).fit(scaled, labels)
+    np.testing.assert_allclose(trained.decision_function(patches), svm.decision_function(scaled), atol=1e-3)
+    np.testing.assert_allclose(trained.templates[0].scale, plain.templates[0].scale / gained.gains)
+    assert np.abs(trained.decision_function(patches) - plain.decision_function(patches)).max() > 0.01
+
+
+def test_gamma_gives_mirrored_patches_another_brightness(patches, labels):
+    plain = mirror_patches(patches)
+    np.testing.assert_array_equal(plain, patches[:, :, ::-1])
+    varied = mirror_patches(patches, gamma=0.4)
+    ratios = varied.mean(axis=(1, 2, 3)) / plain.mean(axis=(1, 2, 3))
+    assert (ratios < 0.95).any()
+    assert (ratios > 1.05).any()
+    # Each patch decides for itself: neither its place nor its neighbours matter.
+    np.testing.assert_array_equal(mirror_patches(patches[::-3], gamma=0.4), varied[::-3])
+    # Black stays black, white stays white, and no value overtakes another.
+    order = np.argsort(plain[0].ravel(), kind="stable")
+    assert (np.diff(varied[0].ravel()[order].astype(int)) >= 0).all()
+    extremes = np.concatenate([np.zeros_like(patches[:1]), np.full_like(patches[:1], 255)])
+    np.testing.assert_array_equal(mirror_patches(extremes, gamma=1.0), extremes)
+    both = np.concatenate([patches, varied])
+    expected = train_classifier(both, np.tile(labels, 2), params=SMALL, mirror=False)
+    found = train_classifier(patches, labels, params=SMALL, gamma=0.4)
+    np.testing.assert_array_equal(found.templates[0].coef, expected.templates[0].coef)
+    assert found.metadata["training"]["gamma"] == 0.4
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"gamma": -0.1}, "gamma must be a number, at least 0 and at most 2; got -0.1"),
+        ({"gamma": 0.4, "mirror": False}, "gamma must be 0 without mirrored patches, .*; got 0.4"),
+    ],
+)
+def test_gamma_is_checked(patches, labels, options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        train_classifier(patches, labels, params=SMALL, **options)
+
+
+def test_the_new_features_survive_a_model_file(tmp_path):
+    params = FeatureParams.preset("lab-9432")
+    random_classifier(params).save(tmp_path / "a.safetensors")
+    assert load_classifier(tmp_path / "a.safetensors").params == params
 
 
 def test_patches_and_their_features_score_alike(trained, patches):
@@ -365,6 +420,7 @@ def write_model(path, tensors=None, **changes):
     header = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
+        "kind": KIND,
         "params": json.dumps(
             {"spatial_size": 8, "hist_bins": 8, "orient": 4, "pix_per_cell": 16, "hog_channel": 0}
         ),
@@ -419,10 +475,13 @@ def test_tensors_that_do_not_fit(tmp_path, tensors, message):
         ({"params": '{"orient": 0}'}, "does not fit its own parameters: orient must be an integer"),
         ({"params": '{"colour": 1}'}, "does not fit its own parameters"),
         ({"params": "[]"}, "does not fit its own parameters"),
-        ({"params": "{"}, "does not fit its own parameters"),
-        ({"params": None}, "does not fit its own parameters: 'params'"),
-        ({"metadata": None}, "does not fit its own parameters: 'metadata'"),
-        ({"metadata": "nonsense"}, "does not fit its own parameters"),
+        ({"params": "{"}, r"has no readable parameters \(.*\); get it again"),
+        ({"params": "5"}, r"has no readable parameters"),
+        ({"params": None}, r"has no readable parameters \('params'\)"),
+        ({"metadata": None}, r"has no readable parameters \('metadata'\)"),
+        ({"metadata": "nonsense"}, "has no readable parameters"),
+        ({"kind": "mixture"}, "holds a model of the kind 'mixture', not 'patches'; load it with load_model"),
+        ({"kind": None}, "holds a model of the kind None, not 'patches'"),
         ({"params": '{"spatial_size": 16}'}, "does not fit its own parameters: templates must have 6156"),
     ],
 )

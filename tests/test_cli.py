@@ -1,4 +1,5 @@
 import errno
+import functools
 import json
 import os
 import re
@@ -17,7 +18,16 @@ import pytest
 from typer.testing import CliRunner
 
 import vehicle_detection
-from vehicle_detection import _files, classifier, datasets, detector, training
+from tests.test_mixture_report import write_set
+from tests.test_mixture_training import SMALL, drawn
+from vehicle_detection import (
+    _files,
+    classifier,
+    datasets,
+    detector,
+    mixture_report,
+    training,
+)
 from vehicle_detection._cli_output import interruptible, output_folder
 from vehicle_detection._demo import FILES, SHEET, draw_clip
 from vehicle_detection.boxes import Detections
@@ -25,10 +35,11 @@ from vehicle_detection.classifier import VehicleClassifier, load_classifier
 from vehicle_detection.cli import app
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import read_image, write_image
+from vehicle_detection.mixture import load_model
 from vehicle_detection.synthetic import render_drive, render_patches
 from vehicle_detection.video import probe_video, read_frames
 
-COMMANDS = ("demo", "detect", "video", "evaluate", "train", "tune", "fetch", "info")
+COMMANDS = ("demo", "detect", "video", "evaluate", "train", "train-frames", "tune", "fetch", "info")
 ROOT = Path(__file__).parents[1]
 HEADER = "frame,track_id,x1,y1,x2,y2,score"
 
@@ -296,7 +307,7 @@ def bad_images(material, tmp):
         r"cut_road.png must be a whole image file": [material / "cut_road.png"],
         r"nothing.png must be a whole image file": [tmp / "nothing.png"],
         r"floats.tiff must be a whole image file": [floats],
-        r"image of 12x12 pixels holds no search window": [tiny],
+        r"image of 12x12 pixels holds no search window": [tiny, "--model", "highway"],
         r"horizon must be a number, at least 0 and at most 1; got 2": [road, "--horizon", 2],
         r"horizon must be a number, .* got nan": [road, "--horizon", "nan"],
         r"-o \S+ is the folder of road.png, which would be overwritten": [road, "-o", material],
@@ -306,6 +317,7 @@ def bad_images(material, tmp):
         r"path must end in .csv, .* got 'boxes.doc'": [road, "--boxes", tmp / "boxes.doc"],
         r"path needs an existing folder, \S+none is none": [road, "--boxes", tmp / "none" / "boxes.csv"],
         r"model file \S+none.safetensors does not exist": [road, "--model", tmp / "none.safetensors"],
+        r"model file motorway does not exist; .* a shipped model: default, h": [road, "--model", "motorway"],
         r"model file \S+empty is a folder": [road, "--model", material / "empty"],
         r"text.safetensors is no whole safetensors": [road, "--model", material / "text.safetensors"],
     }
@@ -424,7 +436,7 @@ def bad_videos(material, tmp):
         r"text.mp4 is no video that ffmpeg can read": [material / "text.mp4", target],
         r"cut_clip.mp4 is no video .*its index is missing": [material / "cut_clip.mp4", target],
         r"none.mp4 (has no|is no video)": [tmp / "none.mp4", target],
-        r"image of 32x32 pixels holds no search window": [tiny, target],
+        r"image of 32x32 pixels holds no search window": [tiny, target, "--model", "highway"],
         r"target \S+clip.mp4 is the source itself": [clip, clip],
         r"target needs an existing folder, \S+none is none": [clip, tmp / "none" / "out.mp4"],
         r"target must end in .mp4, .* got 'out.gif'": [clip, tmp / "out.gif"],
@@ -655,12 +667,106 @@ def test_fetch_that_fails_leaves_no_folder(monkeypatch, tmp_path):
     assert contents(tmp_path) == []
 
 
-def test_info_of_the_shipped_model():
-    out = succeed("info")
+def test_info_of_the_shipped_models():
+    out = succeed("info", "highway")
     model = load_classifier()
-    assert out.startswith(f"shipped model: {model.params.length} features, 1 template\n")
+    assert out.startswith(f"highway: {model.params.length} features, 1 template\n")
     assert re.search(rf"color_space +{model.params.color_space}\s", out)
     assert re.search(r"numpy +\d", out)
+    out = succeed("info", "default")
+    assert succeed("info") == out
+    default = load_model()
+    assert out.startswith(f"default: 3 templates, threshold {default.threshold:.2f} (log-odds)\n")
+    assert "box of 7x6 cells" in out
+    for name, scores in default.metadata["metrics"]["left_out"].items():
+        assert re.search(rf"{name} .*{scores['f1']:.3f}", out)
+
+
+def test_info_of_a_model_whose_scores_are_not_all_known(tmp_path):
+    model, path = load_model(), tmp_path / "m.safetensors"
+    model.with_metadata({"metrics": {"left_out": {"road": {"f1": 0.25}}}}).save(path)
+    assert re.search(r"road\W+0\.250", succeed("info", path))
+
+
+def test_info_of_what_is_no_model(material):
+    assert "model file motorway does not exist; check the path" in refuse("info", "motorway")
+    assert "is a folder; name a file in it" in refuse("info", material / "empty")
+
+
+def test_models_by_name(picture):
+    assert re.search(r": \d+ vehicle", succeed("detect", picture))
+    assert succeed("detect", picture, "--model", "default") == succeed("detect", picture)
+    assert re.search(r": \d+ vehicle", succeed("detect", picture, "--model", "highway"))
+
+
+# --- train-frames ---
+
+
+@pytest.fixture
+def small_training(monkeypatch):
+    """Train with the few windows that a handful of drawn frames has."""
+    judge = functools.partial(mixture_report.judge_mixture, params=SMALL)
+    monkeypatch.setattr(mixture_report, "judge_mixture", judge)
+
+
+@pytest.fixture(scope="module")
+def drawn_roads(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("roads")
+    write_set(folder, "town", drawn(range(6)))
+    write_set(folder, "stills", drawn(range(6, 10)), place=".")
+    return folder
+
+
+def test_train_frames(drawn_roads, small_training, tmp_path):
+    names = [tmp_path / f"road.{suffix}" for suffix in ("safetensors", "md", "csv")]
+    words = [
+        "train-frames",
+        drawn_roads,
+        "-o",
+        names[0],
+        "--card",
+        names[1],
+        "--curves",
+        names[2],
+        "--seed",
+        5,
+    ]
+    out = succeed(*words)
+    assert "town: judged by a model that does not know it" in out
+    assert "on sources left out of training, IoU 0.5" in out
+    assert out.endswith(f"wrote {', '.join(map(str, names))}\n")
+    model = load_model(names[0])
+    assert [template.box_cells for template in model.templates] == [(6, 5)]
+    assert model.metadata["training"] == {"random_state": 5}
+    assert model.metadata["data"] == {"town": 6, "course": 4}
+    assert names[1].read_text().startswith("# Model card: road")
+    assert names[2].read_text().startswith("frames,value,precision,recall\ntown,")
+    shown = succeed("info", names[0])
+    assert re.search(r"town\W+\d\.\d{3}", shown)
+    first = names[0].read_bytes()
+    succeed(*words)
+    assert names[0].read_bytes() == first
+
+
+def test_train_frames_refuses_bad_input_before_it_trains(drawn_roads, tmp_path, monkeypatch):
+    monkeypatch.setattr(mixture_report, "train_mixture", None)
+    one = tmp_path / "one"
+    write_set(one, "town", drawn(range(2)))
+    model = tmp_path / "m.safetensors"
+    (tmp_path / "empty").mkdir()
+    cases = {
+        r"folder \S+none does not exist; name the folder of the labelled": [tmp_path / "none", "-o", model],
+        r"folder \S+empty has no labels/NAME.csv": [tmp_path / "empty", "-o", model],
+        r"sources must be two or more, .*; got 1": [one, "-o", model],
+        r"-o needs an existing folder": [drawn_roads, "-o", tmp_path / "none" / "m.safetensors"],
+        r"-o must be a file, got the folder": [drawn_roads, "-o", tmp_path],
+        r"--card needs an existing folder": [drawn_roads, "-o", model, "--card", tmp_path / "none" / "m.md"],
+        r"--curves \S+ is -o \S+ as well": [drawn_roads, "-o", model, "--curves", model],
+        r"random_state must be an integer from 0": [drawn_roads, "-o", model, "--seed", -1],
+    }
+    for message, words in cases.items():
+        assert re.search(message, refuse("train-frames", *words)), message
+    assert not model.exists()
 
 
 def test_info_of_a_model_with_other_metadata(tmp_path):

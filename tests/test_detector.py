@@ -7,9 +7,10 @@ import pytest
 
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.camera import Camera
-from vehicle_detection.classifier import Template, VehicleClassifier, load_classifier
+from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.detector import FrameResult, VehicleDetector
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.mixture import load_model
 from vehicle_detection.params import FeatureParams, HeatParams, RegionParams, SearchBand, SearchParams
 
 HEIGHT, WIDTH = 180, 320
@@ -427,7 +428,7 @@ def test_features_that_cannot_be_shared_are_searched_window_by_window():
 
 def test_the_default_is_the_shipped_model():
     detector = VehicleDetector()
-    assert detector.classifier.params == load_classifier().params
+    assert detector.classifier.threshold == load_model("default").threshold
     gray = np.full((720, 1280, 3), 90, np.uint8)
     assert len(detector.detect(gray)) == 0
     assert detector.process(gray).tracks == ()

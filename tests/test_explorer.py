@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from vehicle_detection import explorer as room
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera
+from vehicle_detection.classifier import load_classifier
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
@@ -56,7 +57,7 @@ def test_it_finds_what_the_detector_finds(explorer, scenes, kind, min_score):
     for number, scene in enumerate(scenes):
         explorer.set_frame(number)
         expected = VehicleDetector(
-            regions=kind, search=SearchParams(bands=explorer.search.bands, horizon=0.56,
+            load_classifier(), regions=kind, search=SearchParams(bands=explorer.search.bands, horizon=0.56,
                                               min_score=min_score, overhang=0.5), n_jobs=1
         )  # fmt: skip
         windows = expected.search(scene).windows
@@ -359,15 +360,16 @@ def decode(picture):
 
 def test_the_controls_begin_with_the_state(explorer, panel):
     controls, line, picture = panel
-    said = {name: control.value for name, control in controls.items()}
+    said, fit = {name: control.value for name, control in controls.items()}, RegionParams()
     assert said == {
         "frame": "frame 0", "show": "windows", "score above": 0.0, "horizon": 0.56,
-        "windows (px)": tuple(range(8)), "boxes": "fitted", "least peak": 0.6, "least evidence": 1.5,
-        "heat above": 2.0, "share of peak": 0.35, "a window adds": "score",
+        "windows (px)": tuple(range(8)), "boxes": "fitted", "least peak": fit.min_peak,
+        "least evidence": fit.min_evidence, "heat above": 2.0,
+        "share of peak": 0.35, "a window adds": "score",
     }  # fmt: skip
     assert line.value == explorer.summary()
     difference = decode(picture).astype(int) - explorer.render()
-    assert np.abs(difference).mean() < 6  # JPEG
+    assert np.abs(difference).mean() < 8  # JPEG
 
 
 def test_each_control_does_what_it_says(explorer, panel, searches):

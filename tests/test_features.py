@@ -75,7 +75,7 @@ def assert_equals_the_reference(patches, params):
     assert fast.dtype == np.float32
     assert fast.shape == reference.shape == (len(patches), params.length)
     counted = params.spatial_length + params.hist_length
-    np.testing.assert_array_equal(fast[:, :counted], reference[:, :counted])
+    np.testing.assert_array_equal(fast[:, :counted], reference[:, :counted].astype(np.float32))
     np.testing.assert_allclose(fast[:, counted:], reference[:, counted:], rtol=0, atol=TOLERANCE)
 
 
@@ -121,6 +121,13 @@ def test_the_presets_equal_the_reference(preset):
         {"spatial_feat": False, "hist_feat": False},
         {"hog_feat": False},
         {"hog_feat": False, "spatial_feat": False},
+        {"hist_sqrt": True},
+        {"hist_sqrt": True, "hist_bins": 256, "hog_feat": False},
+        {"coarse_hog": True},
+        {"coarse_hog": True, "hog_channel": "GRAY", "transform_sqrt": True},
+        {"coarse_hog": True, "pix_per_cell": 7, "cell_per_block": 3},
+        {"coarse_hog": True, "pix_per_cell": 2, "cell_per_block": 1, "hog_channel": 1},
+        {"coarse_hog": True, "hog_feat": False},
     ],
     ids=str,
 )
@@ -139,6 +146,7 @@ def feature_params(draw):
         st.sampled_from([(True, True, True), (True, False, True), (False, True, True), (False,) * 2])
     )
     cell = draw(st.integers(4, 64))
+    block = draw(st.integers(1, min(4, 64 // cell)))
     return FeatureParams(
         color_space=draw(st.sampled_from(COLOR_SPACES)),
         spatial_feat=parts[0],
@@ -148,9 +156,11 @@ def feature_params(draw):
         hist_bins=draw(st.integers(1, 256)),
         orient=draw(st.integers(1, 20)),
         pix_per_cell=cell,
-        cell_per_block=draw(st.integers(1, min(4, 64 // cell))),
+        cell_per_block=block,
         hog_channel=draw(st.sampled_from(HOG_CHANNELS)),
         transform_sqrt=draw(st.booleans()),
+        hist_sqrt=draw(st.booleans()),
+        coarse_hog=64 // cell // 2 >= block and draw(st.booleans()),
     )
 
 
@@ -391,6 +401,26 @@ def test_the_vector_is_spatial_then_histogram_then_hog():
     np.testing.assert_array_equal(vector[:192], bin_spatial(patch, 8))
     np.testing.assert_array_equal(vector[192:204], color_hist(patch, 4))
     np.testing.assert_array_equal(vector[204:], get_hog_features(patch[..., 1], 6))
+
+
+def test_the_coarse_hog_is_that_of_larger_cells():
+    fine = FeatureParams(hog_channel=0, orient=8)
+    params = dataclasses.replace(fine, coarse_hog=True)
+    patch = PATCHES[-1]
+    coarse = get_hog_features(convert_color(patch)[..., 0], 8, 16)
+    for extract in (single_img_features, lambda patch, params: extract_features([patch], params)[0]):
+        vector = extract(patch, params)
+        np.testing.assert_array_equal(vector[: fine.length], extract(patch, fine))
+        np.testing.assert_allclose(vector[fine.length :], coarse, atol=TOLERANCE)
+
+
+def test_roots_of_the_histogram():
+    plain = FeatureParams(spatial_feat=False, hog_feat=False)
+    counts = extract_features(PATCHES, plain)
+    roots = extract_features(PATCHES, dataclasses.replace(plain, hist_sqrt=True))
+    np.testing.assert_allclose(roots**2, counts, rtol=1e-6)
+    # Every patch has as many pixels: the roots of a channel's counts have one length.
+    np.testing.assert_allclose((roots**2).sum(axis=1), 3 * 64 * 64, rtol=1e-6)
 
 
 @pytest.mark.parametrize("color_space", COLOR_SPACES)

@@ -1,5 +1,6 @@
 import dataclasses
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from vehicle_detection.params import (
     FeatureParams,
     HeatParams,
     PixelBand,
+    PyramidParams,
     RegionParams,
     SearchBand,
     SearchParams,
@@ -60,6 +62,7 @@ def test_every_field_is_checked_and_named(params, field, value):
         ("luv-2384", 2384, (768, 48, 1568)),
         ("ycrcb-6156", 6156, (768, 96, 5292)),
         ("ycrcb-8460", 8460, (3072, 96, 5292)),
+        ("lab-9432", 9432, (3072, 96, 5292 + 972)),
     ],
 )
 def test_the_presets_have_the_known_lengths(name, length, parts):
@@ -81,6 +84,24 @@ def test_features_that_are_off_have_no_length():
     assert FeatureParams(hog_feat=False).length == 768 + 96
 
 
+def test_the_coarse_hog_is_the_end_of_hog():
+    params = FeatureParams(coarse_hog=True)
+    assert (params.coarse_blocks, params.coarse_length) == (3, 3 * 3 * 4 * 9 * 3)
+    assert params.hog_length == 5292 + params.coarse_length
+    assert params.length == 768 + 96 + params.hog_length
+    assert FeatureParams(coarse_hog=True, cell_per_block=4).coarse_length == 4 * 4 * 9 * 3
+    assert FeatureParams(coarse_hog=True, hog_feat=False).length == 768 + 96
+    assert (FeatureParams().coarse_blocks, FeatureParams().coarse_length) == (0, 0)
+
+
+def test_gains_lie_on_their_parts():
+    params = FeatureParams(coarse_hog=True, hist_gain=3, coarse_gain=2)
+    expected = np.repeat([1.0, 3.0, 1.0, 2.0], [768, 96, 5292, 972])
+    np.testing.assert_array_equal(params.gains, expected)
+    assert (FeatureParams(hist_gain=3, hist_feat=False, coarse_gain=2).gains == 1).all()
+    assert (FeatureParams().gains == 1).all()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -95,6 +116,14 @@ def test_features_that_are_off_have_no_length():
         ({"pix_per_cell": 16, "cell_per_block": 5}, "cell_per_block must be an integer from 1 to 4"),
         ({"hog_channel": 3}, "hog_channel must be one of 0, 1, 2, 'ALL', 'GRAY'; got 3"),
         ({"hog_channel": "all"}, "hog_channel must be one of"),
+        ({"hist_sqrt": 1}, "hist_sqrt must be True or False; got 1"),
+        ({"coarse_hog": 1}, "coarse_hog must be True or False; got 1"),
+        (
+            {"coarse_hog": True, "cell_per_block": 5},
+            "coarse_hog must be False where no block of 5 cells of 16 pixels fits into a patch; got True",
+        ),
+        ({"hist_gain": 0}, "hist_gain must be a number, at least 0.01 and at most 100; got 0"),
+        ({"coarse_gain": 101}, "coarse_gain must be a number, at least 0.01 and at most 100; got 101"),
     ],
 )
 def test_feature_params_refuse(arguments, message):
@@ -105,10 +134,14 @@ def test_feature_params_refuse(arguments, message):
 def test_numbers_of_numpy_become_plain():
     # A grid of parameters from numpy.arange has to fit into the JSON of a model file.
     params = FeatureParams(
-        orient=np.int64(9), hog_channel=np.int64(0), spatial_size=np.int32(8), hist_bins=np.uint8(4)
+        orient=np.int64(9),
+        hog_channel=np.int64(0),
+        spatial_size=np.int32(8),
+        hist_bins=np.uint8(4),
+        hist_gain=np.float32(2),
     )
-    assert params == FeatureParams(orient=9, hog_channel=0, spatial_size=8, hist_bins=4)
-    assert all(type(value) in (int, str, bool) for value in dataclasses.asdict(params).values())
+    assert params == FeatureParams(orient=9, hog_channel=0, spatial_size=8, hist_bins=4, hist_gain=2)
+    assert all(type(value) in (int, str, bool, float) for value in dataclasses.asdict(params).values())
 
 
 @pytest.mark.parametrize("cls", [FeatureParams, SearchParams])
@@ -272,3 +305,52 @@ def test_the_third_systems_windows_at_a_step_of_one_cell():
     bands = SearchParams.preset("three-scales").place((720, 1280))
     assert [band.window for band in bands] == [(96, 96), (64, 64), (51, 51)]
     assert {(band.x1, band.y1, band.x2, band.y2) for band in bands} == {(0, 400, 1280, 656)}
+
+
+# --- the pyramid of a mixture ---
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"camera_height_m": 1.2}, r"camera_height_m must be the least and the most, such as .*; got 1.2"),
+        ({"camera_height_m": (1.0, 1.2, 1.4)}, "camera_height_m must be the least and the most"),
+        ({"camera_height_m": (2.0, 1.0)}, r"camera_height_m must be the least one first; got \(2.0, 1.0\)"),
+        ({"camera_height_m": (0.0, 1.0)}, "camera_height_m must be a number, greater than 0"),
+        ({"camera_height_m": (1.0, "x")}, "camera_height_m must be a number"),
+        ({"least_width": 8}, "least_width must be a number, at least 16"),
+        ({"most_height": 0}, "most_height must be a number, greater than 0"),
+        ({"per_octave": 2.5}, "per_octave must be an integer"),
+        ({"horizon": 1.5}, "horizon must be a number, at least 0 and at most 1"),
+        ({"horizon_error": -0.1}, "horizon_error must be a number"),
+        ({"min_score": None}, "min_score must be a number"),
+    ],
+)
+def test_pyramids_that_make_no_sense(options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        PyramidParams(**options)
+
+
+@given(
+    least=st.floats(16, 200),
+    per_octave=st.integers(1, 12),
+    cells=st.tuples(st.floats(2, 16), st.floats(2, 16)),
+    height=st.integers(1, 3000),
+)
+def test_sizes_of_a_pyramid_rise_from_the_least_width_to_the_most_height(least, per_octave, cells, height):
+    params = PyramidParams(least_width=least, per_octave=per_octave)
+    sizes = params.sizes(*cells, (height, 100))
+    assert sizes[0] == least / cells[0]
+    assert all(after / before == pytest.approx(2 ** (1 / per_octave)) for before, after in pairwise(sizes))
+    assert len(sizes) == 1 or sizes[-1] * cells[1] <= params.most_height * height * (1 + 1e-9)
+
+
+def test_rows_of_a_flat_road():
+    everywhere = PyramidParams(horizon=None)
+    assert everywhere.rows(90, 80, (720, 1280)) == (0, 720)
+    assert everywhere.with_horizon(None) is everywhere
+    known = PyramidParams(horizon=0.5, camera_height_m=[1.0, 2.0], horizon_error=0.05)
+    assert known.camera_height_m == (1.0, 2.0)
+    # 90 px are 1.8 m: the foot of a vehicle is 50 to 100 px below the horizon, which may be 36 px wrong.
+    assert known.rows(90, 80, (720, 1280)) == (360 + 50 - 36 - 80, 360 + 100 + 36)
+    assert everywhere.with_horizon(0.4).horizon == 0.4

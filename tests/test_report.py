@@ -24,6 +24,7 @@ from vehicle_detection.classifier import load_classifier
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.mixture import load_model
 from vehicle_detection.params import TrackParams
 from vehicle_detection.report import ReportWriter
 from vehicle_detection.video import VideoReport
@@ -301,7 +302,8 @@ def test_an_hour_of_video_is_a_small_page(tmp_path):
 
 def test_settings_and_model_are_those_of_the_detector(tmp_path):
     camera = Camera.for_frame((720, 1280), height_m=1.75)
-    with VehicleDetector(n_jobs=1, camera=camera, track=TrackParams(gate=0.625)) as detector:
+    options = {"camera": camera, "track": TrackParams(gate=0.625)}
+    with VehicleDetector(load_classifier(), n_jobs=1, **options) as detector:
         page = written(tmp_path, FRAMES, detector=detector)
     assert "<dt>gate</dt><dd>0.625</dd>" in page
     assert "<dt>height m</dt><dd>1.75</dd>" in page
@@ -311,8 +313,21 @@ def test_settings_and_model_are_those_of_the_detector(tmp_path):
     metadata = load_classifier().metadata
     assert metadata["data"]["fingerprint"] in page
     assert f"{metadata['metrics']['splits']['random']['accuracy']:.4f}" in page
-    assert "lab-8460: 8,460 values" in page
+    assert re.search(r"lab-(8460|9432): [89],\d{3} values", page)
     assert "CC BY-NC-SA 3.0" in page
+
+
+def test_a_mixture_of_templates_tells_what_it_reaches_on_other_roads(tmp_path):
+    with VehicleDetector(n_jobs=1, horizon=0.5) as detector:
+        page = written(tmp_path, FRAMES, detector=detector)
+    assert "<dt>horizon</dt><dd>0.5</dd>" in page
+    assert "<summary>Camera (assumed)</summary>" in page
+    assert "fitted boxes" not in page
+    assert "3 templates, for boxes of 6\xa0\xd7\xa08, 7\xa0\xd7\xa06" in page
+    for name, scores in load_model().metadata["metrics"]["left_out"].items():
+        assert name in page
+        assert f"{scores['f1']:.6g}" in page
+    assert "inherits the terms of the frames" in page
 
 
 def test_settings_of_the_course_s_way(tmp_path):

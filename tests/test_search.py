@@ -10,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.test_classifier import random_classifier
+from vehicle_detection._buffers import Buffers
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import COLOR_SPACES, FeatureParams, PixelBand, SearchBand, SearchParams
-from vehicle_detection.search import BandSearch, _Buffers, find_cars, resize_band, resized_shape
+from vehicle_detection.search import BandSearch, find_cars, resize_band, resized_shape
 from vehicle_detection.windows import search_windows, slide_window
 
 PRESETS = sorted(FeatureParams.PRESETS)
@@ -106,6 +107,24 @@ def test_the_presets_equal_the_reference_at_the_courses_scales(preset, window):
         {"spatial_size": 64},
         {"spatial_feat": False, "spatial_size": 20},
         *({"color_space": space} for space in COLOR_SPACES),
+        {"coarse_hog": True},
+        {"coarse_hog": True, "hog_channel": 1, "orient": 5},
+        {"coarse_hog": True, "hog_channel": "GRAY", "transform_sqrt": True},
+        {"coarse_hog": True, "cell_per_block": 1, "orient": 8},
+        {"coarse_hog": True, "cell_per_block": 4},
+        {"coarse_hog": True, "pix_per_cell": 16},
+        {"coarse_hog": True, "pix_per_cell": 4, "cell_per_block": 3, "hog_channel": 0},
+        {"coarse_hog": True, "pix_per_cell": 32, "cell_per_block": 1, "spatial_size": 2},
+        {"coarse_hog": True, "hog_feat": False},
+        {"hist_sqrt": True},
+        {"hist_sqrt": True, "hist_bins": 1},
+        {"hist_sqrt": True, "hist_bins": 256},
+        {"hist_sqrt": True, "hist_bins": 20, "pix_per_cell": 16},
+        {"hist_sqrt": True, "pix_per_cell": 4, "hog_channel": 0},
+        {"hist_sqrt": True, "pix_per_cell": 64, "cell_per_block": 1, "spatial_size": 1},
+        {"hist_sqrt": True, "spatial_feat": False, "hog_feat": False},
+        {"hist_sqrt": True, "hist_feat": False},
+        {"hist_sqrt": True, "coarse_hog": True, "color_space": "HSV", "spatial_feat": False},
     ],
     ids=str,
 )
@@ -162,7 +181,7 @@ def test_any_band_equals_the_reference(window, corner, more, seed):
         assert_equals_the_reference(IMAGE, band, classifier)
 
 
-@pytest.mark.parametrize("preset", ["ycrcb-6156", "luv-2384"])
+@pytest.mark.parametrize("preset", ["ycrcb-6156", "luv-2384", "lab-9432"])
 def test_two_templates_give_the_better_score(preset):
     params = FeatureParams.preset(preset)
     both = random_classifier(params, 3, templates=2, bias=0.3)
@@ -445,7 +464,7 @@ def test_a_strided_frame_gives_the_same():
 
 
 def test_frames_of_many_sizes_share_the_memory_of_the_largest():
-    buffers = _Buffers()
+    buffers = Buffers()
     large = buffers.take((40, 60, 3), np.uint8, "band")
     large[:] = 7
     for side in range(10, 40):

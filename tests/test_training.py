@@ -62,9 +62,9 @@ def test_every_split_is_judged(judged, patch_set):
     assert (report.split, report.features) == ("random", f"{SMALL.length} features")
 
 
-@pytest.mark.parametrize("mirror", [True, False])
-def test_the_scores_are_those_of_a_classifier_that_saw_the_training_part_alone(patch_set, mirror):
-    _, report = train_and_judge(patch_set, params=SMALL, random_state=3, seeds=2, mirror=mirror)
+@pytest.mark.parametrize(("mirror", "gamma"), [(True, 0.0), (False, 0.0), (True, 0.4)])
+def test_the_scores_are_those_of_a_classifier_that_saw_the_training_part_alone(patch_set, mirror, gamma):
+    _, report = train_and_judge(patch_set, params=SMALL, random_state=3, seeds=2, mirror=mirror, gamma=gamma)
     splits = {
         "random": [split_random(patch_set, random_state=seed) for seed in (3, 4)],
         "sequences": [split_sequences(patch_set)],
@@ -79,6 +79,7 @@ def test_the_scores_are_those_of_a_classifier_that_saw_the_training_part_alone(p
                 patch_set.labels[train],
                 params=SMALL,
                 mirror=mirror,
+                gamma=gamma,
                 random_state=3,
             )
             assert alone.score(patch_set.patches[test], patch_set.labels[test]) == accuracy

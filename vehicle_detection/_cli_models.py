@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vehicle_detection._cli_frames import print_road_scores
 from vehicle_detection._cli_output import (
     check_apart,
     codec_messages,
@@ -29,8 +30,8 @@ def train(
     non_vehicles: Annotated[Path, typer.Option(metavar="PATH", help="Folder or zip of patches without one.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Model file to write.")],
     features: Annotated[
-        str, typer.Option(metavar="PRESET", help="lab-8460, ycrcb-8460, ycrcb-6156 or luv-2384.")
-    ] = "lab-8460",
+        str, typer.Option(metavar="PRESET", help="lab-9432, lab-8460, ycrcb-8460, ycrcb-6156 or luv-2384.")
+    ] = "lab-9432",
     split: Annotated[
         str, typer.Option(metavar="random|sequences", help="The split whose accuracy stands for the model.")
     ] = "random",
@@ -39,6 +40,9 @@ def train(
     ] = 1e-4,
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of the solver and of the first split.")] = 0,
     no_mirror: Annotated[bool, typer.Option("--no-mirror", help="Leave out the mirrored patches.")] = False,
+    gamma: Annotated[
+        float, typer.Option(metavar="F", help="Spread of the mirrored patches' brightness; 0.4 is much.")
+    ] = 0.0,
     report: Annotated[
         Path | None, typer.Option(metavar="FILE.json", help="Accuracy on every split, counts, timings.")
     ] = None,
@@ -58,7 +62,8 @@ def train(
     targets = {name: check_target(path, name) for name, path in named.items() if path is not None}
     check_apart({"--non-vehicles": non_vehicles, **targets}, {"--vehicles": vehicles})
     presets = [FeatureParams.preset(name) for name in (features, *(compare or ()))]
-    options: dict[str, Any] = {"C": C, "mirror": not no_mirror, "random_state": seed, "split": split}
+    options: dict[str, Any] = {"C": C, "mirror": not no_mirror, "gamma": gamma}
+    options |= {"random_state": seed, "split": split}
 
     with codec_messages():
         patches = load_training_patches(vehicles, non_vehicles)
@@ -78,6 +83,7 @@ def train(
     if card is not None:
         words = ["--vehicles", vehicles.name, "--non-vehicles", non_vehicles.name, "--features", features]
         words += ["--split", split, "--C", f"{C:g}", "--seed", str(seed)] + ["--no-mirror"] * no_mirror
+        words += ["--gamma", f"{gamma:g}"] if gamma else []
         words += [word for name in compare or () for word in ("--compare", name)]
         words += ["-o", output.name, "--card", card.name]
         text = model_card(
@@ -131,21 +137,29 @@ def fetch(
 
 def info(
     model: Annotated[
-        Path | None, typer.Argument(metavar="[MODEL]", help="Model file; the shipped one if none is given.")
-    ] = None,
+        str, typer.Argument(metavar="[MODEL]", help='"default", "highway" or a model file.')
+    ] = "default",
 ) -> None:
     """Show what a model is: parameters, accuracy, data, versions."""
-    from vehicle_detection.classifier import load_classifier
+    from vehicle_detection.mixture import TemplateMixture, load_model
     from vehicle_detection.training import SPLITS
 
-    classifier = load_classifier(model)
-    params, count = classifier.params, len(classifier.templates)
-    print_facts(
-        f"{model or 'shipped model'}: {params.length} features, {count} template{'s' * (count > 1)}",
-        dataclasses.asdict(params),
-    )
-    for name, values in classifier.metadata.items():
+    loaded = load_model(model)
+    count = len(loaded.templates)
+    templates = f"{count} template{'s' * (count > 1)}"
+    if isinstance(loaded, TemplateMixture):
+        shapes = {
+            str(number): f"box of {template.box_cells[0]:g}x{template.box_cells[1]:g} cells"
+            for number, template in enumerate(loaded.templates, 1)
+        }
+        print_facts(f"{model}: {templates}, threshold {loaded.threshold:.2f} (log-odds)", shapes)
+    else:
+        print_facts(
+            f"{model}: {loaded.params.length} features, {templates}", dataclasses.asdict(loaded.params)
+        )
+    for name, values in loaded.metadata.items():
         scores = values.get("splits") if isinstance(values, dict) else None
+        left_out = values.get("left_out") if isinstance(values, dict) else None
         if name == "metrics" and isinstance(scores, dict) and scores.keys() <= SPLITS.keys():
             columns = ("accuracy", "missed", "false", "near_copies", "test")
             rows = [
@@ -154,5 +168,7 @@ def info(
                 if split in scores
             ]
             print_table(name, ("tested on", *(column.replace("_", " ") for column in columns)), rows)
+        elif name == "metrics" and isinstance(left_out, dict):
+            print_road_scores(left_out)
         else:  # a model that was not trained by this command line tells what it likes
             print_facts(name, values if isinstance(values, dict) else {"": values})

@@ -84,7 +84,10 @@ def lay_out(
             "the explorer's sliders need ipywidgets; pip install 'vehicle-detection[notebooks]', or use "
             "its methods without them"
         ) from None
-    wide = {"layout": widgets.Layout(width="98%"), "style": {"description_width": "110px"}}
+    style = {"description_width": "96px"}
+    wide = {"layout": widgets.Layout(width="98%"), "style": style}
+    # Buttons as wide as their words stand in one line.
+    snug = {"layout": widgets.Layout(width="98%"), "style": {**style, "button_width": "auto"}}
 
     def slider(text: str, value: float, low: float, high: float, step: float) -> Any:
         # A value beyond the usual range widens it: the slider must not change what it shows.
@@ -92,7 +95,7 @@ def lay_out(
         return widgets.FloatSlider(value=value, description=text, readout_format=".2f", **ends, **wide)
 
     def choice(text: str, options: Sequence[str], value: str) -> Any:
-        return widgets.ToggleButtons(options=options, value=value, description=text, **wide)
+        return widgets.ToggleButtons(options=options, value=value, description=text, **snug)
 
     sizes = [
         (f"{number}: {round(band.window[0])}x{round(band.window[1])}", number)
@@ -115,6 +118,6 @@ def lay_out(
     }
     picture = widgets.Image(format="jpeg", layout=widgets.Layout(width="100%"))
     line = widgets.HTML()
-    left = widgets.VBox(list(controls.values()), layout=widgets.Layout(width="32%"))
-    right = widgets.VBox([line, picture], layout=widgets.Layout(width="68%"))
+    left = widgets.VBox(list(controls.values()), layout=widgets.Layout(width="35%"))
+    right = widgets.VBox([line, picture], layout=widgets.Layout(width="65%"))
     return Panel(controls, picture, line, widgets.HBox([left, right]))

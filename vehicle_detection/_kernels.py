@@ -178,7 +178,32 @@ def sum_orientations(gx, gy, angles, bounds, channels, cell, cells):
 
 
 @jit
-def normalise_blocks(cells, block, blocks):
+def pool_cells(cells, pooled):
+    """Average cells with their neighbours to the right, below and between: cells of twice the side.
+
+    Parameters
+    ----------
+    cells
+        ``(channels, orient, cell rows, cell columns)`` float32.
+    pooled
+        Output of the same shape: ``[c, k, y, x]`` is the mean of ``cells[c, k, y : y + 2, x : x + 2]``. The
+        last row and column become zero.
+    """
+    channels, orient, rows, columns = cells.shape
+    quarter = np.float32(0.25)
+    for channel in range(channels):
+        for k in range(orient):
+            for y in range(rows - 1):
+                above, below = cells[channel, k, y], cells[channel, k, y + 1]
+                out = pooled[channel, k, y]
+                for x in range(columns - 1):
+                    out[x] = ((above[x] + above[x + 1]) + (below[x] + below[x + 1])) * quarter
+                out[columns - 1] = np.float32(0)
+            pooled[channel, k, rows - 1] = np.float32(0)
+
+
+@jit
+def normalise_blocks(cells, block, spread, blocks):
     """Normalise overlapping blocks of cells by L2-Hys: L2, clip at 0.2, L2 again.
 
     Dalal and Triggs, "Histograms of oriented gradients for human detection" (CVPR 2005), section 6.4, with
@@ -190,16 +215,20 @@ def normalise_blocks(cells, block, blocks):
         ``(channels, orient, cell rows, cell columns)`` float32.
     block
         Side of a block in cells.
+    spread
+        Distance of a block's cells: 1, or 2 for cells of `pool_cells`.
     blocks
         Output, ``(channels, block, block, orient, cell rows, cell columns)`` float32: plane
-        ``[c, i, j, k]`` holds at ``[y, x]`` the value of cell ``[y + i, x + j]`` in the block that starts
-        at cell ``[y, x]``. The last ``block - 1`` rows and columns start no block and become zero.
+        ``[c, i, j, k]`` holds at ``[y, x]`` the value of cell ``[y + i * spread, x + j * spread]`` in the
+        block that starts at cell ``[y, x]``. The last ``(block - 1) * spread`` rows and columns start no
+        block and become zero.
     """
     channels, orient, rows, columns = cells.shape
+    height = rows - (block - 1) * spread
     eps = np.float32(1e-10)
     clip = np.float32(0.2)
     one = np.float32(1)
-    width = columns - block + 1
+    width = columns - (block - 1) * spread
     energy = np.empty((rows, columns), np.float32)
     scale = np.empty(width, np.float32)
     clipped = np.empty(width, np.float32)
@@ -211,11 +240,11 @@ def normalise_blocks(cells, block, blocks):
                 sums = energy[y]
                 for x in range(columns):
                     sums[x] += line[x] * line[x]
-        for y in range(rows - block + 1):
+        for y in range(height):
             scale[:] = eps
             for i in range(block):
                 for j in range(block):
-                    line = energy[y + i, j : j + width]
+                    line = energy[y + i * spread, j * spread : j * spread + width]
                     for x in range(width):
                         scale[x] += line[x]
             for x in range(width):
@@ -224,7 +253,7 @@ def normalise_blocks(cells, block, blocks):
             for i in range(block):
                 for j in range(block):
                     for k in range(orient):
-                        line = cells[channel, k, y + i, j : j + width]
+                        line = cells[channel, k, y + i * spread, j * spread : j * spread + width]
                         out = blocks[channel, i, j, k, y]
                         for x in range(width):
                             value = min(line[x] * scale[x], clip)
@@ -239,7 +268,7 @@ def normalise_blocks(cells, block, blocks):
                         for x in range(width):
                             out[x] *= clipped[x]
                         out[width:] = np.float32(0)
-        blocks[channel, :, :, :, rows - block + 1 :] = np.float32(0)
+        blocks[channel, :, :, :, height:] = np.float32(0)
 
 
 @jit
@@ -367,6 +396,33 @@ def sum_shifted(products, window_rows, window_columns, bias, scores):
 
 
 @jit
+def add_spread(products, places, spread, scores):
+    """Add, to each window's score, the products that its blocks have at their place in the window.
+
+    Parameters
+    ----------
+    products
+        ``(places**2 or more, cell rows, cell columns)`` float32; plane ``[i * places + j]`` holds what a
+        block contributes to a window in which it starts at the cell of row ``i * spread``, column
+        ``j * spread``.
+    places
+        Blocks along a side of the window.
+    spread
+        Cells between the starts of two blocks.
+    scores
+        Changed in place, ``(window rows, window columns)`` float32.
+    """
+    height, width = scores.shape
+    for y in range(height):
+        out = scores[y]
+        for i in range(places):
+            for j in range(places):
+                line = products[i * places + j, y + i * spread, j * spread : j * spread + width]
+                for x in range(width):
+                    out[x] += line[x]
+
+
+@jit
 def value_counts(image, counts):
     """Count the values of each channel: `image` ``(H, W, 3)`` uint8, `counts` ``(3, 256)`` output."""
     counts[:] = 0
@@ -378,18 +434,21 @@ def value_counts(image, counts):
 
 
 @jit
-def arrange_blocks(planes, features):
+def arrange_blocks(planes, places, spread, features):
     """Write the block planes of one patch as a vector in scikit-image's order.
 
     Parameters
     ----------
     planes
         As `normalise_blocks` fills them.
+    places
+        Blocks along a side of the patch.
+    spread
+        Cells between the starts of two blocks.
     features
         Output, 1-D float32: channel, block row, block column, cell row, cell column, orientation.
     """
     channels, block, orient = planes.shape[0], planes.shape[1], planes.shape[3]
-    places = planes.shape[4] - block + 1
     position = 0
     for channel in range(channels):
         for y in range(places):
@@ -397,12 +456,26 @@ def arrange_blocks(planes, features):
                 for i in range(block):
                     for j in range(block):
                         for k in range(orient):
-                            features[position] = planes[channel, i, j, k, y, x]
+                            features[position] = planes[channel, i, j, k, y * spread, x * spread]
                             position += 1
 
 
 @jit
-def patch_hog(patches, channels, cell, block, cotangents, features):
+def write_blocks(cells, block, coarse, planes, features):
+    """Normalise the cells of one patch, and pooled ones where `coarse`, and write them as a vector."""
+    places = cells.shape[2] - block + 1
+    normalise_blocks(cells, block, 1, planes)
+    fine = cells.shape[0] * places * places * block * block * cells.shape[1]
+    arrange_blocks(planes, places, 1, features[:fine])
+    if coarse > 0:
+        pooled = np.empty_like(cells)
+        pool_cells(cells, pooled)
+        normalise_blocks(pooled, block, 2, planes)
+        arrange_blocks(planes, coarse, 2, features[fine:])
+
+
+@jit
+def patch_hog(patches, channels, cell, block, coarse, cotangents, features):
     """HOG of each patch.
 
     Parameters
@@ -413,8 +486,10 @@ def patch_hog(patches, channels, cell, block, cotangents, features):
         As for `hog_cells`.
     block
         Side of a block in cells.
+    coarse
+        Block positions of the coarse HOG along a side of the patch, 0 for none.
     features
-        Output, ``(N, channels * blocks**2 * block**2 * orient)`` float32.
+        Output, ``(N, channels * (blocks**2 + coarse**2) * block**2 * orient)`` float32.
     """
     orient = len(cotangents)
     side = patches.shape[1] // cell
@@ -422,12 +497,11 @@ def patch_hog(patches, channels, cell, block, cotangents, features):
     planes = np.empty((channels, block, block, orient, side, side), np.float32)
     for index in range(len(patches)):
         hog_cells(patches[index], channels, cell, cotangents, cells)
-        normalise_blocks(cells, block, planes)
-        arrange_blocks(planes, features[index])
+        write_blocks(cells, block, coarse, planes, features[index])
 
 
 @jit
-def patch_hog_of_angles(gx, gy, angles, bounds, channels, cell, block, features):
+def patch_hog_of_angles(gx, gy, angles, bounds, channels, cell, block, coarse, features):
     """HOG of each patch from known gradients ``(N, side, side * channels)``; see `sum_orientations`."""
     orient = len(bounds) - 1
     side = gx.shape[1] // cell
@@ -435,8 +509,7 @@ def patch_hog_of_angles(gx, gy, angles, bounds, channels, cell, block, features)
     planes = np.empty((channels, block, block, orient, side, side), np.float32)
     for index in range(len(gx)):
         sum_orientations(gx[index], gy[index], angles[index], bounds, channels, cell, cells)
-        normalise_blocks(cells, block, planes)
-        arrange_blocks(planes, features[index])
+        write_blocks(cells, block, coarse, planes, features[index])
 
 
 @jit

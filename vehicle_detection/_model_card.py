@@ -46,10 +46,11 @@ def _about(classifier: VehicleClassifier, report: TrainingReport, command: str |
     params = report.params
     parts = f"{params.spatial_length} spatial bins, {params.hist_length} histogram, {params.hog_length} HOG"
     versions = ", ".join(f"{name} {text}" for name, text in classifier.metadata["versions"].items())
-    mirrored = "with" if report.mirror else "without"
+    mirrored = "with mirrored patches" if report.mirror else "without mirrored patches"
+    mirrored += f" of other brightness (gamma {report.gamma:g})" if report.gamma else ""
     facts = [
         f"Features: {report.features}, in {params.color_space}, {params.length} values ({parts})",
-        f"Training: C = {report.C:g}, {mirrored} mirrored patches, seed {report.random_state}",
+        f"Training: C = {report.C:g}, {mirrored}, seed {report.random_state}",
         f"Versions: {versions}",
     ]
     text = [

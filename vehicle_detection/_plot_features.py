@@ -345,7 +345,8 @@ def part_bounds(params: FeatureParams) -> dict[str, tuple[int, int]]:
     lengths = {
         "spatial bins": params.spatial_length,
         "colour histogram": params.hist_length,
-        "HOG": params.hog_length,
+        "HOG": params.hog_length - params.coarse_length,
+        "coarse HOG": params.coarse_length,
     }
     bounds, start = {}, 0
     for name, length in lengths.items():
@@ -356,7 +357,8 @@ def part_bounds(params: FeatureParams) -> dict[str, tuple[int, int]]:
 
 
 def _shade_parts(panel: Axes, params: FeatureParams) -> None:
-    for color, (name, (start, stop)) in zip((COLORS[1], COLORS[3], "0.6"), part_bounds(params).items()):
+    colors = (COLORS[1], COLORS[3], "0.6", COLORS[2])
+    for color, (name, (start, stop)) in zip(colors, part_bounds(params).items()):
         panel.axvspan(start, stop, color=color, alpha=0.18, linewidth=0)
         panel.annotate(
             f"{name} ({stop - start:,})",

@@ -26,7 +26,7 @@ from vehicle_detection._scores import prepare_sides
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import DetectionScores, _match
+from vehicle_detection.evaluation import DetectionScores, match_detections
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -233,7 +233,7 @@ def plot_errors(
     limit = check_number(iou, "iou", above=0, high=1)
     most = check_integer(count, "count", low=1, high=1000)
     predictions, labels, keys = prepare_sides(predictions, frames.labels, frames.keys)
-    found = _match(predictions, labels, keys, limit)
+    found = match_detections(predictions, labels, keys, limit)
     if kind == "missed":
         side, rows = labels, np.setdiff1d(found.usable, found.partner)
         title = f"{len(rows):,} of {len(found.usable):,} vehicles missed"

@@ -59,9 +59,9 @@ def plot_weights(classifier: VehicleClassifier, *, template: int = 0, figure: Sh
     Returns
     -------
     matplotlib.figure.Figure or SubFigure
-        A row for each channel: HOG for and against, weights of the spatial bins and of the histogram as far
-        as the model has them. With spatial bins the last column shows the mean patch in colour, and moved
-        towards and away from what the SVM takes for a vehicle.
+        A row for each channel: HOG for and against, fine and coarse, weights of the spatial bins and of the
+        histogram as far as the model has them. With spatial bins the last column shows the mean patch in
+        colour, and moved towards and away from what the SVM takes for a vehicle.
 
     Raises
     ------
@@ -71,8 +71,8 @@ def plot_weights(classifier: VehicleClassifier, *, template: int = 0, figure: Sh
     Examples
     --------
     >>> from vehicle_detection import load_classifier
-    >>> [panel.get_title() for panel in plot_weights(load_classifier()).axes[:4]]
-    ['HOG for a vehicle', 'HOG against', 'spatial bins', 'histogram']
+    >>> [panel.get_title() for panel in plot_weights(load_classifier()).axes[:2]]
+    ['HOG for a vehicle', 'HOG against']
     """
     check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
     known = classifier.templates[
@@ -81,16 +81,19 @@ def plot_weights(classifier: VehicleClassifier, *, template: int = 0, figure: Sh
     params = classifier.params
     names = channel_names(params.color_space)
     columns = ["HOG for a vehicle", "HOG against"] if params.hog_feat else []
+    columns += ["coarse HOG for", "coarse HOG against"] if params.coarse_length else []
     columns += ["spatial bins"] if params.spatial_feat else []
     columns += ["histogram"] if params.hist_feat else []
     columns += ["in colour"] if params.spatial_feat else []
-    sheet = new_figure(figure, 2.6 * len(columns), 7.2)
+    sheet = new_figure(figure, min(2.6 * len(columns), 15), 7.2)
     grid = panels(sheet, 3, len(columns))
     for title, panel in zip(columns, grid[0]):
         panel.set_title(title, fontsize=10)
     parts = {name: known.coef[start:stop] for name, (start, stop) in part_bounds(params).items()}
     if params.hog_feat:
-        _put_hog_weights(grid[:, :2], parts["HOG"], params)
+        _put_hog_weights(grid[:, :2], parts["HOG"], params, params.blocks)
+    if params.coarse_length:
+        _put_hog_weights(grid[:, 2:4], parts["coarse HOG"], params, params.coarse_blocks)
     if params.spatial_feat:
         _put_spatial_weights(grid[:, columns.index("spatial bins")], parts["spatial bins"], params, names)
         _put_colour(grid[:, -1], known, params)
@@ -108,14 +111,17 @@ def plot_weights(classifier: VehicleClassifier, *, template: int = 0, figure: Sh
     return sheet
 
 
-def _put_hog_weights(grid: NDArray[Any], weights: NDArray[np.float64], params: FeatureParams) -> None:
+def _put_hog_weights(
+    grid: NDArray[Any], weights: NDArray[np.float64], params: FeatureParams, blocks: int
+) -> None:
+    """Draw the weights of all channels' HOG with so many blocks along a side of the patch."""
     block = params.cell_per_block
-    shape = (params.hog_channels, params.blocks, params.blocks, block, block, params.orient)
+    shape = (params.hog_channels, blocks, blocks, block, block, params.orient)
     cells = [sum_blocks(channel)[0] for channel in weights.reshape(shape)]
     peak = float(np.abs(cells).max()) or 1.0
     for row, channel, name in zip(grid, cells, hog_channel_names(params)):
         for panel, signed in zip(row, (channel, -channel)):
-            put_glyphs(panel, signed.clip(0), size=PATCH_SIZE / params.cells, peak=peak)
+            put_glyphs(panel, signed.clip(0), size=PATCH_SIZE / len(signed), peak=peak)
         row[0].set_ylabel(f"channel {name}", fontsize=9)
     for panel in grid[len(cells) :].flat:
         panel.remove()
@@ -199,6 +205,8 @@ def plot_scores(
         )
     limit = check_number(threshold, "threshold")
     count = check_integer(bins, "bins", low=1, high=10_000)
+    from matplotlib.ticker import LogFormatter
+
     edges = _edges(values, limit, count)
     axes = new_axes(ax)
     for vehicle, color in ((True, VEHICLE), (False, OTHER)):
@@ -212,6 +220,9 @@ def plot_scores(
     axes.axvline(limit, color="black", linestyle="--", linewidth=1, label=f"threshold {limit:g}")
     axes.set_yscale("log")
     axes.set_ylim(bottom=0.7)
+    # Few patches fill less than a decade, where the scale's own formatter writes 4x10^0.
+    axes.yaxis.set_major_formatter("{x:,.0f}")
+    axes.yaxis.set_minor_formatter(LogFormatter())
     axes.set_xlabel("score (decision value)")
     axes.set_ylabel("patches")
     axes.legend(fontsize=9, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False)

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 # Greatest over least value from which a scale is logarithmic.
 _WIDE = 20
+# Letters that fit side by side under the x axis.
+_ROOM = 60
 
 
 def plot_tradeoff(
@@ -145,7 +147,12 @@ def plot_parameter(
             label=None if by is None else str(name),
         )
     if not numeric:
-        axes.set_xticks(range(len(listed)), [str(value) for value in listed])
+        texts = [str(value) for value in listed]
+        axes.set_xticks(range(len(listed)), texts)
+        if max(map(len, texts)) * len(texts) > _ROOM:
+            axes.tick_params(axis="x", rotation=30)
+            for label in axes.get_xticklabels():
+                label.set_horizontalalignment("right")
     elif listed[0] > 0 and listed[-1] > _WIDE * listed[0]:
         axes.set_xscale("log")
     axes.set_xlabel(parameter.replace("_", " "))

@@ -9,7 +9,8 @@ from typing import Any
 from vehicle_detection._report_html import amount, table, tag, text
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import VehicleClassifier
-from vehicle_detection.params import FeatureParams, SearchParams
+from vehicle_detection.mixture import TemplateMixture
+from vehicle_detection.params import FeatureParams, PyramidParams, SearchParams
 from vehicle_detection.training import SPLITS
 
 _TIMES = "\N{NO-BREAK SPACE}\N{MULTIPLICATION SIGN}\N{NO-BREAK SPACE}"
@@ -21,13 +22,15 @@ def settings_part(detector: Any, shape: tuple[int, ...]) -> str:
     search = getattr(detector, "search_params", None)
     camera = getattr(detector, "camera", None)
     camera_title = "Camera"
-    if camera is None and isinstance(search, SearchParams):
-        camera, camera_title = Camera.for_frame(shape, horizon=search.horizon), "Camera (assumed)"
+    on_pyramid = isinstance(search, PyramidParams)
+    if camera is None and isinstance(search, (SearchParams, PyramidParams)):
+        known = {} if search.horizon is None else {"horizon": search.horizon}
+        camera, camera_title = Camera.for_frame(shape, **known), "Camera (assumed)"
     heat = getattr(detector, "regions", None) == "heat"
     groups = {
         "Search": search,
         "Regions (heat map)": getattr(detector, "heat_params", None) if heat else None,
-        "Regions (fitted boxes)": None if heat else getattr(detector, "region_params", None),
+        "Regions (fitted boxes)": None if heat or on_pyramid else getattr(detector, "region_params", None),
         "Tracks": getattr(detector, "track_params", None),
         camera_title: camera,
     }
@@ -41,6 +44,8 @@ def settings_part(detector: Any, shape: tuple[int, ...]) -> str:
 
 def model_part(classifier: Any) -> str:
     """Write what a model's file tells of it, and under which terms it may be used."""
+    if isinstance(classifier, TemplateMixture):
+        return _mixture_part(classifier)
     if not isinstance(classifier, VehicleClassifier):
         return ""
     params, metadata = classifier.params, classifier.metadata
@@ -58,11 +63,45 @@ def model_part(classifier: Any) -> str:
     if isinstance(scores, Mapping) and scores.keys() <= SPLITS.keys():
         parts.append(_accuracy(scores))
     parts.append(tag("details", tag("summary", "Features"), _lines(_fields(params))))
+    return tag("section", tag("h2", "Model"), *parts, *_facts(metadata, "splits"))
+
+
+def _mixture_part(mixture: TemplateMixture) -> str:
+    """Write what the file of a mixture of templates tells of it."""
+    shapes = ", ".join(_TIMES.join(_short(side) for side in each.box_cells) for each in mixture.templates)
+    about = (
+        f"{amount(len(mixture.templates), 'template')}, for boxes of {shapes} cells. "
+        f"A vehicle is shown from log-odds {_short(mixture.threshold)} on."
+    )
+    licence = "Licence: the model inherits the terms of the frames it was trained on."
+    parts = [tag("p", text(about)), tag("p", text(licence))]
+    metrics = mixture.metadata.get("metrics")
+    scores = metrics.get("left_out") if isinstance(metrics, Mapping) else None
+    if isinstance(scores, Mapping) and all(isinstance(each, Mapping) for each in scores.values()):
+        parts.append(_left_out(scores))
+    return tag("section", tag("h2", "Model"), *parts, *_facts(mixture.metadata, "left_out"))
+
+
+def _facts(metadata: Mapping[str, Any], shown_already: str) -> list[str]:
+    """Write the rest of what a model file tells, a fold for each part."""
+    parts = []
     for name, values in metadata.items():
         shown = values if isinstance(values, Mapping) else {name: values}
-        shown = {key: value for key, value in shown.items() if key != "splits" or name != "metrics"}
-        parts.append(tag("details", tag("summary", text(name.capitalize())), _lines(shown)))
-    return tag("section", tag("h2", "Model"), *parts)
+        shown = {key: value for key, value in shown.items() if key != shown_already or name != "metrics"}
+        if shown:
+            parts.append(tag("details", tag("summary", text(name.capitalize())), _lines(shown)))
+    return parts
+
+
+def _left_out(scores: Mapping[str, Any]) -> str:
+    columns = ("f1", "average_precision", "precision", "recall", "mean_iou")
+    rows = [
+        (text(name), *(text(_plain(values.get(column, ""))) for column in columns))
+        for name, values in scores.items()
+    ]
+    note = "On frames of sources that were left out of training, single frames, IoU 0.5."
+    heads = ("Frames", *(column.replace("_", " ").capitalize() for column in columns))
+    return tag("p", note, class_="soft") + table(heads, rows, label="Quality of the model")
 
 
 def _licence(metadata: Mapping[str, Any]) -> str:

@@ -56,7 +56,7 @@ class TrainingReport:
 
     Attributes
     ----------
-    params, C, mirror, random_state
+    params, C, mirror, gamma, random_state
         What was trained.
     split
         The split whose accuracy stands for the model.
@@ -77,6 +77,7 @@ class TrainingReport:
     params: FeatureParams
     C: float
     mirror: bool
+    gamma: float
     random_state: int
     split: str
     sources: dict[str, int]

@@ -16,7 +16,8 @@ class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """Turn 64x64 patches into feature vectors, for ``Pipeline`` and ``GridSearchCV``.
 
     The arguments are the fields of `FeatureParams`, checked when `fit` is called, and `n_jobs` of
-    `extract_features`. The transformer learns nothing: it works without `fit`.
+    `extract_features`. The transformer learns nothing: it works without `fit`. The gains say what
+    `train_classifier` does with the features; here they change nothing.
 
     Examples
     --------
@@ -41,6 +42,10 @@ class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         cell_per_block: int = 2,
         hog_channel: int | Literal["ALL", "GRAY"] = "ALL",
         transform_sqrt: bool = False,
+        hist_sqrt: bool = False,
+        coarse_hog: bool = False,
+        hist_gain: float = 1.0,
+        coarse_gain: float = 1.0,
         n_jobs: int | None = None,
     ) -> None:
         self.color_space = color_space
@@ -54,6 +59,10 @@ class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         self.cell_per_block = cell_per_block
         self.hog_channel = hog_channel
         self.transform_sqrt = transform_sqrt
+        self.hist_sqrt = hist_sqrt
+        self.coarse_hog = coarse_hog
+        self.hist_gain = hist_gain
+        self.coarse_gain = coarse_gain
         self.n_jobs = n_jobs
 
     def to_params(self) -> FeatureParams:

@@ -225,11 +225,13 @@ def fit_features(
 
     weights = None if recipe.vehicle_weight == 1 else {0: 1.0, 1: recipe.vehicle_weight}
     svm = LinearSVC(C=recipe.C, random_state=seed, class_weight=weights, max_iter=_MOST_ITERATIONS)
-    pipeline = Pipeline([("scaler", StandardScaler(copy=False)), ("svm", svm)])
+    scaler = StandardScaler(copy=False).fit(features)
+    scaler.scale_ /= recipe.params.gains
+    pipeline = Pipeline([("scaler", scaler), ("svm", svm)])
     with warnings.catch_warnings():
         # A solver that stops early is judged by its accuracy, as all are.
         warnings.simplefilter("ignore", ConvergenceWarning)
-        pipeline.fit(features, targets)
+        svm.fit(scaler.transform(features), targets)
     return VehicleClassifier.from_pipeline(pipeline, recipe.params)
 
 

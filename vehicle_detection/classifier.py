@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from importlib import resources
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 import vehicle_detection
 from vehicle_detection._checks import check_integer, check_number, check_patches, describe
-from vehicle_detection._files import written_whole
+from vehicle_detection._model_file import ModelData, read_model, write_model
+from vehicle_detection._variants import mirror_patches
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.features import extract_features
 from vehicle_detection.params import PATCH_SIZE, FeatureParams
@@ -26,8 +23,9 @@ if TYPE_CHECKING:
 
 CLASSIFIER_REMEDY = "load_classifier, train_classifier or VehicleClassifier.from_pipeline make one"
 
-FORMAT = "vehicle-detection-model"
-FORMAT_VERSION = "1"
+KIND = "patches"
+"""Kind of the model files that hold a classifier of patches."""
+
 DEFAULT_C = 1e-4
 
 _CHUNK = 1024
@@ -241,62 +239,26 @@ class VehicleClassifier:
         InvalidInputError
             If the folder is missing or read-only, or the metadata holds more than JSON values.
         """
-        from safetensors.numpy import save
-
         tensors = {
             f"{index}.{name}": np.atleast_1d(np.asarray(getattr(template, name), np.float64))
             for index, template in enumerate(self.templates)
             for name in _TENSORS
         }
-        try:
-            facts = json.dumps(dict(self.metadata), sort_keys=True)
-        except (TypeError, ValueError) as error:
-            raise InvalidInputError(
-                f"metadata must hold JSON values only: {error}; convert numbers of numpy with .item()"
-            ) from error
-        header = {
-            "format": FORMAT,
-            "format_version": FORMAT_VERSION,
-            "params": json.dumps(asdict(self.params), sort_keys=True),
-            "metadata": facts,
-        }
-        header["sha256"] = _checksum(header, tensors)
-        with written_whole(path, "path") as part:
-            part.write_bytes(_with_sorted_header(save(tensors, metadata=header)))
-
-
-def _with_sorted_header(data: bytes) -> bytes:
-    """Sort the header's keys: safetensors writes the metadata in an order that is never the same."""
-    stop = 8 + int.from_bytes(data[:8], "little")
-    header = json.dumps(json.loads(data[8:stop]), sort_keys=True, separators=(",", ":")).encode()
-    header += b" " * (-len(header) % 8)
-    return len(header).to_bytes(8, "little") + header + data[stop:]
-
-
-def _checksum(header: Mapping[str, str], tensors: Mapping[str, NDArray[Any]]) -> str:
-    """Hash everything a model file says, so that an edited one is noticed."""
-    digest = hashlib.sha256()
-    for key in sorted(header):
-        if key != "sha256":
-            digest.update(f"{key}={header[key]}\n".encode())
-    for name in sorted(tensors):
-        digest.update(f"{name} {tensors[name].shape} {tensors[name].dtype}\n".encode())
-        digest.update(np.ascontiguousarray(tensors[name]).tobytes())
-    return digest.hexdigest()
+        write_model(path, KIND, asdict(self.params), tensors, self.metadata)
 
 
 def load_classifier(path: str | os.PathLike[str] | None = None) -> VehicleClassifier:
-    """Load a model file, or the model that the package ships.
+    """Load a classifier of patches: a model file, or the one that the package ships, ``"highway"``.
 
     Parameters
     ----------
     path
-        A ``.safetensors`` file written by `VehicleClassifier.save`; None loads the shipped default.
+        A ``.safetensors`` file written by `VehicleClassifier.save`; None loads the shipped one.
 
     Raises
     ------
     ModelFileError
-        If the file is missing, cut, edited, of another version, holds NaN, or does not fit its own
+        If the file is missing, cut, edited, of another kind or version, holds NaN, or does not fit its own
         parameters.
 
     Examples
@@ -304,45 +266,13 @@ def load_classifier(path: str | os.PathLike[str] | None = None) -> VehicleClassi
     >>> load_classifier().params.color_space
     'LAB'
     """
-    if path is None:
-        resource = resources.files("vehicle_detection") / "models" / "default.safetensors"
-        return _parse_model(resource.read_bytes(), "the shipped model")
-    file = Path(path)
-    try:
-        data = file.read_bytes()
-    except FileNotFoundError:
-        raise ModelFileError(f"model file {file} does not exist; check the path") from None
-    except IsADirectoryError:
-        raise ModelFileError(f"model file {file} is a folder; name a file in it") from None
-    except OSError as error:
-        raise ModelFileError(f"model file {file} cannot be read: {error.strerror}") from error
-    return _parse_model(data, f"model file {file}")
+    return build_classifier(read_model("highway" if path is None else path, KIND))
 
 
-def _parse_model(data: bytes, name: str) -> VehicleClassifier:
-    """Check and build a classifier from the bytes of a model file."""
-    from safetensors import SafetensorError
-    from safetensors.numpy import load
-
+def build_classifier(model: ModelData) -> VehicleClassifier:
+    """Build a classifier from what a model file holds."""
+    tensors = model.tensors
     try:
-        tensors = load(data)
-        length = int.from_bytes(data[:8], "little")
-        header = json.loads(data[8 : 8 + length])["__metadata__"]
-    except (SafetensorError, ValueError, KeyError) as error:
-        raise ModelFileError(
-            f"{name} is no whole safetensors model ({error}); get it again or train"
-        ) from error
-    if header.get("format") != FORMAT:
-        raise ModelFileError(f"{name} is a safetensors file, but no model of this library; train one")
-    if header.get("format_version") != FORMAT_VERSION:
-        raise ModelFileError(
-            f"{name} has format version {header.get('format_version')}, this release reads "
-            f"{FORMAT_VERSION}; train again or install the release that wrote it"
-        )
-    if header.get("sha256") != _checksum(header, tensors):
-        raise ModelFileError(f"{name} was changed after it was written (checksum differs); get it again")
-    try:
-        params = FeatureParams(**json.loads(header["params"]))
         count = len({key.split(".")[0] for key in tensors})
         templates = tuple(
             Template(
@@ -353,9 +283,9 @@ def _parse_model(data: bytes, name: str) -> VehicleClassifier:
             )
             for index in range(count)
         )
-        return VehicleClassifier(params, templates, json.loads(header["metadata"]))
+        return VehicleClassifier(FeatureParams(**model.params), templates, model.metadata)
     except (InvalidInputError, KeyError, TypeError, ValueError) as error:
-        raise ModelFileError(f"{name} does not fit its own parameters: {error}") from error
+        raise ModelFileError(f"{model.name} does not fit its own parameters: {error}") from error
 
 
 def train_classifier(
@@ -365,6 +295,7 @@ def train_classifier(
     params: FeatureParams | None = None,
     C: float = DEFAULT_C,
     mirror: bool = True,
+    gamma: float = 0.0,
     random_state: int = 0,
     n_jobs: int | None = None,
     metadata: Mapping[str, Any] | None = None,
@@ -383,6 +314,8 @@ def train_classifier(
         Inverse strength of the regularisation. Small values generalise better to other sequences.
     mirror
         Add each patch mirrored left to right.
+    gamma
+        Give the mirrored patches another brightness: exponents between ``exp(-gamma)`` and ``exp(gamma)``.
     random_state
         Seed of the solver.
     n_jobs
@@ -404,16 +337,38 @@ def train_classifier(
     images = check_patches(patches, PATCH_SIZE)
     targets = check_labels(labels, len(images))
     check_number(C, "C", above=0, high=1e12)
+    check_gamma(gamma, mirror)
     check_integer(random_state, "random_state", low=0, high=2**32 - 1)
-    features = patch_features(images, params, mirror=mirror, n_jobs=n_jobs)
-    targets = np.tile(targets, 2 if mirror else 1)
+    features = patch_features(images, params, mirror=mirror, gamma=gamma, n_jobs=n_jobs)
     return fit_features(
-        features, targets, params=params, C=C, mirror=mirror, random_state=random_state, metadata=metadata
+        features,
+        np.tile(targets, 2 if mirror else 1),
+        params=params,
+        C=C,
+        mirror=mirror,
+        gamma=gamma,
+        random_state=random_state,
+        metadata=metadata,
     )
 
 
+def check_gamma(gamma: object, mirror: bool) -> float:
+    """Return `gamma` if it is one that patches with or without mirrored ones can have."""
+    number = check_number(gamma, "gamma", low=0, high=2)
+    if number and not mirror:
+        raise InvalidInputError(
+            f"gamma must be 0 without mirrored patches, whose brightness it changes; got {number:g}"
+        )
+    return number
+
+
 def patch_features(
-    images: NDArray[np.uint8], params: FeatureParams, *, mirror: bool, n_jobs: int | None = None
+    images: NDArray[np.uint8],
+    params: FeatureParams,
+    *,
+    mirror: bool,
+    gamma: float = 0.0,
+    n_jobs: int | None = None,
 ) -> NDArray[np.float32]:
     """Features of all patches and, with `mirror`, below them those of all mirrored ones."""
     if not mirror:
@@ -421,8 +376,7 @@ def patch_features(
     count = len(images)
     features = np.empty((2 * count, params.length), np.float32)
     features[:count] = extract_features(images, params, n_jobs=n_jobs)
-    mirrored = np.ascontiguousarray(images[:, :, ::-1])
-    features[count:] = extract_features(mirrored, params, n_jobs=n_jobs)
+    features[count:] = extract_features(mirror_patches(images, gamma=gamma), params, n_jobs=n_jobs)
     return features
 
 
@@ -433,6 +387,7 @@ def fit_features(
     params: FeatureParams,
     C: float,
     mirror: bool,
+    gamma: float = 0.0,
     random_state: int,
     metadata: Mapping[str, Any] | None = None,
 ) -> VehicleClassifier:
@@ -444,14 +399,16 @@ def fit_features(
         ``(N, params.length)`` float32, mirrored ones included.
     labels
         ``(N,)`` zeros and ones, both present.
-    params, C, mirror, random_state, metadata
-        As in `train_classifier`; `mirror` tells whether half of the features are of mirrored patches.
+    params, C, mirror, gamma, random_state, metadata
+        As in `train_classifier`; `mirror` tells whether half of the features are of mirrored patches, and
+        `gamma` of what brightness.
     """
     from sklearn.pipeline import Pipeline
     from sklearn.preprocessing import StandardScaler
     from sklearn.svm import LinearSVC
 
     scaler = StandardScaler().fit(features)
+    scaler.scale_ /= params.gains
     # The solver wants float64: scaled straight into that, it copies nothing, and the features stay intact.
     scaled = np.empty(features.shape)
     for start in range(0, len(features), _CHUNK):
@@ -462,6 +419,7 @@ def fit_features(
         "training": {
             "C": C,
             "mirror": mirror,
+            "gamma": gamma,
             "random_state": random_state,
             "vehicles": vehicles // copies,
             "non_vehicles": (len(labels) - vehicles) // copies,

@@ -16,6 +16,7 @@ import typer
 from typer.core import TyperGroup
 
 from vehicle_detection import __version__
+from vehicle_detection._cli_frames import train_frames
 from vehicle_detection._cli_models import fetch, info, train
 from vehicle_detection._cli_output import check_apart, codec_messages, complain, output_folder, print_facts
 from vehicle_detection._cli_tuning import tune
@@ -81,13 +82,12 @@ def _start(
 
 
 Model = Annotated[
-    Path | None, typer.Option("--model", metavar="FILE", help="Model file; the shipped one if none is given.")
+    str,
+    typer.Option("--model", metavar="NAME|FILE", help='"default": any road; "highway": fastest; or a file.'),
 ]
 Horizon = Annotated[
     float | None,
-    typer.Option(
-        metavar="F", help="Height of the horizon as a share of the frame's height, 0 at the top; 0.58."
-    ),
+    typer.Option(metavar="F", help="Height of the horizon as a share of the frame's height, 0 at the top."),
 ]
 
 
@@ -128,16 +128,16 @@ def detect(
     boxes: Annotated[
         Path | None, typer.Option(metavar="FILE.csv", help="Table of all boxes, by file name.")
     ] = None,
-    model: Model = None,
+    model: Model = "default",
     horizon: Horizon = None,
 ) -> None:
     """Find the vehicles of images."""
-    from vehicle_detection.classifier import load_classifier
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.export import write_boxes
+    from vehicle_detection.mixture import load_model
 
     _check_images(images, output, boxes)
-    with VehicleDetector(load_classifier(model), horizon=horizon) as detector, output_folder(output, "-o"):
+    with VehicleDetector(load_model(model), horizon=horizon) as detector, output_folder(output, "-o"):
         found = _detect_each(images, detector, output)
         if boxes is None:
             for _ in found:
@@ -216,7 +216,7 @@ def video(
         bool,
         typer.Option("--diagnostics", help="Show frame, positive windows, heat map and tracks side by side."),
     ] = False,
-    model: Model = None,
+    model: Model = "default",
     start: Annotated[float | None, typer.Option(metavar="S", help="Second to start at.")] = None,
     end: Annotated[float | None, typer.Option(metavar="S", help="Second to end at.")] = None,
     preset: Annotated[
@@ -228,9 +228,9 @@ def video(
     profile: Annotated[bool, typer.Option("--profile", help="Show the time of each stage.")] = False,
 ) -> None:
     """Follow the vehicles of a video and write it again with their boxes."""
-    from vehicle_detection.classifier import load_classifier
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.export import TrackWriter
+    from vehicle_detection.mixture import load_model
     from vehicle_detection.report import ReportWriter
     from vehicle_detection.video import process_video
 
@@ -242,7 +242,7 @@ def video(
         if tracks is not None:
             writers.append(stack.enter_context(TrackWriter(tracks)))
         detector = stack.enter_context(
-            VehicleDetector(load_classifier(model), horizon=horizon, diagnostics=diagnostics)
+            VehicleDetector(load_model(model), horizon=horizon, diagnostics=diagnostics)
         )
         page = None
         if report is not None:
@@ -294,5 +294,5 @@ def evaluate(
             part.write_text(dumps(plain, indent=2) + "\n", encoding="utf-8")
 
 
-for _command in (train, tune, fetch, info):
+for _command in (train, train_frames, tune, fetch, info):
     app.command()(_command)

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from vehicle_detection._checks import check_choice, check_image, check_number, check_type
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera
-from vehicle_detection.classifier import VehicleClassifier, load_classifier
+from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.drawing import draw_diagnostics, draw_tracks
+from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import HeatHistory, frame_heat, label_boxes
-from vehicle_detection.params import HeatParams, RegionParams, SearchParams, TrackParams
+from vehicle_detection.mixture import MixtureSearch, TemplateMixture, load_model
+from vehicle_detection.params import HeatParams, PyramidParams, RegionParams, SearchParams, TrackParams
 from vehicle_detection.regions import find_vehicles
 from vehicle_detection.search import BandSearch
 from vehicle_detection.tracking import Track, Tracker
@@ -36,6 +38,8 @@ class FoundWindows:
     ----------
     windows
         Windows that score above the search's least score.
+    vehicles
+        Boxes of the vehicles, where the model tells them; None where they follow from the windows.
     shape
         ``(height, width)`` of the frame.
     thumbnail
@@ -45,6 +49,7 @@ class FoundWindows:
     """
 
     windows: Detections
+    vehicles: Detections | None
     shape: tuple[int, int]
     thumbnail: NDArray[np.float32]
     seconds: float
@@ -89,14 +94,17 @@ class VehicleDetector:
     Parameters
     ----------
     classifier
-        The trained model; None loads the one that the package ships.
+        The trained model: a `TemplateMixture`, for any road, or a `VehicleClassifier` of patches, such as
+        ``load_model("highway")``; None loads ``load_model("default")``.
     method
         ``"shared"``: the fast search, features shared by all windows. ``"windows"``: the reference, each
-        window by its own patch, any step.
+        window by its own patch, any step; for classifiers of patches.
     regions
         ``"fitted"``: a box from each group of agreeing windows. ``"heat"``: the course's way, regions of a
         heat map over the last frames.
-    search, heat, fit, track
+    search
+        `PyramidParams` for a mixture, `SearchParams` for a classifier of patches.
+    heat, fit, track
         Parameters of the stages; by default those of the project.
     camera
         The camera, for distances and boxes; by default a dash-cam with the search's horizon.
@@ -117,11 +125,11 @@ class VehicleDetector:
 
     def __init__(
         self,
-        classifier: VehicleClassifier | None = None,
+        classifier: VehicleClassifier | TemplateMixture | None = None,
         *,
         method: Literal["shared", "windows"] = "shared",
         regions: Literal["fitted", "heat"] = "fitted",
-        search: SearchParams | None = None,
+        search: SearchParams | PyramidParams | None = None,
         heat: HeatParams | None = None,
         fit: RegionParams | None = None,
         track: TrackParams | None = None,
@@ -133,8 +141,6 @@ class VehicleDetector:
         check_choice(method, "method", ("shared", "windows"))
         check_choice(regions, "regions", ("fitted", "heat"))
         for name, value, kind in (
-            ("classifier", classifier, VehicleClassifier),
-            ("search", search, SearchParams),
             ("heat", heat, HeatParams),
             ("fit", fit, RegionParams),
             ("track", track, TrackParams),
@@ -142,19 +148,30 @@ class VehicleDetector:
         ):
             if value is not None:
                 check_type(value, name, kind, "leave it out for the project's own")
-        self.classifier = classifier or load_classifier()
+        self.classifier = load_model() if classifier is None else classifier
         self.method = method
         self.regions = regions
-        self.search_params = (search or SearchParams.preset()).with_horizon(horizon)
+        self.search_params = _search_params(self.classifier, search).with_horizon(horizon)
         self.heat_params = heat or HeatParams()
         self.region_params = fit or RegionParams()
         self.track_params = track or TrackParams()
         self.camera = camera
         self.diagnostics = diagnostics
         self._n_jobs = n_jobs
-        self._bands = BandSearch(self.classifier, n_jobs=n_jobs) if method == "shared" else None
+        self._engine = self._open_engine()
         self._history = HeatHistory(self.heat_params.frames)
         self.reset()
+
+    def _open_engine(self) -> MixtureSearch | BandSearch | None:
+        """Search of the model's kind; None where windows are looked at one by one."""
+        if isinstance(self.classifier, TemplateMixture):
+            if self.method == "windows":
+                raise InvalidInputError(
+                    "method must be 'shared' for a mixture of templates, got 'windows'; "
+                    'pass load_model("highway")'
+                )
+            return MixtureSearch(self.classifier, n_jobs=self._n_jobs)
+        return BandSearch(self.classifier, n_jobs=self._n_jobs) if self.method == "shared" else None
 
     def reset(self, *, fps: float = 25.0) -> None:
         """Forget all frames, before the first frame of another video.
@@ -185,19 +202,26 @@ class VehicleDetector:
         """
         began = clock.perf_counter()
         check_image(frame, "frame")
-        if self._bands is not None:
-            windows = self._bands.find(frame, self.search_params)
+        vehicles = None
+        params = self.search_params
+        if isinstance(params, PyramidParams):
+            assert isinstance(self._engine, MixtureSearch)
+            found = self._engine.find(frame, params)
+            windows, vehicles = found.windows, found.vehicles
+        elif isinstance(self._engine, BandSearch):
+            windows = self._engine.find(frame, params)
         else:
-            windows = self._search_one_by_one(frame)
+            windows = self._search_one_by_one(frame, params)
         height, width = frame.shape[:2]
         # Every n-th pixel is enough to notice a cut, and costs nothing.
         rows = np.linspace(0, height - 1, _THUMBNAIL[1]).astype(int)
         columns = np.linspace(0, width - 1, _THUMBNAIL[0]).astype(int)
         thumbnail = frame[np.ix_(rows, columns)].mean(axis=2, dtype=np.float32)
-        return FoundWindows(windows, (height, width), thumbnail, clock.perf_counter() - began)
+        seconds = clock.perf_counter() - began
+        return FoundWindows(windows, vehicles, (height, width), thumbnail, seconds)
 
-    def _search_one_by_one(self, frame: NDArray[np.uint8]) -> Detections:
-        search = self.search_params
+    def _search_one_by_one(self, frame: NDArray[np.uint8], search: SearchParams) -> Detections:
+        assert isinstance(self.classifier, VehicleClassifier)
         bands = [band_windows(band) for band in search.place(frame.shape)]
         # Windows of an overhang need pixels beyond the frame; the reference does without them.
         windows = np.concatenate(bands)
@@ -230,13 +254,18 @@ class VehicleDetector:
         return self._fit(found)
 
     def _fit(self, found: FoundWindows) -> Detections:
+        if found.vehicles is not None:
+            return found.vehicles
         return find_vehicles(found.windows, self._camera_of(found.shape), found.shape, self.region_params)
 
     def _label(self, heat: NDArray[np.float32]) -> Detections:
         return label_boxes(heat, threshold=self.heat_params.threshold, share=self.heat_params.share)
 
     def _camera_of(self, shape: tuple[int, int]) -> Camera:
-        return self.camera or Camera.for_frame(shape, horizon=self.search_params.horizon)
+        if self.camera is not None:
+            return self.camera
+        horizon = self.search_params.horizon
+        return Camera.for_frame(shape) if horizon is None else Camera.for_frame(shape, horizon=horizon)
 
     def process(self, frame: NDArray[np.uint8], time: float | None = None) -> FrameResult:
         """Search the next frame of a video and follow its vehicles.
@@ -321,11 +350,32 @@ class VehicleDetector:
 
     def close(self) -> None:
         """End the search's threads; the detector starts them again when it is used."""
-        if self._bands is not None:
-            self._bands.close()
+        if self._engine is not None:
+            self._engine.close()
 
     def __enter__(self) -> VehicleDetector:
         return self
 
     def __exit__(self, *_: Any) -> None:
         self.close()
+
+
+def _search_params(
+    model: VehicleClassifier | TemplateMixture, search: SearchParams | PyramidParams | None
+) -> SearchParams | PyramidParams:
+    """Check that model and search belong together, or choose the search of the model's kind."""
+    if isinstance(model, TemplateMixture):
+        if search is not None:
+            check_type(
+                search,
+                "search",
+                PyramidParams,
+                "leave it out: a mixture of templates is searched for on a pyramid",
+            )
+        return search or PyramidParams()
+    check_type(model, "classifier", VehicleClassifier, "load_model and load_classifier load one")
+    if search is not None:
+        check_type(
+            search, "search", SearchParams, "leave it out: a classifier of patches is searched for in bands"
+        )
+    return search or SearchParams.preset()

@@ -172,7 +172,7 @@ def evaluate_detections(
     """
     predictions, labels, keys = prepare_sides(predictions, labels, frames)
     limit = check_number(iou, "iou", above=0, high=1)
-    found = _match(predictions, labels, keys, limit)
+    found = match_detections(predictions, labels, keys, limit)
     hit, false = found.partner >= 0, (found.partner < 0) & ~found.neutral
     missed = np.setdiff1d(found.usable, found.partner)
 
@@ -239,7 +239,7 @@ def precision_recall_curve(
     if len(predictions) and predictions.scores is None:
         raise InvalidInputError("predictions need scores for a curve; pass Labels with scores=")
     limit = check_number(iou, "iou", above=0, high=1)
-    return _curve(predictions, _match(predictions, labels, keys, limit))
+    return _curve(predictions, match_detections(predictions, labels, keys, limit))
 
 
 def calibration_error(probabilities: ArrayLike, labels: ArrayLike, *, bins: int = 15) -> float:
@@ -296,10 +296,19 @@ def _widths(labels: Labels) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True)
-class _Matching:
-    """Every prediction's fate: the label row it found (else -1) and their overlap, or whether it is neutral.
+class Matching:
+    """The fate of every prediction.
 
-    `usable` lists the label rows that are scored.
+    Attributes
+    ----------
+    partner
+        ``(N,)`` row of the label that each prediction found, -1 for none.
+    overlap
+        ``(N,)`` IoU of the two.
+    neutral
+        ``(N,)`` whether the prediction is neither right nor wrong.
+    usable
+        Rows of the labels that are scored.
     """
 
     partner: NDArray[np.intp]
@@ -308,8 +317,18 @@ class _Matching:
     usable: NDArray[np.intp]
 
 
-def _match(predictions: Labels, labels: Labels, keys: list[FrameKey], limit: float) -> _Matching:
-    """Match each frame greedily by score, then find what is neutral among the rest."""
+def match_detections(predictions: Labels, labels: Labels, keys: list[FrameKey], limit: float) -> Matching:
+    """Match each frame greedily by score, then find what is neutral among the rest.
+
+    Parameters
+    ----------
+    predictions, labels
+        Found and true boxes.
+    keys
+        The frames to match in.
+    limit
+        Least IoU of a match.
+    """
     count = len(predictions)
     scores = np.zeros(count) if predictions.scores is None else predictions.scores
     partner, overlap, neutral = np.full(count, -1, np.intp), np.zeros(count), np.zeros(count, np.bool_)
@@ -327,11 +346,11 @@ def _match(predictions: Labels, labels: Labels, keys: list[FrameKey], limit: flo
                 overlaps[:, target] = -1
         rest = here[partner[here] < 0]
         neutral[rest] = find_neutral(predictions.boxes[rest], labels, rows, limit)
-    return _Matching(partner, overlap, neutral, np.array(usable, np.intp))
+    return Matching(partner, overlap, neutral, np.array(usable, np.intp))
 
 
 def _curve(
-    predictions: Labels, found: _Matching
+    predictions: Labels, found: Matching
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Precision, recall and threshold for every distinct score, highest first.
 

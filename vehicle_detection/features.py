@@ -1,4 +1,4 @@
-"""A 64x64 patch, or a batch of them, to feature vectors ``[spatial | histogram | HOG]``.
+"""A 64x64 patch, or a batch of them, to feature vectors ``[spatial | histogram | HOG | coarse HOG]``.
 
 The functions the course knows are the readable reference: scikit-image's HOG, ``cv2.resize`` and
 ``numpy.histogram``. `extract_features` computes the same numbers with kernels, many patches at once.
@@ -307,7 +307,7 @@ def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None =
     Returns
     -------
     numpy.ndarray
-        ``(params.length,)`` float64, ``[spatial | histogram | HOG]``, each channel by channel.
+        ``(params.length,)`` float64, ``[spatial | histogram | HOG | coarse HOG]``, each channel by channel.
 
     Raises
     ------
@@ -326,17 +326,21 @@ def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None =
     if params.spatial_feat:
         parts.append(bin_spatial(converted, params.spatial_size))
     if params.hist_feat:
-        parts.append(color_hist(converted, params.hist_bins))
+        counts = color_hist(converted, params.hist_bins)
+        parts.append(np.sqrt(counts) if params.hist_sqrt else counts)
     if params.hog_feat:
         source = hog_source(image, params)
+        # The histogram of a cell is the sum of those of its quarters: the coarse HOG is that of larger cells.
+        sides = (params.pix_per_cell, 2 * params.pix_per_cell)
         parts += [
             get_hog_features(
                 source[..., channel],
                 params.orient,
-                params.pix_per_cell,
+                side,
                 params.cell_per_block,
                 transform_sqrt=params.transform_sqrt,
             )
+            for side in sides[: 2 if params.coarse_hog else 1]
             for channel in range(params.hog_channels)
         ]
     return np.concatenate(parts).astype(np.float64)
@@ -458,6 +462,7 @@ def bin_of_value(bins: int) -> NDArray[np.intp]:
 def _batch_extractor(params: FeatureParams) -> Callable[[NDArray[np.uint8], NDArray[np.float32]], None]:
     """Build the function that fills the features of a batch of patches."""
     channels, cell, block = params.hog_channels, params.pix_per_cell, params.cell_per_block
+    coarse = params.coarse_blocks
     cotangents = orientation_cotangents(params.orient)
     bounds = degree_bounds(params.orient)
     bins = bin_of_value(params.hist_bins)
@@ -475,7 +480,10 @@ def _batch_extractor(params: FeatureParams) -> Callable[[NDArray[np.uint8], NDAr
                 small = cv2.resize(patch, (size, size))
                 features[index, :spatial_stop].reshape(3, size, size)[:] = small.transpose(2, 0, 1)
         if params.hist_feat:
-            _kernels.patch_histograms(converted, bins, params.hist_bins, features[:, spatial_stop:hist_stop])
+            counts = features[:, spatial_stop:hist_stop]
+            _kernels.patch_histograms(converted, bins, params.hist_bins, counts)
+            if params.hist_sqrt:
+                np.sqrt(counts, out=counts)
         if params.hog_feat:
             gray = params.hog_channel == "GRAY"
             source = hog_source(tall, params) if gray else pick_hog_channels(converted, params)
@@ -483,10 +491,10 @@ def _batch_extractor(params: FeatureParams) -> Callable[[NDArray[np.uint8], NDAr
             hog = features[:, hist_stop:]
             if params.transform_sqrt:
                 gradients = sqrt_gradients(source)
-                _kernels.patch_hog_of_angles(*gradients, bounds, channels, cell, block, hog)
+                _kernels.patch_hog_of_angles(*gradients, bounds, channels, cell, block, coarse, hog)
             else:
                 flat = source.reshape(n, PATCH_SIZE, PATCH_SIZE * channels)
-                _kernels.patch_hog(flat, channels, cell, block, cotangents, hog)
+                _kernels.patch_hog(flat, channels, cell, block, coarse, cotangents, hog)
 
     return extract
 

@@ -7,7 +7,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from vehicle_detection._checks import check_choice, check_integer, check_number, describe
+from vehicle_detection._pyramid_params import PyramidParams as PyramidParams
 from vehicle_detection.errors import InvalidInputError
 
 PATCH_SIZE = 64
@@ -36,6 +40,8 @@ def _check_pair(value: object, name: str, *, low: float, high: float) -> None:
 class FeatureParams:
     """What a 64x64 patch is turned into: ``[spatial | histogram | HOG]``, each channel by channel.
 
+    With `coarse_hog` a second, coarser HOG stands at the end: ``[spatial | histogram | HOG | coarse HOG]``.
+
     Attributes
     ----------
     color_space
@@ -46,6 +52,8 @@ class FeatureParams:
         Side of the grid of spatial bins; ``spatial_size**2 * 3`` values.
     hist_bins
         Bins of each channel's histogram over 0-255.
+    hist_sqrt
+        Square roots of the histogram's counts: a full bin drowns the others less.
     orient
         HOG orientations over 0-180 degrees.
     pix_per_cell
@@ -56,6 +64,12 @@ class FeatureParams:
         0, 1, 2, ``"ALL"``, or ``"GRAY"`` (HOG of the gray image, whatever `color_space`).
     transform_sqrt
         HOG of the square root of the pixel values.
+    coarse_hog
+        HOG of cells twice as large, too, as ``2 * pix_per_cell`` would give it: each is four of the cells.
+    hist_gain, coarse_gain
+        What the scaled histogram and the scaled coarse HOG are multiplied by in training, so that the SVM's
+        regularisation holds the few of them back less than the many other values. They change the weights
+        alone, not the features and not the time of a search.
 
     Examples
     --------
@@ -76,6 +90,10 @@ class FeatureParams:
     cell_per_block: int = 2
     hog_channel: int | Literal["ALL", "GRAY"] = "ALL"
     transform_sqrt: bool = False
+    hist_sqrt: bool = False
+    coarse_hog: bool = False
+    hist_gain: float = 1.0
+    coarse_gain: float = 1.0
 
     PRESETS: ClassVar[dict[str, dict[str, Any]]] = {
         "luv-2384": {
@@ -88,11 +106,20 @@ class FeatureParams:
         "ycrcb-6156": {},
         "ycrcb-8460": {"spatial_size": 32},
         "lab-8460": {"color_space": "LAB", "spatial_size": 32},
+        "lab-9432": {
+            "color_space": "LAB",
+            "spatial_size": 32,
+            "hist_sqrt": True,
+            "coarse_hog": True,
+            "hist_gain": 4.0,
+            "coarse_gain": 3.0,
+        },
     }
 
     def __post_init__(self) -> None:
         check_choice(self.color_space, "color_space", COLOR_SPACES)
-        for name in ("spatial_feat", "hist_feat", "hog_feat", "transform_sqrt"):
+        switches = ("spatial_feat", "hist_feat", "hog_feat", "transform_sqrt", "hist_sqrt", "coarse_hog")
+        for name in switches:
             if not isinstance(getattr(self, name), bool):
                 raise InvalidInputError(f"{name} must be True or False; got {describe(getattr(self, name))}")
         if not (self.spatial_feat or self.hist_feat or self.hog_feat):
@@ -105,6 +132,15 @@ class FeatureParams:
         check_choice(self.hog_channel, "hog_channel", HOG_CHANNELS)
         if not isinstance(self.hog_channel, str):
             self._check_integer("hog_channel", 0, 2)
+        if self.coarse_hog and self.cells // 2 < self.cell_per_block:
+            raise InvalidInputError(
+                f"coarse_hog must be False where no block of {self.cell_per_block} cells of "
+                f"{2 * self.pix_per_cell} pixels fits into a patch; got True"
+            )
+
+        for name in ("hist_gain", "coarse_gain"):
+            gain = check_number(getattr(self, name), name, low=0.01, high=100)
+            object.__setattr__(self, name, float(gain))
 
     def _check_integer(self, name: str, low: int, high: int) -> None:
         # A plain int replaces one of numpy, which the JSON of a model file does not take.
@@ -115,7 +151,8 @@ class FeatureParams:
         """Parameters of a course system or of the shipped model.
 
         ``"luv-2384"``, ``"ycrcb-6156"`` and ``"ycrcb-8460"`` are the three systems' of the course;
-        ``"lab-8460"`` is the shipped model's.
+        ``"lab-9432"`` is the shipped highway model's: roots of the histogram and a coarse HOG beside what
+        ``"lab-8460"`` has.
         """
         check_choice(name, "preset", cls.PRESETS)
         return cls(**cls.PRESETS[name])
@@ -136,6 +173,11 @@ class FeatureParams:
         return self.cells - self.cell_per_block + 1
 
     @property
+    def coarse_blocks(self) -> int:
+        """Block positions of the coarse HOG along a side of the patch, 0 without it."""
+        return self.cells // 2 - self.cell_per_block + 1 if self.coarse_hog else 0
+
+    @property
     def spatial_length(self) -> int:
         """Values from spatial bins."""
         return self.spatial_size**2 * 3 if self.spatial_feat else 0
@@ -147,14 +189,28 @@ class FeatureParams:
 
     @property
     def hog_length(self) -> int:
-        """Values from HOG."""
+        """Values from HOG, the coarse ones included."""
         values = self.blocks**2 * self.cell_per_block**2 * self.orient * self.hog_channels
+        return values + self.coarse_length if self.hog_feat else 0
+
+    @property
+    def coarse_length(self) -> int:
+        """Values from the coarse HOG, at the end of the vector."""
+        values = self.coarse_blocks**2 * self.cell_per_block**2 * self.orient * self.hog_channels
         return values if self.hog_feat else 0
 
     @property
     def length(self) -> int:
         """Length of the feature vector."""
         return self.spatial_length + self.hist_length + self.hog_length
+
+    @property
+    def gains(self) -> NDArray[np.float64]:
+        """What each scaled value is multiplied by in training, ``(length,)`` float64."""
+        gains = np.ones(self.length)
+        gains[self.spatial_length :][: self.hist_length] = self.hist_gain
+        gains[self.length - self.coarse_length :] = self.coarse_gain
+        return gains
 
 
 @dataclass(frozen=True)
@@ -397,8 +453,8 @@ class RegionParams:
         Share of the visible flank by which the box's middle moves towards the vanishing point.
     """
 
-    min_peak: float = 0.6
-    min_evidence: float = 1.5
+    min_peak: float = 0.7
+    min_evidence: float = 1.75
     overlap: float = 0.5
     power: float = 2.0
     reach: float = 0.6

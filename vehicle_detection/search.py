@@ -7,7 +7,10 @@ cells, and each part of the weights is a filter over an 8x8 neighbourhood of cel
 - HOG: a plane for each channel, place in the block and orientation, normalised once for all windows.
 - Spatial bins: a plane for each channel and place of a bin in its cell.
 - Colour histogram: the weight of a pixel's value is looked up, so the histogram's share of the score is one
-  plane of sums over cells. No histogram is built.
+  plane of sums over cells. No histogram is built, but where `hist_sqrt` asks for the roots of its counts:
+  these slide over the band.
+- Coarse HOG: planes of its own, of cells averaged by fours at every cell; a window's blocks start two cells
+  apart.
 
 One matrix product gives what every cell contributes at every place in a window, and 64 shifted sums make
 the scores of all windows. Dalal and Triggs (CVPR 2005) for HOG; Felzenszwalb et al. (PAMI 2010), section 3,
@@ -16,17 +19,16 @@ for linear templates as filters over a feature map.
 
 from __future__ import annotations
 
-import math
 import threading
-from collections.abc import Callable
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection import _kernels
+from vehicle_detection._buffers import Buffers, Take, new_array
 from vehicle_detection._checks import check_image, check_number, check_type
+from vehicle_detection._histogram_kernels import add_root_histograms
 from vehicle_detection._jobs import Crew, single_threaded_opencv
 from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import CLASSIFIER_REMEDY, Template, VehicleClassifier
@@ -137,7 +139,7 @@ class BandSearch:
             ``(rows, columns)`` float32: entry ``[i, j]`` is the window whose first cell is row `i`, column
             `j` of the resized band. With several templates, the best of them.
         """
-        buffers = self._local.__dict__.setdefault("buffers", _Buffers())
+        buffers = self._local.__dict__.setdefault("buffers", Buffers())
         return self._filters.score_map(resize_band(image, band, buffers.take), buffers.take)
 
 
@@ -148,14 +150,7 @@ def resized_shape(band: PixelBand) -> tuple[int, int]:
     return max(height, PATCH_SIZE), max(width, PATCH_SIZE)
 
 
-Take = Callable[..., NDArray[Any]]
-
-
-def _new_array(shape: tuple[int, ...], dtype: Any, _name: str = "") -> NDArray[Any]:
-    return np.empty(shape, dtype)
-
-
-def resize_band(image: NDArray[np.uint8], band: PixelBand, take: Take = _new_array) -> NDArray[np.uint8]:
+def resize_band(image: NDArray[np.uint8], band: PixelBand, take: Take = new_array) -> NDArray[np.uint8]:
     """Cut a band out and resize it so that a window is 64x64; `take` hands out the memory."""
     height, width = resized_shape(band)
     scale = PATCH_SIZE / band.window[0]
@@ -197,21 +192,6 @@ def _hits(scores: NDArray[np.float32], band: PixelBand, filters: _Filters, least
     return Detections(boxes, grid[rows, columns].astype(np.float64))
 
 
-class _Buffers:
-    """Arrays that are used again by the next band: fresh memory costs as much as the work in it."""
-
-    def __init__(self) -> None:
-        self._arrays: dict[tuple[Any, ...], NDArray[Any]] = {}
-
-    def take(self, shape: tuple[int, ...], dtype: Any, name: str = "") -> NDArray[Any]:
-        """Hand out an array of `shape` with whatever was in it, of the same memory for the same name."""
-        size = math.prod(shape)
-        array = self._arrays.get((name, dtype))
-        if array is None or array.size < size:
-            array = self._arrays[name, dtype] = np.empty(size, dtype)
-        return array[:size].reshape(shape)
-
-
 def _padded(count: int) -> int:
     """Round up to a multiple of four, as `multiply` asks for."""
     return -(-count // 4) * 4
@@ -228,11 +208,21 @@ class _Filters:
         self.per_cell = params.spatial_size // params.cells
         self.hog_planes = params.hog_channels * self.block**2 * params.orient if params.hog_feat else 0
         self.spatial_planes = 3 * self.per_cell**2 if params.spatial_feat else 0
-        self.used = self.hog_planes + self.spatial_planes + int(params.hist_feat)
-        self.planes = _padded(self.used)
+        self.roots = params.hist_feat and params.hist_sqrt
+        self.looks_up = params.hist_feat and not params.hist_sqrt
+        self.coarse = params.coarse_blocks if params.hog_feat else 0
+        self.used = self.hog_planes + self.spatial_planes + int(self.looks_up)
+        self.planes = _padded(max(self.used, 1))
         self.cotangents = orientation_cotangents(params.orient)
         self.bounds = degree_bounds(params.orient)
+        self.bins = bin_of_value(params.hist_bins)
         laid_out = [self._lay_out(template) for template in classifier.templates]
+        folded = [template.fold()[0] for template in classifier.templates]
+        self.coarse_weights = [self._lay_out_coarse(weights) for weights in folded]
+        hist = slice(params.spatial_length, params.spatial_length + params.hist_length)
+        self.root_weights = np.array([weights[hist] for weights in folded], np.float32).reshape(
+            len(folded), 3, -1
+        )
         self.biases = [np.float32(bias) for _, _, bias in laid_out]
         # Each template with a histogram has a weight table, and so a plane, of its own.
         self.tables = [table for _, table, _ in laid_out]
@@ -248,14 +238,15 @@ class _Filters:
             planes = part.transpose(1, 3, 0, 2, 4).reshape(cells, cells, -1)
             filters[..., self.hog_planes : self.hog_planes + self.spatial_planes] = planes
         table = np.zeros((3, 256), np.float32)
-        if params.hist_feat:
+        if self.looks_up:
             start = params.spatial_length
             part = weights[start : start + params.hist_length].reshape(3, params.hist_bins)
-            table[:] = part[:, bin_of_value(params.hist_bins)]
+            table[:] = part[:, self.bins]
             filters[..., self.used - 1] = 1
         if params.hog_feat:
             blocks = params.blocks
-            part = weights[params.length - params.hog_length :]
+            start = params.length - params.hog_length
+            part = weights[start : params.length - params.coarse_length]
             part = part.reshape(params.hog_channels, blocks, blocks, -1)
             planes = part.transpose(1, 2, 0, 3).reshape(blocks, blocks, -1)
             filters[:blocks, :blocks, : self.hog_planes] = planes
@@ -263,30 +254,53 @@ class _Filters:
         rows[: cells * cells] = filters.reshape(cells * cells, -1)
         return rows, table, bias
 
+    def _lay_out_coarse(self, weights: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Lay out the coarse HOG's weights as filters ``(places**2, planes)``, both padded."""
+        places = self.coarse**2
+        rows = np.zeros((_padded(places), _padded(self.hog_planes)), np.float32)
+        if places:
+            part = weights[self.params.length - self.params.coarse_length :]
+            part = part.reshape(self.params.hog_channels, places, -1)
+            rows[:places, : self.hog_planes] = part.transpose(1, 0, 2).reshape(places, -1)
+        return rows
+
     def score_map(self, band: NDArray[np.uint8], take: Take) -> NDArray[np.float32]:
         """Scores of all windows of a resized band, ``(rows, columns)`` float32, as a new array."""
         cell = self.params.pix_per_cell
         rows, columns = band.shape[0] // cell, band.shape[1] // cell
         planes = take((self.planes, rows, columns), np.float32, "planes")
         planes[self.used :] = 0
-        converted = self._fill_planes(band, planes, take)
-        best: NDArray[np.float32] | None = None
-        for weights, table, bias in zip(self.weights, self.tables, self.biases):
-            if self.params.hist_feat:
+        coarse = (
+            take((_padded(self.hog_planes), rows, columns), np.float32, "coarse") if self.coarse else None
+        )
+        converted = self._fill_planes(band, planes, coarse, take)
+        shape = (len(self.weights), rows - self.cells + 1, columns - self.cells + 1)
+        scores = np.empty(shape, np.float32)
+        for template, (weights, table, bias) in enumerate(zip(self.weights, self.tables, self.biases)):
+            if self.looks_up:
                 _kernels.histogram_cells(converted, table, cell, planes[self.used - 1])
             products = take((len(weights), rows * columns), np.float32, "products")
             _kernels.multiply(weights, planes.reshape(self.planes, -1), products)
-            scores = np.empty((rows - self.cells + 1, columns - self.cells + 1), np.float32)
             stacked = products.reshape(-1, rows, columns)
-            _kernels.sum_shifted(stacked, self.cells, self.cells, bias, scores)
-            best = scores if best is None else np.maximum(best, scores, out=best)
-        assert best is not None
-        return best
+            _kernels.sum_shifted(stacked, self.cells, self.cells, bias, scores[template])
+            if coarse is not None:
+                weights = self.coarse_weights[template]
+                products = take((len(weights), rows * columns), np.float32, "products")
+                _kernels.multiply(weights, coarse.reshape(len(coarse), -1), products)
+                stacked = products.reshape(-1, rows, columns)
+                _kernels.add_spread(stacked, self.coarse, 2, scores[template])
+        if self.roots:
+            add_root_histograms(converted, self.bins, self.root_weights, cell, self.cells, scores)
+        return scores[0] if len(scores) == 1 else np.asarray(scores.max(axis=0))
 
     def _fill_planes(
-        self, band: NDArray[np.uint8], planes: NDArray[np.float32], take: Take
+        self,
+        band: NDArray[np.uint8],
+        planes: NDArray[np.float32],
+        coarse: NDArray[np.float32] | None,
+        take: Take,
     ) -> NDArray[np.uint8]:
-        """Fill the HOG and spatial planes; return the band in the features' colour space."""
+        """Fill the planes of HOG, coarse HOG and spatial bins; return the band in the features' space."""
         params = self.params
         rows, columns = planes.shape[1:]
         cell = params.pix_per_cell
@@ -302,7 +316,12 @@ class _Filters:
                 flat = np.ascontiguousarray(source).reshape(source.shape[0], -1)
                 _kernels.hog_cells(flat, channels, cell, self.cotangents, cells)
             shape = (channels, self.block, self.block, params.orient, rows, columns)
-            _kernels.normalise_blocks(cells, self.block, planes[: self.hog_planes].reshape(shape))
+            _kernels.normalise_blocks(cells, self.block, 1, planes[: self.hog_planes].reshape(shape))
+            if coarse is not None:
+                pooled = take(cells.shape, np.float32, "pooled")
+                _kernels.pool_cells(cells, pooled)
+                coarse[self.hog_planes :] = 0
+                _kernels.normalise_blocks(pooled, self.block, 2, coarse[: self.hog_planes].reshape(shape))
         if params.spatial_feat:
             size = (columns * self.per_cell, rows * self.per_cell)
             whole = converted[: rows * cell, : columns * cell]

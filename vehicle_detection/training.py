@@ -17,6 +17,7 @@ from vehicle_detection._training_report import SPLITS, SplitScore, TrainingRepor
 from vehicle_detection.classifier import (
     DEFAULT_C,
     VehicleClassifier,
+    check_gamma,
     check_labels,
     fit_features,
     patch_features,
@@ -43,6 +44,7 @@ def train_and_judge(
     params: FeatureParams | None = None,
     C: float = DEFAULT_C,
     mirror: bool = True,
+    gamma: float = 0.0,
     random_state: int = 0,
     split: Literal["random", "sequences"] = "random",
     seeds: int = 5,
@@ -60,7 +62,7 @@ def train_and_judge(
         Patches of both classes.
     params
         Features; the default is ``FeatureParams()``.
-    C, mirror
+    C, mirror, gamma
         As in `train_classifier`.
     random_state
         Seed of the solver, and first one of the random splits.
@@ -104,17 +106,20 @@ def train_and_judge(
     labels = check_labels(patch_set.labels, len(patch_set))
     params = params or FeatureParams()
     check_number(C, "C", above=0, high=1e12)
+    check_gamma(gamma, mirror)
     check_choice(split, "split", ("random", "sequences"))
     check_integer(seeds, "seeds", low=1, high=1000)
     check_integer(random_state, "random_state", low=0, high=2**32 - seeds)
     plans, skipped = _plan(patch_set, split, range(random_state, random_state + seeds))
 
-    train = functools.partial(fit_features, params=params, C=C, mirror=mirror, random_state=random_state)
+    train = functools.partial(
+        fit_features, params=params, C=C, mirror=mirror, gamma=gamma, random_state=random_state
+    )
     count, copies = len(patch_set), 2 if mirror else 1
     seconds: dict[str, float] = {}
     with _progress(progress, sum(map(len, plans.values())) + 1, seconds) as step:
         with step("features", fits=0):
-            features = patch_features(patch_set.patches, params, mirror=mirror, n_jobs=n_jobs)
+            features = patch_features(patch_set.patches, params, mirror=mirror, gamma=gamma, n_jobs=n_jobs)
         scores = {}
         for name, splits in plans.items():
             answers = []
@@ -130,6 +135,7 @@ def train_and_judge(
             params=params,
             C=C,
             mirror=mirror,
+            gamma=gamma,
             random_state=random_state,
             split=split,
             sources=patch_set.counts(),

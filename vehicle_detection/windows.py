@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any, Literal
 
 import cv2
@@ -28,7 +29,7 @@ from vehicle_detection.features import (
     hog_blocks,
     hog_source,
 )
-from vehicle_detection.params import PATCH_SIZE, PixelBand
+from vehicle_detection.params import PATCH_SIZE, FeatureParams, PixelBand
 
 Range = tuple[int | None, int | None]
 
@@ -207,12 +208,41 @@ def _shared_hog_features(
             )
             for channel in range(params.hog_channels)
         ]
+    coarse = []
+    if params.hog_feat and params.coarse_hog:
+        coarse = [_coarse_blocks(source[..., channel], params) for channel in range(params.hog_channels)]
+    span = 2 * params.coarse_blocks
     features = np.empty((len(boxes), params.length))
     for row, (x1, y1, x2, y2) in enumerate(boxes):
         patch = np.ascontiguousarray(converted[y1:y2, x1:x2])
         parts: list[NDArray[Any]] = [bin_spatial(patch, params.spatial_size)] if params.spatial_feat else []
-        parts += [color_hist(patch, params.hist_bins)] if params.hist_feat else []
+        if params.hist_feat:
+            counts = color_hist(patch, params.hist_bins)
+            parts.append(np.sqrt(counts) if params.hist_sqrt else counts)
         top, left = y1 // cell, x1 // cell
         parts += [part[top : top + blocks, left : left + blocks].ravel() for part in hog]
+        parts += [part[top : top + span : 2, left : left + span : 2].ravel() for part in coarse]
         features[row] = np.concatenate(parts)
     return features
+
+
+def _coarse_blocks(channel: NDArray[np.uint8], params: FeatureParams) -> NDArray[np.float64]:
+    """HOG of double-sized cells at every cell: ``[y, x]`` is the block that starts at cell ``[y, x]``.
+
+    For odd cells the image is shifted by one, and what comes in is its reflection: the gradient across an
+    edge between an image and its reflection is zero, as it is at the image's border.
+    """
+    cell, block = params.pix_per_cell, params.cell_per_block
+    rows, columns = (side // cell for side in channel.shape)
+    found = np.zeros((rows, columns, block, block, params.orient))
+    for odd_y, odd_x in itertools.product((0, 1), repeat=2):
+        shifted = cv2.copyMakeBorder(channel, odd_y * cell, 0, odd_x * cell, 0, cv2.BORDER_REFLECT_101)
+        blocks = hog_blocks(
+            np.asarray(shifted, np.uint8),
+            params.orient,
+            2 * cell,
+            block,
+            transform_sqrt=params.transform_sqrt,
+        )[odd_y:, odd_x:]
+        found[odd_y::2, odd_x::2][: len(blocks), : blocks.shape[1]] = blocks
+    return found

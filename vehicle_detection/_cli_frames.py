@@ -1,0 +1,64 @@
+"""``vehicle-detection train-frames``: the model for any road, from labelled frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from vehicle_detection._cli_output import check_apart, print_table
+
+_COLUMNS = ("f1", "best_f1", "average_precision", "precision", "recall", "mean_iou")
+_COUNTS = ("false_per_frame", "false_per_empty_frame")
+
+
+def train_frames(
+    data: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DATA", help="Folder with labels/NAME.csv and frames/NAME/ or videos/NAME.mp4."
+        ),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Model file to write.")],
+    card: Annotated[
+        Path | None, typer.Option(metavar="FILE.md", help="Model card to write, from these measurements.")
+    ] = None,
+    curves: Annotated[
+        Path | None, typer.Option(metavar="FILE.csv", help="Precision and recall of every source left out.")
+    ] = None,
+    seed: Annotated[int, typer.Option(metavar="N", help="Seed of everything random.")] = 0,
+) -> None:
+    """Train the model for any road, and judge it on sources that it was not trained on."""
+    from vehicle_detection._files import check_target
+    from vehicle_detection._frame_sources import find_sources
+    from vehicle_detection._mixture_card import write_card, write_curves
+    from vehicle_detection.mixture_report import as_metadata, judge_mixture
+
+    named = {"-o": output, "--card": card, "--curves": curves}
+    targets = {name: check_target(path, name) for name, path in named.items() if path is not None}
+    check_apart(targets, {"DATA": data})
+    sources = find_sources(data)
+    trained, scores, held = judge_mixture(sources, random_state=seed, on_step=typer.echo)
+    trained.with_metadata(as_metadata(scores, sources, seed)).save(output)
+    if card is not None:
+        write_card(card, trained, scores, sources, seed)
+    if curves is not None:
+        write_curves(curves, held)
+    print_road_scores({score.name: score.to_dict() for score in scores})
+    typer.echo(f"wrote {', '.join(map(str, targets.values()))}")
+
+
+def print_road_scores(scores: Mapping[str, Mapping[str, Any]]) -> None:
+    """Print a table of `RoadScore` values, a row for each set of frames."""
+    rows = [
+        (
+            name,
+            *(f"{values[column]:.3f}" if column in values else "" for column in _COLUMNS),
+            *(f"{values[column]:.2f}" if column in values else "" for column in _COUNTS),
+        )
+        for name, values in scores.items()
+    ]
+    titles = (column.replace("_", " ") for column in (*_COLUMNS, *_COUNTS))
+    print_table("on sources left out of training, IoU 0.5", ("frames", *titles), rows)

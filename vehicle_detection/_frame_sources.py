@@ -1,0 +1,75 @@
+"""The labelled frames of a data folder, by source."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from vehicle_detection._labelled_frames import LabelledFrames
+from vehicle_detection._mixture_windows import FrameSource
+from vehicle_detection.datasets import load_frames
+from vehicle_detection.errors import DatasetError, InvalidInputError
+from vehicle_detection.evaluation import Labels, read_labels
+
+COURSE = "course"
+"""Source of everything that is not below ``frames``: the images and clips of the course's road."""
+
+# Frames a second of the clips that are trained on; neighbours show the same.
+_CLIP_RATE = 3.0
+# Sources that leave small vehicles of the background unlabelled, and the width from which on they do not.
+_COMPLETE_FROM = {"indonesia": 60.0}
+
+
+def find_sources(folder: str | os.PathLike[str]) -> list[FrameSource]:
+    """Find the labelled frames of a folder.
+
+    Parameters
+    ----------
+    folder
+        Holds ``labels/NAME.csv`` for each set of frames, and these in ``frames/NAME/`` (a source of its own),
+        ``NAME/`` or ``videos/NAME.mp4`` (together the source ``"course"``).
+
+    Returns
+    -------
+    list of FrameSource
+        By name, the course last.
+
+    Raises
+    ------
+    DatasetError
+        If there are no labels, or frames to labels are missing.
+    InvalidInputError
+        If a file of labels is damaged, or knows none of its frames.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise DatasetError(f"folder {root} does not exist; name the folder of the labelled frames")
+    files = sorted(root.glob("labels/*.csv"))
+    if not files:
+        raise DatasetError(f"folder {root} has no labels/NAME.csv; name the folder of the labelled frames")
+    sources, course = [], []
+    for file in files:
+        name, labels = file.stem, read_labels(file)
+        frames, images, video = root / "frames" / name, root / name, root / "videos" / f"{name}.mp4"
+        try:
+            if frames.is_dir():
+                part = LabelledFrames(name, load_frames(frames), labels)
+                sources.append(FrameSource(name, (part,), _COMPLETE_FROM.get(name, 0.0)))
+            elif images.is_dir():
+                course.append(LabelledFrames(name, load_frames(images), labels))
+            elif video.is_file():
+                course.append(_sampled(video, labels))
+            else:
+                raise DatasetError(
+                    f"{file} has no frames: neither {frames}, {images} nor {video} exists; add them"
+                )
+        except InvalidInputError as error:
+            raise InvalidInputError(f"{file}: {error}") from error
+    return sources + ([FrameSource(COURSE, tuple(course))] if course else [])
+
+
+def _sampled(video: Path, labels: Labels) -> LabelledFrames:
+    from vehicle_detection.video import probe_video
+
+    every = max(1, round(float(probe_video(video).fps) / _CLIP_RATE))
+    return LabelledFrames.from_video(video, labels, every=every)

@@ -1,0 +1,361 @@
+"""Several linear templates for vehicles of any shape: the model, its search and its file.
+
+A car from behind, a car from the side and a bus do not fit one square window. Each template has a shape of
+its own and is a linear SVM over the same feature maps (`_feature_maps`), so that one pyramid of a frame
+serves them all; what they find together becomes boxes by suppression, voting and a linear correction.
+Felzenszwalb et al. (PAMI 2010) for the mixture and the box prediction; Ohn-Bar and Trivedi, "Learning to
+detect vehicles by clustering appearance patterns" (IEEE T-ITS 2015) for vehicles.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection import _fhog_kernels
+from vehicle_detection._buffers import Buffers
+from vehicle_detection._checks import check_image, check_number, check_type, describe
+from vehicle_detection._feature_maps import COARSE, PLANES, FeatureMap, Level, halved, level_maps, pair_levels
+from vehicle_detection._jobs import Crew, single_threaded_opencv
+from vehicle_detection._model_file import read_model, write_model
+from vehicle_detection._refinement import WEAKEST, Candidates, Refinement, finite_array, suppress
+from vehicle_detection.boxes import Detections
+from vehicle_detection.classifier import KIND as PATCH_KIND
+from vehicle_detection.classifier import VehicleClassifier, build_classifier
+from vehicle_detection.errors import InvalidInputError, ModelFileError
+from vehicle_detection.params import PyramidParams
+
+KIND = "mixture"
+"""Kind of the model files that hold a mixture of templates."""
+
+_MOST_WINDOWS = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class MixtureTemplate:
+    """One linear template over the cells of a feature map.
+
+    Attributes
+    ----------
+    weights
+        ``(rows, columns, 28)`` float32.
+    bias
+        Added to the weighted sum.
+    margin
+        Cells around the vehicle's box at the left and right, and above and below.
+    """
+
+    weights: NDArray[np.float32]
+    bias: float
+    margin: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        weights = finite_array(self.weights, "weights", (None, None, PLANES))
+        check_number(self.bias, "bias")
+        rows, columns = weights.shape[:2]
+        margin: object = self.margin
+        if not isinstance(margin, tuple) or len(margin) != 2:
+            raise InvalidInputError(f"margin must be two numbers of cells, got {describe(margin)}")
+        for cells, side in zip(margin, (columns, rows)):
+            # Above half a side nothing would be left for the box.
+            if not check_number(cells, "margin", low=-1) < side / 2:
+                raise InvalidInputError(
+                    f"margin must leave cells for the box of {columns}x{rows} cells, got {describe(margin)}"
+                )
+        object.__setattr__(self, "weights", weights)
+
+    @property
+    def box_cells(self) -> tuple[float, float]:
+        """Columns and rows of cells that the vehicle's box fills."""
+        rows, columns = self.weights.shape[:2]
+        return columns - 2 * self.margin[0], rows - 2 * self.margin[1]
+
+    def scores(self, planes: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Score of every window of a map, ``(rows, columns)`` float32; empty where none fits."""
+        rows, columns = self.weights.shape[:2]
+        shape = max(planes.shape[1] - rows + 1, 0), max(planes.shape[2] - columns + 1, 0)
+        scores = np.empty(shape, np.float32)
+        if scores.size:
+            _fhog_kernels.correlate(planes, self.weights, np.float32(self.bias), scores)
+        return scores
+
+    def boxes(
+        self, level: FeatureMap, rows: NDArray[np.intp], columns: NDArray[np.intp]
+    ) -> NDArray[np.float64]:
+        """Boxes, in pixels of the frame, of the windows that start at these cells of a map."""
+        width, height = self.box_cells
+        left = level.left + (columns + self.margin[0]) * level.step_x
+        top = level.top + (rows + self.margin[1]) * level.step_y
+        return np.stack([left, top, left + width * level.step_x, top + height * level.step_y], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class TemplateMixture:
+    """A model of several templates, for vehicles on any road.
+
+    Attributes
+    ----------
+    templates
+        One or more `MixtureTemplate`.
+    refinement
+        Corrects the boxes.
+    slope, offset
+        Turn a template's value into log-odds that it is a vehicle: ``slope * value + offset``.
+    threshold
+        Least log-odds of a vehicle.
+    metadata
+        What the model file tells about itself. JSON values only.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is no template, or a number is not finite.
+
+    Examples
+    --------
+    >>> mixture = load_model()
+    >>> [template.box_cells for template in mixture.templates]
+    [(6.0, 8.0), (7.0, 6.0), (10.0, 6.0)]
+    """
+
+    templates: tuple[MixtureTemplate, ...]
+    refinement: Refinement
+    slope: float = 1.0
+    offset: float = 0.0
+    threshold: float = 0.0
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        templates = tuple(self.templates)
+        if not templates:
+            raise InvalidInputError("templates must hold at least one template; got none")
+        for template in templates:
+            check_type(template, "templates", MixtureTemplate, "train_mixture makes them")
+        check_type(self.refinement, "refinement", Refinement, "train_mixture makes one")
+        check_number(self.slope, "slope", above=0, high=1e9)
+        check_number(self.offset, "offset")
+        check_number(self.threshold, "threshold")
+        object.__setattr__(self, "templates", templates)
+
+    def scores(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Turn the templates' values into log-odds above the threshold."""
+        return self.slope * values + self.offset - self.threshold
+
+    def value(self, score: float) -> float:
+        """Value of the templates that has a score."""
+        return (score + self.threshold - self.offset) / self.slope
+
+    def with_metadata(self, metadata: Mapping[str, Any]) -> TemplateMixture:
+        """Return the same model with other facts in its file."""
+        return replace(self, metadata=dict(metadata))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the model as a safetensors file: tensors and JSON, nothing that runs when loaded."""
+        tensors: dict[str, NDArray[Any]] = {
+            "refinement.weights": self.refinement.weights,
+            "refinement.bias": self.refinement.bias,
+        }
+        for index, template in enumerate(self.templates):
+            tensors[f"{index}.weights"] = template.weights
+        params = {
+            "biases": [template.bias for template in self.templates],
+            "margins": [template.margin for template in self.templates],
+            "slope": self.slope,
+            "offset": self.offset,
+            "threshold": self.threshold,
+        }
+        write_model(path, KIND, params, tensors, self.metadata)
+
+
+def load_model(path: str | os.PathLike[str] = "default") -> TemplateMixture | VehicleClassifier:
+    """Load a model of either kind.
+
+    Parameters
+    ----------
+    path
+        ``"default"``, for any road; ``"highway"``, one template, the fastest; or a ``.safetensors`` file.
+
+    Raises
+    ------
+    ModelFileError
+        If the file is missing, cut, edited, of another version, or does not fit its own parameters.
+    InvalidInputError
+        If `path` is neither a path nor a name.
+
+    Examples
+    --------
+    >>> len(load_model("highway").templates)
+    1
+    """
+    model = read_model(path)
+    if model.kind == PATCH_KIND:
+        return build_classifier(model)
+    if model.kind != KIND:
+        raise ModelFileError(f"{model.name} holds a model of the unknown kind {model.kind!r}; train one")
+    params, tensors = model.params, model.tensors
+    try:
+        templates = tuple(
+            MixtureTemplate(tensors[f"{index}.weights"], float(bias), (float(margin[0]), float(margin[1])))
+            for index, (bias, margin) in enumerate(zip(params["biases"], params["margins"], strict=True))
+        )
+        refinement = Refinement(tensors["refinement.weights"], tensors["refinement.bias"])
+        numbers = {name: float(params[name]) for name in ("slope", "offset", "threshold")}
+        return TemplateMixture(templates, refinement, **numbers, metadata=model.metadata)
+    except (InvalidInputError, KeyError, IndexError, TypeError, ValueError) as error:
+        raise ModelFileError(f"{model.name} does not fit its own parameters: {error}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class MixtureFind:
+    """What the search with several templates finds in a frame.
+
+    Attributes
+    ----------
+    windows
+        Windows above the search's least score, best first, with log-odds above the model's threshold.
+    vehicles
+        Boxes of the vehicles, with scores above 0.
+    """
+
+    windows: Detections
+    vehicles: Detections
+
+
+class MixtureSearch:
+    """The search with its threads and buffers kept from frame to frame; any thread may use it.
+
+    Parameters
+    ----------
+    mixture
+        The model.
+    n_jobs
+        Threads that share the sizes of a frame; the result does not depend on them.
+
+    Raises
+    ------
+    InvalidInputError
+        If the model is no mixture.
+
+    Examples
+    --------
+    >>> search = MixtureSearch(load_model(), n_jobs=1)
+    >>> len(search.find(np.full((360, 640, 3), 90, np.uint8)).vehicles)
+    0
+    """
+
+    def __init__(self, mixture: TemplateMixture, *, n_jobs: int | None = None) -> None:
+        check_type(mixture, "mixture", TemplateMixture, 'load_model("default") or train_mixture make one')
+        self.mixture = mixture
+        self._crew = Crew(n_jobs, name="search")
+        self._local = threading.local()
+
+    def close(self) -> None:
+        """End the threads."""
+        self._crew.close()
+
+    def find(self, image: NDArray[np.uint8], params: PyramidParams | None = None) -> MixtureFind:
+        """Find the vehicles of a frame.
+
+        Parameters
+        ----------
+        image
+            ``(H, W, 3)`` uint8 RGB.
+        params
+            Sizes and places of the windows; by default those of any dash-cam.
+
+        Returns
+        -------
+        MixtureFind
+            Boxes in pixels of the frame. Those of the vehicles lie inside it; those of windows may overhang.
+
+        Raises
+        ------
+        InvalidInputError
+            If the image is malformed. One that is smaller than a template holds no vehicle.
+        """
+        params = params if params is not None else PyramidParams()
+        found = self.candidates(image, params)
+        mixture = self.mixture
+        scores = mixture.scores(found.scores)
+        evidence = scores >= params.min_score
+        grouped = suppress(found, least=mixture.value(0.0))
+        boxes, values = mixture.refinement.apply(image, grouped)
+        return MixtureFind(
+            Detections(found.boxes[evidence], scores[evidence]), Detections(boxes, mixture.scores(values))
+        )
+
+    def candidates(self, image: NDArray[np.uint8], params: PyramidParams) -> Candidates:
+        """Windows with their templates' values, the best ones first, weak ones too: they vote for boxes."""
+        check_image(image)
+        check_type(params, "params", PyramidParams, "a mixture of templates is searched for on a pyramid")
+        least = np.float32(min(WEAKEST, self.mixture.value(params.min_score)))
+        shape = image.shape[:2]
+        narrow = min(self.mixture.templates, key=lambda template: template.box_cells[0])
+        low = min(self.mixture.templates, key=lambda template: template.box_cells[1])
+        sizes = params.sizes(narrow.box_cells[0], low.box_cells[1], shape)
+        levels = pair_levels(sizes, share=params.horizon is None)
+        with single_threaded_opencv():
+            images = halved(image)
+            parts = self._crew.map(
+                lambda level: self._level(images, level, params, least),
+                levels,
+                cost=lambda level: level.shrink,
+            )
+        return Candidates.join(parts, shape).best(_MOST_WINDOWS)
+
+    def _level(
+        self, images: list[NDArray[np.uint8]], level: Level, params: PyramidParams, least: np.float32
+    ) -> Candidates:
+        """Windows of all templates on one resized frame."""
+        shape = images[0].shape[:2]
+        templates = {
+            pixels: [
+                (index, template)
+                for index, template in enumerate(self.mixture.templates)
+                if template.box_cells[0] * pixels >= params.least_width * 0.999
+                and template.box_cells[1] * pixels <= params.most_height * shape[0]
+            ]
+            for pixels, _ in level.sizes
+        }
+        reach = [
+            self._rows(template, pixels, params, shape)
+            for pixels, those in templates.items()
+            for _, template in those
+        ]
+        rows = min((top for top, _ in reach), default=0), max((bottom for _, bottom in reach), default=0)
+        if min(rows[1] - rows[0], shape[1]) * level.shrink < COARSE:
+            return Candidates.empty()
+        buffers = self._local.__dict__.setdefault("buffers", Buffers())
+        found = [
+            self._hits(index, template, features, least)
+            for pixels, features in level_maps(images, level, rows, buffers.take)
+            for index, template in templates[pixels]
+        ]
+        return Candidates.join(found, shape)
+
+    @staticmethod
+    def _rows(
+        template: MixtureTemplate, pixels: float, params: PyramidParams, shape: tuple[int, ...]
+    ) -> tuple[int, int]:
+        width, height = (cells * pixels for cells in template.box_cells)
+        top, bottom = params.rows(width, height, shape)
+        margin = round(template.margin[1] * pixels)
+        return max(0, top - margin), min(shape[0], bottom + margin)
+
+    @staticmethod
+    def _hits(index: int, template: MixtureTemplate, level: FeatureMap, least: np.float32) -> Candidates:
+        scores = template.scores(level.planes)
+        if not scores.size:
+            return Candidates.empty()
+        rows, columns = np.divmod(np.flatnonzero(scores > least), scores.shape[1])
+        return Candidates(
+            template.boxes(level, rows, columns),
+            scores[rows, columns].astype(np.float64),
+            np.full(len(rows), index, np.intp),
+        )

@@ -1,0 +1,250 @@
+"""How good a mixture is on roads it was not trained on, and the probabilities that follow from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import vehicle_detection
+from vehicle_detection._checks import check_integer
+from vehicle_detection._jobs import resolve_jobs
+from vehicle_detection._labelled_frames import LabelledFrames
+from vehicle_detection._mixture_windows import check_sources
+from vehicle_detection._refinement import suppress
+from vehicle_detection.boxes import Detections
+from vehicle_detection.evaluation import Labels, evaluate_detections, match_detections, precision_recall_curve
+from vehicle_detection.mixture import MixtureSearch, TemplateMixture
+from vehicle_detection.mixture_training import FrameSource, MixtureParams, train_mixture
+from vehicle_detection.params import PyramidParams
+
+Floats = NDArray[np.float64]
+
+# Least value of a box that is judged, and the thresholds that are tried.
+_LOWEST = -1.0
+_THRESHOLDS = np.arange(-1.0, 1.5, 0.02)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoadScore:
+    """What a mixture finds in a set of frames whose source it was not trained on.
+
+    Attributes
+    ----------
+    name, source
+        Names of the set and of its source.
+    frames, vehicles
+        Number of frames, and of boxes that count.
+    f1, precision, recall, mean_iou
+        At the threshold that the other sources tell.
+    false_per_frame, false_per_empty_frame
+        False boxes a frame, and on frames without any label; NaN where there are none.
+    average_precision, best_f1
+        Over all thresholds, and at the best one.
+    """
+
+    name: str
+    source: str
+    frames: int
+    vehicles: int
+    f1: float
+    precision: float
+    recall: float
+    mean_iou: float
+    false_per_frame: float
+    false_per_empty_frame: float
+    average_precision: float
+    best_f1: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON, rounded to four digits; what is not known is left out."""
+        values = asdict(self).items()
+        return {
+            name: round(value, 4) if isinstance(value, float) else value
+            for name, value in values
+            if value == value  # NaN is not
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """What models found in the frames of sources that they were not trained on.
+
+    Attributes
+    ----------
+    source
+        Name of the source.
+    frames
+        Labelled frames.
+    found
+        Boxes with the templates' values as scores.
+    """
+
+    source: str
+    frames: LabelledFrames
+    found: Labels
+
+    @property
+    def truth(self) -> Labels:
+        """Labels with all frames as frames."""
+        return replace(self.frames.labels, frame_keys=tuple(self.frames.keys))
+
+    @property
+    def scores(self) -> Floats:
+        """Templates' value of each box."""
+        assert self.found.scores is not None
+        return self.found.scores
+
+    def above(self, threshold: float) -> Labels:
+        """Boxes from a threshold on."""
+        return self.found[self.scores >= threshold]
+
+
+def judge_mixture(
+    sources: Sequence[FrameSource],
+    params: MixtureParams | None = None,
+    *,
+    random_state: int = 0,
+    n_jobs: int | None = None,
+    on_step: Callable[[str], object] | None = None,
+) -> tuple[TemplateMixture, list[RoadScore], list[HeldOut]]:
+    """Train a mixture on all sources, calibrated and judged by leaving out one source after the other.
+
+    Parameters
+    ----------
+    sources
+        Labelled frames of two sources or more.
+    params, random_state, n_jobs, on_step
+        As for `train_mixture`.
+
+    Returns
+    -------
+    tuple
+        The model trained on everything; a score for each set of frames, at the threshold that is best for the
+        other sources; what was found there.
+
+    Raises
+    ------
+    InvalidInputError
+        If there are not two sources, or `train_mixture` finds too few vehicles without one of them.
+
+    Notes
+    -----
+    The threshold of the model is the best one over all sources left out, each with the same weight. Log-odds
+    are fitted to the same boxes (Platt, "Probabilistic outputs for support vector machines", 1999).
+    """
+    sources = check_sources(sources, least=2)
+    check_integer(random_state, "random_state", low=0, high=2**32 - 1)
+    tell = on_step or (lambda line: None)
+    held: list[HeldOut] = []
+    for out in sources:
+        rest = [source for source in sources if source is not out]
+        mixture = train_mixture(
+            rest, params, random_state=random_state, n_jobs=n_jobs, on_step=lambda line: None
+        )
+        held += find_in(mixture, out, n_jobs=n_jobs)
+        tell(f"{out.name}: judged by a model that does not know it")
+    scores = [
+        _score(part, _threshold([other for other in held if other.source != part.source])) for part in held
+    ]
+    slope, offset = _log_odds(held)
+    threshold = slope * _threshold(held) + offset
+    mixture = train_mixture(sources, params, random_state=random_state, n_jobs=n_jobs, on_step=on_step)
+    calibrated = replace(mixture, slope=slope, offset=offset, threshold=threshold)
+    return calibrated, scores, held
+
+
+def find_in(mixture: TemplateMixture, source: FrameSource, *, n_jobs: int | None = None) -> list[HeldOut]:
+    """Find vehicles in all frames of a source, weak ones too."""
+    search = MixtureSearch(mixture, n_jobs=1)
+    sizes = PyramidParams(horizon=None)
+
+    def boxes_of(pair: tuple[Any, NDArray[np.uint8]]) -> tuple[Any, Detections]:
+        key, image = pair
+        windows = suppress(search.candidates(image, sizes), least=_LOWEST)
+        return key, Detections(*mixture.refinement.apply(image, windows))
+
+    with ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
+        return [
+            HeldOut(source.name, part, Labels.from_detections(dict(pool.map(boxes_of, part))))
+            for part in source.sets
+        ]
+
+
+def _score(part: HeldOut, threshold: float) -> RoadScore:
+    truth, kept = part.truth, part.above(threshold)
+    scores = evaluate_detections(kept, truth)
+    precision, recall, _ = precision_recall_curve(part.found, truth)
+    best = np.maximum.accumulate(precision[::-1])[::-1]
+    values, empty = _on_empty(part)
+    return RoadScore(
+        name=part.frames.name,
+        source=part.source,
+        frames=len(part.frames),
+        vehicles=int((~truth.ignore).sum()),
+        f1=scores.f1,
+        precision=scores.precision,
+        recall=scores.recall,
+        mean_iou=scores.mean_iou,
+        false_per_frame=scores.false_positives_per_frame,
+        false_per_empty_frame=int((values >= threshold).sum()) / empty if empty else float("nan"),
+        average_precision=float((np.diff(recall, prepend=0) * best).sum()),
+        best_f1=float(_f1(precision, recall).max(initial=0.0)),
+    )
+
+
+def _f1(precision: Floats, recall: Floats) -> Floats:
+    """F1 for each threshold; 0 where no vehicle is labelled."""
+    recall = np.nan_to_num(recall)
+    return np.asarray(2 * precision * recall / np.maximum(precision + recall, 1e-9), np.float64)
+
+
+def _on_empty(part: HeldOut) -> tuple[Floats, int]:
+    """Values of the boxes on frames without any label, all of them false, and the number of the frames."""
+    empty = [key for key in part.frames.keys if not len(part.frames.labels.rows(key))]
+    rows = np.concatenate([np.empty(0, np.intp), *(part.found.rows(key) for key in empty)])
+    return part.scores[rows], len(empty)
+
+
+def _threshold(held: Sequence[HeldOut]) -> float:
+    """Choose the threshold with the best mean F1 over these sets, each source with the same weight."""
+    sources = [part.source for part in held]
+    mean = np.zeros(len(_THRESHOLDS))
+    for part in held:
+        precision, recall, levels = precision_recall_curve(part.found, part.truth)
+        # Levels fall: at a threshold, everything up to the last level above it is found. Before, nothing is.
+        count = np.searchsorted(-levels, -_THRESHOLDS, side="right")
+        mean += np.append(0.0, _f1(precision, recall))[count] / sources.count(part.source)
+    return float(_THRESHOLDS[mean.argmax()])
+
+
+def _log_odds(held: Sequence[HeldOut]) -> tuple[float, float]:
+    """Slope and offset that turn values into log-odds, by what was found in sources left out."""
+    from sklearn.linear_model import LogisticRegression
+
+    values, right = [], []
+    for part in held:
+        fate = match_detections(part.found, part.truth, list(part.frames.keys), 0.5)
+        judged = ~fate.neutral
+        values += part.scores[judged].tolist()
+        right += (fate.partner[judged] >= 0).tolist()
+    if len(set(right)) < 2:
+        return 1.0, 0.0
+    fitted = LogisticRegression(C=1e6).fit(np.array(values)[:, None], right)
+    slope = float(fitted.coef_[0, 0])
+    # Of a few boxes the better ones may be the wrong ones: such a line would turn the order round.
+    return (slope, float(fitted.intercept_[0])) if slope > 0 else (1.0, 0.0)
+
+
+def as_metadata(scores: Sequence[RoadScore], sources: Sequence[FrameSource], seed: int) -> dict[str, Any]:
+    """Collect what a model file tells of its training."""
+    return {
+        "metrics": {"left_out": {score.name: score.to_dict() for score in scores}},
+        "data": {source.name: sum(len(part) for part in source.sets) for source in sources},
+        "training": {"random_state": seed},
+        "versions": {"vehicle_detection": vehicle_detection.__version__},
+    }

@@ -1,0 +1,288 @@
+"""Train the templates of a mixture on labelled frames, with hard negatives mined from the same frames."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection._checks import check_integer, check_type
+from vehicle_detection._feature_maps import COARSE, FINE, PLANES, mirror_planes
+from vehicle_detection._jobs import resolve_jobs
+from vehicle_detection._mixture_windows import (
+    Frame,
+    FrameSource,
+    Mined,
+    MixtureParams,
+    Negatives,
+    check_sources,
+    frames_of,
+    mine_windows,
+    random_windows,
+    with_mirrored,
+)
+from vehicle_detection._refinement import CROP_LENGTH, Refinement, box_planes, crop_features, suppress
+from vehicle_detection.boxes import iou_matrix
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.mixture import MixtureSearch, MixtureTemplate, TemplateMixture
+
+__all__ = ["FrameSource", "MixtureParams", "train_mixture"]
+
+Image = NDArray[np.uint8]
+Floats = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+# Steps of the solver while negatives are still looked for, and in the end.
+_FEW_STEPS, _MANY_STEPS = 50, 200
+
+
+def train_mixture(
+    sources: Sequence[FrameSource],
+    params: MixtureParams | None = None,
+    *,
+    random_state: int = 0,
+    n_jobs: int | None = None,
+    on_step: Callable[[str], object] | None = None,
+) -> TemplateMixture:
+    """Train a mixture of templates.
+
+    Parameters
+    ----------
+    sources
+        Labelled frames.
+    params
+        Shapes of the templates, and how they are trained.
+    random_state
+        Seed of the jitter and of the first negatives.
+    n_jobs
+        Threads; the model does not depend on them.
+    on_step
+        Called with a line about each step that is done.
+
+    Returns
+    -------
+    TemplateMixture
+        Uncalibrated: its scores are the templates' values. See `judge_mixture`.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is no source, or no vehicle for one of the templates.
+
+    Notes
+    -----
+    Linear SVMs on the vehicles and on windows without one, at random at first and then those that the
+    templates so far wrongly like best: Felzenszwalb et al. (PAMI 2010), section 5.
+    """
+    sources = check_sources(sources)
+    params = params if params is not None else MixtureParams()
+    check_type(params, "params", MixtureParams, "leave it out for the project's own")
+    check_integer(random_state, "random_state", low=0, high=2**32 - 1)
+    tell = on_step or log.info
+    frames = frames_of(sources)
+    rng = np.random.default_rng(random_state)
+    templates = [_blank(shape, params.margin) for shape in params.shapes]
+    positives = _positives(frames, templates, params, rng)
+    for shape, rows in zip(params.shapes, positives):
+        if not len(rows):
+            raise InvalidInputError(
+                f"sources must hold vehicles of every shape, got none like {shape[0]:g}x{shape[1]:g} that is "
+                f"{params.least_width:g} pixels wide or more; leave that shape out of MixtureParams"
+            )
+    for index in np.flatnonzero(params.facing).tolist():
+        positives[index] = turned(positives[index], rng)
+    tell(f"{[len(rows) for rows in positives]} vehicles")
+    with ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
+        rounds = _Rounds(frames, positives, params, pool)
+        seeds = rng.integers(2**32, size=len(frames)).tolist()
+        rounds.draw(templates, seeds)
+        for step, share in enumerate(params.rounds):
+            templates = rounds.solve(templates, _FEW_STEPS)
+            chosen = rng.permutation(len(frames))[: math.ceil(share * len(frames))]
+            new, total = rounds.mine(templates, chosen.tolist())
+            tell(f"round {step + 1}: {new} new of {total} negatives")
+            if share == 1 and new < 0.01 * total:
+                break
+        templates = rounds.solve(templates, _MANY_STEPS)
+        found = tuple(view.template for view in with_mirrored(templates, params.facing))
+        refinement = _fit_refinement(TemplateMixture(found, Refinement.none()), frames, params, pool)
+    return TemplateMixture(found, refinement)
+
+
+class _Rounds:
+    """The rounds of mining and solving, with what they keep."""
+
+    def __init__(
+        self,
+        frames: Sequence[Frame],
+        positives: list[NDArray[np.float32]],
+        params: MixtureParams,
+        pool: ThreadPoolExecutor,
+    ) -> None:
+        self._frames, self._positives, self._params, self._pool = frames, positives, params, pool
+        self._negatives = Negatives([rows.shape[1] for rows in positives])
+        self._vectors = [np.zeros(rows.shape[1] + 1) for rows in positives]
+
+    def draw(self, templates: Sequence[MixtureTemplate], seeds: Sequence[int]) -> None:
+        """Take windows at random."""
+        views = with_mirrored(templates, self._params.facing)
+
+        def windows(number: int) -> tuple[int, Mined]:
+            return number, random_windows(self._frames[number], seeds[number], views, self._params)
+
+        self._negatives.add(self._pool.map(windows, range(len(self._frames))))
+
+    def mine(self, templates: Sequence[MixtureTemplate], numbers: Sequence[int]) -> tuple[int, int]:
+        """Take hard negatives from these frames; return how many are new, and how many there are."""
+        self._negatives.trim(templates, self._params.most_negatives)
+        views = with_mirrored(templates, self._params.facing)
+
+        def windows(number: int) -> tuple[int, Mined]:
+            return number, mine_windows(self._frames[number], views, self._params)
+
+        new = self._negatives.add(self._pool.map(windows, numbers))
+        return new, sum(len(rows) for rows in self._negatives.rows)
+
+    def solve(self, templates: Sequence[MixtureTemplate], steps: int) -> list[MixtureTemplate]:
+        """Train the templates on what there is, from where they stand."""
+
+        def solved(index: int) -> Floats:
+            rows = self._positives[index], self._negatives.rows[index]
+            return _solve(*rows, self._params, self._vectors[index], steps)
+
+        self._vectors = list(self._pool.map(solved, range(len(templates))))
+        return [_filled(template, vector) for template, vector in zip(templates, self._vectors)]
+
+
+def turned(rows: NDArray[np.float32], rng: np.random.Generator, tries: int = 5) -> NDArray[np.float32]:
+    """Choose of each vehicle and its mirror image, which are neighbouring rows, the one like the others.
+
+    Two clusters that are each other's mirror image, by k-means from a few random starts.
+    """
+    if not len(rows):
+        return rows
+    pairs = rows.reshape(len(rows) // 2, 2, -1)
+    centred = pairs - pairs.mean(axis=(0, 1))
+    number = np.arange(len(pairs))
+    best, length = np.zeros(len(pairs), np.intp), -1.0
+    for _ in range(tries):
+        chosen = rng.integers(0, 2, len(pairs))
+        for _ in range(15):
+            mean = centred[number, chosen].mean(axis=0)
+            chosen = (centred @ mean).argmax(axis=1)
+        if float(np.linalg.norm(mean)) > length:
+            best, length = chosen, float(np.linalg.norm(mean))
+    return np.ascontiguousarray(pairs[number, best])
+
+
+def _blank(shape: tuple[float, float], margin: float) -> MixtureTemplate:
+    columns, rows = (round(side + 2 * margin) for side in shape)
+    return MixtureTemplate(
+        np.zeros((rows, columns, PLANES), np.float32),
+        0.0,
+        ((columns - shape[0]) / 2, (rows - shape[1]) / 2),
+    )
+
+
+def _filled(template: MixtureTemplate, vector: Floats) -> MixtureTemplate:
+    weights = vector[:-1].astype(np.float32).reshape(template.weights.shape)
+    return MixtureTemplate(weights, float(np.float32(vector[-1])), template.margin)
+
+
+def _window(image: Image, box: Floats, template: MixtureTemplate) -> NDArray[np.float32]:
+    """Features of a box as a template sees it, ``(rows, columns, 28)``."""
+    inside = template.box_cells
+    rows, columns = template.weights.shape[:2]
+    size = np.sqrt((box[2] - box[0]) / inside[0] * (box[3] - box[1]) / inside[1])
+    cell = FINE if size < COARSE else COARSE
+    return box_planes(image, box.tolist(), inside, (columns, rows), cell)
+
+
+def _positives(
+    frames: Sequence[Frame],
+    templates: Sequence[MixtureTemplate],
+    params: MixtureParams,
+    rng: np.random.Generator,
+) -> list[NDArray[np.float32]]:
+    """Features of the vehicles of each template, mirrored and jittered, ``(N, length)``."""
+    aspects = np.log([template.box_cells[0] / template.box_cells[1] for template in templates])
+    found: list[list[NDArray[np.float32]]] = [[] for _ in templates]
+    for frame in frames:
+        for box in frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.least_width]:
+            sides = np.tile(box[2:] - box[:2], 2)
+            apart = np.abs(np.log(sides[0] / sides[1]) - aspects)
+            for index in np.flatnonzero((apart == apart.min()) | (apart < params.near)).tolist():
+                for copy in range(params.jitter):
+                    shift = rng.uniform(-1, 1, 4) * params.shake * sides * (copy > 0)
+                    planes = _window(frame.image, box + shift, templates[index])
+                    for view in (planes, mirror_planes(planes)):
+                        found[index].append(view.transpose(1, 2, 0).ravel())
+    return [np.array(rows, np.float32).reshape(-1, t.weights.size) for rows, t in zip(found, templates)]
+
+
+def _solve(
+    positives: NDArray[np.float32],
+    negatives: NDArray[np.float32],
+    params: MixtureParams,
+    start: Floats,
+    steps: int,
+) -> Floats:
+    """Weights and bias of a linear SVM with squared hinge loss, in the primal (Chapelle, 2007)."""
+    from scipy.optimize import minimize
+
+    sides = (positives, 1.0, params.vehicles / len(positives)), (negatives, -1.0, 1.0)
+
+    def loss(vector: Floats) -> tuple[float, Floats]:
+        weights, bias = vector[:-1].astype(np.float32), vector[-1]
+        gradient = np.append(vector[:-1], 0.0)
+        value = 0.5 * float(vector[:-1] @ vector[:-1])
+        for rows, sign, weight in sides:
+            margin = np.maximum(1 - sign * ((rows @ weights).astype(np.float64) + bias), 0)
+            value += params.C * weight * float(margin @ margin)
+            pull = (-2 * params.C * weight * sign * margin).astype(np.float32)
+            gradient[:-1] += pull @ rows
+            gradient[-1] += float(pull.sum())
+        return value, gradient
+
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", options={"maxiter": steps})
+    return np.asarray(found.x, np.float64)
+
+
+def _fit_refinement(
+    mixture: TemplateMixture, frames: Sequence[Frame], params: MixtureParams, pool: ThreadPoolExecutor
+) -> Refinement:
+    """Learn how the boxes that are found differ from the true ones, by ridge regression."""
+    from sklearn.linear_model import Ridge
+
+    search = MixtureSearch(mixture, n_jobs=1)
+
+    def pairs(frame: Frame) -> tuple[NDArray[np.float32], Floats]:
+        empty = np.empty((0, CROP_LENGTH), np.float32), np.empty((0, 4))
+        if not len(frame.boxes):
+            return empty
+        found = search.candidates(frame.image, params.search)
+        boxes = suppress(found, least=-1.0).boxes
+        if not len(boxes):
+            return empty
+        overlap = iou_matrix(boxes, frame.boxes)
+        near = overlap.max(axis=1) >= 0.4
+        boxes, true = boxes[near], frame.boxes[overlap.argmax(axis=1)[near]]
+        shifts = (true - boxes) / np.tile(boxes[:, 2:] - boxes[:, :2], 2)
+        mirrored = np.ascontiguousarray(frame.image[:, ::-1])
+        width = frame.image.shape[1]
+        flipped = np.stack([width - boxes[:, 2], boxes[:, 1], width - boxes[:, 0], boxes[:, 3]], axis=1)
+        back = np.stack([-shifts[:, 2], shifts[:, 1], -shifts[:, 0], shifts[:, 3]], axis=1)
+        features = np.concatenate([crop_features(frame.image, boxes), crop_features(mirrored, flipped)])
+        return features, np.concatenate([shifts, back])
+
+    found = list(pool.map(pairs, frames))
+    search.close()
+    features, shifts = (np.concatenate(side) for side in zip(*found))
+    if not len(features):
+        return Refinement.none()
+    fitted = Ridge(alpha=30.0).fit(features.astype(np.float64), np.clip(shifts, -0.5, 0.5))
+    return Refinement(fitted.coef_.T.astype(np.float32), fitted.intercept_.astype(np.float32))
