@@ -26,6 +26,7 @@ from vehicle_detection import (
     render_patches,
     train_classifier,
 )
+from vehicle_detection._model_file import FORMAT_VERSION
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.synthetic import Drive
 
@@ -142,7 +143,7 @@ def classifier_for_search(name: str = "ycrcb-8460") -> tuple[VehicleClassifier, 
     kind = "real" if is_real() else "synthetic"
     folder = Path(tempfile.gettempdir()) / "vehicle-detection-benchmarks"
     folder.mkdir(exist_ok=True)
-    file = folder / f"{name}-{kind}.safetensors"
+    file = folder / f"{name}-{kind}-{FORMAT_VERSION}.safetensors"
     if not file.exists():
         found, _ = patches()
         part = found[::_EVERY] if is_real() else found
