@@ -19,6 +19,7 @@ from benchmarks._material import Context, classifier_for_search, searched_frame
 from benchmarks._report import Row
 from benchmarks._timing import median_of, median_seconds, seconds_of
 from vehicle_detection import SearchParams, VehicleClassifier, _kernels, load_classifier, search
+from vehicle_detection._correlation import Filter
 from vehicle_detection._jobs import available_cores
 from vehicle_detection.params import SearchBand
 from vehicle_detection.search import BandSearch
@@ -142,11 +143,9 @@ _KERNELS = {
     "normalise_blocks": "blocks",
     "histogram_cells": "histogram",
     "spatial_cells": "spatial bins",
-    "multiply": "product",
-    "sum_shifted": "sums",
 }
 _MODULES = {"cv2": {"resize": "spatial bins"}}
-_FUNCTIONS = {"resize_band": "resize", "_convert": "colour", "_hits": "hits"}
+_FUNCTIONS = {"resize_band": "resize", "convert_color": "colour", "_hits": "hits"}
 
 
 @contextlib.contextmanager
@@ -162,6 +161,8 @@ def _watch(clock: _Clock) -> Iterator[None]:
             put(name, _Watched(getattr(search, name), clock, functions, everything=False))
         for name, stage in _FUNCTIONS.items():
             put(name, clock.wrap(stage, getattr(search, name)))
+        timed = clock.wrap("correlation", Filter.add_to)
+        stack.enter_context(mock.patch.object(Filter, "add_to", timed))
         yield
 
 

@@ -44,7 +44,7 @@ def edge_sums(image: NDArray[np.uint8], take: Take = new_array) -> NDArray[np.fl
     channels = take((3, height, width), np.uint8, "channels")
     cv2.split(image, list(channels))
     sums = take((16, height // FINE, width // FINE), np.float32, "sums")
-    _fhog_kernels.orientation_sums(channels, FINE, _COTANGENTS, sums)
+    _fhog_kernels.orientation_sums(channels, _COTANGENTS, sums)
     return sums
 
 

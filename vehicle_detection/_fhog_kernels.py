@@ -7,114 +7,113 @@ import numpy as np
 from vehicle_detection._kernels import jit
 
 # Columns whose sums of all orientations stay in the first-level cache.
-_COLUMNS = 256
+_COLUMNS = 512
 
 
 @jit
-def orientation_sums(channels, part, cotangents, sums):
-    """Sum gradient magnitudes into 16 signed orientations over squares of `part` pixels.
+def orientation_sums(channels, cotangents, sums):
+    """Sum gradient magnitudes into 16 signed orientations over squares of 4x4 pixels.
 
     Of the channels the one with the longest gradient decides (Dalal and Triggs, CVPR 2005, section 6.2). The
     bins are centred: bin `k` holds the angles within 11.25 degrees of ``22.5 k``, bin ``k + 8`` the opposite
     ones. So upright and level edges lie in the middle of a bin, and the features of a mirrored image are
-    those of the image, mirrored and in another order.
+    those of the image, mirrored and in another order. A bin's sum is the difference of what lies past its two
+    bounds, and these sums stay in registers over the four rows of a square.
 
     Parameters
     ----------
     channels
-        ``(C, H, W)`` uint8.
-    part
-        Side of a square in pixels, an even number.
+        ``(3, H, W)`` uint8.
     cotangents
         ``(8,)`` float32, of the angles 11.25, 33.75, ..., 168.75 degrees.
     sums
-        Output, ``(16, rows, columns)`` float32; the image has ``rows * part`` rows or more.
+        Output, ``(16, rows, columns)`` float32; the image has four times as many rows and columns, or more.
     """
-    count, height, width = channels.shape
+    height, width = channels.shape[1:]
     rows, columns = sums.shape[1:]
-    per_tile = max(1, _COLUMNS // part)
-    size = per_tile * part
-    quotient = np.empty(size, np.float32)
-    squared = np.empty(size, np.float32)
-    across = np.empty(size, np.float32)
-    down = np.empty(size, np.float32)
-    ahead = np.empty(size, np.float32)
-    back = np.empty(size, np.float32)
-    # Cumulative over the bounds: what points ahead (or down) past each bound, and what points back.
-    totals = np.empty((18, size), np.float32)
-    zero = np.float32(0)
-    infinite = np.float32(np.inf)
+    wide = 4 * columns
+    lines = np.empty((3, width + 2), np.uint8)
+    left0, left1, left2 = lines[0], lines[1], lines[2]
+    right0, right1, right2 = lines[0, 2:], lines[1, 2:], lines[2, 2:]
+    # Cotangents of four rows; lengths of what points down (or ahead, along the row), and of what points back.
+    quotients = np.empty((4, wide), np.float32)
+    lengths = np.empty((2, 4, wide), np.float32)
+    bins = np.empty((2, 8, _COLUMNS), np.float32)
+    beyond = np.empty((2, _COLUMNS), np.float32)
+    c0, c1, c2, c3 = cotangents[0], cotangents[1], cotangents[2], cotangents[3]
+    c4, c5, c6, c7 = cotangents[4], cotangents[5], cotangents[6], cotangents[7]
+    zero, infinite = np.float32(0), np.float32(np.inf)
     for row in range(rows):
-        for first in range(0, columns, per_tile):
-            cells = min(per_tile, columns - first)
-            start = first * part
-            n = cells * part
-            totals[:] = zero
-            for y in range(row * part, (row + 1) * part):
-                low = 1 if start == 0 else 0
-                high = n - 1 if start + n == width else n
-                inside = 0 < y < height - 1
-                squared[:n] = np.float32(-1)
-                for c in range(count):
-                    above = channels[c, y - 1 if inside else y, start : start + n]
-                    below = channels[c, y + 1 if inside else y, start : start + n]
-                    left = channels[c, y, start + low - 1 : start + high - 1]
-                    right = channels[c, y, start + low + 1 : start + high + 1]
-                    quotient[:low] = zero
-                    quotient[high:n] = zero
-                    inner = quotient[low:high]
-                    for i in range(high - low):
-                        inner[i] = np.float32(right[i]) - np.float32(left[i])
-                    for i in range(n):
-                        gx = quotient[i]
-                        gy = np.float32(below[i]) - np.float32(above[i])
-                        length = gx * gx + gy * gy
-                        longer = length > squared[i]
-                        squared[i] = length if longer else squared[i]
-                        across[i] = gx if longer else across[i]
-                        down[i] = gy if longer else down[i]
-                for i in range(n):
-                    gx, gy = across[i], down[i]
-                    magnitude = np.sqrt(squared[i])
-                    # Along the row the angle is 0, whichever way it points.
-                    quotient[i] = gx / gy if gy != zero else infinite
-                    forth = gx if gy == zero else gy
-                    ahead[i] = magnitude if forth > zero else zero
-                    back[i] = zero if forth > zero else magnitude
-                t0, t1 = totals[0], totals[9]
-                for i in range(n):
-                    t0[i] += ahead[i]
-                    t1[i] += back[i]
-                for k in range(0, 8, 2):
-                    c0, c1 = cotangents[k], cotangents[k + 1]
-                    a0, a1 = totals[k + 1], totals[k + 2]
-                    b0, b1 = totals[k + 10], totals[k + 11]
-                    for i in range(n):
-                        q, a, b = quotient[i], ahead[i], back[i]
-                        a0[i] += a if q <= c0 else zero
-                        b0[i] += b if q <= c0 else zero
-                        a1[i] += a if q <= c1 else zero
-                        b1[i] += b if q <= c1 else zero
-            for side in range(2):
+        for part in range(4):
+            y = 4 * row + part
+            for c in range(3):
+                own, line = channels[c, y], lines[c]
+                for x in range(width):
+                    line[x + 1] = own[x]
+                # The gradient is zero at the border: what would be beyond equals the other neighbour.
+                line[0], line[width + 1] = line[2], line[width - 1]
+            up, down = (y - 1, y + 1) if 0 < y < height - 1 else (y, y)
+            up0, up1, up2 = channels[0, up], channels[1, up], channels[2, up]
+            down0, down1, down2 = channels[0, down], channels[1, down], channels[2, down]
+            q, ahead, back = quotients[part], lengths[0, part], lengths[1, part]
+            for x in range(wide):
+                gx = np.int32(right0[x]) - np.int32(left0[x])
+                gy = np.int32(down0[x]) - np.int32(up0[x])
+                squared = gx * gx + gy * gy
+                hx = np.int32(right1[x]) - np.int32(left1[x])
+                hy = np.int32(down1[x]) - np.int32(up1[x])
+                other = hx * hx + hy * hy
+                gx = hx if other > squared else gx
+                gy = hy if other > squared else gy
+                squared = other if other > squared else squared
+                hx = np.int32(right2[x]) - np.int32(left2[x])
+                hy = np.int32(down2[x]) - np.int32(up2[x])
+                other = hx * hx + hy * hy
+                across = np.float32(hx if other > squared else gx)
+                along = np.float32(hy if other > squared else gy)
+                size = np.sqrt(np.float32(other if other > squared else squared))
+                # Along the row the angle is 0, whichever way it points.
+                q[x] = across / along if along != zero else infinite
+                forth = across if along == zero else along
+                ahead[x] = size if forth > zero else zero
+                back[x] = zero if forth > zero else size
+        for first in range(0, wide, _COLUMNS):
+            n = min(_COLUMNS, wide - first)
+            quotient = quotients[:, first : first + n]
+            for way in range(2):
+                length, out = lengths[way, :, first : first + n], bins[way]
+                rest = beyond[way]
+                for x in range(n):
+                    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = zero
+                    for part in range(4):
+                        q, s = quotient[part, x], length[part, x]
+                        s0 += s
+                        s1 += s if q <= c0 else zero
+                        s2 += s if q <= c1 else zero
+                        s3 += s if q <= c2 else zero
+                        s4 += s if q <= c3 else zero
+                        s5 += s if q <= c4 else zero
+                        s6 += s if q <= c5 else zero
+                        s7 += s if q <= c6 else zero
+                        s8 += s if q <= c7 else zero
+                    out[0, x] = s0 - s1
+                    out[1, x] = s1 - s2
+                    out[2, x] = s2 - s3
+                    out[3, x] = s3 - s4
+                    out[4, x] = s4 - s5
+                    out[5, x] = s5 - s6
+                    out[6, x] = s6 - s7
+                    out[7, x] = s7 - s8
+                    rest[x] = s8
+            for way in range(2):
+                # Past the last bound lies the first bin of the other way.
+                line, rest = bins[way, 0], beyond[1 - way]
+                for x in range(n):
+                    line[x] += rest[x]
                 for k in range(8):
-                    over, under = totals[side * 9 + k], totals[side * 9 + k + 1]
-                    out = sums[side * 8 + k, row, first : first + cells]
-                    for i in range(n):
-                        quotient[i] = over[i] - under[i]
-                    if k == 0:
-                        # Past the last bound lies the first bin of the other way.
-                        other = totals[17 - side * 9]
-                        for i in range(n):
-                            quotient[i] += other[i]
-                    # Pairs for all columns at once, of which every other one is wanted.
-                    even, odd, pairs = quotient[: n - 1], quotient[1:n], across[: n - 1]
-                    for i in range(n - 1):
-                        pairs[i] = even[i] + odd[i]
-                    for column in range(cells):
-                        value = zero
-                        for x in range(column * part, (column + 1) * part, 2):
-                            value += across[x]
-                        out[column] = value
+                    line, out = bins[way, k], sums[8 * way + k, row, first // 4 : (first + n) // 4]
+                    for x in range(n // 4):
+                        out[x] = (line[4 * x] + line[4 * x + 1]) + (line[4 * x + 2] + line[4 * x + 3])
 
 
 @jit
@@ -244,54 +243,3 @@ def normalise_four_ways(cells, eps, planes):
             line, out = texture[k], planes[24 + k, y]
             for x in range(columns):
                 out[x] = share * line[x]
-
-
-@jit
-def correlate(planes, weights, bias, scores):
-    """Score every window of a map: the sum of weights times planes over the window's cells.
-
-    Two rows of windows and four planes are worked on at once, so that a value that is loaded is used twice
-    and a sum that is loaded takes four products.
-
-    Parameters
-    ----------
-    planes
-        ``(planes, rows, columns)`` float32, a multiple of four planes.
-    weights
-        ``(window rows, window columns, planes)`` float32.
-    bias
-        Added to every score.
-    scores
-        Output, ``(rows - window rows + 1, columns - window columns + 1)`` float32.
-    """
-    count = planes.shape[0]
-    rows, columns = weights.shape[:2]
-    height, width = scores.shape
-    for y in range(0, height, 2):
-        two = y + 1 < height
-        out0, out1 = scores[y], scores[y + 1 if two else y]
-        for x in range(width):
-            out0[x] = bias
-            out1[x] = bias
-        for i in range(rows + 1 if two else rows):
-            # Row `i` of the first windows is row `i - 1` of those below them.
-            for j in range(columns):
-                for k in range(0, count, 4):
-                    b0 = planes[k, y + i, j : j + width]
-                    b1 = planes[k + 1, y + i, j : j + width]
-                    b2 = planes[k + 2, y + i, j : j + width]
-                    b3 = planes[k + 3, y + i, j : j + width]
-                    upper, lower = weights[min(i, rows - 1), j], weights[max(i - 1, 0), j]
-                    w0, w1, w2, w3 = upper[k], upper[k + 1], upper[k + 2], upper[k + 3]
-                    v0, v1, v2, v3 = lower[k], lower[k + 1], lower[k + 2], lower[k + 3]
-                    if i == 0 or not two:
-                        for x in range(width):
-                            out0[x] += w0 * b0[x] + w1 * b1[x] + w2 * b2[x] + w3 * b3[x]
-                    elif i == rows:
-                        for x in range(width):
-                            out1[x] += v0 * b0[x] + v1 * b1[x] + v2 * b2[x] + v3 * b3[x]
-                    else:
-                        for x in range(width):
-                            x0, x1, x2, x3 = b0[x], b1[x], b2[x], b3[x]
-                            out0[x] += w0 * x0 + w1 * x1 + w2 * x2 + w3 * x3
-                            out1[x] += v0 * x0 + v1 * x1 + v2 * x2 + v3 * x3

@@ -1,4 +1,4 @@
-"""The numba kernels: HOG cells, block normalisation, weight tables and correlation sums.
+"""The numba kernels of the patch features: HOG cells, block normalisation and histograms.
 
 All of them work on row-major arrays, release the GIL and are compiled once into a cache on disk.
 The images are interleaved: a row of an ``(H, W, C)`` image is seen as ``W * C`` values, and the left and
@@ -27,9 +27,6 @@ def jit(function: Callable[..., None]) -> Callable[..., None]:
 
 # A tile of gradients and its histograms (10 rows of floats) stays in the first-level cache.
 _TILE = 768
-
-# Four rows of planes and of products, this many columns of them, stay in it too.
-_PRODUCT_TILE = 512
 
 
 @jit
@@ -325,101 +322,6 @@ def spatial_cells(bins, per_cell, cells):
                     out = cells[channel, i, j, y]
                     for x in range(columns):
                         out[x] = line[x * per_cell + j, channel]
-
-
-@jit
-def multiply(weights, planes, products):
-    """Multiply matrices: ``products = weights @ planes``, as fast as BLAS and without its threads.
-
-    Four rows of either side are worked on at once, so that a value that is loaded is used four times.
-
-    Parameters
-    ----------
-    weights
-        ``(P, K)`` float32, `P` and `K` multiples of four.
-    planes
-        ``(K, N)`` float32.
-    products
-        Output, ``(P, N)`` float32.
-    """
-    rows, depth = weights.shape
-    for start in range(0, planes.shape[1], _PRODUCT_TILE):
-        stop = min(start + _PRODUCT_TILE, planes.shape[1])
-        for p in range(0, rows, 4):
-            w = weights[p : p + 4]
-            a0 = products[p, start:stop]
-            a1 = products[p + 1, start:stop]
-            a2 = products[p + 2, start:stop]
-            a3 = products[p + 3, start:stop]
-            products[p : p + 4, start:stop] = np.float32(0)
-            for k in range(0, depth, 4):
-                b0 = planes[k, start:stop]
-                b1 = planes[k + 1, start:stop]
-                b2 = planes[k + 2, start:stop]
-                b3 = planes[k + 3, start:stop]
-                w00, w01, w02, w03 = w[0, k], w[0, k + 1], w[0, k + 2], w[0, k + 3]
-                w10, w11, w12, w13 = w[1, k], w[1, k + 1], w[1, k + 2], w[1, k + 3]
-                w20, w21, w22, w23 = w[2, k], w[2, k + 1], w[2, k + 2], w[2, k + 3]
-                w30, w31, w32, w33 = w[3, k], w[3, k + 1], w[3, k + 2], w[3, k + 3]
-                for i in range(stop - start):
-                    x0, x1, x2, x3 = b0[i], b1[i], b2[i], b3[i]
-                    a0[i] += w00 * x0 + w01 * x1 + w02 * x2 + w03 * x3
-                    a1[i] += w10 * x0 + w11 * x1 + w12 * x2 + w13 * x3
-                    a2[i] += w20 * x0 + w21 * x1 + w22 * x2 + w23 * x3
-                    a3[i] += w30 * x0 + w31 * x1 + w32 * x2 + w33 * x3
-
-
-@jit
-def sum_shifted(products, window_rows, window_columns, bias, scores):
-    """Add up, for each window, the products that its cells have at their place in the window.
-
-    Parameters
-    ----------
-    products
-        ``(window_rows * window_columns, cell rows, cell columns)`` float32; plane ``[i * window_columns +
-        j]`` holds what a cell contributes to a window in which it is the cell of row `i`, column `j`.
-    bias
-        Added to every score.
-    scores
-        Output, ``(cell rows - window_rows + 1, cell columns - window_columns + 1)`` float32.
-    """
-    height, width = scores.shape
-    for y in range(height):
-        out = scores[y]
-        for x in range(width):
-            out[x] = bias
-        for i in range(window_rows):
-            for j in range(window_columns):
-                line = products[i * window_columns + j, y + i, j : j + width]
-                for x in range(width):
-                    out[x] += line[x]
-
-
-@jit
-def add_spread(products, places, spread, scores):
-    """Add, to each window's score, the products that its blocks have at their place in the window.
-
-    Parameters
-    ----------
-    products
-        ``(places**2 or more, cell rows, cell columns)`` float32; plane ``[i * places + j]`` holds what a
-        block contributes to a window in which it starts at the cell of row ``i * spread``, column
-        ``j * spread``.
-    places
-        Blocks along a side of the window.
-    spread
-        Cells between the starts of two blocks.
-    scores
-        Changed in place, ``(window rows, window columns)`` float32.
-    """
-    height, width = scores.shape
-    for y in range(height):
-        out = scores[y]
-        for i in range(places):
-            for j in range(places):
-                line = products[i * places + j, y + i * spread, j * spread : j * spread + width]
-                for x in range(width):
-                    out[x] += line[x]
 
 
 @jit

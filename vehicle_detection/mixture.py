@@ -9,6 +9,7 @@ detect vehicles by clustering appearance patterns" (IEEE T-ITS 2015) for vehicle
 
 from __future__ import annotations
 
+import functools
 import os
 import threading
 from collections.abc import Mapping
@@ -18,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection import _fhog_kernels
-from vehicle_detection._buffers import Buffers
+from vehicle_detection._buffers import Buffers, Take, new_array
 from vehicle_detection._checks import check_image, check_number, check_type, describe
+from vehicle_detection._correlation import Filter
 from vehicle_detection._feature_maps import COARSE, PLANES, FeatureMap, Level, halved, level_maps, pair_levels
 from vehicle_detection._jobs import Crew, single_threaded_opencv
 from vehicle_detection._model_file import read_model, write_model
@@ -76,14 +77,18 @@ class MixtureTemplate:
         rows, columns = self.weights.shape[:2]
         return columns - 2 * self.margin[0], rows - 2 * self.margin[1]
 
-    def scores(self, planes: NDArray[np.float32]) -> NDArray[np.float32]:
+    def scores(self, planes: NDArray[np.float32], take: Take = new_array) -> NDArray[np.float32]:
         """Score of every window of a map, ``(rows, columns)`` float32; empty where none fits."""
         rows, columns = self.weights.shape[:2]
         shape = max(planes.shape[1] - rows + 1, 0), max(planes.shape[2] - columns + 1, 0)
-        scores = np.empty(shape, np.float32)
+        scores = np.full(shape, self.bias, np.float32)
         if scores.size:
-            _fhog_kernels.correlate(planes, self.weights, np.float32(self.bias), scores)
+            self._filter.add_to(planes, scores, take)
         return scores
+
+    @functools.cached_property
+    def _filter(self) -> Filter:
+        return Filter(self.weights)
 
     def boxes(
         self, level: FeatureMap, rows: NDArray[np.intp], columns: NDArray[np.intp]
@@ -333,7 +338,7 @@ class MixtureSearch:
             return Candidates.empty()
         buffers = self._local.__dict__.setdefault("buffers", Buffers())
         found = [
-            self._hits(index, template, features, least)
+            self._hits(index, template, features, least, buffers.take)
             for pixels, features in level_maps(images, level, rows, buffers.take)
             for index, template in templates[pixels]
         ]
@@ -349,8 +354,10 @@ class MixtureSearch:
         return max(0, top - margin), min(shape[0], bottom + margin)
 
     @staticmethod
-    def _hits(index: int, template: MixtureTemplate, level: FeatureMap, least: np.float32) -> Candidates:
-        scores = template.scores(level.planes)
+    def _hits(
+        index: int, template: MixtureTemplate, level: FeatureMap, least: np.float32, take: Take
+    ) -> Candidates:
+        scores = template.scores(level.planes, take)
         if not scores.size:
             return Candidates.empty()
         rows, columns = np.divmod(np.flatnonzero(scores > least), scores.shape[1])

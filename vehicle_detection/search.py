@@ -12,8 +12,7 @@ cells, and each part of the weights is a filter over an 8x8 neighbourhood of cel
 - Coarse HOG: planes of its own, of cells averaged by fours at every cell; a window's blocks start two cells
   apart.
 
-One matrix product gives what every cell contributes at every place in a window, and 64 shifted sums make
-the scores of all windows. Dalal and Triggs (CVPR 2005) for HOG; Felzenszwalb et al. (PAMI 2010), section 3,
+The correlation of the planes with the filters makes the scores of all windows. Dalal and Triggs (CVPR 2005) for HOG; Felzenszwalb et al. (PAMI 2010), section 3,
 for linear templates as filters over a feature map.
 """
 
@@ -28,10 +27,11 @@ from numpy.typing import NDArray
 from vehicle_detection import _kernels
 from vehicle_detection._buffers import Buffers, Take, new_array
 from vehicle_detection._checks import check_image, check_number, check_type
+from vehicle_detection._correlation import Filter
 from vehicle_detection._histogram_kernels import add_root_histograms
 from vehicle_detection._jobs import Crew, single_threaded_opencv
 from vehicle_detection.boxes import Detections
-from vehicle_detection.classifier import CLASSIFIER_REMEDY, Template, VehicleClassifier
+from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import (
     bin_of_value,
@@ -192,11 +192,6 @@ def _hits(scores: NDArray[np.float32], band: PixelBand, filters: _Filters, least
     return Detections(boxes, grid[rows, columns].astype(np.float64))
 
 
-def _padded(count: int) -> int:
-    """Round up to a multiple of four, as `multiply` asks for."""
-    return -(-count // 4) * 4
-
-
 class _Filters:
     """The folded weights of a classifier, laid out as filters over planes of cells."""
 
@@ -206,135 +201,103 @@ class _Filters:
         self.cells = params.cells
         self.block = params.cell_per_block
         self.per_cell = params.spatial_size // params.cells
-        self.hog_planes = params.hog_channels * self.block**2 * params.orient if params.hog_feat else 0
-        self.spatial_planes = 3 * self.per_cell**2 if params.spatial_feat else 0
         self.roots = params.hist_feat and params.hist_sqrt
         self.looks_up = params.hist_feat and not params.hist_sqrt
         self.coarse = params.coarse_blocks if params.hog_feat else 0
-        self.used = self.hog_planes + self.spatial_planes + int(self.looks_up)
-        self.planes = _padded(max(self.used, 1))
         self.cotangents = orientation_cotangents(params.orient)
         self.bounds = degree_bounds(params.orient)
         self.bins = bin_of_value(params.hist_bins)
-        laid_out = [self._lay_out(template) for template in classifier.templates]
-        folded = [template.fold()[0] for template in classifier.templates]
-        self.coarse_weights = [self._lay_out_coarse(weights) for weights in folded]
+        folded = [template.fold() for template in classifier.templates]
+        self.biases = [bias for _, bias in folded]
+        self.filters = [self._lay_out(weights) for weights, _ in folded]
         hist = slice(params.spatial_length, params.spatial_length + params.hist_length)
-        self.root_weights = np.array([weights[hist] for weights in folded], np.float32).reshape(
-            len(folded), 3, -1
-        )
-        self.biases = [np.float32(bias) for _, _, bias in laid_out]
         # Each template with a histogram has a weight table, and so a plane, of its own.
-        self.tables = [table for _, table, _ in laid_out]
-        self.weights = [weights for weights, _, _ in laid_out]
+        by_bin = np.array([weights[hist] for weights, _ in folded], np.float32).reshape(len(folded), 3, -1)
+        self.tables = by_bin[:, :, self.bins] if self.looks_up else None
+        self.root_weights = by_bin if self.roots else None
 
-    def _lay_out(self, template: Template) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
-        """Lay out a template as filters ``(cells**2, planes)``, value table ``(3, 256)`` and bias."""
+    def _lay_out(self, weights: NDArray[np.float64]) -> list[Filter]:
+        """Lay out a template as filters over the planes of HOG, of coarse HOG and of the cells' values."""
         params, cells = self.params, self.cells
-        weights, bias = template.fold()
-        filters = np.zeros((cells, cells, self.planes))
+        filters = []
+        if params.hog_feat:
+            start, stop = params.length - params.hog_length, params.length - params.coarse_length
+            for places, part, spread in (
+                (params.blocks, weights[start:stop], 1),
+                (self.coarse, weights[stop:], 2),
+            ):
+                if places:
+                    blocks = part.reshape(params.hog_channels, places, places, -1).transpose(1, 2, 0, 3)
+                    filters.append(Filter(blocks.reshape(places, places, -1), spread=spread))
+        values = []
         if params.spatial_feat:
             part = weights[: params.spatial_length].reshape(3, cells, self.per_cell, cells, self.per_cell)
-            planes = part.transpose(1, 3, 0, 2, 4).reshape(cells, cells, -1)
-            filters[..., self.hog_planes : self.hog_planes + self.spatial_planes] = planes
-        table = np.zeros((3, 256), np.float32)
+            values.append(part.transpose(1, 3, 0, 2, 4).reshape(cells, cells, -1))
         if self.looks_up:
-            start = params.spatial_length
-            part = weights[start : start + params.hist_length].reshape(3, params.hist_bins)
-            table[:] = part[:, self.bins]
-            filters[..., self.used - 1] = 1
-        if params.hog_feat:
-            blocks = params.blocks
-            start = params.length - params.hog_length
-            part = weights[start : params.length - params.coarse_length]
-            part = part.reshape(params.hog_channels, blocks, blocks, -1)
-            planes = part.transpose(1, 2, 0, 3).reshape(blocks, blocks, -1)
-            filters[:blocks, :blocks, : self.hog_planes] = planes
-        rows = np.zeros((_padded(cells * cells), self.planes), np.float32)
-        rows[: cells * cells] = filters.reshape(cells * cells, -1)
-        return rows, table, bias
-
-    def _lay_out_coarse(self, weights: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Lay out the coarse HOG's weights as filters ``(places**2, planes)``, both padded."""
-        places = self.coarse**2
-        rows = np.zeros((_padded(places), _padded(self.hog_planes)), np.float32)
-        if places:
-            part = weights[self.params.length - self.params.coarse_length :]
-            part = part.reshape(self.params.hog_channels, places, -1)
-            rows[:places, : self.hog_planes] = part.transpose(1, 0, 2).reshape(places, -1)
-        return rows
+            values.append(np.ones((cells, cells, 1)))
+        return [*filters, Filter(np.concatenate(values, axis=2))] if values else filters
 
     def score_map(self, band: NDArray[np.uint8], take: Take) -> NDArray[np.float32]:
         """Scores of all windows of a resized band, ``(rows, columns)`` float32, as a new array."""
-        cell = self.params.pix_per_cell
+        params, cell = self.params, self.params.pix_per_cell
         rows, columns = band.shape[0] // cell, band.shape[1] // cell
-        planes = take((self.planes, rows, columns), np.float32, "planes")
-        planes[self.used :] = 0
-        coarse = (
-            take((_padded(self.hog_planes), rows, columns), np.float32, "coarse") if self.coarse else None
-        )
-        converted = self._fill_planes(band, planes, coarse, take)
-        shape = (len(self.weights), rows - self.cells + 1, columns - self.cells + 1)
+        converted = convert_color(band, params.color_space, out=take(band.shape, np.uint8, "converted"))
+        maps = self._hog_maps(band, converted, take) if params.hog_feat else []
+        if params.spatial_feat or self.looks_up:
+            maps.append(self._value_map(converted, take))
+        shape = (len(self.filters), rows - self.cells + 1, columns - self.cells + 1)
         scores = np.empty(shape, np.float32)
-        for template, (weights, table, bias) in enumerate(zip(self.weights, self.tables, self.biases)):
-            if self.looks_up:
-                _kernels.histogram_cells(converted, table, cell, planes[self.used - 1])
-            products = take((len(weights), rows * columns), np.float32, "products")
-            _kernels.multiply(weights, planes.reshape(self.planes, -1), products)
-            stacked = products.reshape(-1, rows, columns)
-            _kernels.sum_shifted(stacked, self.cells, self.cells, bias, scores[template])
-            if coarse is not None:
-                weights = self.coarse_weights[template]
-                products = take((len(weights), rows * columns), np.float32, "products")
-                _kernels.multiply(weights, coarse.reshape(len(coarse), -1), products)
-                stacked = products.reshape(-1, rows, columns)
-                _kernels.add_spread(stacked, self.coarse, 2, scores[template])
-        if self.roots:
+        for template, (filters, bias) in enumerate(zip(self.filters, self.biases)):
+            scores[template] = bias
+            if self.tables is not None:
+                _kernels.histogram_cells(converted, self.tables[template], cell, maps[-1][-1])
+            for part, planes in zip(filters, maps):
+                part.add_to(planes, scores[template], take)
+        if self.root_weights is not None:
             add_root_histograms(converted, self.bins, self.root_weights, cell, self.cells, scores)
         return scores[0] if len(scores) == 1 else np.asarray(scores.max(axis=0))
 
-    def _fill_planes(
-        self,
-        band: NDArray[np.uint8],
-        planes: NDArray[np.float32],
-        coarse: NDArray[np.float32] | None,
-        take: Take,
-    ) -> NDArray[np.uint8]:
-        """Fill the planes of HOG, coarse HOG and spatial bins; return the band in the features' space."""
-        params = self.params
-        rows, columns = planes.shape[1:]
+    def _hog_maps(
+        self, band: NDArray[np.uint8], converted: NDArray[np.uint8], take: Take
+    ) -> list[NDArray[np.float32]]:
+        """Maps of the blocks of HOG and, if asked for, of coarse HOG: ``(planes, rows, columns)``."""
+        params, channels = self.params, self.params.hog_channels
         cell = params.pix_per_cell
-        converted = _convert(band, params, take)
-        if params.hog_feat:
-            gray = params.hog_channel == "GRAY"
-            source = hog_source(band, params) if gray else pick_hog_channels(converted, params)
-            channels = params.hog_channels
-            cells = take((channels, params.orient, rows, columns), np.float32, "cells")
-            if params.transform_sqrt:
-                _kernels.sum_orientations(*sqrt_gradients(source), self.bounds, channels, cell, cells)
-            else:
-                flat = np.ascontiguousarray(source).reshape(source.shape[0], -1)
-                _kernels.hog_cells(flat, channels, cell, self.cotangents, cells)
-            shape = (channels, self.block, self.block, params.orient, rows, columns)
-            _kernels.normalise_blocks(cells, self.block, 1, planes[: self.hog_planes].reshape(shape))
-            if coarse is not None:
-                pooled = take(cells.shape, np.float32, "pooled")
-                _kernels.pool_cells(cells, pooled)
-                coarse[self.hog_planes :] = 0
-                _kernels.normalise_blocks(pooled, self.block, 2, coarse[: self.hog_planes].reshape(shape))
-        if params.spatial_feat:
-            size = (columns * self.per_cell, rows * self.per_cell)
+        rows, columns = band.shape[0] // cell, band.shape[1] // cell
+        gray = params.hog_channel == "GRAY"
+        source = hog_source(band, params) if gray else pick_hog_channels(converted, params)
+        cells = take((channels, params.orient, rows, columns), np.float32, "cells")
+        if params.transform_sqrt:
+            _kernels.sum_orientations(*sqrt_gradients(source), self.bounds, channels, cell, cells)
+        else:
+            flat = np.ascontiguousarray(source).reshape(source.shape[0], -1)
+            _kernels.hog_cells(flat, channels, cell, self.cotangents, cells)
+        shape = (channels, self.block, self.block, params.orient, rows, columns)
+        blocks = take(shape, np.float32, "blocks")
+        _kernels.normalise_blocks(cells, self.block, 1, blocks)
+        maps = [blocks.reshape(-1, rows, columns)]
+        if self.coarse:
+            pooled = take(cells.shape, np.float32, "pooled")
+            _kernels.pool_cells(cells, pooled)
+            blocks = take(shape, np.float32, "coarse blocks")
+            _kernels.normalise_blocks(pooled, self.block, 2, blocks)
+            maps.append(blocks.reshape(-1, rows, columns))
+        return maps
+
+    def _value_map(self, converted: NDArray[np.uint8], take: Take) -> NDArray[np.float32]:
+        """Map of the spatial bins of each cell and, last, room for its looked-up histogram."""
+        cell, per_cell = self.params.pix_per_cell, self.per_cell
+        rows, columns = converted.shape[0] // cell, converted.shape[1] // cell
+        count = 3 * per_cell**2 if self.params.spatial_feat else 0
+        planes = take((count + int(self.looks_up), rows, columns), np.float32, "values")
+        if count:
+            size = (columns * per_cell, rows * per_cell)
             whole = converted[: rows * cell, : columns * cell]
             bins = cv2.resize(whole, size, dst=take((size[1], size[0], 3), np.uint8, "bins"))
-            part = planes[self.hog_planes : self.hog_planes + self.spatial_planes]
-            part = part.reshape(3, self.per_cell, self.per_cell, rows, columns)
-            _kernels.spatial_cells(bins, self.per_cell, part)
-        return converted
-
-
-def _convert(band: NDArray[np.uint8], params: FeatureParams, take: Take) -> NDArray[np.uint8]:
-    """Convert a resized band to the features' colour space."""
-    return convert_color(band, params.color_space, out=take(band.shape, np.uint8, "converted"))
+            _kernels.spatial_cells(
+                bins, per_cell, planes[:count].reshape(3, per_cell, per_cell, rows, columns)
+            )
+        return planes
 
 
 def _check_shareable(params: FeatureParams) -> None:
