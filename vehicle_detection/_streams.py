@@ -27,6 +27,8 @@ _COPIED_AUDIO = {"mp4": {"aac", "mp3"}, "mov": {"aac", "mp3"}}
 _COPIED_AUDIO["matroska"] = {*_COPIED_AUDIO["mp4"], "ac3", "eac3", "flac", "opus", "vorbis"}
 _LONGEST_STILL = 5
 """Seconds for which one frame of a video with a varying rate may be shown, when reading starts inside it."""
+# More threads than that wait for each other, and the search needs the cores.
+_DECODER_THREADS = "2"
 _CUT = re.compile(r"partial file|ended prematurely")
 
 
@@ -52,7 +54,7 @@ class FrameReader:
             seek = float((first - early) / info.fps)
             filters = [f"fps={info.fps}:start_time=0", f"trim=start_frame={early}", *filters]
         options = ["-ss", f"{seek:.6f}"] if seek else []
-        options += ["-i", f"file:{path}", "-map", "0:V:0", "-vf", ",".join(filters)]
+        options += ["-threads", _DECODER_THREADS, "-i", f"file:{path}", "-map", "0:V:0", "-vf", ",".join(filters)]
         if count is not None:
             options += ["-frames:v", str(count)]
         options += ["-fps_mode", "passthrough"]

@@ -128,7 +128,8 @@ class BandSearch:
             parts = self._crew.map(
                 lambda band: _hits(self.score_map(image, band), band, self._filters, least), bands, cost=_cost
             )
-        return Detections(np.concatenate([p.boxes for p in parts]), np.concatenate([p.scores for p in parts]))
+        boxes, scores = zip(*parts)
+        return Detections(np.concatenate(boxes), np.concatenate(scores))
 
     def score_map(self, image: NDArray[np.uint8], band: PixelBand) -> NDArray[np.float32]:
         """Score of every window of a band at a step of one cell.
@@ -178,18 +179,23 @@ def _cost(band: PixelBand) -> float:
     return float(height * width)
 
 
-def _hits(scores: NDArray[np.float32], band: PixelBand, filters: _Filters, least: float) -> Detections:
-    """Boxes, in pixels of the frame, of the windows of a score map above `least`."""
+def _hits(
+    scores: NDArray[np.float32], band: PixelBand, filters: _Filters, least: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Boxes, in pixels of the frame, and scores of the windows of a score map above `least`."""
     height, width = resized_shape(band)
-    scale = np.array([(band.x2 - band.x1) / width, (band.y2 - band.y1) / height])
+    wide, high = (band.x2 - band.x1) / width, (band.y2 - band.y1) / height
     cell = filters.params.pix_per_cell
     # Steps in pixels of the frame become whole cells of the resized band.
-    steps = [max(1, round(step / (cell * factor))) for step, factor in zip(band.step, scale)]
-    grid = scores[:: steps[1], :: steps[0]]
-    rows, columns = np.divmod(np.flatnonzero(grid > least), grid.shape[1])
-    corner = np.stack([columns * steps[0], rows * steps[1]], axis=1) * cell * scale + (band.x1, band.y1)
-    boxes = np.concatenate([corner, corner + scale * PATCH_SIZE], axis=1)
-    return Detections(boxes, grid[rows, columns].astype(np.float64))
+    across, down = (max(1, round(step / (cell * scale))) for step, scale in zip(band.step, (wide, high)))
+    grid = scores[::down, ::across]
+    rows, columns = (grid > least).nonzero()
+    boxes = np.empty((len(rows), 4))
+    boxes[:, 0] = columns * (across * cell) * wide + band.x1
+    boxes[:, 1] = rows * (down * cell) * high + band.y1
+    boxes[:, 2] = boxes[:, 0] + wide * PATCH_SIZE
+    boxes[:, 3] = boxes[:, 1] + high * PATCH_SIZE
+    return boxes, grid[rows, columns].astype(np.float64)
 
 
 class _Filters:
