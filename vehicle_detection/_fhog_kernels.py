@@ -198,7 +198,7 @@ def normalise_four_ways(cells, eps, planes):
     blocks = np.empty((2, columns + 1), np.float32)
     texture = np.empty((4, columns), np.float32)
     clip, half, share = np.float32(0.2), np.float32(0.5), np.float32(0.2357)
-    one = np.float32(1)
+    zero, one = np.float32(0), np.float32(1)
     for k in range(8):
         for y in range(rows):
             out = energy[y + 1, 1 : columns + 1]
@@ -206,11 +206,13 @@ def normalise_four_ways(cells, eps, planes):
             for x in range(columns):
                 both = forth[x] + back[x]
                 out[x] += both * both
-    # Beyond the border the outermost cells go on.
-    energy[0] = energy[1]
-    energy[rows + 1] = energy[rows]
-    energy[:, 0] = energy[:, 1]
-    energy[:, columns + 1] = energy[:, columns]
+    # Beyond the border the outermost cells go on. Loops: to assign parts of arrays takes seconds to compile.
+    for x in range(1, columns + 1):
+        energy[0, x] = energy[1, x]
+        energy[rows + 1, x] = energy[rows, x]
+    for y in range(rows + 2):
+        energy[y, 0] = energy[y, 1]
+        energy[y, columns + 1] = energy[y, columns]
     for y in range(rows):
         for side in range(2):
             upper, lower = energy[y + side], energy[y + side + 1]
@@ -219,8 +221,9 @@ def normalise_four_ways(cells, eps, planes):
                 out[x] = one / np.sqrt(upper[x] + upper[x + 1] + lower[x] + lower[x + 1] + eps)
         n0, n1 = blocks[0, :columns], blocks[0, 1:]
         n2, n3 = blocks[1, :columns], blocks[1, 1:]
-        texture[:] = np.float32(0)
         t0, t1, t2, t3 = texture[0], texture[1], texture[2], texture[3]
+        for x in range(columns):
+            t0[x] = t1[x] = t2[x] = t3[x] = zero
         for k in range(16):
             line, out = cells[k, y], planes[k, y]
             for x in range(columns):

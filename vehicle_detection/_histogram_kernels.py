@@ -37,8 +37,15 @@ def add_root_histograms(image, bin_of_value, weights, cell, window, scores):
     counts = np.empty((3 * bins, columns), np.uint16)
     flat = counts.reshape(-1)
     # Where a bin's counts start; unsigned, or each access would ask whether it counts from the end.
-    first = (bin_of_value * columns).astype(np.uintp)
-    second, third = first + np.uintp(bins * columns), first + np.uintp(2 * bins * columns)
+    first, second, third = (
+        np.empty(256, np.uintp),
+        np.empty(256, np.uintp),
+        np.empty(256, np.uintp),
+    )
+    for value in range(256):
+        first[value] = bin_of_value[value] * columns
+        second[value] = first[value] + np.uintp(bins * columns)
+        third[value] = second[value] + np.uintp(bins * columns)
     one = np.uint16(1)
     wide = np.empty(columns, np.uint16)
     recent = np.zeros((window, 3 * bins, width), np.uint16)
@@ -47,7 +54,7 @@ def add_root_histograms(image, bin_of_value, weights, cell, window, scores):
     roots = np.empty(width, np.float32)
     flat_weights = weights.reshape(templates, 3 * bins)
     for row in range(rows):
-        counts[:] = np.uint16(0)
+        counts.fill(np.uint16(0))
         for y in range(row * cell, (row + 1) * cell):
             line = image[y]
             for column in range(columns):

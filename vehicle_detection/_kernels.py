@@ -70,7 +70,7 @@ def hog_cells(image, channels, cell, cotangents, cells):
             count = min(per_tile, columns - first)
             start = first * span
             n = count * span
-            sums[:] = zero
+            sums.fill(zero)
             for y in range(row * cell, (row + 1) * cell):
                 # At the array's border there is no neighbour on one side: the gradient is zero.
                 low = channels if start == 0 else 0
@@ -230,7 +230,7 @@ def normalise_blocks(cells, block, spread, blocks):
     scale = np.empty(width, np.float32)
     clipped = np.empty(width, np.float32)
     for channel in range(channels):
-        energy[:] = np.float32(0)
+        energy.fill(np.float32(0))
         for k in range(orient):
             for y in range(rows):
                 line = cells[channel, k, y]
@@ -238,7 +238,7 @@ def normalise_blocks(cells, block, spread, blocks):
                 for x in range(columns):
                     sums[x] += line[x] * line[x]
         for y in range(height):
-            scale[:] = eps
+            scale.fill(eps)
             for i in range(block):
                 for j in range(block):
                     line = energy[y + i * spread, j * spread : j * spread + width]
@@ -246,7 +246,7 @@ def normalise_blocks(cells, block, spread, blocks):
                         scale[x] += line[x]
             for x in range(width):
                 scale[x] = one / np.sqrt(scale[x])
-            clipped[:] = eps
+            clipped.fill(eps)
             for i in range(block):
                 for j in range(block):
                     for k in range(orient):
@@ -264,8 +264,12 @@ def normalise_blocks(cells, block, spread, blocks):
                         out = blocks[channel, i, j, k, y]
                         for x in range(width):
                             out[x] *= clipped[x]
-                        out[width:] = np.float32(0)
-        blocks[channel, :, :, :, height:] = np.float32(0)
+                        out[width:].fill(np.float32(0))
+        for y in range(height, rows):
+            for i in range(block):
+                for j in range(block):
+                    for k in range(orient):
+                        blocks[channel, i, j, k, y].fill(np.float32(0))
 
 
 @jit
