@@ -60,7 +60,8 @@ def hog_cells(image, channels, cell, cotangents, cells):
     size = per_tile * span
     quotient = np.empty(size, np.float32)
     magnitude = np.empty(size, np.float32)
-    fours = np.empty(size, np.float32)
+    fours, eights = np.empty(size, np.float32), np.empty(size, np.float32)
+    reduced = np.empty((orient, channels, per_tile), np.float32)
     sums = np.empty((orient, size), np.float32)
     scale = np.float32(1.0 / (cell * cell))
     zero = np.float32(0)
@@ -110,32 +111,38 @@ def hog_cells(image, channels, cell, cotangents, cells):
                     c0, t0 = cotangents[k], sums[k]
                     for i in range(n):
                         t0[i] += magnitude[i] if quotient[i] <= c0 else zero
-            # A cell's columns: sums of four for all values at once, of which those at its columns are wanted.
-            reach = max(0, n - 3 * channels)
-            grouped = cell // 4 * 4
+            # A cell's columns: sums of four and of eight for all values at once; one in `span` is wanted.
+            ahead = n - 3 * channels
             for k in range(orient):
                 total = sums[k]
-                s0, s1 = total[:reach], total[channels : channels + reach]
-                s2, s3 = (
-                    total[2 * channels : 2 * channels + reach],
-                    total[3 * channels : 3 * channels + reach],
-                )
-                for i in range(reach):
-                    fours[i] = (s0[i] + s1[i]) + (s2[i] + s3[i])
+                single, step = total, 1
+                if cell % 4 == 0:
+                    s1, s2, s3 = total[channels:], total[2 * channels :], total[3 * channels :]
+                    for i in range(ahead):
+                        fours[i] = (total[i] + s1[i]) + (s2[i] + s3[i])
+                    single, step = fours, 4
+                    if cell % 8 == 0:
+                        other = fours[4 * channels :]
+                        for i in range(ahead - 4 * channels):
+                            eights[i] = fours[i] + other[i]
+                        single, step = eights, 8
                 for channel in range(channels):
-                    out = cells[channel, k, row, first : first + count]
                     for column in range(count):
                         at = column * span + channel
-                        value = zero
-                        for x in range(0, grouped, 4):
-                            value += fours[at + x * channels]
-                        for x in range(grouped, cell):
-                            value += total[at + x * channels]
-                        out[column] = value * scale
+                        value = single[at]
+                        for x in range(step, cell, step):
+                            value += single[at + x * channels]
+                        reduced[k, channel, column] = value
             for channel in range(channels):
-                for k in range(orient - 1):
-                    for column in range(first, first + count):
-                        cells[channel, k, row, column] -= cells[channel, k + 1, row, column]
+                for k in range(orient):
+                    out, within = cells[channel, k, row, first : first + count], reduced[k, channel]
+                    if k + 1 < orient:
+                        past = reduced[k + 1, channel]
+                        for column in range(count):
+                            out[column] = (within[column] - past[column]) * scale
+                    else:
+                        for column in range(count):
+                            out[column] = within[column] * scale
 
 
 @jit

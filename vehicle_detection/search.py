@@ -12,8 +12,8 @@ cells, and each part of the weights is a filter over an 8x8 neighbourhood of cel
 - Coarse HOG: planes of its own, of cells averaged by fours at every cell; a window's blocks start two cells
   apart.
 
-The correlation of the planes with the filters makes the scores of all windows. Dalal and Triggs (CVPR 2005) for HOG; Felzenszwalb et al. (PAMI 2010), section 3,
-for linear templates as filters over a feature map.
+The correlation of the planes with the filters makes the scores of all windows. Dalal and Triggs (CVPR 2005)
+for HOG; Felzenszwalb et al. (PAMI 2010), section 3, for linear templates as filters over a feature map.
 """
 
 from __future__ import annotations
@@ -266,7 +266,7 @@ class _Filters:
     def _hog_maps(
         self, band: NDArray[np.uint8], converted: NDArray[np.uint8], take: Take
     ) -> list[NDArray[np.float32]]:
-        """Maps of the blocks of HOG and, if asked for, of coarse HOG: ``(planes, rows, columns)``."""
+        """Compute the blocks of HOG and, if asked for, of coarse HOG: ``(planes, rows, columns)``."""
         params, channels = self.params, self.params.hog_channels
         cell = params.pix_per_cell
         rows, columns = band.shape[0] // cell, band.shape[1] // cell
