@@ -36,7 +36,7 @@ def orientation_sums(channels, cotangents, sums):
     left0, left1, left2 = lines[0], lines[1], lines[2]
     right0, right1, right2 = lines[0, 2:], lines[1, 2:], lines[2, 2:]
     # Cotangents of four rows; lengths of what points down (or ahead, along the row), and of what points back.
-    quotients = np.empty((4, wide), np.float32)
+    angles = np.empty((4, wide), np.float32)
     lengths = np.empty((2, 4, wide), np.float32)
     bins = np.empty((2, 8, _COLUMNS), np.float32)
     beyond = np.empty((2, _COLUMNS), np.float32)
@@ -55,7 +55,7 @@ def orientation_sums(channels, cotangents, sums):
             up, down = (y - 1, y + 1) if 0 < y < height - 1 else (y, y)
             up0, up1, up2 = channels[0, up], channels[1, up], channels[2, up]
             down0, down1, down2 = channels[0, down], channels[1, down], channels[2, down]
-            q, ahead, back = quotients[part], lengths[0, part], lengths[1, part]
+            angle, ahead, back = angles[part], lengths[0, part], lengths[1, part]
             for x in range(wide):
                 gx = np.int32(right0[x]) - np.int32(left0[x])
                 gy = np.int32(down0[x]) - np.int32(up0[x])
@@ -73,20 +73,19 @@ def orientation_sums(channels, cotangents, sums):
                 along = np.float32(hy if other > squared else gy)
                 size = np.sqrt(np.float32(other if other > squared else squared))
                 # Along the row the angle is 0, whichever way it points.
-                q[x] = across / along if along != zero else infinite
+                angle[x] = across / along if along != zero else infinite
                 forth = across if along == zero else along
                 ahead[x] = size if forth > zero else zero
                 back[x] = zero if forth > zero else size
         for first in range(0, wide, _COLUMNS):
             n = min(_COLUMNS, wide - first)
-            quotient = quotients[:, first : first + n]
+            tile = angles[:, first : first + n]
             for way in range(2):
-                length, out = lengths[way, :, first : first + n], bins[way]
-                rest = beyond[way]
+                length, out, rest = lengths[way, :, first : first + n], bins[way], beyond[way]
                 for x in range(n):
                     s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = zero
                     for part in range(4):
-                        q, s = quotient[part, x], length[part, x]
+                        q, s = tile[part, x], length[part, x]
                         s0 += s
                         s1 += s if q <= c0 else zero
                         s2 += s if q <= c1 else zero

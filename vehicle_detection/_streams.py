@@ -54,16 +54,8 @@ class FrameReader:
             seek = float((first - early) / info.fps)
             filters = [f"fps={info.fps}:start_time=0", f"trim=start_frame={early}", *filters]
         options = ["-ss", f"{seek:.6f}"] if seek else []
-        options += [
-            "-threads",
-            _DECODER_THREADS,
-            "-i",
-            f"file:{path}",
-            "-map",
-            "0:V:0",
-            "-vf",
-            ",".join(filters),
-        ]
+        options += ["-threads", _DECODER_THREADS, "-i", f"file:{path}"]
+        options += ["-map", "0:V:0", "-vf", ",".join(filters)]
         if count is not None:
             options += ["-frames:v", str(count)]
         options += ["-fps_mode", "passthrough"]
