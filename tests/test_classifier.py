@@ -143,7 +143,7 @@ def test_training_tells_what_it_did(trained):
     training = trained.metadata["training"]
     assert (training["vehicles"], training["non_vehicles"]) == (40, 40)
     assert training["random_state"] == 0
-    assert {"vehicle_detection", "numpy", "scikit-learn"} <= trained.metadata["versions"].keys()
+    assert {"vehicle_detection", "numpy", "numba"} <= trained.metadata["versions"].keys()
     assert trained.metadata["accuracy"] == 1.0
     json.dumps(trained.metadata)
 
