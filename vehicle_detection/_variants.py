@@ -85,12 +85,13 @@ def degrade_patches(images: NDArray[np.uint8], *, mirror: bool = True) -> NDArra
         pale = cv2.addWeighted(coarse, colour, gray, 1 - colour, 0)
         quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.uniform(*_QUALITY))]
         _, coded = cv2.imencode(".jpg", cv2.cvtColor(pale, cv2.COLOR_RGB2BGR), quality)
-        out[:] = cv2.cvtColor(cv2.imdecode(coded, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+        decoded = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), np.uint8)
+        out[:] = cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
     return degraded
 
 
 def _generator(image: NDArray[np.uint8], kind: int) -> np.random.Generator:
-    return np.random.default_rng((kind, zlib.crc32(np.ascontiguousarray(image))))
+    return np.random.default_rng((kind, zlib.crc32(image.tobytes())))
 
 
 def _coarse(image: NDArray[np.uint8], rng: np.random.Generator, mirror: bool) -> NDArray[np.uint8]:
