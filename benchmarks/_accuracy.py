@@ -58,7 +58,7 @@ def accuracy_of(found: PatchSet, split: Split) -> float:
     """Train on one side as the shipped model was trained, and judge by the other."""
     shipped = load_classifier()
     training = shipped.metadata.get("training", {})
-    options = {name: training[name] for name in ("C", "mirror", "gamma") if name in training}
+    options = {name: training[name] for name in ("C", "mirror", "gamma", "degraded") if name in training}
     train, test = found[split.train], found[split.test]
     classifier = train_classifier(train.patches, train.labels, params=shipped.params, **options)
     return classifier.score(test.patches, test.labels)

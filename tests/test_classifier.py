@@ -12,12 +12,15 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 
 from vehicle_detection._model_file import FORMAT, FORMAT_VERSION, _checksum
-from vehicle_detection._variants import mirror_patches
+from vehicle_detection._svm_solver import fit_svm
+from vehicle_detection._variants import blur_patches, degrade_patches, mirror_patches
 from vehicle_detection.classifier import (
     KIND,
     Template,
     VehicleClassifier,
+    copy_weights,
     load_classifier,
+    patch_features,
     train_classifier,
 )
 from vehicle_detection.errors import InvalidInputError, ModelFileError
@@ -112,14 +115,29 @@ def test_gamma_gives_mirrored_patches_another_brightness(patches, labels):
     assert found.metadata["training"]["gamma"] == 0.4
 
 
+def test_degraded_copies_weigh_less(patches, labels):
+    features = patch_features(patches, SMALL, mirror=True, gamma=0.4, degraded=0.2)
+    copies = (patches, mirror_patches(patches, gamma=0.4), blur_patches(patches), degrade_patches(patches))
+    np.testing.assert_array_equal(features, np.concatenate([extract_features(c, SMALL) for c in copies]))
+    assert copy_weights(True, 0.2) == (1, 1, 0.2, 0.2)
+    assert copy_weights(False, 0.2) == (1, 0.2, 0.2)
+    assert copy_weights(False, 0.0) == (1,)
+    found = train_classifier(patches, labels, params=SMALL, gamma=0.4, degraded=0.2)
+    fitted = fit_svm(features, np.tile(labels, 4), 1e-4 * np.repeat([1, 1, 0.2, 0.2], 80), gains=SMALL.gains)
+    np.testing.assert_array_equal(found.templates[0].coef, fitted.coef)
+    training = found.metadata["training"]
+    assert (training["degraded"], training["vehicles"], training["non_vehicles"]) == (0.2, 40, 40)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"degraded": 1.5}, "degraded must be a number, at least 0 and at most 1; got 1.5"),
         ({"gamma": -0.1}, "gamma must be a number, at least 0 and at most 2; got -0.1"),
         ({"gamma": 0.4, "mirror": False}, "gamma must be 0 without mirrored patches, .*; got 0.4"),
     ],
 )
-def test_gamma_is_checked(patches, labels, options, message):
+def test_how_copies_are_made_is_checked(patches, labels, options, message):
     with pytest.raises(InvalidInputError, match=message):
         train_classifier(patches, labels, params=SMALL, **options)
 
@@ -143,7 +161,7 @@ def test_training_tells_what_it_did(trained):
     training = trained.metadata["training"]
     assert (training["vehicles"], training["non_vehicles"]) == (40, 40)
     assert training["random_state"] == 0
-    assert {"vehicle_detection", "numpy", "scikit-learn"} <= trained.metadata["versions"].keys()
+    assert {"vehicle_detection", "numpy", "numba"} <= trained.metadata["versions"].keys()
     assert trained.metadata["accuracy"] == 1.0
     json.dumps(trained.metadata)
 

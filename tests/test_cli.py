@@ -565,7 +565,7 @@ def test_train_writes_model_report_and_card(material, tmp_path):
     assert set(told["splits"]) == {"random", "sequences"}
     assert told["params"]["color_space"] == "LUV"
     assert told["others"][0]["features"] == "ycrcb-6156"
-    assert {"features", "random", "sequences", "leakage", "final"} == set(told["seconds"])
+    assert {"features", "calibration", "random", "sequences", "leakage", "final"} == set(told["seconds"])
     text = card.read_text()
     assert (
         "vehicle-detection train --vehicles vehicles.zip --non-vehicles non-vehicles --features luv-2384 "

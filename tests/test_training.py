@@ -57,7 +57,8 @@ def test_every_split_is_judged(judged, patch_set):
         assert 0.5 < score.accuracy <= 1
         wrong = (score.missed + score.false) / 2
         assert 1 - score.accuracy == pytest.approx(wrong, abs=0.1)
-    assert set(report.seconds) == {"features", *SPLITS, "leakage", "final"}
+    assert set(report.seconds) == {"features", *SPLITS, "calibration", "leakage", "final"}
+    assert 0 <= report.calibration_error < 0.5
     assert report.accuracy == report.splits["random"].accuracy
     assert (report.split, report.features) == ("random", f"{SMALL.length} features")
 
@@ -133,7 +134,7 @@ def test_features_are_fitted_as_they_are(patch_set):
     mirrored = np.ascontiguousarray(patch_set.patches[:, :, ::-1])
     np.testing.assert_array_equal(features[160:], extract_features(mirrored, SMALL))
     before = features.copy()
-    labels = np.tile(patch_set.labels.astype(np.int64), 2)
+    labels = patch_set.labels.astype(np.int64)
     fitted = fit_features(features, labels, params=SMALL, C=1e-4, mirror=True, random_state=0)
     np.testing.assert_array_equal(features, before)
     assert fitted.metadata["training"]["vehicles"] == 80
@@ -185,7 +186,7 @@ def test_a_bar_shows_on_a_terminal_alone(patch_set, monkeypatch, capsys):
     train_and_judge(patch_set[::4], params=SMALL, seeds=1)
     assert terminal.getvalue() == ""
     train_and_judge(patch_set[::4], params=SMALL, seeds=1, progress=True)
-    assert "3/3" in terminal.getvalue()  # the two splits that these allow, and the model
+    assert "4/4" in terminal.getvalue()  # the two splits that these allow, the probabilities, and the model
 
 
 # --- the card ---

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._checks import check_number, describe
+from vehicle_detection._checks import check_integer, check_number, describe
 from vehicle_detection.errors import InvalidInputError
 
 
@@ -117,3 +117,52 @@ def _fit(values: NDArray[np.float64], truth: NDArray[np.int64]) -> Platt:
     regression = LogisticRegression(C=np.inf, tol=1e-8, max_iter=1000)
     regression.fit(column, classes, sample_weight=np.concatenate([target, 1 - target]))
     return Platt(-float(regression.coef_[0, 0]) / spread, -float(regression.intercept_[0]))
+
+
+def calibration_error(probabilities: ArrayLike, labels: ArrayLike, *, bins: int = 15) -> float:
+    """Measure how far probabilities are from the share of vehicles among them: the ECE.
+
+    The expected calibration error is the sum over `bins` equal bins of ``|mean label - mean probability|``,
+    weighted by the bin's share of the samples (Naeini et al., "Obtaining well calibrated probabilities
+    using Bayesian binning", 2015).
+
+    Parameters
+    ----------
+    probabilities
+        ``(N,)`` probabilities of a vehicle, in [0, 1].
+    labels
+        ``(N,)`` truth, 0 or 1 or bool.
+    bins
+        Number of bins over [0, 1].
+
+    Returns
+    -------
+    float
+        In [0, 1]; 0 is perfect.
+
+    Raises
+    ------
+    InvalidInputError
+        If the arrays are empty, differ in length, or hold other values.
+
+    Examples
+    --------
+    >>> round(calibration_error([0.9, 0.9, 0.1, 0.1], [1, 1, 0, 1]), 3)
+    0.25
+    """
+    shares, truth = np.asarray(probabilities), np.asarray(labels)
+    inside = shares.dtype.kind in "iuf" and bool(((shares >= 0) & (shares <= 1)).all())
+    if shares.ndim != 1 or not shares.size or not inside:
+        raise InvalidInputError(
+            f"probabilities must be a one-dimensional array of numbers from 0 to 1, got {describe(shares)}; "
+            "a decision value becomes one by the classifier's calibration"
+        )
+    if truth.shape != shares.shape or not np.isin(truth, (0, 1)).all():
+        raise InvalidInputError(
+            f"labels must be 0 or 1 for each of the {len(shares)} probabilities, got {describe(truth)}; "
+            "labels of -1 and 1 convert with labels > 0"
+        )
+    count = check_integer(bins, "bins", low=1)
+    chosen = np.minimum((shares * count).astype(np.intp), count - 1)
+    gaps = np.bincount(chosen, weights=truth.astype(np.float64) - shares, minlength=count)
+    return float(np.abs(gaps).sum() / len(shares))

@@ -43,6 +43,10 @@ def train(
     gamma: Annotated[
         float, typer.Option(metavar="F", help="Spread of the mirrored patches' brightness; 0.4 is much.")
     ] = 0.0,
+    degraded: Annotated[
+        float,
+        typer.Option(metavar="W", help="Weight of blurred, pale and compressed copies of each patch, 0-1."),
+    ] = 0.0,
     report: Annotated[
         Path | None, typer.Option(metavar="FILE.json", help="Accuracy on every split, counts, timings.")
     ] = None,
@@ -63,6 +67,7 @@ def train(
     check_apart({"--non-vehicles": non_vehicles, **targets}, {"--vehicles": vehicles})
     presets = [FeatureParams.preset(name) for name in (features, *(compare or ()))]
     options: dict[str, Any] = {"C": C, "mirror": not no_mirror, "gamma": gamma}
+    options["degraded"] = degraded
     options |= {"random_state": seed, "split": split}
 
     with codec_messages():
@@ -84,6 +89,7 @@ def train(
         words = ["--vehicles", vehicles.name, "--non-vehicles", non_vehicles.name, "--features", features]
         words += ["--split", split, "--C", f"{C:g}", "--seed", str(seed)] + ["--no-mirror"] * no_mirror
         words += ["--gamma", f"{gamma:g}"] if gamma else []
+        words += ["--degraded", f"{degraded:g}"] if degraded else []
         words += [word for name in compare or () for word in ("--compare", name)]
         words += ["-o", output.name, "--card", card.name]
         text = model_card(
@@ -115,6 +121,8 @@ def _show(report: TrainingReport) -> None:
             for name, score in report.splits.items()
         ],
     )
+    if report.calibration_error is not None:
+        typer.echo(f"calibration error on the split 'sequences': {report.calibration_error:.4f}")
     for name, reason in report.skipped.items():
         typer.echo(f"left out {SPLITS[name]!r}: {reason}")
     typer.echo(", ".join(f"{name} {seconds:.1f} s" for name, seconds in report.seconds.items()))

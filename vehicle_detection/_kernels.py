@@ -10,14 +10,24 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import numba
 import numpy as np
 
 
-def jit(function: Callable[..., None]) -> Callable[..., None]:
-    """Compile a kernel when it is first called, into a cache on disk wherever one can be kept."""
-    compiler = functools.partial(numba.njit, nogil=True, error_model="numpy", boundscheck=False)
+def jit(function: Callable[..., Any], *, reorder: bool = False) -> Callable[..., Any]:
+    """Compile a kernel when it is first called, into a cache on disk wherever one can be kept.
+
+    With `reorder`, sums may be taken in another order: a long one fills a vector register.
+    """
+    compiler = functools.partial(
+        numba.njit,
+        nogil=True,
+        error_model="numpy",
+        boundscheck=False,
+        fastmath={"reassoc", "contract", "nsz"} if reorder else False,
+    )
     try:
         return compiler(cache=True)(function)  # type: ignore[no-any-return]
     except RuntimeError:

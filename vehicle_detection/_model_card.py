@@ -48,6 +48,7 @@ def _about(classifier: VehicleClassifier, report: TrainingReport, command: str |
     versions = ", ".join(f"{name} {text}" for name, text in classifier.metadata["versions"].items())
     mirrored = "with mirrored patches" if report.mirror else "without mirrored patches"
     mirrored += f" of other brightness (gamma {report.gamma:g})" if report.gamma else ""
+    mirrored += f", and degraded ones of weight {report.degraded:g}" if report.degraded else ""
     facts = [
         f"Features: {report.features}, in {params.color_space}, {params.length} values ({parts})",
         f"Training: C = {report.C:g}, {mirrored}, seed {report.random_state}",
@@ -121,6 +122,13 @@ def _accuracy(report: TrainingReport, others: Sequence[TrainingReport]) -> list[
         for name, score in report.splits.items()
     ]
     text = ["## Accuracy", _wrap(how), _table(columns, rows)]
+    if report.calibration_error is not None:
+        text.append(
+            _wrap(
+                f"Probabilities: the expected calibration error is {report.calibration_error:.4f} on the "
+                "last fifth of each folder, with Platt's sigmoid fitted on the last fifth of the rest."
+            )
+        )
     if others:
         names = [name for name in SPLITS if name in report.splits]
         accuracies = [

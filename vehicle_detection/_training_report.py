@@ -56,7 +56,7 @@ class TrainingReport:
 
     Attributes
     ----------
-    params, C, mirror, gamma, random_state
+    params, C, mirror, gamma, degraded, random_state
         What was trained.
     split
         The split whose accuracy stands for the model.
@@ -68,16 +68,22 @@ class TrainingReport:
         That of the patches, see `PatchSet`.
     splits
         The score on each split of ``SPLITS`` that the patches allow.
+    calibration_error
+        That of probabilities on the split by sequences, 0-1 (see `calibration_error` in `evaluation`).
+        Platt's sigmoid is fitted on the last fifth of the training part, with a classifier of the rest. None
+        where the patches do not allow that split twice.
     skipped
         Why the others were left out.
     seconds
-        Time of each step: ``"features"``, each split, ``"leakage"`` and ``"final"``, the fit on all patches.
+        Time of each step: ``"features"``, each split, ``"calibration"``, ``"leakage"`` and
+        ``"final"``, the fit on all patches. Those that run side by side count each.
     """
 
     params: FeatureParams
     C: float
     mirror: bool
     gamma: float
+    degraded: float
     random_state: int
     split: str
     sources: dict[str, int]
@@ -85,6 +91,7 @@ class TrainingReport:
     non_vehicles: int
     fingerprint: str
     splits: dict[str, SplitScore]
+    calibration_error: float | None
     skipped: dict[str, str]
     seconds: dict[str, float]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 import vehicle_detection
 from vehicle_detection._checks import check_integer, check_number, check_patches, describe
 from vehicle_detection._model_file import ModelData, read_model, write_model
-from vehicle_detection._variants import mirror_patches
+from vehicle_detection._svm_solver import fit_svm
+from vehicle_detection._variants import blur_patches, degrade_patches, mirror_patches
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.features import extract_features
 from vehicle_detection.params import PATCH_SIZE, FeatureParams
@@ -296,6 +297,7 @@ def train_classifier(
     C: float = DEFAULT_C,
     mirror: bool = True,
     gamma: float = 0.0,
+    degraded: float = 0.0,
     random_state: int = 0,
     n_jobs: int | None = None,
     metadata: Mapping[str, Any] | None = None,
@@ -316,6 +318,9 @@ def train_classifier(
         Add each patch mirrored left to right.
     gamma
         Give the mirrored patches another brightness: exponents between ``exp(-gamma)`` and ``exp(gamma)``.
+    degraded
+        Weight of two more copies of each patch, in [0, 1]: one coarse, as from further away, and one coarse,
+        pale and compressed, as of another camera. It helps most on other cameras; 0 leaves them out.
     random_state
         Seed of the solver.
     n_jobs
@@ -338,15 +343,17 @@ def train_classifier(
     targets = check_labels(labels, len(images))
     check_number(C, "C", above=0, high=1e12)
     check_gamma(gamma, mirror)
+    check_number(degraded, "degraded", low=0, high=1)
     check_integer(random_state, "random_state", low=0, high=2**32 - 1)
-    features = patch_features(images, params, mirror=mirror, gamma=gamma, n_jobs=n_jobs)
+    features = patch_features(images, params, mirror=mirror, gamma=gamma, degraded=degraded, n_jobs=n_jobs)
     return fit_features(
         features,
-        np.tile(targets, 2 if mirror else 1),
+        targets,
         params=params,
         C=C,
         mirror=mirror,
         gamma=gamma,
+        degraded=degraded,
         random_state=random_state,
         metadata=metadata,
     )
@@ -362,21 +369,33 @@ def check_gamma(gamma: object, mirror: bool) -> float:
     return number
 
 
+def copy_weights(mirror: bool, degraded: float) -> tuple[float, ...]:
+    """Weights of the copies of each patch that are trained on, in the order of `patch_features`."""
+    return (1.0, *(1.0,) * mirror, *(degraded, degraded) * (degraded > 0))
+
+
 def patch_features(
     images: NDArray[np.uint8],
     params: FeatureParams,
     *,
     mirror: bool,
     gamma: float = 0.0,
+    degraded: float = 0.0,
     n_jobs: int | None = None,
 ) -> NDArray[np.float32]:
-    """Features of all patches and, with `mirror`, below them those of all mirrored ones."""
-    if not mirror:
+    """Features of all patches and below them, as asked for, of all mirrored, coarse and degraded ones."""
+    makers: list[Callable[[], NDArray[np.uint8]]] = [lambda: images]
+    if mirror:
+        makers.append(lambda: mirror_patches(images, gamma=gamma))
+    if degraded:
+        makers.append(lambda: blur_patches(images, mirror=mirror))
+        makers.append(lambda: degrade_patches(images, mirror=mirror))
+    if len(makers) == 1:
         return extract_features(images, params, n_jobs=n_jobs)
     count = len(images)
-    features = np.empty((2 * count, params.length), np.float32)
-    features[:count] = extract_features(images, params, n_jobs=n_jobs)
-    features[count:] = extract_features(mirror_patches(images, gamma=gamma), params, n_jobs=n_jobs)
+    features = np.empty((len(makers) * count, params.length), np.float32)
+    for copy, make in enumerate(makers):
+        features[copy * count : (copy + 1) * count] = extract_features(make(), params, n_jobs=n_jobs)
     return features
 
 
@@ -388,7 +407,9 @@ def fit_features(
     C: float,
     mirror: bool,
     gamma: float = 0.0,
+    degraded: float = 0.0,
     random_state: int,
+    rows: NDArray[np.intp] | None = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> VehicleClassifier:
     """Fit a scaler and a linear SVM on features that `patch_features` computed; the caller checks.
@@ -396,45 +417,46 @@ def fit_features(
     Parameters
     ----------
     features
-        ``(N, params.length)`` float32, mirrored ones included.
+        ``(copies * N, params.length)`` float32; not changed, and not copied.
     labels
-        ``(N,)`` zeros and ones, both present.
-    params, C, mirror, gamma, random_state, metadata
-        As in `train_classifier`; `mirror` tells whether half of the features are of mirrored patches, and
-        `gamma` of what brightness.
+        ``(N,)`` zeros and ones of the patches, both present.
+    rows
+        Patches to train on, with all their copies; all if None.
+    params, C, mirror, gamma, degraded, random_state, metadata
+        As in `train_classifier`; `mirror` and `degraded` tell which copies the features are of.
     """
-    from sklearn.pipeline import Pipeline
-    from sklearn.preprocessing import StandardScaler
-    from sklearn.svm import LinearSVC
-
-    scaler = StandardScaler().fit(features)
-    scaler.scale_ /= params.gains
-    # The solver wants float64: scaled straight into that, it copies nothing, and the features stay intact.
-    scaled = np.empty(features.shape)
-    for start in range(0, len(features), _CHUNK):
-        scaled[start : start + _CHUNK] = scaler.transform(features[start : start + _CHUNK])
-    svm = LinearSVC(C=C, random_state=random_state, max_iter=20_000).fit(scaled, labels)
-    vehicles, copies = int(labels.sum()), 2 if mirror else 1
+    weights = copy_weights(mirror, degraded)
+    count = len(labels)
+    chosen = np.arange(count) if rows is None else rows
+    fitted = fit_svm(
+        features,
+        np.tile(labels, len(weights)),
+        C * np.repeat(weights, count),
+        rows=np.concatenate([chosen + copy * count for copy in range(len(weights))]),
+        gains=params.gains,
+        random_state=random_state,
+    )
+    vehicles = int(labels[chosen].sum())
     facts = {
         "training": {
             "C": C,
             "mirror": mirror,
             "gamma": gamma,
+            "degraded": degraded,
             "random_state": random_state,
-            "vehicles": vehicles // copies,
-            "non_vehicles": (len(labels) - vehicles) // copies,
+            "vehicles": vehicles,
+            "non_vehicles": len(chosen) - vehicles,
         },
         "versions": {"vehicle_detection": vehicle_detection.__version__, **_library_versions()},
         **(metadata or {}),
     }
-    pipeline = Pipeline([("scaler", scaler), ("svm", svm)])
-    return VehicleClassifier.from_pipeline(pipeline, params, metadata=facts)
+    return VehicleClassifier(params, (Template(*fitted),), facts)
 
 
 def _library_versions() -> dict[str, str]:
     from importlib.metadata import version
 
-    return {name: version(name) for name in ("numpy", "opencv-python-headless", "scikit-learn")}
+    return {name: version(name) for name in ("numba", "numpy", "opencv-python-headless")}
 
 
 def check_labels(labels: ArrayLike, count: int) -> NDArray[np.int64]:

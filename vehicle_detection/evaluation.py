@@ -14,9 +14,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_integer, check_number, describe
+from vehicle_detection._calibration import calibration_error
+from vehicle_detection._checks import check_number
 from vehicle_detection._label_files import read_labels
 from vehicle_detection._labels import FrameKey, Labels
 from vehicle_detection._scores import (
@@ -240,55 +241,6 @@ def precision_recall_curve(
         raise InvalidInputError("predictions need scores for a curve; pass Labels with scores=")
     limit = check_number(iou, "iou", above=0, high=1)
     return _curve(predictions, match_detections(predictions, labels, keys, limit))
-
-
-def calibration_error(probabilities: ArrayLike, labels: ArrayLike, *, bins: int = 15) -> float:
-    """Measure how far probabilities are from the share of vehicles among them: the ECE.
-
-    The expected calibration error is the sum over `bins` equal bins of ``|mean label - mean probability|``,
-    weighted by the bin's share of the samples (Naeini et al., "Obtaining well calibrated probabilities
-    using Bayesian binning", 2015).
-
-    Parameters
-    ----------
-    probabilities
-        ``(N,)`` probabilities of a vehicle, in [0, 1].
-    labels
-        ``(N,)`` truth, 0 or 1 or bool.
-    bins
-        Number of bins over [0, 1].
-
-    Returns
-    -------
-    float
-        In [0, 1]; 0 is perfect.
-
-    Raises
-    ------
-    InvalidInputError
-        If the arrays are empty, differ in length, or hold other values.
-
-    Examples
-    --------
-    >>> round(calibration_error([0.9, 0.9, 0.1, 0.1], [1, 1, 0, 1]), 3)
-    0.25
-    """
-    shares, truth = np.asarray(probabilities), np.asarray(labels)
-    inside = shares.dtype.kind in "iuf" and bool(((shares >= 0) & (shares <= 1)).all())
-    if shares.ndim != 1 or not shares.size or not inside:
-        raise InvalidInputError(
-            f"probabilities must be a one-dimensional array of numbers from 0 to 1, got {describe(shares)}; "
-            "a decision value becomes one by the classifier's calibration"
-        )
-    if truth.shape != shares.shape or not np.isin(truth, (0, 1)).all():
-        raise InvalidInputError(
-            f"labels must be 0 or 1 for each of the {len(shares)} probabilities, got {describe(truth)}; "
-            "labels of -1 and 1 convert with labels > 0"
-        )
-    count = check_integer(bins, "bins", low=1)
-    chosen = np.minimum((shares * count).astype(np.intp), count - 1)
-    gaps = np.bincount(chosen, weights=truth.astype(np.float64) - shares, minlength=count)
-    return float(np.abs(gaps).sum() / len(shares))
 
 
 def _widths(labels: Labels) -> NDArray[np.float64]:

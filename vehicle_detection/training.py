@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-import functools
+import dataclasses
+import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection._calibration import calibrate_scores, calibration_error
 from vehicle_detection._checks import check_choice, check_integer, check_number, describe
+from vehicle_detection._jobs import resolve_jobs
 from vehicle_detection._model_card import model_card
 from vehicle_detection._training_report import SPLITS, SplitScore, TrainingReport
 from vehicle_detection.classifier import (
@@ -45,6 +49,7 @@ def train_and_judge(
     C: float = DEFAULT_C,
     mirror: bool = True,
     gamma: float = 0.0,
+    degraded: float = 0.0,
     random_state: int = 0,
     split: Literal["random", "sequences"] = "random",
     seeds: int = 5,
@@ -53,8 +58,8 @@ def train_and_judge(
 ) -> tuple[VehicleClassifier, TrainingReport]:
     """Judge by splits, then train on all patches.
 
-    On each split, scaler and SVM are fitted on its training part alone, mirrored patches included, and
-    judged on its test part as it is. Features are computed once.
+    On each split, scaler and SVM are fitted on its training part alone, mirrored and degraded patches
+    included, and judged on its test part as it is. Features are computed once, and no fit copies them.
 
     Parameters
     ----------
@@ -62,7 +67,7 @@ def train_and_judge(
         Patches of both classes.
     params
         Features; the default is ``FeatureParams()``.
-    C, mirror, gamma
+    C, mirror, gamma, degraded
         As in `train_classifier`.
     random_state
         Seed of the solver, and first one of the random splits.
@@ -72,7 +77,7 @@ def train_and_judge(
     seeds
         Number of random splits, each with its own seed.
     n_jobs
-        Threads of the feature extraction; the result is the same for any number.
+        Threads; the result is the same for any number.
     progress
         Show a bar on standard error if that is a terminal.
 
@@ -107,48 +112,70 @@ def train_and_judge(
     params = params or FeatureParams()
     check_number(C, "C", above=0, high=1e12)
     check_gamma(gamma, mirror)
+    check_number(degraded, "degraded", low=0, high=1)
     check_choice(split, "split", ("random", "sequences"))
     check_integer(seeds, "seeds", low=1, high=1000)
     check_integer(random_state, "random_state", low=0, high=2**32 - seeds)
     plans, skipped = _plan(patch_set, split, range(random_state, random_state + seeds))
 
-    train = functools.partial(
-        fit_features, params=params, C=C, mirror=mirror, gamma=gamma, random_state=random_state
-    )
-    count, copies = len(patch_set), 2 if mirror else 1
+    inner = _inner_split(patch_set, plans.get("sequences"))
+    options: dict[str, Any] = {"mirror": mirror, "gamma": gamma, "degraded": degraded}
     seconds: dict[str, float] = {}
-    with _progress(progress, sum(map(len, plans.values())) + 1, seconds) as step:
+    fits = sum(map(len, plans.values())) + (inner is not None) + 1
+    with ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool, _progress(progress, fits, seconds) as step:
         with step("features", fits=0):
-            features = patch_features(patch_set.patches, params, mirror=mirror, gamma=gamma, n_jobs=n_jobs)
+            features = patch_features(patch_set.patches, params, n_jobs=n_jobs, **options)
+
+        def train(name: str, rows: NDArray[np.intp] | None = None) -> VehicleClassifier:
+            with step(name):
+                return fit_features(
+                    features, labels, params=params, C=C, random_state=random_state, rows=rows, **options
+                )
+
+        def judge(name: str, split: Split) -> NDArray[np.float64]:
+            return train(name, split.train).decision_function(features[split.test])
+
+        final = pool.submit(train, "final")
+        running = {
+            name: [pool.submit(judge, name, split) for split in splits] for name, splits in plans.items()
+        }
+        held = pool.submit(judge, "calibration", inner) if inner is not None else None
         scores = {}
-        for name, splits in plans.items():
-            answers = []
-            for rows, tested in splits:
-                with step(name):
-                    both = np.concatenate([rows + copy * count for copy in range(copies)])
-                    predicted = train(features[both], np.tile(labels[rows], copies)).predict(features[tested])
-                answers.append(_shares(predicted, labels[tested]))
-            with step("leakage", fits=0):
-                leakage = split_leakage(patch_set, splits[0])
-            scores[name] = _score(answers, splits[0], leakage)
-        report = TrainingReport(
-            params=params,
-            C=C,
-            mirror=mirror,
-            gamma=gamma,
-            random_state=random_state,
-            split=split,
-            sources=patch_set.counts(),
-            vehicles=int(labels.sum()),
-            non_vehicles=int(count - labels.sum()),
-            fingerprint=patch_set.fingerprint,
-            splits=scores,
-            skipped=skipped,
-            seconds=seconds,
-        )
-        with step("final"):
-            classifier = train(features, np.tile(labels, copies), metadata=_facts(report))
-    return classifier, report
+        try:
+            for name, splits in plans.items():
+                with step("leakage", fits=0):
+                    leakage = split_leakage(patch_set, splits[0])
+                pairs = [
+                    (each.result() > 0, labels[split.test]) for each, split in zip(running[name], splits)
+                ]
+                scores[name] = _score([_shares(*pair) for pair in pairs], splits[0], leakage)
+            error = None
+            if held is not None and inner is not None:
+                platt = calibrate_scores(held.result(), labels[inner.test])
+                tested = labels[plans["sequences"][0].test]
+                error = calibration_error(platt.probability(running["sequences"][0].result()), tested)
+            classifier = final.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+    report = TrainingReport(
+        params=params,
+        C=C,
+        mirror=mirror,
+        gamma=gamma,
+        degraded=degraded,
+        random_state=random_state,
+        split=split,
+        sources=patch_set.counts(),
+        vehicles=int(labels.sum()),
+        non_vehicles=int((labels == 0).sum()),
+        fingerprint=patch_set.fingerprint,
+        splits=scores,
+        calibration_error=error,
+        skipped=skipped,
+        seconds=seconds,
+    )
+    facts = {**classifier.metadata, **_facts(report)}
+    return dataclasses.replace(classifier, metadata=facts), report
 
 
 def _plan(patch_set: PatchSet, chosen: str, seeds: range) -> tuple[dict[str, list[Split]], dict[str, str]]:
@@ -176,7 +203,20 @@ def _plan(patch_set: PatchSet, chosen: str, seeds: range) -> tuple[dict[str, lis
     return plans, skipped
 
 
-def _shares(predicted: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple[float, float, float]:
+def _inner_split(patch_set: PatchSet, splits: list[Split] | None) -> Split | None:
+    """Split the training part of the split by sequences once more, for the sigmoid of probabilities."""
+    if not splits:
+        return None
+    rows = splits[0].train
+    try:
+        inner = split_sequences(patch_set[rows])
+    except InvalidInputError:
+        return None
+    split = Split(rows[inner.train], rows[inner.test])
+    return split if all(len(np.unique(patch_set.labels[side])) == 2 for side in split) else None
+
+
+def _shares(predicted: NDArray[Any], labels: NDArray[np.int64]) -> tuple[float, float, float]:
     """Accuracy, share of vehicles missed, share of others taken for vehicles."""
     wrong = predicted != labels
     vehicle = labels == 1
@@ -208,8 +248,11 @@ def _facts(report: TrainingReport) -> dict[str, Any]:
         }
         for name, score in report.splits.items()
     }
+    metrics = {"accuracy": round(report.accuracy, 5), "split": report.split, "splits": splits}
+    if report.calibration_error is not None:
+        metrics["calibration_error"] = round(report.calibration_error, 5)
     return {
-        "metrics": {"accuracy": round(report.accuracy, 5), "split": report.split, "splits": splits},
+        "metrics": metrics,
         "data": {
             "fingerprint": report.fingerprint,
             "sources": report.sources,
@@ -223,6 +266,7 @@ def _progress(show: bool, total: int, seconds: dict[str, float]) -> Iterator[Cal
     """Show a bar of fits; yield a context that times a step and counts it as so many fits."""
     from tqdm import tqdm
 
+    lock = threading.Lock()
     # None: tqdm stays quiet unless its file is a terminal.
     with tqdm(total=total, unit="fit", disable=None if show else True) as bar:
 
@@ -231,7 +275,8 @@ def _progress(show: bool, total: int, seconds: dict[str, float]) -> Iterator[Cal
             bar.set_description(name)
             began = time.perf_counter()
             yield
-            seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - began
-            bar.update(fits)
+            with lock:
+                seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - began
+                bar.update(fits)
 
         yield step

@@ -1,0 +1,60 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.preprocessing import StandardScaler
+from sklearn.svm import LinearSVC
+
+from vehicle_detection._svm_solver import fit_svm
+
+
+def material(count=120, length=30, seed=0):
+    """Two clouds that overlap, on columns of very different mean and spread; the last one is constant."""
+    rng = np.random.default_rng(seed)
+    labels = np.arange(count) % 2
+    features = rng.normal(0, 1, (count, length)) + 0.4 * labels[:, None]
+    features = features * rng.uniform(0.01, 50, length) + rng.uniform(-100, 100, length)
+    features[:, -1] = 7.1
+    return features.astype(np.float32), labels
+
+
+def scores_of(fitted, features):
+    return (features - fitted.mean) / fitted.scale @ fitted.coef + fitted.intercept
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 1000), st.sampled_from([1e-3, 0.01, 0.1]))
+def test_the_optimum_is_that_of_scikit_learn(seed, C):
+    features, labels = material(seed=seed)
+    weights = np.where(np.arange(len(labels)) % 3, 1.0, 0.2)
+    gains = np.linspace(0.5, 2, features.shape[1])
+    scaler = StandardScaler().fit(features.astype(np.float64))
+    scaled = scaler.transform(features.astype(np.float64)) * gains
+    svm = LinearSVC(C=C, tol=1e-8, max_iter=100_000).fit(scaled, labels, sample_weight=weights)
+    fitted = fit_svm(features, labels, C * weights, gains=gains)
+    np.testing.assert_allclose(fitted.mean, scaler.mean_, rtol=1e-6)
+    np.testing.assert_allclose(fitted.scale, scaler.scale_ / gains, rtol=1e-4)
+    # The tolerance of the solver, not that of float32.
+    np.testing.assert_allclose(scores_of(fitted, features), svm.decision_function(scaled), atol=5e-3)
+
+
+def test_rows_are_as_if_there_were_no_others():
+    features, labels = material()
+    rows = np.flatnonzero(np.arange(len(labels)) % 5)
+    costs = np.full(len(labels), 0.01)
+    before = features.copy()
+    some = fit_svm(features, labels, costs, rows=rows, random_state=3)
+    alone = fit_svm(features[rows], labels[rows], costs[rows], random_state=3)
+    for found, expected in zip(some, alone):
+        np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(features, before)
+
+
+def test_the_seed_decides_on_nothing_but_the_last_digits():
+    features, labels = material()
+    costs = np.full(len(labels), 0.01)
+    first, again, other = (fit_svm(features, labels, costs, random_state=seed) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first.coef, again.coef)
+    np.testing.assert_allclose(scores_of(first, features), scores_of(other, features), atol=5e-3)
+    assert first.scale[-1] == 1.0
+    assert first.coef[-1] == pytest.approx(0, abs=1e-6)
