@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection import _kalman
-from vehicle_detection.camera import Camera, cut_edges
+from vehicle_detection.camera import Camera, cut_edges, inner_edges
 from vehicle_detection.params import TrackParams
 
 Floats = NDArray[np.float64]
@@ -166,7 +166,8 @@ def start_filters(box: Floats, frame: Frame, dt: float, camera: Camera, params: 
     mean, cov = _kalman.start(whole[None], error[None])
     distance, spread = _kalman.range_start(camera)
     alike = params.box_noise_seconds
-    distances = _kalman.range_update(distance[None], spread[None], box[None], cut, camera, dt, alike)
+    aside = inner_edges(box[None], frame)
+    distances = _kalman.range_update(distance[None], spread[None], box[None], cut, aside, camera, dt, alike)
     return Filters(mean, cov, np.zeros((1, 4)), *distances)
 
 
@@ -214,7 +215,8 @@ def correct_filters(
     restless = (np.abs(drift) > _RESTLESS).any(axis=1)
     range_mean, range_cov = filters.range_mean, filters.range_cov.copy()
     range_cov[:, 0, 0] += restless * np.square(_RANGE_DOUBT * range_mean[:, 0]) * dt
-    ranges = _kalman.range_update(range_mean, range_cov, boxes, cut, camera, dt, params.box_noise_seconds)
+    aside, alike = inner_edges(boxes, frame), params.box_noise_seconds
+    ranges = _kalman.range_update(range_mean, range_cov, boxes, cut, aside, camera, dt, alike)
     return Filters(mean, cov, drift, *ranges)
 
 

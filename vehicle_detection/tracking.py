@@ -23,6 +23,7 @@ from vehicle_detection._association import (
     same_vehicle,
 )
 from vehicle_detection._checks import check_number, describe
+from vehicle_detection._horizon_filter import HorizonFilter
 from vehicle_detection._vehicle import (
     OUTWARDS,
     Filters,
@@ -36,7 +37,7 @@ from vehicle_detection._vehicle import (
     start_filters,
 )
 from vehicle_detection.boxes import Detections, box_areas
-from vehicle_detection.camera import Camera, check_shape
+from vehicle_detection.camera import Camera, check_shape, cut_edges
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import TrackParams
 
@@ -141,7 +142,7 @@ class Tracker:
 
     def reset(self) -> None:
         """Forget everything: the next frame is the first, and the next vehicle has the id 1."""
-        self._camera = self._fixed_camera or Camera.for_frame((720, 1280))
+        self._horizon = HorizonFilter(self._fixed_camera or Camera.for_frame((720, 1280)))
         self._shape: Frame | None = None
         self._time: float | None = None
         self._next_id = 1
@@ -149,7 +150,13 @@ class Tracker:
 
     def set_camera(self, camera: Camera) -> None:
         """Look through another camera from the next frame on, as where frames of another size follow."""
-        self._fixed_camera = self._camera = camera
+        if camera != self._fixed_camera:
+            self._fixed_camera, self._horizon = camera, HorizonFilter(camera)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera as it is known by now: its horizon is learned from the vehicles, where it is in doubt."""
+        return self._horizon.camera
 
     def cut(self) -> None:
         """End all tracks, as the picture jumps to another scene; ids and time go on."""
@@ -196,11 +203,12 @@ class Tracker:
         free = np.ones(len(boxes), np.bool_)
         if self._vehicles:
             unseen = np.array([vehicle.misses > 0 for vehicle in self._vehicles])
-            self._filters = predict_filters(self._filters, unseen, dt, self._camera, self.params)
+            self._filters = predict_filters(self._filters, unseen, dt, self.camera, self.params)
             free = self._correct(boxes, scores, frame, dt)
         self._end(frame, dt)
         self._begin(boxes[free], scores[free], frame, dt)
         self._confirm(frame)
+        self._learn(frame, dt)
         self._tracks, self._at_start = self._snapshot(frame), False
         return self._tracks
 
@@ -217,7 +225,7 @@ class Tracker:
             self.cut()
             dt = usual
         if self._shape != frame:
-            self._camera = self._fixed_camera or Camera.for_frame(frame)
+            self._horizon = HorizonFilter(self._fixed_camera or Camera.for_frame(frame))
         self._time, self._shape = now, frame
         return dt
 
@@ -236,7 +244,7 @@ class Tracker:
         measured = boxes[[source[row] for row in rows]]
         partly = np.array([row in region or row in merged for row in rows])
         before = self._filters.take(rows)
-        after = correct_filters(before, measured, partly, frame, dt, self._camera, self.params)
+        after = correct_filters(before, measured, partly, frame, dt, self.camera, self.params)
         if self.params.smoother != "kalman":
             moved = [
                 follow_box(vehicles[row], old, box, dt, self.params)
@@ -308,7 +316,7 @@ class Tracker:
             if score < params.birth_score or same_vehicle(box, taken, params.max_overlap, params.max_cover):
                 continue
             taken = np.vstack((taken, box))
-            filters = start_filters(box, frame, dt, self._camera, params)
+            filters = start_filters(box, frame, dt, self.camera, params)
             vehicle = Vehicle(score * (1 - math.exp(-dt / params.memory)))
             vehicle.sure = self._at_start and score >= params.start_score
             vehicle.past.append((0.0, filters.mean[0, :4]))
@@ -328,12 +336,20 @@ class Tracker:
                 vehicles[row].id, self._next_id = self._next_id, self._next_id + 1
         self._keep(sorted(range(len(vehicles)), key=lambda row: vehicles[row].id or math.inf))
 
+    def _learn(self, frame: Frame, dt: float) -> None:
+        """Learn the horizon from the vehicles that are seen whole."""
+        boxes = self._filters.boxes()
+        seen = np.array([v.id > 0 and v.misses == 0 for v in self._vehicles], np.bool_)
+        seen &= ~cut_edges(boxes, frame).any(axis=1)
+        ids = np.array([v.id for v in self._vehicles], np.int64)
+        self._horizon.take(ids[seen], boxes[seen], frame, dt)
+
     def _snapshot(self, frame: Frame) -> tuple[Track, ...]:
         """Describe the tracks as they stand now."""
         boxes = _clip(self._filters.boxes(), frame)
         boxes.setflags(write=False)
         unseen = np.array([v.unseen for v in self._vehicles])
-        ranges = known_ranges(self._filters, unseen, self._camera)
+        ranges = known_ranges(self._filters, unseen, self.camera)
         speeds = self._filters.mean[:, 4:6].tolist()
         return tuple(
             Track(
