@@ -19,10 +19,12 @@ from vehicle_detection.camera import Camera, inner_edges, width_times_distance
 
 Floats = NDArray[np.float64]
 
-# The errors of a vehicle's boxes stay alike for the first time; after the second nothing is left of them.
-_ALIKE_SECONDS, _MEMORY_SECONDS = 0.5, 30.0
-# Standard errors beyond which a vehicle is no car on this road; least weight of one that is remembered.
-_FAR_OFF, _LEAST = 3.0, 0.02
+# The errors of a vehicle's boxes stay alike for the first time; memory fades in the second, and in the third
+# where no vehicle fits it.
+_ALIKE_SECONDS, _MEMORY_SECONDS, _RETHINK_SECONDS = 0.5, 30.0, 3.0
+# Standard errors beyond which a vehicle is no car on this road; least weight of one that is remembered, as a
+# share of the greatest.
+_FAR_OFF, _LEAST = 3.0, 1e-4
 # No less than this standard error is ever claimed, in pixels of the reference camera.
 _SUREST = 1.0
 
@@ -34,10 +36,15 @@ class HorizonFilter:
     ----------
     camera
         The camera; a horizon without doubt is left as it is.
+
+    Attributes
+    ----------
+    given, camera
+        The camera as it was given, and as it is known by now.
     """
 
     def __init__(self, camera: Camera) -> None:
-        self._given = self.camera = camera
+        self.given = self.camera = camera
         self._ids = np.empty(0, np.int64)
         # For each vehicle the sums of 1, width, width squared, foot, and width times foot, over variances.
         self._sums = np.empty((0, 5))
@@ -56,9 +63,9 @@ class HorizonFilter:
         dt
             Seconds since the last frame.
         """
-        if not self._given.horizon_doubt_px or not len(boxes):
+        if not self.given.horizon_doubt_px or not len(boxes):
             return
-        camera, scale = self.camera, self._given.pixel_scale
+        camera, scale = self.camera, self.given.pixel_scale
         sides = boxes[:, 2:] - boxes[:, :2]
         # The width that the face alone has, and its foot.
         straight = camera.focal_px * camera.vehicle_width_m
@@ -73,24 +80,29 @@ class HorizonFilter:
         off = boxes[:, 3] - (camera.horizon_px + slope * width)
         allowed = variance + camera.horizon_doubt_px**2 + np.square(self._slope_errors()[1] * width)
         good = np.square(off) < _FAR_OFF**2 * allowed
-        self._sums *= math.exp(-dt / _MEMORY_SECONDS)
+        # Where most vehicles do not fit what is remembered, it is that which is wrong.
+        strange = 1 - float(good.mean())
+        self._sums *= math.exp(-dt / _MEMORY_SECONDS - dt * strange**2 / _RETHINK_SECONDS)
         weight = min(dt / _ALIKE_SECONDS, 1.0) / variance[good]
         x, y = width[good], boxes[good, 3]
-        self._add(ids[good], np.stack([weight, weight * x, weight * x * x, weight * y, weight * x * y], axis=1))
+        self._add(
+            ids[good], np.stack([weight, weight * x, weight * x * x, weight * y, weight * x * y], axis=1)
+        )
         self._solve()
 
     def _add(self, ids: NDArray[np.int64], sums: Floats) -> None:
+        """Add to the sums of the vehicles; those of which next to nothing is remembered go."""
         fresh = ids[~np.isin(ids, self._ids)]
         self._ids = np.concatenate((self._ids, fresh))
         self._sums = np.concatenate((self._sums, np.zeros((len(fresh), 5))))
-        places = (self._ids[None] == ids[:, None]).argmax(axis=1)
-        self._sums[places] += sums
-        kept = self._sums[:, 0] * self._given.pixel_scale**2 > _LEAST / 100
+        if len(ids):
+            self._sums[(self._ids[None] == ids[:, None]).argmax(axis=1)] += sums
+        kept = self._sums[:, 0] > _LEAST * self._sums[:, 0].max(initial=0.0)
         self._ids, self._sums = self._ids[kept], self._sums[kept]
 
     def _slope_errors(self) -> tuple[float, float]:
         """Spread of the slope that all vehicles have in common, and that of one vehicle's."""
-        camera = self._given
+        camera = self.given
         slope = camera.height_m / camera.vehicle_width_m
         common = slope * camera.height_error_m / camera.height_m
         own = slope * camera.vehicle_width_error_m / camera.vehicle_width_m
@@ -98,7 +110,7 @@ class HorizonFilter:
 
     def _solve(self) -> None:
         """Find the horizon, and with it the camera as it is known now."""
-        camera = self._given
+        camera = self.given
         slope = camera.height_m / camera.vehicle_width_m
         common, both = self._slope_errors()
         own = max(both**2 - common**2, 1e-12)

@@ -51,6 +51,8 @@ class Vehicle:
         Seconds for which it may still be drawn without a detection.
     hidden
         Whether another vehicle is the reason why it is unseen.
+    astray
+        Whether it was moved so far since it was last seen that its place is a guess.
     sure
         Whether its first detection is reason enough to believe it.
     past
@@ -66,20 +68,24 @@ class Vehicle:
     idle: float = 0.0
     credit: float = 0.0
     hidden: bool = False
+    astray: bool = False
     sure: bool = False
     past: deque[tuple[float, Floats]] = field(default_factory=deque)
 
     @property
     def shown(self) -> bool:
         """Whether to draw it."""
-        return self.id > 0 and (self.misses == 0 or self.hidden or self.credit > -TINY)
+        return self.id > 0 and (
+            self.misses == 0
+            or (not self.astray and (self.credit > -TINY or (self.hidden and 2 * self.unseen < self.age)))
+        )
 
     def live(self, score: float | None, dt: float, params: TrackParams) -> None:
         """Grow older by a frame, with the score of its detection or without one."""
         keep = math.exp(-dt / params.memory)
         self.score = keep * self.score + (1 - keep) * (score or 0.0)
         self.age += dt
-        self.hidden = False
+        self.hidden = self.astray = False
         if score is None:
             self.misses += 1
             self.unseen += dt
@@ -88,9 +94,9 @@ class Vehicle:
             self.misses, self.unseen, self.idle = 0, 0.0, 0.0
             self.credit = min(self.credit + dt, params.show_coast) if self.id else 0.0
 
-    def wait(self, hidden: bool, dt: float) -> None:
+    def wait(self, hidden: bool, dt: float, astray: bool = False) -> None:
         """Spend a frame unseen, behind another vehicle or for no known reason."""
-        self.hidden = hidden
+        self.hidden, self.astray = hidden, astray
         self.idle += dt / 2 if hidden else dt
         self.credit -= 0.0 if hidden else dt
 
@@ -186,6 +192,12 @@ def predict_filters(
         cov = _kalman.bound(mean, cov)
     ranges = _kalman.range_predict(filters.range_mean, filters.range_cov, dt, camera)
     return Filters(mean, cov, filters.drift, *ranges)
+
+
+def moved_unseen(mean: Floats, unseen: Floats) -> Floats:
+    """Sizes by which vehicles have moved since they were last seen, at the speeds that are slowing down."""
+    pace = np.abs(mean[:, 4:6] / mean[:, 2:4]).max(axis=1)
+    return np.asarray(pace * _DAMPING[0] * np.expm1(unseen / _DAMPING[0]))
 
 
 def correct_filters(

@@ -28,10 +28,6 @@ BORDER_PX, BORDER_SHARE = 1.5, 0.04
 """A box that ends this near to the frame's border, or within this share of its size, may go on beyond."""
 
 
-# Where a dash-cam's horizon is, as a share of the frame's height, and the standard error of this guess.
-_GUESS, _GUESS_ERROR = 0.56, 0.05
-
-
 class Distance(NamedTuple):
     """Distances ahead of the camera and their standard errors, arrays of one shape.
 
@@ -122,7 +118,7 @@ class Camera:
         cls,
         shape: tuple[int, ...],
         *,
-        horizon: float | None = None,
+        horizon: float = 0.56,
         field_of_view: float = 58.0,
         height_m: float = 1.3,
         **known: float,
@@ -134,8 +130,7 @@ class Camera:
         shape
             ``(height, width, ...)``, as ``image.shape``.
         horizon
-            Row of the horizon as a share of the height, 0 at the top. None: 0.56, as a guess that may be
-            wrong by 0.05.
+            Row of the horizon as a share of the height, 0 at the top; with ``horizon_doubt_px`` as a guess.
         field_of_view
             Angle in degrees that the frame's longer side sees.
         height_m
@@ -149,9 +144,7 @@ class Camera:
             If a value is out of range or no attribute has that name.
         """
         height, width = check_shape(shape)
-        if horizon is None:
-            known = {"horizon_doubt_px": _GUESS_ERROR * height} | known
-        share = check_number(_GUESS if horizon is None else horizon, "horizon", low=-10, high=10)
+        share = check_number(horizon, "horizon", low=-10, high=10)
         angle = check_number(field_of_view, "field_of_view", low=1, high=170)
         unknown = sorted(known.keys() - cls.__dataclass_fields__.keys() | known.keys() & {"focal_px"})
         if unknown:
@@ -215,7 +208,7 @@ def distance_from_width(
     width_error_px: ArrayLike | None = None,
     aside_px: ArrayLike = 0.0,
 ) -> Distance:
-    """Distance of vehicles from the width of their boxes, ``focal * vehicle width / width`` if straight ahead.
+    """Distance of vehicles from their boxes' width: ``focal * vehicle width / width`` straight ahead.
 
     A vehicle beside the camera's path shows its flank too. Its face begins at the outer edge of the box, the
     flank ends at the inner one, `aside_px` from the middle of the frame and ``length`` farther away: so it

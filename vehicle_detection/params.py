@@ -504,7 +504,8 @@ class TrackParams:
         A track that is not yet believed ends once it is unseen for longer than this.
     show_coast
         A believed track is drawn this long without a detection, and less if it was seen for less than twice
-        as long; while other vehicles hide it, up to `max_coast`.
+        as long; while other vehicles hide it, up to `max_coast`, if it was seen for as long as it is unseen.
+        It is drawn no more once it must have moved by half of its own size.
     max_coast
         A believed track ends once it is unseen for longer than this.
     max_gap

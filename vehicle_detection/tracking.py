@@ -33,6 +33,7 @@ from vehicle_detection._vehicle import (
     correct_filters,
     follow_box,
     known_ranges,
+    moved_unseen,
     predict_filters,
     start_filters,
 )
@@ -45,6 +46,10 @@ State = Literal["tentative", "confirmed", "coasting"]
 
 # Shares of a box: inside the frame, below which it leaves or has left; covered, above which it is hidden.
 _LEAVES, _LEFT, _HIDDEN = 0.5, 0.15, 0.5
+# How far, in its own sizes, a vehicle may move unseen and still be drawn: farther on it is a guess.
+_BLIND = 0.5
+# Standard error of a horizon that nobody stated, as a share of the frame's height.
+_HORIZON_DOUBT = 0.05
 # Share of the gate for tracks that are not believed yet.
 _TENTATIVE_GATE = 0.6
 
@@ -104,7 +109,8 @@ class Tracker:
     fps
         Frames a second, used where `update` is not told the time.
     camera
-        The camera, for distances and speeds; by default ``Camera.for_frame`` of each video's frame size.
+        The camera, for distances and speeds; by default ``Camera.for_frame`` of each video's frame size,
+        with a horizon that is learned from the vehicles.
 
     Raises
     ------
@@ -142,7 +148,7 @@ class Tracker:
 
     def reset(self) -> None:
         """Forget everything: the next frame is the first, and the next vehicle has the id 1."""
-        self._horizon = HorizonFilter(self._fixed_camera or Camera.for_frame((720, 1280)))
+        self._horizon = HorizonFilter(self._fixed_camera or _guess_camera((720, 1280)))
         self._shape: Frame | None = None
         self._time: float | None = None
         self._next_id = 1
@@ -155,11 +161,12 @@ class Tracker:
 
     @property
     def camera(self) -> Camera:
-        """The camera as it is known by now: its horizon is learned from the vehicles, where it is in doubt."""
+        """The camera as it is known by now: a horizon in doubt is learned from the vehicles."""
         return self._horizon.camera
 
     def cut(self) -> None:
-        """End all tracks, as the picture jumps to another scene; ids and time go on."""
+        """End all tracks and forget the horizon, as the picture jumps elsewhere; ids and time go on."""
+        self._horizon = HorizonFilter(self._horizon.given)
         self._vehicles: list[Vehicle] = []
         self._filters = Filters.empty()
         self._at_start = True
@@ -225,7 +232,7 @@ class Tracker:
             self.cut()
             dt = usual
         if self._shape != frame:
-            self._horizon = HorizonFilter(self._fixed_camera or Camera.for_frame(frame))
+            self._horizon = HorizonFilter(self._fixed_camera or _guess_camera(frame))
         self._time, self._shape = now, frame
         return dt
 
@@ -288,9 +295,10 @@ class Tracker:
             front = np.array([v.id > 0 and v.misses == 0 for v in vehicles])
             nearer = whole[None, :, 3] > whole[:, None, 3]
             hiding = (overlap_matrices(inside, inside)[1] > _HIDDEN) & nearer & front
-            for vehicle, behind in zip(vehicles, hiding.any(axis=1).tolist()):
+            far = moved_unseen(self._filters.mean, np.array([v.unseen for v in vehicles])) > _BLIND
+            for vehicle, unseen_behind, lost in zip(vehicles, hiding.any(axis=1).tolist(), far.tolist()):
                 if vehicle.misses:
-                    vehicle.wait(vehicle.hidden or behind, dt)
+                    vehicle.wait(vehicle.hidden or unseen_behind, dt, lost)
         self._keep(
             [
                 row
@@ -369,6 +377,10 @@ class Tracker:
             )
             for vehicle, box, speed, told in zip(self._vehicles, boxes, speeds, ranges)
         )
+
+
+def _guess_camera(frame: Frame) -> Camera:
+    return Camera.for_frame(frame, horizon_doubt_px=_HORIZON_DOUBT * frame[0])
 
 
 def _inside(detections: Detections, frame: Frame) -> tuple[Floats, Floats]:
