@@ -33,7 +33,7 @@ _FOUR = np.arange(4)
 # the place of an edge is then uncertain by.
 _FAR_OFF, _MOST, _DOUBT = 2.5, 6.0, 0.25
 # Speeds of a new box, in box sizes a second: of its centre, of its size.
-_START_SPEEDS = np.array([2.0, 0.6, 0.7, 0.7])
+_START_SPEEDS = np.array([1.0, 0.6, 0.35, 0.35])
 
 
 def boxes_of(mean: Floats) -> Floats:
