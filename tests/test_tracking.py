@@ -234,6 +234,23 @@ class TestLife:
         assert shown == 7  # 0.3 s at 25 fps
         assert alive == 25  # 1 s
 
+    @pytest.mark.parametrize(
+        ("params", "least"), [({"confirm_hits": 6}, 6), ({"confirm_seconds": 0.4}, 11)], ids=["hits", "time"]
+    )
+    def test_hits_and_time_each_hold_a_track_back(self, params, least):
+        tracker = Tracker(TrackParams(**params))
+        tracker.update(Detections.empty(), SHAPE)
+        shown = [any(t.shown for t in tracker.update(found(CAR, score=9.0), SHAPE)) for _ in range(20)]
+        assert shown.index(True) + 1 == least
+
+    @pytest.mark.parametrize("fps", [10.0, 60.0])
+    def test_neither_few_boxes_nor_a_short_time_are_enough(self, fps):
+        """At 10 frames a second three boxes take 0.2 s, at 60 four boxes take 0.05 s: not shown yet."""
+        tracker = Tracker(fps=fps)
+        tracker.update(Detections.empty(), SHAPE)
+        shown = [any(t.shown for t in tracker.update(found(CAR, score=9.0), SHAPE)) for _ in range(12)]
+        assert shown.index(True) + 1 == (4 if fps == 10 else 9)
+
     def test_a_vehicle_seen_for_a_moment_is_shown_for_a_moment_only(self):
         tracker = Tracker()
         for _ in range(5):
@@ -289,8 +306,16 @@ class TestMeetings:
 
     def test_a_hidden_vehicle_is_shown_throughout(self):
         scene = {"near": lambda t: on_road(10), "far": lambda t: on_road(20, x=3 - min(t, 4) * 0.8)}
-        steps = play(scene, 5, unseen=lambda name, t: name == "far" and 2 <= t < 3.2)
-        assert all(track for time, _, track in matched(steps, "far") if 0.5 < time < 3.2)
+        steps = play(scene, 5, unseen=lambda name, t: name == "far" and 2 <= t < 3)
+        assert all(track for time, _, track in matched(steps, "far") if 0.5 < time < 3)
+
+    def test_a_hidden_vehicle_is_drawn_for_a_second_and_remembered_for_two(self):
+        tracker, near, far = Tracker(), [300.0, 380, 800, 600], [745.0, 420, 835, 465]
+        for _ in range(60):
+            tracker.update(found(near, far), SHAPE)
+        steps = [tracker.update(found(near), SHAPE) for _ in range(70)]
+        assert sum(sum(t.shown for t in tracks) == 2 for tracks in steps) == 25
+        assert sum(len(tracks) == 2 for tracks in steps) == 50
 
     @pytest.mark.parametrize("seed", range(4))
     def test_crossing_vehicles_keep_their_identity(self, seed):
@@ -336,7 +361,8 @@ class TestMeetings:
     def test_a_vehicle_seen_for_a_moment_is_not_drawn_for_long_behind_another(self):
         tracker, near = Tracker(), [300.0, 380, 800, 600]
         for index in range(40):
-            tracker.update(found(near, *[[500.0, 420, 560, 465]] * (index >= 34)), SHAPE)
+            tracks = tracker.update(found(near, *[[745.0, 420, 835, 465]] * (index >= 34)), SHAPE)
+        assert sum(track.shown for track in tracks) == 2
         shown = [sum(t.shown for t in tracker.update(found(near), SHAPE)) for _ in range(20)]
         assert set(shown[7:]) == {1}
 

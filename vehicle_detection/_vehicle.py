@@ -52,7 +52,7 @@ class Vehicle:
     hidden
         Whether another vehicle is the reason why it is unseen.
     astray
-        Whether it was moved so far since it was last seen that its place is a guess.
+        Whether it has been unseen for so long, or moved so far since, that its place is a guess.
     sure
         Whether its first detection is reason enough to believe it.
     past
@@ -75,10 +75,11 @@ class Vehicle:
     @property
     def shown(self) -> bool:
         """Whether to draw it."""
-        return self.id > 0 and (
-            self.misses == 0
-            or (not self.astray and (self.credit > -TINY or (self.hidden and 2 * self.unseen < self.age)))
-        )
+        if not self.id or self.astray:
+            return False
+        # Behind another vehicle it is drawn for as long as it was seen.
+        known = 2 * self.unseen < self.age + TINY if self.hidden else self.credit > -TINY
+        return self.misses == 0 or known
 
     def live(self, score: float | None, dt: float, params: TrackParams) -> None:
         """Grow older by a frame, with the score of its detection or without one."""

@@ -26,6 +26,7 @@ from vehicle_detection._checks import check_number, describe
 from vehicle_detection._horizon_filter import HorizonFilter
 from vehicle_detection._vehicle import (
     OUTWARDS,
+    TINY,
     Filters,
     Floats,
     Frame,
@@ -295,7 +296,9 @@ class Tracker:
             front = np.array([v.id > 0 and v.misses == 0 for v in vehicles])
             nearer = whole[None, :, 3] > whole[:, None, 3]
             hiding = (overlap_matrices(inside, inside)[1] > _HIDDEN) & nearer & front
-            far = moved_unseen(self._filters.mean, np.array([v.unseen for v in vehicles])) > _BLIND
+            unseen = np.array([v.unseen for v in vehicles])
+            far = moved_unseen(self._filters.mean, unseen) > _BLIND
+            far |= unseen > self.params.max_coast + TINY
             for vehicle, unseen_behind, lost in zip(vehicles, hiding.any(axis=1).tolist(), far.tolist()):
                 if vehicle.misses:
                     vehicle.wait(vehicle.hidden or unseen_behind, dt, lost)
