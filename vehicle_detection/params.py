@@ -495,11 +495,11 @@ class TrackParams:
     confirm_score
         Running mean of the scores at which a track is believed. A vehicle of score `s` reaches it after
         ``memory * log(s / (s - confirm_score))`` seconds, one that scores less never does. Both shipped
-        models put their least score of a vehicle at 0, and on drives they were not tuned on their vehicles
-        lie far above: distances of 2.7 to 4.2 with the model for highways, log-odds of 1 to 8 (half of them
-        above 5) with the mixture, whose false boxes seldom reach 0.7. With 0 instead of 0.35, and weaker
-        boxes taken too, the mixture's tracks found 20% more of the weak vehicles, but three times the false
-        boxes.
+        models put the least score of a vehicle at 0. With the mixture, whose scores are log-odds, vehicles
+        of drives that it was not tuned on score 1 to 8, half of them above 5, and false boxes seldom 0.7; at
+        0 instead of 0.35, with boxes down to -1.5 taken too, a quarter of the missed vehicles were found but
+        ten times as many false ones. With the model for highways, a true but far vehicle of a real road may
+        score as little as a false box of another: 0.7 would miss it.
     confirm_hits, confirm_seconds
         A track is believed after this many detections at the earliest, and this long after the first.
     start_score
