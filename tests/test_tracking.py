@@ -130,6 +130,15 @@ class TestFollowing:
         (track,) = tracker.update(found([560.0, 340.0, 760.0, 520.0]), SHAPE)
         assert np.abs(track.box - CAR).max() < 12
 
+    def test_a_vehicle_that_changes_lanes_after_a_long_straight_is_followed(self):
+        steps = play({"car": lambda t: on_road(15, x=3.6 / (1 + np.exp(-4 * (t - 6))))}, 9, noise=0.02)
+        errors = [
+            np.abs(tracks[0].box[[0, 2]] - truth["car"][[0, 2]]).max()
+            for time, truth, tracks in steps
+            if 5 < time < 7
+        ]
+        assert max(errors) < 25
+
     @pytest.mark.parametrize("fps", [10.0, 25.0, 60.0])
     def test_a_track_that_is_wrong_comes_round_soon(self, fps):
         tracker, larger = Tracker(fps=fps), [570.0, 380.0, 720.0, 520.0]
@@ -268,6 +277,15 @@ class TestLife:
         growth = np.prod(track.box[2:] - track.box[:2]) / np.prod(before[2:] - before[:2])
         assert 0.5 < growth < 2.5
 
+    def test_a_coasting_vehicle_slows_down(self):
+        """Speeds in the image do not last: undamped it would be 72 px on."""
+        tracker = Tracker()
+        for index in range(50):
+            (last,) = tracker.update(found(np.array(CAR) + [3 * index, 0, 3 * index, 0]), SHAPE)
+        for _ in range(24):
+            (track,) = tracker.update(Detections.empty(), SHAPE)
+        assert 40 < track.box[0] - last.box[0] < 62
+
     def test_two_boxes_on_one_vehicle_make_one_track(self):
         nested, part = [620.0, 410.0, 670.0, 460.0], [600.0, 400.0, 660.0, 490.0]
         tracker, shown = Tracker(), set()
@@ -281,6 +299,14 @@ class TestLife:
             {"car": lambda t: on_road(15)}, 4, extra=lambda t: [np.array([600, 420, 670, 500.0])] * (t > 1)
         )
         assert shown_ids(steps) == {1}
+
+    def test_a_box_of_the_same_size_that_is_shifted_by_a_third_makes_no_second_track(self):
+        shifted = [635.0, 400.0, 735.0, 490.0]  # IoU 0.48, and neither covers 0.7 of the other
+        tracker, shown = Tracker(), set()
+        for index in range(50):
+            tracks = tracker.update(found(CAR, *[shifted] * (index > 10)), SHAPE)
+            shown |= {track.id for track in tracks if track.shown}
+        assert shown == {1}
 
     def test_ids_are_consecutive_whatever_else_was_tried(self):
         rng = np.random.default_rng(3)
