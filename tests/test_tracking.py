@@ -281,7 +281,7 @@ class TestLife:
         """Speeds in the image do not last: undamped it would be 72 px on."""
         tracker = Tracker()
         for index in range(50):
-            (last,) = tracker.update(found(np.array(CAR) + [3 * index, 0, 3 * index, 0]), SHAPE)
+            (last,) = tracker.update(found(np.add(CAR, [3 * index, 0, 3 * index, 0])), SHAPE)
         for _ in range(24):
             (track,) = tracker.update(Detections.empty(), SHAPE)
         assert 40 < track.box[0] - last.box[0] < 62
