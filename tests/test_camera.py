@@ -97,6 +97,30 @@ def test_relative_error_of_the_foot_grows_with_distance_that_of_the_width_hardly
     assert np.ptp(width.error / width.metres) < 0.02
 
 
+def test_a_vehicle_aside_is_wider_by_its_flank():
+    """Face and flank as a pinhole sees them: the inner edge is that of the far end."""
+    distance, aside, length = 20.0, 3.6, CAMERA.vehicle_length_m
+    outer = CAMERA.focal_px * (aside + 0.9) / distance
+    inner = CAMERA.focal_px * (aside - 0.9) / (distance + length)
+    width = distance_from_width(outer - inner, CAMERA, aside_px=inner)
+    assert width.metres == pytest.approx(distance)
+    assert distance_from_width(outer - inner, CAMERA).metres < 0.81 * distance
+    foot = CAMERA.horizon_px + CAMERA.focal_px * CAMERA.height_m / distance
+    for left, right in ((640 + inner, 640 + outer), (640 - outer, 640 - inner)):
+        assert estimate_distance([[left, 300, right, foot]], CAMERA, SHAPE).metres == pytest.approx(
+            [distance]
+        )
+
+
+def test_a_doubtful_horizon_leaves_the_word_to_the_width():
+    doubtful = Camera.for_frame(SHAPE, horizon=0.5, horizon_doubt_px=40.0)
+    foot, width = CAMERA.horizon_px + CAMERA.focal_px * 1.3 / 30, CAMERA.focal_px * 1.8 / 30
+    box = [[640 - width / 2, foot - width, 640 + width / 2, foot]]
+    assert estimate_distance(box, doubtful, SHAPE).metres == pytest.approx([30.0], rel=0.15)
+    sure = Camera.for_frame(SHAPE, horizon=0.5)
+    assert estimate_distance(box, sure, SHAPE).metres < 25
+
+
 def test_width_is_unknown_below_a_pixel():
     metres, error = distance_from_width([0.0, -3.0, 0.5], CAMERA)
     assert np.isnan(metres).all()

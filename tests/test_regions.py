@@ -290,3 +290,28 @@ def test_find_vehicles_is_both_steps():
     np.testing.assert_array_equal(both.scores, steps.scores)
     default = find_vehicles(found, CAMERA, SHAPE)
     np.testing.assert_array_equal(default.boxes, find_vehicles(found, CAMERA, SHAPE, RegionParams()).boxes)
+
+
+class TestDefaults:
+    """What the shipped parameters do: each test fails where its parameter is undone."""
+
+    def test_a_lonely_window_is_no_vehicle_and_two_that_agree_are(self):
+        assert len(group_windows(Detections([window(300)], [1.7]))) == 0
+        assert len(group_windows(Detections([window(300), window(304)], [0.9, 0.9]))) == 1
+
+    def test_many_weak_windows_are_no_vehicle(self):
+        assert len(group_windows(around((400.0, 430.0), 100, peak=0.65))) == 0
+
+    def test_windows_of_other_sizes_on_a_vehicle_found_no_second_group(self):
+        small = around((420.0, 440.0), 64, step=6, peak=1.4)
+        large = around((400.0, 430.0), 128, peak=2.5)
+        assert len(group_windows(together(large, small))) == 1
+
+    def test_neighbours_whose_windows_overlap_stay_two(self):
+        found = together(around((400.0, 430.0), 100, spread=1), around((480.0, 430.0), 100, spread=1))
+        assert len(group_windows(found)) == 2
+
+    def test_a_window_on_the_flank_of_a_better_one_is_no_vehicle(self):
+        whole, flank = [1000.0, 380, 1160, 540], [960.0, 400, 1050, 490]
+        boxes = fit_boxes(groups_of([whole, flank], [3.0, 1.5]), CAMERA, SHAPE)
+        assert boxes.scores.tolist() == [3.0]

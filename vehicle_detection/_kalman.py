@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection.camera import Camera
+from vehicle_detection.camera import Camera, width_times_distance
 
 Floats = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ _FOUR = np.arange(4)
 # the place of an edge is then uncertain by.
 _FAR_OFF, _MOST, _DOUBT = 2.5, 6.0, 0.25
 # Speeds of a new box, in box sizes a second: of its centre, of its size.
-_START_SPEEDS = np.array([0.6, 0.6, 0.35, 0.35])
+_START_SPEEDS = np.array([1.0, 0.6, 0.35, 0.35])
 
 
 def boxes_of(mean: Floats) -> Floats:
@@ -174,7 +174,14 @@ def range_predict(mean: Floats, cov: Floats, dt: float, camera: Camera) -> tuple
 
 
 def range_update(
-    mean: Floats, cov: Floats, boxes: Floats, cut: NDArray[np.bool_], camera: Camera, dt: float, alike: float
+    mean: Floats,
+    cov: Floats,
+    boxes: Floats,
+    cut: NDArray[np.bool_],
+    aside: Floats,
+    camera: Camera,
+    dt: float,
+    alike: float,
 ) -> tuple[Floats, Floats]:
     """Correct ``(N, 3)`` distances by the foot and the width of measured boxes (an extended Kalman filter).
 
@@ -184,6 +191,8 @@ def range_update(
         States and covariances ``(N, 3, 3)``.
     boxes, cut
         ``(N, 4)`` measured boxes, and which of their edges the frame's border cuts off.
+    aside
+        ``(N,)`` how far their inner edges lie from the frame's middle.
     camera
         The camera.
     dt
@@ -194,12 +203,12 @@ def range_update(
     mean = mean.copy()
     sides = np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0)
     edge = np.hypot(camera.foot_error_px * camera.pixel_scale, camera.box_error * sides)
-    tilt = camera.horizon_error_px * camera.pixel_scale
+    tilt = camera.tilt_error_px
     fast, slow = max(1.0, alike / dt), max(1.0, _PITCH_SECONDS / dt)
     below = boxes[:, 3] - camera.horizon_px
     foot_seen, width_seen = ~cut[:, 3], ~(cut[:, 0] | cut[:, 2])
 
-    drop, unit = camera.focal_px * camera.height_m, camera.focal_px * camera.vehicle_width_m
+    drop, unit = camera.focal_px * camera.height_m, width_times_distance(camera, aside)
     fresh = cov[:, 0, 0] > _FAR_SPREAD**2 / 2
     if fresh.any():
         # Nothing is known yet: the first measurement itself is the point at which to linearise.
@@ -220,7 +229,8 @@ def range_update(
 
     # Logarithm of the width in pixels: log(unit) + log(width) - log(distance).
     off = np.log(sides[:, 0] / unit) - mean[:, 2] + np.log(mean[:, 0])
-    variance = np.square(edge[:, 0] / sides[:, 0]) * 2 * fast
+    flank = np.square(aside * camera.vehicle_length_error_m / unit)
+    variance = np.square(edge[:, 0] / sides[:, 0]) * 2 * fast + flank * slow
     slope[:, 0], slope[:, 2] = -1 / mean[:, 0], 1.0
     mean, cov = _scalar_update(mean, cov, slope, off, np.where(width_seen, variance, np.inf))
     np.clip(mean[:, 0], _NEAREST, _FARTHEST, out=mean[:, 0])

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection import _kalman
-from vehicle_detection.camera import Camera, cut_edges
+from vehicle_detection.camera import Camera, cut_edges, inner_edges
 from vehicle_detection.params import TrackParams
 
 Floats = NDArray[np.float64]
@@ -51,6 +51,8 @@ class Vehicle:
         Seconds for which it may still be drawn without a detection.
     hidden
         Whether another vehicle is the reason why it is unseen.
+    astray
+        Whether it has been unseen for so long, or moved so far since, that its place is a guess.
     sure
         Whether its first detection is reason enough to believe it.
     past
@@ -66,20 +68,25 @@ class Vehicle:
     idle: float = 0.0
     credit: float = 0.0
     hidden: bool = False
+    astray: bool = False
     sure: bool = False
     past: deque[tuple[float, Floats]] = field(default_factory=deque)
 
     @property
     def shown(self) -> bool:
         """Whether to draw it."""
-        return self.id > 0 and (self.misses == 0 or self.hidden or self.credit > -TINY)
+        if not self.id or self.astray:
+            return False
+        # Behind another vehicle it is drawn for as long as it was seen.
+        known = 2 * self.unseen < self.age + TINY if self.hidden else self.credit > -TINY
+        return self.misses == 0 or known
 
     def live(self, score: float | None, dt: float, params: TrackParams) -> None:
         """Grow older by a frame, with the score of its detection or without one."""
         keep = math.exp(-dt / params.memory)
         self.score = keep * self.score + (1 - keep) * (score or 0.0)
         self.age += dt
-        self.hidden = False
+        self.hidden = self.astray = False
         if score is None:
             self.misses += 1
             self.unseen += dt
@@ -88,9 +95,9 @@ class Vehicle:
             self.misses, self.unseen, self.idle = 0, 0.0, 0.0
             self.credit = min(self.credit + dt, params.show_coast) if self.id else 0.0
 
-    def wait(self, hidden: bool, dt: float) -> None:
+    def wait(self, hidden: bool, dt: float, astray: bool = False) -> None:
         """Spend a frame unseen, behind another vehicle or for no known reason."""
-        self.hidden = hidden
+        self.hidden, self.astray = hidden, astray
         self.idle += dt / 2 if hidden else dt
         self.credit -= 0.0 if hidden else dt
 
@@ -166,7 +173,8 @@ def start_filters(box: Floats, frame: Frame, dt: float, camera: Camera, params: 
     mean, cov = _kalman.start(whole[None], error[None])
     distance, spread = _kalman.range_start(camera)
     alike = params.box_noise_seconds
-    distances = _kalman.range_update(distance[None], spread[None], box[None], cut, camera, dt, alike)
+    aside = inner_edges(box[None], frame)
+    distances = _kalman.range_update(distance[None], spread[None], box[None], cut, aside, camera, dt, alike)
     return Filters(mean, cov, np.zeros((1, 4)), *distances)
 
 
@@ -185,6 +193,12 @@ def predict_filters(
         cov = _kalman.bound(mean, cov)
     ranges = _kalman.range_predict(filters.range_mean, filters.range_cov, dt, camera)
     return Filters(mean, cov, filters.drift, *ranges)
+
+
+def moved_unseen(mean: Floats, unseen: Floats) -> Floats:
+    """Sizes by which vehicles have moved since they were last seen, at the speeds that are slowing down."""
+    pace = np.abs(mean[:, 4:6] / mean[:, 2:4]).max(axis=1)
+    return np.asarray(pace * _DAMPING[0] * np.expm1(unseen / _DAMPING[0]))
 
 
 def correct_filters(
@@ -214,7 +228,8 @@ def correct_filters(
     restless = (np.abs(drift) > _RESTLESS).any(axis=1)
     range_mean, range_cov = filters.range_mean, filters.range_cov.copy()
     range_cov[:, 0, 0] += restless * np.square(_RANGE_DOUBT * range_mean[:, 0]) * dt
-    ranges = _kalman.range_update(range_mean, range_cov, boxes, cut, camera, dt, params.box_noise_seconds)
+    aside, alike = inner_edges(boxes, frame), params.box_noise_seconds
+    ranges = _kalman.range_update(range_mean, range_cov, boxes, cut, aside, camera, dt, alike)
     return Filters(mean, cov, drift, *ranges)
 
 

@@ -62,10 +62,16 @@ class Camera:
         Focal length in pixels: the frame's width over ``2 * tan(half the horizontal field of view)``.
     horizon_px
         Row of the horizon.
+    horizon_doubt_px
+        Standard error of `horizon_px` where it is a guess, in pixels of the frame; 0 where it was measured.
+        The tracker learns the row from the vehicles it follows as far as this lets it.
     height_m
         Height of the lens above the road.
     vehicle_width_m, vehicle_width_error_m
         Width of a vehicle that is not known any better, and its spread.
+    vehicle_length_m, vehicle_length_error_m
+        Length of the flank that a vehicle shows beside the camera's path, as far as it widens the box, and
+        its spread.
     foot_error_px, horizon_error_px
         Standard errors of a box's lower edge and of the horizon (pitch, hills), in pixels of a camera with
         a focal length of ``REFERENCE_FOCAL``. The horizon's stays alike for seconds.
@@ -86,9 +92,12 @@ class Camera:
 
     focal_px: float
     horizon_px: float
+    horizon_doubt_px: float = 0.0
     height_m: float = 1.3
     vehicle_width_m: float = 1.8
     vehicle_width_error_m: float = 0.25
+    vehicle_length_m: float = 4.0
+    vehicle_length_error_m: float = 0.8
     foot_error_px: float = 2.5
     horizon_error_px: float = 3.0
     box_error: float = 0.04
@@ -100,7 +109,8 @@ class Camera:
             check_number(getattr(self, name), name, above=0, high=1e6)
         check_number(self.horizon_px, "horizon_px", low=-1e6, high=1e6)
         errors = ("vehicle_width_error_m", "foot_error_px", "horizon_error_px", "box_error", "focal_error")
-        for name in (*errors, "height_error_m"):
+        lengths = ("vehicle_length_m", "vehicle_length_error_m")
+        for name in (*errors, *lengths, "height_error_m", "horizon_doubt_px"):
             check_number(getattr(self, name), name, low=0, high=1e6)
 
     @classmethod
@@ -120,7 +130,7 @@ class Camera:
         shape
             ``(height, width, ...)``, as ``image.shape``.
         horizon
-            Row of the horizon as a share of the height, 0 at the top.
+            Row of the horizon as a share of the height, 0 at the top; with ``horizon_doubt_px`` as a guess.
         field_of_view
             Angle in degrees that the frame's longer side sees.
         height_m
@@ -150,6 +160,11 @@ class Camera:
         return self.focal_px / REFERENCE_FOCAL
 
     @property
+    def tilt_error_px(self) -> float:
+        """Standard error of the horizon's row in pixels of the frame: the doubt, pitch and hills together."""
+        return math.hypot(self.horizon_error_px * self.pixel_scale, self.horizon_doubt_px)
+
+    @property
     def foot_scale_error(self) -> float:
         """Standard error, as a share, that all distances from the foot have in common."""
         return math.hypot(self.focal_error, self.height_error_m / self.height_m)
@@ -177,7 +192,7 @@ def distance_from_foot(
     """
     rows = np.asarray(y_foot, np.float64)
     own = camera.foot_error_px * camera.pixel_scale if foot_error_px is None else foot_error_px
-    row_error = np.hypot(own, camera.horizon_error_px * camera.pixel_scale)
+    row_error = np.hypot(own, camera.tilt_error_px)
     below = rows - camera.horizon_px
     known = below > row_error
     drop = np.where(known, below, 1.0)
@@ -187,9 +202,17 @@ def distance_from_foot(
 
 
 def distance_from_width(
-    width: ArrayLike, camera: Camera, *, width_error_px: ArrayLike | None = None
+    width: ArrayLike,
+    camera: Camera,
+    *,
+    width_error_px: ArrayLike | None = None,
+    aside_px: ArrayLike = 0.0,
 ) -> Distance:
-    """Distance of vehicles from the width of their boxes: ``focal * vehicle width / width``.
+    """Distance of vehicles from their boxes' width: ``focal * vehicle width / width`` straight ahead.
+
+    A vehicle beside the camera's path shows its flank too. Its face begins at the outer edge of the box, the
+    flank ends at the inner one, `aside_px` from the middle of the frame and ``length`` farther away: so it
+    is ``(focal * vehicle width + aside_px * length) / width`` ahead.
 
     Parameters
     ----------
@@ -199,6 +222,8 @@ def distance_from_width(
         The camera, with the width of a vehicle and its spread.
     width_error_px
         Standard error of the widths in pixels; by default the camera's, for two edges.
+    aside_px
+        How far the boxes' inner edges lie from the middle of the frame; 0 for boxes across it.
 
     Returns
     -------
@@ -211,10 +236,24 @@ def distance_from_width(
     own = camera.foot_error_px * camera.pixel_scale
     edge = np.hypot(own, camera.box_error * seen) * math.sqrt(2)
     width_error = edge if width_error_px is None else np.asarray(width_error_px, np.float64)
-    spread = math.hypot(camera.vehicle_width_error_m / camera.vehicle_width_m, camera.focal_error)
-    metres = np.where(known, camera.focal_px * camera.vehicle_width_m / seen, np.nan)
+    aside = np.asarray(aside_px, np.float64)
+    unit = width_times_distance(camera, aside)
+    varied = np.hypot(camera.focal_px * camera.vehicle_width_error_m, aside * camera.vehicle_length_error_m)
+    spread = np.hypot(varied / unit, camera.focal_error)
+    metres = np.where(known, unit / seen, np.nan)
     error = np.where(known, metres * np.hypot(width_error / seen, spread), np.inf)
     return Distance(metres, error)
+
+
+def width_times_distance(camera: Camera, aside_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Width in pixels times distance in metres of a vehicle, whose flank shows if it is aside."""
+    return camera.focal_px * camera.vehicle_width_m + camera.vehicle_length_m * aside_px
+
+
+def inner_edges(boxes: NDArray[Any], shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """How far the nearer side edge of each box lies from the frame's middle column; 0 if it is across it."""
+    middle = shape[1] / 2
+    return np.maximum(np.maximum(boxes[:, 0] - middle, middle - boxes[:, 2]), 0.0)
 
 
 def join_distances(first: Distance, second: Distance) -> Distance:
@@ -281,7 +320,8 @@ def estimate_distance(boxes: ArrayLike, camera: Camera, shape: tuple[int, ...]) 
         exact,
         foot_error_px=np.hypot(camera.foot_error_px * camera.pixel_scale, height_error),
     )
-    width = distance_from_width(np.where(cut[:, 0] | cut[:, 2], 0.0, array[:, 2] - array[:, 0]), exact)
+    seen = np.where(cut[:, 0] | cut[:, 2], 0.0, array[:, 2] - array[:, 0])
+    width = distance_from_width(seen, exact, aside_px=inner_edges(array, shape))
     metres, error = join_distances(foot, width)
     shared = np.where(np.isfinite(error), camera.focal_error * metres, 0.0)
     return Distance(metres, np.hypot(error, shared))

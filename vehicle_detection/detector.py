@@ -26,6 +26,10 @@ from vehicle_detection.windows import band_windows, search_windows
 
 _THUMBNAIL = (32, 18)
 
+# By how much of the frame's height the horizon of search bands may be wrong, and the share of such an error
+# that is its standard error.
+_BAND_ERROR, _DOUBT = 0.1, 0.4
+
 CUT_DIFFERENCE = 40.0
 """Mean change of a thumbnail's values, 0-255, from one frame to the next that is another scene."""
 
@@ -107,7 +111,8 @@ class VehicleDetector:
     heat, fit, track
         Parameters of the stages; by default those of the project.
     camera
-        The camera, for distances and boxes; by default a dash-cam with the search's horizon.
+        The camera, for distances and boxes; by default a dash-cam with the search's horizon, as a guess that
+        the vehicles of a video correct.
     horizon
         Height of the horizon as a share of the frame's height; overrides the one of `search`.
     n_jobs
@@ -264,8 +269,12 @@ class VehicleDetector:
     def _camera_of(self, shape: tuple[int, int]) -> Camera:
         if self.camera is not None:
             return self.camera
-        horizon = self.search_params.horizon
-        return Camera.for_frame(shape) if horizon is None else Camera.for_frame(shape, horizon=horizon)
+        search = self.search_params
+        if search.horizon is None:
+            return Camera.for_frame(shape)
+        # The search allows for a horizon that is off; the tracker learns by how much.
+        error = search.horizon_error if isinstance(search, PyramidParams) else _BAND_ERROR
+        return Camera.for_frame(shape, horizon=search.horizon, horizon_doubt_px=_DOUBT * error * shape[0])
 
     def process(self, frame: NDArray[np.uint8], time: float | None = None) -> FrameResult:
         """Search the next frame of a video and follow its vehicles.

@@ -23,8 +23,10 @@ from vehicle_detection._association import (
     same_vehicle,
 )
 from vehicle_detection._checks import check_number, describe
+from vehicle_detection._horizon_filter import HorizonFilter
 from vehicle_detection._vehicle import (
     OUTWARDS,
+    TINY,
     Filters,
     Floats,
     Frame,
@@ -32,11 +34,12 @@ from vehicle_detection._vehicle import (
     correct_filters,
     follow_box,
     known_ranges,
+    moved_unseen,
     predict_filters,
     start_filters,
 )
 from vehicle_detection.boxes import Detections, box_areas
-from vehicle_detection.camera import Camera, check_shape
+from vehicle_detection.camera import Camera, check_shape, cut_edges
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import TrackParams
 
@@ -44,6 +47,10 @@ State = Literal["tentative", "confirmed", "coasting"]
 
 # Shares of a box: inside the frame, below which it leaves or has left; covered, above which it is hidden.
 _LEAVES, _LEFT, _HIDDEN = 0.5, 0.15, 0.5
+# How far, in its own sizes, a vehicle may move unseen and still be drawn: farther on it is a guess.
+_BLIND = 0.5
+# Standard error of a horizon that nobody stated, as a share of the frame's height.
+_HORIZON_DOUBT = 0.05
 # Share of the gate for tracks that are not believed yet.
 _TENTATIVE_GATE = 0.6
 
@@ -103,7 +110,8 @@ class Tracker:
     fps
         Frames a second, used where `update` is not told the time.
     camera
-        The camera, for distances and speeds; by default ``Camera.for_frame`` of each video's frame size.
+        The camera, for distances and speeds; by default ``Camera.for_frame`` of each video's frame size,
+        with a horizon that is learned from the vehicles.
 
     Raises
     ------
@@ -141,7 +149,7 @@ class Tracker:
 
     def reset(self) -> None:
         """Forget everything: the next frame is the first, and the next vehicle has the id 1."""
-        self._camera = self._fixed_camera or Camera.for_frame((720, 1280))
+        self._horizon = HorizonFilter(self._fixed_camera or _guess_camera((720, 1280)))
         self._shape: Frame | None = None
         self._time: float | None = None
         self._next_id = 1
@@ -149,10 +157,17 @@ class Tracker:
 
     def set_camera(self, camera: Camera) -> None:
         """Look through another camera from the next frame on, as where frames of another size follow."""
-        self._fixed_camera = self._camera = camera
+        if camera != self._fixed_camera:
+            self._fixed_camera, self._horizon = camera, HorizonFilter(camera)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera as it is known by now: a horizon in doubt is learned from the vehicles."""
+        return self._horizon.camera
 
     def cut(self) -> None:
-        """End all tracks, as the picture jumps to another scene; ids and time go on."""
+        """End all tracks and forget the horizon, as the picture jumps elsewhere; ids and time go on."""
+        self._horizon = HorizonFilter(self._horizon.given)
         self._vehicles: list[Vehicle] = []
         self._filters = Filters.empty()
         self._at_start = True
@@ -196,11 +211,12 @@ class Tracker:
         free = np.ones(len(boxes), np.bool_)
         if self._vehicles:
             unseen = np.array([vehicle.misses > 0 for vehicle in self._vehicles])
-            self._filters = predict_filters(self._filters, unseen, dt, self._camera, self.params)
+            self._filters = predict_filters(self._filters, unseen, dt, self.camera, self.params)
             free = self._correct(boxes, scores, frame, dt)
         self._end(frame, dt)
         self._begin(boxes[free], scores[free], frame, dt)
         self._confirm(frame)
+        self._learn(frame, dt)
         self._tracks, self._at_start = self._snapshot(frame), False
         return self._tracks
 
@@ -217,7 +233,7 @@ class Tracker:
             self.cut()
             dt = usual
         if self._shape != frame:
-            self._camera = self._fixed_camera or Camera.for_frame(frame)
+            self._horizon = HorizonFilter(self._fixed_camera or _guess_camera(frame))
         self._time, self._shape = now, frame
         return dt
 
@@ -236,7 +252,7 @@ class Tracker:
         measured = boxes[[source[row] for row in rows]]
         partly = np.array([row in region or row in merged for row in rows])
         before = self._filters.take(rows)
-        after = correct_filters(before, measured, partly, frame, dt, self._camera, self.params)
+        after = correct_filters(before, measured, partly, frame, dt, self.camera, self.params)
         if self.params.smoother != "kalman":
             moved = [
                 follow_box(vehicles[row], old, box, dt, self.params)
@@ -280,9 +296,12 @@ class Tracker:
             front = np.array([v.id > 0 and v.misses == 0 for v in vehicles])
             nearer = whole[None, :, 3] > whole[:, None, 3]
             hiding = (overlap_matrices(inside, inside)[1] > _HIDDEN) & nearer & front
-            for vehicle, behind in zip(vehicles, hiding.any(axis=1).tolist()):
+            unseen = np.array([v.unseen for v in vehicles])
+            far = moved_unseen(self._filters.mean, unseen) > _BLIND
+            far |= unseen > self.params.max_coast + TINY
+            for vehicle, unseen_behind, lost in zip(vehicles, hiding.any(axis=1).tolist(), far.tolist()):
                 if vehicle.misses:
-                    vehicle.wait(vehicle.hidden or behind, dt)
+                    vehicle.wait(vehicle.hidden or unseen_behind, dt, lost)
         self._keep(
             [
                 row
@@ -308,7 +327,7 @@ class Tracker:
             if score < params.birth_score or same_vehicle(box, taken, params.max_overlap, params.max_cover):
                 continue
             taken = np.vstack((taken, box))
-            filters = start_filters(box, frame, dt, self._camera, params)
+            filters = start_filters(box, frame, dt, self.camera, params)
             vehicle = Vehicle(score * (1 - math.exp(-dt / params.memory)))
             vehicle.sure = self._at_start and score >= params.start_score
             vehicle.past.append((0.0, filters.mean[0, :4]))
@@ -328,12 +347,20 @@ class Tracker:
                 vehicles[row].id, self._next_id = self._next_id, self._next_id + 1
         self._keep(sorted(range(len(vehicles)), key=lambda row: vehicles[row].id or math.inf))
 
+    def _learn(self, frame: Frame, dt: float) -> None:
+        """Learn the horizon from the vehicles that are seen whole."""
+        boxes = self._filters.boxes()
+        seen = np.array([v.id > 0 and v.misses == 0 for v in self._vehicles], np.bool_)
+        seen &= ~cut_edges(boxes, frame).any(axis=1)
+        ids = np.array([v.id for v in self._vehicles], np.int64)
+        self._horizon.take(ids[seen], boxes[seen], frame, dt)
+
     def _snapshot(self, frame: Frame) -> tuple[Track, ...]:
         """Describe the tracks as they stand now."""
         boxes = _clip(self._filters.boxes(), frame)
         boxes.setflags(write=False)
         unseen = np.array([v.unseen for v in self._vehicles])
-        ranges = known_ranges(self._filters, unseen, self._camera)
+        ranges = known_ranges(self._filters, unseen, self.camera)
         speeds = self._filters.mean[:, 4:6].tolist()
         return tuple(
             Track(
@@ -353,6 +380,10 @@ class Tracker:
             )
             for vehicle, box, speed, told in zip(self._vehicles, boxes, speeds, ranges)
         )
+
+
+def _guess_camera(frame: Frame) -> Camera:
+    return Camera.for_frame(frame, horizon_doubt_px=_HORIZON_DOUBT * frame[0])
 
 
 def _inside(detections: Detections, frame: Frame) -> tuple[Floats, Floats]:
