@@ -156,7 +156,7 @@ def _shipped(runs: Runs, folder: Path) -> str:
     columns = "tested on", "shipped model", "best system, C = 1", "errors left", "near-copies in training"
     lines = [
         "## The shipped model", "",
-        "`highway`, trained and judged by the command in its card on mirrored, lighter or darker and degraded",
+        "`highway`, trained and judged by the command in its card on mirrored, lighter, darker and degraded",
         "copies of the training part. Errors left: its errors as a share of the best system's.", "",
         f"| {' | '.join(columns)} |", "|---" * len(columns) + "|",
     ]  # fmt: skip
