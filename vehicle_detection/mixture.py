@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection import _fhog_kernels
+from vehicle_detection._border_strips import border_strip, strip_boxes
 from vehicle_detection._buffers import Buffers
 from vehicle_detection._checks import check_image, check_number, check_type, describe
 from vehicle_detection._feature_maps import COARSE, PLANES, FeatureMap, Level, halved, level_maps, pair_levels
@@ -49,11 +50,15 @@ class MixtureTemplate:
         Added to the weighted sum.
     margin
         Cells around the vehicle's box at the left and right, and above and below.
+    border
+        Whether it shows what is seen of a vehicle that the frame's right border cuts: it ends there, without
+        a margin, and is searched for at the border alone; at the left one it is mirrored.
     """
 
     weights: NDArray[np.float32]
     bias: float
     margin: tuple[float, float]
+    border: bool = False
 
     def __post_init__(self) -> None:
         weights = finite_array(self.weights, "weights", (None, None, PLANES))
@@ -68,13 +73,16 @@ class MixtureTemplate:
                 raise InvalidInputError(
                     f"margin must leave cells for the box of {columns}x{rows} cells, got {describe(margin)}"
                 )
+        border: object = self.border
+        if not isinstance(border, bool):
+            raise InvalidInputError(f"border must be True or False, got {describe(border)}")
         object.__setattr__(self, "weights", weights)
 
     @property
     def box_cells(self) -> tuple[float, float]:
         """Columns and rows of cells that the vehicle's box fills."""
         rows, columns = self.weights.shape[:2]
-        return columns - 2 * self.margin[0], rows - 2 * self.margin[1]
+        return columns - self.margin[0] * (1 if self.border else 2), rows - 2 * self.margin[1]
 
     def scores(self, planes: NDArray[np.float32]) -> NDArray[np.float32]:
         """Score of every window of a map, ``(rows, columns)`` float32; empty where none fits."""
@@ -93,6 +101,16 @@ class MixtureTemplate:
         left = level.left + (columns + self.margin[0]) * level.step_x
         top = level.top + (rows + self.margin[1]) * level.step_y
         return np.stack([left, top, left + width * level.step_x, top + height * level.step_y], axis=1)
+
+    def border_windows(
+        self, level: FeatureMap, end: float, *, left: bool, least: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Boxes and scores, above the least, of the windows that end at a border at this pixel."""
+        strip = border_strip(level, self.weights.shape[1], end, left=left)
+        scores = self.scores(strip)[:, 0] if strip is not None else np.empty(0, np.float32)
+        hits = np.flatnonzero(scores > least)
+        boxes = strip_boxes(level, hits, end, left=left, cells=self.box_cells, above=self.margin[1])
+        return boxes, scores[hits].astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +184,7 @@ class TemplateMixture:
         params = {
             "biases": [template.bias for template in self.templates],
             "margins": [template.margin for template in self.templates],
+            "borders": [template.border for template in self.templates],
             "slope": self.slope,
             "offset": self.offset,
             "threshold": self.threshold,
@@ -200,9 +219,13 @@ def load_model(path: str | os.PathLike[str] = "default") -> TemplateMixture | Ve
         raise ModelFileError(f"{model.name} holds a model of the unknown kind {model.kind!r}; train one")
     params, tensors = model.params, model.tensors
     try:
+        borders = params.get("borders", [False] * len(params["biases"]))
+        rows = zip(params["biases"], params["margins"], borders, strict=True)
         templates = tuple(
-            MixtureTemplate(tensors[f"{index}.weights"], float(bias), (float(margin[0]), float(margin[1])))
-            for index, (bias, margin) in enumerate(zip(params["biases"], params["margins"], strict=True))
+            MixtureTemplate(
+                tensors[f"{index}.weights"], float(bias), (float(margin[0]), float(margin[1])), border
+            )
+            for index, (bias, margin, border) in enumerate(rows)
         )
         refinement = Refinement(tensors["refinement.weights"], tensors["refinement.bias"])
         numbers = {name: float(params[name]) for name in ("slope", "offset", "threshold")}
@@ -296,9 +319,7 @@ class MixtureSearch:
         check_type(params, "params", PyramidParams, "a mixture of templates is searched for on a pyramid")
         least = np.float32(min(WEAKEST, self.mixture.value(params.min_score)))
         shape = image.shape[:2]
-        narrow = min(self.mixture.templates, key=lambda template: template.box_cells[0])
-        low = min(self.mixture.templates, key=lambda template: template.box_cells[1])
-        sizes = params.sizes(narrow.box_cells[0], low.box_cells[1], shape)
+        sizes = params.sizes(*smallest_box(self.mixture.templates), shape)
         levels = pair_levels(sizes, share=params.horizon is None)
         with single_threaded_opencv():
             images = halved(image)
@@ -333,7 +354,7 @@ class MixtureSearch:
             return Candidates.empty()
         buffers = self._local.__dict__.setdefault("buffers", Buffers())
         found = [
-            self._hits(index, template, features, least)
+            self._hits(index, template, features, least, shape[1])
             for pixels, features in level_maps(images, level, rows, buffers.take)
             for index, template in templates[pixels]
         ]
@@ -344,18 +365,33 @@ class MixtureSearch:
         template: MixtureTemplate, pixels: float, params: PyramidParams, shape: tuple[int, ...]
     ) -> tuple[int, int]:
         width, height = (cells * pixels for cells in template.box_cells)
+        if template.border:
+            # What is cut is wider than what is seen of it.
+            width = max(width, height)
         top, bottom = params.rows(width, height, shape)
         margin = round(template.margin[1] * pixels)
         return max(0, top - margin), min(shape[0], bottom + margin)
 
     @staticmethod
-    def _hits(index: int, template: MixtureTemplate, level: FeatureMap, least: np.float32) -> Candidates:
-        scores = template.scores(level.planes)
-        if not scores.size:
-            return Candidates.empty()
-        rows, columns = np.divmod(np.flatnonzero(scores > least), scores.shape[1])
-        return Candidates(
-            template.boxes(level, rows, columns),
-            scores[rows, columns].astype(np.float64),
-            np.full(len(rows), index, np.intp),
-        )
+    def _hits(
+        index: int, template: MixtureTemplate, level: FeatureMap, least: np.float32, width: int
+    ) -> Candidates:
+        if template.border:
+            found = [
+                template.border_windows(level, end, left=left, least=float(least))
+                for left, end in ((True, 0.0), (False, float(width)))
+            ]
+            boxes, values = (np.concatenate(part) for part in zip(*found))
+        else:
+            scores = template.scores(level.planes)
+            if not scores.size:
+                return Candidates.empty()
+            rows, columns = np.divmod(np.flatnonzero(scores > least), scores.shape[1])
+            boxes, values = template.boxes(level, rows, columns), scores[rows, columns].astype(np.float64)
+        return Candidates(boxes, values, np.full(len(boxes), index, np.intp))
+
+
+def smallest_box(templates: Sequence[MixtureTemplate]) -> tuple[float, float]:
+    """Least columns and rows of a box, of whole vehicles where a template shows one."""
+    boxes = [each.box_cells for each in templates if not each.border] or [t.box_cells for t in templates]
+    return min(columns for columns, _ in boxes), min(rows for _, rows in boxes)
