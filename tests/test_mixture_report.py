@@ -107,7 +107,7 @@ def test_drawn_frames_follow_from_the_seed():
             np.testing.assert_array_equal(image, twin)
             assert (image != stranger).any()
             assert len(part.labels.rows(key)) > 0
-    with pytest.raises(InvalidInputError, match="drives must be an integer from 1"):
+    with pytest.raises(InvalidInputError, match="drives must be an integer at least 1; got 0"):
         drawn_source(drives=0)
     with pytest.raises(InvalidInputError, match="frames must be"):
         drawn_source(frames=500)

@@ -112,6 +112,9 @@ def test_vehicles_at_the_border_have_templates_of_their_own(source):
     found = train_mixture([source], params, n_jobs=1)
     assert [template.border for template in found.templates] == [False, True, True]
     assert [template.box_cells for template in found.templates] == [(6, 5), (4, 5), (6, 5)]
+    other = train_mixture([source], dataclasses.replace(params, border_bias=0.5), n_jobs=1)
+    added = [two.bias - one.bias for one, two in zip(found.templates, other.templates)]
+    assert added == pytest.approx([0, 0.8, 0.8])
     # Vehicles that it does not know, in frames that end in their middle.
     values = []
     for frame in frames_of([FrameSource("other", (drawn(range(100, 108)),))]):
@@ -123,8 +126,8 @@ def test_vehicles_at_the_border_have_templates_of_their_own(source):
                 shown = np.array([[box[0], box[1], end, box[3]]])
                 hit = (seen.templates > 0) & (iou_matrix(seen.boxes, shown)[:, 0] > 0.5)
                 values.append(seen.scores[hit].max(initial=-2))
-    assert len(values) > 4
-    assert np.median(values) > -0.5
+    assert len(values) > 2
+    assert min(values) > -0.7
 
 
 def test_what_is_learnt_at_the_border_ends_there(source):

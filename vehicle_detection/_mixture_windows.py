@@ -247,7 +247,7 @@ def _windows_at_ends(
         boxes = np.concatenate(parts)
         inside = np.flatnonzero(mostly_inside(boxes, (height, width)))
         allowed = inside[is_negative(boxes[inside], cut_labels(frame, end, left=left))]
-        for row in _apart(boxes, np.concatenate(values), allowed, max(1, params.per_frame // 3)):
+        for row in _apart(boxes, np.concatenate(values), allowed, max(1, params.per_frame // 5)):
             size, top = places[row]
             block = strips[size][1][:, top : top + template.weights.shape[0]]
             place = (number, size, top, 2 * end + left)
