@@ -144,6 +144,19 @@ def test_windows_of_a_template_at_the_border_end_there():
     np.testing.assert_array_equal(others, expected.boxes[: len(others)])
 
 
+def test_nearer_vehicles_gain():
+    model = random_mixture()
+    gained = dataclasses.replace(model, near_gain=0.1)
+    params = PyramidParams(least_width=60, per_octave=1)
+    plain, other = (MixtureSearch(each, n_jobs=1).candidates(ROAD, params) for each in (model, gained))
+    before = {tuple(box): value for box, value in zip(plain.boxes, plain.scores)}
+    both = [row for row, box in enumerate(other.boxes) if tuple(box) in before]
+    assert len(both) > 500
+    heights = other.boxes[both, 3] - other.boxes[both, 1]
+    expected = [before[tuple(other.boxes[row])] for row in both] + 0.1 * np.log2(4 * heights / 360)
+    np.testing.assert_allclose(other.scores[both], expected)
+
+
 def test_a_template_keeps_a_copy_that_cannot_be_changed():
     weights = np.zeros((3, 4, PLANES), np.float32)
     template = MixtureTemplate(weights, 0.0, (0.0, 0.0))
@@ -413,7 +426,8 @@ def test_corrected_boxes_lie_inside(seed, count):
 
 def test_saving_and_loading_keeps_every_bit(tmp_path):
     path = tmp_path / "model.safetensors"
-    model = random_mixture(slope=1.7, offset=0.1, threshold=-0.3, metadata={"a": [1, {"b": None}]})
+    options = {"slope": 1.7, "offset": 0.1, "threshold": -0.3, "near_gain": 0.02}
+    model = random_mixture(**options, metadata={"a": [1, {"b": None}]})
     model = dataclasses.replace(model, templates=(*model.templates, border_template()))
     model.save(path)
     loaded = load_model(path)
@@ -423,7 +437,7 @@ def test_saving_and_loading_keeps_every_bit(tmp_path):
         assert (one.bias, one.margin, one.border) == (other.bias, other.margin, other.border)
     assert loaded.refinement.weights.tobytes() == model.refinement.weights.tobytes()
     assert loaded.refinement.bias.tobytes() == model.refinement.bias.tobytes()
-    assert (loaded.slope, loaded.offset, loaded.threshold) == (1.7, 0.1, -0.3)
+    assert {name: getattr(loaded, name) for name in options} == options
     assert loaded.metadata == {"a": [1, {"b": None}]}
     first = path.read_bytes()
     loaded.save(path)

@@ -32,7 +32,7 @@ _CASES: tuple[dict[str, Any], ...] = (
 _FRAMES = 200
 
 
-def drawn_source(*, drives: int = 2 * len(_CASES), frames: int = 4, random_state: int = 0) -> FrameSource:
+def drawn_source(*, drives: int = 2 * len(_CASES), frames: int = 1, random_state: int = 0) -> FrameSource:
     """Draw frames of different roads, lights and sizes, with their vehicles.
 
     Parameters
@@ -77,9 +77,9 @@ def _sampled(name: str, drive: Drive, frames: int) -> LabelledFrames:
     rows = [(index, row) for index in chosen for row in drive.truth[index]]
     labels = Labels(
         [index for index, _ in rows],
-        None,
+        np.array([row.track for _, row in rows], np.intp),
         np.array([row.box for _, row in rows], np.float64).reshape(-1, 4),
-        ignore=[bool(row.ignore) for _, row in rows],
+        ignore=np.array([row.ignore for _, row in rows], np.bool_),
         frame_keys=chosen,
     )
     return LabelledFrames(name, images, labels)

@@ -32,6 +32,8 @@ class MixtureParams:
     border_bias
         Added to the values of the templates at the border: less of a vehicle is seen there, so that it must
         be the clearer.
+    near_gain
+        As in `TemplateMixture`.
     margin
         Cells of context on every side.
     C
@@ -70,6 +72,7 @@ class MixtureParams:
     border_shapes: tuple[tuple[float, float], ...] = ((4, 7), (6, 6), (9, 5))
     cuts: tuple[float, ...] = (0.3, 0.5, 0.7)
     border_bias: float = -0.3
+    near_gain: float = 0.04
     margin: float = 1.0
     C: float = 5e-4
     vehicles: float = 1500.0
@@ -93,6 +96,7 @@ class MixtureParams:
                 f"facing must be True or False for each of {len(shapes)} shapes; got {describe(facing)}"
             )
         check_number(self.border_bias, "border_bias")
+        check_number(self.near_gain, "near_gain")
         check_number(self.margin, "margin", low=0, high=8)
         check_number(self.C, "C", above=0, high=1e6)
         check_number(self.vehicles, "vehicles", above=0, high=1e9)

@@ -9,6 +9,7 @@ detect vehicles by clustering appearance patterns" (IEEE T-ITS 2015) for vehicle
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 from collections.abc import Mapping, Sequence
@@ -127,6 +128,9 @@ class TemplateMixture:
         Turn a template's value into log-odds that it is a vehicle: ``slope * value + offset``.
     threshold
         Least log-odds of a vehicle.
+    near_gain
+        Added to a template's value for every doubling of a box's height from a quarter of the frame's on,
+        and taken off for every halving: there are more places for what is small.
     metadata
         What the model file tells about itself. JSON values only.
 
@@ -147,6 +151,7 @@ class TemplateMixture:
     slope: float = 1.0
     offset: float = 0.0
     threshold: float = 0.0
+    near_gain: float = 0.0
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -159,6 +164,7 @@ class TemplateMixture:
         check_number(self.slope, "slope", above=0, high=1e9)
         check_number(self.offset, "offset")
         check_number(self.threshold, "threshold")
+        check_number(self.near_gain, "near_gain")
         object.__setattr__(self, "templates", templates)
 
     def scores(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -188,6 +194,7 @@ class TemplateMixture:
             "slope": self.slope,
             "offset": self.offset,
             "threshold": self.threshold,
+            "near_gain": self.near_gain,
         }
         write_model(path, KIND, params, tensors, self.metadata)
 
@@ -229,6 +236,7 @@ def load_model(path: str | os.PathLike[str] = "default") -> TemplateMixture | Ve
         )
         refinement = Refinement(tensors["refinement.weights"], tensors["refinement.bias"])
         numbers = {name: float(params[name]) for name in ("slope", "offset", "threshold")}
+        numbers["near_gain"] = float(params.get("near_gain", 0.0))
         return TemplateMixture(templates, refinement, **numbers, metadata=model.metadata)
     except (InvalidInputError, KeyError, IndexError, TypeError, ValueError) as error:
         raise ModelFileError(f"{model.name} does not fit its own parameters: {error}") from error
@@ -354,7 +362,7 @@ class MixtureSearch:
             return Candidates.empty()
         buffers = self._local.__dict__.setdefault("buffers", Buffers())
         found = [
-            self._hits(index, template, features, least, shape[1])
+            self._hits(index, template, features, least, shape)
             for pixels, features in level_maps(images, level, rows, buffers.take)
             for index, template in templates[pixels]
         ]
@@ -372,14 +380,21 @@ class MixtureSearch:
         margin = round(template.margin[1] * pixels)
         return max(0, top - margin), min(shape[0], bottom + margin)
 
-    @staticmethod
     def _hits(
-        index: int, template: MixtureTemplate, level: FeatureMap, least: np.float32, width: int
+        self,
+        index: int,
+        template: MixtureTemplate,
+        level: FeatureMap,
+        least: np.float32,
+        shape: tuple[int, ...],
     ) -> Candidates:
+        height = template.box_cells[1] * level.step_y
+        gain = self.mixture.near_gain * math.log2(4 * height / shape[0])
+        least = np.float32(least - gain)
         if template.border:
             found = [
                 template.border_windows(level, end, left=left, least=float(least))
-                for left, end in ((True, 0.0), (False, float(width)))
+                for left, end in ((True, 0.0), (False, float(shape[1])))
             ]
             boxes, values = (np.concatenate(part) for part in zip(*found))
         else:
@@ -388,7 +403,7 @@ class MixtureSearch:
                 return Candidates.empty()
             rows, columns = np.divmod(np.flatnonzero(scores > least), scores.shape[1])
             boxes, values = template.boxes(level, rows, columns), scores[rows, columns].astype(np.float64)
-        return Candidates(boxes, values, np.full(len(boxes), index, np.intp))
+        return Candidates(boxes, values + gain, np.full(len(boxes), index, np.intp))
 
 
 def smallest_box(templates: Sequence[MixtureTemplate]) -> tuple[float, float]:

@@ -120,8 +120,9 @@ def train_mixture(
             replace(each, bias=each.bias + params.border_bias) if each.border else each for each in templates
         ]
         found = tuple(view.template for view in with_mirrored(templates, facing))
-        refinement = _fit_refinement(TemplateMixture(found, Refinement.none()), frames, params, pool)
-    return TemplateMixture(found, refinement)
+        plain = TemplateMixture(found, Refinement.none(), near_gain=params.near_gain)
+        refinement = _fit_refinement(plain, frames, params, pool)
+    return replace(plain, refinement=refinement)
 
 
 class _Rounds:
