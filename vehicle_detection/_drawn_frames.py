@@ -57,7 +57,7 @@ def drawn_source(*, drives: int = 2 * len(_CASES), frames: int = 1, random_state
     Examples
     --------
     >>> drawn_source(drives=1, frames=2).sets
-    (LabelledFrames('drawn 1', 2 frames, 6 boxes),)
+    (LabelledFrames('drawn 1', 2 frames, 16 boxes),)
     """
     count = check_integer(drives, "drives", low=1)
     taken = check_integer(frames, "frames", low=1, high=_FRAMES)
