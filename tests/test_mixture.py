@@ -146,15 +146,19 @@ def test_windows_of_a_template_at_the_border_end_there():
 
 def test_nearer_vehicles_gain():
     model = random_mixture()
+    found = MixtureSearch(model, n_jobs=1).candidates(ROAD, PyramidParams())
+    least = float(np.quantile(found.scores, 0.2))
+    boxes, values = model.vehicles(ROAD, found, least=least)
     gained = dataclasses.replace(model, near_gain=0.1)
-    params = PyramidParams(least_width=60, per_octave=1)
-    plain, other = (MixtureSearch(each, n_jobs=1).candidates(ROAD, params) for each in (model, gained))
-    before = {tuple(box): value for box, value in zip(plain.boxes, plain.scores)}
-    both = [row for row, box in enumerate(other.boxes) if tuple(box) in before]
-    assert len(both) > 500
-    heights = other.boxes[both, 3] - other.boxes[both, 1]
-    expected = [before[tuple(other.boxes[row])] for row in both] + 0.1 * np.log2(4 * heights / 360)
-    np.testing.assert_allclose(other.scores[both], expected)
+    others, more = gained.vehicles(ROAD, found, least=least)
+    before = {tuple(box): value for box, value in zip(boxes, values)}
+    both = [row for row, box in enumerate(others) if tuple(box) in before]
+    assert len(both) > 5
+    heights = others[both, 3] - others[both, 1]
+    expected = [before[tuple(others[row])] for row in both] + 0.1 * np.log2(4 * heights / 360)
+    np.testing.assert_allclose(more[both], expected)
+    assert (more >= least).all()
+    assert (np.diff(more) <= 0).all()
 
 
 def test_a_template_keeps_a_copy_that_cannot_be_changed():

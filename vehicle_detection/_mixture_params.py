@@ -72,7 +72,7 @@ class MixtureParams:
     border_shapes: tuple[tuple[float, float], ...] = ((4, 7), (6, 6), (9, 5))
     cuts: tuple[float, ...] = (0.3, 0.5, 0.7)
     border_bias: float = -0.3
-    near_gain: float = 0.04
+    near_gain: float = 0.03
     margin: float = 1.0
     C: float = 5e-4
     vehicles: float = 1500.0

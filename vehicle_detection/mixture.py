@@ -9,7 +9,6 @@ detect vehicles by clustering appearance patterns" (IEEE T-ITS 2015) for vehicle
 
 from __future__ import annotations
 
-import math
 import os
 import threading
 from collections.abc import Mapping, Sequence
@@ -129,7 +128,7 @@ class TemplateMixture:
     threshold
         Least log-odds of a vehicle.
     near_gain
-        Added to a template's value for every doubling of a box's height from a quarter of the frame's on,
+        Added to a vehicle's value for every doubling of its box's height from a quarter of the frame's on,
         and taken off for every halving: there are more places for what is small.
     metadata
         What the model file tells about itself. JSON values only.
@@ -174,6 +173,18 @@ class TemplateMixture:
     def value(self, score: float) -> float:
         """Value of the templates that has a score."""
         return (score + self.threshold - self.offset) / self.slope
+
+    def vehicles(
+        self, image: NDArray[np.uint8], found: Candidates, *, least: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Boxes and values, `least` or more, of the vehicles to which windows of a frame lead, best first."""
+        # At most the frame's height, which is two doublings, is gained.
+        grouped = suppress(found, least=least - 2 * abs(self.near_gain))
+        boxes, values = self.refinement.apply(image, grouped)
+        values = values + self.near_gain * np.log2(4 * (boxes[:, 3] - boxes[:, 1]) / image.shape[0])
+        rows = np.argsort(-values, kind="stable")
+        rows = rows[values[rows] >= least]
+        return boxes[rows], values[rows]
 
     def with_metadata(self, metadata: Mapping[str, Any]) -> TemplateMixture:
         """Return the same model with other facts in its file."""
@@ -315,8 +326,7 @@ class MixtureSearch:
         mixture = self.mixture
         scores = mixture.scores(found.scores)
         evidence = scores >= params.min_score
-        grouped = suppress(found, least=mixture.value(0.0))
-        boxes, values = mixture.refinement.apply(image, grouped)
+        boxes, values = mixture.vehicles(image, found, least=mixture.value(0.0))
         return MixtureFind(
             Detections(found.boxes[evidence], scores[evidence]), Detections(boxes, mixture.scores(values))
         )
@@ -362,7 +372,7 @@ class MixtureSearch:
             return Candidates.empty()
         buffers = self._local.__dict__.setdefault("buffers", Buffers())
         found = [
-            self._hits(index, template, features, least, shape)
+            self._hits(index, template, features, least, shape[1])
             for pixels, features in level_maps(images, level, rows, buffers.take)
             for index, template in templates[pixels]
         ]
@@ -380,21 +390,14 @@ class MixtureSearch:
         margin = round(template.margin[1] * pixels)
         return max(0, top - margin), min(shape[0], bottom + margin)
 
+    @staticmethod
     def _hits(
-        self,
-        index: int,
-        template: MixtureTemplate,
-        level: FeatureMap,
-        least: np.float32,
-        shape: tuple[int, ...],
+        index: int, template: MixtureTemplate, level: FeatureMap, least: np.float32, width: int
     ) -> Candidates:
-        height = template.box_cells[1] * level.step_y
-        gain = self.mixture.near_gain * math.log2(4 * height / shape[0])
-        least = np.float32(least - gain)
         if template.border:
             found = [
                 template.border_windows(level, end, left=left, least=float(least))
-                for left, end in ((True, 0.0), (False, float(shape[1])))
+                for left, end in ((True, 0.0), (False, float(width)))
             ]
             boxes, values = (np.concatenate(part) for part in zip(*found))
         else:
@@ -403,7 +406,7 @@ class MixtureSearch:
                 return Candidates.empty()
             rows, columns = np.divmod(np.flatnonzero(scores > least), scores.shape[1])
             boxes, values = template.boxes(level, rows, columns), scores[rows, columns].astype(np.float64)
-        return Candidates(boxes, values + gain, np.full(len(boxes), index, np.intp))
+        return Candidates(boxes, values, np.full(len(boxes), index, np.intp))
 
 
 def smallest_box(templates: Sequence[MixtureTemplate]) -> tuple[float, float]:

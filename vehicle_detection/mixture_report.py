@@ -15,7 +15,6 @@ from vehicle_detection._checks import check_integer
 from vehicle_detection._jobs import resolve_jobs
 from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection._mixture_windows import check_sources
-from vehicle_detection._refinement import suppress
 from vehicle_detection.boxes import Detections
 from vehicle_detection.evaluation import Labels, evaluate_detections, match_detections, precision_recall_curve
 from vehicle_detection.mixture import MixtureSearch, TemplateMixture
@@ -171,8 +170,8 @@ def find_in(mixture: TemplateMixture, source: FrameSource, *, n_jobs: int | None
 
     def boxes_of(pair: tuple[Any, NDArray[np.uint8]]) -> tuple[Any, Detections]:
         key, image = pair
-        windows = suppress(search.candidates(image, sizes), least=_LOWEST)
-        return key, Detections(*mixture.refinement.apply(image, windows))
+        found = search.candidates(image, sizes)
+        return key, Detections(*mixture.vehicles(image, found, least=_LOWEST))
 
     with ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
         return [
