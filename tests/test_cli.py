@@ -21,6 +21,7 @@ import vehicle_detection
 from tests.test_mixture_report import write_set
 from tests.test_mixture_training import SMALL, drawn
 from vehicle_detection import (
+    _drawn_frames,
     _files,
     classifier,
     datasets,
@@ -730,6 +731,7 @@ def test_train_frames(drawn_roads, small_training, tmp_path):
         names[2],
         "--seed",
         5,
+        "--no-drawn",
     ]
     out = succeed(*words)
     assert "town: judged by a model that does not know it" in out
@@ -746,6 +748,16 @@ def test_train_frames(drawn_roads, small_training, tmp_path):
     first = names[0].read_bytes()
     succeed(*words)
     assert names[0].read_bytes() == first
+
+
+def test_train_frames_draws_some_itself(drawn_roads, small_training, tmp_path, monkeypatch):
+    few = functools.partial(_drawn_frames.drawn_source, drives=1, frames=1)
+    monkeypatch.setattr(_drawn_frames, "drawn_source", few)
+    card = tmp_path / "m.md"
+    succeed("train-frames", drawn_roads, "-o", tmp_path / "m.safetensors", "--card", card)
+    data = load_model(tmp_path / "m.safetensors").metadata["data"]
+    assert data == {"town": 6, "course": 4, "drawn": 1}
+    assert "- drawn: 1 frames" in card.read_text()
 
 
 def test_train_frames_refuses_bad_input_before_it_trains(drawn_roads, tmp_path, monkeypatch):

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vehicle_detection import VehicleDetector, mixture
-from vehicle_detection._feature_maps import PLANES, Level, halved, level_maps, mirror_planes
+from vehicle_detection._feature_maps import PLANES, FeatureMap, Level, halved, level_maps, mirror_planes
 from vehicle_detection._model_file import FORMAT, FORMAT_VERSION, _checksum
 from vehicle_detection._refinement import (
     CROP_LENGTH,
@@ -97,6 +97,70 @@ def test_boxes_leave_out_the_margin():
     assert box.tolist() == [level.left + 48, level.top + 28, level.left + 104, level.top + 84]
 
 
+def border_template(seed=4):
+    return dataclasses.replace(random_template(5, 6, seed), border=True)
+
+
+def test_a_template_at_the_border_has_its_margin_on_one_side():
+    template = border_template()
+    assert template.box_cells == (4, 4)
+
+
+@given(seed=st.integers(0, 1000), columns=st.integers(3, 12), rows=st.integers(4, 9))
+def test_both_borders_are_searched_alike(seed, columns, rows):
+    rng = np.random.default_rng(seed)
+    planes = rng.uniform(0, 0.3, (PLANES, rows, columns)).astype(np.float32)
+    level = FeatureMap(planes, 0.0, 4.0, 8.0, 8.0)
+    turned = dataclasses.replace(level, planes=mirror_planes(planes))
+    template, width = border_template(), columns * 8.0
+    boxes, values = template.border_windows(level, width, left=False, least=-9.0)
+    assert len(boxes) == (rows - 5 if columns >= 5 and rows >= 6 else 0)
+    assert (boxes[:, 2] == width).all()
+    assert (boxes[:, 2:] - boxes[:, :2] == 32).all()
+    others, same = template.border_windows(turned, 0.0, left=True, least=-9.0)
+    np.testing.assert_array_equal(same, values)
+    np.testing.assert_array_equal(others[:, [1, 3]], boxes[:, [1, 3]])
+    np.testing.assert_array_equal(others[:, [0, 2]], width - boxes[:, [2, 0]])
+    if len(boxes):
+        inside = level.planes[:, :, columns - 5 :]
+        np.testing.assert_allclose(template.scores(np.ascontiguousarray(inside))[:, 0], values)
+
+
+def test_windows_of_a_template_at_the_border_end_there():
+    model = dataclasses.replace(
+        random_mixture(),
+        templates=(random_template(bias=-0.5), dataclasses.replace(border_template(), bias=1.0)),
+    )
+    search = MixtureSearch(model, n_jobs=1)
+    found = search.candidates(ROAD, PyramidParams())
+    at_border = found.boxes[found.templates == 1]
+    assert (at_border[:, 0] == 0).any()
+    assert (at_border[:, 2] == 640).any()
+    assert ((at_border[:, 0] == 0) | (at_border[:, 2] == 640)).all()
+    # The other templates' sizes stay what they are without it.
+    alone = dataclasses.replace(model, templates=model.templates[:1])
+    expected = MixtureSearch(alone, n_jobs=1).candidates(ROAD, PyramidParams())
+    others = found.boxes[found.templates == 0]
+    np.testing.assert_array_equal(others, expected.boxes[: len(others)])
+
+
+def test_nearer_vehicles_gain():
+    model = random_mixture()
+    found = MixtureSearch(model, n_jobs=1).candidates(ROAD, PyramidParams())
+    least = float(np.quantile(found.scores, 0.2))
+    boxes, values = model.vehicles(ROAD, found, least=least)
+    gained = dataclasses.replace(model, near_gain=0.1)
+    others, more = gained.vehicles(ROAD, found, least=least)
+    before = {tuple(box): value for box, value in zip(boxes, values)}
+    both = [row for row, box in enumerate(others) if tuple(box) in before]
+    assert len(both) > 5
+    heights = others[both, 3] - others[both, 1]
+    expected = [before[tuple(others[row])] for row in both] + 0.1 * np.log2(4 * heights / 360)
+    np.testing.assert_allclose(more[both], expected)
+    assert (more >= least).all()
+    assert (np.diff(more) <= 0).all()
+
+
 def test_a_template_keeps_a_copy_that_cannot_be_changed():
     weights = np.zeros((3, 4, PLANES), np.float32)
     template = MixtureTemplate(weights, 0.0, (0.0, 0.0))
@@ -122,6 +186,7 @@ def test_a_template_keeps_a_copy_that_cannot_be_changed():
         ({"margin": (0.0, 1.5)}, "margin must leave cells"),
         ({"margin": 1.0}, "margin must be two numbers of cells, got 1.0"),
         ({"margin": (np.nan, 0.0)}, "margin must be a number"),
+        ({"border": 1}, "border must be True or False, got 1"),
     ],
 )
 def test_templates_that_make_no_sense(changes, message):
@@ -365,16 +430,18 @@ def test_corrected_boxes_lie_inside(seed, count):
 
 def test_saving_and_loading_keeps_every_bit(tmp_path):
     path = tmp_path / "model.safetensors"
-    model = random_mixture(slope=1.7, offset=0.1, threshold=-0.3, metadata={"a": [1, {"b": None}]})
+    options = {"slope": 1.7, "offset": 0.1, "threshold": -0.3, "near_gain": 0.02}
+    model = random_mixture(**options, metadata={"a": [1, {"b": None}]})
+    model = dataclasses.replace(model, templates=(*model.templates, border_template()))
     model.save(path)
     loaded = load_model(path)
     assert isinstance(loaded, TemplateMixture)
     for one, other in zip(model.templates, loaded.templates, strict=True):
         assert one.weights.tobytes() == other.weights.tobytes()
-        assert (one.bias, one.margin) == (other.bias, other.margin)
+        assert (one.bias, one.margin, one.border) == (other.bias, other.margin, other.border)
     assert loaded.refinement.weights.tobytes() == model.refinement.weights.tobytes()
     assert loaded.refinement.bias.tobytes() == model.refinement.bias.tobytes()
-    assert (loaded.slope, loaded.offset, loaded.threshold) == (1.7, 0.1, -0.3)
+    assert {name: getattr(loaded, name) for name in options} == options
     assert loaded.metadata == {"a": [1, {"b": None}]}
     first = path.read_bytes()
     loaded.save(path)
@@ -449,6 +516,8 @@ def test_the_file_of_these_tests_is_sound(tmp_path):
         ({}, {"biases": ["x", 0.0, 0.0]}, "could not convert"),
         ({}, {"margins": [[1.0], [1.0], [1.0]]}, "index out of range"),
         ({}, {"margins": [[4.0, 50.0]] * 3}, "margin must leave cells"),
+        ({}, {"borders": [True]}, "argument"),
+        ({}, {"borders": [1, 0, 0]}, "border must be True or False"),
         ({}, {"slope": 0.0}, "slope must be a number"),
         ({}, {"threshold": None}, "'threshold'"),
     ],

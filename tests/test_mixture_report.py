@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.test_mixture_training import SMALL, drawn
+from vehicle_detection._drawn_frames import drawn_source
 from vehicle_detection._frame_sources import find_sources
 from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection._mixture_card import write_card, write_curves
@@ -86,6 +87,30 @@ def test_the_model_is_the_one_trained_on_everything_and_calibrated(sources, judg
     model.with_metadata(metadata).save(tmp_path / "m.safetensors")
     assert load_model(tmp_path / "m.safetensors").metadata == json.loads(json.dumps(metadata))
     assert metadata["data"] == {"one": 7, "two": 5}
+
+
+def test_a_source_for_every_model_is_never_judged(sources):
+    always = drawn_source(drives=1, frames=1)
+    params = dataclasses.replace(SMALL, rounds=(0.2,))
+    model, scores, held = judge_mixture(sources, params, always=[always], n_jobs=1)
+    assert [score.source for score in scores] == [part.source for part in held] == ["one", "two"]
+    plain = train_mixture([*sources, always], params, n_jobs=1)
+    np.testing.assert_array_equal(model.templates[0].weights, plain.templates[0].weights)
+
+
+def test_drawn_frames_follow_from_the_seed():
+    one, same, other = (drawn_source(drives=2, frames=2, random_state=seed) for seed in (0, 0, 1))
+    assert (one.name, [len(part) for part in one.sets]) == ("drawn", [2, 2])
+    for part, again, different in zip(one.sets, same.sets, other.sets):
+        for (key, image), (_, twin), (_, stranger) in zip(part, again, different):
+            assert image.shape == (720, 1280, 3)
+            np.testing.assert_array_equal(image, twin)
+            assert (image != stranger).any()
+            assert len(part.labels.rows(key)) > 0
+    with pytest.raises(InvalidInputError, match="drives must be an integer at least 1; got 0"):
+        drawn_source(drives=0)
+    with pytest.raises(InvalidInputError, match="frames must be"):
+        drawn_source(frames=500)
 
 
 def test_too_few_sources_are_refused(sources):

@@ -8,7 +8,9 @@ from vehicle_detection import mixture_training
 from vehicle_detection._feature_maps import PLANES, mirror_planes
 from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection._mixture_windows import (
+    Frame,
     Negatives,
+    cut_labels,
     frames_of,
     is_negative,
     mine_windows,
@@ -26,6 +28,8 @@ from vehicle_detection.synthetic import render_scene
 SMALL = MixtureParams(
     shapes=((6, 5),),
     facing=(False,),
+    border_shapes=(),
+    near_gain=0.0,
     C=5e-3,
     vehicles=100.0,
     rounds=(0.5, 1.0, 1.0),
@@ -104,6 +108,39 @@ def test_a_template_that_shows_a_side_gets_a_mirrored_one(source):
     assert lines[1].startswith("round 1: ")
 
 
+def test_vehicles_at_the_border_have_templates_of_their_own(source):
+    params = dataclasses.replace(SMALL, border_shapes=((4, 5), (6, 5)), rounds=(1.0,))
+    found = train_mixture([source], params, n_jobs=1)
+    assert [template.border for template in found.templates] == [False, True, True]
+    assert [template.box_cells for template in found.templates] == [(6, 5), (4, 5), (6, 5)]
+    other = train_mixture([source], dataclasses.replace(params, border_bias=0.5), n_jobs=1)
+    added = [two.bias - one.bias for one, two in zip(found.templates, other.templates)]
+    assert added == pytest.approx([0, 0.8, 0.8])
+    # Vehicles that it does not know, in frames that end in their middle.
+    values = []
+    for frame in frames_of([FrameSource("other", (drawn(range(100, 108)),))]):
+        for box in frame.boxes:
+            end = round((box[0] + box[2]) / 2)
+            if box[2] - box[0] > 70 and end > 60:
+                search = MixtureSearch(found, n_jobs=1)
+                seen = search.candidates(np.ascontiguousarray(frame.image[:, :end]), PyramidParams())
+                shown = np.array([[box[0], box[1], end, box[3]]])
+                hit = (seen.templates > 0) & (iou_matrix(seen.boxes, shown)[:, 0] > 0.5)
+                values.append(seen.scores[hit].max(initial=-2))
+    assert len(values) > 2
+    assert min(values) > -0.7
+
+
+def test_what_is_learnt_at_the_border_ends_there(source):
+    params = dataclasses.replace(SMALL, border_shapes=((4, 5),))
+    frames = frames_of([source])
+    seen = list(mixture_training._cut(frames, params, np.random.default_rng(0)))
+    assert len(seen) > len(frames)
+    for image, box in seen:
+        assert box[2] == image.shape[1]
+        assert box[2] - box[0] >= params.least_width * (1 - params.shake)
+
+
 def test_the_solver_reaches_the_least_loss():
     from sklearn.svm import LinearSVC
 
@@ -159,6 +196,33 @@ def test_negatives_show_no_vehicle(facing):
             assert len({place for _, place, _ in mined}) == len(mined)
             assert all(index == 0 and features.shape == (weights.size,) for index, _, features in mined)
     assert total > 20
+
+
+def test_negatives_at_the_border_show_no_part_of_a_vehicle():
+    weights = np.random.default_rng(0).normal(0, 0.05, (7, 6, PLANES))
+    views = with_mirrored([MixtureTemplate(weights, 0.0, (1.0, 1.0), True)], (False,))
+    total = 0
+    for frame in frames_with_ignored():
+        mined = mine_windows(frame, views, SMALL)
+        total += len(mined)
+        assert len({place for _, place, _ in mined}) == len(mined)
+        assert all(index == 0 and features.shape == (weights.size,) for index, _, features in mined)
+        ends = {place[3] for _, place, _ in mined}
+        assert ends <= {2 * end + left for left in (0, 1) for end in (0, 107, 178, 249, 356)}
+    assert total > 20
+
+
+def test_a_frame_that_ends_earlier_shows_less():
+    frame = Frame(
+        np.zeros((90, 160, 3), np.uint8),
+        np.array([[10.0, 20, 50, 60], [70, 20, 120, 60], [130, 10, 160, 50]]),
+        np.array([[60.0, 0, 100, 90]]),
+        0.0,
+    )
+    left, right = cut_labels(frame, 90, left=False), cut_labels(frame, 90, left=True)
+    assert left.boxes.tolist() == [[10, 20, 50, 60], [70, 20, 90, 60]]
+    assert right.boxes.tolist() == [[90, 20, 120, 60], [130, 10, 160, 50]]
+    assert (left.ignored.tolist(), right.ignored.tolist()) == ([[60, 0, 90, 90]], [[90, 0, 100, 90]])
 
 
 def test_what_is_negative_is_told_by_the_labels():
@@ -219,6 +283,12 @@ def test_the_easiest_negatives_go_for_good():
             r"facing must be True or False for each of 1 shapes; got \(True, False\)",
         ),
         ({"facing": (1,)}, "facing must be True or False"),
+        ({"border_shapes": None}, "border_shapes must be a tuple; got None"),
+        ({"border_shapes": (4, 7)}, r"border_shapes must be \(columns, rows\) of cells each"),
+        ({"border_shapes": ((1, 7),)}, "border_shapes must be a number, at least 2"),
+        ({"cuts": (0.5, 1.5)}, "cuts must be a number, greater than 0 and at most 1"),
+        ({"border_bias": np.nan}, "border_bias must be a number"),
+        ({"near_gain": "much"}, "near_gain must be a number"),
         ({"margin": -1}, "margin must be a number"),
         ({"C": 0}, "C must be a number, greater than 0"),
         ({"vehicles": 0}, "vehicles must be a number, greater than 0"),

@@ -28,19 +28,27 @@ def train_frames(
     curves: Annotated[
         Path | None, typer.Option(metavar="FILE.csv", help="Precision and recall of every source left out.")
     ] = None,
+    drawn: Annotated[
+        bool, typer.Option("--drawn/--no-drawn", help="Train on frames that the project draws, too.")
+    ] = True,
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of everything random.")] = 0,
 ) -> None:
     """Train the model for any road, and judge it on sources that it was not trained on."""
+    from vehicle_detection._drawn_frames import drawn_source
     from vehicle_detection._files import check_target
     from vehicle_detection._frame_sources import find_sources
     from vehicle_detection._mixture_card import write_card, write_curves
+    from vehicle_detection._mixture_windows import check_sources
     from vehicle_detection.mixture_report import as_metadata, judge_mixture
 
     named = {"-o": output, "--card": card, "--curves": curves}
     targets = {name: check_target(path, name) for name, path in named.items() if path is not None}
     check_apart(targets, {"DATA": data})
     sources = find_sources(data)
-    trained, scores, held = judge_mixture(sources, random_state=seed, on_step=typer.echo)
+    check_sources(sources, least=2)
+    always = [drawn_source(random_state=seed)] if drawn else []
+    trained, scores, held = judge_mixture(sources, always=always, random_state=seed, on_step=typer.echo)
+    sources += always
     trained.with_metadata(as_metadata(scores, sources, seed)).save(output)
     if card is not None:
         write_card(card, trained, scores, sources, seed)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vehicle_detection._drawn_frames import DRAWN
 from vehicle_detection._files import written_whole
 from vehicle_detection.evaluation import precision_recall_curve
 from vehicle_detection.mixture import TemplateMixture
@@ -70,13 +71,16 @@ def write_card(
         f"{score.false_per_frame:.2f} | {_or_dash(score.false_per_empty_frame, 2)} |"
         for score in scores
     )
-    shapes = ", ".join("{:g}x{:g}".format(*template.box_cells) for template in mixture.templates)
+    shapes = ", ".join(
+        "{:g}x{:g}".format(*template.box_cells) + " at the border" * template.border
+        for template in mixture.templates
+    )
     data = "\n".join(
         f"- {source.name}: {sum(len(part) for part in source.sets)} frames, "
         f"{sum(int((~part.labels.ignore).sum()) for part in source.sets)} vehicles"
         for source in sources
     )
-    known = {source.name for source in sources} == _SHIPPED_SOURCES
+    known = {source.name for source in sources} - {DRAWN} == _SHIPPED_SOURCES
     text = _CARD.format(
         terms=_TERMS if known else _OTHER_TERMS,
         places=_PLACES if known else "",

@@ -2,121 +2,28 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_integer, check_number, check_type, describe
-from vehicle_detection._feature_maps import halved, level_maps, mirror_planes, pair_levels
+from vehicle_detection._border_strips import border_strip, strip_boxes
+from vehicle_detection._checks import check_number, check_type, describe
+from vehicle_detection._feature_maps import FeatureMap, halved, level_maps, mirror_planes, pair_levels
 from vehicle_detection._jobs import single_threaded_opencv
 from vehicle_detection._labelled_frames import LabelledFrames
+from vehicle_detection._mixture_params import MixtureParams, entries
 from vehicle_detection._refinement import mostly_inside, overlaps
 from vehicle_detection.boxes import box_areas, intersection_matrix, iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture import MixtureTemplate
-from vehicle_detection.params import PyramidParams
+from vehicle_detection.mixture import MixtureTemplate, smallest_box
 
 Floats = NDArray[np.float64]
 
 # A window above this value is a hard negative; so many of one size at most are looked at.
 _HARD, _MOST_HITS = -0.9, 400
-
-
-@dataclass(frozen=True, kw_only=True)
-class MixtureParams:
-    """How a mixture is trained.
-
-    Attributes
-    ----------
-    shapes
-        Columns and rows of cells that the boxes of each template fill.
-    facing
-        Which of them show one side of a vehicle: their vehicles are turned to face the same way, and the
-        mirrored template is searched for too.
-    margin
-        Cells of context on every side.
-    C
-        Inverse strength of the regularisation, as in ``LinearSVC``.
-    vehicles
-        Weight of all vehicles of a template together; a negative weighs 1.
-    least_width
-        Width in pixels of the narrowest box that is trained on.
-    near
-        A box trains every template whose logarithmic aspect ratio is this near, and the nearest.
-    jitter
-        Copies of each box, of which all but the first are moved by up to ``shake`` of its sides.
-    rounds
-        Shares of the frames that the rounds of mining look at; one of all frames that brings under 1% new
-        negatives is the last.
-    per_frame
-        Negatives that a round takes from a frame for each template, at most.
-    most_negatives
-        Negatives that are kept for each template; the easiest go.
-    search
-        Sizes at which negatives are looked for.
-
-    Raises
-    ------
-    InvalidInputError
-        If a value is out of range, or `facing` is not as long as `shapes`.
-
-    Examples
-    --------
-    >>> MixtureParams(shapes=((8, 6),), facing=(True,), rounds=(1.0,)).margin
-    1.0
-    """
-
-    shapes: tuple[tuple[float, float], ...] = ((6, 8), (7, 6), (10, 6))
-    facing: tuple[bool, ...] = (False, False, False)
-    margin: float = 1.0
-    C: float = 5e-4
-    vehicles: float = 1500.0
-    least_width: float = 28.0
-    near: float = 0.2
-    jitter: int = 2
-    shake: float = 0.03
-    rounds: tuple[float, ...] = (0.15, 0.3, 0.6, 1.0)
-    per_frame: int = 30
-    most_negatives: int = 12_000
-    search: PyramidParams = PyramidParams(least_width=24.0, horizon=None)  # noqa: RUF009 - frozen
-
-    def __post_init__(self) -> None:
-        shapes, facing = _entries(self.shapes, "shapes"), _entries(self.facing, "facing")
-        for shape in shapes:
-            if not isinstance(shape, (tuple, list)) or len(shape) != 2:
-                raise InvalidInputError(
-                    f"shapes must be (columns, rows) of cells each, such as ((7, 6),); got {describe(shape)}"
-                )
-            for cells in shape:
-                check_number(cells, "shapes", low=2, high=64)
-        if len(facing) != len(shapes) or not all(isinstance(each, (bool, np.bool_)) for each in facing):
-            raise InvalidInputError(
-                f"facing must be True or False for each of {len(shapes)} shapes; got {describe(facing)}"
-            )
-        check_number(self.margin, "margin", low=0, high=8)
-        check_number(self.C, "C", above=0, high=1e6)
-        check_number(self.vehicles, "vehicles", above=0, high=1e9)
-        check_number(self.least_width, "least_width", low=8, high=10_000)
-        check_number(self.near, "near", low=0, high=10)
-        check_integer(self.jitter, "jitter", low=1, high=100)
-        check_number(self.shake, "shake", low=0, high=0.25)
-        rounds = _entries(self.rounds, "rounds")
-        for share in rounds:
-            check_number(share, "rounds", above=0, high=1)
-        check_integer(self.per_frame, "per_frame", low=1)
-        check_integer(self.most_negatives, "most_negatives", low=1)
-        check_type(self.search, "search", PyramidParams, "it tells where negatives are looked for")
-        for name, values in (("shapes", tuple(map(tuple, shapes))), ("facing", facing), ("rounds", rounds)):
-            object.__setattr__(self, name, values)
-
-
-def _entries(values: object, name: str) -> tuple[Any, ...]:
-    if not isinstance(values, (tuple, list)) or not values:
-        raise InvalidInputError(f"{name} must be a tuple of at least one entry; got {describe(values)}")
-    return tuple(values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +60,7 @@ class FrameSource:
         name: object = self.name
         if not isinstance(name, str) or not name:
             raise InvalidInputError(f"name must be a word for the source, got {describe(name)}")
-        sets = _entries(self.sets, "sets")
+        sets = entries(self.sets, "sets")
         for part in sets:
             check_type(part, "sets", LabelledFrames, "pass the frames with their labels as LabelledFrames")
         check_number(self.complete_from, "complete_from", low=0)
@@ -227,7 +134,7 @@ def with_mirrored(templates: Sequence[MixtureTemplate], facing: Sequence[bool]) 
     for index, template in enumerate(templates):
         if facing[index]:
             weights = mirror_planes(template.weights.transpose(2, 0, 1)).transpose(1, 2, 0)
-            views.append(View(MixtureTemplate(weights, template.bias, template.margin), index, True))
+            views.append(View(replace(template, weights=weights), index, True))
     return views
 
 
@@ -276,8 +183,7 @@ def _windows_of(
 ) -> Mined:
     """Windows of a frame that `choose` takes by their scores, and that are no vehicles."""
     shape = frame.image.shape[:2]
-    cells = [view.template.box_cells for view in views]
-    sizes = params.search.sizes(min(c for c, _ in cells), min(r for _, r in cells), shape)
+    sizes = params.search.sizes(*smallest_box([view.template for view in views]), shape)
     with single_threaded_opencv():
         images = halved(frame.image)
         levels = [
@@ -287,6 +193,9 @@ def _windows_of(
         ]
     mined: Mined = []
     for number, view in enumerate(views):
+        if view.template.border:
+            mined += _windows_at_ends(frame, levels, number, view, params, choose)
+            continue
         places, parts, values = [], [], []
         for size, level in enumerate(levels):
             scores = view.template.scores(level.planes)
@@ -304,6 +213,58 @@ def _windows_of(
             block = mirror_planes(block) if view.mirrored else block
             mined.append((view.index, (number, size, top, left), block.transpose(1, 2, 0).ravel()))
     return mined
+
+
+def _windows_at_ends(
+    frame: Frame,
+    levels: Sequence[FeatureMap],
+    number: int,
+    view: View,
+    params: MixtureParams,
+    choose: Callable[[NDArray[np.float32]], NDArray[np.intp]],
+) -> Mined:
+    """Windows next to the borders of a frame, and where it might as well have ended."""
+    template, (height, width) = view.template, frame.image.shape[:2]
+    columns = template.weights.shape[1]
+    mined: Mined = []
+    for left, share in itertools.product((False, True), (1.0, *params.cuts)):
+        end = round(width * (1 - share if left else share))
+        strips = {
+            size: (level, strip)
+            for size, level in enumerate(levels)
+            if template.box_cells[0] * level.step_x > 0.999 * params.search.least_width
+            and (strip := border_strip(level, columns, end, left=left)) is not None
+        }
+        places, parts, values = [], [np.empty((0, 4))], [np.empty(0)]
+        for size, (level, strip) in strips.items():
+            scores = template.scores(strip).ravel()
+            rows = choose(scores)
+            parts.append(
+                strip_boxes(level, rows, end, left=left, cells=template.box_cells, above=template.margin[1])
+            )
+            values.append(scores[rows].astype(np.float64))
+            places += [(size, row) for row in rows.tolist()]
+        boxes = np.concatenate(parts)
+        inside = np.flatnonzero(mostly_inside(boxes, (height, width)))
+        allowed = inside[is_negative(boxes[inside], cut_labels(frame, end, left=left))]
+        for row in _apart(boxes, np.concatenate(values), allowed, max(1, params.per_frame // 5)):
+            size, top = places[row]
+            block = strips[size][1][:, top : top + template.weights.shape[0]]
+            place = (number, size, top, 2 * end + left)
+            mined.append((view.index, place, block.transpose(1, 2, 0).ravel()))
+    return mined
+
+
+def cut_labels(frame: Frame, end: float, *, left: bool) -> Frame:
+    """Cut a frame's labels where the frame is taken to end; the image stays whole."""
+
+    def rest(boxes: Floats) -> Floats:
+        boxes = boxes.copy()
+        side = boxes[:, 0:3:2]
+        side[:] = np.maximum(side, end) if left else np.minimum(side, end)
+        return boxes[boxes[:, 2] > boxes[:, 0]]
+
+    return replace(frame, boxes=rest(frame.boxes), ignored=rest(frame.ignored))
 
 
 def _apart(boxes: Floats, values: Floats, rows: NDArray[np.intp], most: int) -> list[int]:

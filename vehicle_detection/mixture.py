@@ -12,13 +12,14 @@ from __future__ import annotations
 import functools
 import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection._border_strips import border_strip, strip_boxes
 from vehicle_detection._buffers import Buffers, Take, new_array
 from vehicle_detection._checks import check_image, check_number, check_type, describe
 from vehicle_detection._correlation import Filter
@@ -50,11 +51,15 @@ class MixtureTemplate:
         Added to the weighted sum.
     margin
         Cells around the vehicle's box at the left and right, and above and below.
+    border
+        Whether it shows what is seen of a vehicle that the frame's right border cuts: it ends there, without
+        a margin, and is searched for at the border alone; at the left one it is mirrored.
     """
 
     weights: NDArray[np.float32]
     bias: float
     margin: tuple[float, float]
+    border: bool = False
 
     def __post_init__(self) -> None:
         weights = finite_array(self.weights, "weights", (None, None, PLANES))
@@ -69,26 +74,37 @@ class MixtureTemplate:
                 raise InvalidInputError(
                     f"margin must leave cells for the box of {columns}x{rows} cells, got {describe(margin)}"
                 )
+        border: object = self.border
+        if not isinstance(border, bool):
+            raise InvalidInputError(f"border must be True or False, got {describe(border)}")
         object.__setattr__(self, "weights", weights)
 
     @property
     def box_cells(self) -> tuple[float, float]:
         """Columns and rows of cells that the vehicle's box fills."""
         rows, columns = self.weights.shape[:2]
-        return columns - 2 * self.margin[0], rows - 2 * self.margin[1]
+        return columns - self.margin[0] * (1 if self.border else 2), rows - 2 * self.margin[1]
 
     def scores(self, planes: NDArray[np.float32], take: Take = new_array) -> NDArray[np.float32]:
         """Score of every window of a map, ``(rows, columns)`` float32; empty where none fits."""
         rows, columns = self.weights.shape[:2]
         shape = max(planes.shape[1] - rows + 1, 0), max(planes.shape[2] - columns + 1, 0)
         scores = np.full(shape, self.bias, np.float32)
-        if scores.size:
+        if scores.shape[1] == 1:
+            # Of a strip, the places of its windows are put side by side: they are worked on together.
+            line = np.ascontiguousarray(planes.transpose(0, 2, 1)).reshape(-1, 1, planes.shape[1])
+            self._strip_filter.add_to(line, scores.reshape(1, -1), take)
+        elif scores.size:
             self._filter.add_to(planes, scores, take)
         return scores
 
     @functools.cached_property
     def _filter(self) -> Filter:
         return Filter(self.weights)
+
+    @functools.cached_property
+    def _strip_filter(self) -> Filter:
+        return Filter(self.weights.transpose(0, 2, 1).reshape(1, len(self.weights), -1))
 
     def boxes(
         self, level: FeatureMap, rows: NDArray[np.intp], columns: NDArray[np.intp]
@@ -98,6 +114,16 @@ class MixtureTemplate:
         left = level.left + (columns + self.margin[0]) * level.step_x
         top = level.top + (rows + self.margin[1]) * level.step_y
         return np.stack([left, top, left + width * level.step_x, top + height * level.step_y], axis=1)
+
+    def border_windows(
+        self, level: FeatureMap, end: float, *, left: bool, least: float, take: Take = new_array
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Boxes and scores, above the least, of the windows that end at a border at this pixel."""
+        strip = border_strip(level, self.weights.shape[1], end, left=left)
+        scores = self.scores(strip, take)[:, 0] if strip is not None else np.empty(0, np.float32)
+        hits = np.flatnonzero(scores > least)
+        boxes = strip_boxes(level, hits, end, left=left, cells=self.box_cells, above=self.margin[1])
+        return boxes, scores[hits].astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +140,9 @@ class TemplateMixture:
         Turn a template's value into log-odds that it is a vehicle: ``slope * value + offset``.
     threshold
         Least log-odds of a vehicle.
+    near_gain
+        Added to a vehicle's value for every doubling of its box's height from a quarter of the frame's on,
+        and taken off for every halving: there are more places for what is small.
     metadata
         What the model file tells about itself. JSON values only.
 
@@ -134,6 +163,7 @@ class TemplateMixture:
     slope: float = 1.0
     offset: float = 0.0
     threshold: float = 0.0
+    near_gain: float = 0.0
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -146,6 +176,7 @@ class TemplateMixture:
         check_number(self.slope, "slope", above=0, high=1e9)
         check_number(self.offset, "offset")
         check_number(self.threshold, "threshold")
+        check_number(self.near_gain, "near_gain")
         object.__setattr__(self, "templates", templates)
 
     def scores(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -155,6 +186,18 @@ class TemplateMixture:
     def value(self, score: float) -> float:
         """Value of the templates that has a score."""
         return (score + self.threshold - self.offset) / self.slope
+
+    def vehicles(
+        self, image: NDArray[np.uint8], found: Candidates, *, least: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Boxes and values, `least` or more, of the vehicles to which windows of a frame lead, best first."""
+        # At most the frame's height, which is two doublings, is gained.
+        grouped = suppress(found, least=least - 2 * abs(self.near_gain))
+        boxes, values = self.refinement.apply(image, grouped)
+        values = values + self.near_gain * np.log2(4 * (boxes[:, 3] - boxes[:, 1]) / image.shape[0])
+        rows = np.argsort(-values, kind="stable")
+        rows = rows[values[rows] >= least]
+        return boxes[rows], values[rows]
 
     def with_metadata(self, metadata: Mapping[str, Any]) -> TemplateMixture:
         """Return the same model with other facts in its file."""
@@ -171,9 +214,11 @@ class TemplateMixture:
         params = {
             "biases": [template.bias for template in self.templates],
             "margins": [template.margin for template in self.templates],
+            "borders": [template.border for template in self.templates],
             "slope": self.slope,
             "offset": self.offset,
             "threshold": self.threshold,
+            "near_gain": self.near_gain,
         }
         write_model(path, KIND, params, tensors, self.metadata)
 
@@ -205,12 +250,17 @@ def load_model(path: str | os.PathLike[str] = "default") -> TemplateMixture | Ve
         raise ModelFileError(f"{model.name} holds a model of the unknown kind {model.kind!r}; train one")
     params, tensors = model.params, model.tensors
     try:
+        borders = params.get("borders", [False] * len(params["biases"]))
+        rows = zip(params["biases"], params["margins"], borders, strict=True)
         templates = tuple(
-            MixtureTemplate(tensors[f"{index}.weights"], float(bias), (float(margin[0]), float(margin[1])))
-            for index, (bias, margin) in enumerate(zip(params["biases"], params["margins"], strict=True))
+            MixtureTemplate(
+                tensors[f"{index}.weights"], float(bias), (float(margin[0]), float(margin[1])), border
+            )
+            for index, (bias, margin, border) in enumerate(rows)
         )
         refinement = Refinement(tensors["refinement.weights"], tensors["refinement.bias"])
         numbers = {name: float(params[name]) for name in ("slope", "offset", "threshold")}
+        numbers["near_gain"] = float(params.get("near_gain", 0.0))
         return TemplateMixture(templates, refinement, **numbers, metadata=model.metadata)
     except (InvalidInputError, KeyError, IndexError, TypeError, ValueError) as error:
         raise ModelFileError(f"{model.name} does not fit its own parameters: {error}") from error
@@ -289,8 +339,7 @@ class MixtureSearch:
         mixture = self.mixture
         scores = mixture.scores(found.scores)
         evidence = scores >= params.min_score
-        grouped = suppress(found, least=mixture.value(0.0))
-        boxes, values = mixture.refinement.apply(image, grouped)
+        boxes, values = mixture.vehicles(image, found, least=mixture.value(0.0))
         return MixtureFind(
             Detections(found.boxes[evidence], scores[evidence]), Detections(boxes, mixture.scores(values))
         )
@@ -301,9 +350,7 @@ class MixtureSearch:
         check_type(params, "params", PyramidParams, "a mixture of templates is searched for on a pyramid")
         least = np.float32(min(WEAKEST, self.mixture.value(params.min_score)))
         shape = image.shape[:2]
-        narrow = min(self.mixture.templates, key=lambda template: template.box_cells[0])
-        low = min(self.mixture.templates, key=lambda template: template.box_cells[1])
-        sizes = params.sizes(narrow.box_cells[0], low.box_cells[1], shape)
+        sizes = params.sizes(*smallest_box(self.mixture.templates), shape)
         levels = pair_levels(sizes, share=params.horizon is None)
         with single_threaded_opencv():
             images = halved(image)
@@ -338,7 +385,7 @@ class MixtureSearch:
             return Candidates.empty()
         buffers = self._local.__dict__.setdefault("buffers", Buffers())
         found = [
-            self._hits(index, template, features, least, buffers.take)
+            self._hits(index, template, features, least, shape[1], buffers.take)
             for pixels, features in level_maps(images, level, rows, buffers.take)
             for index, template in templates[pixels]
         ]
@@ -349,20 +396,36 @@ class MixtureSearch:
         template: MixtureTemplate, pixels: float, params: PyramidParams, shape: tuple[int, ...]
     ) -> tuple[int, int]:
         width, height = (cells * pixels for cells in template.box_cells)
+        if template.border:
+            # What is cut is wider than what is seen of it.
+            width = max(width, height)
         top, bottom = params.rows(width, height, shape)
         margin = round(template.margin[1] * pixels)
         return max(0, top - margin), min(shape[0], bottom + margin)
 
     @staticmethod
     def _hits(
-        index: int, template: MixtureTemplate, level: FeatureMap, least: np.float32, take: Take
+        index: int,
+        template: MixtureTemplate,
+        level: FeatureMap,
+        least: np.float32,
+        width: int,
+        take: Take,
     ) -> Candidates:
-        scores = template.scores(level.planes, take)
-        if not scores.size:
-            return Candidates.empty()
-        rows, columns = np.divmod(np.flatnonzero(scores > least), scores.shape[1])
-        return Candidates(
-            template.boxes(level, rows, columns),
-            scores[rows, columns].astype(np.float64),
-            np.full(len(rows), index, np.intp),
-        )
+        if template.border:
+            found = [
+                template.border_windows(level, end, left=left, least=float(least), take=take)
+                for left, end in ((True, 0.0), (False, float(width)))
+            ]
+            boxes, values = (np.concatenate(part) for part in zip(*found))
+        else:
+            scores = template.scores(level.planes, take)
+            rows, columns = (scores > least).nonzero()
+            boxes, values = template.boxes(level, rows, columns), scores[rows, columns].astype(np.float64)
+        return Candidates(boxes, values, np.full(len(boxes), index, np.intp))
+
+
+def smallest_box(templates: Sequence[MixtureTemplate]) -> tuple[float, float]:
+    """Least columns and rows of a box, of whole vehicles where a template shows one."""
+    boxes = [each.box_cells for each in templates if not each.border] or [t.box_cells for t in templates]
+    return min(columns for columns, _ in boxes), min(rows for _, rows in boxes)

@@ -15,7 +15,6 @@ from vehicle_detection._checks import check_integer
 from vehicle_detection._jobs import resolve_jobs
 from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection._mixture_windows import check_sources
-from vehicle_detection._refinement import suppress
 from vehicle_detection.boxes import Detections
 from vehicle_detection.evaluation import Labels, evaluate_detections, match_detections, precision_recall_curve
 from vehicle_detection.mixture import MixtureSearch, TemplateMixture
@@ -108,6 +107,7 @@ def judge_mixture(
     sources: Sequence[FrameSource],
     params: MixtureParams | None = None,
     *,
+    always: Sequence[FrameSource] = (),
     random_state: int = 0,
     n_jobs: int | None = None,
     on_step: Callable[[str], object] | None = None,
@@ -118,6 +118,8 @@ def judge_mixture(
     ----------
     sources
         Labelled frames of two sources or more.
+    always
+        Further sources, that every model is trained on and none is judged by.
     params, random_state, n_jobs, on_step
         As for `train_mixture`.
 
@@ -138,11 +140,12 @@ def judge_mixture(
     are fitted to the same boxes (Platt, "Probabilistic outputs for support vector machines", 1999).
     """
     sources = check_sources(sources, least=2)
+    known = check_sources((*sources, *check_sources(always, least=0)))[len(sources) :]
     check_integer(random_state, "random_state", low=0, high=2**32 - 1)
     tell = on_step or (lambda line: None)
     held: list[HeldOut] = []
     for out in sources:
-        rest = [source for source in sources if source is not out]
+        rest = [source for source in sources if source is not out] + [*known]
         mixture = train_mixture(
             rest, params, random_state=random_state, n_jobs=n_jobs, on_step=lambda line: None
         )
@@ -153,7 +156,9 @@ def judge_mixture(
     ]
     slope, offset = _log_odds(held)
     threshold = slope * _threshold(held) + offset
-    mixture = train_mixture(sources, params, random_state=random_state, n_jobs=n_jobs, on_step=on_step)
+    mixture = train_mixture(
+        [*sources, *known], params, random_state=random_state, n_jobs=n_jobs, on_step=on_step
+    )
     calibrated = replace(mixture, slope=slope, offset=offset, threshold=threshold)
     return calibrated, scores, held
 
@@ -165,8 +170,8 @@ def find_in(mixture: TemplateMixture, source: FrameSource, *, n_jobs: int | None
 
     def boxes_of(pair: tuple[Any, NDArray[np.uint8]]) -> tuple[Any, Detections]:
         key, image = pair
-        windows = suppress(search.candidates(image, sizes), least=_LOWEST)
-        return key, Detections(*mixture.refinement.apply(image, windows))
+        found = search.candidates(image, sizes)
+        return key, Detections(*mixture.vehicles(image, found, least=_LOWEST))
 
     with ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
         return [

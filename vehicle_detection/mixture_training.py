@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +14,11 @@ from numpy.typing import NDArray
 from vehicle_detection._checks import check_integer, check_type
 from vehicle_detection._feature_maps import COARSE, FINE, PLANES, mirror_planes
 from vehicle_detection._jobs import resolve_jobs
+from vehicle_detection._mixture_params import MixtureParams
 from vehicle_detection._mixture_windows import (
     Frame,
     FrameSource,
     Mined,
-    MixtureParams,
     Negatives,
     check_sources,
     frames_of,
@@ -38,6 +39,9 @@ log = logging.getLogger(__name__)
 
 # Steps of the solver while negatives are still looked for, and in the end.
 _FEW_STEPS, _MANY_STEPS = 50, 200
+# A vehicle is cut by a border that it comes nearer to than this, in pixels; share of a vehicle that is left
+# where it is cut on purpose.
+_AT_BORDER, _SHOWN = 3, (0.3, 0.85)
 
 
 def train_mixture(
@@ -86,8 +90,11 @@ def train_mixture(
     frames = frames_of(sources)
     rng = np.random.default_rng(random_state)
     templates = [_blank(shape, params.margin) for shape in params.shapes]
-    positives = _positives(frames, templates, params, rng)
-    for shape, rows in zip(params.shapes, positives):
+    positives = _positives(_whole(frames, params, rng), templates, params)
+    at_border = [_blank(shape, params.margin, border=True) for shape in params.border_shapes]
+    positives += _positives(_cut(frames, params, rng), at_border, params)
+    templates += at_border
+    for shape, rows in zip(params.shapes + params.border_shapes, positives):
         if not len(rows):
             raise InvalidInputError(
                 f"sources must hold vehicles of every shape, got none like {shape[0]:g}x{shape[1]:g} that is "
@@ -97,7 +104,8 @@ def train_mixture(
         positives[index] = turned(positives[index], rng)
     tell(f"{[len(rows) for rows in positives]} vehicles")
     with ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
-        rounds = _Rounds(frames, positives, params, pool)
+        facing = params.facing + (False,) * len(at_border)
+        rounds = _Rounds(frames, positives, facing, params, pool)
         seeds = rng.integers(2**32, size=len(frames)).tolist()
         rounds.draw(templates, seeds)
         for step, share in enumerate(params.rounds):
@@ -108,9 +116,13 @@ def train_mixture(
             if share == 1 and new < 0.01 * total:
                 break
         templates = rounds.solve(templates, _MANY_STEPS)
-        found = tuple(view.template for view in with_mirrored(templates, params.facing))
-        refinement = _fit_refinement(TemplateMixture(found, Refinement.none()), frames, params, pool)
-    return TemplateMixture(found, refinement)
+        templates = [
+            replace(each, bias=each.bias + params.border_bias) if each.border else each for each in templates
+        ]
+        found = tuple(view.template for view in with_mirrored(templates, facing))
+        plain = TemplateMixture(found, Refinement.none(), near_gain=params.near_gain)
+        refinement = _fit_refinement(plain, frames, params, pool)
+    return replace(plain, refinement=refinement)
 
 
 class _Rounds:
@@ -120,16 +132,18 @@ class _Rounds:
         self,
         frames: Sequence[Frame],
         positives: list[NDArray[np.float32]],
+        facing: Sequence[bool],
         params: MixtureParams,
         pool: ThreadPoolExecutor,
     ) -> None:
         self._frames, self._positives, self._params, self._pool = frames, positives, params, pool
+        self._facing = facing
         self._negatives = Negatives([rows.shape[1] for rows in positives])
         self._vectors = [np.zeros(rows.shape[1] + 1) for rows in positives]
 
     def draw(self, templates: Sequence[MixtureTemplate], seeds: Sequence[int]) -> None:
         """Take windows at random."""
-        views = with_mirrored(templates, self._params.facing)
+        views = with_mirrored(templates, self._facing)
 
         def windows(number: int) -> tuple[int, Mined]:
             return number, random_windows(self._frames[number], seeds[number], views, self._params)
@@ -139,7 +153,7 @@ class _Rounds:
     def mine(self, templates: Sequence[MixtureTemplate], numbers: Sequence[int]) -> tuple[int, int]:
         """Take hard negatives from these frames; return how many are new, and how many there are."""
         self._negatives.trim(templates, self._params.most_negatives)
-        views = with_mirrored(templates, self._params.facing)
+        views = with_mirrored(templates, self._facing)
 
         def windows(number: int) -> tuple[int, Mined]:
             return number, mine_windows(self._frames[number], views, self._params)
@@ -179,48 +193,78 @@ def turned(rows: NDArray[np.float32], rng: np.random.Generator, tries: int = 5) 
     return np.ascontiguousarray(pairs[number, best])
 
 
-def _blank(shape: tuple[float, float], margin: float) -> MixtureTemplate:
-    columns, rows = (round(side + 2 * margin) for side in shape)
-    return MixtureTemplate(
-        np.zeros((rows, columns, PLANES), np.float32),
-        0.0,
-        ((columns - shape[0]) / 2, (rows - shape[1]) / 2),
-    )
+def _blank(shape: tuple[float, float], margin: float, *, border: bool = False) -> MixtureTemplate:
+    columns, rows = round(shape[0] + margin * (1 if border else 2)), round(shape[1] + 2 * margin)
+    across = (columns - shape[0]) / (1 if border else 2)
+    weights = np.zeros((rows, columns, PLANES), np.float32)
+    return MixtureTemplate(weights, 0.0, (across, (rows - shape[1]) / 2), border)
 
 
 def _filled(template: MixtureTemplate, vector: Floats) -> MixtureTemplate:
     weights = vector[:-1].astype(np.float32).reshape(template.weights.shape)
-    return MixtureTemplate(weights, float(np.float32(vector[-1])), template.margin)
+    return replace(template, weights=weights, bias=float(np.float32(vector[-1])))
 
 
 def _window(image: Image, box: Floats, template: MixtureTemplate) -> NDArray[np.float32]:
-    """Features of a box as a template sees it, ``(rows, columns, 28)``."""
+    """Features of a box as a template sees it, ``(28, rows, columns)``."""
     inside = template.box_cells
     rows, columns = template.weights.shape[:2]
-    size = np.sqrt((box[2] - box[0]) / inside[0] * (box[3] - box[1]) / inside[1])
-    cell = FINE if size < COARSE else COARSE
+    step_x, step_y = (box[2] - box[0]) / inside[0], (box[3] - box[1]) / inside[1]
+    cell = FINE if np.sqrt(step_x * step_y) < COARSE else COARSE
+    if template.border:
+        # The window ends with the box: its margin is part of what is warped.
+        box, inside = box - [template.margin[0] * step_x, 0, 0, 0], (float(columns), inside[1])
     return box_planes(image, box.tolist(), inside, (columns, rows), cell)
 
 
-def _positives(
-    frames: Sequence[Frame],
-    templates: Sequence[MixtureTemplate],
-    params: MixtureParams,
-    rng: np.random.Generator,
-) -> list[NDArray[np.float32]]:
-    """Features of the vehicles of each template, mirrored and jittered, ``(N, length)``."""
-    aspects = np.log([template.box_cells[0] / template.box_cells[1] for template in templates])
-    found: list[list[NDArray[np.float32]]] = [[] for _ in templates]
+Seen = Iterator[tuple[Image, Floats]]
+"""Images and the place of a vehicle in each."""
+
+
+def _whole(frames: Sequence[Frame], params: MixtureParams, rng: np.random.Generator) -> Seen:
+    """Vehicles where they are, and moved a little."""
     for frame in frames:
         for box in frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.least_width]:
-            sides = np.tile(box[2:] - box[:2], 2)
-            apart = np.abs(np.log(sides[0] / sides[1]) - aspects)
-            for index in np.flatnonzero((apart == apart.min()) | (apart < params.near)).tolist():
-                for copy in range(params.jitter):
-                    shift = rng.uniform(-1, 1, 4) * params.shake * sides * (copy > 0)
-                    planes = _window(frame.image, box + shift, templates[index])
-                    for view in (planes, mirror_planes(planes)):
-                        found[index].append(view.transpose(1, 2, 0).ravel())
+            for copy in range(params.jitter):
+                shift = rng.uniform(-1, 1, 4) * params.shake * np.tile(box[2:] - box[:2], 2)
+                yield frame.image, box + shift * (copy > 0)
+
+
+def _cut(frames: Sequence[Frame], params: MixtureParams, rng: np.random.Generator) -> Seen:
+    """Vehicles that the right border cuts, and whole ones in images that are cut through them."""
+    for frame in frames:
+        width = frame.image.shape[1]
+        mirrored = np.ascontiguousarray(frame.image[:, ::-1])
+        for image, boxes in (frame.image, frame.boxes), (mirrored, mirror_boxes(frame.boxes, width)):
+            for box in boxes[boxes[:, 2] - boxes[:, 0] >= params.least_width]:
+                sides = np.tile(box[2:] - box[:2], 2)
+                if box[2] >= width - _AT_BORDER:
+                    for copy in range(params.jitter):
+                        x1, y1, _, y2 = box + rng.uniform(-1, 1, 4) * params.shake * sides * (copy > 0)
+                        yield image, np.array([x1, y1, width, y2])
+                end = round(box[0] + rng.uniform(*_SHOWN) * sides[0])
+                if box[0] > _AT_BORDER and params.least_width <= end - box[0] and end < width - _AT_BORDER:
+                    yield image[:, :end], np.array([*box[:2], end, box[3]])
+
+
+def mirror_boxes(boxes: Floats, width: float) -> Floats:
+    """Boxes in the mirrored image of this width."""
+    return np.stack([width - boxes[:, 2], boxes[:, 1], width - boxes[:, 0], boxes[:, 3]], axis=1)
+
+
+def _positives(
+    vehicles: Seen, templates: Sequence[MixtureTemplate], params: MixtureParams
+) -> list[NDArray[np.float32]]:
+    """Features of the vehicles of each template, ``(N, length)``."""
+    found: list[list[NDArray[np.float32]]] = [[] for _ in templates]
+    aspects = np.log([template.box_cells[0] / template.box_cells[1] for template in templates])
+    for image, box in vehicles if templates else ():
+        apart = np.abs(np.log((box[2] - box[0]) / (box[3] - box[1])) - aspects)
+        for index in np.flatnonzero((apart == apart.min()) | (apart < params.near)).tolist():
+            planes = _window(image, box, templates[index])
+            # At the border every vehicle comes from both sides already.
+            for view in (planes,) if templates[index].border else (planes, mirror_planes(planes)):
+                found[index].append(view.transpose(1, 2, 0).ravel())
     return [np.array(rows, np.float32).reshape(-1, t.weights.size) for rows, t in zip(found, templates)]
 
 
@@ -274,8 +318,7 @@ def _fit_refinement(
         shifts = (true - boxes) / np.tile(boxes[:, 2:] - boxes[:, :2], 2)
         mirrored = np.ascontiguousarray(frame.image[:, ::-1])
         width = frame.image.shape[1]
-        flipped = np.stack([width - boxes[:, 2], boxes[:, 1], width - boxes[:, 0], boxes[:, 3]], axis=1)
-        back = np.stack([-shifts[:, 2], shifts[:, 1], -shifts[:, 0], shifts[:, 3]], axis=1)
+        flipped, back = mirror_boxes(boxes, width), mirror_boxes(shifts, 0)
         features = np.concatenate([crop_features(frame.image, boxes), crop_features(mirrored, flipped)])
         return features, np.concatenate([shifts, back])
 
