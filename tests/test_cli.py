@@ -718,6 +718,9 @@ def drawn_roads(tmp_path_factory):
     return folder
 
 
+PICTURES = ("curves", "town-missed", "town-false", "stills-missed", "stills-false")
+
+
 def test_train_frames(drawn_roads, small_training, tmp_path):
     names = [tmp_path / f"road.{suffix}" for suffix in ("safetensors", "md", "csv")]
     words = [
@@ -732,11 +735,15 @@ def test_train_frames(drawn_roads, small_training, tmp_path):
         "--seed",
         5,
         "--no-drawn",
+        "--pictures",
+        tmp_path / "pictures",
     ]
     out = succeed(*words)
+    pictures = [tmp_path / "pictures" / f"{name}.png" for name in PICTURES]
     assert "town: judged by a model that does not know it" in out
     assert "on sources left out of training, IoU 0.5" in out
-    assert out.endswith(f"wrote {', '.join(map(str, names))}\n")
+    assert out.endswith(f"wrote {', '.join(map(str, names + pictures))}\n")
+    assert [picture.read_bytes()[:4] for picture in pictures] == 5 * [b"\x89PNG"]
     model = load_model(names[0])
     assert [template.box_cells for template in model.templates] == [(6, 5)]
     assert model.metadata["training"] == {"random_state": 5}
@@ -774,6 +781,13 @@ def test_train_frames_refuses_bad_input_before_it_trains(drawn_roads, tmp_path, 
         r"-o must be a file, got the folder": [drawn_roads, "-o", tmp_path],
         r"--card needs an existing folder": [drawn_roads, "-o", model, "--card", tmp_path / "none" / "m.md"],
         r"--curves \S+ is -o \S+ as well": [drawn_roads, "-o", model, "--curves", model],
+        r"--pictures must be a folder, .* cannot be made": [
+            drawn_roads,
+            "-o",
+            model,
+            "--pictures",
+            one / "labels" / "town.csv" / "x",
+        ],
         r"random_state must be an integer from 0": [drawn_roads, "-o", model, "--seed", -1],
     }
     for message, words in cases.items():

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from vehicle_detection._cli_output import check_apart, print_table
+from vehicle_detection._cli_output import check_apart, output_folder, print_table
 
 _COLUMNS = ("f1", "best_f1", "average_precision", "precision", "recall", "mean_iou")
 _COUNTS = ("false_per_frame", "false_per_empty_frame")
@@ -31,6 +31,10 @@ def train_frames(
     drawn: Annotated[
         bool, typer.Option("--drawn/--no-drawn", help="Train on frames that the project draws, too.")
     ] = True,
+    pictures: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder for the curves and the worst mistakes as pictures."),
+    ] = None,
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of everything random.")] = 0,
 ) -> None:
     """Train the model for any road, and judge it on sources that it was not trained on."""
@@ -47,15 +51,21 @@ def train_frames(
     sources = find_sources(data)
     check_sources(sources, least=2)
     always = [drawn_source(random_state=seed)] if drawn else []
-    trained, scores, held = judge_mixture(sources, always=always, random_state=seed, on_step=typer.echo)
-    sources += always
-    trained.with_metadata(as_metadata(scores, sources, seed)).save(output)
-    if card is not None:
-        write_card(card, trained, scores, sources, seed)
-    if curves is not None:
-        write_curves(curves, held)
+    with output_folder(pictures, "--pictures"):
+        trained, scores, held = judge_mixture(sources, always=always, random_state=seed, on_step=typer.echo)
+        sources += always
+        trained.with_metadata(as_metadata(scores, sources, seed)).save(output)
+        if card is not None:
+            write_card(card, trained, scores, sources, seed)
+        if curves is not None:
+            write_curves(curves, held)
+        written = [*targets.values()]
+        if pictures is not None:
+            from vehicle_detection._mixture_pictures import write_pictures
+
+            written += [pictures / name for name in write_pictures(pictures, scores, held)]
     print_road_scores({score.name: score.to_dict() for score in scores})
-    typer.echo(f"wrote {', '.join(map(str, targets.values()))}")
+    typer.echo(f"wrote {', '.join(map(str, written))}")
 
 
 def print_road_scores(scores: Mapping[str, Mapping[str, Any]]) -> None:

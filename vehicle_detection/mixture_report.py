@@ -42,6 +42,8 @@ class RoadScore:
         At the threshold that the other sources tell.
     false_per_frame, false_per_empty_frame
         False boxes a frame, and on frames without any label; NaN where there are none.
+    threshold
+        That threshold, a value of the templates.
     average_precision, best_f1
         Over all thresholds, and at the best one.
     """
@@ -56,6 +58,7 @@ class RoadScore:
     mean_iou: float
     false_per_frame: float
     false_per_empty_frame: float
+    threshold: float
     average_precision: float
     best_f1: float
 
@@ -197,6 +200,7 @@ def _score(part: HeldOut, threshold: float) -> RoadScore:
         mean_iou=scores.mean_iou,
         false_per_frame=scores.false_positives_per_frame,
         false_per_empty_frame=int((values >= threshold).sum()) / empty if empty else float("nan"),
+        threshold=threshold,
         average_precision=float((np.diff(recall, prepend=0) * best).sum()),
         best_f1=float(_f1(precision, recall).max(initial=0.0)),
     )
