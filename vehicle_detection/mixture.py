@@ -155,7 +155,7 @@ class TemplateMixture:
     --------
     >>> mixture = load_model()
     >>> [template.box_cells for template in mixture.templates]
-    [(6.0, 8.0), (7.0, 6.0), (10.0, 6.0)]
+    [(6.0, 8.0), (7.0, 6.0), (10.0, 6.0), (4.0, 7.0), (6.0, 6.0), (9.0, 5.0)]
     """
 
     templates: tuple[MixtureTemplate, ...]
