@@ -163,10 +163,8 @@ def _shipped(runs: Runs, folder: Path) -> str:
     for split in (split for split in SPLITS if split in _SPLIT_KEYS):
         own = metrics["splits"][_SPLIT_KEYS[split]]
         best = max(row["accuracy"] for row in course.where(split=split))
-        left = (1 - own["accuracy"]) / (1 - best)
-        lines.append(
-            f"| {split} | {own['accuracy']:.4f} | {best:.4f} | {left:.0%} | {own['near_copies']:.1%} |"
-        )
+        left = f"{(1 - own['accuracy']) / (1 - best):.0%}" if best < 1 else "-"
+        lines.append(f"| {split} | {own['accuracy']:.4f} | {best:.4f} | {left} | {own['near_copies']:.1%} |")
     text = f"The expected calibration error is {metrics['calibration_error']:.4f} on the split by sequences."
     return "\n".join([*lines, "", text, ""])
 

@@ -677,8 +677,9 @@ def test_info_of_the_shipped_models():
     out = succeed("info", "default")
     assert succeed("info") == out
     default = load_model()
-    assert out.startswith(f"default: 3 templates, threshold {default.threshold:.2f} (log-odds)\n")
-    assert "box of 7x6 cells" in out
+    assert out.startswith(f"default: 6 templates, threshold {default.threshold:.2f} (log-odds)\n")
+    assert re.search(r"box of 7x6 cells\s*\n", out)
+    assert "box of 6x6 cells at the frame's border" in out
     for name, scores in default.metadata["metrics"]["left_out"].items():
         assert re.search(rf"{name} .*{scores['f1']:.3f}", out)
 

@@ -1098,8 +1098,9 @@ def test_the_course_tables_are_written(patch_set, tmp_path, monkeypatch):
     course_tables.main(command)
     page = (out / "results.md").read_text(encoding="utf-8")
     rows = (out / "results" / "rows.csv").read_bytes()
-    assert page.count("\n## ") == 8
+    assert page.count("\n## ") == 9
     assert "| random | 96 | 24 |" in page
+    assert "## The shipped model" in page
     assert "| (9, 8, 2, All) | " in page
     assert str(tmp_path) not in page
     figures = sorted(path.stem for path in (out / "results").glob("*.png"))

@@ -157,7 +157,8 @@ def info(
     templates = f"{count} template{'s' * (count > 1)}"
     if isinstance(loaded, TemplateMixture):
         shapes = {
-            str(number): f"box of {template.box_cells[0]:g}x{template.box_cells[1]:g} cells"
+            str(number): "box of {:g}x{:g} cells".format(*template.box_cells)
+            + " at the frame's border" * template.border
             for number, template in enumerate(loaded.templates, 1)
         }
         print_facts(f"{model}: {templates}, threshold {loaded.threshold:.2f} (log-odds)", shapes)
