@@ -87,8 +87,7 @@ def test_stages_are_measured_and_the_search_is_put_back(frame, classifier):
         "blocks",
         "spatial bins",
         "histogram",
-        "product",
-        "sums",
+        "correlation",
         "hits",
     }
     assert known | {"rest"} == set(stages)

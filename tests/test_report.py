@@ -323,7 +323,7 @@ def test_a_mixture_of_templates_tells_what_it_reaches_on_other_roads(tmp_path):
     assert "<dt>horizon</dt><dd>0.5</dd>" in page
     assert "<summary>Camera (assumed)</summary>" in page
     assert "fitted boxes" not in page
-    assert "3 templates, for boxes of 6\xa0\xd7\xa08, 7\xa0\xd7\xa06" in page
+    assert "6 templates, for boxes of 6\xa0\xd7\xa08, 7\xa0\xd7\xa06" in page
     for name, scores in load_model().metadata["metrics"]["left_out"].items():
         assert name in page
         assert f"{scores['f1']:.6g}" in page
