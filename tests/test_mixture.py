@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from vehicle_detection import VehicleDetector, mixture
 from vehicle_detection._feature_maps import PLANES, FeatureMap, Level, halved, level_maps, mirror_planes
+from vehicle_detection._mixture_template import MixtureTemplate
 from vehicle_detection._model_file import FORMAT, FORMAT_VERSION, _checksum
 from vehicle_detection._refinement import (
     CROP_LENGTH,
@@ -22,7 +23,7 @@ from vehicle_detection._refinement import (
 from vehicle_detection.boxes import box_areas, clip_boxes, iou_matrix
 from vehicle_detection.classifier import VehicleClassifier, load_classifier
 from vehicle_detection.errors import InvalidInputError, ModelFileError
-from vehicle_detection.mixture import MixtureSearch, MixtureTemplate, TemplateMixture, load_model
+from vehicle_detection.mixture import MixtureSearch, TemplateMixture, load_model
 from vehicle_detection.params import PyramidParams, SearchParams
 from vehicle_detection.search import find_cars
 from vehicle_detection.synthetic import render_scene

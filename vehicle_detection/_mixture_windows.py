@@ -15,10 +15,10 @@ from vehicle_detection._feature_maps import FeatureMap, halved, level_maps, mirr
 from vehicle_detection._jobs import single_threaded_opencv
 from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection._mixture_params import MixtureParams, entries
+from vehicle_detection._mixture_template import MixtureTemplate, smallest_box
 from vehicle_detection._refinement import mostly_inside, overlaps
 from vehicle_detection.boxes import box_areas, intersection_matrix, iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture import MixtureTemplate, smallest_box
 
 Floats = NDArray[np.float64]
 

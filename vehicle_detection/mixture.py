@@ -9,24 +9,22 @@ detect vehicles by clustering appearance patterns" (IEEE T-ITS 2015) for vehicle
 
 from __future__ import annotations
 
-import functools
 import os
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._border_strips import border_strip, strip_boxes
-from vehicle_detection._buffers import Buffers, Take, new_array
-from vehicle_detection._checks import check_image, check_number, check_type, describe
-from vehicle_detection._correlation import Filter
-from vehicle_detection._feature_maps import COARSE, PLANES, FeatureMap, Level, halved, level_maps, pair_levels
+from vehicle_detection._buffers import Buffers, Take
+from vehicle_detection._checks import check_image, check_number, check_type
+from vehicle_detection._feature_maps import COARSE, FeatureMap, Level, halved, level_maps, pair_levels
 from vehicle_detection._jobs import Crew, single_threaded_opencv
+from vehicle_detection._mixture_template import MixtureTemplate, smallest_box
 from vehicle_detection._model_file import read_model, write_model
-from vehicle_detection._refinement import WEAKEST, Candidates, Refinement, finite_array, suppress
+from vehicle_detection._refinement import WEAKEST, Candidates, Refinement, suppress
 from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import KIND as PATCH_KIND
 from vehicle_detection.classifier import VehicleClassifier, build_classifier
@@ -37,93 +35,6 @@ KIND = "mixture"
 """Kind of the model files that hold a mixture of templates."""
 
 _MOST_WINDOWS = 2000
-
-
-@dataclass(frozen=True, eq=False)
-class MixtureTemplate:
-    """One linear template over the cells of a feature map.
-
-    Attributes
-    ----------
-    weights
-        ``(rows, columns, 28)`` float32.
-    bias
-        Added to the weighted sum.
-    margin
-        Cells around the vehicle's box at the left and right, and above and below.
-    border
-        Whether it shows what is seen of a vehicle that the frame's right border cuts: it ends there, without
-        a margin, and is searched for at the border alone; at the left one it is mirrored.
-    """
-
-    weights: NDArray[np.float32]
-    bias: float
-    margin: tuple[float, float]
-    border: bool = False
-
-    def __post_init__(self) -> None:
-        weights = finite_array(self.weights, "weights", (None, None, PLANES))
-        check_number(self.bias, "bias")
-        rows, columns = weights.shape[:2]
-        margin: object = self.margin
-        if not isinstance(margin, tuple) or len(margin) != 2:
-            raise InvalidInputError(f"margin must be two numbers of cells, got {describe(margin)}")
-        for cells, side in zip(margin, (columns, rows)):
-            # Above half a side nothing would be left for the box.
-            if not check_number(cells, "margin", low=-1) < side / 2:
-                raise InvalidInputError(
-                    f"margin must leave cells for the box of {columns}x{rows} cells, got {describe(margin)}"
-                )
-        border: object = self.border
-        if not isinstance(border, bool):
-            raise InvalidInputError(f"border must be True or False, got {describe(border)}")
-        object.__setattr__(self, "weights", weights)
-
-    @property
-    def box_cells(self) -> tuple[float, float]:
-        """Columns and rows of cells that the vehicle's box fills."""
-        rows, columns = self.weights.shape[:2]
-        return columns - self.margin[0] * (1 if self.border else 2), rows - 2 * self.margin[1]
-
-    def scores(self, planes: NDArray[np.float32], take: Take = new_array) -> NDArray[np.float32]:
-        """Score of every window of a map, ``(rows, columns)`` float32; empty where none fits."""
-        rows, columns = self.weights.shape[:2]
-        shape = max(planes.shape[1] - rows + 1, 0), max(planes.shape[2] - columns + 1, 0)
-        scores = np.full(shape, self.bias, np.float32)
-        if scores.shape[1] == 1:
-            # Of a strip, the places of its windows are put side by side: they are worked on together.
-            line = np.ascontiguousarray(planes.transpose(0, 2, 1)).reshape(-1, 1, planes.shape[1])
-            self._strip_filter.add_to(line, scores.reshape(1, -1), take)
-        elif scores.size:
-            self._filter.add_to(planes, scores, take)
-        return scores
-
-    @functools.cached_property
-    def _filter(self) -> Filter:
-        return Filter(self.weights)
-
-    @functools.cached_property
-    def _strip_filter(self) -> Filter:
-        return Filter(self.weights.transpose(0, 2, 1).reshape(1, len(self.weights), -1))
-
-    def boxes(
-        self, level: FeatureMap, rows: NDArray[np.intp], columns: NDArray[np.intp]
-    ) -> NDArray[np.float64]:
-        """Boxes, in pixels of the frame, of the windows that start at these cells of a map."""
-        width, height = self.box_cells
-        left = level.left + (columns + self.margin[0]) * level.step_x
-        top = level.top + (rows + self.margin[1]) * level.step_y
-        return np.stack([left, top, left + width * level.step_x, top + height * level.step_y], axis=1)
-
-    def border_windows(
-        self, level: FeatureMap, end: float, *, left: bool, least: float, take: Take = new_array
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Boxes and scores, above the least, of the windows that end at a border at this pixel."""
-        strip = border_strip(level, self.weights.shape[1], end, left=left)
-        scores = self.scores(strip, take)[:, 0] if strip is not None else np.empty(0, np.float32)
-        hits = np.flatnonzero(scores > least)
-        boxes = strip_boxes(level, hits, end, left=left, cells=self.box_cells, above=self.margin[1])
-        return boxes, scores[hits].astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -423,9 +334,3 @@ class MixtureSearch:
             rows, columns = (scores > least).nonzero()
             boxes, values = template.boxes(level, rows, columns), scores[rows, columns].astype(np.float64)
         return Candidates(boxes, values, np.full(len(boxes), index, np.intp))
-
-
-def smallest_box(templates: Sequence[MixtureTemplate]) -> tuple[float, float]:
-    """Least columns and rows of a box, of whole vehicles where a template shows one."""
-    boxes = [each.box_cells for each in templates if not each.border] or [t.box_cells for t in templates]
-    return min(columns for columns, _ in boxes), min(rows for _, rows in boxes)

@@ -15,6 +15,7 @@ from vehicle_detection._checks import check_integer, check_type
 from vehicle_detection._feature_maps import COARSE, FINE, PLANES, mirror_planes
 from vehicle_detection._jobs import resolve_jobs
 from vehicle_detection._mixture_params import MixtureParams
+from vehicle_detection._mixture_template import MixtureTemplate
 from vehicle_detection._mixture_windows import (
     Frame,
     FrameSource,
@@ -29,7 +30,7 @@ from vehicle_detection._mixture_windows import (
 from vehicle_detection._refinement import CROP_LENGTH, Refinement, box_planes, crop_features, suppress
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture import MixtureSearch, MixtureTemplate, TemplateMixture
+from vehicle_detection.mixture import MixtureSearch, TemplateMixture
 
 __all__ = ["FrameSource", "MixtureParams", "train_mixture"]
 
