@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import motmetrics
@@ -459,11 +460,38 @@ def test_ignore_rules(track, ignored_box, detection, neutral):
     assert tracked.longest_false_positive_run == int(not neutral)
 
 
+@pytest.mark.parametrize(
+    ("ignored_box", "neutral"),
+    [
+        pytest.param((-100, -100, 400, 200), True, id="inside"),
+        pytest.param((50, 0, 400, 60), True, id="half inside"),
+        pytest.param((51, 0, 400, 60), False, id="less than half inside"),
+        pytest.param((40, 20, 60, 40), False, id="around the ignored box"),
+        pytest.param((100, 0, 400, 60), False, id="beside it"),
+    ],
+)
+def test_ignored_boxes_as_regions(ignored_box, neutral):
+    labels = boxes_of((0, 4, ignored_box), ignore=IGNORED)
+    found = boxes_of((0, 7, CAR, 1.0))
+    assert evaluate_detections(found, labels).fp == 1
+    scores = evaluate_detections(found, labels, ignored_as_regions=True)
+    assert (scores.ignored, scores.fp) == (int(neutral), int(not neutral))
+
+
+def test_the_curve_with_ignored_boxes_as_regions():
+    labels = boxes_of((0, 1, moved(500)), (0, 2, (0, 0, 300, 90)), ignore=np.array([False, True]))
+    found = boxes_of((0, -1, CAR, 2.0), (0, -1, moved(500), 1.0))
+    assert precision_recall_curve(found, labels)[0].tolist() == [0.0, 0.5]
+    precision, recall, thresholds = precision_recall_curve(found, labels, ignored_as_regions=True)
+    assert [each.tolist() for each in (precision, recall, thresholds)] == [[1.0], [1.0], [1.0]]
+
+
 def test_a_usable_box_is_matched_before_the_ignore_rules():
     labels = boxes_of((0, 1, CAR), (0, -1, (0, 0, 500, 500)), ignore=np.array([False, True]))
     found = boxes_of((0, 1, CAR, 1.0), (0, 2, moved(20), 0.5))
     scores = evaluate_detections(found, labels)
     assert (scores.tp, scores.fp, scores.fn, scores.ignored) == (1, 0, 0, 1)
+    assert scores == evaluate_detections(found, labels, ignored_as_regions=True)
     assert evaluate_tracks(found, labels).ignored == 1
     assert evaluate_detections(boxes_of((0, 1, moved(300), 1.0)), labels).fn == 1
 
@@ -768,6 +796,21 @@ def test_a_prediction_in_an_ignore_region_changes_nothing(trial, box):
         before, after = evaluate(found, region).to_dict(), evaluate(more, region).to_dict()
         assert after.pop("ignored") == before.pop("ignored") + 1
         assert after == before
+
+
+@given(trial=trials(), data=st.data())
+def test_ignored_boxes_as_regions_only_forgive(trial, data):
+    found, labels = trial
+    ignore = np.array(data.draw(st.lists(st.booleans(), min_size=len(labels), max_size=len(labels))), bool)
+    labels = replace(labels, ignore=ignore)
+    plain, lenient = (
+        evaluate_detections(found, labels, ignored_as_regions=option) for option in (False, True)
+    )
+    assert (lenient.tp, lenient.fn) == (plain.tp, plain.fn)
+    assert lenient.fp + lenient.ignored == plain.fp + plain.ignored
+    assert lenient.fp <= plain.fp
+    # NaN where nothing is left to find.
+    assert not lenient.average_precision < plain.average_precision - 1e-12
 
 
 @given(trial=trials(), data=st.data())

@@ -135,6 +135,23 @@ def test_scores_by_hand():
     assert "false_per_empty_frame" not in _score(held_out([1.0], [True]), 0.0).to_dict()
 
 
+def test_a_vehicle_in_an_ignored_group_is_false_in_the_plain_reading_only():
+    part = held_out([1.0, 0.5, 0.2], [True, True, False])
+    single = part.frames.labels
+    labels = Labels(
+        [*single.frames, 2],
+        range(5),
+        [*single.boxes, [80.0, 0.0, 160.0, 60.0]],
+        ignore=np.arange(5) == 4,
+        frame_keys=single.frame_keys,
+    )
+    part = HeldOut("road", LabelledFrames("road", part.frames.frames, labels), part.found)
+    score = _score(part, 0.0)
+    assert (score.precision, score.f1) == (pytest.approx(2 / 3), pytest.approx(4 / 7))
+    assert score.region_f1 == pytest.approx(4 / 6)
+    assert score.average_precision == score.region_average_precision == 0.5
+
+
 def test_scores_of_nothing():
     nothing = _score(held_out([], []), 0.0)
     assert (nothing.f1, nothing.best_f1, nothing.average_precision, nothing.recall) == (0, 0, 0, 0)
@@ -208,7 +225,7 @@ def test_the_card_of_scores_that_are_not_known(sources, judged, tmp_path):
     score = _score(held_out([], []), 0.0)
     write_card(tmp_path / "m.md", judged[0], [score], sources, 0)
     assert (
-        "| road | 4 | 4 | 0.000 | 0.000 | 0.000 | - | 0.000 | - | 0.00 | - |"
+        "| road | 4 | 4 | 0.000 | 0.000 | 0.000 | - | 0.000 | - | 0.00 | - | 0.000 | 0.000 |"
         in (tmp_path / "m.md").read_text()
     )
 

@@ -12,6 +12,7 @@ from vehicle_detection._cli_output import check_apart, output_folder, print_tabl
 
 _COLUMNS = ("f1", "best_f1", "average_precision", "precision", "recall", "mean_iou")
 _COUNTS = ("false_per_frame", "false_per_empty_frame")
+_REGIONS = ("region_f1", "region_average_precision")
 
 
 def train_frames(
@@ -75,8 +76,9 @@ def print_road_scores(scores: Mapping[str, Mapping[str, Any]]) -> None:
             name,
             *(f"{values[column]:.3f}" if column in values else "" for column in _COLUMNS),
             *(f"{values[column]:.2f}" if column in values else "" for column in _COUNTS),
+            *(f"{values[column]:.3f}" if column in values else "" for column in _REGIONS),
         )
         for name, values in scores.items()
     ]
-    titles = (column.replace("_", " ") for column in (*_COLUMNS, *_COUNTS))
+    titles = (column.replace("_", " ") for column in (*_COLUMNS, *_COUNTS, *_REGIONS))
     print_table("on sources left out of training, IoU 0.5", ("frames", *titles), rows)

@@ -15,8 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._checks import describe
 from vehicle_detection._labels import NO_TRACK, FrameKey, Labels, check_keys, frame_order
-from vehicle_detection.boxes import iou_matrix
+from vehicle_detection.boxes import box_areas, intersection_matrix, iou_matrix
 from vehicle_detection.errors import InvalidInputError
+
+# Share of a box that lies in an ignored box which is taken as a region.
+_WITHIN = 0.5
 
 
 @dataclass(frozen=True)
@@ -83,14 +86,25 @@ def _given_frames(predictions: Labels, frames: tuple[FrameKey, ...]) -> list[Fra
 
 
 def find_neutral(
-    boxes: NDArray[np.float64], labels: Labels, rows: NDArray[np.intp], limit: float
+    boxes: NDArray[np.float64],
+    labels: Labels,
+    rows: NDArray[np.intp],
+    limit: float,
+    *,
+    as_regions: bool = False,
 ) -> NDArray[np.bool_]:
-    """Whether each box lies with its centre in a region, or covers an ignored box, of the label `rows`."""
+    """Whether each box lies with its centre in a region, or covers an ignored box, of the label `rows`.
+
+    With `as_regions` also whether half of it or more lies in an ignored box, whatever that is.
+    """
     ignored = rows[labels.ignore[rows]]
     regions = labels.boxes[ignored[labels.tracks[ignored] == NO_TRACK]]
     centre = (boxes[:, :2] + boxes[:, 2:]) / 2
     inside = (regions[:, :2] <= centre[:, None]) & (centre[:, None] < regions[:, 2:])
     covers = iou_matrix(boxes, labels.boxes[ignored]) >= limit
+    if as_regions:
+        shared = intersection_matrix(boxes, labels.boxes[ignored])
+        covers |= shared >= np.maximum(_WITHIN * box_areas(boxes)[:, None], 1e-9)
     return np.asarray(inside.all(axis=2).any(axis=1) | covers.any(axis=1))
 
 

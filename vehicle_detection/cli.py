@@ -273,6 +273,12 @@ def evaluate(
     predictions: Annotated[Path, typer.Argument(metavar="PREDICTIONS.csv", help="Boxes or tracks.")],
     labels: Annotated[Path, typer.Argument(metavar="LABELS.csv", help="True boxes.")],
     iou: Annotated[float, typer.Option(metavar="F", help="Overlap from which a box is right.")] = 0.5,
+    regions: Annotated[
+        bool,
+        typer.Option(
+            "--regions/--no-regions", help="Do not judge boxes of which half lies in an ignored box."
+        ),
+    ] = False,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="File for all scores.")] = None,
 ) -> None:
     """Score boxes, and tracks where there are any, against labels."""
@@ -284,7 +290,9 @@ def evaluate(
     if json is not None:
         check_apart({"--json": check_target(json, "--json")}, {"PREDICTIONS": predictions, "LABELS": labels})
     found, true = read_labels(predictions), read_labels(labels)
-    scores: dict[str, Any] = {"detections": evaluate_detections(found, true, iou=iou)}
+    scores: dict[str, Any] = {
+        "detections": evaluate_detections(found, true, iou=iou, ignored_as_regions=regions)
+    }
     if (found.tracks >= 0).any() and (true.tracks >= 0).any():
         scores["tracks"] = evaluate_tracks(found, true, iou=iou)
     typer.echo("\n\n".join(each.summary() for each in scores.values()))

@@ -4,6 +4,9 @@ The boxes of `Labels` marked ``ignore`` are not scored, and a prediction on them
 one whose centre lies in a region (``ignore`` with track -1), or that covers an ignored box at the IoU in
 use. Usable boxes are matched first, so an ignore region over a vehicle does not take its detection away.
 
+Where a box to ignore holds several vehicles, such as cars that touch in a mask of a class, none of them
+covers it. With ``ignored_as_regions`` a prediction is neutral, too, where half of it or more lies in one.
+
 A ratio with nothing to count is NaN: ``n/a`` in a summary, None in ``to_dict``.
 """
 
@@ -132,7 +135,12 @@ class DetectionScores(Scores):
 
 
 def evaluate_detections(
-    predictions: Labels, labels: Labels, *, iou: float = 0.5, frames: Sequence[FrameKey] | None = None
+    predictions: Labels,
+    labels: Labels,
+    *,
+    iou: float = 0.5,
+    frames: Sequence[FrameKey] | None = None,
+    ignored_as_regions: bool = False,
 ) -> DetectionScores:
     """Score detections against labels, each frame by itself.
 
@@ -151,6 +159,9 @@ def evaluate_detections(
     frames
         All evaluated frames, so that those without label and prediction count too. Labels in other frames
         are left out. None takes all frames that `predictions` or `labels` know of.
+    ignored_as_regions
+        Whether a detection of which half or more lies in an ignored box is neutral as well: for labels whose
+        ignored boxes hold several vehicles each.
 
     Returns
     -------
@@ -173,7 +184,7 @@ def evaluate_detections(
     """
     predictions, labels, keys = prepare_sides(predictions, labels, frames)
     limit = check_number(iou, "iou", above=0, high=1)
-    found = match_detections(predictions, labels, keys, limit)
+    found = match_detections(predictions, labels, keys, limit, ignored_as_regions=ignored_as_regions)
     hit, false = found.partner >= 0, (found.partner < 0) & ~found.neutral
     missed = np.setdiff1d(found.usable, found.partner)
 
@@ -204,7 +215,7 @@ def evaluate_detections(
 
 
 def precision_recall_curve(
-    predictions: Labels, labels: Labels, *, iou: float = 0.5
+    predictions: Labels, labels: Labels, *, iou: float = 0.5, ignored_as_regions: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Precision and recall for every threshold on the detections' scores.
 
@@ -216,6 +227,8 @@ def precision_recall_curve(
         True boxes.
     iou
         Overlap in (0, 1] from which a detection matches a vehicle.
+    ignored_as_regions
+        As in `evaluate_detections`.
 
     Returns
     -------
@@ -240,7 +253,8 @@ def precision_recall_curve(
     if len(predictions) and predictions.scores is None:
         raise InvalidInputError("predictions need scores for a curve; pass Labels with scores=")
     limit = check_number(iou, "iou", above=0, high=1)
-    return _curve(predictions, match_detections(predictions, labels, keys, limit))
+    found = match_detections(predictions, labels, keys, limit, ignored_as_regions=ignored_as_regions)
+    return _curve(predictions, found)
 
 
 def _widths(labels: Labels) -> NDArray[np.float64]:
@@ -269,7 +283,14 @@ class Matching:
     usable: NDArray[np.intp]
 
 
-def match_detections(predictions: Labels, labels: Labels, keys: list[FrameKey], limit: float) -> Matching:
+def match_detections(
+    predictions: Labels,
+    labels: Labels,
+    keys: list[FrameKey],
+    limit: float,
+    *,
+    ignored_as_regions: bool = False,
+) -> Matching:
     """Match each frame greedily by score, then find what is neutral among the rest.
 
     Parameters
@@ -280,6 +301,8 @@ def match_detections(predictions: Labels, labels: Labels, keys: list[FrameKey], 
         The frames to match in.
     limit
         Least IoU of a match.
+    ignored_as_regions
+        As in `evaluate_detections`.
     """
     count = len(predictions)
     scores = np.zeros(count) if predictions.scores is None else predictions.scores
@@ -297,7 +320,9 @@ def match_detections(predictions: Labels, labels: Labels, keys: list[FrameKey], 
                 partner[here[index]], overlap[here[index]] = targets[target], overlaps[index, target]
                 overlaps[:, target] = -1
         rest = here[partner[here] < 0]
-        neutral[rest] = find_neutral(predictions.boxes[rest], labels, rows, limit)
+        neutral[rest] = find_neutral(
+            predictions.boxes[rest], labels, rows, limit, as_regions=ignored_as_regions
+        )
     return Matching(partner, overlap, neutral, np.array(usable, np.intp))
 
 
