@@ -96,6 +96,18 @@ def test_another_seed_gives_another_model(source, trained):
     assert (other.templates[0].weights != trained.templates[0].weights).any()
 
 
+def test_vehicles_are_taken_at_other_exposures_too(source):
+    frames = frames_of([source])
+    wide = [box for frame in frames for box in frame.boxes if box[2] - box[0] >= SMALL.least_width]
+    for exposures in (0, 2):
+        params = dataclasses.replace(SMALL, jitter=3, exposures=exposures)
+        seen = list(mixture_training._whole(frames, params, np.random.default_rng(0)))
+        assert len(seen) == (3 + exposures) * len(wide)
+        others = [box for image, box in seen if not any(image is frame.image for frame in frames)]
+        assert len(others) == exposures * len(wide)
+        assert {tuple(box) for box in others} == ({tuple(box) for box in wide} if exposures else set())
+
+
 def test_a_template_that_shows_a_side_gets_a_mirrored_one(source):
     params = dataclasses.replace(SMALL, shapes=((6, 5), (8, 5)), facing=(False, True), rounds=(0.2,))
     lines = []
@@ -297,6 +309,7 @@ def test_the_easiest_negatives_go_for_good():
         ({"near": -0.1}, "near must be a number"),
         ({"jitter": 0}, "jitter must be an integer from 1"),
         ({"shake": 0.5}, "shake must be a number"),
+        ({"exposures": -1}, "exposures must be an integer from 0"),
         ({"rounds": ()}, "rounds must be a tuple of at least one entry"),
         ({"rounds": (0.5, 1.5)}, "rounds must be a number, greater than 0 and at most 1"),
         ({"per_frame": 0}, "per_frame must be an integer"),

@@ -46,6 +46,8 @@ class MixtureParams:
         A box trains every template whose logarithmic aspect ratio is this near, and the nearest.
     jitter
         Copies of each box, of which all but the first are moved by up to ``shake`` of its sides.
+    exposures
+        Further copies of each box of a whole vehicle, each in a frame of another exposure and contrast.
     rounds
         Shares of the frames that the rounds of mining look at; one of all frames that brings under 1% new
         negatives is the last.
@@ -80,6 +82,7 @@ class MixtureParams:
     near: float = 0.2
     jitter: int = 2
     shake: float = 0.03
+    exposures: int = 1
     rounds: tuple[float, ...] = (0.15, 0.3, 0.6, 1.0)
     per_frame: int = 30
     most_negatives: int = 12_000
@@ -104,6 +107,7 @@ class MixtureParams:
         check_number(self.near, "near", low=0, high=10)
         check_integer(self.jitter, "jitter", low=1, high=100)
         check_number(self.shake, "shake", low=0, high=0.25)
+        check_integer(self.exposures, "exposures", low=0, high=100)
         rounds = entries(self.rounds, "rounds")
         for share in rounds:
             check_number(share, "rounds", above=0, high=1)

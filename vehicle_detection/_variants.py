@@ -1,4 +1,4 @@
-"""Variants of training patches: mirrored, of another brightness, and as a worse camera takes them."""
+"""Variants of training images: mirrored, of another brightness, and as a worse camera takes them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 # A degraded patch: times that it is smaller (logarithms), share of its colour (logarithms), JPEG quality.
 _SHRINK, _COLOUR, _QUALITY = (0.0, 1.6), (-1.5, 0.2), (20.0, 90.0)
+# Another exposure: exponent of the values (its logarithm), and the share of their range that is left.
+_EXPONENT, _RANGE = (-0.7, 0.7), (0.5, 1.0)
 
 
 def mirror_patches(images: NDArray[np.uint8], *, gamma: float = 0.0) -> NDArray[np.uint8]:
@@ -88,6 +90,29 @@ def degrade_patches(images: NDArray[np.uint8], *, mirror: bool = True) -> NDArra
         decoded = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), np.uint8)
         out[:] = cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
     return degraded
+
+
+def relight(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Give an image another exposure and less contrast.
+
+    A value `v` becomes ``255 * (r * (v / 255)**e + a)``: the exponent, the range that is left and where it
+    lies are drawn once for the whole image.
+
+    Parameters
+    ----------
+    image
+        ``(H, W, 3)`` uint8.
+    rng
+        Draws three numbers.
+
+    Returns
+    -------
+    numpy.ndarray
+        A new array of the same shape, uint8.
+    """
+    exponent, left = float(np.exp(rng.uniform(*_EXPONENT))), rng.uniform(*_RANGE)
+    values = left * (np.arange(256) / 255) ** exponent + rng.uniform(0, 1 - left)
+    return np.asarray(cv2.LUT(image, np.round(255 * values).astype(np.uint8)), np.uint8)
 
 
 def _generator(image: NDArray[np.uint8], kind: int) -> np.random.Generator:

@@ -28,6 +28,7 @@ from vehicle_detection._mixture_windows import (
     with_mirrored,
 )
 from vehicle_detection._refinement import CROP_LENGTH, Refinement, box_planes, crop_features, suppress
+from vehicle_detection._variants import relight
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture import MixtureSearch, TemplateMixture
@@ -223,12 +224,17 @@ Seen = Iterator[tuple[Image, Floats]]
 
 
 def _whole(frames: Sequence[Frame], params: MixtureParams, rng: np.random.Generator) -> Seen:
-    """Vehicles where they are, and moved a little."""
+    """Vehicles where they are, moved a little, and at other exposures."""
     for frame in frames:
-        for box in frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.least_width]:
+        boxes = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.least_width]
+        for box in boxes:
             for copy in range(params.jitter):
                 shift = rng.uniform(-1, 1, 4) * params.shake * np.tile(box[2:] - box[:2], 2)
                 yield frame.image, box + shift * (copy > 0)
+        for _ in range(params.exposures if len(boxes) else 0):
+            image = relight(frame.image, rng)
+            for box in boxes:
+                yield image, box
 
 
 def _cut(frames: Sequence[Frame], params: MixtureParams, rng: np.random.Generator) -> Seen:
