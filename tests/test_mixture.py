@@ -162,6 +162,22 @@ def test_nearer_vehicles_gain():
     assert (np.diff(more) <= 0).all()
 
 
+def test_what_many_windows_agree_on_gains():
+    model = dataclasses.replace(random_mixture(), refinement=Refinement.none())
+    vehicle, twins = [100.0, 100.0, 200.0, 180.0], 30
+    boxes = np.array([[400.0, 100.0, 500.0, 180.0], *[vehicle] * twins])
+    windows = Candidates(boxes, np.array([0.5, *[0.4] * twins]), np.zeros(twins + 1, np.intp))
+    assert model.vehicles(ROAD, windows, least=0.0)[1].tolist() == [0.5, 0.4]
+    gained = dataclasses.replace(model, support_gain=0.1)
+    found, values = gained.vehicles(ROAD, windows, least=0.0)
+    assert found.tolist() == [vehicle, boxes[0].tolist()]
+    # Of 30 windows that exceed -1.1 by 1.5 each, e^4 count.
+    np.testing.assert_allclose(values, [0.4 + 0.1 * (np.log(46) - 2), 0.5 + 0.1 * (np.log(2.6) - 2)])
+    assert len(gained.vehicles(ROAD, windows, least=0.5)[0]) == 1
+    more = Candidates(np.array([vehicle] * 90), np.full(90, 0.4), np.zeros(90, np.intp))
+    np.testing.assert_allclose(gained.vehicles(ROAD, more, least=0.0)[1], [0.6])
+
+
 def test_a_template_keeps_a_copy_that_cannot_be_changed():
     weights = np.zeros((3, 4, PLANES), np.float32)
     template = MixtureTemplate(weights, 0.0, (0.0, 0.0))
@@ -206,6 +222,7 @@ def test_templates_that_make_no_sense(changes, message):
         ({"slope": -1.0}, "slope must be a number, greater than 0"),
         ({"offset": np.nan}, "offset must be a number"),
         ({"threshold": np.inf}, "threshold must be a number"),
+        ({"support_gain": np.nan}, "support_gain must be a number"),
     ],
 )
 def test_mixtures_that_make_no_sense(changes, message):
@@ -371,7 +388,7 @@ def windows_of(count, seed):
 )
 def test_suppression(count, seed, least, most):
     windows = windows_of(count, seed)
-    kept = suppress(windows, least=least, most=most)
+    kept, support = suppress(windows, least=least, most=most)
     assert len(kept) <= most
     assert kept.boxes.shape == (len(kept), 4)
     assert (kept.scores >= least).all()
@@ -383,14 +400,19 @@ def test_suppression(count, seed, least, most):
         assert (kept.boxes <= windows.boxes.max(axis=0) + 1e-9).all()
         # The weaker windows change no score and take none away: they vote for places only.
         strong = windows[windows.scores >= least]
-        assert suppress(strong, least=least, most=most).scores.tolist() == kept.scores.tolist()
+        again, less = suppress(strong, least=least, most=most)
+        assert again.scores.tolist() == kept.scores.tolist()
+        # A window supports itself, and the more there are the better.
+        assert (support >= np.maximum(kept.scores + 1.1, 0) - 1e-9).all()
+        assert (less <= support + 1e-9).all()
 
 
 def test_neighbours_vote():
     boxes = np.array([[0.0, 0, 40, 40], [4, 0, 44, 40], [200, 0, 240, 40]])
     windows = Candidates(boxes, np.array([1.0, 1.0, 0.5]), np.array([0, 1, 2]))
-    kept = suppress(windows, least=0.0)
+    kept, support = suppress(windows, least=0.0)
     np.testing.assert_allclose(kept.boxes, [[2, 0, 42, 40], [200, 0, 240, 40]])
+    np.testing.assert_allclose(support, [4.2, 1.6])
     assert kept.templates.tolist() == [0, 2]
 
 
@@ -417,7 +439,7 @@ def test_corrected_boxes_lie_inside(seed, count):
     windows = windows_of(count, seed)
     image = np.random.default_rng(seed).integers(0, 256, (90, 110, 3), dtype=np.uint8)
     strong = Refinement(np.random.default_rng(seed).normal(0, 0.1, (CROP_LENGTH, 4)), np.zeros(4))
-    for refinement in (strong, Refinement.none()):
+    for refinement in (strong, dataclasses.replace(strong, looks=3), Refinement.none()):
         boxes, scores = refinement.apply(image, windows)
         assert len(boxes) == len(scores) <= count
         assert (boxes[:, :2] >= 0).all()
@@ -426,14 +448,32 @@ def test_corrected_boxes_lie_inside(seed, count):
     assert not Refinement.none().shifts(image, windows.boxes).any()
 
 
+def test_a_box_is_looked_at_again_while_it_moves():
+    image = np.random.default_rng(1).integers(0, 256, (200, 200, 3), dtype=np.uint8)
+    windows = Candidates(np.array([[50.0, 50.0, 100.0, 100.0]]), np.array([1.0]), np.array([0]))
+    still = np.zeros((CROP_LENGTH, 4))
+    for shift, looks, expected in [
+        (0.2, 1, [50, 50, 110, 100]),
+        (0.2, 3, [50, 50, 136.4, 100]),
+        (0.1, 3, [50, 50, 105, 100]),
+        (0.9, 2, [50, 50, 134.5, 100]),
+    ]:
+        refinement = Refinement(still, np.array([0, 0, shift, 0]), looks)
+        boxes, _ = refinement.apply(image, windows)
+        np.testing.assert_allclose(boxes, [expected], rtol=1e-6)
+    assert windows.boxes.tolist() == [[50, 50, 100, 100]]
+
+
 # Files.
 
 
 def test_saving_and_loading_keeps_every_bit(tmp_path):
     path = tmp_path / "model.safetensors"
-    options = {"slope": 1.7, "offset": 0.1, "threshold": -0.3, "near_gain": 0.02}
+    options = {"slope": 1.7, "offset": 0.1, "threshold": -0.3, "near_gain": 0.02, "support_gain": 0.04}
     model = random_mixture(**options, metadata={"a": [1, {"b": None}]})
-    model = dataclasses.replace(model, templates=(*model.templates, border_template()))
+    refinement = dataclasses.replace(model.refinement, looks=2)
+    templates = *model.templates, border_template()
+    model = dataclasses.replace(model, templates=templates, refinement=refinement)
     model.save(path)
     loaded = load_model(path)
     assert isinstance(loaded, TemplateMixture)
@@ -442,6 +482,7 @@ def test_saving_and_loading_keeps_every_bit(tmp_path):
         assert (one.bias, one.margin, one.border) == (other.bias, other.margin, other.border)
     assert loaded.refinement.weights.tobytes() == model.refinement.weights.tobytes()
     assert loaded.refinement.bias.tobytes() == model.refinement.bias.tobytes()
+    assert loaded.refinement.looks == 2
     assert {name: getattr(loaded, name) for name in options} == options
     assert loaded.metadata == {"a": [1, {"b": None}]}
     first = path.read_bytes()
@@ -500,7 +541,10 @@ def write_file(path, tensors=None, params=None, *, params_text=None, **changes):
 
 
 def test_the_file_of_these_tests_is_sound(tmp_path):
-    assert len(load_model(write_file(tmp_path / "m.safetensors")).templates) == 3
+    model = load_model(write_file(tmp_path / "m.safetensors"))
+    assert len(model.templates) == 3
+    # Files of before know neither of these.
+    assert (model.near_gain, model.support_gain, model.refinement.looks) == (0.0, 0.0, 1)
 
 
 @pytest.mark.parametrize(
@@ -520,6 +564,8 @@ def test_the_file_of_these_tests_is_sound(tmp_path):
         ({}, {"borders": [True]}, "argument"),
         ({}, {"borders": [1, 0, 0]}, "border must be True or False"),
         ({}, {"slope": 0.0}, "slope must be a number"),
+        ({}, {"looks": 0}, "looks must be an integer from 1"),
+        ({}, {"support_gain": "much"}, "could not convert"),
         ({}, {"threshold": None}, "'threshold'"),
     ],
 )

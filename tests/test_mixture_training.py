@@ -3,6 +3,8 @@ import functools
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from vehicle_detection import mixture_training
 from vehicle_detection._feature_maps import PLANES, mirror_planes
@@ -31,6 +33,7 @@ SMALL = MixtureParams(
     facing=(False,),
     border_shapes=(),
     near_gain=0.0,
+    support_gain=0.0,
     C=5e-3,
     vehicles=100.0,
     rounds=(0.5, 1.0, 1.0),
@@ -106,6 +109,20 @@ def test_vehicles_are_taken_at_other_exposures_too(source):
         others = [box for image, box in seen if not any(image is frame.image for frame in frames)]
         assert len(others) == exposures * len(wide)
         assert {tuple(box) for box in others} == ({tuple(box) for box in wide} if exposures else set())
+
+
+@given(seed=st.integers(0, 1000), count=st.integers(0, 8))
+def test_moved_boxes_still_show_their_vehicles(seed, count):
+    rng = np.random.default_rng(seed)
+    corners = rng.uniform(0, 500, (count, 2))
+    boxes = np.hstack([corners, corners + rng.uniform(20, 200, (count, 2))])
+    moved = mixture_training._moved(boxes, rng)
+    assert moved.shape == boxes.shape
+    if count:
+        assert (np.diag(iou_matrix(boxes, moved)) > 0.15).all()
+        ratio = (moved[:, 2:] - moved[:, :2]) / (boxes[:, 2:] - boxes[:, :2])
+        assert (ratio > np.exp(-0.6) - 1e-9).all()
+        assert (ratio < np.exp(0.45) + 1e-9).all()
 
 
 def test_a_template_that_shows_a_side_gets_a_mirrored_one(source):
@@ -302,6 +319,8 @@ def test_the_easiest_negatives_go_for_good():
         ({"cuts": (0.5, 1.5)}, "cuts must be a number, greater than 0 and at most 1"),
         ({"border_bias": np.nan}, "border_bias must be a number"),
         ({"near_gain": "much"}, "near_gain must be a number"),
+        ({"support_gain": "much"}, "support_gain must be a number"),
+        ({"looks": 0}, "looks must be an integer from 1"),
         ({"margin": -1}, "margin must be a number"),
         ({"C": 0}, "C must be a number, greater than 0"),
         ({"vehicles": 0}, "vehicles must be a number, greater than 0"),

@@ -32,8 +32,10 @@ class MixtureParams:
     border_bias
         Added to the values of the templates at the border: less of a vehicle is seen there, so that it must
         be the clearer.
-    near_gain
+    near_gain, support_gain
         As in `TemplateMixture`.
+    looks
+        How often a box is corrected at most, as in `Refinement`.
     margin
         Cells of context on every side.
     C
@@ -75,6 +77,8 @@ class MixtureParams:
     cuts: tuple[float, ...] = (0.3, 0.5, 0.7)
     border_bias: float = -0.3
     near_gain: float = 0.03
+    support_gain: float = 0.05
+    looks: int = 2
     margin: float = 1.0
     C: float = 5e-4
     vehicles: float = 1500.0
@@ -100,6 +104,8 @@ class MixtureParams:
             )
         check_number(self.border_bias, "border_bias")
         check_number(self.near_gain, "near_gain")
+        check_number(self.support_gain, "support_gain")
+        check_integer(self.looks, "looks", low=1, high=10)
         check_number(self.margin, "margin", low=0, high=8)
         check_number(self.C, "C", above=0, high=1e6)
         check_number(self.vehicles, "vehicles", above=0, high=1e9)

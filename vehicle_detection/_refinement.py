@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import describe
+from vehicle_detection._checks import check_integer, describe
 from vehicle_detection._feature_maps import COARSE, PLANES, feature_planes
 from vehicle_detection.boxes import box_areas, clip_boxes, intersection_matrix
 from vehicle_detection.errors import InvalidInputError
@@ -33,8 +33,9 @@ _VOTE_FROM = -1.1
 _MOST_VEHICLES = 60
 # Least share of a box inside the frame.
 _LEAST_INSIDE = 0.35
-# A correction moves an edge by this share of the box's side at most.
-_MOST_SHIFT = 0.3
+# A correction moves an edge by this share of the box's side at most; a box is looked at again where it moved
+# one by more than the second.
+_MOST_SHIFT, _SETTLED = 0.3, 0.15
 
 Floats = NDArray[np.float64]
 
@@ -105,7 +106,7 @@ def overlaps(box: Floats, others: Floats) -> tuple[Floats, Floats]:
     )
 
 
-def suppress(windows: Candidates, *, least: float, most: int = _MOST_VEHICLES) -> Candidates:
+def suppress(windows: Candidates, *, least: float, most: int = _MOST_VEHICLES) -> tuple[Candidates, Floats]:
     """Keep the best window of each group, at the place for which the windows around it vote.
 
     Parameters
@@ -119,23 +120,29 @@ def suppress(windows: Candidates, *, least: float, most: int = _MOST_VEHICLES) -
     -------
     Candidates
         At most `most` of them; they still overlap as vehicles behind one another do.
+    numpy.ndarray
+        Support of each: the sum of what the windows that vote for it exceed -1.1 by.
     """
     left = np.flatnonzero(windows.scores >= least)
     boxes: list[Floats] = []
     kept: list[int] = []
-    weights = np.maximum(windows.scores - _VOTE_FROM, 0) ** 2
+    support: list[float] = []
+    strengths = np.maximum(windows.scores - _VOTE_FROM, 0)
+    weights = strengths**2
     while len(left) and len(kept) < most:
         best = int(left[0])
         iou, _ = overlaps(windows.boxes[best], windows.boxes)
-        votes = weights * (iou > _VOTE)
+        voters = iou > _VOTE
+        support.append(float(strengths @ voters))
+        votes = weights * voters
         votes[best] = max(votes[best], 1e-9)
         boxes.append(votes @ windows.boxes / votes.sum())
         kept.append(best)
         left = left[iou[left] <= _VOTE]
         left = left[left != best]
-    return Candidates(
-        np.array(boxes).reshape(-1, 4), windows.scores[kept], windows.templates[np.array(kept, np.intp)]
-    )
+    rows = np.array(kept, np.intp)
+    groups = Candidates(np.array(boxes).reshape(-1, 4), windows.scores[rows], windows.templates[rows])
+    return groups, np.array(support)
 
 
 def resolve(boxes: Floats, scores: Floats) -> NDArray[np.intp]:
@@ -245,12 +252,17 @@ class Refinement:
         `crop_features`.
     bias
         ``(4,)`` float32.
+    looks
+        How often a box is corrected; from the second time on only those that the last correction moved much.
+        A box that is far too small or beside its vehicle shows too little of it at first.
     """
 
     weights: NDArray[np.float32]
     bias: NDArray[np.float32]
+    looks: int = 1
 
     def __post_init__(self) -> None:
+        check_integer(self.looks, "looks", low=1, high=10)
         weights = finite_array(self.weights, "refinement.weights", (CROP_LENGTH, 4))
         object.__setattr__(self, "weights", weights)
         object.__setattr__(self, "bias", finite_array(self.bias, "refinement.bias", (4,)))
@@ -269,11 +281,16 @@ class Refinement:
 
     def apply(self, image: NDArray[np.uint8], windows: Candidates) -> tuple[Floats, Floats]:
         """Correct boxes, clip them to the image and drop the weaker of two on one vehicle."""
-        sides = np.tile(windows.boxes[:, 2:] - windows.boxes[:, :2], 2)
-        boxes = windows.boxes + self.shifts(image, windows.boxes) * sides
-        boxes = clip_boxes(
-            np.concatenate([boxes[:, :2], np.maximum(boxes[:, 2:], boxes[:, :2])], axis=1), image.shape
-        )
-        rows = resolve(boxes, windows.scores)
-        rows = rows[box_areas(boxes[rows]) > 0]
-        return np.asarray(boxes[rows], np.float64), windows.scores[rows]
+        boxes, values = windows.boxes.copy(), windows.scores
+        moving = np.ones(len(boxes), np.bool_)
+        for _ in range(self.looks):
+            # No box turns inside out: of a side, at least two fifths are left.
+            sides = np.tile(boxes[moving, 2:] - boxes[moving, :2], 2)
+            shifts = self.shifts(image, boxes[moving])
+            boxes[moving] += shifts * sides
+            moving[moving] = np.abs(shifts).max(axis=1, initial=0) > _SETTLED
+            inside = clip_boxes(boxes, image.shape)
+            rows = resolve(inside, values)
+            rows = rows[box_areas(inside[rows]) > 0]
+            boxes, values, moving = boxes[rows], values[rows], moving[rows]
+        return np.asarray(clip_boxes(boxes, image.shape), np.float64), values

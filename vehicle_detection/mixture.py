@@ -54,6 +54,10 @@ class TemplateMixture:
     near_gain
         Added to a vehicle's value for every doubling of its box's height from a quarter of the frame's on,
         and taken off for every halving: there are more places for what is small.
+    support_gain
+        Added to a vehicle's value for every factor e in how many windows, and how good ones, agree on it: a
+        vehicle is found by many of similar place and size, clutter by one or two. Few windows take as much
+        off.
     metadata
         What the model file tells about itself. JSON values only.
 
@@ -75,6 +79,7 @@ class TemplateMixture:
     offset: float = 0.0
     threshold: float = 0.0
     near_gain: float = 0.0
+    support_gain: float = 0.0
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -88,6 +93,7 @@ class TemplateMixture:
         check_number(self.offset, "offset")
         check_number(self.threshold, "threshold")
         check_number(self.near_gain, "near_gain")
+        check_number(self.support_gain, "support_gain")
         object.__setattr__(self, "templates", templates)
 
     def scores(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -102,8 +108,11 @@ class TemplateMixture:
         self, image: NDArray[np.uint8], found: Candidates, *, least: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Boxes and values, `least` or more, of the vehicles to which windows of a frame lead, best first."""
-        # At most the frame's height, which is two doublings, is gained.
-        grouped = suppress(found, least=least - 2 * abs(self.near_gain))
+        # At most the frame's height, which is two doublings, is gained; of support two steps count as well.
+        least_alone = least - 2 * abs(self.near_gain)
+        grouped, support = suppress(found, least=least_alone - 2 * abs(self.support_gain))
+        values = grouped.scores + self.support_gain * np.minimum(np.log1p(support) - 2, 2)
+        grouped = replace(grouped, scores=values)[values >= least_alone]
         boxes, values = self.refinement.apply(image, grouped)
         values = values + self.near_gain * np.log2(4 * (boxes[:, 3] - boxes[:, 1]) / image.shape[0])
         rows = np.argsort(-values, kind="stable")
@@ -130,6 +139,8 @@ class TemplateMixture:
             "offset": self.offset,
             "threshold": self.threshold,
             "near_gain": self.near_gain,
+            "support_gain": self.support_gain,
+            "looks": self.refinement.looks,
         }
         write_model(path, KIND, params, tensors, self.metadata)
 
@@ -169,9 +180,10 @@ def load_model(path: str | os.PathLike[str] = "default") -> TemplateMixture | Ve
             )
             for index, (bias, margin, border) in enumerate(rows)
         )
-        refinement = Refinement(tensors["refinement.weights"], tensors["refinement.bias"])
+        looks = params.get("looks", 1)
+        refinement = Refinement(tensors["refinement.weights"], tensors["refinement.bias"], looks)
         numbers = {name: float(params[name]) for name in ("slope", "offset", "threshold")}
-        numbers["near_gain"] = float(params.get("near_gain", 0.0))
+        numbers |= {name: float(params.get(name, 0.0)) for name in ("near_gain", "support_gain")}
         return TemplateMixture(templates, refinement, **numbers, metadata=model.metadata)
     except (InvalidInputError, KeyError, IndexError, TypeError, ValueError) as error:
         raise ModelFileError(f"{model.name} does not fit its own parameters: {error}") from error

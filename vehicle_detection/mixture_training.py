@@ -122,8 +122,11 @@ def train_mixture(
             replace(each, bias=each.bias + params.border_bias) if each.border else each for each in templates
         ]
         found = tuple(view.template for view in with_mirrored(templates, facing))
-        plain = TemplateMixture(found, Refinement.none(), near_gain=params.near_gain)
-        refinement = _fit_refinement(plain, frames, params, pool)
+        plain = TemplateMixture(
+            found, Refinement.none(), near_gain=params.near_gain, support_gain=params.support_gain
+        )
+        seeds = rng.integers(2**32, size=len(frames)).tolist()
+        refinement = _fit_refinement(plain, frames, seeds, params, pool)
     return replace(plain, refinement=refinement)
 
 
@@ -304,24 +307,27 @@ def _solve(
 
 
 def _fit_refinement(
-    mixture: TemplateMixture, frames: Sequence[Frame], params: MixtureParams, pool: ThreadPoolExecutor
+    mixture: TemplateMixture,
+    frames: Sequence[Frame],
+    seeds: Sequence[int],
+    params: MixtureParams,
+    pool: ThreadPoolExecutor,
 ) -> Refinement:
-    """Learn how the boxes that are found differ from the true ones, by ridge regression."""
+    """Learn how boxes that are found, or moved at random, differ from the true ones, by ridge regression."""
     from sklearn.linear_model import Ridge
 
     search = MixtureSearch(mixture, n_jobs=1)
 
-    def pairs(frame: Frame) -> tuple[NDArray[np.float32], Floats]:
-        empty = np.empty((0, CROP_LENGTH), np.float32), np.empty((0, 4))
+    def pairs(frame: Frame, seed: int) -> tuple[NDArray[np.float32], Floats]:
         if not len(frame.boxes):
-            return empty
-        found = search.candidates(frame.image, params.search)
-        boxes = suppress(found, least=-1.0).boxes
-        if not len(boxes):
-            return empty
-        overlap = iou_matrix(boxes, frame.boxes)
+            return np.empty((0, CROP_LENGTH), np.float32), np.empty((0, 4))
+        found = suppress(search.candidates(frame.image, params.search), least=-1.0)[0].boxes
+        overlap = iou_matrix(found, frame.boxes)
         near = overlap.max(axis=1) >= 0.4
-        boxes, true = boxes[near], frame.boxes[overlap.argmax(axis=1)[near]]
+        wide = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.least_width]
+        copies = np.tile(wide, (params.jitter, 1))
+        boxes = np.concatenate([found[near], _moved(copies, np.random.default_rng(seed))])
+        true = np.concatenate([frame.boxes[overlap.argmax(axis=1)[near]], copies])
         shifts = (true - boxes) / np.tile(boxes[:, 2:] - boxes[:, :2], 2)
         mirrored = np.ascontiguousarray(frame.image[:, ::-1])
         width = frame.image.shape[1]
@@ -329,10 +335,20 @@ def _fit_refinement(
         features = np.concatenate([crop_features(frame.image, boxes), crop_features(mirrored, flipped)])
         return features, np.concatenate([shifts, back])
 
-    found = list(pool.map(pairs, frames))
+    found = list(pool.map(pairs, frames, seeds))
     search.close()
     features, shifts = (np.concatenate(side) for side in zip(*found))
     if not len(features):
         return Refinement.none()
     fitted = Ridge(alpha=30.0).fit(features.astype(np.float64), np.clip(shifts, -0.5, 0.5))
-    return Refinement(fitted.coef_.T.astype(np.float32), fitted.intercept_.astype(np.float32))
+    weights, bias = fitted.coef_.T.astype(np.float32), fitted.intercept_.astype(np.float32)
+    return Refinement(weights, bias, params.looks)
+
+
+def _moved(boxes: Floats, rng: np.random.Generator) -> Floats:
+    """Boxes as a search may find them: beside their vehicles, too small or too large, of another shape."""
+    sides = boxes[:, 2:] - boxes[:, :2]
+    centres = boxes[:, :2] + sides * (0.5 + rng.uniform(-0.2, 0.2, sides.shape))
+    size, shape = rng.uniform(-0.45, 0.3, (len(boxes), 1)), rng.uniform(-0.15, 0.15, sides.shape)
+    halves = sides / 2 * np.exp(size + shape)
+    return np.concatenate([centres - halves, centres + halves], axis=1)
