@@ -28,8 +28,16 @@ _CASES: tuple[dict[str, Any], ...] = (
     {"light": "night"},
     {"shape": (540, 960)},
     {"shape": (1080, 1920)},
+    {"scenario": "overtaking", "cut": True},
+    {"scenario": "overtaking", "light": "night", "cut": True},
 )
+"""Options of `render_drive` for each kind; "cut": shown where the frame's border cuts a vehicle."""
+
 _FRAMES = 200
+# Share of a vehicle outside the frame from which on the border cuts it.
+_CUT = 0.2
+# Frames from one that is looked at for such a vehicle to the next.
+_STEP = 5
 
 
 def drawn_source(*, drives: int = 2 * len(_CASES), frames: int = 1, random_state: int = 0) -> FrameSource:
@@ -66,15 +74,20 @@ def drawn_source(*, drives: int = 2 * len(_CASES), frames: int = 1, random_state
     for number, case in zip(range(count), itertools.cycle(_CASES)):
         # Two numbers: a drive that somebody draws from one number is another one.
         rng = np.random.default_rng([random_state, number])
-        drive = render_drive(frames=_FRAMES, random_state=rng, **case)
-        parts.append(_sampled(f"{DRAWN} {number + 1}", drive, taken))
+        options = {name: value for name, value in case.items() if name != "cut"}
+        drive = render_drive(frames=_FRAMES, random_state=rng, **options)
+        parts.append(_sampled(f"{DRAWN} {number + 1}", drive, taken, cut=case.get("cut", False)))
     return FrameSource(DRAWN, tuple(parts))
 
 
-def _sampled(name: str, drive: Drive, frames: int) -> LabelledFrames:
+def _sampled(name: str, drive: Drive, frames: int, *, cut: bool) -> LabelledFrames:
+    """Take frames at equal distances from a drive, or those near them in which the border cuts a vehicle."""
     chosen = np.linspace(0, len(drive) - 1, frames + 2)[1:-1].astype(int).tolist()
-    images: dict[FrameKey, Any] = {index: drive[index].image for index in chosen}
-    rows = [(index, row) for index in chosen for row in drive.truth[index]]
+    if cut:
+        chosen = [_where_cut(drive, index) for index in chosen]
+    scenes = {index: drive[index] for index in chosen}
+    images: dict[FrameKey, Any] = {index: scene.image for index, scene in scenes.items()}
+    rows = [(index, row) for index, scene in scenes.items() for row in scene.truth]
     labels = Labels(
         [index for index, _ in rows],
         np.array([row.track for _, row in rows], np.intp),
@@ -83,3 +96,11 @@ def _sampled(name: str, drive: Drive, frames: int) -> LabelledFrames:
         frame_keys=chosen,
     )
     return LabelledFrames(name, images, labels)
+
+
+def _where_cut(drive: Drive, index: int) -> int:
+    """Find the frame next to this one in which the border cuts a vehicle; this one if there is none."""
+    for other in sorted(range(index % _STEP, len(drive), _STEP), key=lambda other: abs(other - index)):
+        if any(row.truncated > _CUT and not row.ignore for row in drive[other].truth):
+            return other
+    return index

@@ -1,9 +1,9 @@
 """Maps of road features: what a vehicle of any size looks like, cell by cell, on a pyramid of a frame.
 
 A cell holds 16 signed and 8 unsigned orientations of its edges, each normalised by the contrast around it,
-and four sums that tell how strong they are there: 28 values, the scheme of Felzenszwalb et al., "Object
-detection with discriminatively trained part-based models" (PAMI 2010), section 6, with 8 orientations
-instead of 9.
+and four sums that tell how strong they are there: 28 values. Edges are those of the square roots of the
+pixels' values, which shows what is dark. The scheme is that of Felzenszwalb et al., "Object detection with
+discriminatively trained part-based models" (PAMI 2010), section 6, with 8 orientations instead of 9.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ COARSE, FINE = 8, 4
 
 _BOUNDS = np.deg2rad(np.arange(11.25, 180, 22.5))
 _COTANGENTS = (np.cos(_BOUNDS) / np.sin(_BOUNDS)).astype(np.float32)
-# Energy of a block, in squared gray levels of the mean gradient, that counts as contrast.
-_EPS = np.float32(1e-4)
+# Added to the energy of a block, in squared gray levels of the mean gradient: the noise of a plain surface is
+# about 0.5, and shall not be stretched to full contrast.
+_EPS = np.float32(2)
 
 
 def edge_sums(image: NDArray[np.uint8], take: Take = new_array) -> NDArray[np.float32]:

@@ -11,14 +11,26 @@ _COLUMNS = 512
 
 
 @jit
+def _take_roots(own, line):
+    """Write the square roots of a row's values, and beyond either end what makes the gradient zero there."""
+    width = len(own)
+    scale = np.float32(255)
+    for x in range(width):
+        line[x + 1] = np.sqrt(scale * np.float32(own[x]))
+    line[0], line[width + 1] = line[2], line[width - 1]
+
+
+@jit
 def orientation_sums(channels, cotangents, sums):
     """Sum gradient magnitudes into 16 signed orientations over squares of 4x4 pixels.
 
-    Of the channels the one with the longest gradient decides (Dalal and Triggs, CVPR 2005, section 6.2). The
-    bins are centred: bin `k` holds the angles within 11.25 degrees of ``22.5 k``, bin ``k + 8`` the opposite
-    ones. So upright and level edges lie in the middle of a bin, and the features of a mirrored image are
-    those of the image, mirrored and in another order. A bin's sum is the difference of what lies past its two
-    bounds, and these sums stay in registers over the four rows of a square.
+    The gradients are those of the square roots of the values, ``sqrt(255 * value)``: so the edges of what is
+    dark count for more (Dalal and Triggs, CVPR 2005, section 6.1). Of the channels the one with the longest
+    gradient decides (section 6.2). The bins are centred: bin `k` holds the angles within 11.25 degrees of
+    ``22.5 k``, bin ``k + 8`` the opposite ones. So upright and level edges lie in the middle of a bin, and
+    the features of a mirrored image are those of the image, mirrored and in another order. A bin's sum is
+    the difference of what lies past its two bounds, and these sums stay in registers over the four rows of a
+    square.
 
     Parameters
     ----------
@@ -32,9 +44,10 @@ def orientation_sums(channels, cotangents, sums):
     height, width = channels.shape[1:]
     rows, columns = sums.shape[1:]
     wide = 4 * columns
-    lines = np.empty((3, width + 2), np.uint8)
-    left0, left1, left2 = lines[0], lines[1], lines[2]
-    right0, right1, right2 = lines[0, 2:], lines[1, 2:], lines[2, 2:]
+    # Roots of the rows above, at and below, in turns.
+    roots = np.empty((3, 3, width + 2), np.float32)
+    for c in range(3):
+        _take_roots(channels[c, 0], roots[c, 0])
     # Cotangents of four rows; lengths of what points down (or ahead, along the row), and of what points back.
     angles = np.empty((4, wide), np.float32)
     lengths = np.empty((2, 4, wide), np.float32)
@@ -46,32 +59,29 @@ def orientation_sums(channels, cotangents, sums):
     for row in range(rows):
         for part in range(4):
             y = 4 * row + part
-            for c in range(3):
-                own, line = channels[c, y], lines[c]
-                for x in range(width):
-                    line[x + 1] = own[x]
-                # The gradient is zero at the border: what would be beyond equals the other neighbour.
-                line[0], line[width + 1] = line[2], line[width - 1]
-            up, down = (y - 1, y + 1) if 0 < y < height - 1 else (y, y)
-            up0, up1, up2 = channels[0, up], channels[1, up], channels[2, up]
-            down0, down1, down2 = channels[0, down], channels[1, down], channels[2, down]
+            if y + 1 < height:
+                for c in range(3):
+                    _take_roots(channels[c, y + 1], roots[c, (y + 1) % 3])
+            own = y % 3
+            up, down = ((y - 1) % 3, (y + 1) % 3) if 0 < y < height - 1 else (own, own)
+            left0, left1, left2 = roots[0, own], roots[1, own], roots[2, own]
+            right0, right1, right2 = left0[2:], left1[2:], left2[2:]
+            up0, up1, up2 = roots[0, up, 1:], roots[1, up, 1:], roots[2, up, 1:]
+            down0, down1, down2 = roots[0, down, 1:], roots[1, down, 1:], roots[2, down, 1:]
             angle, ahead, back = angles[part], lengths[0, part], lengths[1, part]
             for x in range(wide):
-                gx = np.int32(right0[x]) - np.int32(left0[x])
-                gy = np.int32(down0[x]) - np.int32(up0[x])
+                gx, gy = right0[x] - left0[x], down0[x] - up0[x]
                 squared = gx * gx + gy * gy
-                hx = np.int32(right1[x]) - np.int32(left1[x])
-                hy = np.int32(down1[x]) - np.int32(up1[x])
+                hx, hy = right1[x] - left1[x], down1[x] - up1[x]
                 other = hx * hx + hy * hy
                 gx = hx if other > squared else gx
                 gy = hy if other > squared else gy
                 squared = other if other > squared else squared
-                hx = np.int32(right2[x]) - np.int32(left2[x])
-                hy = np.int32(down2[x]) - np.int32(up2[x])
+                hx, hy = right2[x] - left2[x], down2[x] - up2[x]
                 other = hx * hx + hy * hy
-                across = np.float32(hx if other > squared else gx)
-                along = np.float32(hy if other > squared else gy)
-                size = np.sqrt(np.float32(other if other > squared else squared))
+                across = hx if other > squared else gx
+                along = hy if other > squared else gy
+                size = np.sqrt(other if other > squared else squared)
                 # Along the row the angle is 0, whichever way it points.
                 angle[x] = across / along if along != zero else infinite
                 forth = across if along == zero else along
