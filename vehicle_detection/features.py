@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection import _kernels
+from vehicle_detection import _colour_kernels, _hog_kernels
 from vehicle_detection._checks import (
     check_channel,
     check_choice,
@@ -481,7 +481,7 @@ def _batch_extractor(params: FeatureParams) -> Callable[[NDArray[np.uint8], NDAr
                 features[index, :spatial_stop].reshape(3, size, size)[:] = small.transpose(2, 0, 1)
         if params.hist_feat:
             counts = features[:, spatial_stop:hist_stop]
-            _kernels.patch_histograms(converted, bins, params.hist_bins, counts)
+            _colour_kernels.patch_histograms(converted, bins, params.hist_bins, counts)
             if params.hist_sqrt:
                 np.sqrt(counts, out=counts)
         if params.hog_feat:
@@ -491,10 +491,10 @@ def _batch_extractor(params: FeatureParams) -> Callable[[NDArray[np.uint8], NDAr
             hog = features[:, hist_stop:]
             if params.transform_sqrt:
                 gradients = sqrt_gradients(source)
-                _kernels.patch_hog_of_angles(*gradients, bounds, channels, cell, block, coarse, hog)
+                _hog_kernels.patch_hog_of_angles(*gradients, bounds, channels, cell, block, coarse, hog)
             else:
                 flat = source.reshape(n, PATCH_SIZE, PATCH_SIZE * channels)
-                _kernels.patch_hog(flat, channels, cell, block, coarse, cotangents, hog)
+                _hog_kernels.patch_hog(flat, channels, cell, block, coarse, cotangents, hog)
 
     return extract
 
