@@ -15,21 +15,23 @@ from sklearn.utils import estimator_checks
 from sklearn.utils.estimator_checks import check_estimator
 
 from vehicle_detection import _hog_kernels
+from vehicle_detection._kernel_inputs import (
+    bin_of_value,
+    degree_bounds,
+    orientation_cotangents,
+    sqrt_gradients,
+)
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import (
     PatchFeatures,
-    bin_of_value,
     bin_spatial,
     color_hist,
     convert_color,
-    degree_bounds,
     extract_features,
     get_hog_features,
     hog_blocks,
     hog_picture,
-    orientation_cotangents,
     single_img_features,
-    sqrt_gradients,
 )
 from vehicle_detection.images import decode_image, write_image
 from vehicle_detection.params import COLOR_SPACES, HOG_CHANNELS, FeatureParams

@@ -29,6 +29,8 @@ ROWS = [
     "_jit",
     "_hog_kernels",
     "_colour_kernels",
+    "_kernel_inputs",
+    "_channels",
     "features",
     "_transformer",
     "datasets",

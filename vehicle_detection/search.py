@@ -26,21 +26,19 @@ from numpy.typing import NDArray
 
 from vehicle_detection import _colour_kernels, _hog_kernels
 from vehicle_detection._buffers import Buffers, Take, new_array
+from vehicle_detection._channels import convert_color, hog_source, pick_hog_channels
 from vehicle_detection._checks import check_image, check_number, check_type
 from vehicle_detection._correlation import Filter
 from vehicle_detection._jobs import Crew, single_threaded_opencv
+from vehicle_detection._kernel_inputs import (
+    bin_of_value,
+    degree_bounds,
+    orientation_cotangents,
+    sqrt_gradients,
+)
 from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import (
-    bin_of_value,
-    convert_color,
-    degree_bounds,
-    hog_source,
-    orientation_cotangents,
-    pick_hog_channels,
-    sqrt_gradients,
-)
 from vehicle_detection.params import PATCH_SIZE, FeatureParams, PixelBand, SearchParams
 
 
