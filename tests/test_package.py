@@ -36,6 +36,7 @@ ROWS = [
     "datasets",
     "synthetic",
     "_model_file",
+    "_classifier_training",
     "classifier",
     "training",
     "windows",

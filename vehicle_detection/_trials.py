@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._checks import check_number
+from vehicle_detection._classifier_training import check_labels
 from vehicle_detection._feature_cache import FeatureCache, digest_of
 from vehicle_detection._labelled_frames import LabelledFrames
-from vehicle_detection.classifier import DEFAULT_C, VehicleClassifier, check_labels
+from vehicle_detection.classifier import DEFAULT_C, VehicleClassifier
 from vehicle_detection.datasets import PatchSet, Split
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
