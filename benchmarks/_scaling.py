@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from benchmarks._material import Context, classifier_for_search, searched_frame
 from benchmarks._report import Row
 from benchmarks._timing import median_of, median_seconds, seconds_of
-from vehicle_detection import SearchParams, VehicleClassifier, _kernels, load_classifier, search
+from vehicle_detection import (
+    SearchParams,
+    VehicleClassifier,
+    _colour_kernels,
+    _hog_kernels,
+    load_classifier,
+    search,
+)
 from vehicle_detection._correlation import Filter
 from vehicle_detection._jobs import available_cores
 from vehicle_detection.params import SearchBand
@@ -142,6 +149,7 @@ _KERNELS = {
     "hog_cells": "HOG cells",
     "normalise_blocks": "blocks",
     "histogram_cells": "histogram",
+    "add_root_histograms": "histogram",
     "spatial_cells": "spatial bins",
 }
 _MODULES = {"cv2": {"resize": "spatial bins"}}
@@ -156,7 +164,8 @@ def _watch(clock: _Clock) -> Iterator[None]:
         def put(name: str, value: Any) -> None:
             stack.enter_context(mock.patch.object(search, name, value))
 
-        put("_kernels", _Watched(_kernels, clock, _KERNELS, everything=True))
+        put("_hog_kernels", _Watched(_hog_kernels, clock, _KERNELS, everything=True))
+        put("_colour_kernels", _Watched(_colour_kernels, clock, _KERNELS, everything=True))
         for name, functions in _MODULES.items():
             put(name, _Watched(getattr(search, name), clock, functions, everything=False))
         for name, stage in _FUNCTIONS.items():

@@ -11,6 +11,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 
+from vehicle_detection._classifier_training import copy_weights, patch_features
 from vehicle_detection._model_file import FORMAT, FORMAT_VERSION, _checksum
 from vehicle_detection._svm_solver import fit_svm
 from vehicle_detection._variants import blur_patches, degrade_patches, mirror_patches
@@ -18,9 +19,7 @@ from vehicle_detection.classifier import (
     KIND,
     Template,
     VehicleClassifier,
-    copy_weights,
     load_classifier,
-    patch_features,
     train_classifier,
 )
 from vehicle_detection.errors import InvalidInputError, ModelFileError

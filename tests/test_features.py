@@ -14,22 +14,24 @@ from sklearn.svm import LinearSVC
 from sklearn.utils import estimator_checks
 from sklearn.utils.estimator_checks import check_estimator
 
-from vehicle_detection import _kernels
+from vehicle_detection import _hog_kernels
+from vehicle_detection._kernel_inputs import (
+    bin_of_value,
+    degree_bounds,
+    orientation_cotangents,
+    sqrt_gradients,
+)
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import (
     PatchFeatures,
-    bin_of_value,
     bin_spatial,
     color_hist,
     convert_color,
-    degree_bounds,
     extract_features,
     get_hog_features,
     hog_blocks,
     hog_picture,
-    orientation_cotangents,
     single_img_features,
-    sqrt_gradients,
 )
 from vehicle_detection.images import decode_image, write_image
 from vehicle_detection.params import COLOR_SPACES, HOG_CHANNELS, FeatureParams
@@ -218,7 +220,7 @@ def reference_bins(gx, gy, orient):
 
 @pytest.mark.parametrize("orient", [1, 2, 3, 4, 5, 6, 8, 9, 12, 16, 18, 36, 180])
 def test_every_uint8_gradient_falls_into_the_references_bin(orient):
-    # The comparison of `_kernels.hog_cells`, operation by operation.
+    # The comparison of `_hog_kernels.hog_cells`, operation by operation.
     _, gx, gy = all_gradients()
     some = (gx != 0) | (gy != 0)
     gx, gy = gx[some], gy[some]
@@ -246,7 +248,7 @@ def test_the_kernel_puts_every_uint8_gradient_into_the_references_bin(orient):
     for start in range(0, 511, 73):
         tiles = np.ascontiguousarray(image[start : start + 73].reshape(73 * 3, 511 * 3))
         cells = np.empty((1, orient, *tiles.shape), np.float32)
-        _kernels.hog_cells(tiles, 1, 1, cotangents, cells)
+        _hog_kernels.hog_cells(tiles, 1, 1, cotangents, cells)
         middles = cells[0, :, 1::3, 1::3]
         rows = slice(start, start + 73)
         np.testing.assert_allclose(middles.sum(axis=0), length[rows], rtol=1e-6)

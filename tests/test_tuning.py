@@ -150,9 +150,15 @@ def test_a_trial_is_what_training_on_that_part_gives(patch_set, mirror, split):
         patch_set, [SMALL], splits=split, C=0.01, mirror=mirror, seeds=[3], time_search=False
     )
     train, test = patch_set[parts.train], patch_set[parts.test]
+    params = FeatureParams(**SMALL)
     classifier = train_classifier(
-        train.patches, train.labels, params=FeatureParams(**SMALL), C=0.01, mirror=mirror, random_state=3
+        train.patches, train.labels, params=params, C=0.01, mirror=mirror, random_state=3
     )
+    recipe = _trials.Recipe(params=params, C=0.01, mirror=mirror)
+    tried = Bench(patch_set, FeatureCache(patch_set.patches)).train(recipe, parts.train, 3)
+    for name in ("mean", "scale", "coef", "intercept"):
+        expected, found = (getattr(each.templates[0], name) for each in (classifier, tried))
+        np.testing.assert_array_equal(found, expected)
     assert row["accuracy"] == classifier.score(test.patches, test.labels)
     assert row["train_accuracy"] == classifier.score(train.patches, train.labels)
     assert (row["train_size"], row["test_size"]) == (len(train), len(test))
@@ -201,7 +207,7 @@ def test_impossible_combinations_are_reported_and_skipped(patch_set, caplog):
 
 
 def test_features_beyond_the_memory_are_refused(patch_set, monkeypatch):
-    monkeypatch.setattr(_trials.os, "sysconf", lambda name: 1000)
+    monkeypatch.setattr(_trials.os, "sysconf", lambda name: 100)
     (row,) = compare_configurations(patch_set, [SMALL], **PLAIN)
     assert row["status"] == "refused"
     assert "features of 96 patches need about 1 GB to train on, this machine has 0" in row["message"]

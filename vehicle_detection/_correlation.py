@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._buffers import Take, new_array
-from vehicle_detection._kernels import jit
+from vehicle_detection._jit import jit
 from vehicle_detection._vector_kernels import block_adder, host_block
 
 _BLOCK = host_block()

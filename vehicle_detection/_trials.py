@@ -6,7 +6,6 @@ import dataclasses
 import math
 import os
 import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,9 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._checks import check_number
+from vehicle_detection._classifier_training import check_labels
 from vehicle_detection._feature_cache import FeatureCache, digest_of
 from vehicle_detection._labelled_frames import LabelledFrames
-from vehicle_detection.classifier import DEFAULT_C, VehicleClassifier, check_labels
+from vehicle_detection._svm_solver import fit_svm
+from vehicle_detection.classifier import DEFAULT_C, Template, VehicleClassifier
 from vehicle_detection.datasets import PatchSet, Split
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
@@ -40,7 +41,6 @@ COLUMNS = (
 
 _TIMED_SHAPE = (720, 1280)
 _TIMED_RUNS = 15
-_MOST_ITERATIONS = 20_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,9 +161,8 @@ class Bench:
         copies = (False, True) if recipe.mirror else (False,)
         _check_memory(recipe.params.length, len(self.labels), len(rows), len(copies))
         parts = [self.cache.rows(recipe.params, rows, mirrored=copy) for copy in copies]
-        # Nobody else holds these rows: they are scaled in place.
         features = np.concatenate(parts) if len(parts) > 1 else parts[0]
-        del parts
+        del parts  # They fill as much memory again.
         return fit_features(features, np.tile(targets, len(copies)), recipe, seed)
 
     def accuracy(self, classifier: VehicleClassifier, rows: NDArray[np.intp]) -> float:
@@ -217,22 +216,10 @@ def best_f1(found: Labels, labels: Labels) -> float:
 def fit_features(
     features: NDArray[np.float32], targets: NDArray[np.int64], recipe: Recipe, seed: int
 ) -> VehicleClassifier:
-    """Fit a scaler and a linear SVM on feature vectors, which are scaled in place."""
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.pipeline import Pipeline
-    from sklearn.preprocessing import StandardScaler
-    from sklearn.svm import LinearSVC
-
-    weights = None if recipe.vehicle_weight == 1 else {0: 1.0, 1: recipe.vehicle_weight}
-    svm = LinearSVC(C=recipe.C, random_state=seed, class_weight=weights, max_iter=_MOST_ITERATIONS)
-    scaler = StandardScaler(copy=False).fit(features)
-    scaler.scale_ /= recipe.params.gains
-    pipeline = Pipeline([("scaler", scaler), ("svm", svm)])
-    with warnings.catch_warnings():
-        # A solver that stops early is judged by its accuracy, as all are.
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        svm.fit(scaler.transform(features), targets)
-    return VehicleClassifier.from_pipeline(pipeline, recipe.params)
+    """Fit a scaler and a linear SVM on feature vectors, as `train_classifier` does."""
+    costs = recipe.C * np.where(targets == 1, recipe.vehicle_weight, 1.0)
+    fitted = fit_svm(features, targets, costs, gains=recipe.params.gains, random_state=seed)
+    return VehicleClassifier(recipe.params, (Template(*fitted),))
 
 
 def _digest_frames(frames: LabelledFrames) -> str:
@@ -251,8 +238,8 @@ def _mean(values: ArrayLike) -> float | None:
 
 def _check_memory(length: int, patches: int, rows: int, copies: int) -> None:
     """Refuse features that do not fit into this machine, instead of being ended by it."""
-    # Features and their rows in float32; scikit-learn's float64 copy; liblinear's index and value.
-    needed = length * copies * (4 * patches + (4 + 8 + 16) * rows)
+    # Features in float32 and the rows among them to train on, which are held twice while they are joined.
+    needed = length * copies * (4 * patches + (4 + 4) * rows)
     try:
         present = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):  # Not told by this system.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
@@ -13,12 +12,23 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from vehicle_detection._checks import check_boxes, check_choice, check_image, check_integer, describe
+from vehicle_detection._strokes import (
+    BLACK,
+    WHITE,
+    Color,
+    Image,
+    Rectangle,
+    frame_box,
+    line_width,
+    put_text,
+    rounded,
+    text_scale,
+    text_size,
+    touch,
+)
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.tracking import Track
-
-Image = NDArray[np.uint8]
-Color = tuple[int, int, int]
 
 TRACK_COLORS: tuple[Color, ...] = (
     (230, 159, 0),
@@ -38,12 +48,8 @@ FIELDS = ("id", "score", "distance", "speed", "errors")
 """What a track's label can show; ``"errors"`` adds standard errors to distance and speed."""
 
 _TENTATIVE: Color = (160, 160, 160)
-_BLACK, _WHITE = (0, 0, 0), (255, 255, 255)
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
 # Seconds in which a track that is not seen fades, and how far.
 _FADE_SECONDS, _FAINTEST = 0.5, 0.35
-
-Rectangle = tuple[int, int, int, int]
 
 
 def draw_boxes(image: Image, boxes: ArrayLike, *, color: Color = (0, 0, 255), thickness: int = 6) -> Image:
@@ -81,7 +87,7 @@ def draw_boxes(image: Image, boxes: ArrayLike, *, color: Color = (0, 0, 255), th
     result = check_image(image).copy()
     rgb, width = _check_color(color), check_integer(thickness, "thickness", low=1, high=10_000)
     for box in _corner_array(boxes):
-        _frame_box(result, _rounded(box), rgb, width)
+        frame_box(result, rounded(box), rgb, width)
     return result
 
 
@@ -163,15 +169,32 @@ def draw_tracks_onto(
     for name in (show,) if isinstance(show, str) else show:
         check_choice(name, "show", FIELDS)
     drawn = sorted((track for track in _check_tracks(tracks) if track.shown), key=lambda track: track.box[3])
-    scale = _text_scale(picture)
+    scale = text_scale(picture)
     occupied: list[Rectangle] = []
     # Near vehicles last: their boxes lie over those of the ones behind them.
     for track in drawn:
-        _frame_box(picture, _rounded(track.box), track_color(track), _line_width(picture), _alpha(track))
+        frame_box(picture, rounded(track.box), track_color(track), line_width(picture), _alpha(track))
     for track in reversed(drawn):
         text = track_text(track, show)
         if text:
             _put_label(picture, track, text, scale, occupied)
+
+
+def _put_label(image: Image, track: Track, text: str, scale: float, occupied: list[Rectangle]) -> None:
+    """Write a label above its box, or below, or inside: where it hides no other one and fits."""
+    rows, columns = image.shape[:2]
+    box, color = rounded(track.box), track_color(track)
+    while scale > 0.2 and text_size(text, scale)[0] > columns:
+        scale *= 0.9
+    width, height, _ = text_size(text, scale)
+    x = min(max(box[0], 0), max(columns - width, 0))
+    places = [min(max(y, 0), max(rows - height, 0)) for y in (box[1] - height, box[3], box[1])]
+    rectangles = [(x, y, x + width, y + height) for y in places]
+    free = [one for one in rectangles if not any(touch(one, other) for other in occupied)]
+    x, y, *_ = (free or rectangles)[0]
+    red, green, blue = color
+    ink = BLACK if 0.299 * red + 0.587 * green + 0.114 * blue > 110 else WHITE
+    occupied.append(put_text(image, text, ink, x, y, scale, color, _alpha(track)))
 
 
 def track_color(track: Track) -> Color:
@@ -256,7 +279,7 @@ def draw_diagnostics(
         top, left = index // 2 * height, index % 2 * width
         view = mosaic[top : top + height, left : left + width]
         view[:] = panel
-        _put_text(view, title, _WHITE, 0, 0, _text_scale(view), _BLACK, 0.6)
+        put_text(view, title, WHITE, 0, 0, text_scale(view), BLACK, 0.6)
     return mosaic
 
 
@@ -316,90 +339,3 @@ def _corner_array(boxes: ArrayLike) -> NDArray[Any]:
         corners = np.asarray(boxes)
         return check_boxes(np.concatenate((corners.min(axis=1), corners.max(axis=1)), axis=1))
     return check_boxes(boxes)
-
-
-def _rounded(box: NDArray[Any]) -> Rectangle:
-    # Python's integers: a box far outside must not overflow.
-    x1, y1, x2, y2 = (math.floor(float(value) + 0.5) for value in box)
-    return x1, y1, x2, y2
-
-
-def _line_width(image: Image) -> int:
-    return max(2, round(math.sqrt(image.shape[0] * image.shape[1]) / 320))
-
-
-def _text_scale(image: Image) -> float:
-    """Scale of the font, whose capitals are 22 pixels high at 1."""
-    return min(max(math.sqrt(image.shape[0] * image.shape[1]) / 1600, 0.36), 4.0)
-
-
-def _fill(image: Image, rectangle: Rectangle, color: Color, alpha: float = 1.0) -> None:
-    """Blend a rectangle into an image, as far as it lies inside."""
-    x1, y1, x2, y2 = rectangle
-    view = image[max(y1, 0) : max(y2, 0), max(x1, 0) : max(x2, 0)]
-    if not view.size:
-        return
-    if alpha < 1:
-        paint = np.empty_like(view)
-        paint[:] = color
-        view[:] = cv2.addWeighted(view, 1 - alpha, paint, alpha, 0)
-    else:
-        view[:] = color
-
-
-def _frame_box(image: Image, box: Rectangle, color: Color, width: int, alpha: float = 1.0) -> None:
-    """Draw the four sides of a box, `width` pixels inwards from its edge."""
-    x1, y1, x2, y2 = box
-    if x2 <= x1 or y2 <= y1:
-        return
-    thick_x, thick_y = min(width, (x2 - x1 + 1) // 2), min(width, (y2 - y1 + 1) // 2)
-    low, high = y1 + thick_y, y2 - thick_y
-    _fill(image, (x1, y1, x2, low), color, alpha)
-    _fill(image, (x1, max(high, low), x2, y2), color, alpha)
-    _fill(image, (x1, low, x1 + thick_x, high), color, alpha)
-    _fill(image, (max(x2 - thick_x, x1 + thick_x), low, x2, high), color, alpha)
-
-
-def _text_size(text: str, scale: float) -> tuple[int, int, int]:
-    """Width, height and margin of a label in pixels."""
-    (width, height), _ = cv2.getTextSize(text, _FONT, scale, _text_weight(scale))
-    margin = max(2, round(8 * scale))
-    return width + 2 * margin, height + 2 * margin, margin
-
-
-def _text_weight(scale: float) -> int:
-    return max(1, round(1.6 * scale))
-
-
-def _put_text(
-    image: Image, text: str, ink: Color, x: int, y: int, scale: float, ground: Color, alpha: float
-) -> Rectangle:
-    """Write text on a ground whose upper left corner is ``(x, y)``; return the ground's rectangle."""
-    width, height, margin = _text_size(text, scale)
-    rectangle = (x, y, x + width, y + height)
-    _fill(image, rectangle, ground, alpha)
-    foot = (x + margin, y + height - margin)
-    cv2.putText(image, text, foot, _FONT, scale, ink, _text_weight(scale), cv2.LINE_AA)
-    return rectangle
-
-
-def _put_label(image: Image, track: Track, text: str, scale: float, occupied: list[Rectangle]) -> None:
-    """Write a label above its box, or below, or inside: where it hides no other one and fits."""
-    rows, columns = image.shape[:2]
-    box, color = _rounded(track.box), track_color(track)
-    while scale > 0.2 and _text_size(text, scale)[0] > columns:
-        scale *= 0.9
-    width, height, _ = _text_size(text, scale)
-    x = min(max(box[0], 0), max(columns - width, 0))
-    places = [min(max(y, 0), max(rows - height, 0)) for y in (box[1] - height, box[3], box[1])]
-    rectangles = [(x, y, x + width, y + height) for y in places]
-    free = [one for one in rectangles if not any(_touch(one, other) for other in occupied)]
-    x, y, *_ = (free or rectangles)[0]
-    red, green, blue = color
-    ink = _BLACK if 0.299 * red + 0.587 * green + 0.114 * blue > 110 else _WHITE
-    occupied.append(_put_text(image, text, ink, x, y, scale, color, _alpha(track)))
-
-
-def _touch(first: Rectangle, second: Rectangle) -> bool:
-    across = first[0] < second[2] and second[0] < first[2]
-    return across and first[1] < second[3] and second[1] < first[3]

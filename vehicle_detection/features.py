@@ -7,7 +7,7 @@ The functions the course knows are the readable reference: scikit-image's HOG, `
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -15,10 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection import _kernels
+from vehicle_detection._channels import convert_color, hog_source
 from vehicle_detection._checks import (
     check_channel,
-    check_choice,
     check_image,
     check_integer,
     check_patches,
@@ -26,21 +25,25 @@ from vehicle_detection._checks import (
     describe,
 )
 from vehicle_detection._jobs import resolve_jobs
+from vehicle_detection._patch_batch import batch_extractor
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import read_image
-from vehicle_detection.params import COLOR_SPACES, PATCH_SIZE, FeatureParams
+from vehicle_detection.params import PATCH_SIZE, FeatureParams
 
 if TYPE_CHECKING:
     from vehicle_detection._transformer import PatchFeatures
 
-_CODES = {
-    "HSV": cv2.COLOR_RGB2HSV,
-    "LUV": cv2.COLOR_RGB2LUV,
-    "HLS": cv2.COLOR_RGB2HLS,
-    "YUV": cv2.COLOR_RGB2YUV,
-    "YCrCb": cv2.COLOR_RGB2YCrCb,
-    "LAB": cv2.COLOR_RGB2LAB,
-}
+__all__ = [
+    "PatchFeatures",
+    "bin_spatial",
+    "color_hist",
+    "convert_color",
+    "extract_features",
+    "get_hog_features",
+    "hog_blocks",
+    "hog_picture",
+    "single_img_features",
+]
 
 _CHUNK = 256
 
@@ -52,47 +55,6 @@ def __getattr__(name: str) -> Any:
 
         return PatchFeatures
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def convert_color(
-    image: NDArray[np.uint8], color_space: str = "YCrCb", *, out: NDArray[np.uint8] | None = None
-) -> NDArray[np.uint8]:
-    """Convert an RGB image to another colour space, by OpenCV's 8-bit conventions.
-
-    Parameters
-    ----------
-    image
-        ``(H, W, 3)`` uint8 RGB.
-    color_space
-        ``"RGB"``, ``"HSV"`` (hue 0-179), ``"LUV"``, ``"HLS"``, ``"YUV"``, ``"YCrCb"`` or ``"LAB"``; the
-        course's spelling ``"RGB2YCrCb"`` is understood too.
-    out
-        Array of the image's shape to write into; a new one if None.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(H, W, 3)`` uint8; a copy, also for ``"RGB"``.
-
-    Raises
-    ------
-    InvalidInputError
-        If the image is not uint8 RGB or the colour space is unknown.
-
-    Examples
-    --------
-    >>> convert_color(np.full((1, 1, 3), 200, np.uint8), "YCrCb").tolist()
-    [[[200, 128, 128]]]
-    """
-    check_image(image)
-    space = str(color_space).removeprefix("RGB2")
-    check_choice(space, "color_space", COLOR_SPACES)
-    if space != "RGB":
-        return np.asarray(cv2.cvtColor(image, _CODES[space], dst=out), np.uint8)
-    if out is None:
-        return image.copy()
-    out[:] = image
-    return out
 
 
 def hog_blocks(
@@ -273,27 +235,6 @@ def color_hist(img: NDArray[np.uint8], nbins: int = 32) -> NDArray[np.int64]:
     return np.concatenate(channels)
 
 
-def hog_source(image: NDArray[np.uint8], params: FeatureParams) -> NDArray[np.uint8]:
-    """Channels that HOG sees: ``(H, W, hog_channels)`` uint8 of an ``(H, W, 3)`` RGB image."""
-    if params.hog_channel == "GRAY":
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)[..., None]
-    return pick_hog_channels(convert_color(image, params.color_space), params)
-
-
-def pick_hog_channels(converted: NDArray[np.uint8], params: FeatureParams) -> NDArray[np.uint8]:
-    """Channels that HOG sees, of an image that is already in the colour space; not for ``"GRAY"``."""
-    if params.hog_channel == "ALL":
-        return converted
-    return np.ascontiguousarray(converted[..., int(params.hog_channel), None])
-
-
-def _check_params(params: FeatureParams | None) -> FeatureParams:
-    if params is None:
-        return FeatureParams()
-    check_type(params, "params", FeatureParams, "pass FeatureParams(...) or FeatureParams.preset(...)")
-    return params
-
-
 def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None = None) -> NDArray[np.float64]:
     """Feature vector of one 64x64 patch by the reference functions.
 
@@ -385,7 +326,7 @@ def extract_features(
     params = _check_params(params)
     patches = check_patches(_read_all(source), PATCH_SIZE, "source")
     features = np.empty((len(patches), params.length), np.float32)
-    extract = _batch_extractor(params)
+    extract = batch_extractor(params)
 
     def run(start: int) -> int:
         stop = min(start + _CHUNK, len(patches))
@@ -418,95 +359,8 @@ def _read_all(source: Any) -> Any:
     return [read_image(item) if isinstance(item, (str, os.PathLike)) else item for item in items]
 
 
-def orientation_cotangents(orient: int) -> NDArray[np.float32]:
-    """Cotangent of the lower bound of each orientation bin, infinite for the first."""
-    angles = np.arange(orient) * (np.pi / orient)
-    # Rounding makes the bound at 90 degrees exact, so that a vertical edge falls where it should.
-    cosines, sines = np.cos(angles).round(15), np.sin(angles)
-    cotangents = np.full(orient, np.inf)
-    np.divide(cosines, sines, out=cotangents, where=sines > 0)
-    return cotangents.astype(np.float32)
-
-
-def sqrt_gradients(source: NDArray[np.uint8]) -> tuple[NDArray[np.float64], ...]:
-    """Gradients of the square root of images, and their arctangent, as scikit-image computes them.
-
-    Parameters
-    ----------
-    source
-        ``(..., H, W, C)`` uint8.
-
-    Returns
-    -------
-    tuple of numpy.ndarray
-        ``gx``, ``gy`` and ``arctan2(gy, gx)``, each ``(..., H, W * C)`` float64.
-    """
-    root = np.sqrt(np.arange(256.0))[source]
-    gx, gy = np.zeros_like(root), np.zeros_like(root)
-    np.subtract(root[..., :, 2:, :], root[..., :, :-2, :], out=gx[..., :, 1:-1, :])
-    np.subtract(root[..., 2:, :, :], root[..., :-2, :, :], out=gy[..., 1:-1, :, :])
-    shape = (*root.shape[:-2], -1)
-    return gx.reshape(shape), gy.reshape(shape), np.arctan2(gy, gx).reshape(shape)
-
-
-def degree_bounds(orient: int) -> NDArray[np.float64]:
-    """Bounds of the orientation bins in degrees, ``(orient + 1,)``, as scikit-image rounds them."""
-    return np.asarray((180.0 / orient) * np.arange(orient + 1), np.float64)
-
-
-def bin_of_value(bins: int) -> NDArray[np.intp]:
-    """Histogram bin of each value 0-255 when `bins` bins cover ``[0, 256)``; ``(256,)`` intp."""
-    return np.arange(256, dtype=np.intp) * bins // 256
-
-
-def _batch_extractor(params: FeatureParams) -> Callable[[NDArray[np.uint8], NDArray[np.float32]], None]:
-    """Build the function that fills the features of a batch of patches."""
-    channels, cell, block = params.hog_channels, params.pix_per_cell, params.cell_per_block
-    coarse = params.coarse_blocks
-    cotangents = orientation_cotangents(params.orient)
-    bounds = degree_bounds(params.orient)
-    bins = bin_of_value(params.hist_bins)
-    size = params.spatial_size
-    spatial_stop = params.spatial_length
-    hist_stop = spatial_stop + params.hist_length
-
-    def extract(patches: NDArray[np.uint8], features: NDArray[np.float32]) -> None:
-        n = len(patches)
-        # Colour conversion is pixel by pixel: the batch is converted as one tall image.
-        tall = np.ascontiguousarray(patches).reshape(n * PATCH_SIZE, PATCH_SIZE, 3)
-        converted = convert_color(tall, params.color_space).reshape(patches.shape)
-        if params.spatial_feat:
-            for index, patch in enumerate(converted):
-                small = cv2.resize(patch, (size, size))
-                features[index, :spatial_stop].reshape(3, size, size)[:] = small.transpose(2, 0, 1)
-        if params.hist_feat:
-            counts = features[:, spatial_stop:hist_stop]
-            _kernels.patch_histograms(converted, bins, params.hist_bins, counts)
-            if params.hist_sqrt:
-                np.sqrt(counts, out=counts)
-        if params.hog_feat:
-            gray = params.hog_channel == "GRAY"
-            source = hog_source(tall, params) if gray else pick_hog_channels(converted, params)
-            source = source.reshape(n, PATCH_SIZE, PATCH_SIZE, channels)
-            hog = features[:, hist_stop:]
-            if params.transform_sqrt:
-                gradients = sqrt_gradients(source)
-                _kernels.patch_hog_of_angles(*gradients, bounds, channels, cell, block, coarse, hog)
-            else:
-                flat = source.reshape(n, PATCH_SIZE, PATCH_SIZE * channels)
-                _kernels.patch_hog(flat, channels, cell, block, coarse, cotangents, hog)
-
-    return extract
-
-
-__all__ = [
-    "PatchFeatures",
-    "bin_spatial",
-    "color_hist",
-    "convert_color",
-    "extract_features",
-    "get_hog_features",
-    "hog_blocks",
-    "hog_picture",
-    "single_img_features",
-]
+def _check_params(params: FeatureParams | None) -> FeatureParams:
+    if params is None:
+        return FeatureParams()
+    check_type(params, "params", FeatureParams, "pass FeatureParams(...) or FeatureParams.preset(...)")
+    return params

@@ -24,24 +24,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection import _kernels
+from vehicle_detection import _colour_kernels, _hog_kernels
 from vehicle_detection._buffers import Buffers, Take, new_array
+from vehicle_detection._channels import convert_color, hog_source, pick_hog_channels
 from vehicle_detection._checks import check_image, check_number, check_type
 from vehicle_detection._correlation import Filter
-from vehicle_detection._histogram_kernels import add_root_histograms
 from vehicle_detection._jobs import Crew, single_threaded_opencv
+from vehicle_detection._kernel_inputs import (
+    bin_of_value,
+    degree_bounds,
+    orientation_cotangents,
+    sqrt_gradients,
+)
 from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import (
-    bin_of_value,
-    convert_color,
-    degree_bounds,
-    hog_source,
-    orientation_cotangents,
-    pick_hog_channels,
-    sqrt_gradients,
-)
 from vehicle_detection.params import PATCH_SIZE, FeatureParams, PixelBand, SearchParams
 
 
@@ -256,11 +253,13 @@ class _Filters:
         for template, (filters, bias) in enumerate(zip(self.filters, self.biases)):
             scores[template] = bias
             if self.tables is not None:
-                _kernels.histogram_cells(converted, self.tables[template], cell, maps[-1][-1])
+                _colour_kernels.histogram_cells(converted, self.tables[template], cell, maps[-1][-1])
             for part, planes in zip(filters, maps):
                 part.add_to(planes, scores[template], take)
         if self.root_weights is not None:
-            add_root_histograms(converted, self.bins, self.root_weights, cell, self.cells, scores)
+            _colour_kernels.add_root_histograms(
+                converted, self.bins, self.root_weights, cell, self.cells, scores
+            )
         return scores[0] if len(scores) == 1 else np.asarray(scores.max(axis=0))
 
     def _hog_maps(
@@ -274,19 +273,19 @@ class _Filters:
         source = hog_source(band, params) if gray else pick_hog_channels(converted, params)
         cells = take((channels, params.orient, rows, columns), np.float32, "cells")
         if params.transform_sqrt:
-            _kernels.sum_orientations(*sqrt_gradients(source), self.bounds, channels, cell, cells)
+            _hog_kernels.sum_orientations(*sqrt_gradients(source), self.bounds, channels, cell, cells)
         else:
             flat = np.ascontiguousarray(source).reshape(source.shape[0], -1)
-            _kernels.hog_cells(flat, channels, cell, self.cotangents, cells)
+            _hog_kernels.hog_cells(flat, channels, cell, self.cotangents, cells)
         shape = (channels, self.block, self.block, params.orient, rows, columns)
         blocks = take(shape, np.float32, "blocks")
-        _kernels.normalise_blocks(cells, self.block, 1, blocks)
+        _hog_kernels.normalise_blocks(cells, self.block, 1, blocks)
         maps = [blocks.reshape(-1, rows, columns)]
         if self.coarse:
             pooled = take(cells.shape, np.float32, "pooled")
-            _kernels.pool_cells(cells, pooled)
+            _hog_kernels.pool_cells(cells, pooled)
             blocks = take(shape, np.float32, "coarse blocks")
-            _kernels.normalise_blocks(pooled, self.block, 2, blocks)
+            _hog_kernels.normalise_blocks(pooled, self.block, 2, blocks)
             maps.append(blocks.reshape(-1, rows, columns))
         return maps
 
@@ -300,7 +299,7 @@ class _Filters:
             size = (columns * per_cell, rows * per_cell)
             whole = converted[: rows * cell, : columns * cell]
             bins = cv2.resize(whole, size, dst=take((size[1], size[0], 3), np.uint8, "bins"))
-            _kernels.spatial_cells(
+            _colour_kernels.spatial_cells(
                 bins, per_cell, planes[:count].reshape(3, per_cell, per_cell, rows, columns)
             )
         return planes

@@ -1,10 +1,78 @@
-"""The numba kernel of square-rooted histograms: counts that slide over a band, and their weighted roots."""
+"""The numba kernels of colour: histograms of patches and of all windows of a band, and spatial bins."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from vehicle_detection._kernels import jit
+from vehicle_detection._jit import jit
+
+
+@jit
+def value_counts(image, counts):
+    """Count the values of each channel: `image` ``(H, W, 3)`` uint8, `counts` ``(3, 256)`` output."""
+    counts[:] = 0
+    for y in range(image.shape[0]):
+        for x in range(image.shape[1]):
+            counts[0, image[y, x, 0]] += 1
+            counts[1, image[y, x, 1]] += 1
+            counts[2, image[y, x, 2]] += 1
+
+
+@jit
+def patch_histograms(patches, bin_of_value, bins, features):
+    """Colour histogram of each patch, channel by channel.
+
+    Parameters
+    ----------
+    patches
+        ``(N, side, side, 3)`` uint8.
+    bin_of_value
+        ``(256,)`` intp, the bin of each value.
+    bins
+        Number of bins.
+    features
+        Output, ``(N, 3 * bins)`` float32.
+    """
+    counts = np.empty((3, 256), np.int64)
+    for index in range(len(patches)):
+        value_counts(patches[index], counts)
+        out = features[index]
+        out[:] = 0
+        for channel in range(3):
+            for value in range(256):
+                out[channel * bins + bin_of_value[value]] += counts[channel, value]
+
+
+@jit
+def histogram_cells(image, table, cell, cells):
+    """Sum, over each cell, the table's weights of the pixel values of all channels.
+
+    Parameters
+    ----------
+    image
+        ``(H, W, 3)`` uint8.
+    table
+        ``(3, 256)`` float32, the weight of each value.
+    cell
+        Side of a cell in pixels.
+    cells
+        Output, ``(cell rows, cell columns)`` float32.
+    """
+    rows, columns = cells.shape
+    for row in range(rows):
+        for column in range(columns):
+            cells[row, column] = 0
+        for y in range(row * cell, (row + 1) * cell):
+            line = image[y]
+            for column in range(columns):
+                first = np.float32(0)
+                second = np.float32(0)
+                third = np.float32(0)
+                for x in range(column * cell, (column + 1) * cell):
+                    first += table[0, line[x, 0]]
+                    second += table[1, line[x, 1]]
+                    third += table[2, line[x, 2]]
+                cells[row, column] += first + second + third
 
 
 @jit
@@ -99,3 +167,27 @@ def add_root_histograms(image, bin_of_value, weights, cell, window, scores):
                     out = scores[template, row - window + 1]
                     for x in range(width):
                         out[x] += weight * roots[x]
+
+
+@jit
+def spatial_cells(bins, per_cell, cells):
+    """Deal the spatial bins of a band out to planes: one plane for each place of a bin in its cell.
+
+    Parameters
+    ----------
+    bins
+        ``(H, W, 3)`` uint8, the band resized to the bin grid.
+    per_cell
+        Bins along a cell's side.
+    cells
+        Output, ``(3, per_cell, per_cell, cell rows, cell columns)`` float32.
+    """
+    rows, columns = cells.shape[3], cells.shape[4]
+    for channel in range(3):
+        for i in range(per_cell):
+            for j in range(per_cell):
+                for y in range(rows):
+                    line = bins[y * per_cell + i]
+                    out = cells[channel, i, j, y]
+                    for x in range(columns):
+                        out[x] = line[x * per_cell + j, channel]

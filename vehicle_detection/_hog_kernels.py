@@ -1,39 +1,16 @@
-"""The numba kernels of the patch features: HOG cells, block normalisation and histograms.
+"""The numba kernels of HOG: orientation histograms of cells, blocks of cells, and vectors of patches.
 
-All of them work on row-major arrays, release the GIL and are compiled once into a cache on disk.
-The images are interleaved: a row of an ``(H, W, C)`` image is seen as ``W * C`` values, and the left and
-right neighbour of a value lie `C` places away. So three channels cost no shuffling, and every inner
-loop runs over neighbouring values, which the compiler turns into vector instructions.
+All of them work on row-major arrays. The images are interleaved: a row of an ``(H, W, C)`` image is seen as
+``W * C`` values, and the left and right neighbour of a value lie `C` places away. So three channels cost no
+shuffling, and every inner loop runs over neighbouring values, which the compiler turns into vector
+instructions.
 """
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
-from typing import Any
-
-import numba
 import numpy as np
 
-
-def jit(function: Callable[..., Any], *, reorder: bool = False) -> Callable[..., Any]:
-    """Compile a kernel when it is first called, into a cache on disk wherever one can be kept.
-
-    With `reorder`, sums may be taken in another order: a long one fills a vector register.
-    """
-    compiler = functools.partial(
-        numba.njit,
-        nogil=True,
-        error_model="numpy",
-        boundscheck=False,
-        fastmath={"reassoc", "contract", "nsz"} if reorder else False,
-    )
-    try:
-        return compiler(cache=True)(function)  # type: ignore[no-any-return]
-    except RuntimeError:
-        # Neither the package's folder nor the user's cache can be written: compile in every process.
-        return compiler()(function)  # type: ignore[no-any-return]
-
+from vehicle_detection._jit import jit
 
 # A tile of gradients and its histograms (10 rows of floats) stays in the first-level cache.
 _TILE = 768
@@ -290,73 +267,6 @@ def normalise_blocks(cells, block, spread, blocks):
 
 
 @jit
-def histogram_cells(image, table, cell, cells):
-    """Sum, over each cell, the table's weights of the pixel values of all channels.
-
-    Parameters
-    ----------
-    image
-        ``(H, W, 3)`` uint8.
-    table
-        ``(3, 256)`` float32, the weight of each value.
-    cell
-        Side of a cell in pixels.
-    cells
-        Output, ``(cell rows, cell columns)`` float32.
-    """
-    rows, columns = cells.shape
-    for row in range(rows):
-        for column in range(columns):
-            cells[row, column] = 0
-        for y in range(row * cell, (row + 1) * cell):
-            line = image[y]
-            for column in range(columns):
-                first = np.float32(0)
-                second = np.float32(0)
-                third = np.float32(0)
-                for x in range(column * cell, (column + 1) * cell):
-                    first += table[0, line[x, 0]]
-                    second += table[1, line[x, 1]]
-                    third += table[2, line[x, 2]]
-                cells[row, column] += first + second + third
-
-
-@jit
-def spatial_cells(bins, per_cell, cells):
-    """Deal the spatial bins of a band out to planes: one plane for each place of a bin in its cell.
-
-    Parameters
-    ----------
-    bins
-        ``(H, W, 3)`` uint8, the band resized to the bin grid.
-    per_cell
-        Bins along a cell's side.
-    cells
-        Output, ``(3, per_cell, per_cell, cell rows, cell columns)`` float32.
-    """
-    rows, columns = cells.shape[3], cells.shape[4]
-    for channel in range(3):
-        for i in range(per_cell):
-            for j in range(per_cell):
-                for y in range(rows):
-                    line = bins[y * per_cell + i]
-                    out = cells[channel, i, j, y]
-                    for x in range(columns):
-                        out[x] = line[x * per_cell + j, channel]
-
-
-@jit
-def value_counts(image, counts):
-    """Count the values of each channel: `image` ``(H, W, 3)`` uint8, `counts` ``(3, 256)`` output."""
-    counts[:] = 0
-    for y in range(image.shape[0]):
-        for x in range(image.shape[1]):
-            counts[0, image[y, x, 0]] += 1
-            counts[1, image[y, x, 1]] += 1
-            counts[2, image[y, x, 2]] += 1
-
-
-@jit
 def arrange_blocks(planes, places, spread, features):
     """Write the block planes of one patch as a vector in scikit-image's order.
 
@@ -433,28 +343,3 @@ def patch_hog_of_angles(gx, gy, angles, bounds, channels, cell, block, coarse, f
     for index in range(len(gx)):
         sum_orientations(gx[index], gy[index], angles[index], bounds, channels, cell, cells)
         write_blocks(cells, block, coarse, planes, features[index])
-
-
-@jit
-def patch_histograms(patches, bin_of_value, bins, features):
-    """Colour histogram of each patch, channel by channel.
-
-    Parameters
-    ----------
-    patches
-        ``(N, side, side, 3)`` uint8.
-    bin_of_value
-        ``(256,)`` intp, the bin of each value.
-    bins
-        Number of bins.
-    features
-        Output, ``(N, 3 * bins)`` float32.
-    """
-    counts = np.empty((3, 256), np.int64)
-    for index in range(len(patches)):
-        value_counts(patches[index], counts)
-        out = features[index]
-        out[:] = 0
-        for channel in range(3):
-            for value in range(256):
-                out[channel * bins + bin_of_value[value]] += counts[channel, value]
