@@ -21,6 +21,7 @@ import vehicle_detection
 from tests.test_mixture_report import write_set
 from tests.test_mixture_training import SMALL, drawn
 from vehicle_detection import (
+    _clip_horizon,
     _drawn_frames,
     _files,
     classifier,
@@ -35,6 +36,7 @@ from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import VehicleClassifier, load_classifier
 from vehicle_detection.cli import app
 from vehicle_detection.errors import DatasetError, InvalidInputError
+from vehicle_detection.horizon import HorizonEstimate
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.mixture import load_model
 from vehicle_detection.synthetic import render_drive, render_patches
@@ -422,6 +424,17 @@ def test_video_can_be_quiet_and_take_a_part(clip, tmp_path):
     assert "wrote" not in out
 
 
+def test_video_looks_for_the_horizon_first(clip, tmp_path, monkeypatch):
+    words = ["video", clip, tmp_path / "out.mp4", "--end", 0.12, "--horizon", "auto"]
+    found = HorizonEstimate(horizon=0.551, error=0.012, camera_height_m=1.3, boxes=40)
+    monkeypatch.setattr(_clip_horizon, "clip_horizon", lambda *_, **__: found)
+    assert "horizon 0.551, give or take 0.012, from 40 boxes" in succeed(*words)
+    monkeypatch.setattr(_clip_horizon, "clip_horizon", lambda *_, **__: None)
+    result = run(*words)
+    assert result.exit_code == 0
+    assert "warning: --horizon auto: the vehicles do not tell the horizon" in result.stderr
+
+
 def bad_videos(material, tmp):
     clip, target = material / "clip.mp4", tmp / "out.mp4"
     tiny = tmp / "tiny.mp4"
@@ -448,6 +461,7 @@ def bad_videos(material, tmp):
         r"end must be a number, .* got nan": [clip, target, "--end", "nan"],
         r"preset must be one of 'ultrafast'": [clip, target, "--preset", "hasty"],
         r"horizon must be a number": [clip, target, "--horizon", -0.5],
+        r"--horizon must be a share .* or auto; got 'high'": [clip, target, "--horizon", "high"],
         r"path must end in .csv, .*got 'tracks.doc'": [clip, target, "--tracks", tmp / "tracks.doc"],
         r"path needs an existing folder": [clip, target, "--tracks", tmp / "none" / "tracks.csv"],
         r"path must end in .html, .*got 'page.pdf'": [clip, target, "--report", tmp / "page.pdf"],

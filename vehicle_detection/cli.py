@@ -24,7 +24,9 @@ from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
 
 if TYPE_CHECKING:
     from vehicle_detection.boxes import Detections
+    from vehicle_detection.classifier import VehicleClassifier
     from vehicle_detection.detector import VehicleDetector
+    from vehicle_detection.mixture import TemplateMixture
 
 BAD_INPUT, INTERRUPTED = 2, 130
 
@@ -222,7 +224,14 @@ def video(
     preset: Annotated[
         str, typer.Option(metavar="P", help="Speed of the H.264 encoder, ultrafast to placebo.")
     ] = "veryfast",
-    horizon: Horizon = None,
+    horizon: Annotated[
+        str | None,
+        typer.Option(
+            metavar="F|auto",
+            help='Height of the horizon as a share of the frame\'s height, 0 at the top; "auto": look at the '
+            "vehicles first.",
+        ),
+    ] = None,
     no_audio: Annotated[bool, typer.Option("--no-audio", help="Leave out the sound.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors.")] = False,
     profile: Annotated[bool, typer.Option("--profile", help="Show the time of each stage.")] = False,
@@ -241,9 +250,12 @@ def video(
         writers: list[Callable[[Any], object]] = []
         if tracks is not None:
             writers.append(stack.enter_context(TrackWriter(tracks)))
-        detector = stack.enter_context(
-            VehicleDetector(load_model(model), horizon=horizon, diagnostics=diagnostics)
-        )
+        loaded = load_model(model)
+        if horizon == "auto":
+            share = _look_for_horizon(source, loaded, start, end, quiet)
+        else:
+            share = None if horizon is None else _as_share(horizon)
+        detector = stack.enter_context(VehicleDetector(loaded, horizon=share, diagnostics=diagnostics))
         page = None
         if report is not None:
             page = ReportWriter(report, video=target, source=source, detector=detector)
@@ -266,6 +278,36 @@ def video(
         typer.echo("\n".join(lines if profile else lines[:1]))
     if not quiet:
         typer.echo(f"wrote {' and '.join(map(str, (target, *outputs.values())))}")
+
+
+def _as_share(horizon: str) -> float:
+    try:
+        return float(horizon)
+    except ValueError:
+        raise InvalidInputError(
+            f"--horizon must be a share of the frame's height, such as 0.55, or auto; got {horizon!r}"
+        ) from None
+
+
+def _look_for_horizon(
+    source: Path,
+    model: VehicleClassifier | TemplateMixture,
+    start: float | None,
+    end: float | None,
+    quiet: bool,
+) -> float | None:
+    """Estimate the horizon of a video from its vehicles, and say what came of it."""
+    from vehicle_detection._clip_horizon import clip_horizon
+    from vehicle_detection.detector import VehicleDetector
+
+    with VehicleDetector(model) as detector:
+        found = clip_horizon(source, detector, start=start, end=end)
+    if found is None:
+        complain("warning: --horizon auto: the vehicles do not tell the horizon; it is left open")
+        return None
+    if not quiet:
+        typer.echo(f"horizon {found.horizon:.3f}, give or take {found.error:.3f}, from {found.boxes} boxes")
+    return found.horizon
 
 
 @app.command()
