@@ -28,6 +28,8 @@ _CASES: tuple[dict[str, Any], ...] = (
     {"light": "night"},
     {"shape": (540, 960)},
     {"shape": (1080, 1920)},
+    {"light": "night", "rain": 0.6},
+    {"light": "night", "shape": (540, 960)},
     {"scenario": "overtaking", "cut": True},
     {"scenario": "overtaking", "light": "night", "cut": True},
 )

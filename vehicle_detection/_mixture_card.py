@@ -28,10 +28,11 @@ Templates, in cells of the vehicle's box: {shapes}. A vehicle is shown from log-
 
 ## On roads it was not trained on
 
-Each source was left out of training in turn, single frames, IoU 0.5. F1 at the threshold that is best for the
-other sources, then at the best one; AP is the average precision; false boxes a frame, and on frames without
-any label. "Region F1" and "region AP" do not judge a box of which half or more lies in an ignored box: where
-labels put one ignored box around a group of vehicles, the other columns count each one found there as false.
+Each source was left out of training in turn; single frames, searched as by default, IoU 0.5. F1 at the
+threshold that is best for the other sources, then at the best one; AP is the average precision; false boxes a
+frame, and on frames without any label. "Region F1" and "region AP" do not judge a box of which half or more
+lies in an ignored box: where labels put one ignored box around a group of vehicles, the other columns count
+each one found there as false.
 
 | frames | images | vehicles | F1 | best F1 | AP | precision | recall | mean IoU | false | on empty |{regions}
 |---|---|---|---|---|---|---|---|---|---|---|---|---|

@@ -173,9 +173,9 @@ def judge_mixture(
 
 
 def find_in(mixture: TemplateMixture, source: FrameSource, *, n_jobs: int | None = None) -> list[HeldOut]:
-    """Find vehicles in all frames of a source, weak ones too."""
+    """Find vehicles in all frames of a source as a detector does that is told nothing, weak ones too."""
     search = MixtureSearch(mixture, n_jobs=1)
-    sizes = PyramidParams(horizon=None)
+    sizes = PyramidParams()
 
     def boxes_of(pair: tuple[Any, NDArray[np.uint8]]) -> tuple[Any, Detections]:
         key, image = pair
