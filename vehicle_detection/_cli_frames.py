@@ -10,9 +10,19 @@ import typer
 
 from vehicle_detection._cli_output import check_apart, output_folder, print_table
 
-_COLUMNS = ("f1", "best_f1", "average_precision", "precision", "recall", "mean_iou")
-_COUNTS = ("false_per_frame", "false_per_empty_frame")
-_REGIONS = ("region_f1", "region_average_precision")
+# Columns of the table: titles, and digits behind the point.
+_COLUMNS = {
+    "f1": ("F1", 3),
+    "best_f1": ("best F1", 3),
+    "average_precision": ("AP", 3),
+    "precision": ("precision", 3),
+    "recall": ("recall", 3),
+    "mean_iou": ("mean IoU", 3),
+    "false_per_frame": ("false", 2),
+    "false_per_empty_frame": ("on empty", 2),
+    "region_f1": ("region F1", 3),
+    "region_average_precision": ("region AP", 3),
+}
 
 
 def train_frames(
@@ -74,11 +84,9 @@ def print_road_scores(scores: Mapping[str, Mapping[str, Any]]) -> None:
     rows = [
         (
             name,
-            *(f"{values[column]:.3f}" if column in values else "" for column in _COLUMNS),
-            *(f"{values[column]:.2f}" if column in values else "" for column in _COUNTS),
-            *(f"{values[column]:.3f}" if column in values else "" for column in _REGIONS),
+            *(f"{values[key]:.{digits}f}" if key in values else "" for key, (_, digits) in _COLUMNS.items()),
         )
         for name, values in scores.items()
     ]
-    titles = (column.replace("_", " ") for column in (*_COLUMNS, *_COUNTS, *_REGIONS))
+    titles = (title for title, _ in _COLUMNS.values())
     print_table("on sources left out of training, IoU 0.5", ("frames", *titles), rows)
