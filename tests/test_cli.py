@@ -433,6 +433,7 @@ def test_video_looks_for_the_horizon_first(clip, tmp_path, monkeypatch):
     result = run(*words)
     assert result.exit_code == 0
     assert "warning: --horizon auto: the vehicles do not tell the horizon" in result.stderr
+    assert run(*words, "--quiet").output == ""
 
 
 def bad_videos(material, tmp):

@@ -2,12 +2,13 @@ import csv
 import dataclasses
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tests.test_mixture_training import SMALL, drawn
-from vehicle_detection._drawn_frames import drawn_source
+from vehicle_detection._drawn_frames import _where_cut, drawn_source
 from vehicle_detection._frame_sources import find_sources
 from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection._mixture_card import write_card, write_curves
@@ -96,6 +97,24 @@ def test_a_source_for_every_model_is_never_judged(sources):
     assert [score.source for score in scores] == [part.source for part in held] == ["one", "two"]
     plain = train_mixture([*sources, always], params, n_jobs=1)
     np.testing.assert_array_equal(model.templates[0].weights, plain.templates[0].weights)
+
+
+def test_the_nearest_frame_in_which_the_border_cuts_a_vehicle():
+    def moment(truncated, ignore):
+        return SimpleNamespace(truth=[SimpleNamespace(truncated=truncated, ignore=ignore)])
+
+    drive = [moment(0.0, False)] * 40
+    assert _where_cut(drive, 17) == 17
+    drive[2], drive[32], drive[22], drive[16] = (
+        moment(0.5, False),
+        moment(0.3, False),
+        moment(0.9, True),
+        moment(0.5, False),
+    )
+    # Too small a part is ignored, and one that is between the frames that are looked at is not seen.
+    assert _where_cut(drive, 17) == 2
+    drive[12] = moment(0.21, False)
+    assert _where_cut(drive, 17) == 12
 
 
 def test_drawn_frames_follow_from_the_seed():

@@ -34,8 +34,8 @@ COARSE, FINE = 8, 4
 
 _BOUNDS = np.deg2rad(np.arange(11.25, 180, 22.5))
 _COTANGENTS = (np.cos(_BOUNDS) / np.sin(_BOUNDS)).astype(np.float32)
-# Added to the energy of a block, in squared gray levels of the mean gradient: the noise of a plain surface is
-# about 0.5, and shall not be stretched to full contrast.
+# Added to the energy of a block, in squared gray levels of the mean gradient: noise of one gray level on a
+# surface of medium gray has about as much, and shall not be stretched to full contrast.
 _EPS = np.float32(2)
 
 

@@ -34,7 +34,8 @@ frame, and on frames without any label. "Region F1" and "region AP" do not judge
 lies in an ignored box: where labels put one ignored box around a group of vehicles, the other columns count
 each one found there as false.
 
-| frames | images | vehicles | F1 | best F1 | AP | precision | recall | mean IoU | false | on empty |{regions}
+| frames | images | vehicles | F1 | best F1 | AP | precision | recall | mean IoU | false | on empty |\
+ region F1 | region AP |
 |---|---|---|---|---|---|---|---|---|---|---|---|---|
 {rows}
 
@@ -50,7 +51,6 @@ each one found there as false.
 by the frame, seen from the side at close range or under 32 pixels wide are missed more often; scooters, signs
 and shop fronts fire. Use it to explore and to annotate, not to drive.
 """
-_REGIONS = " region F1 | region AP |"
 # What is known of the shipped model's sources; of others the card says nothing.
 _SHIPPED_SOURCES = {"india", "camvid", "indonesia", "course"}
 _TERMS = """The frames of India, of Cambridge (CamVid) and of Indonesia were published for research and other
@@ -94,7 +94,6 @@ def write_card(
         shapes=shapes,
         threshold=mixture.threshold,
         rows=rows,
-        regions=_REGIONS,
         data=data,
     )
     with written_whole(path, "path") as part:

@@ -302,12 +302,11 @@ def _look_for_horizon(
 
     with VehicleDetector(model) as detector:
         found = clip_horizon(source, detector, start=start, end=end)
-    if found is None:
+    if not quiet and found is None:
         complain("warning: --horizon auto: the vehicles do not tell the horizon; it is left open")
-        return None
-    if not quiet:
+    elif not quiet and found is not None:
         typer.echo(f"horizon {found.horizon:.3f}, give or take {found.error:.3f}, from {found.boxes} boxes")
-    return found.horizon
+    return None if found is None else found.horizon
 
 
 @app.command()
