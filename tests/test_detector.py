@@ -11,7 +11,15 @@ from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.detector import FrameResult, VehicleDetector
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture import load_model
-from vehicle_detection.params import FeatureParams, HeatParams, RegionParams, SearchBand, SearchParams
+from vehicle_detection.params import (
+    FeatureParams,
+    HeatParams,
+    RegionParams,
+    SearchBand,
+    SearchParams,
+    TrackParams,
+)
+from vehicle_detection.synthetic import render_scene
 
 HEIGHT, WIDTH = 180, 320
 SIDES = (160, 200, 250)  # of windows in a 1280 wide frame: 40, 50 and 62 pixels in these
@@ -143,6 +151,29 @@ def test_a_result_tells_what_was_found():
     assert set(last.seconds) == {"search", "regions", "track"}
     assert all(seconds >= 0 for seconds in last.seconds.values())
     assert detector.process(frame_with(CAR)).time is None
+
+
+def test_what_is_too_weak_for_a_still_is_for_the_tracker_alone():
+    model, road = load_model(), render_scene(shape=(360, 640), vehicles=3, random_state=5).image
+    with VehicleDetector(model, n_jobs=1) as detector:
+        scores = detector.detect(road).scores
+        clear = detector.process(road)
+    assert (scores > 0).all()
+    # The best one is now a little below a vehicle.
+    strict = dataclasses.replace(model, threshold=model.threshold + scores.max() + 0.4)
+    with VehicleDetector(strict, n_jobs=1) as detector:
+        assert len(detector.detect(road)) == 0
+        weak = detector.search(road).vehicles.scores
+        assert weak.max() == pytest.approx(-0.4)
+        assert weak.min() >= -1.5
+        result = detector.process(road)
+        assert len(result.regions) == 0
+        assert [track.state for track in result.tracks].count("tentative") > 0
+    assert len(clear.regions) == len(scores)
+    blunt = TrackParams(keep_score=0.0, birth_score=0.0)
+    with VehicleDetector(strict, track=blunt, n_jobs=1) as detector:
+        assert len(detector.search(road).vehicles) == 0
+        assert detector.process(road).tracks == ()
 
 
 @pytest.mark.parametrize("regions", ["fitted", "heat"])

@@ -207,13 +207,13 @@ class TestLife:
 
     def test_a_weak_vehicle_is_shown_later_and_a_very_weak_one_never(self):
         first = {}
-        for score in (1.5, 0.5, 0.3):
+        for score in (1.5, 0.15, 0.08):
             tracker = Tracker()
             tracker.update(Detections.empty(), SHAPE)
             shown = [any(t.shown for t in tracker.update(found(CAR, score=score), SHAPE)) for _ in range(100)]
             first[score] = shown.index(True) if any(shown) else None
-        assert first[1.5] < first[0.5] < 12
-        assert first[0.3] is None
+        assert first[1.5] < first[0.15] < 12
+        assert first[0.08] is None
 
     def test_scores_below_the_birth_score_start_no_track_but_keep_one(self):
         tracker = Tracker(TrackParams(birth_score=0.5))
@@ -222,6 +222,48 @@ class TestLife:
             tracker.update(found(CAR, score=1.0), SHAPE)
         (track,) = tracker.update(found(CAR, score=0.4), SHAPE)
         assert (track.state, track.misses) == ("confirmed", 0)
+
+    @pytest.mark.parametrize(("score", "misses"), [(-0.4, 0), (-1.4, 0), (-1.6, 5)])
+    def test_a_believed_vehicle_is_kept_by_weak_detections(self, score, misses):
+        tracker = Tracker()
+        for _ in range(10):
+            tracker.update(found(CAR, score=3.0), SHAPE)
+        for _ in range(5):
+            (track,) = tracker.update(found(CAR, score=score), SHAPE)
+        assert track.misses == misses
+
+    def test_weak_detections_alone_are_no_vehicle(self):
+        for score in (-0.4, -1.0):
+            tracker = Tracker()
+            for _ in range(100):
+                assert not any(track.shown for track in tracker.update(found(CAR, score=score), SHAPE))
+
+    def test_a_vehicle_that_wavers_about_the_least_score_is_followed_without_a_gap(self):
+        tracker, shown = Tracker(), []
+        for frame in range(100):
+            tracks = tracker.update(found(CAR, score=0.9 if frame % 3 else -0.7), SHAPE)
+            shown.append([track.id for track in tracks if track.shown])
+        assert shown.index([1]) < 25
+        assert all(ids == [1] for ids in shown[25:])
+
+    def test_a_weak_detection_takes_no_vehicle_from_a_clear_one(self):
+        tracker, moved = Tracker(), np.array(CAR) + [12.0, 0, 12, 0]
+        for _ in range(10):
+            tracker.update(found(CAR, score=3.0), SHAPE)
+        (track,) = tracker.update(Detections([CAR, moved], [-0.6, 3.0]), SHAPE)
+        assert track.score > 2
+        assert track.box[0] > CAR[0] + 2
+
+    def test_a_weak_detection_must_be_nearer_than_a_clear_one(self):
+        width = CAR[2] - CAR[0]
+        for share, clear, weak in ((0.2, 0, 0), (0.5, 0, 1)):
+            beside = np.array(CAR) + np.array([share * width, 0, share * width, 0])
+            for score, misses in ((3.0, clear), (-1.0, weak)):
+                tracker = Tracker()
+                for _ in range(10):
+                    tracker.update(found(CAR, score=3.0), SHAPE)
+                tracks = tracker.update(found(beside, score=score), SHAPE)
+                assert tracks[0].misses == misses
 
     def test_states_and_ids(self):
         tracker = Tracker()

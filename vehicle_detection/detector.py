@@ -43,7 +43,8 @@ class FoundWindows:
     windows
         Windows that score above the search's least score.
     vehicles
-        Boxes of the vehicles, where the model tells them; None where they follow from the windows.
+        Boxes of the vehicles, where the model tells them, and of what may be some: scores below 0 are for the
+        tracker alone. None where they follow from the windows.
     shape
         ``(height, width)`` of the frame.
     thumbnail
@@ -211,7 +212,8 @@ class VehicleDetector:
         params = self.search_params
         if isinstance(params, PyramidParams):
             assert isinstance(self._engine, MixtureSearch)
-            found = self._engine.find(frame, params)
+            least = min(0.0, self.track_params.keep_score, self.track_params.birth_score)
+            found = self._engine.find(frame, params, least=least)
             windows, vehicles = found.windows, found.vehicles
         elif isinstance(self._engine, BandSearch):
             windows = self._engine.find(frame, params)
@@ -256,7 +258,7 @@ class VehicleDetector:
         found = self.search(image)
         if self.regions == "heat":
             return self._label(frame_heat(found.shape, found.windows, self.heat_params))
-        return self._fit(found)
+        return _sure(self._fit(found))
 
     def _fit(self, found: FoundWindows) -> Detections:
         if found.vehicles is not None:
@@ -327,7 +329,7 @@ class VehicleDetector:
             "regions": fitted - began,
             "track": clock.perf_counter() - fitted,
         }
-        result = FrameResult(self._index, time, found.windows, regions, tracks, seconds)
+        result = FrameResult(self._index, time, found.windows, _sure(regions), tracks, seconds)
         self._index += 1
         return result
 
@@ -367,6 +369,11 @@ class VehicleDetector:
 
     def __exit__(self, *_: Any) -> None:
         self.close()
+
+
+def _sure(vehicles: Detections) -> Detections:
+    """Leave out what is for the tracker alone."""
+    return vehicles if (vehicles.scores >= 0).all() else vehicles[vehicles.scores >= 0]
 
 
 def _search_params(

@@ -198,7 +198,7 @@ class MixtureFind:
     windows
         Windows above the search's least score, best first, with log-odds above the model's threshold.
     vehicles
-        Boxes of the vehicles, with scores above 0.
+        Boxes of the vehicles, with scores above the least one that was asked for.
     """
 
     windows: Detections
@@ -237,7 +237,9 @@ class MixtureSearch:
         """End the threads."""
         self._crew.close()
 
-    def find(self, image: NDArray[np.uint8], params: PyramidParams | None = None) -> MixtureFind:
+    def find(
+        self, image: NDArray[np.uint8], params: PyramidParams | None = None, *, least: float = 0.0
+    ) -> MixtureFind:
         """Find the vehicles of a frame.
 
         Parameters
@@ -246,6 +248,8 @@ class MixtureSearch:
             ``(H, W, 3)`` uint8 RGB.
         params
             Sizes and places of the windows; by default those of any dash-cam.
+        least
+            Least score of a vehicle, in log-odds above the model's threshold.
 
         Returns
         -------
@@ -262,7 +266,7 @@ class MixtureSearch:
         mixture = self.mixture
         scores = mixture.scores(found.scores)
         evidence = scores >= params.min_score
-        boxes, values = mixture.vehicles(image, found, least=mixture.value(0.0))
+        boxes, values = mixture.vehicles(image, found, least=mixture.value(least))
         return MixtureFind(
             Detections(found.boxes[evidence], scores[evidence]), Detections(boxes, mixture.scores(values))
         )

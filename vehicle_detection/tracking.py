@@ -4,6 +4,8 @@ Each frame's boxes are assigned to the tracks (Hungarian assignment on overlap a
 constant-velocity Kalman filter over its box and another one over its distance. The scheme is that of Bewley
 et al., *Simple Online and Realtime Tracking* (ICIP 2016), with a life that weighs scores instead of counting
 frames, and that knows why a vehicle may be unseen: hidden by another, merged with it, cut off by the frame.
+Detections that would be too weak for a still keep a believed track alive, as in Zhang et al., *ByteTrack:
+Multi-Object Tracking by Associating Every Detection Box* (ECCV 2022).
 """
 
 from __future__ import annotations
@@ -53,6 +55,8 @@ _BLIND = 0.5
 _HORIZON_DOUBT = 0.05
 # Share of the gate for tracks that are not believed yet.
 _TENTATIVE_GATE = 0.6
+# The same for weak detections.
+_WEAK_GATE = 0.5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -208,6 +212,8 @@ class Tracker:
         if dt == 0:
             return self._tracks
         boxes, scores = _inside(detections, frame)
+        known = scores >= min(self.params.birth_score, self.params.keep_score)
+        boxes, scores = boxes[known], scores[known]
         free = np.ones(len(boxes), np.bool_)
         if self._vehicles:
             unseen = np.array([vehicle.misses > 0 for vehicle in self._vehicles])
@@ -240,7 +246,7 @@ class Tracker:
     def _correct(self, boxes: Floats, scores: Floats, frame: Frame, dt: float) -> NDArray[np.bool_]:
         """Correct the tracks by the detections that belong to them; return which detections are left."""
         vehicles, free = self._vehicles, np.ones(len(boxes), np.bool_)
-        own, region, merged = self._assign(boxes, frame)
+        own, region, merged = self._assign(boxes, scores, frame)
         for row, vehicle in enumerate(vehicles):
             vehicle.live(float(scores[own[row]]) if row in own else None, dt, self.params)
             vehicle.hidden = row in region
@@ -262,7 +268,9 @@ class Tracker:
         self._filters = self._filters.put(rows, after)
         return free
 
-    def _assign(self, boxes: Floats, frame: Frame) -> tuple[dict[int, int], dict[int, int], set[int]]:
+    def _assign(
+        self, boxes: Floats, scores: Floats, frame: Frame
+    ) -> tuple[dict[int, int], dict[int, int], set[int]]:
         """Find each track's detection, the regions that show one beside another, and those others."""
         predicted = _clip(self._filters.boxes(), frame)
         # The longer unseen, the farther off it may be; clutter that leaps about shall not pass for a vehicle.
@@ -271,8 +279,13 @@ class Tracker:
         match = match_nearest if self.params.smoother == "nearest" else match_boxes
         # Believed tracks come first in the list, and choose first.
         believed = sum(v.id > 0 for v in self._vehicles)
-        own = dict(match(predicted[:believed], boxes, gate[:believed]))
-        merged, region = merged_regions(predicted[:believed], boxes, own)
+        # Detections come the best one first; weak ones are for tracks that found no other.
+        clear = int((scores >= self.params.birth_score).sum())
+        own = dict(match(predicted[:believed], boxes[:clear], gate[:believed]))
+        merged, region = merged_regions(predicted[:believed], boxes[:clear], own)
+        lost = [row for row in range(believed) if row not in own and row not in region]
+        for row, column in match(predicted[lost], boxes[clear:], _WEAK_GATE * gate[lost]):
+            own[lost[row]] = clear + column
         taken = set(own.values())
         left = [column for column in range(len(boxes)) if column not in taken]
         for row, column in match(predicted[believed:], boxes[left], gate[believed:]):
