@@ -2,6 +2,7 @@ import csv
 import dataclasses
 import json
 import math
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from tests.test_mixture_training import SMALL, drawn
 from vehicle_detection._drawn_frames import _where_cut, drawn_source
-from vehicle_detection._frame_sources import find_sources
+from vehicle_detection._frame_sources import find_patches, find_sources
 from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection._mixture_card import write_card, write_curves
 from vehicle_detection.boxes import Detections
@@ -291,6 +292,22 @@ def test_sources_of_a_folder(tmp_path):
     assert [[len(part) for part in source.sets] for source in found] == [[2], [3], [4]]
     assert [source.complete_from for source in found] == [60.0, 0.0, 0.0]
     assert len(found[1].sets[0].labels) == len(drawn(range(3)).labels)
+
+
+@pytest.mark.parametrize("zipped", [True, False], ids=["zip", "folder"])
+def test_every_twelfth_patch_of_a_folder(tmp_path, zipped):
+    assert find_patches(tmp_path) == []
+    for number in range(25):
+        (tmp_path / "vehicles" / "GTI_Far").mkdir(parents=True, exist_ok=True)
+        write_image(
+            tmp_path / "vehicles" / "GTI_Far" / f"{number}.png", np.full((64, 64, 3), number, np.uint8)
+        )
+    if zipped:
+        shutil.make_archive(str(tmp_path / "vehicles"), "zip", tmp_path, "vehicles")
+        shutil.rmtree(tmp_path / "vehicles")
+    found = find_patches(tmp_path)
+    assert [image.shape for image in found] == [(64, 64, 3)] * 3
+    assert [image[0, 0, 0] for image in found] == [0, 12, 24]
 
 
 def test_folders_that_are_refused(tmp_path):

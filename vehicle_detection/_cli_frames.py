@@ -29,7 +29,9 @@ def train_frames(
     data: Annotated[
         Path,
         typer.Argument(
-            metavar="DATA", help="Folder with labels/NAME.csv and frames/NAME/ or videos/NAME.mp4."
+            metavar="DATA",
+            help="Folder with labels/NAME.csv and frames/NAME/ or videos/NAME.mp4; the course's patches in "
+            "vehicles.zip or vehicles/ are used where they are there.",
         ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Model file to write.")],
@@ -51,7 +53,7 @@ def train_frames(
     """Train the model for any road, and judge it on sources that it was not trained on."""
     from vehicle_detection._drawn_frames import drawn_source
     from vehicle_detection._files import check_target
-    from vehicle_detection._frame_sources import find_sources
+    from vehicle_detection._frame_sources import find_patches, find_sources
     from vehicle_detection._mixture_card import write_card, write_curves
     from vehicle_detection._mixture_windows import check_sources
     from vehicle_detection.mixture_report import as_metadata, judge_mixture
@@ -61,13 +63,16 @@ def train_frames(
     check_apart(targets, {"DATA": data})
     sources = find_sources(data)
     check_sources(sources, least=2)
+    patches = find_patches(data)
     always = [drawn_source(random_state=seed)] if drawn else []
     with output_folder(pictures, "--pictures"):
-        trained, scores, held = judge_mixture(sources, always=always, random_state=seed, on_step=typer.echo)
+        trained, scores, held = judge_mixture(
+            sources, always=always, patches=patches, random_state=seed, on_step=typer.echo
+        )
         sources += always
-        trained.with_metadata(as_metadata(scores, sources, seed)).save(output)
+        trained.with_metadata(as_metadata(scores, sources, seed, len(patches))).save(output)
         if card is not None:
-            write_card(card, trained, scores, sources, seed)
+            write_card(card, trained, scores, sources, seed, len(patches))
         if curves is not None:
             write_curves(curves, held)
         written = [*targets.values()]

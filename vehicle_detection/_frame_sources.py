@@ -5,9 +5,12 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection._mixture_windows import FrameSource
-from vehicle_detection.datasets import load_frames
+from vehicle_detection.datasets import load_frames, load_patches
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation import Labels, read_labels
 
@@ -18,6 +21,8 @@ COURSE = "course"
 _CLIP_RATE = 3.0
 # Sources that leave small vehicles of the background unlabelled, and the width from which on they do not.
 _COMPLETE_FROM = {"indonesia": 60.0}
+# Every so many of the course's patches are trained on; neighbours show the same car.
+_PATCH_STEP = 12
 
 
 def find_sources(folder: str | os.PathLike[str]) -> list[FrameSource]:
@@ -66,6 +71,25 @@ def find_sources(folder: str | os.PathLike[str]) -> list[FrameSource]:
         except InvalidInputError as error:
             raise InvalidInputError(f"{file}: {error}") from error
     return sources + ([FrameSource(COURSE, tuple(course))] if course else [])
+
+
+def find_patches(folder: str | os.PathLike[str]) -> list[NDArray[np.uint8]]:
+    """Take some of the course's vehicle patches, ``(64, 64, 3)`` each, from a folder; none where it has none.
+
+    Parameters
+    ----------
+    folder
+        May hold ``vehicles.zip``, or what it unpacks to in ``vehicles/``.
+
+    Raises
+    ------
+    DatasetError
+        As in `datasets.load_patches`.
+    """
+    for place in (Path(folder) / "vehicles.zip", Path(folder) / "vehicles"):
+        if place.exists():
+            return list(load_patches(place, label=1).patches[::_PATCH_STEP])
+    return []
 
 
 def _sampled(video: Path, labels: Labels) -> LabelledFrames:

@@ -55,6 +55,8 @@ and shop fronts fire. Use it to explore and to annotate, not to drive.
 _SHIPPED_SOURCES = {"india", "camvid", "indonesia", "course"}
 _TERMS = """The frames of India, of Cambridge (CamVid) and of Indonesia were published for research and other
 non-commercial use, and the model inherits that; the course's images and clips are MIT licensed."""
+_PATCH_TERMS = """
+The patches come from the GTI vehicle image database and from KITTI (CC BY-NC-SA 3.0)."""
 _PLACES = "Trained on daylight and dusk in three countries and on one American highway. "
 _OTHER_TERMS = "The terms of these frames hold for the model as well."
 
@@ -65,6 +67,7 @@ def write_card(
     scores: Sequence[RoadScore],
     sources: Sequence[FrameSource],
     seed: int,
+    patches: int = 0,
 ) -> None:
     """Write the model card."""
     rows = "\n".join(
@@ -84,9 +87,11 @@ def write_card(
         f"{sum(int((~part.labels.ignore).sum()) for part in source.sets)} vehicles"
         for source in sources
     )
+    if patches:
+        data += f"\n- {patches} vehicles on the course's patches"
     known = {source.name for source in sources} - {DRAWN} == _SHIPPED_SOURCES
     text = _CARD.format(
-        terms=_TERMS if known else _OTHER_TERMS,
+        terms=(_TERMS if known else _OTHER_TERMS) + _PATCH_TERMS * (patches > 0),
         places=_PLACES if known else "",
         name=Path(path).stem,
         count=len(mixture.templates),

@@ -38,8 +38,9 @@ class MixtureParams:
         How often a box is corrected at most, as in `Refinement`.
     margin
         Cells of context on every side.
-    C
-        Inverse strength of the regularisation, as in ``LinearSVC``.
+    C, border_C
+        Inverse strength of the regularisation, as in ``LinearSVC``, of the templates of whole vehicles and of
+        those at the border.
     vehicles
         Weight of all vehicles of a template together; a negative weighs 1.
     least_width
@@ -48,6 +49,9 @@ class MixtureParams:
         A box trains every template whose logarithmic aspect ratio is this near, and the nearest.
     jitter
         Copies of each box, of which all but the first are moved by up to ``shake`` of its sides.
+    border_jitter
+        The same for each vehicle that a border cuts: they are few, and seen from another side than those that
+        are cut on purpose.
     exposures
         Further copies of each box of a whole vehicle, each in a frame of another exposure and contrast.
     rounds
@@ -80,11 +84,13 @@ class MixtureParams:
     support_gain: float = 0.05
     looks: int = 2
     margin: float = 1.0
-    C: float = 5e-4
+    C: float = 1e-3
+    border_C: float = 4e-3  # noqa: N815 - as C
     vehicles: float = 1500.0
     least_width: float = 28.0
     near: float = 0.2
     jitter: int = 2
+    border_jitter: int = 8
     shake: float = 0.03
     exposures: int = 1
     rounds: tuple[float, ...] = (0.15, 0.3, 0.6, 1.0)
@@ -108,10 +114,12 @@ class MixtureParams:
         check_integer(self.looks, "looks", low=1, high=10)
         check_number(self.margin, "margin", low=0, high=8)
         check_number(self.C, "C", above=0, high=1e6)
+        check_number(self.border_C, "border_C", above=0, high=1e6)
         check_number(self.vehicles, "vehicles", above=0, high=1e9)
         check_number(self.least_width, "least_width", low=8, high=10_000)
         check_number(self.near, "near", low=0, high=10)
         check_integer(self.jitter, "jitter", low=1, high=100)
+        check_integer(self.border_jitter, "border_jitter", low=1, high=100)
         check_number(self.shake, "shake", low=0, high=0.25)
         check_integer(self.exposures, "exposures", low=0, high=100)
         rounds = entries(self.rounds, "rounds")

@@ -117,6 +117,7 @@ def judge_mixture(
     params: MixtureParams | None = None,
     *,
     always: Sequence[FrameSource] = (),
+    patches: Sequence[NDArray[np.uint8]] = (),
     random_state: int = 0,
     n_jobs: int | None = None,
     on_step: Callable[[str], object] | None = None,
@@ -129,7 +130,7 @@ def judge_mixture(
         Labelled frames of two sources or more.
     always
         Further sources, that every model is trained on and none is judged by.
-    params, random_state, n_jobs, on_step
+    params, patches, random_state, n_jobs, on_step
         As for `train_mixture`.
 
     Returns
@@ -156,7 +157,12 @@ def judge_mixture(
     for out in sources:
         rest = [source for source in sources if source is not out] + [*known]
         mixture = train_mixture(
-            rest, params, random_state=random_state, n_jobs=n_jobs, on_step=lambda line: None
+            rest,
+            params,
+            patches=patches,
+            random_state=random_state,
+            n_jobs=n_jobs,
+            on_step=lambda line: None,
         )
         held += find_in(mixture, out, n_jobs=n_jobs)
         tell(f"{out.name}: judged by a model that does not know it")
@@ -166,7 +172,12 @@ def judge_mixture(
     slope, offset = _log_odds(held)
     threshold = slope * _threshold(held) + offset
     mixture = train_mixture(
-        [*sources, *known], params, random_state=random_state, n_jobs=n_jobs, on_step=on_step
+        [*sources, *known],
+        params,
+        patches=patches,
+        random_state=random_state,
+        n_jobs=n_jobs,
+        on_step=on_step,
     )
     calibrated = replace(mixture, slope=slope, offset=offset, threshold=threshold)
     return calibrated, scores, held
@@ -258,11 +269,14 @@ def _log_odds(held: Sequence[HeldOut]) -> tuple[float, float]:
     return (slope, float(fitted.intercept_[0])) if slope > 0 else (1.0, 0.0)
 
 
-def as_metadata(scores: Sequence[RoadScore], sources: Sequence[FrameSource], seed: int) -> dict[str, Any]:
+def as_metadata(
+    scores: Sequence[RoadScore], sources: Sequence[FrameSource], seed: int, patches: int = 0
+) -> dict[str, Any]:
     """Collect what a model file tells of its training."""
+    data = {source.name: sum(len(part) for part in source.sets) for source in sources}
     return {
         "metrics": {"left_out": {score.name: score.to_dict() for score in scores}},
-        "data": {source.name: sum(len(part) for part in source.sets) for source in sources},
+        "data": data | ({"patches": patches} if patches else {}),
         "training": {"random_state": seed},
         "versions": {"vehicle_detection": vehicle_detection.__version__},
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -12,10 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._checks import check_integer, check_type
-from vehicle_detection._feature_maps import COARSE, FINE, PLANES, mirror_planes
+from vehicle_detection._feature_maps import PLANES
 from vehicle_detection._jobs import resolve_jobs
 from vehicle_detection._mixture_params import MixtureParams
 from vehicle_detection._mixture_template import MixtureTemplate
+from vehicle_detection._mixture_vehicles import (
+    cut_vehicles,
+    mirror_boxes,
+    moved_boxes,
+    patch_features,
+    turned,
+    vehicle_features,
+    whole_vehicles,
+)
 from vehicle_detection._mixture_windows import (
     Frame,
     FrameSource,
@@ -27,8 +36,7 @@ from vehicle_detection._mixture_windows import (
     random_windows,
     with_mirrored,
 )
-from vehicle_detection._refinement import CROP_LENGTH, Refinement, box_planes, crop_features, suppress
-from vehicle_detection._variants import relight
+from vehicle_detection._refinement import CROP_LENGTH, Refinement, crop_features, suppress
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture import MixtureSearch, TemplateMixture
@@ -41,15 +49,13 @@ log = logging.getLogger(__name__)
 
 # Steps of the solver while negatives are still looked for, and in the end.
 _FEW_STEPS, _MANY_STEPS = 50, 200
-# A vehicle is cut by a border that it comes nearer to than this, in pixels; share of a vehicle that is left
-# where it is cut on purpose.
-_AT_BORDER, _SHOWN = 3, (0.3, 0.85)
 
 
 def train_mixture(
     sources: Sequence[FrameSource],
     params: MixtureParams | None = None,
     *,
+    patches: Sequence[Image] = (),
     random_state: int = 0,
     n_jobs: int | None = None,
     on_step: Callable[[str], object] | None = None,
@@ -62,6 +68,9 @@ def train_mixture(
         Labelled frames.
     params
         Shapes of the templates, and how they are trained.
+    patches
+        Further vehicles: ``(H, W, 3)`` uint8 RGB images of any size, of which one vehicle fills most, such
+        as the course's patches. Where it is on them is told by what is learned about boxes.
     random_state
         Seed of the jitter and of the first negatives.
     n_jobs
@@ -92,20 +101,11 @@ def train_mixture(
     frames = frames_of(sources)
     rng = np.random.default_rng(random_state)
     templates = [_blank(shape, params.margin) for shape in params.shapes]
-    positives = _positives(_whole(frames, params, rng), templates, params)
     at_border = [_blank(shape, params.margin, border=True) for shape in params.border_shapes]
-    positives += _positives(_cut(frames, params, rng), at_border, params)
-    templates += at_border
-    for shape, rows in zip(params.shapes + params.border_shapes, positives):
-        if not len(rows):
-            raise InvalidInputError(
-                f"sources must hold vehicles of every shape, got none like {shape[0]:g}x{shape[1]:g} that is "
-                f"{params.least_width:g} pixels wide or more; leave that shape out of MixtureParams"
-            )
-    for index in np.flatnonzero(params.facing).tolist():
-        positives[index] = turned(positives[index], rng)
-    tell(f"{[len(rows) for rows in positives]} vehicles")
     with ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
+        positives = _positives(frames, patches, templates, at_border, params, rng, pool)
+        tell(f"{[len(rows) for rows in positives]} vehicles")
+        templates += at_border
         facing = params.facing + (False,) * len(at_border)
         rounds = _Rounds(frames, positives, facing, params, pool)
         seeds = rng.integers(2**32, size=len(frames)).tolist()
@@ -125,9 +125,37 @@ def train_mixture(
         plain = TemplateMixture(
             found, Refinement.none(), near_gain=params.near_gain, support_gain=params.support_gain
         )
-        seeds = rng.integers(2**32, size=len(frames)).tolist()
-        refinement = _fit_refinement(plain, frames, seeds, params, pool)
+        search = MixtureSearch(plain, n_jobs=1)
+        refinement = _fit_refinement(frames, rng, params, pool, search)
+        search.close()
     return replace(plain, refinement=refinement)
+
+
+def _positives(
+    frames: Sequence[Frame],
+    patches: Sequence[Image],
+    templates: Sequence[MixtureTemplate],
+    at_border: Sequence[MixtureTemplate],
+    params: MixtureParams,
+    rng: np.random.Generator,
+    pool: ThreadPoolExecutor,
+) -> list[NDArray[np.float32]]:
+    """Features of the vehicles of each template."""
+    found = vehicle_features(whole_vehicles(frames, params, rng), templates, params)
+    cut = vehicle_features(cut_vehicles(frames, params, rng), at_border, params)
+    for shape, rows in zip(params.shapes + params.border_shapes, found + cut):
+        if not len(rows):
+            raise InvalidInputError(
+                f"sources must hold vehicles of every shape, got none like {shape[0]:g}x{shape[1]:g} that is "
+                f"{params.least_width:g} pixels wide or more; leave that shape out of MixtureParams"
+            )
+    if len(patches):
+        placing = _fit_refinement(frames, rng, params, pool)
+        more = patch_features(patches, placing, templates, found, params)
+        found = [np.concatenate(both) for both in zip(found, more)]
+    for index in np.flatnonzero(params.facing).tolist():
+        found[index] = turned(found[index], rng)
+    return found + cut
 
 
 class _Rounds:
@@ -171,31 +199,11 @@ class _Rounds:
 
         def solved(index: int) -> Floats:
             rows = self._positives[index], self._negatives.rows[index]
-            return _solve(*rows, self._params, self._vectors[index], steps)
+            C = self._params.border_C if templates[index].border else self._params.C
+            return _solve(*rows, C, self._params.vehicles, self._vectors[index], steps)
 
         self._vectors = list(self._pool.map(solved, range(len(templates))))
         return [_filled(template, vector) for template, vector in zip(templates, self._vectors)]
-
-
-def turned(rows: NDArray[np.float32], rng: np.random.Generator, tries: int = 5) -> NDArray[np.float32]:
-    """Choose of each vehicle and its mirror image, which are neighbouring rows, the one like the others.
-
-    Two clusters that are each other's mirror image, by k-means from a few random starts.
-    """
-    if not len(rows):
-        return rows
-    pairs = rows.reshape(len(rows) // 2, 2, -1)
-    centred = pairs - pairs.mean(axis=(0, 1))
-    number = np.arange(len(pairs))
-    best, length = np.zeros(len(pairs), np.intp), -1.0
-    for _ in range(tries):
-        chosen = rng.integers(0, 2, len(pairs))
-        for _ in range(15):
-            mean = centred[number, chosen].mean(axis=0)
-            chosen = (centred @ mean).argmax(axis=1)
-        if float(np.linalg.norm(mean)) > length:
-            best, length = chosen, float(np.linalg.norm(mean))
-    return np.ascontiguousarray(pairs[number, best])
 
 
 def _blank(shape: tuple[float, float], margin: float, *, border: bool = False) -> MixtureTemplate:
@@ -210,85 +218,18 @@ def _filled(template: MixtureTemplate, vector: Floats) -> MixtureTemplate:
     return replace(template, weights=weights, bias=float(np.float32(vector[-1])))
 
 
-def _window(image: Image, box: Floats, template: MixtureTemplate) -> NDArray[np.float32]:
-    """Features of a box as a template sees it, ``(28, rows, columns)``."""
-    inside = template.box_cells
-    rows, columns = template.weights.shape[:2]
-    step_x, step_y = (box[2] - box[0]) / inside[0], (box[3] - box[1]) / inside[1]
-    cell = FINE if np.sqrt(step_x * step_y) < COARSE else COARSE
-    if template.border:
-        # The window ends with the box: its margin is part of what is warped.
-        box, inside = box - [template.margin[0] * step_x, 0, 0, 0], (float(columns), inside[1])
-    return box_planes(image, box.tolist(), inside, (columns, rows), cell)
-
-
-Seen = Iterator[tuple[Image, Floats]]
-"""Images and the place of a vehicle in each."""
-
-
-def _whole(frames: Sequence[Frame], params: MixtureParams, rng: np.random.Generator) -> Seen:
-    """Vehicles where they are, moved a little, and at other exposures."""
-    for frame in frames:
-        boxes = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.least_width]
-        for box in boxes:
-            for copy in range(params.jitter):
-                shift = rng.uniform(-1, 1, 4) * params.shake * np.tile(box[2:] - box[:2], 2)
-                yield frame.image, box + shift * (copy > 0)
-        for _ in range(params.exposures if len(boxes) else 0):
-            image = relight(frame.image, rng)
-            for box in boxes:
-                yield image, box
-
-
-def _cut(frames: Sequence[Frame], params: MixtureParams, rng: np.random.Generator) -> Seen:
-    """Vehicles that the right border cuts, and whole ones in images that are cut through them."""
-    for frame in frames:
-        width = frame.image.shape[1]
-        mirrored = np.ascontiguousarray(frame.image[:, ::-1])
-        for image, boxes in (frame.image, frame.boxes), (mirrored, mirror_boxes(frame.boxes, width)):
-            for box in boxes[boxes[:, 2] - boxes[:, 0] >= params.least_width]:
-                sides = np.tile(box[2:] - box[:2], 2)
-                if box[2] >= width - _AT_BORDER:
-                    for copy in range(params.jitter):
-                        x1, y1, _, y2 = box + rng.uniform(-1, 1, 4) * params.shake * sides * (copy > 0)
-                        yield image, np.array([x1, y1, width, y2])
-                end = round(box[0] + rng.uniform(*_SHOWN) * sides[0])
-                if box[0] > _AT_BORDER and params.least_width <= end - box[0] and end < width - _AT_BORDER:
-                    yield image[:, :end], np.array([*box[:2], end, box[3]])
-
-
-def mirror_boxes(boxes: Floats, width: float) -> Floats:
-    """Boxes in the mirrored image of this width."""
-    return np.stack([width - boxes[:, 2], boxes[:, 1], width - boxes[:, 0], boxes[:, 3]], axis=1)
-
-
-def _positives(
-    vehicles: Seen, templates: Sequence[MixtureTemplate], params: MixtureParams
-) -> list[NDArray[np.float32]]:
-    """Features of the vehicles of each template, ``(N, length)``."""
-    found: list[list[NDArray[np.float32]]] = [[] for _ in templates]
-    aspects = np.log([template.box_cells[0] / template.box_cells[1] for template in templates])
-    for image, box in vehicles if templates else ():
-        apart = np.abs(np.log((box[2] - box[0]) / (box[3] - box[1])) - aspects)
-        for index in np.flatnonzero((apart == apart.min()) | (apart < params.near)).tolist():
-            planes = _window(image, box, templates[index])
-            # At the border every vehicle comes from both sides already.
-            for view in (planes,) if templates[index].border else (planes, mirror_planes(planes)):
-                found[index].append(view.transpose(1, 2, 0).ravel())
-    return [np.array(rows, np.float32).reshape(-1, t.weights.size) for rows, t in zip(found, templates)]
-
-
 def _solve(
     positives: NDArray[np.float32],
     negatives: NDArray[np.float32],
-    params: MixtureParams,
+    C: float,
+    vehicles: float,
     start: Floats,
     steps: int,
 ) -> Floats:
     """Weights and bias of a linear SVM with squared hinge loss, in the primal (Chapelle, 2007)."""
     from scipy.optimize import minimize
 
-    sides = (positives, 1.0, params.vehicles / len(positives)), (negatives, -1.0, 1.0)
+    sides = (positives, 1.0, vehicles / len(positives)), (negatives, -1.0, 1.0)
 
     def loss(vector: Floats) -> tuple[float, Floats]:
         weights, bias = vector[:-1].astype(np.float32), vector[-1]
@@ -296,8 +237,8 @@ def _solve(
         value = 0.5 * float(vector[:-1] @ vector[:-1])
         for rows, sign, weight in sides:
             margin = np.maximum(1 - sign * ((rows @ weights).astype(np.float64) + bias), 0)
-            value += params.C * weight * float(margin @ margin)
-            pull = (-2 * params.C * weight * sign * margin).astype(np.float32)
+            value += C * weight * float(margin @ margin)
+            pull = (-2 * C * weight * sign * margin).astype(np.float32)
             gradient[:-1] += pull @ rows
             gradient[-1] += float(pull.sum())
         return value, gradient
@@ -307,26 +248,31 @@ def _solve(
 
 
 def _fit_refinement(
-    mixture: TemplateMixture,
     frames: Sequence[Frame],
-    seeds: Sequence[int],
+    rng: np.random.Generator,
     params: MixtureParams,
     pool: ThreadPoolExecutor,
+    search: MixtureSearch | None = None,
 ) -> Refinement:
-    """Learn how boxes that are found, or moved at random, differ from the true ones, by ridge regression."""
+    """Learn how boxes that a search finds, and others moved at random, differ from the true ones.
+
+    By ridge regression; without a search, from the moved ones alone.
+    """
     from sklearn.linear_model import Ridge
 
-    search = MixtureSearch(mixture, n_jobs=1)
+    seeds = rng.integers(2**32, size=len(frames)).tolist()
 
     def pairs(frame: Frame, seed: int) -> tuple[NDArray[np.float32], Floats]:
         if not len(frame.boxes):
             return np.empty((0, CROP_LENGTH), np.float32), np.empty((0, 4))
-        found = suppress(search.candidates(frame.image, params.search), least=-1.0)[0].boxes
+        found = np.empty((0, 4))
+        if search is not None:
+            found = suppress(search.candidates(frame.image, params.search), least=-1.0)[0].boxes
         overlap = iou_matrix(found, frame.boxes)
         near = overlap.max(axis=1) >= 0.4
         wide = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.least_width]
         copies = np.tile(wide, (params.jitter, 1))
-        boxes = np.concatenate([found[near], _moved(copies, np.random.default_rng(seed))])
+        boxes = np.concatenate([found[near], moved_boxes(copies, np.random.default_rng(seed))])
         true = np.concatenate([frame.boxes[overlap.argmax(axis=1)[near]], copies])
         shifts = (true - boxes) / np.tile(boxes[:, 2:] - boxes[:, :2], 2)
         mirrored = np.ascontiguousarray(frame.image[:, ::-1])
@@ -336,19 +282,9 @@ def _fit_refinement(
         return features, np.concatenate([shifts, back])
 
     found = list(pool.map(pairs, frames, seeds))
-    search.close()
     features, shifts = (np.concatenate(side) for side in zip(*found))
     if not len(features):
         return Refinement.none()
     fitted = Ridge(alpha=30.0).fit(features.astype(np.float64), np.clip(shifts, -0.5, 0.5))
     weights, bias = fitted.coef_.T.astype(np.float32), fitted.intercept_.astype(np.float32)
     return Refinement(weights, bias, params.looks)
-
-
-def _moved(boxes: Floats, rng: np.random.Generator) -> Floats:
-    """Boxes as a search may find them: beside their vehicles, too small or too large, of another shape."""
-    sides = boxes[:, 2:] - boxes[:, :2]
-    centres = boxes[:, :2] + sides * (0.5 + rng.uniform(-0.2, 0.2, sides.shape))
-    size, shape = rng.uniform(-0.45, 0.3, (len(boxes), 1)), rng.uniform(-0.15, 0.15, sides.shape)
-    halves = sides / 2 * np.exp(size + shape)
-    return np.concatenate([centres - halves, centres + halves], axis=1)
