@@ -247,7 +247,7 @@ class TestLife:
         assert all(ids == [1] for ids in shown[25:])
 
     def test_a_weak_detection_takes_no_vehicle_from_a_clear_one(self):
-        tracker, moved = Tracker(), np.array(CAR) + [12.0, 0, 12, 0]
+        tracker, moved = Tracker(), [612.0, 400.0, 712.0, 490.0]
         for _ in range(10):
             tracker.update(found(CAR, score=3.0), SHAPE)
         (track,) = tracker.update(Detections([CAR, moved], [-0.6, 3.0]), SHAPE)

@@ -28,9 +28,9 @@ class TrackParams:
     confirm_score
         Running mean of the scores at which a track is believed. A vehicle of score `s` reaches it after
         ``memory * log(s / (s - confirm_score))`` seconds, one that scores less never does. Both shipped
-        models put the least score of a vehicle on a still at 0. A vehicle that scores about as much, now above
-        and now below, is believed as soon as the mean of its scores says so, and then kept: of the vehicles
-        of drawn drives that were missed at 0.35, with boxes from 0 on alone, two thirds are followed.
+        models put the least score of a vehicle on a still at 0. A vehicle that scores now above it and now
+        below is believed as soon as the mean says so, and then kept: more than half of what was missed on
+        drawn drives at 0.35, with boxes from 0 on alone, is followed.
     confirm_hits, confirm_seconds
         A track is believed after this many detections at the earliest, and this long after the first.
     start_score
