@@ -265,6 +265,20 @@ class TestLife:
                 tracks = tracker.update(found(beside, score=score), SHAPE)
                 assert tracks[0].misses == misses
 
+    def test_a_vehicle_that_stops_growing_does_not_run_away(self):
+        """As one that comes in from the left, fast at first: its box shall not shoot beyond it later on."""
+        rng = np.random.default_rng(0)
+        tracker = Tracker()
+        for frame in range(120):
+            right = 40 + 3 * min(frame, 40) + 1.2 * max(frame - 40, 0)
+            width = min(right, 140.0)
+            height = 40 + 50 * min(frame / 30, 1) - 0.2 * max(frame - 40, 0)
+            box = np.array([right - width, 390 - height, right, 390]) + rng.normal(0, 3, 4)
+            (track,) = tracker.update(found(box, score=3.0), SHAPE)
+            assert frame < 10 or iou_matrix(track.box[None], box[None].clip(0))[0, 0] > 0.6
+        assert track.id == 1
+        assert np.abs(track.velocity).max() < 100
+
     def test_states_and_ids(self):
         tracker = Tracker()
         states = []

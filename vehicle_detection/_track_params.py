@@ -75,9 +75,9 @@ class TrackParams:
 
     smoother: Literal["kalman", "history", "nearest"] = "kalman"
     memory: float = 0.3
-    birth_score: float = -0.5
+    birth_score: float = -0.3
     keep_score: float = -1.5
-    confirm_score: float = 0.1
+    confirm_score: float = 0.2
     confirm_hits: int = 4
     confirm_seconds: float = 0.12
     start_score: float = 1.3

@@ -187,7 +187,12 @@ def predict_filters(
         # At constant speed on the road, what grows in the image moves there ever faster: v' = 2 v w'/w.
         growth = np.clip((mean[:, 6:] / mean[:, 2:4]).mean(axis=1), -_MOST_GROWTH, _MOST_GROWTH)
         rates = np.where(unseen[:, None], -1 / _DAMPING, 2 * growth[:, None])
-        mean = np.concatenate((mean[:, :4], mean[:, 4:] * np.exp(dt * rates)), axis=1)
+        faster = np.concatenate((np.ones_like(rates), np.exp(dt * rates)), axis=1)
+        # An error of a speed grows as the speed does, and that of a growth by what it adds to itself as well.
+        spread = faster.copy()
+        spread[:, 6:] *= 1 + dt * np.maximum(2 * growth[:, None], 0) * ~unseen[:, None]
+        mean = mean * faster
+        cov = cov * spread[:, :, None] * spread[:, None, :]
         wander = np.array([params.agility, params.agility, params.growth, params.growth])
         mean, cov = _kalman.predict(mean, cov, dt, np.square(mean[:, [2, 3, 2, 3]] * wander))
         cov = _kalman.bound(mean, cov)
