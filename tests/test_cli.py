@@ -736,6 +736,10 @@ def drawn_roads(tmp_path_factory):
     folder = tmp_path_factory.mktemp("roads")
     write_set(folder, "town", drawn(range(6)))
     write_set(folder, "stills", drawn(range(6, 10)), place=".")
+    cars = folder / "vehicles" / "cars"
+    cars.mkdir(parents=True)
+    for number, patch in enumerate(render_patches(14, random_state=0)[0][:7]):
+        write_image(cars / f"{number}.png", patch)
     return folder
 
 
@@ -768,7 +772,9 @@ def test_train_frames(drawn_roads, small_training, tmp_path):
     model = load_model(names[0])
     assert [template.box_cells for template in model.templates] == [(6, 5)]
     assert model.metadata["training"] == {"random_state": 5}
-    assert model.metadata["data"] == {"town": 6, "course": 4}
+    assert model.metadata["data"] == {"town": 6, "course": 4, "patches": 2}
+    assert "- 2 vehicles on the course's patches" in names[1].read_text()
+    assert "KITTI (CC BY-NC-SA 3.0)" in names[1].read_text()
     assert names[1].read_text().startswith("# Model card: road")
     assert names[2].read_text().startswith("frames,value,precision,recall\ntown,")
     shown = succeed("info", names[0])
@@ -784,7 +790,7 @@ def test_train_frames_draws_some_itself(drawn_roads, small_training, tmp_path, m
     card = tmp_path / "m.md"
     succeed("train-frames", drawn_roads, "-o", tmp_path / "m.safetensors", "--card", card)
     data = load_model(tmp_path / "m.safetensors").metadata["data"]
-    assert data == {"town": 6, "course": 4, "drawn": 1}
+    assert data == {"town": 6, "course": 4, "drawn": 1, "patches": 2}
     assert "- drawn: 1 frames" in card.read_text()
 
 

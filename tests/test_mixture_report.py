@@ -295,7 +295,7 @@ def test_sources_of_a_folder(tmp_path):
 
 
 @pytest.mark.parametrize("zipped", [True, False], ids=["zip", "folder"])
-def test_every_twelfth_patch_of_a_folder(tmp_path, zipped):
+def test_every_sixth_patch_of_a_folder(tmp_path, zipped):
     assert find_patches(tmp_path) == []
     for number in range(25):
         (tmp_path / "vehicles" / "GTI_Far").mkdir(parents=True, exist_ok=True)
@@ -306,8 +306,8 @@ def test_every_twelfth_patch_of_a_folder(tmp_path, zipped):
         shutil.make_archive(str(tmp_path / "vehicles"), "zip", tmp_path, "vehicles")
         shutil.rmtree(tmp_path / "vehicles")
     found = find_patches(tmp_path)
-    assert [image.shape for image in found] == [(64, 64, 3)] * 3
-    assert [image[0, 0, 0] for image in found] == [0, 12, 24]
+    assert [image.shape for image in found] == [(64, 64, 3)] * 5
+    assert [image[0, 0, 0] for image in found] == [0, 6, 12, 18, 24]
 
 
 def test_folders_that_are_refused(tmp_path):

@@ -42,7 +42,7 @@ _CUT = 0.2
 _STEP = 5
 
 
-def drawn_source(*, drives: int = 2 * len(_CASES), frames: int = 1, random_state: int = 0) -> FrameSource:
+def drawn_source(*, drives: int = 2 * len(_CASES), frames: int = 2, random_state: int = 0) -> FrameSource:
     """Draw frames of different roads, lights and sizes, with their vehicles.
 
     Parameters

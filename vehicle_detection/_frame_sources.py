@@ -21,8 +21,8 @@ COURSE = "course"
 _CLIP_RATE = 3.0
 # Sources that leave small vehicles of the background unlabelled, and the width from which on they do not.
 _COMPLETE_FROM = {"indonesia": 60.0}
-# Every so many of the course's patches are trained on; neighbours show the same car.
-_PATCH_STEP = 12
+# One of so many of the course's patches are trained on; neighbours show the same car.
+_PATCH_STEP = 6
 
 
 def find_sources(folder: str | os.PathLike[str]) -> list[FrameSource]:

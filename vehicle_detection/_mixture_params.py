@@ -81,10 +81,10 @@ class MixtureParams:
     cuts: tuple[float, ...] = (0.3, 0.5, 0.7)
     border_bias: float = -0.3
     near_gain: float = 0.03
-    support_gain: float = 0.05
+    support_gain: float = 0.1
     looks: int = 2
     margin: float = 1.0
-    C: float = 1e-3
+    C: float = 2e-3
     border_C: float = 4e-3  # noqa: N815 - as C
     vehicles: float = 1500.0
     least_width: float = 28.0
