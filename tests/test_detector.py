@@ -160,11 +160,11 @@ def test_what_is_too_weak_for_a_still_is_for_the_tracker_alone():
         clear = detector.process(road)
     assert (scores > 0).all()
     # The best one is now a little below a vehicle.
-    strict = dataclasses.replace(model, threshold=model.threshold + scores.max() + 0.4)
+    strict = dataclasses.replace(model, threshold=model.threshold + scores.max() + 0.2)
     with VehicleDetector(strict, n_jobs=1) as detector:
         assert len(detector.detect(road)) == 0
         weak = detector.search(road).vehicles.scores
-        assert weak.max() == pytest.approx(-0.4)
+        assert weak.max() == pytest.approx(-0.2)
         assert weak.min() >= -1.5
         result = detector.process(road)
         assert len(result.regions) == 0

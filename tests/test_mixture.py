@@ -624,7 +624,7 @@ def test_the_shipped_models():
     assert isinstance(default, TemplateMixture)
     assert isinstance(highway, VehicleClassifier)
     assert default.metadata["metrics"]["left_out"].keys() >= {"india", "camvid", "indonesia", "project_clip"}
-    assert set(default.metadata["data"]) == {"india", "camvid", "indonesia", "course", "drawn"}
+    assert set(default.metadata["data"]) == {"india", "camvid", "indonesia", "course", "drawn", "patches"}
     assert highway.metadata == load_classifier().metadata
     with pytest.raises(
         ModelFileError,

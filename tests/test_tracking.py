@@ -207,13 +207,13 @@ class TestLife:
 
     def test_a_weak_vehicle_is_shown_later_and_a_very_weak_one_never(self):
         first = {}
-        for score in (1.5, 0.15, 0.08):
+        for score in (1.5, 0.3, 0.15):
             tracker = Tracker()
             tracker.update(Detections.empty(), SHAPE)
             shown = [any(t.shown for t in tracker.update(found(CAR, score=score), SHAPE)) for _ in range(100)]
             first[score] = shown.index(True) if any(shown) else None
-        assert first[1.5] < first[0.15] < 12
-        assert first[0.08] is None
+        assert first[1.5] < first[0.3] < 12
+        assert first[0.15] is None
 
     def test_scores_below_the_birth_score_start_no_track_but_keep_one(self):
         tracker = Tracker(TrackParams(birth_score=0.5))
