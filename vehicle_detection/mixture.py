@@ -109,15 +109,21 @@ class TemplateMixture:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Boxes and values, `least` or more, of the vehicles to which windows of a frame lead, best first."""
         # At most the frame's height, which is two doublings, is gained; of support two steps count as well.
-        least_alone = least - 2 * abs(self.near_gain)
-        grouped, support = suppress(found, least=least_alone - 2 * abs(self.support_gain))
+        least_alone = least - 2 * abs(self.near_gain) - 2 * abs(self.support_gain)
+        grouped, support = suppress(found, least=least_alone)
         values = grouped.scores + self.support_gain * np.minimum(np.log1p(support) - 2, 2)
-        grouped = replace(grouped, scores=values)[values >= least_alone]
+        # A look makes a box 1.6 times as high at most, which is 0.68 doublings.
+        slack = 0.68 * self.refinement.looks * abs(self.near_gain)
+        most = values + self._gain_of_height(grouped.boxes, image) + slack
+        grouped = replace(grouped, scores=values)[most >= least]
         boxes, values = self.refinement.apply(image, grouped)
-        values = values + self.near_gain * np.log2(4 * (boxes[:, 3] - boxes[:, 1]) / image.shape[0])
+        values = values + self._gain_of_height(boxes, image)
         rows = np.argsort(-values, kind="stable")
         rows = rows[values[rows] >= least]
         return boxes[rows], values[rows]
+
+    def _gain_of_height(self, boxes: NDArray[np.float64], image: NDArray[np.uint8]) -> NDArray[np.float64]:
+        return np.asarray(self.near_gain * np.log2(4 * (boxes[:, 3] - boxes[:, 1]) / image.shape[0]))
 
     def with_metadata(self, metadata: Mapping[str, Any]) -> TemplateMixture:
         """Return the same model with other facts in its file."""
