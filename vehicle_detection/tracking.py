@@ -11,8 +11,6 @@ Multi-Object Tracking by Associating Every Detection Box* (ECCV 2022).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +24,7 @@ from vehicle_detection._association import (
 )
 from vehicle_detection._checks import check_number, describe
 from vehicle_detection._horizon_filter import HorizonFilter
+from vehicle_detection._track import Track
 from vehicle_detection._vehicle import (
     OUTWARDS,
     TINY,
@@ -45,7 +44,7 @@ from vehicle_detection.camera import Camera, check_shape, cut_edges
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import TrackParams
 
-State = Literal["tentative", "confirmed", "coasting"]
+__all__ = ["Track", "Tracker"]
 
 # Shares of a box: inside the frame, below which it leaves or has left; covered, above which it is hidden.
 _LEAVES, _LEFT, _HIDDEN = 0.5, 0.15, 0.5
@@ -57,51 +56,6 @@ _HORIZON_DOUBT = 0.05
 _TENTATIVE_GATE = 0.6
 # The same for weak detections.
 _WEAK_GATE = 0.5
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Track:
-    """A vehicle as it stands after one frame.
-
-    Attributes
-    ----------
-    id
-        Number of the vehicle, from 1 in the order in which they were believed; 0 while tentative.
-    box
-        ``(4,)`` float64 box inside the frame; read-only.
-    score
-        Running mean of the detections' scores, in which a frame without a detection counts as 0.
-    state
-        ``"tentative"`` (not yet believed), ``"confirmed"`` (seen in this frame) or ``"coasting"`` (believed,
-        but not seen in this frame: the box is a prediction).
-    shown
-        Whether to draw it.
-    age
-        Seconds since the first detection.
-    misses, unseen
-        Frames and seconds since the last detection.
-    velocity
-        Velocity of the box's centre in pixels a second, right and down.
-    distance_m, distance_error_m
-        Distance along the road in metres and its standard error; None where it is unknown.
-    speed_mps, speed_error_mps
-        Speed relative to the camera in metres a second, positive when moving away, and its standard error;
-        None where it is unknown.
-    """
-
-    id: int
-    box: Floats
-    score: float
-    state: State
-    shown: bool
-    age: float
-    misses: int
-    unseen: float
-    velocity: tuple[float, float]
-    distance_m: float | None = None
-    distance_error_m: float | None = None
-    speed_mps: float | None = None
-    speed_error_mps: float | None = None
 
 
 class Tracker:
