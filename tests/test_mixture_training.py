@@ -264,7 +264,7 @@ def test_the_easiest_negatives_go_for_good():
         ({"cuts": (0.5, 1.5)}, "cuts must be a number, greater than 0 and at most 1"),
         ({"border_bias": np.nan}, "border_bias must be a number"),
         ({"near_gain": "much"}, "near_gain must be a number"),
-        ({"support_gain": "much"}, "support_gain must be a number"),
+        ({"support_gain": -0.1}, "support_gain must be a number, at least 0"),
         ({"looks": 0}, "looks must be an integer from 1"),
         ({"margin": -1}, "margin must be a number"),
         ({"C": 0}, "C must be a number, greater than 0"),

@@ -21,6 +21,7 @@ from vehicle_detection._mixture_vehicles import (
 from vehicle_detection._mixture_windows import Frame, frames_of
 from vehicle_detection._refinement import Refinement
 from vehicle_detection.boxes import iou_matrix
+from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture_training import FrameSource, train_mixture
 
 
@@ -165,6 +166,20 @@ def test_patches_train_the_templates_of_their_shape(source):
     image = np.zeros((64, 64, 3), np.uint8)
     counts = [len(rows) for rows in patch_features([image], Refinement.none(), templates, known, params)]
     assert counts == [2, 0]
+
+
+@pytest.mark.parametrize(
+    ("patches", "message"),
+    [
+        (5, "patches must be"),
+        ([np.zeros((64, 64), np.uint8)], "patches must be"),
+        ([np.zeros((64, 64, 3))], "patches must be"),
+    ],
+    ids=["number", "gray", "float"],
+)
+def test_what_is_no_patch_is_refused(source, patches, message):
+    with pytest.raises(InvalidInputError, match=message):
+        train_mixture([source], SMALL, patches=patches, n_jobs=1)
 
 
 def test_patches_are_further_vehicles(source):

@@ -109,8 +109,8 @@ class MixtureParams:
                 f"facing must be True or False for each of {len(shapes)} shapes; got {describe(facing)}"
             )
         check_number(self.border_bias, "border_bias")
-        check_number(self.near_gain, "near_gain")
-        check_number(self.support_gain, "support_gain")
+        check_number(self.near_gain, "near_gain", low=0)
+        check_number(self.support_gain, "support_gain", low=0)
         check_integer(self.looks, "looks", low=1, high=10)
         check_number(self.margin, "margin", low=0, high=8)
         check_number(self.C, "C", above=0, high=1e6)

@@ -23,13 +23,14 @@ class TrackParams:
     birth_score
         Detections below this score start no track.
     keep_score
-        Detections from this score on, where they are below `birth_score`, keep a believed track alive that
-        found no better one. Of less the tracker knows nothing.
+        Detections from this score on, where they are below `birth_score`, keep a track alive that found no
+        better one; a believed track only where they are half as far off as `gate` allows. Of less the tracker
+        knows nothing.
     confirm_score
         Running mean of the scores at which a track is believed. A vehicle of score `s` reaches it after
         ``memory * log(s / (s - confirm_score))`` seconds, one that scores less never does. Both shipped
         models put the least score of a vehicle on a still at 0. A vehicle that scores now above it and now
-        below is believed as soon as the mean says so, and then kept: more than half of what was missed on
+        below is believed as soon as the mean says so, and then kept: about half of what was missed on
         drawn drives at 0.35, with boxes from 0 on alone, is followed.
     confirm_hits, confirm_seconds
         A track is believed after this many detections at the earliest, and this long after the first.

@@ -373,7 +373,7 @@ class VehicleDetector:
 
 def _sure(vehicles: Detections) -> Detections:
     """Leave out what is for the tracker alone."""
-    return vehicles if (vehicles.scores >= 0).all() else vehicles[vehicles.scores >= 0]
+    return vehicles[vehicles.scores >= 0]
 
 
 def _search_params(

@@ -64,7 +64,7 @@ class TemplateMixture:
     Raises
     ------
     InvalidInputError
-        If there is no template, or a number is not finite.
+        If there is no template, a number is not finite, or a gain is negative.
 
     Examples
     --------
@@ -92,8 +92,8 @@ class TemplateMixture:
         check_number(self.slope, "slope", above=0, high=1e9)
         check_number(self.offset, "offset")
         check_number(self.threshold, "threshold")
-        check_number(self.near_gain, "near_gain")
-        check_number(self.support_gain, "support_gain")
+        check_number(self.near_gain, "near_gain", low=0)
+        check_number(self.support_gain, "support_gain", low=0)
         object.__setattr__(self, "templates", templates)
 
     def scores(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -109,11 +109,11 @@ class TemplateMixture:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Boxes and values, `least` or more, of the vehicles to which windows of a frame lead, best first."""
         # At most the frame's height, which is two doublings, is gained; of support two steps count as well.
-        least_alone = least - 2 * abs(self.near_gain) - 2 * abs(self.support_gain)
+        least_alone = least - 2 * self.near_gain - 2 * self.support_gain
         grouped, support = suppress(found, least=least_alone)
         values = grouped.scores + self.support_gain * np.minimum(np.log1p(support) - 2, 2)
         # A look makes a box 1.6 times as high at most, which is 0.68 doublings.
-        slack = 0.68 * self.refinement.looks * abs(self.near_gain)
+        slack = 0.68 * self.refinement.looks * self.near_gain
         most = values + self._gain_of_height(grouped.boxes, image) + slack
         grouped = replace(grouped, scores=values)[most >= least]
         boxes, values = self.refinement.apply(image, grouped)
@@ -265,9 +265,10 @@ class MixtureSearch:
         Raises
         ------
         InvalidInputError
-            If the image is malformed. One that is smaller than a template holds no vehicle.
+            If an argument is malformed. An image that is smaller than a template holds no vehicle.
         """
         params = params if params is not None else PyramidParams()
+        check_number(least, "least")
         found = self.candidates(image, params)
         mixture = self.mixture
         scores = mixture.scores(found.scores)

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_integer, check_type
+from vehicle_detection._checks import check_image, check_integer, check_type, describe
 from vehicle_detection._feature_maps import PLANES
 from vehicle_detection._jobs import resolve_jobs
 from vehicle_detection._mixture_params import MixtureParams
@@ -86,7 +86,7 @@ def train_mixture(
     Raises
     ------
     InvalidInputError
-        If there is no source, or no vehicle for one of the templates.
+        If there is no source, no vehicle for one of the templates, or a patch is no image.
 
     Notes
     -----
@@ -97,6 +97,11 @@ def train_mixture(
     params = params if params is not None else MixtureParams()
     check_type(params, "params", MixtureParams, "leave it out for the project's own")
     check_integer(random_state, "random_state", low=0, high=2**32 - 1)
+    given: object = patches
+    if not isinstance(given, (list, tuple, np.ndarray)):
+        raise InvalidInputError(f"patches must be images of one vehicle each, got {describe(given)}")
+    for image in patches:
+        check_image(image, "patches")
     tell = on_step or log.info
     frames = frames_of(sources)
     rng = np.random.default_rng(random_state)
