@@ -184,17 +184,17 @@ def test_scores_of_nothing():
 def test_the_threshold_is_the_best_of_all():
     part = held_out([1.0, 0.5, 0.0, -0.5], [True, True, True, False])
     assert -0.5 < _threshold([part]) <= 0.0
-    # Sets count alike: one that is better from 0.4 on outweighs nothing that the other loses.
     other = held_out([0.9, 0.3], [True, False], frames=1)
     assert 0.3 < _threshold([other]) <= 0.9
 
 
-def test_the_sources_count_alike_however_many_sets_they_have():
-    # Each of the two sets of one road is best at 0.9, the one of another road at 0.1, where they lose.
+def test_every_vehicle_counts_alike_whatever_its_set():
+    # One set is best at 0.9, another one at 0.1, where the first loses: the one with more vehicles decides.
     strict = held_out([0.9, 0.2, 0.15, 0.15, 0.15, 0.15], [True, False, False, False, False, False], frames=1)
-    mild = held_out([0.1] * 4, [True] * 4, source="lane")
+    few, many = held_out([0.1], [True], frames=1), held_out([0.1] * 4, [True] * 4)
     assert 0.2 < _threshold([strict]) <= 0.9
-    assert _threshold([strict, strict, mild]) <= 0.1
+    assert 0.2 < _threshold([strict, few]) <= 0.9
+    assert _threshold([strict, many]) <= 0.1
 
 
 def test_the_threshold_bears_sets_without_vehicles_or_boxes():

@@ -161,6 +161,9 @@ def info(
             + " at the frame's border" * template.border
             for number, template in enumerate(loaded.templates, 1)
         }
+        if loaded.verification is not None:
+            second = loaded.verification
+            shapes["second opinion"] = f"{len(second.weights):,} vectors, share {second.share:g}"
         print_facts(f"{model}: {templates}, threshold {loaded.threshold:.2f} (log-odds)", shapes)
     else:
         print_facts(

@@ -24,7 +24,8 @@ A mixture of {count} linear templates over road features, for vehicles on any ro
 vehicle-detection train-frames DATA --seed {seed} -o {name}.safetensors --card {name}.md --curves {name}.csv
 ```
 
-Templates, in cells of the vehicle's box: {shapes}. A vehicle is shown from log-odds {threshold:.2f} on.
+Templates, in cells of the vehicle's box: {shapes}. {second}A vehicle is shown from log-odds\
+ {threshold:.2f} on.
 
 ## On roads it was not trained on
 
@@ -51,6 +52,9 @@ each one found there as false.
 by the frame, seen from the side at close range or under 32 pixels wide are missed more often; scooters, signs
 and shop fronts fire. Use it to explore and to annotate, not to drive.
 """
+_SECOND = """On what they find, a support
+vector machine with a Gaussian kernel ({vectors:,} vectors, edges and colours) has a share of {share:g} in the
+vehicle's value. """
 # What is known of the shipped model's sources; of others the card says nothing.
 _SHIPPED_SOURCES = {"india", "camvid", "indonesia", "course"}
 _TERMS = """The frames of India, of Cambridge (CamVid) and of Indonesia were published for research and other
@@ -89,6 +93,7 @@ def write_card(
     )
     if patches:
         data += f"\n- {patches} vehicles on the course's patches"
+    second = mixture.verification
     known = {source.name for source in sources} - {DRAWN} == _SHIPPED_SOURCES
     text = _CARD.format(
         terms=(_TERMS if known else _OTHER_TERMS) + _PATCH_TERMS * (patches > 0),
@@ -97,6 +102,7 @@ def write_card(
         count=len(mixture.templates),
         seed=seed,
         shapes=shapes,
+        second=_SECOND.format(vectors=len(second.weights), share=second.share) if second is not None else "",
         threshold=mixture.threshold,
         rows=rows,
         data=data,

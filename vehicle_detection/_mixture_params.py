@@ -36,6 +36,8 @@ class MixtureParams:
         As in `TemplateMixture`.
     looks
         How often a box is corrected at most, as in `Refinement`.
+    verification
+        Share that the second opinion has in a vehicle's value, as in `Verification`; 0 for none.
     margin
         Cells of context on every side.
     C, border_C
@@ -83,6 +85,7 @@ class MixtureParams:
     near_gain: float = 0.03
     support_gain: float = 0.1
     looks: int = 2
+    verification: float = 0.4
     margin: float = 1.0
     C: float = 2e-3
     border_C: float = 4e-3  # noqa: N815 - as C
@@ -112,6 +115,7 @@ class MixtureParams:
         check_number(self.near_gain, "near_gain", low=0)
         check_number(self.support_gain, "support_gain", low=0)
         check_integer(self.looks, "looks", low=1, high=10)
+        check_number(self.verification, "verification", low=0, high=1)
         check_number(self.margin, "margin", low=0, high=8)
         check_number(self.C, "C", above=0, high=1e6)
         check_number(self.border_C, "border_C", above=0, high=1e6)

@@ -16,6 +16,7 @@ from vehicle_detection._jobs import single_threaded_opencv
 from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection._mixture_params import MixtureParams, entries
 from vehicle_detection._mixture_template import MixtureTemplate, smallest_box
+from vehicle_detection._noise import without_noise
 from vehicle_detection._refinement import mostly_inside, overlaps
 from vehicle_detection.boxes import box_areas, intersection_matrix, iou_matrix
 from vehicle_detection.errors import InvalidInputError
@@ -92,7 +93,7 @@ class Frame:
     Attributes
     ----------
     image
-        ``(H, W, 3)`` uint8 RGB.
+        ``(H, W, 3)`` uint8 RGB, without noise.
     boxes
         ``(N, 4)`` boxes of the vehicles, inside the frame.
     ignored
@@ -115,7 +116,7 @@ def frames_of(sources: Sequence[FrameSource]) -> list[Frame]:
             for key, image in part:
                 labels = part.labels.frame(key)
                 boxes, ignored = labels.boxes[~labels.ignore], labels.boxes[labels.ignore]
-                found.append(Frame(image, boxes, ignored, source.complete_from))
+                found.append(Frame(without_noise(image), boxes, ignored, source.complete_from))
     return found
 
 

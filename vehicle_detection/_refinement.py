@@ -6,28 +6,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._checks import check_integer, describe
-from vehicle_detection._feature_maps import COARSE, PLANES, feature_planes
+from vehicle_detection._crops import CROP_LENGTH, crop_features
 from vehicle_detection.boxes import box_areas, clip_boxes, intersection_matrix
 from vehicle_detection.errors import InvalidInputError
 
 WEAKEST = -1.0
 """Least value of a template that makes a window a candidate."""
 
-CROP = 12
-"""Cells of a side of the crop that corrects a box: the box fills 8 of them."""
-
-CROP_LENGTH = PLANES * CROP * CROP + 4
-"""Features of a crop."""
-
-_INSIDE = (8.0, 8.0)
 # Overlaps: of windows that vote for one box; above which the weaker of two vehicles goes, by IoU and by the
 # share of the smaller one that is covered.
 _VOTE, _IOU, _COVER = 0.5, 0.35, 0.75
+# IoU above which two boxes are the same.
+_SAME = 0.7
 # What a window's value exceeds this by counts in a vote.
 _VOTE_FROM = -1.1
 _MOST_VEHICLES = 60
@@ -150,100 +144,20 @@ def suppress(windows: Candidates, *, least: float, most: int = _MOST_VEHICLES) -
     return groups, np.array(support)
 
 
-def resolve(boxes: Floats, scores: Floats) -> NDArray[np.intp]:
-    """Rows of the boxes that stay when the weaker of two on one vehicle goes, from the best one down."""
+def resolve(boxes: Floats, scores: Floats, *, iou: float = _IOU, cover: float = _COVER) -> NDArray[np.intp]:
+    """Rows of the boxes that stay when the weaker of two on one vehicle goes, from the best one down.
+
+    Two boxes are on one vehicle whose IoU is above `iou`, or of which the smaller one is covered by more than
+    `cover`.
+    """
     left = np.argsort(-scores, kind="stable")
     kept: list[int] = []
     while len(left):
         best, left = left[0], left[1:]
         kept.append(best)
-        iou, cover = overlaps(boxes[best], boxes[left])
-        left = left[(iou <= _IOU) & (cover <= _COVER)]
+        overlap, covered = overlaps(boxes[best], boxes[left])
+        left = left[(overlap <= iou) & (covered <= cover)]
     return np.array(kept, np.intp)
-
-
-def crop_features(image: NDArray[np.uint8], boxes: Floats) -> NDArray[np.float32]:
-    """Features of boxes and what is around them, each warped to 12x12 cells of which the box fills 8x8.
-
-    Parameters
-    ----------
-    image
-        ``(H, W, 3)`` uint8; beyond its border the outermost pixels go on.
-    boxes
-        ``(N, 4)``, with any part outside.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(N, 28 * 12 * 12 + 4)`` float32; the last four tell by how much of its sides a box lies outside.
-    """
-    features = np.empty((len(boxes), CROP_LENGTH), np.float32)
-    height, width = image.shape[:2]
-    for row, (x1, y1, x2, y2) in zip(features, boxes):
-        row[:-4] = box_planes(image, (x1, y1, x2, y2), _INSIDE, (CROP, CROP), COARSE).ravel()
-        outside = (-x1 / (x2 - x1), -y1 / (y2 - y1), (x2 - width) / (x2 - x1), (y2 - height) / (y2 - y1))
-        row[-4:] = np.clip(outside, 0, 1)
-    return features
-
-
-def box_planes(
-    image: NDArray[np.uint8],
-    box: Sequence[float],
-    inside: tuple[float, float],
-    cells: tuple[int, int],
-    cell: int,
-) -> NDArray[np.float32]:
-    """Compute the features of one box, warped to a grid of cells with what is around it.
-
-    Parameters
-    ----------
-    image
-        ``(H, W, 3)`` uint8; beyond its border the outermost pixels go on.
-    box
-        ``(x1, y1, x2, y2)``.
-    inside
-        Columns and rows of cells that the box fills.
-    cells
-        Columns and rows of the grid, around the same centre.
-    cell
-        Side of a cell in pixels of the warped box.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(28, rows, columns)`` float32.
-    """
-    x1, y1, x2, y2 = box
-    step_x, step_y = (x2 - x1) / inside[0], (y2 - y1) / inside[1]
-    # One cell more on each side, so that the normalisation of the outermost one sees its neighbours.
-    columns, rows = cells[0] + 2, cells[1] + 2
-    left = x1 - (columns - inside[0]) / 2 * step_x
-    top = y1 - (rows - inside[1]) / 2 * step_y
-    patch = _warp(image, (left, top), (step_x / cell, step_y / cell), (columns * cell, rows * cell))
-    return feature_planes(patch, cell)[:, 1:-1, 1:-1]
-
-
-def _warp(
-    image: NDArray[np.uint8], corner: tuple[float, float], scale: tuple[float, float], size: tuple[int, int]
-) -> NDArray[np.uint8]:
-    """Take ``size * scale`` pixels of an image from `corner` on as an image of `size`, without aliasing."""
-    origin, real = np.array(corner), np.array(scale)
-    if real.max() > 1.5:
-        # Reduce the part first: the warp alone looks at four pixels only.
-        low = np.clip(np.floor(origin), 0, None).astype(int)
-        high = np.clip(np.ceil(origin + real * size), 0, image.shape[1::-1]).astype(int)
-        if (high - low >= 2).all():
-            part = image[low[1] : high[1], low[0] : high[0]]
-            reduced = np.maximum(np.rint((high - low) / np.maximum(real, 1)), 1).astype(int)
-            small = cv2.resize(part, (int(reduced[0]), int(reduced[1])), interpolation=cv2.INTER_AREA)
-            image = np.asarray(small, np.uint8)
-            factor = (high - low) / reduced
-            origin, real = (origin - low) / factor, real / factor
-    shift = origin + real / 2 - 0.5
-    matrix = np.array([[real[0], 0, shift[0]], [0, real[1], shift[1]]])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    warped = cv2.warpAffine(image, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(warped, np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,7 +199,7 @@ class Refinement:
         return np.clip(shifts.astype(np.float64), -_MOST_SHIFT, _MOST_SHIFT)
 
     def apply(self, image: NDArray[np.uint8], windows: Candidates) -> tuple[Floats, Floats]:
-        """Correct boxes, clip them to the image and drop the weaker of two on one vehicle."""
+        """Correct boxes, clip them to the image and drop those that nearly coincide with a better one."""
         boxes, values = windows.boxes.copy(), windows.scores
         moving = np.ones(len(boxes), np.bool_)
         for _ in range(self.looks):
@@ -295,7 +209,7 @@ class Refinement:
             boxes[moving] += shifts * sides
             moving[moving] = np.abs(shifts).max(axis=1, initial=0) > _SETTLED
             inside = clip_boxes(boxes, image.shape)
-            rows = resolve(inside, values)
+            rows = resolve(inside, values, iou=_SAME, cover=np.inf)
             rows = rows[box_areas(inside[rows]) > 0]
             boxes, values, moving = boxes[rows], values[rows], moving[rows]
         return np.asarray(clip_boxes(boxes, image.shape), np.float64), values

@@ -24,7 +24,9 @@ from vehicle_detection._feature_maps import COARSE, FeatureMap, Level, halved, l
 from vehicle_detection._jobs import Crew, single_threaded_opencv
 from vehicle_detection._mixture_template import MixtureTemplate, smallest_box
 from vehicle_detection._model_file import read_model, write_model
-from vehicle_detection._refinement import WEAKEST, Candidates, Refinement, suppress
+from vehicle_detection._noise import without_noise
+from vehicle_detection._refinement import WEAKEST, Candidates, Refinement, resolve, suppress
+from vehicle_detection._verification import LEAST_VALUE, Verification
 from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import KIND as PATCH_KIND
 from vehicle_detection.classifier import VehicleClassifier, build_classifier
@@ -47,8 +49,10 @@ class TemplateMixture:
         One or more `MixtureTemplate`.
     refinement
         Corrects the boxes.
+    verification
+        Gives boxes a second opinion; None leaves their value to the templates.
     slope, offset
-        Turn a template's value into log-odds that it is a vehicle: ``slope * value + offset``.
+        Turn a vehicle's value into log-odds that it is a vehicle: ``slope * value + offset``.
     threshold
         Least log-odds of a vehicle.
     near_gain
@@ -80,6 +84,7 @@ class TemplateMixture:
     threshold: float = 0.0
     near_gain: float = 0.0
     support_gain: float = 0.0
+    verification: Verification | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -89,6 +94,8 @@ class TemplateMixture:
         for template in templates:
             check_type(template, "templates", MixtureTemplate, "train_mixture makes them")
         check_type(self.refinement, "refinement", Refinement, "train_mixture makes one")
+        if self.verification is not None:
+            check_type(self.verification, "verification", Verification, "train_mixture makes one, or None")
         check_number(self.slope, "slope", above=0, high=1e9)
         check_number(self.offset, "offset")
         check_number(self.threshold, "threshold")
@@ -97,17 +104,31 @@ class TemplateMixture:
         object.__setattr__(self, "templates", templates)
 
     def scores(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Turn the templates' values into log-odds above the threshold."""
+        """Turn values into log-odds above the threshold."""
         return self.slope * values + self.offset - self.threshold
 
     def value(self, score: float) -> float:
-        """Value of the templates that has a score."""
+        """Value that has a score."""
         return (score + self.threshold - self.offset) / self.slope
 
     def vehicles(
         self, image: NDArray[np.uint8], found: Candidates, *, least: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Boxes and values, `least` or more, of the vehicles to which windows of a frame lead, best first."""
+        # A bad opinion of the templates cannot be known to stay one; most of what they doubt is clutter.
+        boxes, values = self.proposals(
+            image, found, least=least if self.verification is None else LEAST_VALUE
+        )
+        if self.verification is not None:
+            values = self.verification.apply(image, boxes, values)
+        rows = resolve(boxes, values)
+        rows = rows[values[rows] >= least]
+        return boxes[rows], values[rows]
+
+    def proposals(
+        self, image: NDArray[np.uint8], found: Candidates, *, least: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Corrected boxes, and values by the templates of `least` or more; several may be on one vehicle."""
         # At most the frame's height, which is two doublings, is gained; of support two steps count as well.
         least_alone = least - 2 * self.near_gain - 2 * self.support_gain
         grouped, support = suppress(found, least=least_alone)
@@ -118,9 +139,8 @@ class TemplateMixture:
         grouped = replace(grouped, scores=values)[most >= least]
         boxes, values = self.refinement.apply(image, grouped)
         values = values + self._gain_of_height(boxes, image)
-        rows = np.argsort(-values, kind="stable")
-        rows = rows[values[rows] >= least]
-        return boxes[rows], values[rows]
+        kept = values >= least
+        return boxes[kept], values[kept]
 
     def _gain_of_height(self, boxes: NDArray[np.float64], image: NDArray[np.uint8]) -> NDArray[np.float64]:
         return np.asarray(self.near_gain * np.log2(4 * (boxes[:, 3] - boxes[:, 1]) / image.shape[0]))
@@ -137,7 +157,7 @@ class TemplateMixture:
         }
         for index, template in enumerate(self.templates):
             tensors[f"{index}.weights"] = template.weights
-        params = {
+        params: dict[str, Any] = {
             "biases": [template.bias for template in self.templates],
             "margins": [template.margin for template in self.templates],
             "borders": [template.border for template in self.templates],
@@ -148,6 +168,9 @@ class TemplateMixture:
             "support_gain": self.support_gain,
             "looks": self.refinement.looks,
         }
+        if self.verification is not None:
+            tensors |= self.verification.tensors()
+            params["verification"] = self.verification.numbers()
         write_model(path, KIND, params, tensors, self.metadata)
 
 
@@ -190,7 +213,8 @@ def load_model(path: str | os.PathLike[str] = "default") -> TemplateMixture | Ve
         refinement = Refinement(tensors["refinement.weights"], tensors["refinement.bias"], looks)
         numbers = {name: float(params[name]) for name in ("slope", "offset", "threshold")}
         numbers |= {name: float(params.get(name, 0.0)) for name in ("near_gain", "support_gain")}
-        return TemplateMixture(templates, refinement, **numbers, metadata=model.metadata)
+        second = Verification.build(tensors, params["verification"]) if "verification" in params else None
+        return TemplateMixture(templates, refinement, **numbers, verification=second, metadata=model.metadata)
     except (InvalidInputError, KeyError, IndexError, TypeError, ValueError) as error:
         raise ModelFileError(f"{model.name} does not fit its own parameters: {error}") from error
 
@@ -202,7 +226,8 @@ class MixtureFind:
     Attributes
     ----------
     windows
-        Windows above the search's least score, best first, with log-odds above the model's threshold.
+        Windows above the search's least score, best first, with log-odds above the model's threshold, as far
+        as their templates can tell.
     vehicles
         Boxes of the vehicles, with scores above the least one that was asked for.
     """
@@ -269,17 +294,23 @@ class MixtureSearch:
         """
         params = params if params is not None else PyramidParams()
         check_number(least, "least")
+        check_image(image)
+        image = without_noise(image)
         found = self.candidates(image, params)
         mixture = self.mixture
         scores = mixture.scores(found.scores)
         evidence = scores >= params.min_score
-        boxes, values = mixture.vehicles(image, found, least=mixture.value(least))
+        with single_threaded_opencv():
+            boxes, values = mixture.vehicles(image, found, least=mixture.value(least))
         return MixtureFind(
             Detections(found.boxes[evidence], scores[evidence]), Detections(boxes, mixture.scores(values))
         )
 
     def candidates(self, image: NDArray[np.uint8], params: PyramidParams) -> Candidates:
-        """Windows with their templates' values, the best ones first, weak ones too: they vote for boxes."""
+        """Windows with their templates' values, the best ones first, weak ones too: they vote for boxes.
+
+        The image is taken as it is, noise and all.
+        """
         check_image(image)
         check_type(params, "params", PyramidParams, "a mixture of templates is searched for on a pyramid")
         least = np.float32(min(WEAKEST, self.mixture.value(params.min_score)))

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._checks import check_image, check_integer, check_type, describe
+from vehicle_detection._crops import CROP_LENGTH, crop_features
 from vehicle_detection._feature_maps import PLANES
 from vehicle_detection._jobs import resolve_jobs
 from vehicle_detection._mixture_params import MixtureParams
@@ -36,7 +37,8 @@ from vehicle_detection._mixture_windows import (
     random_windows,
     with_mirrored,
 )
-from vehicle_detection._refinement import CROP_LENGTH, Refinement, crop_features, suppress
+from vehicle_detection._refinement import Refinement, suppress
+from vehicle_detection._verification_training import train_verification
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture import MixtureSearch, TemplateMixture
@@ -91,7 +93,8 @@ def train_mixture(
     Notes
     -----
     Linear SVMs on the vehicles and on windows without one, at random at first and then those that the
-    templates so far wrongly like best: Felzenszwalb et al. (PAMI 2010), section 5.
+    templates so far wrongly like best: Felzenszwalb et al. (PAMI 2010), section 5. What they find then is
+    corrected, and trains a second opinion (`Verification`).
     """
     sources = check_sources(sources)
     params = params if params is not None else MixtureParams()
@@ -131,9 +134,12 @@ def train_mixture(
             found, Refinement.none(), near_gain=params.near_gain, support_gain=params.support_gain
         )
         search = MixtureSearch(plain, n_jobs=1)
-        refinement = _fit_refinement(frames, rng, params, pool, search)
+        refined = replace(plain, refinement=_fit_refinement(frames, rng, params, pool, search))
         search.close()
-    return replace(plain, refinement=refinement)
+        search = MixtureSearch(refined, n_jobs=1)
+        verification = train_verification(frames, search, params, rng, pool) if params.verification else None
+        search.close()
+    return replace(refined, verification=verification)
 
 
 def _positives(
