@@ -11,6 +11,7 @@ from vehicle_detection._crops import COLOURS, EDGES, crop_features, crop_views
 from vehicle_detection._feature_maps import mirror_planes
 from vehicle_detection._mixture_template import MixtureTemplate
 from vehicle_detection._mixture_windows import Frame, frames_of
+from vehicle_detection._products import product
 from vehicle_detection._refinement import Refinement, resolve
 from vehicle_detection._verification import LEAST_VALUE, Projection, Verification
 from vehicle_detection._verification_training import _boxes, _mirrored, train_verification
@@ -96,6 +97,26 @@ def test_mirrored_rows_are_those_of_the_mirrored_image():
 
 
 # The opinion.
+
+
+@given(
+    rows=st.integers(0, 7), depth=st.integers(1, 11), columns=st.integers(1, 1100), seed=st.integers(0, 999)
+)
+def test_products_are_those_of_matrices(rows, depth, columns, seed):
+    rng = np.random.default_rng(seed)
+    left = rng.normal(0, 1, (rows, depth)).astype(np.float32)
+    right = rng.normal(0, 1, (depth, columns)).astype(np.float32)
+    found = product(left, right)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, left.astype(np.float64) @ right, atol=1e-4)
+
+
+def test_few_rows_and_many_give_the_same_products():
+    rng = np.random.default_rng(0)
+    left = rng.normal(0, 1, (300, 20)).astype(np.float32)
+    right = rng.normal(0, 1, (20, 600)).astype(np.float32)
+    few = np.concatenate([product(part, right) for part in np.array_split(left, 5)])
+    np.testing.assert_allclose(product(left, right), few, atol=1e-4)
 
 
 @given(seed=st.integers(0, 1000), rows=st.integers(0, 5), count=st.integers(1, 6))

@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 from vehicle_detection._checks import check_number, describe
 from vehicle_detection._crops import COLOURS, EDGES, crop_views
+from vehicle_detection._products import product
 from vehicle_detection._refinement import finite_array
 from vehicle_detection.errors import InvalidInputError
 
 Floats = NDArray[np.float64]
 
-LEAST_VALUE = -0.9
+LEAST_VALUE = -0.8
 """What templates and the gains give a box that is worth a second opinion."""
 
 
@@ -40,15 +41,18 @@ class Projection:
 
     mean: NDArray[np.float32]
     axes: NDArray[np.float32]
+    _columns: NDArray[np.float32] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         mean = _halved(self.mean, "verification.mean", (None,))
-        object.__setattr__(self, "mean", mean)
-        object.__setattr__(self, "axes", _halved(self.axes, "verification.axes", (None, len(mean))))
+        axes = _halved(self.axes, "verification.axes", (None, len(mean)))
+        columns = np.ascontiguousarray(axes.T)
+        for name, array in ("mean", mean), ("axes", axes), ("_columns", columns):
+            object.__setattr__(self, name, array)
 
     def __call__(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
         """Project rows of features, ``(N, length)`` to ``(N, count)``."""
-        return np.asarray((rows - self.mean) @ self.axes.T, np.float32)
+        return product(rows - self.mean, self._columns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +87,7 @@ class Verification:
     bias: float
     gamma: float
     share: float
+    _columns: NDArray[np.float32] = field(init=False, repr=False)
     _squares: NDArray[np.float32] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -98,6 +103,7 @@ class Verification:
         check_number(self.bias, "verification.bias")
         check_number(self.gamma, "verification.gamma", above=0, high=1e6)
         check_number(self.share, "verification.share", above=0, high=1)
+        object.__setattr__(self, "_columns", np.ascontiguousarray(vectors.T))
         object.__setattr__(self, "_squares", (vectors**2).sum(axis=1))
 
     def coordinates(self, edges: NDArray[np.float32], colours: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -106,8 +112,9 @@ class Verification:
 
     def decide(self, points: NDArray[np.float32]) -> Floats:
         """Value of each point: about 1 and more for vehicles, -1 and less for others."""
-        distances = (points**2).sum(axis=1)[:, None] + self._squares - 2 * (points @ self.vectors.T)
-        return np.asarray(np.exp(-self.gamma * distances) @ self.weights + self.bias, np.float64)
+        distances = (points**2).sum(axis=1)[:, None] + self._squares - 2 * product(points, self._columns)
+        kernels = np.exp(-np.float32(self.gamma) * distances) * self.weights
+        return np.asarray(kernels.sum(axis=1, dtype=np.float64) + self.bias)
 
     def apply(self, image: NDArray[np.uint8], boxes: Floats, values: Floats) -> Floats:
         """Give boxes of a frame a value in which both opinions have their share."""
