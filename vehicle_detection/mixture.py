@@ -115,7 +115,7 @@ class TemplateMixture:
         self, image: NDArray[np.uint8], found: Candidates, *, least: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Boxes and values, `least` or more, of the vehicles to which windows of a frame lead, best first."""
-        # A bad opinion of the templates cannot be known to stay one; most of what they doubt is clutter.
+        # What the second opinion will say of a box is not known before.
         boxes, values = self.proposals(
             image, found, least=least if self.verification is None else LEAST_VALUE
         )
