@@ -23,6 +23,7 @@ from vehicle_detection.params import PyramidParams
 
 from .test_mixture_training import SMALL, drawn
 from .test_mixture_training import source as source
+from .test_mixture_training import trained as trained
 
 
 def random_verification(seed=0, count=5, **changes):
@@ -217,11 +218,6 @@ def test_a_file_with_half_an_opinion_is_refused(tmp_path, monkeypatch):
 
 
 # Training.
-
-
-@pytest.fixture(scope="module")
-def trained(source):
-    return train_mixture([source], SMALL, n_jobs=1)
 
 
 def test_training_makes_an_opinion_that_tells_vehicles_from_clutter(trained):

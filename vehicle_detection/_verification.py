@@ -44,8 +44,8 @@ class Projection:
     _columns: NDArray[np.float32] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        mean = _halved(self.mean, "verification.mean", (None,))
-        axes = _halved(self.axes, "verification.axes", (None, len(mean)))
+        mean = _half_precision(self.mean, "verification.mean", (None,))
+        axes = _half_precision(self.axes, "verification.axes", (None, len(mean)))
         columns = np.ascontiguousarray(axes.T)
         for name, array in ("mean", mean), ("axes", axes), ("_columns", columns):
             object.__setattr__(self, name, array)
@@ -97,9 +97,11 @@ class Verification:
                     f"verification.{name} must take {length} values, got {len(projection.mean)}; train again"
                 )
         count = len(self.edges.axes) + len(self.colours.axes)
-        vectors = _halved(self.vectors, "verification.vectors", (None, count))
+        vectors = _half_precision(self.vectors, "verification.vectors", (None, count))
         object.__setattr__(self, "vectors", vectors)
-        object.__setattr__(self, "weights", _halved(self.weights, "verification.weights", (len(vectors),)))
+        object.__setattr__(
+            self, "weights", _half_precision(self.weights, "verification.weights", (len(vectors),))
+        )
         check_number(self.bias, "verification.bias")
         check_number(self.gamma, "verification.gamma", above=0, high=1e6)
         check_number(self.share, "verification.share", above=0, high=1)
@@ -155,7 +157,7 @@ class Verification:
         )
 
 
-def _halved(values: object, name: str, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
+def _half_precision(values: object, name: str, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
     """Return finite float32 numbers that half precision can hold, rounded to it."""
     array = finite_array(values, name, shape)
     with np.errstate(over="ignore"):

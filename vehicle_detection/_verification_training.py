@@ -78,10 +78,11 @@ def train_verification(
         return None
     # Of clutter there is enough: each piece is taken as it is or mirrored.
     shown = _joined([vehicles, _mirrored(vehicles)])
-    turned = rng.random(len(clutter[0])) < 0.5
-    empty = tuple(np.where(turned[:, None], *both) for both in zip(_mirrored(clutter), clutter))
+    turned = rng.random((len(clutter[0]), 1)) < 0.5
+    back_edges, back_colours = _mirrored(clutter)
+    empty = np.where(turned, back_edges, clutter[0]), np.where(turned, back_colours, clutter[1])
     is_vehicle = np.repeat([True, False], [len(shown[0]), len(clutter[0])])
-    edges, colours = _joined([shown, (empty[0], empty[1])])
+    edges, colours = _joined([shown, empty])
     seed = int(rng.integers(2**31))
     to_edges = _principal(edges, _EDGE_AXES, 1.0, seed)
     to_colours = _principal(colours, _COLOUR_AXES, _COLOUR_WEIGHT, seed)

@@ -295,7 +295,8 @@ class MixtureSearch:
         params = params if params is not None else PyramidParams()
         check_number(least, "least")
         check_image(image)
-        image = without_noise(image)
+        with single_threaded_opencv():
+            image = without_noise(image)
         found = self.candidates(image, params)
         mixture = self.mixture
         scores = mixture.scores(found.scores)
