@@ -26,7 +26,7 @@ from vehicle_detection import (
     render_patches,
     train_classifier,
 )
-from vehicle_detection._model_file import FORMAT_VERSION
+from vehicle_detection._common import FORMAT_VERSION
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.synthetic import Drive
 

@@ -15,8 +15,7 @@ from typing import Any, Literal
 from rich.console import Console
 from rich.table import Table
 
-from vehicle_detection._files import written_whole
-from vehicle_detection._jobs import JOBS_VARIABLE, available_cores
+from vehicle_detection._common import JOBS_VARIABLE, available_cores, written_whole
 
 LIBRARIES = (
     "imageio-ffmpeg",

@@ -26,8 +26,8 @@ from vehicle_detection import (
     load_classifier,
     search,
 )
+from vehicle_detection._common import available_cores
 from vehicle_detection._correlation import Filter
-from vehicle_detection._jobs import available_cores
 from vehicle_detection.params import SearchBand
 from vehicle_detection.search import BandSearch
 

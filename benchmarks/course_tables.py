@@ -17,7 +17,7 @@ from typing import Any
 
 from benchmarks._course_runs import COURSE_C, PLANS, SPLITS, Runs
 from benchmarks._report import machine_facts
-from vehicle_detection._files import written_whole
+from vehicle_detection._common import written_whole
 from vehicle_detection.classifier import load_classifier
 from vehicle_detection.datasets import load_training_patches
 from vehicle_detection.tuning import ResultTable

@@ -4,7 +4,7 @@ import re
 import numpy as np
 import pytest
 
-from vehicle_detection._checks import (
+from vehicle_detection._common import (
     check_boxes,
     check_channel,
     check_choice,

@@ -23,7 +23,6 @@ from tests.test_mixture_training import SMALL, drawn
 from vehicle_detection import (
     _clip_horizon,
     _drawn_frames,
-    _files,
     classifier,
     datasets,
     detector,
@@ -31,6 +30,7 @@ from vehicle_detection import (
     training,
 )
 from vehicle_detection._cli_output import interruptible, output_folder
+from vehicle_detection._common import files as _files
 from vehicle_detection._demo import FILES, SHEET, draw_clip
 from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import VehicleClassifier, load_classifier

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vehicle_detection._buffers import Buffers
+from vehicle_detection._common import Buffers
 from vehicle_detection._correlation import Filter
 from vehicle_detection._vector_kernels import Block, block_adder, host_block
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vehicle_detection import _fhog_kernels
-from vehicle_detection._buffers import Buffers
+from vehicle_detection._common import Buffers
 from vehicle_detection._feature_maps import (
     _COTANGENTS,
     _EPS,

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from vehicle_detection._files import check_target, written_whole
+from vehicle_detection._common import check_target, written_whole
 from vehicle_detection.errors import InvalidInputError
 
 

@@ -4,7 +4,13 @@ import cv2
 import numpy as np
 import pytest
 
-from vehicle_detection._jobs import JOBS_VARIABLE, Crew, available_cores, resolve_jobs, single_threaded_opencv
+from vehicle_detection._common import (
+    JOBS_VARIABLE,
+    Crew,
+    available_cores,
+    resolve_jobs,
+    single_threaded_opencv,
+)
 from vehicle_detection.errors import InvalidInputError
 
 

@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vehicle_detection import VehicleDetector, mixture
+from vehicle_detection._common import FORMAT_VERSION
+from vehicle_detection._common.model_file import FORMAT, _checksum
 from vehicle_detection._feature_maps import PLANES, FeatureMap, Level, halved, level_maps, mirror_planes
 from vehicle_detection._mixture_template import MixtureTemplate
-from vehicle_detection._model_file import FORMAT, FORMAT_VERSION, _checksum
 from vehicle_detection._refinement import (
     CROP_LENGTH,
     Candidates,
@@ -634,6 +635,6 @@ def test_the_shipped_models():
 
 
 def test_a_shipped_model_that_is_missing(tmp_path, monkeypatch):
-    monkeypatch.setattr("vehicle_detection._model_file.resources.files", lambda package: tmp_path)
+    monkeypatch.setattr("vehicle_detection._common.model_file.resources.files", lambda package: tmp_path)
     with pytest.raises(ModelFileError, match="shipped model 'highway' is missing; install the package again"):
         load_model("highway")

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.test_classifier import random_classifier
-from vehicle_detection._buffers import Buffers
+from vehicle_detection._common import Buffers
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import COLOR_SPACES, FeatureParams, PixelBand, SearchBand, SearchParams
@@ -282,7 +282,7 @@ def test_many_threads_share_one_search(monkeypatch):
             time.sleep(0.02)
             super().__init__(*arguments, **options)
 
-    monkeypatch.setattr("vehicle_detection._jobs.ThreadPoolExecutor", SlowToOpen)
+    monkeypatch.setattr("vehicle_detection._common.threads.ThreadPoolExecutor", SlowToOpen)
     classifier = random_classifier(SMALL)
     search = small_search()
     images = [textured(220, 330, seed) for seed in range(8)]

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vehicle_detection._variants import blur_patches, degrade_patches, relight
+from vehicle_detection._common import blur_patches, degrade_patches, relight
 from vehicle_detection.synthetic import render_patches
 
 

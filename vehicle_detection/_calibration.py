@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._checks import check_integer, check_number, describe
+from vehicle_detection._common import check_integer, check_number, describe
 from vehicle_detection.errors import InvalidInputError
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_choice, check_image
+from vehicle_detection._common import check_choice, check_image
 from vehicle_detection.params import COLOR_SPACES, FeatureParams
 
 _CODES = {

@@ -9,10 +9,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import vehicle_detection
-from vehicle_detection._checks import check_integer, check_number, check_patches, describe
+from vehicle_detection._common import (
+    blur_patches,
+    check_integer,
+    check_number,
+    check_patches,
+    degrade_patches,
+    describe,
+    mirror_patches,
+)
 from vehicle_detection._linear_classifier import Template, VehicleClassifier
 from vehicle_detection._svm_solver import fit_svm
-from vehicle_detection._variants import blur_patches, degrade_patches, mirror_patches
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import extract_features
 from vehicle_detection.params import PATCH_SIZE, FeatureParams

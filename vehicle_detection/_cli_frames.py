@@ -51,8 +51,8 @@ def train_frames(
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of everything random.")] = 0,
 ) -> None:
     """Train the model for any road, and judge it on sources that it was not trained on."""
+    from vehicle_detection._common import check_target
     from vehicle_detection._drawn_frames import drawn_source
-    from vehicle_detection._files import check_target
     from vehicle_detection._frame_sources import find_patches, find_sources
     from vehicle_detection._mixture_card import write_card, write_curves
     from vehicle_detection._mixture_windows import check_sources

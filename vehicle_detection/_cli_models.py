@@ -57,7 +57,7 @@ def train(
     ] = None,
 ) -> None:
     """Train a model, and judge it on splits of its patches."""
-    from vehicle_detection._files import check_target, written_whole
+    from vehicle_detection._common import check_target, written_whole
     from vehicle_detection.datasets import load_training_patches
     from vehicle_detection.params import FeatureParams
     from vehicle_detection.training import model_card, train_and_judge

@@ -55,8 +55,7 @@ def tune(
     ] = None,
 ) -> None:
     """Try all combinations of a grid, and show which are best."""
-    from vehicle_detection._checks import check_choice
-    from vehicle_detection._files import check_target
+    from vehicle_detection._common import check_choice, check_target
     from vehicle_detection.datasets import load_training_patches
     from vehicle_detection.tuning import compare_configurations, expand_grid, parse_grid, search_parameters
 
@@ -131,7 +130,7 @@ def _text(value: float | None, digits: int) -> str:
 def _draw(table: ResultTable, path: Path) -> None:
     from matplotlib.figure import Figure
 
-    from vehicle_detection._files import written_whole
+    from vehicle_detection._common import written_whole
     from vehicle_detection.plotting import plot_tradeoff
 
     figure = Figure(figsize=(7, 4.5), layout="constrained")

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_detection._checks import describe
+from vehicle_detection._common import describe
 from vehicle_detection._result_table import number_or_text
 from vehicle_detection._trials import FEATURE_FIELDS, TRAINING_FIELDS, Recipe
 from vehicle_detection.errors import InvalidInputError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._buffers import Take, new_array
+from vehicle_detection._common import Take, new_array
 from vehicle_detection._jit import jit
 from vehicle_detection._vector_kernels import block_adder, host_block
 

@@ -21,8 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_integer, describe
-from vehicle_detection._files import written_whole
+from vehicle_detection._common import check_integer, describe, written_whole
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import decode_image
 

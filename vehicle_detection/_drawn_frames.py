@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_detection._checks import check_integer
+from vehicle_detection._common import check_integer
 from vehicle_detection._labelled_frames import FrameKey, LabelledFrames
 from vehicle_detection._mixture_windows import FrameSource
 from vehicle_detection.evaluation import Labels

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_image, describe
+from vehicle_detection._common import check_image, describe
 from vehicle_detection.boxes import Detections
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_number, check_patches
-from vehicle_detection._files import written_whole
+from vehicle_detection._common import check_number, check_patches, written_whole
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import extract_features
 from vehicle_detection.params import PATCH_SIZE, FeatureParams

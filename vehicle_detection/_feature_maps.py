@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection import _fhog_kernels
-from vehicle_detection._buffers import Take, new_array
+from vehicle_detection._common import Take, new_array
 
 PLANES = 28
 """Values of a cell."""

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_choice, check_integer, check_number, describe
+from vehicle_detection._common import check_choice, check_integer, check_number, describe
 from vehicle_detection.errors import InvalidInputError
 
 PATCH_SIZE = 64

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vehicle_detection._checks import check_choice
+from vehicle_detection._common import check_choice
 from vehicle_detection._label_formats import READERS, Row, read_text, split_words
 from vehicle_detection._labels import NO_TRACK, FrameKey, Labels
 from vehicle_detection.boxes import clip_boxes

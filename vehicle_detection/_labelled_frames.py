@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_image, check_integer, check_number, describe
+from vehicle_detection._common import check_image, check_integer, check_number, describe
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import Labels

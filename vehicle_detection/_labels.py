@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._checks import check_boxes, describe
+from vehicle_detection._common import check_boxes, describe
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_integer, check_number
+from vehicle_detection._common import check_integer, check_number
 from vehicle_detection._labelled_frames import Frames, check_labels_of, keyed_frames, keys_of, pairs_of
 from vehicle_detection.boxes import Detections, intersection_matrix, non_max_suppression
 from vehicle_detection.classifier import VehicleClassifier

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_detection._checks import check_integer, check_number, check_type, describe
+from vehicle_detection._common import check_integer, check_number, check_type, describe
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import PyramidParams
 

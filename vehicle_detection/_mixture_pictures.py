@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from vehicle_detection._files import written_whole
+from vehicle_detection._common import written_whole
 from vehicle_detection.evaluation import precision_recall_curve
 from vehicle_detection.mixture_report import HeldOut, RoadScore
 from vehicle_detection.plotting import plot_errors, plot_precision_recall

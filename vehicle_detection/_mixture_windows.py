@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._border_strips import border_strip, strip_boxes
-from vehicle_detection._checks import check_number, check_type, describe
+from vehicle_detection._common import check_number, check_type, describe, single_threaded_opencv
 from vehicle_detection._feature_maps import FeatureMap, halved, level_maps, mirror_planes, pair_levels
-from vehicle_detection._jobs import single_threaded_opencv
 from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection._mixture_params import MixtureParams, entries
 from vehicle_detection._mixture_template import MixtureTemplate, smallest_box

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_number, check_patches
+from vehicle_detection._common import check_number, check_patches
 from vehicle_detection._patch_set import PatchSet
 from vehicle_detection.params import PATCH_SIZE
 

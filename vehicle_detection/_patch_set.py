@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._checks import check_patches, describe
+from vehicle_detection._common import check_patches, describe
 from vehicle_detection._download import natural_key, parent_folder
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import PATCH_SIZE

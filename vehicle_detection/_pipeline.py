@@ -14,7 +14,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import describe
+from vehicle_detection._common import describe
 from vehicle_detection._streams import FrameReader, FrameWriter
 from vehicle_detection.errors import InvalidInputError
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Union
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._checks import check_boxes, check_image, check_type, describe
+from vehicle_detection._common import check_boxes, check_image, check_type, describe
 from vehicle_detection._labels import Labels
 from vehicle_detection.boxes import Detections
 from vehicle_detection.drawing import TRACK_COLORS

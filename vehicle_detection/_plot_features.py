@@ -9,13 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._channels import hog_source
-from vehicle_detection._checks import (
-    check_choice,
-    check_image,
-    check_integer,
-    check_patches,
-    describe,
-)
+from vehicle_detection._common import check_choice, check_image, check_integer, check_patches, describe
 from vehicle_detection._plot_common import (
     COLORS,
     LINE_COLORS,

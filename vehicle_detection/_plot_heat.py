@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_image, check_type, describe
+from vehicle_detection._common import check_image, check_type, describe
 from vehicle_detection._plot_common import (
     COLORS,
     SKY,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_choice, check_integer, check_number, check_type, describe
+from vehicle_detection._common import check_choice, check_integer, check_number, check_type, describe
 from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection._labels import FrameKey, Labels
 from vehicle_detection._plot_common import (

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._checks import check_image, check_number, check_type, describe
+from vehicle_detection._common import check_image, check_number, check_type, describe
 from vehicle_detection._labels import Labels
 from vehicle_detection._plot_common import (
     BLUE,

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._checks import check_integer, check_number, check_type, describe
+from vehicle_detection._common import check_integer, check_number, check_type, describe
 from vehicle_detection._plot_common import (
     OTHER,
     VEHICLE,

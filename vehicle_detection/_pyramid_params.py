@@ -6,7 +6,7 @@ import dataclasses
 import math
 from dataclasses import dataclass
 
-from vehicle_detection._checks import check_integer, check_number, describe
+from vehicle_detection._common import check_integer, check_number, describe
 from vehicle_detection.errors import InvalidInputError
 
 # By how much of the frame's height a horizon that somebody states may be wrong.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_integer, describe
+from vehicle_detection._common import check_integer, describe
 from vehicle_detection._crops import CROP_LENGTH, crop_features
 from vehicle_detection.boxes import box_areas, clip_boxes, intersection_matrix
 from vehicle_detection.errors import InvalidInputError

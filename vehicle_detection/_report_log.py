@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_integer, check_number, describe
+from vehicle_detection._common import check_integer, check_number, describe
 from vehicle_detection.errors import InvalidInputError
 
 Floats = NDArray[np.float64]

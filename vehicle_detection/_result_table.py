@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import describe
-from vehicle_detection._files import check_target, written_whole
+from vehicle_detection._common import check_target, describe, written_whole
 from vehicle_detection.errors import DatasetError, InvalidInputError
 
 Cell = str | int | float | bool | None

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vehicle_detection._checks import describe
+from vehicle_detection._common import describe
 from vehicle_detection.errors import InvalidInputError
 
 BOX_COLUMNS = ("frame", "track_id", "x1", "y1", "x2", "y2", "score")

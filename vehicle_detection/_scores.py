@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._checks import describe
+from vehicle_detection._common import describe
 from vehicle_detection._labels import NO_TRACK, FrameKey, Labels, check_keys, frame_order
 from vehicle_detection.boxes import box_areas, intersection_matrix, iou_matrix
 from vehicle_detection.errors import InvalidInputError

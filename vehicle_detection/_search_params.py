@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from vehicle_detection._checks import check_choice, check_number, describe
+from vehicle_detection._common import check_choice, check_number, describe
 from vehicle_detection.errors import InvalidInputError
 
 REFERENCE_WIDTH = 1280

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._cars import Car
-from vehicle_detection._checks import check_choice, check_integer, check_number, describe
+from vehicle_detection._common import check_choice, check_integer, check_number, describe
 from vehicle_detection._designs import PAINTS
 from vehicle_detection._optics import LIGHTS, Light, Pinhole, Sensor, make_light
 from vehicle_detection._road import Road

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from vehicle_detection._checks import check_choice, check_integer, check_number
+from vehicle_detection._common import check_choice, check_integer, check_number
 from vehicle_detection.errors import InvalidInputError
 
 

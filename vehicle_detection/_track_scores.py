@@ -10,7 +10,7 @@ from itertools import accumulate, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_number
+from vehicle_detection._common import check_number
 from vehicle_detection._labels import NO_TRACK, FrameKey, Labels
 from vehicle_detection._scores import (
     Scores,

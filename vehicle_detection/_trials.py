@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._checks import check_number
 from vehicle_detection._classifier_training import check_labels
+from vehicle_detection._common import check_number
 from vehicle_detection._feature_cache import FeatureCache, digest_of
 from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection._svm_solver import fit_svm

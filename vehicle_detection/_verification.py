@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_number, describe
+from vehicle_detection._common import check_number, describe
 from vehicle_detection._crops import COLOURS, EDGES, crop_views
 from vehicle_detection._products import product
 from vehicle_detection._refinement import finite_array

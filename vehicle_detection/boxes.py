@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._checks import check_boxes, check_number, describe
+from vehicle_detection._common import check_boxes, check_number, describe
 from vehicle_detection.errors import InvalidInputError
 
 

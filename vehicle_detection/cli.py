@@ -325,7 +325,7 @@ def evaluate(
     """Score boxes, and tracks where there are any, against labels."""
     from json import dumps
 
-    from vehicle_detection._files import check_target, written_whole
+    from vehicle_detection._common import check_target, written_whole
     from vehicle_detection.evaluation import evaluate_detections, evaluate_tracks, read_labels
 
     if json is not None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_choice
+from vehicle_detection._common import check_choice
 from vehicle_detection._download import (
     decode_listings,
     fetch_patches,

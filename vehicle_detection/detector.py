@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_choice, check_image, check_number, check_type
+from vehicle_detection._common import check_choice, check_image, check_number, check_type
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import VehicleClassifier

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from vehicle_detection._checks import check_boxes, check_choice, check_image, check_integer, describe
+from vehicle_detection._common import check_boxes, check_choice, check_image, check_integer, describe
 from vehicle_detection._strokes import (
     BLACK,
     WHITE,

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._calibration import calibration_error
-from vehicle_detection._checks import check_number
+from vehicle_detection._common import check_number
 from vehicle_detection._label_files import read_labels
 from vehicle_detection._labels import FrameKey, Labels
 from vehicle_detection._scores import (

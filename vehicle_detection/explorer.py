@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_choice, check_integer, check_type
+from vehicle_detection._common import check_choice, check_integer, check_type
 from vehicle_detection._explorer_frames import (
     Frames,
     Image,

@@ -14,8 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import IO, Any, Literal, TypeAlias
 
-from vehicle_detection._checks import check_choice, describe
-from vehicle_detection._files import check_target, written_whole
+from vehicle_detection._common import check_choice, check_target, describe, written_whole
 from vehicle_detection._rows import (
     BOX_COLUMNS,
     DIGITS,

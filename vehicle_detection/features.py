@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._channels import convert_color, hog_source
-from vehicle_detection._checks import (
+from vehicle_detection._common import (
     check_channel,
     check_image,
     check_integer,
     check_patches,
     check_type,
     describe,
+    resolve_jobs,
 )
-from vehicle_detection._jobs import resolve_jobs
 from vehicle_detection._patch_batch import batch_extractor
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import read_image

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._checks import check_boxes, check_integer, check_number, describe
+from vehicle_detection._common import check_boxes, check_integer, check_number, describe
 from vehicle_detection.boxes import Detections, clip_boxes
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import HeatParams

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._checks import check_boxes
+from vehicle_detection._common import check_boxes
 from vehicle_detection.camera import check_shape, cut_edges
 from vehicle_detection.errors import InvalidInputError
 

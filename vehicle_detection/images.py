@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_image
-from vehicle_detection._files import written_whole
+from vehicle_detection._common import check_image, written_whole
 from vehicle_detection.errors import InvalidInputError
 
 

@@ -18,12 +18,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._buffers import Buffers, Take
-from vehicle_detection._checks import check_image, check_number, check_type
+from vehicle_detection._common import (
+    Buffers,
+    Crew,
+    Take,
+    check_image,
+    check_number,
+    check_type,
+    read_model,
+    single_threaded_opencv,
+    write_model,
+)
 from vehicle_detection._feature_maps import COARSE, FeatureMap, Level, halved, level_maps, pair_levels
-from vehicle_detection._jobs import Crew, single_threaded_opencv
 from vehicle_detection._mixture_template import MixtureTemplate, smallest_box
-from vehicle_detection._model_file import read_model, write_model
 from vehicle_detection._noise import without_noise
 from vehicle_detection._refinement import WEAKEST, Candidates, Refinement, resolve, suppress
 from vehicle_detection._verification import LEAST_VALUE, Verification

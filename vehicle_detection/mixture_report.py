@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import vehicle_detection
-from vehicle_detection._checks import check_integer
-from vehicle_detection._jobs import resolve_jobs
+from vehicle_detection._common import check_integer, resolve_jobs
 from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection._mixture_windows import check_sources
 from vehicle_detection._noise import without_noise

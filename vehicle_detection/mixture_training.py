@@ -11,10 +11,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import check_image, check_integer, check_type, describe
+from vehicle_detection._common import check_image, check_integer, check_type, describe, resolve_jobs
 from vehicle_detection._crops import CROP_LENGTH, crop_features
 from vehicle_detection._feature_maps import PLANES
-from vehicle_detection._jobs import resolve_jobs
 from vehicle_detection._mixture_params import MixtureParams
 from vehicle_detection._mixture_template import MixtureTemplate
 from vehicle_detection._mixture_vehicles import (

@@ -9,8 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any
 
-from vehicle_detection._checks import check_integer, check_type, describe
-from vehicle_detection._files import check_target, written_whole
+from vehicle_detection._common import check_integer, check_target, check_type, describe, written_whole
 from vehicle_detection._report_log import TrackLog
 from vehicle_detection._report_page import Film, page
 from vehicle_detection.errors import InvalidInputError

@@ -25,11 +25,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection import _colour_kernels, _hog_kernels
-from vehicle_detection._buffers import Buffers, Take, new_array
 from vehicle_detection._channels import convert_color, hog_source, pick_hog_channels
-from vehicle_detection._checks import check_image, check_number, check_type
+from vehicle_detection._common import (
+    Buffers,
+    Crew,
+    Take,
+    check_image,
+    check_number,
+    check_type,
+    new_array,
+    single_threaded_opencv,
+)
 from vehicle_detection._correlation import Filter
-from vehicle_detection._jobs import Crew, single_threaded_opencv
 from vehicle_detection._kernel_inputs import (
     bin_of_value,
     degree_bounds,

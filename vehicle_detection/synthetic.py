@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._cars import Car
-from vehicle_detection._checks import check_choice, check_integer, check_number, describe
+from vehicle_detection._common import check_choice, check_integer, check_number, describe, written_whole
 from vehicle_detection._designs import DESIGNS, KIND_SHARES, PAINT_SHARES, PAINTS, draw_share
-from vehicle_detection._files import written_whole
 from vehicle_detection._optics import Pinhole
 from vehicle_detection._patches import draw_patches
 from vehicle_detection._road import Road

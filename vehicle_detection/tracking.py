@@ -22,7 +22,7 @@ from vehicle_detection._association import (
     overlap_matrices,
     same_vehicle,
 )
-from vehicle_detection._checks import check_number, describe
+from vehicle_detection._common import check_number, describe
 from vehicle_detection._horizon_filter import HorizonFilter
 from vehicle_detection._track import Track
 from vehicle_detection._vehicle import (

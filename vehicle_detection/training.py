@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._calibration import calibrate_scores, calibration_error
-from vehicle_detection._checks import check_choice, check_integer, check_number, describe
 from vehicle_detection._classifier_training import check_gamma, check_labels, fit_features, patch_features
-from vehicle_detection._jobs import resolve_jobs
+from vehicle_detection._common import check_choice, check_integer, check_number, describe, resolve_jobs
 from vehicle_detection._model_card import model_card
 from vehicle_detection._training_report import SPLITS, SplitScore, TrainingReport
 from vehicle_detection.classifier import DEFAULT_C, VehicleClassifier

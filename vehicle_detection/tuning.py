@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from vehicle_detection._calibration import Platt, calibrate_scores
-from vehicle_detection._checks import check_choice, check_integer, describe
+from vehicle_detection._common import check_choice, check_integer, describe
 from vehicle_detection._configurations import (
     Configuration,
     expand_grid,

@@ -19,10 +19,16 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from vehicle_detection._checks import check_choice, check_integer, check_number, describe
+from vehicle_detection._common import (
+    check_choice,
+    check_integer,
+    check_number,
+    check_target,
+    describe,
+    single_threaded_opencv,
+    written_whole,
+)
 from vehicle_detection._ffmpeg import VideoInfo, probe
-from vehicle_detection._files import check_target, written_whole
-from vehicle_detection._jobs import single_threaded_opencv
 from vehicle_detection._pipeline import Line, SupportsFrames
 from vehicle_detection._streams import CONTAINERS, AudioSource, FrameReader, FrameWriter
 from vehicle_detection.errors import InvalidInputError

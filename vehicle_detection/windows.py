@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._channels import hog_source
-from vehicle_detection._checks import (
+from vehicle_detection._common import (
     check_boxes,
     check_choice,
     check_image,

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 import cv2
 
-from vehicle_detection._checks import check_integer
+from vehicle_detection._common.checks import check_integer
 from vehicle_detection.errors import InvalidInputError
 
 Item = TypeVar("Item")

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._checks import describe
-from vehicle_detection._files import written_whole
+from vehicle_detection._common.checks import describe
+from vehicle_detection._common.files import written_whole
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 
 FORMAT = "vehicle-detection-model"

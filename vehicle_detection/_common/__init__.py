@@ -1,0 +1,54 @@
+"""Helpers of every layer: argument checks, files, threads, model files and augmentation."""
+
+from vehicle_detection._common.augment import blur_patches, degrade_patches, mirror_patches, relight
+from vehicle_detection._common.checks import (
+    check_boxes,
+    check_channel,
+    check_choice,
+    check_image,
+    check_integer,
+    check_number,
+    check_patches,
+    check_type,
+    describe,
+)
+from vehicle_detection._common.files import check_target, written_whole
+from vehicle_detection._common.model_file import FORMAT_VERSION, ModelData, read_model, write_model
+from vehicle_detection._common.threads import (
+    JOBS_VARIABLE,
+    Crew,
+    available_cores,
+    resolve_jobs,
+    single_threaded_opencv,
+)
+from vehicle_detection._common.workspace import Buffers, Take, new_array
+
+__all__ = [
+    "FORMAT_VERSION",
+    "JOBS_VARIABLE",
+    "Buffers",
+    "Crew",
+    "ModelData",
+    "Take",
+    "available_cores",
+    "blur_patches",
+    "check_boxes",
+    "check_channel",
+    "check_choice",
+    "check_image",
+    "check_integer",
+    "check_number",
+    "check_patches",
+    "check_target",
+    "check_type",
+    "degrade_patches",
+    "describe",
+    "mirror_patches",
+    "new_array",
+    "read_model",
+    "relight",
+    "resolve_jobs",
+    "single_threaded_opencv",
+    "write_model",
+    "written_whole",
+]
