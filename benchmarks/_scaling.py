@@ -18,16 +18,11 @@ from numpy.typing import NDArray
 from benchmarks._material import Context, classifier_for_search, searched_frame
 from benchmarks._report import Row
 from benchmarks._timing import median_of, median_seconds, seconds_of
-from vehicle_detection import (
-    SearchParams,
-    VehicleClassifier,
-    _colour_kernels,
-    _hog_kernels,
-    load_classifier,
-    search,
-)
+from vehicle_detection import SearchParams, VehicleClassifier, load_classifier, search
 from vehicle_detection._common import available_cores
-from vehicle_detection._correlation import Filter
+from vehicle_detection._kernels import Filter
+from vehicle_detection._kernels import color as _colour_kernels
+from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.params import SearchBand
 from vehicle_detection.search import BandSearch
 

@@ -14,7 +14,7 @@ from sklearn.svm import LinearSVC
 from vehicle_detection._classifier_training import copy_weights, patch_features
 from vehicle_detection._common import FORMAT_VERSION, blur_patches, degrade_patches, mirror_patches
 from vehicle_detection._common.model_file import FORMAT, _checksum
-from vehicle_detection._svm_solver import fit_svm
+from vehicle_detection._kernels import fit_svm
 from vehicle_detection.classifier import (
     KIND,
     Template,

@@ -5,8 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vehicle_detection._common import Buffers
-from vehicle_detection._correlation import Filter
-from vehicle_detection._vector_kernels import Block, block_adder, host_block
+from vehicle_detection._kernels import Filter
+from vehicle_detection._kernels.vector import Block, block_adder, host_block
 
 
 def reference(weights, planes, spread=1):

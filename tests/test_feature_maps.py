@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vehicle_detection import _fhog_kernels
 from vehicle_detection._common import Buffers
 from vehicle_detection._feature_maps import (
     _COTANGENTS,
@@ -26,6 +25,7 @@ from vehicle_detection._feature_maps import (
     pair_levels,
     planes_of_sums,
 )
+from vehicle_detection._kernels import fhog as _fhog_kernels
 from vehicle_detection.synthetic import render_scene
 
 # Float32 against float64: the cumulative sums of a square are differenced.

@@ -14,13 +14,8 @@ from sklearn.svm import LinearSVC
 from sklearn.utils import estimator_checks
 from sklearn.utils.estimator_checks import check_estimator
 
-from vehicle_detection import _hog_kernels
-from vehicle_detection._kernel_inputs import (
-    bin_of_value,
-    degree_bounds,
-    orientation_cotangents,
-    sqrt_gradients,
-)
+from vehicle_detection._kernels import bin_of_value, degree_bounds, orientation_cotangents, sqrt_gradients
+from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import (
     PatchFeatures,

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 
-from vehicle_detection._svm_solver import fit_svm
+from vehicle_detection._kernels import fit_svm
 
 
 def material(count=120, length=30, seed=0):

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from vehicle_detection._crops import COLOURS, EDGES, crop_features, crop_views
 from vehicle_detection._feature_maps import mirror_planes
+from vehicle_detection._kernels import product
 from vehicle_detection._mixture_template import MixtureTemplate
 from vehicle_detection._mixture_windows import Frame, frames_of
-from vehicle_detection._products import product
 from vehicle_detection._refinement import Refinement, resolve
 from vehicle_detection._verification import LEAST_VALUE, Projection, Verification
 from vehicle_detection._verification_training import _boxes, _mirrored, train_verification

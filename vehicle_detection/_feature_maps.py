@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection import _fhog_kernels
 from vehicle_detection._common import Take, new_array
+from vehicle_detection._kernels import fhog as _fhog_kernels
 
 PLANES = 28
 """Values of a cell."""

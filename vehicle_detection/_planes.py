@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._plane_kernels import channels_from_planes, planes_from_channels
+from vehicle_detection._kernels import channels_from_planes, planes_from_channels
 
 FORMATS = ("yuv420p", "yuvj420p")
 """ffmpeg's names of the pixel formats that are read as planes."""

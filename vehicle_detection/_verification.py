@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import check_number, describe
 from vehicle_detection._crops import COLOURS, EDGES, crop_views
-from vehicle_detection._products import product
+from vehicle_detection._kernels import product
 from vehicle_detection._refinement import finite_array
 from vehicle_detection.errors import InvalidInputError
 

@@ -24,7 +24,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection import _colour_kernels, _hog_kernels
 from vehicle_detection._channels import convert_color, hog_source, pick_hog_channels
 from vehicle_detection._common import (
     Buffers,
@@ -36,13 +35,15 @@ from vehicle_detection._common import (
     new_array,
     single_threaded_opencv,
 )
-from vehicle_detection._correlation import Filter
-from vehicle_detection._kernel_inputs import (
+from vehicle_detection._kernels import (
+    Filter,
     bin_of_value,
     degree_bounds,
     orientation_cotangents,
     sqrt_gradients,
 )
+from vehicle_detection._kernels import color as _colour_kernels
+from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError

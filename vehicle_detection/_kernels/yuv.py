@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vehicle_detection._jit import jit
+from vehicle_detection._kernels.jit import jit
 
 
 @jit

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._jit import jit
+from vehicle_detection._kernels.jit import jit
 
 # Columns whose sums stay in the first-level cache.
 _COLUMNS = 512

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import Take, new_array
-from vehicle_detection._jit import jit
-from vehicle_detection._vector_kernels import block_adder, host_block
+from vehicle_detection._kernels.jit import jit
+from vehicle_detection._kernels.vector import block_adder, host_block
 
 _BLOCK = host_block()
 _ROWS, _COLUMNS = _BLOCK.rows, _BLOCK.columns

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._jit import jit
+from vehicle_detection._kernels.jit import jit
 
 Floats = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vehicle_detection._jit import jit
+from vehicle_detection._kernels.jit import jit
 
 # A tile of gradients and its histograms (10 rows of floats) stays in the first-level cache.
 _TILE = 768

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from vehicle_detection._feature_params import COLOR_SPACES, HOG_CHANNELS, PATCH_SIZE, FeatureParams
-from vehicle_detection._pyramid_params import PyramidParams
-from vehicle_detection._region_params import HeatParams, RegionParams
-from vehicle_detection._search_params import REFERENCE_WIDTH, PixelBand, SearchBand, SearchParams
-from vehicle_detection._track_params import TrackParams
+from vehicle_detection.params.features import COLOR_SPACES, HOG_CHANNELS, PATCH_SIZE, FeatureParams
+from vehicle_detection.params.pyramid import PyramidParams
+from vehicle_detection.params.regions import HeatParams, RegionParams
+from vehicle_detection.params.search import REFERENCE_WIDTH, PixelBand, SearchBand, SearchParams
+from vehicle_detection.params.tracking import TrackParams
 
 __all__ = [
     "COLOR_SPACES",

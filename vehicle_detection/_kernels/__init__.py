@@ -1,0 +1,24 @@
+"""Compiled numba kernels: HOG, FHOG, color, correlation, matrix products and the SVM solver."""
+
+from vehicle_detection._kernels.correlation import Filter
+from vehicle_detection._kernels.hog_inputs import (
+    bin_of_value,
+    degree_bounds,
+    orientation_cotangents,
+    sqrt_gradients,
+)
+from vehicle_detection._kernels.linear_svm import fit_svm
+from vehicle_detection._kernels.matmul import product
+from vehicle_detection._kernels.yuv import channels_from_planes, planes_from_channels
+
+__all__ = [
+    "Filter",
+    "bin_of_value",
+    "channels_from_planes",
+    "degree_bounds",
+    "fit_svm",
+    "orientation_cotangents",
+    "planes_from_channels",
+    "product",
+    "sqrt_gradients",
+]
