@@ -20,21 +20,14 @@ from typer.testing import CliRunner
 import vehicle_detection
 from tests.test_mixture_report import write_set
 from tests.test_mixture_training import SMALL, drawn
-from vehicle_detection import (
-    _clip_horizon,
-    _drawn_frames,
-    classifier,
-    datasets,
-    detector,
-    mixture_report,
-    training,
-)
+from vehicle_detection import _clip_horizon, _drawn_frames, classifier, detector, mixture_report, training
 from vehicle_detection._cli_output import interruptible, output_folder
 from vehicle_detection._common import files as _files
 from vehicle_detection._demo import FILES, SHEET, draw_clip
 from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import VehicleClassifier, load_classifier
 from vehicle_detection.cli import app
+from vehicle_detection.datasets import patches as datasets
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.horizon import HorizonEstimate
 from vehicle_detection.images import read_image, write_image

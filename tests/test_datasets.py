@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vehicle_detection import _download
 from vehicle_detection.datasets import (
     PatchSet,
     Split,
@@ -27,6 +26,7 @@ from vehicle_detection.datasets import (
     split_sequences,
     split_sources,
 )
+from vehicle_detection.datasets import archives as _download
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import write_image
 

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check_integer, check_type, describe
-from vehicle_detection._near_copies import make_thumbnails
 from vehicle_detection._plot_common import (
     OTHER,
     VEHICLE,
@@ -22,7 +21,7 @@ from vehicle_detection._plot_common import (
     spread,
     tile_axes,
 )
-from vehicle_detection.datasets import PatchSet, Split
+from vehicle_detection.datasets import PatchSet, Split, make_thumbnails
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:

@@ -261,7 +261,7 @@ def plot_split_scores(report: TrainingReport, *, ax: Axes | None = None) -> Axes
     Examples
     --------
     >>> from vehicle_detection import render_patches, train_and_judge
-    >>> from vehicle_detection.datasets import PatchSet
+    >>> from vehicle_detection.datasets.patches import PatchSet
     >>> patches, labels = render_patches(20)
     >>> drawn = PatchSet(patches, labels, [f"vehicles/drawn/{number}.png" for number in range(20)])
     >>> _, report = train_and_judge(drawn, params=FeatureParams(hog_channel=0), seeds=1)

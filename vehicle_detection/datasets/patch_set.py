@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check_patches, describe
-from vehicle_detection._download import natural_key, parent_folder
+from vehicle_detection.datasets.archives import natural_key, parent_folder
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import PATCH_SIZE
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_choice
-from vehicle_detection._download import (
+from vehicle_detection.datasets.archives import (
     decode_listings,
     fetch_patches,
     infer_labels,
@@ -20,9 +20,9 @@ from vehicle_detection._download import (
     list_patches,
     natural_key,
 )
-from vehicle_detection._near_copies import find_near_duplicates
-from vehicle_detection._patch_set import PatchSet
-from vehicle_detection._splits import (
+from vehicle_detection.datasets.near_duplicates import find_near_duplicates
+from vehicle_detection.datasets.patch_set import PatchSet
+from vehicle_detection.datasets.splits import (
     Split,
     split_groups,
     split_leakage,
