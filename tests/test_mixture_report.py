@@ -11,11 +11,10 @@ import pytest
 from tests.test_mixture_training import SMALL, drawn
 from vehicle_detection._drawn_frames import _where_cut, drawn_source
 from vehicle_detection._frame_sources import find_patches, find_sources
-from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection._mixture_card import write_card, write_curves
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.evaluation import Labels
+from vehicle_detection.evaluation import LabelledFrames, Labels
 from vehicle_detection.images import write_image
 from vehicle_detection.mixture import load_model
 from vehicle_detection.mixture_report import (

@@ -6,7 +6,6 @@ import pytest
 
 from vehicle_detection import mixture_training
 from vehicle_detection._feature_maps import PLANES, mirror_planes
-from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection._mixture_template import MixtureTemplate
 from vehicle_detection._mixture_windows import (
     Frame,
@@ -20,7 +19,7 @@ from vehicle_detection._mixture_windows import (
 )
 from vehicle_detection.boxes import intersection_matrix, iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import Labels, evaluate_detections
+from vehicle_detection.evaluation import LabelledFrames, Labels, evaluate_detections
 from vehicle_detection.mixture import MixtureSearch
 from vehicle_detection.mixture_training import FrameSource, MixtureParams, train_mixture
 from vehicle_detection.params import PyramidParams

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from vehicle_detection._common import check_integer
-from vehicle_detection._labelled_frames import FrameKey, LabelledFrames
 from vehicle_detection._mixture_windows import FrameSource
-from vehicle_detection.evaluation import Labels
+from vehicle_detection.evaluation import FrameKey, LabelledFrames, Labels
 from vehicle_detection.synthetic import Drive, render_drive
 
 DRAWN = "drawn"

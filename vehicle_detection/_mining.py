@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer, check_number
-from vehicle_detection._labelled_frames import Frames, check_labels_of, keyed_frames, keys_of, pairs_of
 from vehicle_detection.boxes import Detections, intersection_matrix, non_max_suppression
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.datasets import PatchSet
-from vehicle_detection.evaluation import Labels
+from vehicle_detection.evaluation import Frames, Labels, check_labels_of, keyed_frames, keys_of, pairs_of
 from vehicle_detection.params import PATCH_SIZE, SearchParams
 from vehicle_detection.search import BandSearch
 

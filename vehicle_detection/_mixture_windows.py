@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from vehicle_detection._border_strips import border_strip, strip_boxes
 from vehicle_detection._common import check_number, check_type, describe, single_threaded_opencv
 from vehicle_detection._feature_maps import FeatureMap, halved, level_maps, mirror_planes, pair_levels
-from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection._mixture_params import MixtureParams, entries
 from vehicle_detection._mixture_template import MixtureTemplate, smallest_box
 from vehicle_detection._noise import without_noise
 from vehicle_detection._refinement import mostly_inside, overlaps
 from vehicle_detection.boxes import box_areas, intersection_matrix, iou_matrix
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import LabelledFrames
 
 Floats = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ class FrameSource:
 
     Examples
     --------
-    >>> from vehicle_detection.evaluation import Labels
+    >>> from vehicle_detection.evaluation.detections import Labels
     >>> road = LabelledFrames("road", [np.zeros((90, 120, 3), np.uint8)], Labels([0], None, [[9, 9, 60, 50]]))
     >>> FrameSource("camera", [road], complete_from=40).sets
     (LabelledFrames('road', 1 frame, 1 box),)

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check_boxes, check_image, check_type, describe
-from vehicle_detection._labels import Labels
 from vehicle_detection.boxes import Detections
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import Labels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

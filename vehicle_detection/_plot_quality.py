@@ -9,8 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_choice, check_integer, check_number, check_type, describe
-from vehicle_detection._labelled_frames import LabelledFrames
-from vehicle_detection._labels import FrameKey, Labels
 from vehicle_detection._plot_common import (
     LINE_COLORS,
     SKY,
@@ -22,11 +20,17 @@ from vehicle_detection._plot_common import (
     put_tiles,
     tile_axes,
 )
-from vehicle_detection._scores import prepare_sides
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import DetectionScores, match_detections
+from vehicle_detection.evaluation import (
+    DetectionScores,
+    FrameKey,
+    LabelledFrames,
+    Labels,
+    match_detections,
+    prepare_sides,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

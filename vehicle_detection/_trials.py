@@ -17,12 +17,11 @@ from vehicle_detection._classifier_training import check_labels
 from vehicle_detection._common import check_number
 from vehicle_detection._feature_cache import FeatureCache, digest_of
 from vehicle_detection._kernels import fit_svm
-from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection.classifier import DEFAULT_C, Template, VehicleClassifier
 from vehicle_detection.datasets import PatchSet, Split
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import Labels, evaluate_detections, precision_recall_curve
+from vehicle_detection.evaluation import LabelledFrames, Labels, evaluate_detections, precision_recall_curve
 from vehicle_detection.params import FeatureParams, RegionParams, SearchParams
 from vehicle_detection.search import BandSearch
 

@@ -13,7 +13,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._calibration import calibrate_scores, calibration_error
 from vehicle_detection._classifier_training import check_gamma, check_labels, fit_features, patch_features
 from vehicle_detection._common import check_choice, check_integer, check_number, describe, resolve_jobs
 from vehicle_detection._model_card import model_card
@@ -28,6 +27,7 @@ from vehicle_detection.datasets import (
     split_sources,
 )
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import calibrate_scores, calibration_error
 from vehicle_detection.params import FeatureParams
 
 __all__ = ["SPLITS", "SplitScore", "TrainingReport", "model_card", "train_and_judge"]

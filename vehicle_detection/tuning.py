@@ -11,7 +11,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from vehicle_detection._calibration import Platt, calibrate_scores
 from vehicle_detection._common import check_choice, check_integer, describe
 from vehicle_detection._configurations import (
     Configuration,
@@ -20,7 +19,6 @@ from vehicle_detection._configurations import (
     read_configurations,
 )
 from vehicle_detection._feature_cache import FeatureCache
-from vehicle_detection._labelled_frames import LabelledFrames
 from vehicle_detection._ledger import Ledger
 from vehicle_detection._mining import mine_negatives
 from vehicle_detection._result_table import ResultTable, RowStore, read_results
@@ -35,6 +33,7 @@ from vehicle_detection.datasets import (
     split_sources,
 )
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import LabelledFrames, Platt, calibrate_scores
 from vehicle_detection.params import RegionParams, SearchParams
 
 __all__ = [

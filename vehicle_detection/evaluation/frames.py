@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vehicle_detection._common import check_image, check_integer, check_number, describe
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import Labels
+from vehicle_detection.evaluation.detections import Labels
 
 FrameKey = int | str
 

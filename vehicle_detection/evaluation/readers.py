@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from vehicle_detection._common import check_choice
-from vehicle_detection._label_formats import READERS, Row, read_text, split_words
-from vehicle_detection._labels import NO_TRACK, FrameKey, Labels
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import DatasetError
+from vehicle_detection.evaluation.formats import READERS, Row, read_text, split_words
+from vehicle_detection.evaluation.labels import NO_TRACK, FrameKey, Labels
 
 
 def read_labels(

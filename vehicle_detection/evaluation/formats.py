@@ -11,8 +11,8 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import NamedTuple
 
-from vehicle_detection._labels import NO_TRACK, FrameKey, frame_order
 from vehicle_detection.errors import DatasetError
+from vehicle_detection.evaluation.labels import NO_TRACK, FrameKey, frame_order
 
 LABEL_COLUMNS = ("frame", "track", "x1", "y1", "x2", "y2", "occluded", "truncated", "ignore")
 PREDICTION_COLUMNS = ("frame", "track_id", "x1", "y1", "x2", "y2", "score")

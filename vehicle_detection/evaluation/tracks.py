@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_number
-from vehicle_detection._labels import NO_TRACK, FrameKey, Labels
-from vehicle_detection._scores import (
+from vehicle_detection.boxes import iou_matrix
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation.labels import NO_TRACK, FrameKey, Labels
+from vehicle_detection.evaluation.matching import (
     Scores,
     as_lines,
     as_text,
@@ -22,8 +24,6 @@ from vehicle_detection._scores import (
     rates,
     ratio,
 )
-from vehicle_detection.boxes import iou_matrix
-from vehicle_detection.errors import InvalidInputError
 
 
 @dataclass(frozen=True)

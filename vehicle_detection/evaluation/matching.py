@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import describe
-from vehicle_detection._labels import NO_TRACK, FrameKey, Labels, check_keys, frame_order
 from vehicle_detection.boxes import box_areas, intersection_matrix, iou_matrix
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation.labels import NO_TRACK, FrameKey, Labels, check_keys, frame_order
 
 # Share of a box that lies in an ignored box which is taken as a region.
 _WITHIN = 0.5

@@ -19,11 +19,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._calibration import calibration_error
 from vehicle_detection._common import check_number
-from vehicle_detection._label_files import read_labels
-from vehicle_detection._labels import FrameKey, Labels
-from vehicle_detection._scores import (
+from vehicle_detection.boxes import iou_matrix
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation.calibration import calibration_error
+from vehicle_detection.evaluation.labels import FrameKey, Labels
+from vehicle_detection.evaluation.matching import (
     Scores,
     as_lines,
     as_text,
@@ -33,9 +34,8 @@ from vehicle_detection._scores import (
     rates,
     ratio,
 )
-from vehicle_detection._track_scores import TrackScores, evaluate_tracks
-from vehicle_detection.boxes import iou_matrix
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation.readers import read_labels
+from vehicle_detection.evaluation.tracks import TrackScores, evaluate_tracks
 
 __all__ = [
     "DetectionScores",
