@@ -268,7 +268,7 @@ def test_names_that_do_not_exist():
     with pytest.raises(AttributeError, match="module 'vehicle_detection' has no attribute 'nothing'"):
         vehicle_detection.nothing  # noqa: B018
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
-        importlib.import_module("vehicle_detection.features").nothing  # noqa: B018
+        importlib.import_module("vehicle_detection.features.extract").nothing  # noqa: B018
 
 
 def test_every_exception_is_one_of_the_library():

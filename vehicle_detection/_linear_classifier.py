@@ -207,7 +207,7 @@ class VehicleClassifier:
         from sklearn.preprocessing import StandardScaler
         from sklearn.svm import LinearSVC
 
-        from vehicle_detection._transformer import PatchFeatures
+        from vehicle_detection.features import PatchFeatures
 
         if len(self.templates) > 1:
             raise InvalidInputError(f"a pipeline holds one template; this model has {len(self.templates)}")

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._channels import hog_source
 from vehicle_detection._common import check_choice, check_image, check_integer, check_patches, describe
 from vehicle_detection._plot_common import (
     COLORS,
@@ -26,7 +25,7 @@ from vehicle_detection._plot_glyphs import put_glyphs, sum_blocks
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import convert_color, extract_features, hog_blocks
+from vehicle_detection.features import convert_color, extract_features, hog_blocks, hog_source
 from vehicle_detection.params import COLOR_SPACES, PATCH_SIZE, FeatureParams
 
 if TYPE_CHECKING:

@@ -24,7 +24,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._channels import convert_color, hog_source, pick_hog_channels
 from vehicle_detection._common import (
     Buffers,
     Crew,
@@ -47,6 +46,7 @@ from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.features import convert_color, hog_source, pick_hog_channels
 from vehicle_detection.params import PATCH_SIZE, FeatureParams, PixelBand, SearchParams
 
 

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._channels import hog_source
 from vehicle_detection._common import (
     check_boxes,
     check_choice,
@@ -28,6 +27,7 @@ from vehicle_detection.features import (
     convert_color,
     extract_features,
     hog_blocks,
+    hog_source,
 )
 from vehicle_detection.params import PATCH_SIZE, FeatureParams, PixelBand
 

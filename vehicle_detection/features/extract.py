@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._channels import convert_color, hog_source
 from vehicle_detection._common import (
     check_channel,
     check_image,
@@ -25,13 +24,14 @@ from vehicle_detection._common import (
     describe,
     resolve_jobs,
 )
-from vehicle_detection._patch_batch import batch_extractor
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.features.batch import batch_extractor
+from vehicle_detection.features.color import convert_color, hog_source
 from vehicle_detection.images import read_image
 from vehicle_detection.params import PATCH_SIZE, FeatureParams
 
 if TYPE_CHECKING:
-    from vehicle_detection._transformer import PatchFeatures
+    from vehicle_detection.features.transformer import PatchFeatures
 
 __all__ = [
     "PatchFeatures",
@@ -51,7 +51,7 @@ _CHUNK = 256
 def __getattr__(name: str) -> Any:
     # The transformer needs scikit-learn, which takes a second to import: only those who ask for it wait.
     if name == "PatchFeatures":
-        from vehicle_detection._transformer import PatchFeatures
+        from vehicle_detection.features.transformer import PatchFeatures
 
         return PatchFeatures
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._channels import convert_color, hog_source, pick_hog_channels
 from vehicle_detection._kernels import bin_of_value, degree_bounds, orientation_cotangents, sqrt_gradients
 from vehicle_detection._kernels import color as _colour_kernels
 from vehicle_detection._kernels import hog as _hog_kernels
+from vehicle_detection.features.color import convert_color, hog_source, pick_hog_channels
 from vehicle_detection.params import PATCH_SIZE, FeatureParams
 
 
