@@ -11,7 +11,6 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 
-from vehicle_detection._classifier_training import copy_weights, patch_features
 from vehicle_detection._common import FORMAT_VERSION, blur_patches, degrade_patches, mirror_patches
 from vehicle_detection._common.model_file import FORMAT, _checksum
 from vehicle_detection._kernels import fit_svm
@@ -20,8 +19,10 @@ from vehicle_detection.classifier import (
     Template,
     VehicleClassifier,
     load_classifier,
+    patch_features,
     train_classifier,
 )
+from vehicle_detection.classifier.fit import copy_weights
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.features import PatchFeatures, extract_features
 from vehicle_detection.params import FeatureParams

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from vehicle_detection import training
-from vehicle_detection._classifier_training import fit_features, patch_features
-from vehicle_detection.classifier import load_classifier, train_classifier
+from vehicle_detection.classifier import fit_features, load_classifier, patch_features, train_classifier
 from vehicle_detection.datasets import (
     PatchSet,
     load_training_patches,

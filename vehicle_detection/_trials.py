@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._classifier_training import check_labels
 from vehicle_detection._common import check_number
 from vehicle_detection._feature_cache import FeatureCache, digest_of
 from vehicle_detection._kernels import fit_svm
-from vehicle_detection.classifier import DEFAULT_C, Template, VehicleClassifier
+from vehicle_detection.classifier import DEFAULT_C, Template, VehicleClassifier, check_labels
 from vehicle_detection.datasets import PatchSet, Split
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError

@@ -13,11 +13,17 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._classifier_training import check_gamma, check_labels, fit_features, patch_features
 from vehicle_detection._common import check_choice, check_integer, check_number, describe, resolve_jobs
 from vehicle_detection._model_card import model_card
 from vehicle_detection._training_report import SPLITS, SplitScore, TrainingReport
-from vehicle_detection.classifier import DEFAULT_C, VehicleClassifier
+from vehicle_detection.classifier import (
+    DEFAULT_C,
+    VehicleClassifier,
+    check_gamma,
+    check_labels,
+    fit_features,
+    patch_features,
+)
 from vehicle_detection.datasets import (
     PatchSet,
     Split,

@@ -19,7 +19,7 @@ from vehicle_detection._common import (
     mirror_patches,
 )
 from vehicle_detection._kernels import fit_svm
-from vehicle_detection._linear_classifier import Template, VehicleClassifier
+from vehicle_detection.classifier.linear import Template, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import extract_features
 from vehicle_detection.params import PATCH_SIZE, FeatureParams

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 
-from vehicle_detection._classifier_training import DEFAULT_C, train_classifier
 from vehicle_detection._common import ModelData, read_model
-from vehicle_detection._linear_classifier import KIND, Template, VehicleClassifier
+from vehicle_detection.classifier.fit import DEFAULT_C, train_classifier
+from vehicle_detection.classifier.linear import KIND, Template, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.params import FeatureParams
 
