@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vehicle_detection._horizon_filter import HorizonFilter
 from vehicle_detection.camera import Camera, cut_edges
+from vehicle_detection.tracking.horizon_filter import HorizonFilter
 
 FRAME = (720, 1280)
 TRUE = Camera.for_frame(FRAME, horizon=0.56)

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vehicle_detection import _kalman
 from vehicle_detection.boxes import Detections, iou_matrix
 from vehicle_detection.camera import Camera
 from vehicle_detection.errors import InvalidInputError
@@ -13,6 +12,7 @@ from vehicle_detection.evaluation import Labels, evaluate_tracks
 from vehicle_detection.params import TrackParams
 from vehicle_detection.synthetic import render_drive
 from vehicle_detection.tracking import Track, Tracker
+from vehicle_detection.tracking import kalman_filter as _kalman
 
 SHAPE = (720, 1280, 3)
 LIMITS = np.array([1280.0, 720.0, 1280.0, 720.0])

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection import _kalman
 from vehicle_detection.camera import Camera, cut_edges, inner_edges
 from vehicle_detection.params import TrackParams
+from vehicle_detection.tracking import kalman_filter as _kalman
 
 Floats = NDArray[np.float64]
 Frame = tuple[int, int]

@@ -15,17 +15,20 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._association import (
+from vehicle_detection._common import check_number, describe
+from vehicle_detection.boxes import Detections, box_areas
+from vehicle_detection.camera import Camera, check_shape, cut_edges
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.params import TrackParams
+from vehicle_detection.tracking.association import (
     match_boxes,
     match_nearest,
     merged_regions,
     overlap_matrices,
     same_vehicle,
 )
-from vehicle_detection._common import check_number, describe
-from vehicle_detection._horizon_filter import HorizonFilter
-from vehicle_detection._track import Track
-from vehicle_detection._vehicle import (
+from vehicle_detection.tracking.horizon_filter import HorizonFilter
+from vehicle_detection.tracking.state import (
     OUTWARDS,
     TINY,
     Filters,
@@ -39,10 +42,7 @@ from vehicle_detection._vehicle import (
     predict_filters,
     start_filters,
 )
-from vehicle_detection.boxes import Detections, box_areas
-from vehicle_detection.camera import Camera, check_shape, cut_edges
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.params import TrackParams
+from vehicle_detection.tracking.track import Track
 
 __all__ = ["Track", "Tracker"]
 
