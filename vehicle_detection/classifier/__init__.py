@@ -5,7 +5,14 @@ from __future__ import annotations
 import os
 
 from vehicle_detection._common import ModelData, read_model
-from vehicle_detection.classifier.fit import DEFAULT_C, train_classifier
+from vehicle_detection.classifier.fit import (
+    DEFAULT_C,
+    check_gamma,
+    check_labels,
+    fit_features,
+    patch_features,
+    train_classifier,
+)
 from vehicle_detection.classifier.linear import KIND, Template, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.params import FeatureParams
@@ -17,7 +24,11 @@ __all__ = [
     "Template",
     "VehicleClassifier",
     "build_classifier",
+    "check_gamma",
+    "check_labels",
+    "fit_features",
     "load_classifier",
+    "patch_features",
     "train_classifier",
 ]
 

@@ -8,7 +8,6 @@ from vehicle_detection.evaluation.detections import (
     precision_recall_curve,
 )
 from vehicle_detection.evaluation.frames import (
-    FrameKey,
     Frames,
     LabelledFrames,
     check_labels_of,

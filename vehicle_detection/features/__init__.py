@@ -1,8 +1,9 @@
 """Patches to feature vectors ``[spatial | histogram | HOG | coarse HOG]``."""
 
+from typing import TYPE_CHECKING, Any
+
 from vehicle_detection.features.color import convert_color, hog_source, pick_hog_channels
 from vehicle_detection.features.extract import (
-    PatchFeatures,
     bin_spatial,
     color_hist,
     extract_features,
@@ -11,7 +12,9 @@ from vehicle_detection.features.extract import (
     hog_picture,
     single_img_features,
 )
-from vehicle_detection.features.transformer import PatchFeatures
+
+if TYPE_CHECKING:
+    from vehicle_detection.features.transformer import PatchFeatures
 
 __all__ = [
     "PatchFeatures",
@@ -26,3 +29,12 @@ __all__ = [
     "pick_hog_channels",
     "single_img_features",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    # PatchFeatures imports scikit-learn, which takes a second: load it on first use.
+    if name == "PatchFeatures":
+        from vehicle_detection.features.transformer import PatchFeatures
+
+        return PatchFeatures
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,31 +30,7 @@ from vehicle_detection.features.color import convert_color, hog_source
 from vehicle_detection.images import read_image
 from vehicle_detection.params import PATCH_SIZE, FeatureParams
 
-if TYPE_CHECKING:
-    from vehicle_detection.features.transformer import PatchFeatures
-
-__all__ = [
-    "PatchFeatures",
-    "bin_spatial",
-    "color_hist",
-    "convert_color",
-    "extract_features",
-    "get_hog_features",
-    "hog_blocks",
-    "hog_picture",
-    "single_img_features",
-]
-
 _CHUNK = 256
-
-
-def __getattr__(name: str) -> Any:
-    # The transformer needs scikit-learn, which takes a second to import: only those who ask for it wait.
-    if name == "PatchFeatures":
-        from vehicle_detection.features.transformer import PatchFeatures
-
-        return PatchFeatures
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def hog_blocks(
