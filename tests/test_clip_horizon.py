@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from tests.test_horizon import boxes_on_a_road
-from vehicle_detection._clip_horizon import clip_horizon
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.video import clip_horizon
 
 
 class Finder:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vehicle_detection._planes import Coding, planes_from_rgb, rgb_from_planes
+from vehicle_detection.video.yuv import Coding, planes_from_rgb, rgb_from_planes
 
 VALUES = st.integers(0, 255)
 SIZES = st.integers(1, 9)

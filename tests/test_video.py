@@ -21,9 +21,10 @@ from hypothesis import strategies as st
 from moviepy import VideoFileClip
 from moviepy.config import FFMPEG_BINARY
 
-from vehicle_detection import _ffmpeg, video
 from vehicle_detection.errors import InvalidInputError, VideoError
 from vehicle_detection.video import VideoReport, probe_video, process_video, read_frames
+from vehicle_detection.video import ffmpeg as _ffmpeg
+from vehicle_detection.video import process as video
 
 LEVELS = 10  # gray levels between one frame of a test clip and the next: far beyond what the codec blurs
 NTSC = Fraction(30000, 1001)

@@ -297,8 +297,8 @@ def _look_for_horizon(
     quiet: bool,
 ) -> float | None:
     """Estimate the horizon of a video from its vehicles, and say what came of it."""
-    from vehicle_detection._clip_horizon import clip_horizon
     from vehicle_detection.detector import VehicleDetector
+    from vehicle_detection.video import clip_horizon
 
     with VehicleDetector(model) as detector:
         found = clip_horizon(source, detector, start=start, end=end)

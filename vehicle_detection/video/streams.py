@@ -15,9 +15,9 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._ffmpeg import Process, VideoInfo, last_line
-from vehicle_detection._planes import FORMATS, planes_from_rgb, rgb_from_planes
 from vehicle_detection.errors import VideoError
+from vehicle_detection.video.ffmpeg import Process, VideoInfo, last_line
+from vehicle_detection.video.yuv import FORMATS, planes_from_rgb, rgb_from_planes
 
 CONTAINERS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
 """Suffix of a file that can be written, and ffmpeg's name for its container."""

@@ -28,10 +28,10 @@ from vehicle_detection._common import (
     single_threaded_opencv,
     written_whole,
 )
-from vehicle_detection._ffmpeg import VideoInfo, probe
-from vehicle_detection._pipeline import Line, SupportsFrames
-from vehicle_detection._streams import CONTAINERS, AudioSource, FrameReader, FrameWriter
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.video.ffmpeg import VideoInfo, probe
+from vehicle_detection.video.pipeline import Line, SupportsFrames
+from vehicle_detection.video.streams import CONTAINERS, AudioSource, FrameReader, FrameWriter
 
 PRESETS = (
     "ultrafast",

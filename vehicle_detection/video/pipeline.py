@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import describe
-from vehicle_detection._streams import FrameReader, FrameWriter
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.video.streams import FrameReader, FrameWriter
 
 Item = TypeVar("Item")
 Frame = NDArray[np.uint8]

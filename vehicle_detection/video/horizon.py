@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.horizon import HorizonEstimate, estimate_horizon
-from vehicle_detection.video import read_frames
+from vehicle_detection.video.process import read_frames
 
 LARGEST_ERROR = 0.05
 """Standard error, as a share of the frame's height, above which an estimate is a guess."""

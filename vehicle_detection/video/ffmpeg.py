@@ -21,8 +21,8 @@ from fractions import Fraction
 from pathlib import Path
 from typing import IO, Any
 
-from vehicle_detection._planes import Coding
 from vehicle_detection.errors import VideoError
+from vehicle_detection.video.yuv import Coding
 
 PIPE_SIZE = 1 << 18
 
