@@ -7,25 +7,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vehicle_detection._common import Buffers
-from vehicle_detection._feature_maps import (
+from vehicle_detection._kernels import fhog as _fhog_kernels
+from vehicle_detection.mixture import COARSE, FINE, PLANES, halved, level_maps, mirror_planes, pair_levels
+from vehicle_detection.mixture.features import (
     _COTANGENTS,
     _EPS,
     BORDER,
-    COARSE,
-    FINE,
     MIRRORED,
-    PLANES,
     WIDE_BORDER,
     Level,
     edge_sums,
     feature_planes,
-    halved,
-    level_maps,
-    mirror_planes,
-    pair_levels,
     planes_of_sums,
 )
-from vehicle_detection._kernels import fhog as _fhog_kernels
 from vehicle_detection.synthetic import render_scene
 
 # Float32 against float64: the cumulative sums of a square are differenced.

@@ -7,24 +7,31 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vehicle_detection import VehicleDetector, mixture
+from vehicle_detection import VehicleDetector
 from vehicle_detection._common import FORMAT_VERSION
 from vehicle_detection._common.model_file import FORMAT, _checksum
-from vehicle_detection._feature_maps import PLANES, FeatureMap, Level, halved, level_maps, mirror_planes
-from vehicle_detection._mixture_template import MixtureTemplate
-from vehicle_detection._refinement import (
-    CROP_LENGTH,
-    Candidates,
-    Refinement,
-    crop_features,
-    overlaps,
-    resolve,
-    suppress,
-)
 from vehicle_detection.boxes import box_areas, clip_boxes, iou_matrix
 from vehicle_detection.classifier import VehicleClassifier, load_classifier
 from vehicle_detection.errors import InvalidInputError, ModelFileError
-from vehicle_detection.mixture import MixtureSearch, TemplateMixture, load_model
+from vehicle_detection.mixture import (
+    CROP_LENGTH,
+    PLANES,
+    FeatureMap,
+    MixtureSearch,
+    MixtureTemplate,
+    Refinement,
+    TemplateMixture,
+    crop_features,
+    halved,
+    level_maps,
+    load_model,
+    mirror_planes,
+    overlaps,
+    suppress,
+)
+from vehicle_detection.mixture import model as mixture
+from vehicle_detection.mixture.boxes import Candidates, resolve
+from vehicle_detection.mixture.features import Level
 from vehicle_detection.params import PyramidParams, SearchParams
 from vehicle_detection.search import find_cars
 from vehicle_detection.synthetic import render_scene

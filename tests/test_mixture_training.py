@@ -5,8 +5,6 @@ import numpy as np
 import pytest
 
 from vehicle_detection import mixture_training
-from vehicle_detection._feature_maps import PLANES, mirror_planes
-from vehicle_detection._mixture_template import MixtureTemplate
 from vehicle_detection._mixture_windows import (
     Frame,
     Negatives,
@@ -20,7 +18,7 @@ from vehicle_detection._mixture_windows import (
 from vehicle_detection.boxes import intersection_matrix, iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, Labels, evaluate_detections
-from vehicle_detection.mixture import MixtureSearch
+from vehicle_detection.mixture import PLANES, MixtureSearch, MixtureTemplate, mirror_planes
 from vehicle_detection.mixture_training import FrameSource, MixtureParams, train_mixture
 from vehicle_detection.params import PyramidParams
 from vehicle_detection.synthetic import render_scene

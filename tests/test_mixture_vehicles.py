@@ -6,8 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.test_mixture_training import SMALL, drawn, scene_of
-from vehicle_detection._feature_maps import PLANES, mirror_planes
-from vehicle_detection._mixture_template import MixtureTemplate
 from vehicle_detection._mixture_vehicles import (
     cut_vehicles,
     moved_boxes,
@@ -19,9 +17,9 @@ from vehicle_detection._mixture_vehicles import (
     window_features,
 )
 from vehicle_detection._mixture_windows import Frame, frames_of
-from vehicle_detection._refinement import Refinement
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.mixture import PLANES, MixtureTemplate, Refinement, mirror_planes
 from vehicle_detection.mixture_training import FrameSource, train_mixture
 
 

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vehicle_detection._noise import noise_level, without_noise
-from vehicle_detection.mixture import MixtureSearch, load_model
+from vehicle_detection.mixture import MixtureSearch, load_model, without_noise
+from vehicle_detection.mixture.denoise import noise_level
 from vehicle_detection.params import PyramidParams
 from vehicle_detection.synthetic import render_drive, render_scene
 

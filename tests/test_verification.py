@@ -7,17 +7,27 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vehicle_detection._crops import COLOURS, EDGES, crop_features, crop_views
-from vehicle_detection._feature_maps import mirror_planes
 from vehicle_detection._kernels import product
-from vehicle_detection._mixture_template import MixtureTemplate
 from vehicle_detection._mixture_windows import Frame, frames_of
-from vehicle_detection._refinement import Refinement, resolve
-from vehicle_detection._verification import LEAST_VALUE, Projection, Verification
 from vehicle_detection._verification_training import _boxes, _mirrored, train_verification
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError, ModelFileError
-from vehicle_detection.mixture import MixtureSearch, TemplateMixture, load_model
+from vehicle_detection.mixture import (
+    COLOURS,
+    EDGES,
+    MixtureSearch,
+    MixtureTemplate,
+    Projection,
+    Refinement,
+    TemplateMixture,
+    Verification,
+    crop_features,
+    crop_views,
+    load_model,
+    mirror_planes,
+)
+from vehicle_detection.mixture.boxes import resolve
+from vehicle_detection.mixture.rescoring import LEAST_VALUE
 from vehicle_detection.mixture_training import FrameSource, MixtureParams, train_mixture
 from vehicle_detection.params import PyramidParams
 

@@ -8,12 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import relight
-from vehicle_detection._crops import box_planes
-from vehicle_detection._feature_maps import COARSE, FINE, mirror_planes
 from vehicle_detection._mixture_params import MixtureParams
-from vehicle_detection._mixture_template import MixtureTemplate
 from vehicle_detection._mixture_windows import Frame
-from vehicle_detection._refinement import Refinement
+from vehicle_detection.mixture import COARSE, FINE, MixtureTemplate, Refinement, box_planes, mirror_planes
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]

@@ -9,16 +9,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._border_strips import border_strip, strip_boxes
 from vehicle_detection._common import check_number, check_type, describe, single_threaded_opencv
-from vehicle_detection._feature_maps import FeatureMap, halved, level_maps, mirror_planes, pair_levels
 from vehicle_detection._mixture_params import MixtureParams, entries
-from vehicle_detection._mixture_template import MixtureTemplate, smallest_box
-from vehicle_detection._noise import without_noise
-from vehicle_detection._refinement import mostly_inside, overlaps
 from vehicle_detection.boxes import box_areas, intersection_matrix, iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames
+from vehicle_detection.mixture import (
+    FeatureMap,
+    MixtureTemplate,
+    border_strip,
+    halved,
+    level_maps,
+    mirror_planes,
+    mostly_inside,
+    overlaps,
+    pair_levels,
+    smallest_box,
+    strip_boxes,
+    without_noise,
+)
 
 Floats = NDArray[np.float64]
 

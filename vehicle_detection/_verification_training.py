@@ -8,14 +8,21 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._crops import COLOURS, CROP, EDGES, crop_views
-from vehicle_detection._feature_maps import PLANES, mirror_planes
 from vehicle_detection._mixture_params import MixtureParams
 from vehicle_detection._mixture_vehicles import moved_boxes
 from vehicle_detection._mixture_windows import Frame, is_negative
-from vehicle_detection._verification import Projection, Verification
 from vehicle_detection.boxes import iou_matrix
-from vehicle_detection.mixture import MixtureSearch
+from vehicle_detection.mixture import (
+    COLOURS,
+    CROP,
+    EDGES,
+    PLANES,
+    MixtureSearch,
+    Projection,
+    Verification,
+    crop_views,
+    mirror_planes,
+)
 from vehicle_detection.params import PyramidParams
 
 Floats = NDArray[np.float64]

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 import vehicle_detection
 from vehicle_detection._common import check_integer, resolve_jobs
 from vehicle_detection._mixture_windows import check_sources
-from vehicle_detection._noise import without_noise
 from vehicle_detection.boxes import Detections
 from vehicle_detection.evaluation import (
     LabelledFrames,
@@ -22,7 +21,7 @@ from vehicle_detection.evaluation import (
     match_detections,
     precision_recall_curve,
 )
-from vehicle_detection.mixture import MixtureSearch, TemplateMixture
+from vehicle_detection.mixture import MixtureSearch, TemplateMixture, without_noise
 from vehicle_detection.mixture_training import FrameSource, MixtureParams, train_mixture
 from vehicle_detection.params import PyramidParams
 

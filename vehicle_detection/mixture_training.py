@@ -12,10 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_image, check_integer, check_type, describe, resolve_jobs
-from vehicle_detection._crops import CROP_LENGTH, crop_features
-from vehicle_detection._feature_maps import PLANES
 from vehicle_detection._mixture_params import MixtureParams
-from vehicle_detection._mixture_template import MixtureTemplate
 from vehicle_detection._mixture_vehicles import (
     cut_vehicles,
     mirror_boxes,
@@ -36,11 +33,19 @@ from vehicle_detection._mixture_windows import (
     random_windows,
     with_mirrored,
 )
-from vehicle_detection._refinement import Refinement, suppress
 from vehicle_detection._verification_training import train_verification
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture import MixtureSearch, TemplateMixture
+from vehicle_detection.mixture import (
+    CROP_LENGTH,
+    PLANES,
+    MixtureSearch,
+    MixtureTemplate,
+    Refinement,
+    TemplateMixture,
+    crop_features,
+    suppress,
+)
 
 __all__ = ["FrameSource", "MixtureParams", "train_mixture"]
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._feature_maps import COARSE, PLANES, feature_planes
+from vehicle_detection.mixture.features import COARSE, PLANES, feature_planes
 
 CROP = 12
 """Cells of a side of the crop that corrects a box: the box fills 8 of them."""

@@ -29,15 +29,15 @@ from vehicle_detection._common import (
     single_threaded_opencv,
     write_model,
 )
-from vehicle_detection._feature_maps import COARSE, FeatureMap, Level, halved, level_maps, pair_levels
-from vehicle_detection._mixture_template import MixtureTemplate, smallest_box
-from vehicle_detection._noise import without_noise
-from vehicle_detection._refinement import WEAKEST, Candidates, Refinement, resolve, suppress
-from vehicle_detection._verification import LEAST_VALUE, Verification
 from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import KIND as PATCH_KIND
 from vehicle_detection.classifier import VehicleClassifier, build_classifier
 from vehicle_detection.errors import InvalidInputError, ModelFileError
+from vehicle_detection.mixture.boxes import WEAKEST, Candidates, Refinement, resolve, suppress
+from vehicle_detection.mixture.denoise import without_noise
+from vehicle_detection.mixture.features import COARSE, FeatureMap, Level, halved, level_maps, pair_levels
+from vehicle_detection.mixture.rescoring import LEAST_VALUE, Verification
+from vehicle_detection.mixture.template import MixtureTemplate, smallest_box
 from vehicle_detection.params import PyramidParams
 
 KIND = "mixture"

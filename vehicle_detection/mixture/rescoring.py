@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_number, describe
-from vehicle_detection._crops import COLOURS, EDGES, crop_views
 from vehicle_detection._kernels import product
-from vehicle_detection._refinement import finite_array
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.mixture.boxes import finite_array
+from vehicle_detection.mixture.crops import COLOURS, EDGES, crop_views
 
 Floats = NDArray[np.float64]
 

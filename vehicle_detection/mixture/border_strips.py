@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._feature_maps import FeatureMap, mirror_planes
+from vehicle_detection.mixture.features import FeatureMap, mirror_planes
 
 
 def border_strip(level: FeatureMap, columns: int, end: float, *, left: bool) -> NDArray[np.float32] | None:
