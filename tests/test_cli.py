@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 import vehicle_detection
 from tests.test_mixture_report import write_set
 from tests.test_mixture_training import SMALL, drawn
-from vehicle_detection import _drawn_frames, classifier, detector, mixture_report, training
+from vehicle_detection import classifier, detector, training
 from vehicle_detection._cli_output import interruptible, output_folder
 from vehicle_detection._common import files as _files
 from vehicle_detection._demo import FILES, SHEET, draw_clip
@@ -32,6 +32,8 @@ from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.horizon import HorizonEstimate
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.mixture import load_model
+from vehicle_detection.mixture_training import cross_validation as mixture_report
+from vehicle_detection.mixture_training import drawn_frames as _drawn_frames
 from vehicle_detection.synthetic import render_drive, render_patches
 from vehicle_detection.video import horizon as _clip_horizon
 from vehicle_detection.video import probe_video, read_frames

@@ -9,24 +9,30 @@ import numpy as np
 import pytest
 
 from tests.test_mixture_training import SMALL, drawn
-from vehicle_detection._drawn_frames import _where_cut, drawn_source
-from vehicle_detection._frame_sources import find_patches, find_sources
-from vehicle_detection._mixture_card import write_card, write_curves
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, Labels
 from vehicle_detection.images import write_image
 from vehicle_detection.mixture import load_model
-from vehicle_detection.mixture_report import (
+from vehicle_detection.mixture_training import (
+    FrameSource,
+    as_metadata,
+    drawn_source,
+    find_patches,
+    find_sources,
+    judge_mixture,
+    train_mixture,
+    write_card,
+    write_curves,
+)
+from vehicle_detection.mixture_training.cross_validation import (
     HeldOut,
     _log_odds,
     _score,
     _threshold,
-    as_metadata,
     find_in,
-    judge_mixture,
 )
-from vehicle_detection.mixture_training import FrameSource, train_mixture
+from vehicle_detection.mixture_training.drawn_frames import _where_cut
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,13 @@ import functools
 import numpy as np
 import pytest
 
-from vehicle_detection import mixture_training
-from vehicle_detection._mixture_windows import (
+from vehicle_detection.boxes import intersection_matrix, iou_matrix
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import LabelledFrames, Labels, evaluate_detections
+from vehicle_detection.mixture import PLANES, MixtureSearch, MixtureTemplate, mirror_planes
+from vehicle_detection.mixture_training import FrameSource, MixtureParams, train_mixture
+from vehicle_detection.mixture_training import train as mixture_training
+from vehicle_detection.mixture_training.negatives import (
     Frame,
     Negatives,
     cut_labels,
@@ -15,11 +20,6 @@ from vehicle_detection._mixture_windows import (
     random_windows,
     with_mirrored,
 )
-from vehicle_detection.boxes import intersection_matrix, iou_matrix
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import LabelledFrames, Labels, evaluate_detections
-from vehicle_detection.mixture import PLANES, MixtureSearch, MixtureTemplate, mirror_planes
-from vehicle_detection.mixture_training import FrameSource, MixtureParams, train_mixture
 from vehicle_detection.params import PyramidParams
 from vehicle_detection.synthetic import render_scene
 

@@ -6,7 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.test_mixture_training import SMALL, drawn, scene_of
-from vehicle_detection._mixture_vehicles import (
+from vehicle_detection.boxes import iou_matrix
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.mixture import PLANES, MixtureTemplate, Refinement, mirror_planes
+from vehicle_detection.mixture_training import FrameSource, train_mixture
+from vehicle_detection.mixture_training.negatives import Frame, frames_of
+from vehicle_detection.mixture_training.positives import (
     cut_vehicles,
     moved_boxes,
     patch_features,
@@ -16,11 +21,6 @@ from vehicle_detection._mixture_vehicles import (
     whole_vehicles,
     window_features,
 )
-from vehicle_detection._mixture_windows import Frame, frames_of
-from vehicle_detection.boxes import iou_matrix
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture import PLANES, MixtureTemplate, Refinement, mirror_planes
-from vehicle_detection.mixture_training import FrameSource, train_mixture
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vehicle_detection._kernels import product
-from vehicle_detection._mixture_windows import Frame, frames_of
-from vehicle_detection._verification_training import _boxes, _mirrored, train_verification
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.mixture import (
@@ -29,6 +27,8 @@ from vehicle_detection.mixture import (
 from vehicle_detection.mixture.boxes import resolve
 from vehicle_detection.mixture.rescoring import LEAST_VALUE
 from vehicle_detection.mixture_training import FrameSource, MixtureParams, train_mixture
+from vehicle_detection.mixture_training.negatives import Frame, frames_of
+from vehicle_detection.mixture_training.rescoring import _boxes, _mirrored, train_verification
 from vehicle_detection.params import PyramidParams
 
 from .test_mixture_training import SMALL, drawn

@@ -59,8 +59,7 @@ if TYPE_CHECKING:
     from vehicle_detection.horizon import HorizonEstimate, estimate_horizon
     from vehicle_detection.images import read_image, write_image
     from vehicle_detection.mixture import MixtureSearch, TemplateMixture, load_model
-    from vehicle_detection.mixture_report import judge_mixture
-    from vehicle_detection.mixture_training import FrameSource, MixtureParams, train_mixture
+    from vehicle_detection.mixture_training import FrameSource, MixtureParams, judge_mixture, train_mixture
     from vehicle_detection.params import (
         FeatureParams,
         HeatParams,

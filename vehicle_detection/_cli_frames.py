@@ -52,11 +52,16 @@ def train_frames(
 ) -> None:
     """Train the model for any road, and judge it on sources that it was not trained on."""
     from vehicle_detection._common import check_target
-    from vehicle_detection._drawn_frames import drawn_source
-    from vehicle_detection._frame_sources import find_patches, find_sources
-    from vehicle_detection._mixture_card import write_card, write_curves
-    from vehicle_detection._mixture_windows import check_sources
-    from vehicle_detection.mixture_report import as_metadata, judge_mixture
+    from vehicle_detection.mixture_training import (
+        as_metadata,
+        check_sources,
+        drawn_source,
+        find_patches,
+        find_sources,
+        judge_mixture,
+        write_card,
+        write_curves,
+    )
 
     named = {"-o": output, "--card": card, "--curves": curves}
     targets = {name: check_target(path, name) for name, path in named.items() if path is not None}
@@ -77,7 +82,7 @@ def train_frames(
             write_curves(curves, held)
         written = [*targets.values()]
         if pictures is not None:
-            from vehicle_detection._mixture_pictures import write_pictures
+            from vehicle_detection.mixture_training import write_pictures
 
             written += [pictures / name for name in write_pictures(pictures, scores, held)]
     print_road_scores({score.name: score.to_dict() for score in scores})

@@ -8,9 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._mixture_params import MixtureParams
-from vehicle_detection._mixture_vehicles import moved_boxes
-from vehicle_detection._mixture_windows import Frame, is_negative
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.mixture import (
     COLOURS,
@@ -23,6 +20,9 @@ from vehicle_detection.mixture import (
     crop_views,
     mirror_planes,
 )
+from vehicle_detection.mixture_training.negatives import Frame, is_negative
+from vehicle_detection.mixture_training.params import MixtureParams
+from vehicle_detection.mixture_training.positives import moved_boxes
 from vehicle_detection.params import PyramidParams
 
 Floats = NDArray[np.float64]

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_number, check_type, describe, single_threaded_opencv
-from vehicle_detection._mixture_params import MixtureParams, entries
 from vehicle_detection.boxes import box_areas, intersection_matrix, iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames
@@ -28,6 +27,7 @@ from vehicle_detection.mixture import (
     strip_boxes,
     without_noise,
 )
+from vehicle_detection.mixture_training.params import MixtureParams, entries
 
 Floats = NDArray[np.float64]
 

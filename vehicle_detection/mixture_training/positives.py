@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import relight
-from vehicle_detection._mixture_params import MixtureParams
-from vehicle_detection._mixture_windows import Frame
 from vehicle_detection.mixture import COARSE, FINE, MixtureTemplate, Refinement, box_planes, mirror_planes
+from vehicle_detection.mixture_training.negatives import Frame
+from vehicle_detection.mixture_training.params import MixtureParams
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]

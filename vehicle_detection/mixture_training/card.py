@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from vehicle_detection._common import written_whole
-from vehicle_detection._drawn_frames import DRAWN
 from vehicle_detection.evaluation import precision_recall_curve
 from vehicle_detection.mixture import TemplateMixture
-from vehicle_detection.mixture_report import HeldOut, RoadScore
-from vehicle_detection.mixture_training import FrameSource
+from vehicle_detection.mixture_training.cross_validation import HeldOut, RoadScore
+from vehicle_detection.mixture_training.drawn_frames import DRAWN
+from vehicle_detection.mixture_training.train import FrameSource
 
 _CARD = """# Model card: {name}
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from vehicle_detection._common import check_integer
-from vehicle_detection._mixture_windows import FrameSource
 from vehicle_detection.evaluation import FrameKey, LabelledFrames, Labels
+from vehicle_detection.mixture_training.negatives import FrameSource
 from vehicle_detection.synthetic import Drive, render_drive
 
 DRAWN = "drawn"

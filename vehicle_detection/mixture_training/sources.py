@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._mixture_windows import FrameSource
 from vehicle_detection.datasets import load_frames, load_patches
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, Labels, read_labels
+from vehicle_detection.mixture_training.negatives import FrameSource
 
 COURSE = "course"
 """Source of everything that is not below ``frames``: the images and clips of the course's road."""

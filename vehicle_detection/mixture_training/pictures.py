@@ -8,7 +8,7 @@ from typing import Literal
 
 from vehicle_detection._common import written_whole
 from vehicle_detection.evaluation import precision_recall_curve
-from vehicle_detection.mixture_report import HeldOut, RoadScore
+from vehicle_detection.mixture_training.cross_validation import HeldOut, RoadScore
 from vehicle_detection.plotting import plot_errors, plot_precision_recall
 
 _KINDS: tuple[Literal["missed", "false"], ...] = ("missed", "false")

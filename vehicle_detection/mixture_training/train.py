@@ -12,28 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_image, check_integer, check_type, describe, resolve_jobs
-from vehicle_detection._mixture_params import MixtureParams
-from vehicle_detection._mixture_vehicles import (
-    cut_vehicles,
-    mirror_boxes,
-    moved_boxes,
-    patch_features,
-    turned,
-    vehicle_features,
-    whole_vehicles,
-)
-from vehicle_detection._mixture_windows import (
-    Frame,
-    FrameSource,
-    Mined,
-    Negatives,
-    check_sources,
-    frames_of,
-    mine_windows,
-    random_windows,
-    with_mirrored,
-)
-from vehicle_detection._verification_training import train_verification
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture import (
@@ -46,6 +24,28 @@ from vehicle_detection.mixture import (
     crop_features,
     suppress,
 )
+from vehicle_detection.mixture_training.negatives import (
+    Frame,
+    FrameSource,
+    Mined,
+    Negatives,
+    check_sources,
+    frames_of,
+    mine_windows,
+    random_windows,
+    with_mirrored,
+)
+from vehicle_detection.mixture_training.params import MixtureParams
+from vehicle_detection.mixture_training.positives import (
+    cut_vehicles,
+    mirror_boxes,
+    moved_boxes,
+    patch_features,
+    turned,
+    vehicle_features,
+    whole_vehicles,
+)
+from vehicle_detection.mixture_training.rescoring import train_verification
 
 __all__ = ["FrameSource", "MixtureParams", "train_mixture"]
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 import vehicle_detection
 from vehicle_detection._common import check_integer, resolve_jobs
-from vehicle_detection._mixture_windows import check_sources
 from vehicle_detection.boxes import Detections
 from vehicle_detection.evaluation import (
     LabelledFrames,
@@ -22,7 +21,8 @@ from vehicle_detection.evaluation import (
     precision_recall_curve,
 )
 from vehicle_detection.mixture import MixtureSearch, TemplateMixture, without_noise
-from vehicle_detection.mixture_training import FrameSource, MixtureParams, train_mixture
+from vehicle_detection.mixture_training.negatives import check_sources
+from vehicle_detection.mixture_training.train import FrameSource, MixtureParams, train_mixture
 from vehicle_detection.params import PyramidParams
 
 Floats = NDArray[np.float64]
