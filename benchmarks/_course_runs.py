@@ -13,9 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._feature_cache import digest_of
-from vehicle_detection._result_table import RowStore
-from vehicle_detection._trials import Recipe, fit_features
 from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.datasets import (
     PatchSet,
@@ -30,7 +27,15 @@ from vehicle_detection.features import extract_features
 from vehicle_detection.params import FeatureParams, SearchParams
 from vehicle_detection.search import BandSearch
 from vehicle_detection.synthetic import render_scene
-from vehicle_detection.tuning import FeatureCache, ResultTable, compare_configurations
+from vehicle_detection.tuning import (
+    FeatureCache,
+    Recipe,
+    ResultTable,
+    RowStore,
+    compare_configurations,
+    digest_of,
+    fit_features,
+)
 
 SEEDS = range(5)
 _TIMED_RUNS = 15

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from vehicle_detection import tuning
 from vehicle_detection.cli import app
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.synthetic import render_patches, render_scene, write_labels
 from vehicle_detection.tuning import read_results
+from vehicle_detection.tuning import search as tuning
 
 SMALL = "spatial_size=8 hist_bins=8 pix_per_cell=16 hog_channel=0 mirror=no"
 
@@ -62,7 +62,7 @@ def test_a_grid_becomes_a_table_and_a_figure(patches, tmp_path, monkeypatch):
     assert np.ptp(read_image(plot)) == 255
     # The same command again has nothing left to measure.
     text = out.read_text()
-    monkeypatch.setattr("vehicle_detection._trials.Bench.measure", None)
+    monkeypatch.setattr("vehicle_detection.tuning.trials.Bench.measure", None)
     assert run(*words).exit_code == 0
     assert out.read_text() == text
 

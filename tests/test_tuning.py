@@ -14,10 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.test_classifier import random_classifier
-from vehicle_detection import _feature_cache, _trials
-from vehicle_detection._halving import make_folds
-from vehicle_detection._result_table import RowStore
-from vehicle_detection._trials import COLUMNS, Bench
 from vehicle_detection.classifier import train_classifier
 from vehicle_detection.datasets import (
     PatchSet,
@@ -38,8 +34,8 @@ from vehicle_detection.synthetic import render_drive, render_patches, render_sce
 from vehicle_detection.tuning import (
     FeatureCache,
     LabelledFrames,
-    Platt,
     ResultTable,
+    RowStore,
     calibrate_scores,
     compare_configurations,
     expand_grid,
@@ -48,6 +44,11 @@ from vehicle_detection.tuning import (
     read_results,
     search_parameters,
 )
+from vehicle_detection.tuning import cache as _feature_cache
+from vehicle_detection.tuning import trials as _trials
+from vehicle_detection.tuning.halving import make_folds
+from vehicle_detection.tuning.search import Platt
+from vehicle_detection.tuning.trials import COLUMNS, Bench
 
 SMALL = {"spatial_size": 8, "hist_bins": 8, "orient": 4, "pix_per_cell": 16, "hog_channel": 0}
 PLAIN = {"time_search": False, "mirror": False}

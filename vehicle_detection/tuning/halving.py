@@ -16,11 +16,11 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.experimental import enable_halving_search_cv  # noqa: F401 - switches the next two on
 from sklearn.model_selection import HalvingGridSearchCV, HalvingRandomSearchCV, PredefinedSplit
 
-from vehicle_detection._configurations import describe_params
-from vehicle_detection._ledger import Ledger
-from vehicle_detection._trials import Recipe
 from vehicle_detection.datasets import PatchSet, Split, split_groups, split_random, split_sequences
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.tuning.grid import describe_params
+from vehicle_detection.tuning.ledger import Ledger
+from vehicle_detection.tuning.trials import Recipe
 
 _FEWEST_PATCHES = 300  # With fewer, chance decides who stays.
 

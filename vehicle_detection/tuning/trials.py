@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check_number
-from vehicle_detection._feature_cache import FeatureCache, digest_of
 from vehicle_detection._kernels import fit_svm
 from vehicle_detection.classifier import DEFAULT_C, Template, VehicleClassifier, check_labels
 from vehicle_detection.datasets import PatchSet, Split
@@ -23,6 +22,7 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, Labels, evaluate_detections, precision_recall_curve
 from vehicle_detection.params import FeatureParams, RegionParams, SearchParams
 from vehicle_detection.search import BandSearch
+from vehicle_detection.tuning.cache import FeatureCache, digest_of
 
 FEATURE_FIELDS = tuple(field.name for field in dataclasses.fields(FeatureParams))
 

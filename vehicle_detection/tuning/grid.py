@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from vehicle_detection._common import describe
-from vehicle_detection._result_table import number_or_text
-from vehicle_detection._trials import FEATURE_FIELDS, TRAINING_FIELDS, Recipe
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import FeatureParams
+from vehicle_detection.tuning.results import number_or_text
+from vehicle_detection.tuning.trials import FEATURE_FIELDS, TRAINING_FIELDS, Recipe
 
 Configuration = FeatureParams | Mapping[str, Any] | str
 """Features, a mapping from fields of `FeatureParams`, C, mirror and vehicle_weight, or a preset's name."""

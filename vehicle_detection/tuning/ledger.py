@@ -6,11 +6,11 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
-from vehicle_detection._configurations import Candidate
-from vehicle_detection._feature_cache import digest_of
-from vehicle_detection._result_table import ResultTable, RowStore
-from vehicle_detection._trials import COLUMNS, Bench, Recipe
 from vehicle_detection.datasets import Split
+from vehicle_detection.tuning.cache import digest_of
+from vehicle_detection.tuning.grid import Candidate
+from vehicle_detection.tuning.results import ResultTable, RowStore
+from vehicle_detection.tuning.trials import COLUMNS, Bench, Recipe
 
 _LOGGER = logging.getLogger(__name__)
 

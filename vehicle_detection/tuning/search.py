@@ -12,17 +12,6 @@ from contextlib import contextmanager
 from typing import Any
 
 from vehicle_detection._common import check_choice, check_integer, describe
-from vehicle_detection._configurations import (
-    Configuration,
-    expand_grid,
-    parse_grid,
-    read_configurations,
-)
-from vehicle_detection._feature_cache import FeatureCache
-from vehicle_detection._ledger import Ledger
-from vehicle_detection._mining import mine_negatives
-from vehicle_detection._result_table import ResultTable, RowStore, read_results
-from vehicle_detection._trials import COLUMNS, Bench
 from vehicle_detection.classifier import DEFAULT_C
 from vehicle_detection.datasets import (
     PatchSet,
@@ -35,6 +24,12 @@ from vehicle_detection.datasets import (
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, Platt, calibrate_scores
 from vehicle_detection.params import RegionParams, SearchParams
+from vehicle_detection.tuning.cache import FeatureCache
+from vehicle_detection.tuning.grid import Configuration, expand_grid, parse_grid, read_configurations
+from vehicle_detection.tuning.ledger import Ledger
+from vehicle_detection.tuning.mining import mine_negatives
+from vehicle_detection.tuning.results import ResultTable, RowStore, read_results
+from vehicle_detection.tuning.trials import COLUMNS, Bench
 
 __all__ = [
     "SPLITS",
@@ -249,7 +244,7 @@ def search_parameters(
     >>> len(table.where(stage="halving")), len(table.where(stage="final"))
     (6, 1)
     """
-    from vehicle_detection._halving import halve, make_folds
+    from vehicle_detection.tuning.halving import halve, make_folds
 
     check_choice(split, "split", ("sequences", "groups", "random"))
     check_integer(folds, "folds", low=2, high=100)
