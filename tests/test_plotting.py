@@ -12,8 +12,6 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure, SubFigure
 
 from vehicle_detection import plotting
-from vehicle_detection._plot_common import COLORS, OTHER, SKY, TRUTH, VEHICLE, VERMILION, YELLOW, spread
-from vehicle_detection._plot_glyphs import put_glyphs, sum_blocks
 from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.datasets import PatchSet, Split, find_near_duplicates, load_frames
@@ -24,6 +22,8 @@ from vehicle_detection.features import extract_features, hog_picture
 from vehicle_detection.heatmap import bounding_boxes, frame_heat
 from vehicle_detection.images import write_image
 from vehicle_detection.params import FeatureParams, HeatParams, SearchBand, SearchParams
+from vehicle_detection.plotting.glyphs import put_glyphs, sum_blocks
+from vehicle_detection.plotting.style import COLORS, OTHER, SKY, TRUTH, VEHICLE, VERMILION, YELLOW, spread
 from vehicle_detection.synthetic import render_drive, render_patches
 from vehicle_detection.tracking import Track
 from vehicle_detection.training import train_and_judge

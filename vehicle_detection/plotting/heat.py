@@ -8,7 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_image, check_type, describe
-from vehicle_detection._plot_common import (
+from vehicle_detection.boxes import Detections
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.heatmap import apply_threshold, frame_heat, label_boxes
+from vehicle_detection.params import HeatParams
+from vehicle_detection.plotting.style import (
     COLORS,
     SKY,
     YELLOW,
@@ -18,10 +22,6 @@ from vehicle_detection._plot_common import (
     put_boxes,
     put_image,
 )
-from vehicle_detection.boxes import Detections
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.heatmap import apply_threshold, frame_heat, label_boxes
-from vehicle_detection.params import HeatParams
 
 Image = NDArray[np.uint8]
 

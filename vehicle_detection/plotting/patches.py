@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check_integer, check_type, describe
-from vehicle_detection._plot_common import (
+from vehicle_detection.datasets import PatchSet, Split, make_thumbnails
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.plotting.style import (
     OTHER,
     VEHICLE,
     check_count,
@@ -21,8 +23,6 @@ from vehicle_detection._plot_common import (
     spread,
     tile_axes,
 )
-from vehicle_detection.datasets import PatchSet, Split, make_thumbnails
-from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

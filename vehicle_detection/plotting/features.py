@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check_choice, check_image, check_integer, check_patches, describe
-from vehicle_detection._plot_common import (
+from vehicle_detection.classifier import VehicleClassifier
+from vehicle_detection.datasets import PatchSet
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.features import convert_color, extract_features, hog_blocks, hog_source
+from vehicle_detection.params import COLOR_SPACES, PATCH_SIZE, FeatureParams
+from vehicle_detection.plotting.glyphs import put_glyphs, sum_blocks
+from vehicle_detection.plotting.style import (
     COLORS,
     LINE_COLORS,
     OTHER,
@@ -21,12 +27,6 @@ from vehicle_detection._plot_common import (
     panels,
     put_image,
 )
-from vehicle_detection._plot_glyphs import put_glyphs, sum_blocks
-from vehicle_detection.classifier import VehicleClassifier
-from vehicle_detection.datasets import PatchSet
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import convert_color, extract_features, hog_blocks, hog_source
-from vehicle_detection.params import COLOR_SPACES, PATCH_SIZE, FeatureParams
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

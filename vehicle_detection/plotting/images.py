@@ -11,7 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check_image, check_integer, describe
-from vehicle_detection._plot_common import (
+from vehicle_detection.boxes import Detections
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import Labels
+from vehicle_detection.plotting.style import (
     SKY,
     TRUTH,
     Sheet,
@@ -24,9 +27,6 @@ from vehicle_detection._plot_common import (
     put_boxes,
     put_image,
 )
-from vehicle_detection.boxes import Detections
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import Labels
 
 Image = NDArray[np.uint8]
 Boxes = Detections | Labels | ArrayLike

@@ -10,10 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_number, check_type, describe
-from vehicle_detection._plot_common import COLORS, DASHES, YELLOW, Paint, Sheet, new_axes, new_figure, panels
 from vehicle_detection.detector import FrameResult
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import NO_TRACK, Labels
+from vehicle_detection.plotting.style import (
+    COLORS,
+    DASHES,
+    YELLOW,
+    Paint,
+    Sheet,
+    new_axes,
+    new_figure,
+    panels,
+)
 from vehicle_detection.synthetic import VehicleTruth
 from vehicle_detection.video import VideoReport
 

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vehicle_detection._plot_common import line_looks, new_axes
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.plotting.style import line_looks, new_axes
 from vehicle_detection.tuning import ResultTable
 
 if TYPE_CHECKING:

@@ -10,7 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check_image, check_number, check_type, describe
-from vehicle_detection._plot_common import (
+from vehicle_detection.boxes import Detections
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import Labels
+from vehicle_detection.params import PixelBand, SearchParams
+from vehicle_detection.plotting.style import (
     BLUE,
     SKY,
     TRUTH,
@@ -24,10 +28,6 @@ from vehicle_detection._plot_common import (
     put_boxes,
     put_image,
 )
-from vehicle_detection.boxes import Detections
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import Labels
-from vehicle_detection.params import PixelBand, SearchParams
 from vehicle_detection.windows import band_windows
 
 if TYPE_CHECKING:

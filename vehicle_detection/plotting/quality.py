@@ -9,17 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_choice, check_integer, check_number, check_type, describe
-from vehicle_detection._plot_common import (
-    LINE_COLORS,
-    SKY,
-    TRUTH,
-    VERMILION,
-    line_looks,
-    new_axes,
-    put_boxes,
-    put_tiles,
-    tile_axes,
-)
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
@@ -30,6 +19,17 @@ from vehicle_detection.evaluation import (
     Labels,
     match_detections,
     prepare_sides,
+)
+from vehicle_detection.plotting.style import (
+    LINE_COLORS,
+    SKY,
+    TRUTH,
+    VERMILION,
+    line_looks,
+    new_axes,
+    put_boxes,
+    put_tiles,
+    tile_axes,
 )
 
 if TYPE_CHECKING:
