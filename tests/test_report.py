@@ -16,9 +16,6 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from vehicle_detection import _report_assets, _report_charts, _report_html, report
-from vehicle_detection._report_charts import COLORS, Clock, Label, Scale, _apart, _lanes
-from vehicle_detection._report_log import TrackHistory, TrackLog, binned
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import load_classifier
 from vehicle_detection.detector import VehicleDetector
@@ -27,6 +24,12 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture import load_model
 from vehicle_detection.params import TrackParams
 from vehicle_detection.report import ReportWriter
+from vehicle_detection.report import assets as _report_assets
+from vehicle_detection.report import charts as _report_charts
+from vehicle_detection.report import html as _report_html
+from vehicle_detection.report import writer as report
+from vehicle_detection.report.charts import COLORS, Clock, Label, Scale, _apart, _lanes
+from vehicle_detection.report.history import TrackHistory, TrackLog, binned
 from vehicle_detection.video import VideoReport
 
 FPS = 25

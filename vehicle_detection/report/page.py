@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import vehicle_detection
-from vehicle_detection._report_assets import SCRIPT, STYLE
-from vehicle_detection._report_charts import (
+from vehicle_detection.report.assets import SCRIPT, STYLE
+from vehicle_detection.report.charts import (
     COLORS,
     Clock,
     Scale,
@@ -26,9 +26,9 @@ from vehicle_detection._report_charts import (
     share_bar,
     steps,
 )
-from vehicle_detection._report_html import amount, clock, facts, file_name, table, tag, text
-from vehicle_detection._report_log import TrackHistory, TrackLog, binned
-from vehicle_detection._report_setup import model_part, settings_part
+from vehicle_detection.report.history import TrackHistory, TrackLog, binned
+from vehicle_detection.report.html import amount, clock, facts, file_name, table, tag, text
+from vehicle_detection.report.setup import model_part, settings_part
 from vehicle_detection.video import VideoReport
 
 VAGUE_SPEED = 3.0

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import IO, Any
 
 from vehicle_detection._common import check_integer, check_target, check_type, describe, written_whole
-from vehicle_detection._report_log import TrackLog
-from vehicle_detection._report_page import Film, page
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.report.history import TrackLog
+from vehicle_detection.report.page import Film, page
 from vehicle_detection.video import VideoReport
 
 EMBED_LIMIT = 60_000_000

@@ -6,11 +6,11 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from vehicle_detection._report_html import amount, table, tag, text
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.mixture import TemplateMixture
 from vehicle_detection.params import FeatureParams, PyramidParams, SearchParams
+from vehicle_detection.report.html import amount, table, tag, text
 from vehicle_detection.training import SPLITS
 
 _TIMES = "\N{NO-BREAK SPACE}\N{MULTIPLICATION SIGN}\N{NO-BREAK SPACE}"

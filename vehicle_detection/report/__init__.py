@@ -1,0 +1,7 @@
+"""The report: one self-contained HTML page about a run over a video."""
+
+from vehicle_detection.report.writer import ReportWriter
+
+__all__ = [
+    "ReportWriter",
+]
