@@ -6,14 +6,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vehicle_detection import explorer as room
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import load_classifier
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.explorer import VIEWS, Explorer
+from vehicle_detection.explorer import Explorer
+from vehicle_detection.explorer import explorer as room
+from vehicle_detection.explorer.explorer import VIEWS
 from vehicle_detection.heatmap import frame_heat
 from vehicle_detection.images import write_image
 from vehicle_detection.params import FeatureParams, HeatParams, RegionParams, SearchParams

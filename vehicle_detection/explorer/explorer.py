@@ -17,21 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_choice, check_integer, check_type
-from vehicle_detection._explorer_frames import (
-    Frames,
-    Image,
-    lay_heat,
-    named_sources,
-    put_windows,
-    remember,
-)
-from vehicle_detection._explorer_widgets import Panel, lay_out
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier, load_classifier
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drawing import TRACK_COLORS, draw_boxes
 from vehicle_detection.errors import VehicleDetectionError
+from vehicle_detection.explorer.frames import Frames, Image, lay_heat, named_sources, put_windows, remember
+from vehicle_detection.explorer.widgets import Panel, lay_out
 from vehicle_detection.heatmap import frame_heat, label_boxes
 from vehicle_detection.params import HeatParams, RegionParams, SearchParams
 from vehicle_detection.regions import find_vehicles

@@ -1,0 +1,7 @@
+"""The interactive explorer for notebooks."""
+
+from vehicle_detection.explorer.explorer import Explorer
+
+__all__ = [
+    "Explorer",
+]
