@@ -9,14 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vehicle_detection import synthetic
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import read_image
 from vehicle_detection.synthetic import (
-    LABEL_COLUMNS,
     Drive,
-    Scene,
     SceneVehicle,
     VehicleTruth,
     render_drive,
@@ -24,6 +21,8 @@ from vehicle_detection.synthetic import (
     render_scene,
     write_labels,
 )
+from vehicle_detection.synthetic import drive as synthetic
+from vehicle_detection.synthetic.drive import LABEL_COLUMNS, Scene
 
 SMALL = (216, 384)
 TEST_IMAGES = Path(__file__).parents[1] / "test_images"

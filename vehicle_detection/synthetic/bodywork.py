@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._designs import profile_at
-from vehicle_detection._easel import Cover, Easel, Outline, rounded
+from vehicle_detection.synthetic.canvas import Cover, Easel, Outline, rounded
+from vehicle_detection.synthetic.shapes import profile_at
 
 if TYPE_CHECKING:
-    from vehicle_detection._cars import Car
-    from vehicle_detection._optics import Floats
+    from vehicle_detection.synthetic.camera_light import Floats
+    from vehicle_detection.synthetic.vehicles import Car
 
 _PLATE = (0.52, 0.115)
 

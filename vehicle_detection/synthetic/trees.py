@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from vehicle_detection._optics import Floats, Light, wrapped_noise
+from vehicle_detection.synthetic.camera_light import Floats, Light, wrapped_noise
 
 _SIDE = 192
 

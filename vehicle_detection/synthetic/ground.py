@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._optics import Floats, Light, Pinhole, wrapped_noise
-from vehicle_detection._road import LANE, Road
+from vehicle_detection.synthetic.camera_light import Floats, Light, Pinhole, wrapped_noise
+from vehicle_detection.synthetic.road import LANE, Road
 
 _PERIOD = 96.0
 _ACROSS = 0.1

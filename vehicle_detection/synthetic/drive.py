@@ -15,16 +15,16 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._cars import Car
 from vehicle_detection._common import check_choice, check_integer, check_number, describe, written_whole
-from vehicle_detection._designs import DESIGNS, KIND_SHARES, PAINT_SHARES, PAINTS, draw_share
-from vehicle_detection._optics import Pinhole
-from vehicle_detection._patches import draw_patches
-from vehicle_detection._road import Road
-from vehicle_detection._staging import Placed, VehicleTruth
-from vehicle_detection._studio import RandomState, Scene, Studio, View, make_generator, make_view
-from vehicle_detection._traffic import SCENARIOS, Mover, make_traffic
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.synthetic.camera_light import Pinhole
+from vehicle_detection.synthetic.patches import draw_patches
+from vehicle_detection.synthetic.render import Placed, VehicleTruth
+from vehicle_detection.synthetic.road import Road
+from vehicle_detection.synthetic.scene import RandomState, Scene, Studio, View, make_generator, make_view
+from vehicle_detection.synthetic.shapes import DESIGNS, KIND_SHARES, PAINT_SHARES, PAINTS, draw_share
+from vehicle_detection.synthetic.traffic import SCENARIOS, Mover, make_traffic
+from vehicle_detection.synthetic.vehicles import Car
 
 __all__ = [
     "LABEL_COLUMNS",

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._optics import Floats, Light, Pinhole, wrapped_noise
+from vehicle_detection.synthetic.camera_light import Floats, Light, Pinhole, wrapped_noise
 
 _PERIOD = 96.0
 _ALONG, _UP = 0.15, 0.1

@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._backdrop import draw_backdrop
-from vehicle_detection._ground import Ground
-from vehicle_detection._hedge import Hedge
-from vehicle_detection._optics import Floats, Light, Pinhole
-from vehicle_detection._road import LANE, Road
-from vehicle_detection._trees import paint_sign, paint_tree
+from vehicle_detection.synthetic.background import draw_backdrop
+from vehicle_detection.synthetic.camera_light import Floats, Light, Pinhole
+from vehicle_detection.synthetic.ground import Ground
+from vehicle_detection.synthetic.hedge import Hedge
+from vehicle_detection.synthetic.road import LANE, Road
+from vehicle_detection.synthetic.trees import paint_sign, paint_tree
 
 _DASH, _DASH_PERIOD = 3.6, 12.0
 _PROP_PERIOD = 240.0

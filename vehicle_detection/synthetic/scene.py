@@ -11,14 +11,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._cars import Car
 from vehicle_detection._common import check_choice, check_integer, check_number, describe
-from vehicle_detection._designs import PAINTS
-from vehicle_detection._optics import LIGHTS, Light, Pinhole, Sensor, make_light
-from vehicle_detection._road import Road
-from vehicle_detection._scenery import Scenery
-from vehicle_detection._staging import Image, Placed, VehicleTruth, stage
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.synthetic.camera_light import LIGHTS, Light, Pinhole, Sensor, make_light
+from vehicle_detection.synthetic.render import Image, Placed, VehicleTruth, stage
+from vehicle_detection.synthetic.road import Road
+from vehicle_detection.synthetic.scenery import Scenery
+from vehicle_detection.synthetic.shapes import PAINTS
+from vehicle_detection.synthetic.vehicles import Car
 
 RandomState = int | np.random.Generator | None
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._optics import Floats
+from vehicle_detection.synthetic.camera_light import Floats
 
 PIXELS_PER_METRE = 112
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._optics import Color
+from vehicle_detection.synthetic.camera_light import Color
 
 Profile = tuple[tuple[float, float], ...]
 

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection import _bodywork
-from vehicle_detection._designs import DESIGNS, Looks, profile_at
-from vehicle_detection._easel import PIXELS_PER_METRE, Easel, Surface
-from vehicle_detection._optics import Color, Floats, Light, wrapped_noise
+from vehicle_detection.synthetic import bodywork as _bodywork
+from vehicle_detection.synthetic.camera_light import Color, Floats, Light, wrapped_noise
+from vehicle_detection.synthetic.canvas import PIXELS_PER_METRE, Easel, Surface
+from vehicle_detection.synthetic.shapes import DESIGNS, Looks, profile_at
 
 _CORNER_POWER = 4.5
 _FLANK_SHARE = 0.975

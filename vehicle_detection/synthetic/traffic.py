@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_detection._designs import KIND_SHARES, PAINT_SHARES, draw_share
-from vehicle_detection._road import LANE, Road
+from vehicle_detection.synthetic.road import LANE, Road
+from vehicle_detection.synthetic.shapes import KIND_SHARES, PAINT_SHARES, draw_share
 
 SCENARIOS = ("highway", "overtaking", "crossing", "occlusion", "empty")
 

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._cars import Car
-from vehicle_detection._designs import KIND_SHARES, PAINT_SHARES, PAINTS, draw_share
-from vehicle_detection._optics import Pinhole, Sensor, make_light
-from vehicle_detection._road import LANE, Road
-from vehicle_detection._scenery import Canvas, Scenery
-from vehicle_detection._staging import Image, Placed, draw_one
+from vehicle_detection.synthetic.camera_light import Pinhole, Sensor, make_light
+from vehicle_detection.synthetic.render import Image, Placed, draw_one
+from vehicle_detection.synthetic.road import LANE, Road
+from vehicle_detection.synthetic.scenery import Canvas, Scenery
+from vehicle_detection.synthetic.shapes import KIND_SHARES, PAINT_SHARES, PAINTS, draw_share
+from vehicle_detection.synthetic.vehicles import Car
 
 _SHAPE = (720, 1280)
 _PER_SCENE = 80

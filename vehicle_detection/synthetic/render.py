@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._cars import Car
-from vehicle_detection._optics import Light, Pinhole
-from vehicle_detection._scenery import Canvas, Scenery
-from vehicle_detection._sprites import NEAR_PLANE, Sprite, draw_sprite, full_box
+from vehicle_detection.synthetic.camera_light import Light, Pinhole
+from vehicle_detection.synthetic.scenery import Canvas, Scenery
+from vehicle_detection.synthetic.sprites import NEAR_PLANE, Sprite, draw_sprite, full_box
+from vehicle_detection.synthetic.vehicles import Car
 
 Image = NDArray[np.uint8]
 

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._cars import Car
-from vehicle_detection._designs import profile_at
-from vehicle_detection._easel import PIXELS_PER_METRE, Surface
-from vehicle_detection._optics import Floats, Pinhole
+from vehicle_detection.synthetic.camera_light import Floats, Pinhole
+from vehicle_detection.synthetic.canvas import PIXELS_PER_METRE, Surface
+from vehicle_detection.synthetic.shapes import profile_at
+from vehicle_detection.synthetic.vehicles import Car
 
 NEAR_PLANE = 1.0
 """Metres ahead of the camera from which on anything is drawn."""

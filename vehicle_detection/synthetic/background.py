@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._optics import Floats, Light, Pinhole, wrapped_noise
+from vehicle_detection.synthetic.camera_light import Floats, Light, Pinhole, wrapped_noise
 
 
 def draw_backdrop(
