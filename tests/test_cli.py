@@ -21,12 +21,12 @@ import vehicle_detection
 from tests.test_mixture_report import write_set
 from tests.test_mixture_training import SMALL, drawn
 from vehicle_detection import classifier, detector, training
-from vehicle_detection._cli_output import interruptible, output_folder
 from vehicle_detection._common import files as _files
-from vehicle_detection._demo import FILES, SHEET, draw_clip
 from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import VehicleClassifier, load_classifier
-from vehicle_detection.cli import app
+from vehicle_detection.cli.app import app
+from vehicle_detection.cli.demo import FILES, SHEET, draw_clip
+from vehicle_detection.cli.output import interruptible, output_folder
 from vehicle_detection.datasets import patches as datasets
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.horizon import HorizonEstimate
@@ -122,7 +122,7 @@ def test_help_is_there_for_every_command_and_loads_nothing_heavy():
     code = (
         "import sys, json\n"
         "from typer.testing import CliRunner\n"
-        "from vehicle_detection.cli import app\n"
+        "from vehicle_detection.cli.app import app\n"
         "pages = [[], *([command] for command in sys.argv[1:])]\n"
         "results = [CliRunner().invoke(app, [*words, '--help']) for words in pages]\n"
         "roots = sorted({name.split('.')[0] for name in sys.modules})\n"
@@ -170,7 +170,7 @@ def test_ctrl_c_leaves_nothing_behind(tmp_path, material):
         "from vehicle_detection import {module}\n"
         "{module}.{name} = lambda *a, **k: (print('now', flush=True), time.sleep(60))\n"
         "sys.argv = ['vehicle-detection', *sys.argv[1:]]\n"
-        "from vehicle_detection.cli import main; main()"
+        "from vehicle_detection.cli.app import main; main()"
     )
     out, patches = tmp_path / "out", (material / "vehicles", material / "non-vehicles")
     runs = {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from vehicle_detection.cli import app
+from vehicle_detection.cli.app import app
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.synthetic import render_patches, render_scene, write_labels
 from vehicle_detection.tuning import read_results

@@ -18,7 +18,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from vehicle_detection._demo import draw_clip
+from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drawing import draw_tracks
 from vehicle_detection.report import ReportWriter

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vehicle_detection._cli_frames import print_road_scores
-from vehicle_detection._cli_output import (
+from vehicle_detection.cli.output import (
     check_apart,
     codec_messages,
     interruptible,
@@ -20,6 +19,7 @@ from vehicle_detection._cli_output import (
     print_facts,
     print_table,
 )
+from vehicle_detection.cli.train_frames import print_road_scores
 
 if TYPE_CHECKING:
     from vehicle_detection.training import TrainingReport

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vehicle_detection._cli_output import check_apart, interruptible, print_table
+from vehicle_detection.cli.output import check_apart, interruptible, print_table
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from vehicle_detection._cli_output import check_apart, output_folder, print_table
+from vehicle_detection.cli.output import check_apart, output_folder, print_table
 
 # Columns of the table: titles, and digits behind the point.
 _COLUMNS = {

@@ -16,10 +16,10 @@ import typer
 from typer.core import TyperGroup
 
 from vehicle_detection import __version__
-from vehicle_detection._cli_frames import train_frames
-from vehicle_detection._cli_models import fetch, info, train
-from vehicle_detection._cli_output import check_apart, codec_messages, complain, output_folder, print_facts
-from vehicle_detection._cli_tuning import tune
+from vehicle_detection.cli.output import check_apart, codec_messages, complain, output_folder, print_facts
+from vehicle_detection.cli.train import fetch, info, train
+from vehicle_detection.cli.train_frames import train_frames
+from vehicle_detection.cli.tune import tune
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def demo(
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of the drive.")] = 0,
 ) -> None:
     """Draw a drive, annotate it with the shipped model and score it against the truth."""
-    from vehicle_detection._demo import FILES, run_demo
+    from vehicle_detection.cli.demo import FILES, run_demo
     from vehicle_detection.detector import VehicleDetector
 
     with output_folder(output, "-o"), VehicleDetector() as detector:
