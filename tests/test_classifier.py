@@ -18,11 +18,11 @@ from vehicle_detection.classifier import (
     KIND,
     Template,
     VehicleClassifier,
+    copy_weights,
     load_classifier,
     patch_features,
     train_classifier,
 )
-from vehicle_detection.classifier.fit import copy_weights
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.features import PatchFeatures, extract_features
 from vehicle_detection.params import FeatureParams

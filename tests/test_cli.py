@@ -23,13 +23,13 @@ from tests.test_mixture_training import SMALL, drawn
 from vehicle_detection import classifier, detector, training
 from vehicle_detection._common import files as _files
 from vehicle_detection.boxes import Detections
+from vehicle_detection.camera import HorizonEstimate
 from vehicle_detection.classifier import VehicleClassifier, load_classifier
 from vehicle_detection.cli.app import app
 from vehicle_detection.cli.demo import FILES, SHEET, draw_clip
 from vehicle_detection.cli.output import interruptible, output_folder
 from vehicle_detection.datasets import patches as datasets
 from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.horizon import HorizonEstimate
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.mixture import load_model
 from vehicle_detection.mixture_training import cross_validation as mixture_report

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from vehicle_detection.camera import estimate_horizon
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.horizon import estimate_horizon
 
 SHAPE = (720, 1280)
 

@@ -22,7 +22,7 @@ from vehicle_detection.features import extract_features, hog_picture
 from vehicle_detection.heatmap import bounding_boxes, frame_heat
 from vehicle_detection.images import write_image
 from vehicle_detection.params import FeatureParams, HeatParams, SearchBand, SearchParams
-from vehicle_detection.plotting.glyphs import put_glyphs, sum_blocks
+from vehicle_detection.plotting.features import put_glyphs, sum_blocks
 from vehicle_detection.plotting.style import COLORS, OTHER, SKY, TRUTH, VEHICLE, VERMILION, YELLOW, spread
 from vehicle_detection.synthetic import render_drive, render_patches
 from vehicle_detection.tracking import Track

@@ -26,7 +26,7 @@ from vehicle_detection.params import TrackParams
 from vehicle_detection.report import ReportWriter
 from vehicle_detection.report import assets as _report_assets
 from vehicle_detection.report import charts as _report_charts
-from vehicle_detection.report import html as _report_html
+from vehicle_detection.report import page as _report_html
 from vehicle_detection.report import writer as report
 from vehicle_detection.report.charts import COLORS, Clock, Label, Scale, _apart, _lanes
 from vehicle_detection.report.history import TrackHistory, TrackLog, binned

@@ -46,8 +46,7 @@ from vehicle_detection.tuning import (
 )
 from vehicle_detection.tuning import cache as _feature_cache
 from vehicle_detection.tuning import trials as _trials
-from vehicle_detection.tuning.halving import make_folds
-from vehicle_detection.tuning.search import Platt
+from vehicle_detection.tuning.search import Platt, make_folds
 from vehicle_detection.tuning.trials import COLUMNS, Bench
 
 SMALL = {"spatial_size": 8, "hist_bins": 8, "orient": 4, "pix_per_cell": 16, "hog_channel": 0}

@@ -12,7 +12,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from vehicle_detection.boxes import Detections, clip_boxes, iou_matrix, non_max_suppression
-    from vehicle_detection.camera import Camera
+    from vehicle_detection.camera import Camera, HorizonEstimate, estimate_horizon
     from vehicle_detection.classifier import VehicleClassifier, load_classifier, train_classifier
     from vehicle_detection.datasets import (
         fetch_patches,
@@ -56,7 +56,6 @@ if TYPE_CHECKING:
         single_img_features,
     )
     from vehicle_detection.heatmap import HeatHistory, add_heat, apply_threshold, bounding_boxes, label_boxes
-    from vehicle_detection.horizon import HorizonEstimate, estimate_horizon
     from vehicle_detection.images import read_image, write_image
     from vehicle_detection.mixture import MixtureSearch, TemplateMixture, load_model
     from vehicle_detection.mixture_training import FrameSource, MixtureParams, judge_mixture, train_mixture

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_choice, check_integer, check_number, describe, resolve_jobs
-from vehicle_detection._model_card import model_card
-from vehicle_detection._training_report import SPLITS, SplitScore, TrainingReport
 from vehicle_detection.classifier import (
     DEFAULT_C,
     VehicleClassifier,
@@ -35,6 +35,285 @@ from vehicle_detection.datasets import (
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import calibrate_scores, calibration_error
 from vehicle_detection.params import FeatureParams
+
+SPLITS = {
+    "random": "random fifth",
+    "sequences": "last fifth of each folder",
+    "gti_to_kitti": "KITTI and Extras, trained on GTI",
+    "kitti_to_gti": "GTI, trained on KITTI and Extras",
+}
+"""The splits that a model is judged on, by what is tested."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitScore:
+    """How a classifier does on patches it has not seen; means over the seeds, where there are several.
+
+    Attributes
+    ----------
+    accuracies
+        Share of right answers, one for each seed.
+    missed
+        Share of the tested vehicles that are taken for something else.
+    false
+        Share of the other tested patches that are taken for vehicles.
+    train, test
+        Number of patches on either side.
+    leakage
+        Share of the test patches with a near-copy among the training patches: `split_leakage` of the first
+        seed.
+    """
+
+    accuracies: tuple[float, ...]
+    missed: float
+    false: float
+    train: int
+    test: int
+    leakage: float
+
+    @property
+    def accuracy(self) -> float:
+        """Mean share of right answers."""
+        return float(np.mean(self.accuracies))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingReport:
+    """What `train_and_judge` found.
+
+    Attributes
+    ----------
+    params, C, mirror, gamma, degraded, random_state
+        What was trained.
+    split
+        The split whose accuracy stands for the model.
+    sources
+        Number of patches of each source folder.
+    vehicles, non_vehicles
+        Number of patches of each class.
+    fingerprint
+        That of the patches, see `PatchSet`.
+    splits
+        The score on each split of ``SPLITS`` that the patches allow.
+    calibration_error
+        That of probabilities on the split by sequences, 0-1 (see `calibration_error` in `evaluation`).
+        Platt's sigmoid is fitted on the last fifth of the training part, with a classifier of the rest. None
+        where the patches do not allow that split twice.
+    skipped
+        Why the others were left out.
+    seconds
+        Time of each step: ``"features"``, each split, ``"calibration"``, ``"leakage"`` and
+        ``"final"``, the fit on all patches. Those that run side by side count each.
+    """
+
+    params: FeatureParams
+    C: float
+    mirror: bool
+    gamma: float
+    degraded: float
+    random_state: int
+    split: str
+    sources: dict[str, int]
+    vehicles: int
+    non_vehicles: int
+    fingerprint: str
+    splits: dict[str, SplitScore]
+    calibration_error: float | None
+    skipped: dict[str, str]
+    seconds: dict[str, float]
+
+    @property
+    def accuracy(self) -> float:
+        """Accuracy on the split that stands for the model."""
+        return self.splits[self.split].accuracy
+
+    @property
+    def balance(self) -> float:
+        """Share of vehicles among the patches."""
+        return self.vehicles / (self.vehicles + self.non_vehicles)
+
+    @property
+    def features(self) -> str:
+        """Name of the feature preset, or the number of features where they are none."""
+        known = (name for name in FeatureParams.PRESETS if FeatureParams.preset(name) == self.params)
+        return next(known, f"{self.params.length} features")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain values, ready for JSON."""
+        plain = asdict(self) | {"accuracy": self.accuracy, "balance": self.balance, "features": self.features}
+        plain["splits"] = {
+            name: {"accuracy": score.accuracy, **asdict(score)} for name, score in self.splits.items()
+        }
+        return plain
+
+
+def model_card(
+    classifier: VehicleClassifier,
+    report: TrainingReport,
+    *,
+    others: Sequence[TrainingReport] = (),
+    command: str | None = None,
+) -> str:
+    """Write what a user of the model should know, as Markdown.
+
+    Parameters
+    ----------
+    classifier, report
+        What `train_and_judge` returned.
+    others
+        Reports of other features on the same patches, for a table beside them.
+    command
+        The command that trains the model.
+
+    Returns
+    -------
+    str
+        Data, licence, accuracy on each split, what flatters it, limits.
+    """
+    parts = [
+        *_about(classifier, report, command),
+        *_data(report),
+        *_accuracy(report, others),
+        "## Limits",
+        "\n".join(_wrap(line, "- ") for line in _limits(report)),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _about(classifier: VehicleClassifier, report: TrainingReport, command: str | None) -> list[str]:
+    params = report.params
+    parts = f"{params.spatial_length} spatial bins, {params.hist_length} histogram, {params.hog_length} HOG"
+    versions = ", ".join(f"{name} {text}" for name, text in classifier.metadata["versions"].items())
+    mirrored = "with mirrored patches" if report.mirror else "without mirrored patches"
+    mirrored += f" of other brightness (gamma {report.gamma:g})" if report.gamma else ""
+    mirrored += f", and degraded ones of weight {report.degraded:g}" if report.degraded else ""
+    facts = [
+        f"Features: {report.features}, in {params.color_space}, {params.length} values ({parts})",
+        f"Training: C = {report.C:g}, {mirrored}, seed {report.random_state}",
+        f"Versions: {versions}",
+    ]
+    text = [
+        "# Model card",
+        "A linear SVM that tells 64x64 RGB patches with a vehicle from those without, to search images with.",
+        "\n".join(_wrap(fact, "- ") for fact in facts),
+    ]
+    if command:
+        text += [
+            "Made by",
+            f"```bash\n{command}\n```",
+            "Again, with the same versions, it makes the same file.",
+        ]
+    return text
+
+
+def _data(report: TrainingReport) -> list[str]:
+    total = report.vehicles + report.non_vehicles
+    counts = (
+        f"{report.vehicles:,} patches of vehicles and {report.non_vehicles:,} of anything else "
+        f"({report.balance:.1%} vehicles). The model is trained on all {total:,}."
+    )
+    if any(source.startswith(("GTI", "KITTI")) for source in report.sources):
+        licence = (
+            "Licence: the patches come from the GTI vehicle image database and the KITTI benchmark, both "
+            "CC BY-NC-SA 3.0. The model is made of them and inherits the note: non-commercial use, with "
+            "attribution."
+        )
+    else:
+        licence = "Licence: the model inherits the terms of the patches it is made of."
+    return [
+        "## Data",
+        _wrap(counts),
+        _table(("source", "patches"), [(name, f"{count:,}") for name, count in report.sources.items()]),
+        f"Fingerprint of the patches (SHA-256): `{report.fingerprint}`",
+        _wrap(licence),
+    ]
+
+
+def _accuracy(report: TrainingReport, others: Sequence[TrainingReport]) -> list[str]:
+    how = (
+        "Scaler and SVM are fitted on the training part of a split alone and judged on the other. A "
+        "near-copy is a tested patch much like one of the training patches: the correlation of their 16x16 "
+        "gray thumbnails is 0.95 or more."
+    )
+    if "random" in report.splits:
+        seeds = len(report.splits["random"].accuracies)
+        how += f" The random split is the mean of {seeds} seed{'s' * (seeds > 1)}."
+    columns = (
+        "tested on",
+        "trained",
+        "tested",
+        "accuracy",
+        "missed vehicles",
+        "false vehicles",
+        "near-copies",
+    )
+    rows = [
+        (
+            SPLITS[name],
+            f"{score.train:,}",
+            f"{score.test:,}",
+            f"{score.accuracy:.4f}",
+            f"{score.missed:.2%}",
+            f"{score.false:.2%}",
+            f"{score.leakage:.1%}",
+        )
+        for name, score in report.splits.items()
+    ]
+    text = ["## Accuracy", _wrap(how), _table(columns, rows)]
+    if report.calibration_error is not None:
+        text.append(
+            _wrap(
+                f"Probabilities: the expected calibration error is {report.calibration_error:.4f} on the "
+                "last fifth of each folder, with Platt's sigmoid fitted on the last fifth of the rest."
+            )
+        )
+    if others:
+        names = [name for name in SPLITS if name in report.splits]
+        accuracies = [
+            (each.features, str(each.params.length), *(f"{each.splits[name].accuracy:.4f}" for name in names))
+            for each in (report, *others)
+        ]
+        heads = ("features", "length", *(SPLITS[name] for name in names))
+        text += ["Other features, trained and judged in the same way:", _table(heads, accuracies)]
+    return text
+
+
+def _limits(report: TrainingReport) -> list[str]:
+    lines = [
+        "The accuracy is that of patches, not of vehicles found in frames, where most windows show none."
+    ]
+    if "random" in report.splits:
+        lines.append(
+            "Neighbouring patches show the same vehicle from one frame to the next: a random split tests on "
+            "near-copies of what it trained on, which flatters."
+        )
+    if "KITTI_extracted" in report.sources:
+        lines.append(
+            "The numbers of `KITTI_extracted` are shuffled: the split by sequences leaks there as the random "
+            "one does. Only the cross-source rows test on another camera and other roads."
+        )
+    if "Extras" in report.sources:
+        lines.append(
+            "`Extras` holds crops of the road of the course's project video: scores on clips of that road "
+            "are flattered."
+        )
+    lines.append(
+        "The patches show mostly cars from behind, by day. Trucks, buses, motorcycles, vehicles straight "
+        "from the side, night and heavy rain are rare among them or missing."
+    )
+    return lines
+
+
+def _wrap(text: str, mark: str = "") -> str:
+    return textwrap.fill(
+        text, 110, initial_indent=mark, subsequent_indent=" " * len(mark), break_on_hyphens=False
+    )
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
 
 __all__ = ["SPLITS", "SplitScore", "TrainingReport", "model_card", "train_and_judge"]
 

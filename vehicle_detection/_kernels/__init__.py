@@ -1,7 +1,7 @@
 """Compiled numba kernels: HOG, FHOG, color, correlation, matrix products and the SVM solver."""
 
 from vehicle_detection._kernels.correlation import Filter
-from vehicle_detection._kernels.hog_inputs import (
+from vehicle_detection._kernels.hog import (
     bin_of_value,
     degree_bounds,
     orientation_cotangents,

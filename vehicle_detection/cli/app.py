@@ -17,8 +17,7 @@ from typer.core import TyperGroup
 
 from vehicle_detection import __version__
 from vehicle_detection.cli.output import check_apart, codec_messages, complain, output_folder, print_facts
-from vehicle_detection.cli.train import fetch, info, train
-from vehicle_detection.cli.train_frames import train_frames
+from vehicle_detection.cli.train import fetch, info, train, train_frames
 from vehicle_detection.cli.tune import tune
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
 

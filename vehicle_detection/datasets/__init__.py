@@ -2,8 +2,13 @@
 
 from vehicle_detection.datasets.archives import fetch_patches
 from vehicle_detection.datasets.near_duplicates import find_near_duplicates, make_thumbnails
-from vehicle_detection.datasets.patch_set import PatchSet
-from vehicle_detection.datasets.patches import FrameSet, load_frames, load_patches, load_training_patches
+from vehicle_detection.datasets.patches import (
+    FrameSet,
+    PatchSet,
+    load_frames,
+    load_patches,
+    load_training_patches,
+)
 from vehicle_detection.datasets.splits import (
     Split,
     split_groups,

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_number, check_patches
-from vehicle_detection.datasets.patch_set import PatchSet
+from vehicle_detection.datasets.patches import PatchSet
 from vehicle_detection.params import PATCH_SIZE
 
 _CHUNK = 512  # Rows compared with all others at a time: the table of products stays small.

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from vehicle_detection._common import check_integer, check_number, describe
 from vehicle_detection.datasets.archives import natural_key, parent_folder
 from vehicle_detection.datasets.near_duplicates import find_nearest, group_copies, make_thumbnails
-from vehicle_detection.datasets.patch_set import PatchSet, check_labels
+from vehicle_detection.datasets.patches import PatchSet, check_labels
 from vehicle_detection.errors import InvalidInputError
 
 

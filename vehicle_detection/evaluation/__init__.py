@@ -7,15 +7,17 @@ from vehicle_detection.evaluation.detections import (
     match_detections,
     precision_recall_curve,
 )
-from vehicle_detection.evaluation.frames import (
+from vehicle_detection.evaluation.labels import (
+    NO_TRACK,
+    FrameKey,
     Frames,
     LabelledFrames,
+    Labels,
     check_labels_of,
     keyed_frames,
     keys_of,
     pairs_of,
 )
-from vehicle_detection.evaluation.labels import NO_TRACK, FrameKey, Labels
 from vehicle_detection.evaluation.matching import prepare_sides
 from vehicle_detection.evaluation.readers import read_labels
 from vehicle_detection.evaluation.tracks import TrackScores, evaluate_tracks

@@ -2,19 +2,287 @@
 
 from __future__ import annotations
 
+import csv
+import io
+import json
 import math
 import os
 import re
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from vehicle_detection._common import check_choice
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import DatasetError
-from vehicle_detection.evaluation.formats import READERS, Row, read_text, split_words
-from vehicle_detection.evaluation.labels import NO_TRACK, FrameKey, Labels
+from vehicle_detection.evaluation.labels import NO_TRACK, FrameKey, Labels, frame_order
+
+LABEL_COLUMNS = ("frame", "track", "x1", "y1", "x2", "y2", "occluded", "truncated", "ignore")
+PREDICTION_COLUMNS = ("frame", "track_id", "x1", "y1", "x2", "y2", "score")
+
+VEHICLE_CLASSES = ("car", "van", "truck", "bus", "vehicle")
+LOOKALIKE_CLASSES = ("tram", "train", "misc", "trailer", "caravan", "autorickshaw", "vehicle fallback")
+PERSON_CLASSES = ("pedestrian", "person_sitting", "cyclist")
+
+# What the project's own labels leave unscored: largely hidden, cut off, too small.
+HIDDEN, CUT_OFF, NARROW = 2, 0.7, 40.0
+
+
+class Row(NamedTuple):
+    """One box as a reader found it; `where` names its file and line."""
+
+    where: str
+    frame: FrameKey
+    track: int
+    box: tuple[float, float, float, float]
+    occluded: int = 0
+    truncated: float = 0.0
+    ignore: bool = False
+    score: float | None = None
+    distance_m: float = math.nan
+    speed_mps: float = math.nan
+
+
+Found = tuple[list[Row], list[FrameKey]]
+
+
+def read_text(file: Path) -> str:
+    """Read a whole file."""
+    try:
+        return file.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise DatasetError(f"{file} is no UTF-8 text; save it as UTF-8") from None
+    except OSError as error:
+        raise DatasetError(f"{file} cannot be read: {error.strerror}") from error
+
+
+def split_words(line: str) -> list[str]:
+    """Split a line at commas and blanks."""
+    return re.split(r"\s*,\s*|\s+", line.strip())
+
+
+def _number(text: str, name: str, where: str, *, low: float = -math.inf, high: float = math.inf) -> float:
+    """One finite number in ``[low, high]``."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        hint = "; write decimals with a point" if re.fullmatch(r"\s*-?\d+,\d+\s*", text) else ""
+        raise DatasetError(f"{where}: {name} must be a finite number, got {text!r}{hint}")
+    if not low <= value <= high:
+        bound = f"at least {low:g}" if value < low else f"at most {high:g}"
+        raise DatasetError(f"{where}: {name} must be {bound}, got {text!r}")
+    return value
+
+
+def _whole(text: str, name: str, where: str, *, low: int) -> int:
+    value = _number(text, name, where, low=low, high=2.0**53)
+    if value != int(value):
+        raise DatasetError(f"{where}: {name} must be a whole number, got {text!r}")
+    return int(value)
+
+
+def _read_csv(source: Path, classes: Collection[str] | None) -> Found:
+    del classes  # The columns hold vehicles only.
+    text = read_text(source)
+    header = text.split("\n", 1)[0]
+    separator = max(",;\t", key=header.count)
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
+    try:
+        lines = [(reader.line_num, line) for line in reader]
+    except csv.Error as error:
+        raise DatasetError(f"{source} line {reader.line_num}: no CSV text ({error})") from None
+    names = [" ".join(name.split()).lower() for name in lines[0][1]] if lines else []
+    predicted = "track_id" in names or ("score" in names and "track" not in names)
+    expected = PREDICTION_COLUMNS if predicted else LABEL_COLUMNS
+    missing = [name for name in expected if name not in names]
+    if missing:
+        raise DatasetError(
+            f"{source} lacks the columns {', '.join(missing)}; found {', '.join(names) or 'an empty file'}; "
+            f"labels have {','.join(LABEL_COLUMNS)}, predictions {','.join(PREDICTION_COLUMNS)}"
+        )
+    twice = sorted({name for name in expected if names.count(name) > 1})
+    if twice:
+        raise DatasetError(f"{source} has the column {', '.join(twice)} more than once; keep one of each")
+    records: list[tuple[str, dict[str, str]]] = []
+    for number, line in lines[1:]:
+        where = f"{source} line {number}"
+        if not any(cell.strip() for cell in line):
+            continue
+        if len(line) != len(names):
+            raise DatasetError(f"{where}: {len(names)} columns are expected, found {len(line)}")
+        records.append((where, dict(zip(names, (cell.strip() for cell in line)))))
+    # A number with leading zeros is a name; one with a sign or a decimal point is a number, checked below.
+    counted = all(re.fullmatch(r"-?(0|[1-9][0-9]*)(\.0*)?", record["frame"]) for _, record in records)
+    return [_csv_row(where, record, predicted, counted) for where, record in records], []
+
+
+def _csv_row(where: str, record: dict[str, str], predicted: bool, counted: bool) -> Row:
+    if not record["frame"]:
+        raise DatasetError(f"{where}: frame is empty; give its number from 0 or its file name")
+    frame: FrameKey = _whole(record["frame"], "frame", where, low=0) if counted else record["frame"]
+    x1, y1, x2, y2 = (_number(record[name], name, where) for name in ("x1", "y1", "x2", "y2"))
+    if predicted:
+        track = record["track_id"]
+        optional = {name: record.get(name, "") for name in ("distance_m", "speed_mps")}
+        distance, speed = (
+            math.nan if text.lower() in ("", "nan") else _number(text, name, where)
+            for name, text in optional.items()
+        )
+        return Row(
+            where,
+            frame,
+            _whole(track, "track_id", where, low=NO_TRACK) if track else NO_TRACK,
+            (x1, y1, x2, y2),
+            score=_number(record["score"], "score", where),
+            distance_m=distance,
+            speed_mps=speed,
+        )
+    flag = {"0": False, "1": True, "false": False, "true": True}.get(record["ignore"].lower())
+    if flag is None:
+        raise DatasetError(f"{where}: ignore must be 0 or 1, got {record['ignore']!r}")
+    return Row(
+        where,
+        frame,
+        _whole(record["track"], "track", where, low=NO_TRACK),
+        (x1, y1, x2, y2),
+        _whole(record["occluded"], "occluded", where, low=0),
+        _number(record["truncated"], "truncated", where, low=0, high=1),
+        flag,
+    )
+
+
+def _read_kitti(source: Path, classes: Collection[str] | None) -> Found:
+    files = (
+        sorted(source.glob("*.txt"), key=lambda file: frame_order(file.name)) if source.is_dir() else [source]
+    )
+    if not files:
+        raise DatasetError(f"{source} holds no .txt file; name a KITTI label_2 folder or a label file")
+    rows: list[Row] = []
+    for file in files:
+        for number, line in enumerate(read_text(file).splitlines(), 1):
+            if line.strip():
+                row = _kitti_row(f"{file} line {number}", file.stem, len(rows), line.split(), classes)
+                rows += [row] if row else []
+    return rows, [file.stem for file in files]
+
+
+def _kitti_row(
+    where: str, frame: str, number: int, words: list[str], classes: Collection[str] | None
+) -> Row | None:
+    """One KITTI object; None for a person. KITTI's stills have no tracks: every box gets its own number."""
+    if len(words) not in (15, 16):
+        raise DatasetError(f"{where}: a KITTI object has 15 values (16 with a score), found {len(words)}")
+    name = words[0].lower()
+    x1, y1, x2, y2 = (
+        _number(word, corner, where) for word, corner in zip(words[4:8], ("x1", "y1", "x2", "y2"))
+    )
+    score = _number(words[15], "score", where) if len(words) == 16 else None
+    if name == "dontcare":
+        return Row(where, frame, NO_TRACK, (x1, y1, x2, y2), ignore=True, score=score)
+    wanted = name in (VEHICLE_CLASSES if classes is None else classes)
+    if not wanted and name in PERSON_CLASSES:
+        return None
+    # Results carry -1 for what a detector does not know; 3 is KITTI's "unknown".
+    truncated = min(max(_number(words[1], "truncated", where), 0.0), 1.0)
+    occluded = min(max(int(_number(words[2], "occluded", where)), 0), HIDDEN)
+    unfit = occluded >= HIDDEN or truncated > CUT_OFF or x2 - x1 < NARROW
+    ignore = not wanted or (unfit and score is None)
+    return Row(where, frame, number, (x1, y1, x2, y2), occluded, truncated, ignore, score)
+
+
+def _read_mot(source: Path, classes: Collection[str] | None) -> Found:
+    rows: list[Row] = []
+    for number, line in enumerate(read_text(source).splitlines(), 1):
+        words, where = split_words(line.strip().rstrip(",")), f"{source} line {number}"
+        if words == [""]:
+            continue
+        if len(words) < 6:
+            raise DatasetError(
+                f"{where}: frame, id, x, y, width, height are expected, found {len(words)} values"
+            )
+        frame = _whole(words[0], "frame (counted from 1)", where, low=1) - 1
+        track = _whole(words[1], "id", where, low=NO_TRACK)
+        x, y, width, height = (
+            _number(word, name, where) for word, name in zip(words[2:6], ("x", "y", "width", "height"))
+        )
+        box = (x, y, x + width, y + height)
+        # Nine columns are ground truth: flag, class, visibility. Results have -1 for class, or ten columns.
+        if len(words) == 9 and words[7] != "-1":
+            if classes is None or words[7] in classes:
+                rows.append(Row(where, frame, track, box, ignore=_number(words[6], "flag", where) == 0))
+        else:
+            score = _number(words[6], "score", where) if len(words) > 6 else None
+            rows.append(Row(where, frame, track, box, score=score))
+    return rows, []
+
+
+def _read_coco(source: Path, classes: Collection[str] | None) -> Found:
+    try:
+        data = json.loads(read_text(source))
+    except json.JSONDecodeError as error:
+        raise DatasetError(f"{source} line {error.lineno}: no JSON text ({error.msg})") from None
+    parts = data if isinstance(data, dict) else {}
+    missing = [
+        name for name in ("images", "annotations", "categories") if not isinstance(parts.get(name), list)
+    ]
+    if missing:
+        raise DatasetError(f"{source} is no COCO file: it lacks the lists {', '.join(missing)}")
+    try:
+        images = {image["id"]: image.get("file_name", image["id"]) for image in data["images"]}
+        names = {entry["id"]: str(entry["name"]).lower() for entry in data["categories"]}
+    except (KeyError, TypeError, AttributeError):
+        raise DatasetError(
+            f"{source}: every image and category needs an id, and a category its name"
+        ) from None
+    if {*map(type, images.values())} not in (set(), {int}, {str}):
+        raise DatasetError(f"{source}: give every image its file_name, or none and an integer id")
+    if len(set(images.values())) < len(data["images"]):
+        raise DatasetError(f"{source}: two images share an id or a file_name; give each its own")
+    wanted = VEHICLE_CLASSES if classes is None else classes
+    if data["annotations"] and not set(names.values()) & set(wanted):
+        raise DatasetError(
+            f"{source} has no category among {', '.join(wanted)}; found "
+            f"{', '.join(map(repr, names.values())) or 'none'}; name those that are vehicles with classes="
+        )
+    rows: list[Row] = []
+    for number, entry in enumerate(data["annotations"]):
+        where = f"{source} annotation {number}"
+        try:
+            x, y, width, height = (_number(str(side), "bbox", where) for side in entry["bbox"])
+            frame, name = images[entry["image_id"]], names[entry["category_id"]]
+        except (KeyError, TypeError, ValueError) as error:
+            raise DatasetError(
+                f"{where}: it needs bbox [x, y, width, height] and the image_id and category_id of an image "
+                f"and a category in the file ({error})"
+            ) from None
+        if name not in wanted and name not in LOOKALIKE_CLASSES:
+            continue
+        score = entry.get("score")
+        track = entry.get("track_id", number if score is None else NO_TRACK)
+        crowd = bool(entry.get("iscrowd"))
+        rows.append(
+            Row(
+                where,
+                frame,
+                NO_TRACK if crowd or track is None else _whole(str(track), "track_id", where, low=NO_TRACK),
+                (x, y, x + width, y + height),
+                ignore=crowd or bool(entry.get("ignore")) or name not in wanted,
+                score=None if score is None else _number(str(score), "score", where),
+            )
+        )
+    return rows, list(images.values())
+
+
+READERS: dict[str, Callable[[Path, Collection[str] | None], Found]] = {
+    "csv": _read_csv,
+    "kitti": _read_kitti,
+    "mot": _read_mot,
+    "coco": _read_coco,
+}
 
 
 def read_labels(

@@ -1,29 +1,31 @@
 """The mixture of templates: a model for any road, and its search."""
 
-from vehicle_detection.mixture.border_strips import border_strip, strip_boxes
 from vehicle_detection.mixture.boxes import Refinement, mostly_inside, overlaps, suppress
-from vehicle_detection.mixture.crops import (
-    COLOURS,
-    CROP,
-    CROP_LENGTH,
-    EDGES,
-    box_planes,
-    crop_features,
-    crop_views,
-)
 from vehicle_detection.mixture.denoise import without_noise
 from vehicle_detection.mixture.features import (
     COARSE,
     FINE,
     PLANES,
     FeatureMap,
+    border_strip,
     halved,
     level_maps,
     mirror_planes,
     pair_levels,
+    strip_boxes,
 )
 from vehicle_detection.mixture.model import MixtureSearch, TemplateMixture, load_model
-from vehicle_detection.mixture.rescoring import Projection, Verification
+from vehicle_detection.mixture.rescoring import (
+    COLOURS,
+    CROP,
+    CROP_LENGTH,
+    EDGES,
+    Projection,
+    Verification,
+    box_planes,
+    crop_features,
+    crop_views,
+)
 from vehicle_detection.mixture.template import MixtureTemplate, smallest_box
 
 __all__ = [

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vehicle_detection._common import check_integer, describe
 from vehicle_detection.boxes import box_areas, clip_boxes, intersection_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture.crops import CROP_LENGTH, crop_features
+from vehicle_detection.mixture.rescoring import CROP_LENGTH, crop_features
 
 WEAKEST = -1.0
 """Least value of a template that makes a window a candidate."""

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from vehicle_detection._common import Take, check_number, describe, new_array
 from vehicle_detection._kernels import Filter
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture.border_strips import border_strip, strip_boxes
 from vehicle_detection.mixture.boxes import finite_array
-from vehicle_detection.mixture.features import PLANES, FeatureMap
+from vehicle_detection.mixture.features import PLANES, FeatureMap, border_strip, strip_boxes
 
 
 @dataclass(frozen=True, eq=False)

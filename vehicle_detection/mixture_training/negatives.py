@@ -27,7 +27,7 @@ from vehicle_detection.mixture import (
     strip_boxes,
     without_noise,
 )
-from vehicle_detection.mixture_training.params import MixtureParams, entries
+from vehicle_detection.mixture_training.train import MixtureParams, entries
 
 Floats = NDArray[np.float64]
 

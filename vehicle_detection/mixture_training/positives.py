@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from vehicle_detection._common import relight
 from vehicle_detection.mixture import COARSE, FINE, MixtureTemplate, Refinement, box_planes, mirror_planes
 from vehicle_detection.mixture_training.negatives import Frame
-from vehicle_detection.mixture_training.params import MixtureParams
+from vehicle_detection.mixture_training.train import MixtureParams
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]

@@ -21,8 +21,8 @@ from vehicle_detection.mixture import (
     mirror_planes,
 )
 from vehicle_detection.mixture_training.negatives import Frame, is_negative
-from vehicle_detection.mixture_training.params import MixtureParams
 from vehicle_detection.mixture_training.positives import moved_boxes
+from vehicle_detection.mixture_training.train import MixtureParams
 from vehicle_detection.params import PyramidParams
 
 Floats = NDArray[np.float64]

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from vehicle_detection.params.features import COLOR_SPACES, HOG_CHANNELS, PATCH_SIZE, FeatureParams
-from vehicle_detection.params.pyramid import PyramidParams
 from vehicle_detection.params.regions import HeatParams, RegionParams
-from vehicle_detection.params.search import REFERENCE_WIDTH, PixelBand, SearchBand, SearchParams
+from vehicle_detection.params.search import (
+    REFERENCE_WIDTH,
+    PixelBand,
+    PyramidParams,
+    SearchBand,
+    SearchParams,
+)
 from vehicle_detection.params.tracking import TrackParams
 
 __all__ = [

@@ -12,14 +12,24 @@ uniform maps.
 from __future__ import annotations
 
 from vehicle_detection.plotting.features import plot_channels, plot_features, plot_hog
-from vehicle_detection.plotting.heat import plot_heatmap
 from vehicle_detection.plotting.images import ImageFacts, describe_image, plot_methods, show_images
 from vehicle_detection.plotting.patches import plot_balance, plot_near_copies, plot_patches
-from vehicle_detection.plotting.quality import plot_errors, plot_f1, plot_precision_recall
-from vehicle_detection.plotting.search import plot_bands, plot_comparison, plot_speedups, plot_windows
+from vehicle_detection.plotting.quality import (
+    plot_errors,
+    plot_f1,
+    plot_parameter,
+    plot_precision_recall,
+    plot_tradeoff,
+)
+from vehicle_detection.plotting.search import (
+    plot_bands,
+    plot_comparison,
+    plot_heatmap,
+    plot_speedups,
+    plot_windows,
+)
 from vehicle_detection.plotting.tracks import plot_stage_times, plot_tracks
 from vehicle_detection.plotting.training import plot_scores, plot_split_scores, plot_weights
-from vehicle_detection.plotting.tuning import plot_parameter, plot_tradeoff
 
 __all__ = [
     "ImageFacts",

@@ -12,8 +12,13 @@ from vehicle_detection._common import check_integer, check_number, check_type, d
 from vehicle_detection.classifier import CLASSIFIER_REMEDY, Template, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import PATCH_SIZE, FeatureParams
-from vehicle_detection.plotting.features import channel_names, hog_channel_names, part_bounds
-from vehicle_detection.plotting.glyphs import put_glyphs, sum_blocks
+from vehicle_detection.plotting.features import (
+    channel_names,
+    hog_channel_names,
+    part_bounds,
+    put_glyphs,
+    sum_blocks,
+)
 from vehicle_detection.plotting.style import OTHER, VEHICLE, Sheet, new_axes, new_figure, panels, put_image
 from vehicle_detection.training import SPLITS, TrainingReport
 

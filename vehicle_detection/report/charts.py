@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection.report.history import Floats, TrackHistory, binned, runs
-from vehicle_detection.report.html import clock, tag, text
+from vehicle_detection.report.page import clock, tag, text
 
 COLORS = 7
 """Number of colours, as many as `draw_tracks` has; classes ``c0``, ``c1``, ..."""

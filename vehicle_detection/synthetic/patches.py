@@ -8,10 +8,8 @@ from numpy.typing import NDArray
 
 from vehicle_detection.synthetic.camera_light import Pinhole, Sensor, make_light
 from vehicle_detection.synthetic.render import Image, Placed, draw_one
-from vehicle_detection.synthetic.road import LANE, Road
-from vehicle_detection.synthetic.scenery import Canvas, Scenery
-from vehicle_detection.synthetic.shapes import KIND_SHARES, PAINT_SHARES, PAINTS, draw_share
-from vehicle_detection.synthetic.vehicles import Car
+from vehicle_detection.synthetic.scenery import LANE, Canvas, Road, Scenery
+from vehicle_detection.synthetic.vehicles import KIND_SHARES, PAINT_SHARES, PAINTS, Car, draw_share
 
 _SHAPE = (720, 1280)
 _PER_SCENE = 80

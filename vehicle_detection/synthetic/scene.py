@@ -15,10 +15,8 @@ from vehicle_detection._common import check_choice, check_integer, check_number,
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.synthetic.camera_light import LIGHTS, Light, Pinhole, Sensor, make_light
 from vehicle_detection.synthetic.render import Image, Placed, VehicleTruth, stage
-from vehicle_detection.synthetic.road import Road
-from vehicle_detection.synthetic.scenery import Scenery
-from vehicle_detection.synthetic.shapes import PAINTS
-from vehicle_detection.synthetic.vehicles import Car
+from vehicle_detection.synthetic.scenery import Road, Scenery
+from vehicle_detection.synthetic.vehicles import PAINTS, Car
 
 RandomState = int | np.random.Generator | None
 

@@ -28,12 +28,13 @@ from vehicle_detection.tracking.association import (
     same_vehicle,
 )
 from vehicle_detection.tracking.horizon_filter import HorizonFilter
-from vehicle_detection.tracking.state import (
+from vehicle_detection.tracking.track import (
     OUTWARDS,
     TINY,
     Filters,
     Floats,
     Frame,
+    Track,
     Vehicle,
     correct_filters,
     follow_box,
@@ -42,7 +43,6 @@ from vehicle_detection.tracking.state import (
     predict_filters,
     start_filters,
 )
-from vehicle_detection.tracking.track import Track
 
 __all__ = ["Track", "Tracker"]
 

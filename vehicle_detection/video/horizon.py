@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection.camera import HorizonEstimate, estimate_horizon
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.horizon import HorizonEstimate, estimate_horizon
 from vehicle_detection.video.process import read_frames
 
 LARGEST_ERROR = 0.05
