@@ -35,7 +35,9 @@ def run(context: Context) -> list[Row]:
             details={"accuracies": [round(value, 5) for value in accuracies]},
         ),
         Row(what="random split: the worst of the seeds", value=min(accuracies)),
-        Row(what="random split: near-copies among the test patches", value=split_leakage(found, random[0])),
+        Row(
+            what="random split: near duplicates among the test patches", value=split_leakage(found, random[0])
+        ),
     ]
     sequences = split_sequences(found)
     rows += [
@@ -44,7 +46,10 @@ def run(context: Context) -> list[Row]:
             value=accuracy_of(found, sequences),
             target=if_real(at_least(0.995)),
         ),
-        Row(what="sequence split: near-copies among the test patches", value=split_leakage(found, sequences)),
+        Row(
+            what="sequence split: near duplicates among the test patches",
+            value=split_leakage(found, sequences),
+        ),
     ]
     if is_real():
         for train, test in ((("GTI",), ("KITTI", "Extras")), (("KITTI", "Extras"), ("GTI",))):

@@ -5,7 +5,7 @@ window are cut out of it, its spatial bins and histograms are made, and scaler a
 Features are those of the course's third system: YCrCb, 32x32 spatial bins, 32 histogram bins, HOG of all
 channels with 9 orientations, 8 pixels a cell and 2 cells a block: 8460 values.
 
-One line differs from the course's: the band is resized before its colours are converted, not after, so that
+One line differs from the course's: the band is resized before its colors are converted, not after, so that
 rounding gives the same pixels on both sides. It costs the same.
 """
 

@@ -236,7 +236,7 @@ class Runs:
         return ResultTable([{**row, "samples": len(split.test)} for row in rows])
 
     def leakage(self, thresholds: Sequence[float] = (0.9, 0.95, 0.98)) -> ResultTable:
-        """Share of each split's test patches that have a near-copy among those trained on."""
+        """Share of each split's test patches that have a near duplicate among those trained on."""
         rows = []
         for name, seed, split in self.parts(SPLITS):
             shares = {

@@ -38,7 +38,7 @@ CASES: dict[str, dict[str, Any]] = {
 
 SEED = 7
 NEAR_M, FAR_M = 10.0, 60.0
-"""Distances, in metres, between which distance and speed are judged."""
+"""Distances, in meters, between which distance and speed are judged."""
 
 
 def run(context: Context) -> list[Row]:
@@ -81,7 +81,7 @@ def drive_rows(name: str, drive: Drive, detector: VehicleDetector, context: Cont
 
 @dataclass(frozen=True)
 class RangeErrors:
-    """Median errors of what is told about vehicles 10 to 60 m away: percent, and metres a second."""
+    """Median errors of what is told about vehicles 10 to 60 m away: percent, and meters a second."""
 
     distance: float
     speed: float

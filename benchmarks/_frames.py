@@ -19,7 +19,7 @@ from vehicle_detection import (
     read_frames,
     read_labels,
 )
-from vehicle_detection.evaluation import Labels, TrackScores
+from vehicle_detection.evaluation import FrameBoxes, TrackScores
 
 
 def run(context: Context) -> list[Row]:
@@ -43,7 +43,9 @@ def run(context: Context) -> list[Row]:
 
 def _still_rows(model: str, folder: Path, labels: Path, material: str) -> list[Row]:
     with VehicleDetector(load_model(model)) as detector:
-        found = Labels.from_detections({name: detector.detect(image) for name, image in load_frames(folder)})
+        found = FrameBoxes.from_detections(
+            {name: detector.detect(image) for name, image in load_frames(folder)}
+        )
     scores = evaluate_detections(found, read_labels(labels))
     return [
         Row(
@@ -96,10 +98,10 @@ def track_scores(source: Path, labels: Path, model: str = "default") -> TrackSco
     return evaluate_tracks(shown_boxes(results), read_labels(labels), frames=range(len(results)))
 
 
-def shown_boxes(results: Iterable[FrameResult]) -> Labels:
+def shown_boxes(results: Iterable[FrameResult]) -> FrameBoxes:
     """Boxes of the tracks that are drawn, as predictions."""
     rows = [(result.index, track) for result in results for track in result.shown]
-    return Labels(
+    return FrameBoxes(
         [index for index, _ in rows],
         np.array([track.id for _, track in rows], np.int64),
         np.array([track.box for _, track in rows], np.float64).reshape(-1, 4),

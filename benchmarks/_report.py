@@ -15,7 +15,7 @@ from typing import Any, Literal
 from rich.console import Console
 from rich.table import Table
 
-from vehicle_detection._common import JOBS_VARIABLE, available_cores, written_whole
+from vehicle_detection._common import JOBS_VARIABLE, atomic_write, available_cores
 
 LIBRARIES = (
     "imageio-ffmpeg",
@@ -162,5 +162,5 @@ def write_json(results: Results, path: Path) -> None:
             kept = dict(earlier["benchmarks"])
     kept |= {name: [row.to_dict() for row in rows] for name, rows in results.items()}
     text = json.dumps({"machine": facts, "benchmarks": kept}, indent=2, ensure_ascii=False)
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         part.write_text(text + "\n", encoding="utf-8")

@@ -21,7 +21,7 @@ from benchmarks._timing import median_of, median_seconds, seconds_of
 from vehicle_detection import SearchParams, VehicleClassifier, load_classifier, search
 from vehicle_detection._common import available_cores
 from vehicle_detection._kernels import Filter
-from vehicle_detection._kernels import color as _colour_kernels
+from vehicle_detection._kernels import color as _color_kernels
 from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.params import SearchBand
 from vehicle_detection.search import BandSearch
@@ -142,13 +142,13 @@ class _Watched:
 
 _KERNELS = {
     "hog_cells": "HOG cells",
-    "normalise_blocks": "blocks",
+    "normalize_blocks": "blocks",
     "histogram_cells": "histogram",
     "add_root_histograms": "histogram",
     "spatial_cells": "spatial bins",
 }
 _MODULES = {"cv2": {"resize": "spatial bins"}}
-_FUNCTIONS = {"resize_band": "resize", "convert_color": "colour", "_hits": "hits"}
+_FUNCTIONS = {"resize_band": "resize", "convert_color": "color", "_hits": "hits"}
 
 
 @contextlib.contextmanager
@@ -160,7 +160,7 @@ def _watch(clock: _Clock) -> Iterator[None]:
             stack.enter_context(mock.patch.object(search, name, value))
 
         put("_hog_kernels", _Watched(_hog_kernels, clock, _KERNELS, everything=True))
-        put("_colour_kernels", _Watched(_colour_kernels, clock, _KERNELS, everything=True))
+        put("_color_kernels", _Watched(_color_kernels, clock, _KERNELS, everything=True))
         for name, functions in _MODULES.items():
             put(name, _Watched(getattr(search, name), clock, functions, everything=False))
         for name, stage in _FUNCTIONS.items():

@@ -17,7 +17,7 @@ from typing import Any
 
 from benchmarks._course_runs import COURSE_C, PLANS, SPLITS, Runs
 from benchmarks._report import machine_facts
-from vehicle_detection._common import written_whole
+from vehicle_detection._common import atomic_write
 from vehicle_detection.classifier import load_classifier
 from vehicle_detection.datasets import load_training_patches
 from vehicle_detection.tuning import ResultTable
@@ -32,7 +32,7 @@ where FOLDER holds the course's `vehicles.zip` and `non-vehicles.zip` (8,792 and
 page, each table stands as a CSV and a figure in `results/`, and every single run in `results/rows.csv`.
 
 All are linear SVMs behind a `StandardScaler` that saw the training part alone, on the patches as they are
-(not mirrored). `random` is the course's split, 80 to 20, and `groups` tests on whole groups of near-copies:
+(not mirrored). `random` is the course's split, 80 to 20, and `groups` tests on whole groups of near duplicates:
 both with five seeds, mean ± standard deviation. The other splits have no chance in them: `sequences` tests
 on the last fifth of each folder by the number in the file name, `GTI to KITTI` trains on the GTI folders
 and tests on `KITTI_extracted` and `Extras`, and `KITTI to GTI` the other way round. `search, ms` is the
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         load_training_patches(Path(folder) / "vehicles.zip", Path(folder) / "non-vehicles.zip"), results
     )
     parts = [_HEAD, *(section(runs, results) for section in _SECTIONS), _machine()]
-    with written_whole(Path(options.out) / "results.md") as part:
+    with atomic_write(Path(options.out) / "results.md") as part:
         part.write_text("\n".join(parts), encoding="utf-8")
 
 
@@ -134,12 +134,12 @@ def _leakage(runs: Runs, folder: Path) -> str:
     summary = table.summarize(by=("split", "train", "test"), values=limits)
     summary.write(folder / "leakage.csv")
     _draw_bars(
-        summary, "split", "leakage_0.95", folder / "leakage.png", "share of near-copies, correlation 0.95"
+        summary, "split", "leakage_0.95", folder / "leakage.png", "share of near duplicates, correlation 0.95"
     )
     titles = " | ".join(name.replace("leakage_", "from ") for name in limits)
     lines = [
         "## How much each split leaks", "",
-        "Share of the test patches that have a near-copy among the training patches (`split_leakage`): the",
+        "Share of the test patches that have a near duplicate among the training patches (`split_leakage`): the",
         "16x16 gray thumbnails of the two correlate by at least this much.", "",
         f"| split | trained on | tested on | {titles} |", "|---|---|---|" + "---|" * len(limits),
     ]  # fmt: skip
@@ -153,7 +153,7 @@ def _shipped(runs: Runs, folder: Path) -> str:
     """Put the shipped model beside the best of the three systems as the course trained them."""
     metrics = load_classifier().metadata["metrics"]
     course = runs.compare(PLANS["systems"]).where(C=COURSE_C).summarize()
-    columns = "tested on", "shipped model", "best system, C = 1", "errors left", "near-copies in training"
+    columns = "tested on", "shipped model", "best system, C = 1", "errors left", "near duplicates in training"
     lines = [
         "## The shipped model", "",
         "`highway`, trained and judged by the command in its card on mirrored, lighter, darker and degraded",
@@ -164,7 +164,9 @@ def _shipped(runs: Runs, folder: Path) -> str:
         own = metrics["splits"][_SPLIT_KEYS[split]]
         best = max(row["accuracy"] for row in course.where(split=split))
         left = f"{(1 - own['accuracy']) / (1 - best):.0%}" if best < 1 else "-"
-        lines.append(f"| {split} | {own['accuracy']:.4f} | {best:.4f} | {left} | {own['near_copies']:.1%} |")
+        lines.append(
+            f"| {split} | {own['accuracy']:.4f} | {best:.4f} | {left} | {own['near_duplicates']:.1%} |"
+        )
     text = f"The expected calibration error is {metrics['calibration_error']:.4f} on the split by sequences."
     return "\n".join([*lines, "", text, ""])
 
@@ -254,7 +256,7 @@ def _draw_bars(table: ResultTable, label: str, value: str, path: Path, title: st
 def _save(figure: Any, path: Path) -> None:
     import matplotlib.pyplot as plt
 
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         figure.savefig(part, dpi=100)
     plt.close(figure)
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 import vehicle_detection as vd
 from vehicle_detection.datasets import PatchSet
-from vehicle_detection.evaluation import Labels
+from vehicle_detection.evaluation import FrameBoxes
 from vehicle_detection.synthetic import SceneVehicle
 
 Image = NDArray[np.uint8]
@@ -181,7 +181,7 @@ def _thinned(name: str, count: int) -> vd.LabelledFrames:
 def labelled(name: str, drawn: Sequence[Any]) -> vd.LabelledFrames:
     """Put drawn scenes and their truth together under a name."""
     rows = [(number, row) for number, scene in enumerate(drawn) for row in scene.truth]
-    labels = Labels(
+    labels = FrameBoxes(
         [number for number, _ in rows],
         np.array([row.track for _, row in rows], int),
         np.array([row.box for _, row in rows], float).reshape(-1, 4),
@@ -212,7 +212,7 @@ class Clip:
     path: Path
     horizon: float
     end: float
-    labels: Labels
+    labels: FrameBoxes
     truth: Any
 
 

@@ -5,6 +5,9 @@ import matplotlib
 import pytest
 from hypothesis import settings
 
+from tests.helpers import SMALL_MIXTURE, drawn
+from vehicle_detection.mixture_training import FrameDataset, train_mixture
+
 matplotlib.use("Agg")
 settings.register_profile("steady", derandomize=True, deadline=None, max_examples=50)
 settings.load_profile("steady")
@@ -19,3 +22,13 @@ def real_data() -> Path:
     path = Path(folder)
     assert path.is_dir(), f"VEHICLE_DETECTION_DATA names {path}, which is no folder"
     return path
+
+
+@pytest.fixture(scope="session")
+def drawn_source():
+    return FrameDataset("drawn", (drawn(range(12)),))
+
+
+@pytest.fixture(scope="session")
+def small_mixture(drawn_source):
+    return train_mixture([drawn_source], SMALL_MIXTURE, n_jobs=1)

@@ -82,7 +82,7 @@ def test_stages_are_measured_and_the_search_is_put_back(frame, classifier):
     assert vars(search) == before
     known = {
         "resize",
-        "colour",
+        "color",
         "HOG cells",
         "blocks",
         "spatial bins",

@@ -11,6 +11,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 
+from tests.helpers import random_classifier, random_template
 from vehicle_detection._common import FORMAT_VERSION, blur_patches, degrade_patches, mirror_patches
 from vehicle_detection._common.model_file import FORMAT, _checksum
 from vehicle_detection._kernels import fit_svm
@@ -28,24 +29,6 @@ from vehicle_detection.features import PatchFeatures, extract_features
 from vehicle_detection.params import FeatureParams
 
 SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
-
-
-def random_template(params, seed=0, *, bias=0.0):
-    """A template whose scores are of the order of one, on features of the usual sizes."""
-    rng = np.random.default_rng(seed)
-    hist = (params.hist_length, 8, 8) if params.hist_sqrt else (params.hist_length, 128, 100)
-    parts = ((params.spatial_length, 128, 60), hist, (params.hog_length, 0.1, 0.1))
-    mean = np.concatenate([np.full(count, mean) for count, mean, _ in parts])
-    scale = np.concatenate([scale * rng.uniform(0.5, 2, count) for count, _, scale in parts])
-    coef = rng.normal(0, params.length**-0.5, params.length)
-    return Template(mean, scale, coef, bias)
-
-
-def random_classifier(params, seed=0, *, templates=1, bias=0.0):
-    """A classifier that was never trained: its scores are as good as any for comparing two searches."""
-    return VehicleClassifier(
-        params, tuple(random_template(params, seed + index, bias=bias) for index in range(templates))
-    )
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +84,7 @@ def test_gamma_gives_mirrored_patches_another_brightness(patches, labels):
     ratios = varied.mean(axis=(1, 2, 3)) / plain.mean(axis=(1, 2, 3))
     assert (ratios < 0.95).any()
     assert (ratios > 1.05).any()
-    # Each patch decides for itself: neither its place nor its neighbours matter.
+    # Each patch decides for itself: neither its place nor its neighbors matter.
     np.testing.assert_array_equal(mirror_patches(patches[::-3], gamma=0.4), varied[::-3])
     # Black stays black, white stays white, and no value overtakes another.
     order = np.argsort(plain[0].ravel(), kind="stable")
@@ -491,7 +474,7 @@ def test_tensors_that_do_not_fit(tmp_path, tensors, message):
         ({"format_version": None}, "has format version None"),
         ({"sha256": "0" * 64}, r"was changed after it was written \(checksum differs\)"),
         ({"params": '{"orient": 0}'}, "does not fit its own parameters: orient must be an integer"),
-        ({"params": '{"colour": 1}'}, "does not fit its own parameters"),
+        ({"params": '{"color": 1}'}, "does not fit its own parameters"),
         ({"params": "[]"}, "does not fit its own parameters"),
         ({"params": "{"}, r"has no readable parameters \(.*\); get it again"),
         ({"params": "5"}, r"has no readable parameters"),

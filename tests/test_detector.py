@@ -24,11 +24,13 @@ from vehicle_detection.synthetic import render_scene
 HEIGHT, WIDTH = 180, 320
 SIDES = (160, 200, 250)  # of windows in a 1280 wide frame: 40, 50 and 62 pixels in these
 SEARCH = SearchParams(
-    bands=tuple(SearchBand(window=(side, side), y=(-100, 300)) for side in SIDES), horizon=0.5, overhang=0.3
+    bands=tuple(SearchBand(window=(side, side), y=(-100, 300)) for side in SIDES),
+    horizon=0.5,
+    horizontal_padding=0.3,
 )
 # No flanks: the red squares are flat.
-FIT = RegionParams(face_width=0.78, face_height=0.78, drop=0.0, flank_length_m=0.0)
-HEAT = HeatParams(frames=3, threshold=3.0, share=0.5)
+FIT = RegionParams(face_width=0.78, face_height=0.78, face_offset_y=0.0, flank_length_m=0.0)
+HEAT = HeatParams(frames=3, threshold=3.0, peak_fraction=0.5)
 MODES = [("shared", "fitted"), ("shared", "heat"), ("windows", "fitted"), ("windows", "heat")]
 
 
@@ -170,7 +172,7 @@ def test_what_is_too_weak_for_a_still_is_for_the_tracker_alone():
         assert len(result.regions) == 0
         assert [track.state for track in result.tracks].count("tentative") > 0
     assert len(clear.regions) == len(scores)
-    blunt = TrackParams(keep_score=0.0, birth_score=0.0)
+    blunt = TrackParams(low_threshold=0.0, high_threshold=0.0)
     with VehicleDetector(strict, track=blunt, n_jobs=1) as detector:
         assert len(detector.search(road).vehicles) == 0
         assert detector.process(road).tracks == ()

@@ -41,9 +41,9 @@ def track(box=(600, 400, 700, 490), **changes):
         "unseen": 0.0,
         "velocity": (3.0, 0.0),
         "distance_m": 23.6,
-        "distance_error_m": 2.2,
+        "distance_std_m": 2.2,
         "speed_mps": -1.75,
-        "speed_error_mps": 0.5,
+        "speed_std_mps": 0.5,
     }
     return Track(**(attributes | changes))
 
@@ -143,18 +143,18 @@ class TestTracks:
         assert draw_tracks_onto(image, [track()]) is None
         np.testing.assert_array_equal(drawn, image)
 
-    def test_box_and_label_have_the_tracks_colour(self):
+    def test_box_and_label_have_the_tracks_color(self):
         drawn = draw_tracks(blank(), [track(id=3)])
         assert tuple(drawn[489, 650].tolist()) == TRACK_COLORS[2]
         assert tuple(drawn[399, 601].tolist()) == TRACK_COLORS[2]
 
-    def test_colours_stay_with_the_id_and_repeat_after_the_palette(self):
+    def test_colors_stay_with_the_id_and_repeat_after_the_palette(self):
         count = len(TRACK_COLORS)
         assert [track_color(track(id=1 + k)) for k in range(count)] == list(TRACK_COLORS)
         assert track_color(track(id=1 + count)) == TRACK_COLORS[0]
         assert track_color(track(id=0, state="tentative")) not in TRACK_COLORS
 
-    def test_colours_are_apart_in_brightness_or_hue_for_colour_blind_eyes(self):
+    def test_colors_are_apart_in_brightness_or_hue_for_color_blind_eyes(self):
         """Machado et al. (2009), full protanopia, deuteranopia and tritanopia."""
         simulations = [
             [
@@ -185,8 +185,10 @@ class TestTracks:
 
     def test_a_coasting_track_fades(self):
         strength = []
-        for unseen in (0.0, 0.1, 0.3, 5.0):
-            drawn = draw_tracks(blank(), [track(unseen=unseen, misses=int(unseen * 25))])
+        for time_since_update in (0.0, 0.1, 0.3, 5.0):
+            drawn = draw_tracks(
+                blank(), [track(time_since_update=time_since_update, misses=int(time_since_update * 25))]
+            )
             strength.append(np.abs(drawn[489, 650].astype(int) - 90).sum())
         assert strength[0] > strength[1] > strength[2] > strength[3] > 0
 
@@ -214,11 +216,11 @@ class TestTracks:
             bare = draw_tracks(blank(height, width), tracks, show=())
             x1, y1, x2, y2 = touched(draw_tracks(blank(height, width), tracks), bare)
             sizes.append((x2 - x1, y2 - y1))
-        # A label on its own box's lines has their colour: only so much may seem to be missing.
+        # A label on its own box's lines has their color: only so much may seem to be missing.
         line = max(2, round(np.sqrt(height * width) / 320))
         assert np.abs(np.subtract(*sizes)).max() <= line
 
-    def test_labels_of_neighbours_do_not_hide_each_other(self):
+    def test_labels_of_neighbors_do_not_hide_each_other(self):
         image = blank()
         pair = [track((600, 400, 700, 490)), track((610, 402, 712, 495), id=2)]
         bare = draw_tracks(image, pair, show=())
@@ -249,10 +251,10 @@ class TestTracks:
         st.integers(1, 300),
         st.floats(0, 2),
     )
-    def test_tracks_may_lie_partly_outside_any_picture(self, corners, height, width, unseen):
+    def test_tracks_may_lie_partly_outside_any_picture(self, corners, height, width, time_since_update):
         image = blank(height, width)
         tracks = [
-            track([min(a, c), min(b, d), max(a, c), max(b, d)], id=index, unseen=unseen)
+            track([min(a, c), min(b, d), max(a, c), max(b, d)], id=index, time_since_update=time_since_update)
             for index, (a, b, c, d) in enumerate(corners, 1)
         ]
         drawn = draw_tracks(image, tracks, show=FIELDS)
@@ -283,7 +285,7 @@ class TestText:
         assert track_text(track(), ()) == ""
 
     def test_leaves_out_what_is_unknown(self):
-        unknown = track(distance_m=None, distance_error_m=None, speed_mps=None, speed_error_mps=None)
+        unknown = track(distance_m=None, distance_std_m=None, speed_mps=None, speed_std_mps=None)
         assert track_text(unknown, FIELDS) == "#1  1.2"
 
     def test_is_plain_ascii_as_the_font_has_no_more(self):

@@ -132,24 +132,24 @@ def test_regions_are_those_of_scipy(heat, threshold):
     np.testing.assert_array_equal(heat, before)
 
 
-def part_around_the_peak(heat, labels, index, share):
+def part_around_the_peak(heat, labels, index, peak_fraction):
     own = np.where(labels == index, heat, 0)
-    parts, _ = ndimage.label(own >= share * own.max(), EIGHT)
+    parts, _ = ndimage.label(own >= peak_fraction * own.max(), EIGHT)
     rows, columns = np.nonzero(parts == parts[np.unravel_index(own.argmax(), own.shape)])
     return [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
 
 
 @given(heats, st.integers(0, 2), st.floats(0.05, 0.99))
-def test_a_share_of_the_peak_shrinks_the_box_around_it(heat, threshold, share):
+def test_a_share_of_the_peak_shrinks_the_box_around_it(heat, threshold, peak_fraction):
     whole = label_boxes(heat, threshold=threshold)
-    core = label_boxes(heat, threshold=threshold, share=share)
+    core = label_boxes(heat, threshold=threshold, peak_fraction=peak_fraction)
     np.testing.assert_array_equal(core.scores, whole.scores)
     assert (core.boxes[:, :2] >= whole.boxes[:, :2]).all()
     assert (core.boxes[:, 2:] <= whole.boxes[:, 2:]).all()
     labels, count = ndimage.label(heat > threshold, EIGHT)
-    expected = [part_around_the_peak(heat, labels, index, share) for index in range(1, count + 1)]
+    expected = [part_around_the_peak(heat, labels, index, peak_fraction) for index in range(1, count + 1)]
     assert sorted(core.boxes.tolist()) == sorted(map(list, expected))
-    smaller = label_boxes(heat, threshold=threshold, share=min(0.99, share * 1.5))
+    smaller = label_boxes(heat, threshold=threshold, peak_fraction=min(0.99, peak_fraction * 1.5))
     assert (smaller.boxes[:, :2] >= core.boxes[:, :2]).all()
     assert (smaller.boxes[:, 2:] <= core.boxes[:, 2:]).all()
 
@@ -161,7 +161,7 @@ def test_regions_that_touch_at_a_corner_are_one():
 
 
 def test_no_heat_has_no_regions():
-    found = label_boxes(np.zeros(SHAPE), share=0.5)
+    found = label_boxes(np.zeros(SHAPE), peak_fraction=0.5)
     assert found.boxes.shape == (0, 4)
     assert len(label_boxes(np.ones(SHAPE), threshold=1.0)) == 0
 
@@ -171,8 +171,8 @@ def test_no_heat_has_no_regions():
     [
         ({"threshold": -1}, "threshold must be a number, at least 0"),
         ({"threshold": np.nan}, "threshold must be a number"),
-        ({"share": 1.0}, "share must be a number, at least 0 and at most 0.99"),
-        ({"share": -0.1}, "share must be a number"),
+        ({"peak_fraction": 1.0}, "peak_fraction must be a number, at least 0 and at most 0.99"),
+        ({"peak_fraction": -0.1}, "peak_fraction must be a number"),
     ],
 )
 def test_label_boxes_refuses(options, message):
@@ -184,7 +184,7 @@ def test_label_boxes_refuses(options, message):
 
 @given(windows(st.integers(-6, 24)))
 def test_bounding_boxes_is_the_three_in_one(found):
-    counted = HeatParams(weighting="count", threshold=1, share=0)
+    counted = HeatParams(weighting="count", threshold=1, peak_fraction=0)
     expected = label_boxes(apply_threshold(add_heat(np.zeros(SHAPE), found.boxes), 1))
     result = bounding_boxes((*SHAPE, 3), found, params=counted)
     np.testing.assert_array_equal(result.boxes, expected.boxes)
@@ -195,10 +195,10 @@ def test_windows_weigh_what_they_score():
     found = Detections([[0, 0, 5, 5], [10, 0, 15, 5], [5, 8, 9, 12]], [3.0, 1.0, -2.0])
     heat = frame_heat((*SHAPE, 3), found, HeatParams())
     assert (heat[0, 0], heat[0, 10], heat[9, 6]) == (3, 1, 0)
-    result = bounding_boxes(SHAPE, found, params=HeatParams(threshold=2, share=0))
+    result = bounding_boxes(SHAPE, found, params=HeatParams(threshold=2, peak_fraction=0))
     assert result.boxes.tolist() == [[0, 0, 5, 5]]
     assert result.scores.tolist() == [3]
-    counted = bounding_boxes(SHAPE, found, params=HeatParams(weighting="count", threshold=0, share=0))
+    counted = bounding_boxes(SHAPE, found, params=HeatParams(weighting="count", threshold=0, peak_fraction=0))
     assert len(counted) == 3
     assert len(bounding_boxes(SHAPE, Detections.empty())) == 0
 

@@ -5,18 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.helpers import SHAPE, boxes_on_a_road
 from vehicle_detection.camera import estimate_horizon
 from vehicle_detection.errors import InvalidInputError
-
-SHAPE = (720, 1280)
-
-
-def boxes_on_a_road(horizon, camera_height, count=40, seed=0, noise=0.0):
-    rng = np.random.default_rng(seed)
-    width = rng.uniform(30, 200, count)
-    foot = horizon * SHAPE[0] + width * camera_height / 1.8 + rng.normal(0, noise, count) * width
-    centre = rng.uniform(300, 980, count)
-    return np.stack([centre - width / 2, foot - 0.8 * width, centre + width / 2, foot], axis=1)
 
 
 @given(st.floats(0.35, 0.6), st.floats(0.9, 2.0), st.integers(0, 1000))

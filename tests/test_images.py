@@ -17,7 +17,7 @@ LOSSY = [".jpg", ".webp"]
 
 @pytest.fixture(scope="module")
 def picture():
-    """Smooth colours with a red top left corner, 40 rows of 60."""
+    """Smooth colors with a red top left corner, 40 rows of 60."""
     noise = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
     image = cv2.GaussianBlur(noise, (0, 0), 4)
     image[:10, :20] = (250, 10, 10)

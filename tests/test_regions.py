@@ -20,7 +20,7 @@ PLAIN = RegionParams(
     reach=0.6,
     face_width=0.8,
     face_height=0.75,
-    drop=0.05,
+    face_offset_y=0.05,
     flank_length_m=4.0,
     flank_shift=0.25,
     covered=0.5,
@@ -28,11 +28,11 @@ PLAIN = RegionParams(
 )
 
 
-def around(centre, side, *, step=8, spread=2, peak=2.0):
+def around(center, side, *, step=8, spread=2, peak=2.0):
     """Windows as the search leaves them around a vehicle: the nearer to it, the better."""
     offsets = np.arange(-spread, spread + 1) * step
     shifts = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
-    corners = np.array(centre) + shifts - side / 2
+    corners = np.array(center) + shifts - side / 2
     boxes = np.concatenate([corners, corners + side], axis=1)
     scores = peak - 0.03 * np.abs(shifts).sum(axis=1)
     return Detections(boxes, scores)
@@ -73,8 +73,8 @@ def test_the_mean_is_finer_than_the_step():
     # The vehicle stands between two positions of the search.
     windows = around((640.0, 420.0), 96)
     middle = np.array([642.5, 420.0])
-    centres = (windows.boxes[:, :2] + windows.boxes[:, 2:]) / 2
-    scores = 2 - 0.03 * np.abs(centres - middle).sum(axis=1)
+    centers = (windows.boxes[:, :2] + windows.boxes[:, 2:]) / 2
+    scores = 2 - 0.03 * np.abs(centers - middle).sum(axis=1)
     box = group_windows(Detections(windows.boxes, scores), PLAIN).boxes[0]
     assert 640.2 < (box[0] + box[2]) / 2 < 644
     assert (box[1] + box[3]) / 2 == pytest.approx(420)
@@ -229,7 +229,9 @@ def test_left_and_right_are_alike(found):
     np.testing.assert_allclose(boxes.boxes, expected, atol=1e-6)
 
 
-@given(any_windows(), st.sampled_from([PLAIN, RegionParams(), dataclasses.replace(PLAIN, drop=-0.5)]))
+@given(
+    any_windows(), st.sampled_from([PLAIN, RegionParams(), dataclasses.replace(PLAIN, face_offset_y=-0.5)])
+)
 def test_a_box_never_leaves_the_frame(found, params):
     boxes = find_vehicles(found, CAMERA, SHAPE, params)
     height, width = SHAPE
@@ -307,7 +309,7 @@ class TestDefaults:
         large = around((400.0, 430.0), 128, peak=2.5)
         assert len(group_windows(together(large, small))) == 1
 
-    def test_neighbours_whose_windows_overlap_stay_two(self):
+    def test_neighbors_whose_windows_overlap_stay_two(self):
         found = together(around((400.0, 430.0), 100, spread=1), around((480.0, 430.0), 100, spread=1))
         assert len(group_windows(found)) == 2
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.test_classifier import random_classifier
+from tests.helpers import random_classifier
 from vehicle_detection._common import Buffers
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
@@ -240,7 +240,7 @@ def small_search(**changes):
 @pytest.mark.parametrize("templates", [1, 2])
 def test_threads_do_not_change_the_result(params, templates):
     classifier = random_classifier(params, 2, templates=templates)
-    search = small_search(overhang=0.3)
+    search = small_search(horizontal_padding=0.3)
     one = find_cars(IMAGE, classifier, search, n_jobs=1)
     assert len(one) > 10
     for n_jobs in (2, 3):
@@ -303,7 +303,7 @@ def test_many_threads_share_one_search(monkeypatch):
 
 def test_searching_changes_nothing():
     before = IMAGE.copy()
-    find_cars(IMAGE, random_classifier(SMALL), small_search(overhang=0.5))
+    find_cars(IMAGE, random_classifier(SMALL), small_search(horizontal_padding=0.5))
     np.testing.assert_array_equal(IMAGE, before)
 
 
@@ -344,9 +344,9 @@ def test_boxes_map_back_to_the_frame():
     st.floats(0, 0.5),
 )
 @settings(max_examples=30)
-def test_windows_lie_in_the_band_and_keep_their_size(shape, window, overlap, overhang):
+def test_windows_lie_in_the_band_and_keep_their_size(shape, window, overlap, horizontal_padding):
     band = SearchBand(window=window, y=(-300, 300), overlap=overlap)
-    search = SearchParams(bands=(band,), horizon=0.5, min_score=-1e6, overhang=overhang)
+    search = SearchParams(bands=(band,), horizon=0.5, min_score=-1e6, horizontal_padding=horizontal_padding)
     try:
         (placed,) = search.place(shape)
     except InvalidInputError:

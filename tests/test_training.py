@@ -19,7 +19,7 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import extract_features
 from vehicle_detection.params import FeatureParams
 from vehicle_detection.synthetic import render_patches
-from vehicle_detection.training import SPLITS, model_card, train_and_judge
+from vehicle_detection.training import SPLITS, model_card, train_and_evaluate
 
 SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=6, pix_per_cell=16, hog_channel=0)
 SOURCES = {True: ("GTI_Far", "KITTI_extracted"), False: ("GTI", "Extras")}
@@ -41,7 +41,7 @@ def patch_set():
 
 @pytest.fixture(scope="module")
 def judged(patch_set):
-    return train_and_judge(patch_set, params=SMALL, random_state=3, seeds=2)
+    return train_and_evaluate(patch_set, params=SMALL, random_state=3, seeds=2)
 
 
 def test_every_split_is_judged(judged, patch_set):
@@ -55,7 +55,7 @@ def test_every_split_is_judged(judged, patch_set):
     for score in report.splits.values():
         assert score.train + score.test == 160
         assert 0.5 < score.accuracy <= 1
-        wrong = (score.missed + score.false) / 2
+        wrong = (score.false_negative_rate + score.false_positive_rate) / 2
         assert 1 - score.accuracy == pytest.approx(wrong, abs=0.1)
     assert set(report.seconds) == {"features", *SPLITS, "calibration", "leakage", "final"}
     assert 0 <= report.calibration_error < 0.5
@@ -65,7 +65,9 @@ def test_every_split_is_judged(judged, patch_set):
 
 @pytest.mark.parametrize(("mirror", "gamma"), [(True, 0.0), (False, 0.0), (True, 0.4)])
 def test_the_scores_are_those_of_a_classifier_that_saw_the_training_part_alone(patch_set, mirror, gamma):
-    _, report = train_and_judge(patch_set, params=SMALL, random_state=3, seeds=2, mirror=mirror, gamma=gamma)
+    _, report = train_and_evaluate(
+        patch_set, params=SMALL, random_state=3, seeds=2, mirror=mirror, gamma=gamma
+    )
     splits = {
         "random": [split_random(patch_set, random_state=seed) for seed in (3, 4)],
         "sequences": [split_sequences(patch_set)],
@@ -117,7 +119,7 @@ def test_the_model_is_that_of_all_patches(judged, patch_set):
 def test_again_it_is_the_same_file(patch_set, tmp_path, split):
     before = patch_set.patches.copy()
     for name, jobs in (("a", 1), ("b", 3)):
-        classifier, report = train_and_judge(
+        classifier, report = train_and_evaluate(
             patch_set, params=SMALL, split=split, seeds=1, n_jobs=jobs, random_state=5
         )
         classifier.save(tmp_path / name)
@@ -143,23 +145,23 @@ def test_features_are_fitted_as_they_are(patch_set):
 def test_splits_that_the_patches_do_not_allow_are_left_out():
     patches, labels = render_patches(24)
     own = named(patches, labels, {True: ("mine", "mine"), False: ("other", "other")})
-    _, report = train_and_judge(own, params=SMALL, seeds=1)
+    _, report = train_and_evaluate(own, params=SMALL, seeds=1)
     assert set(report.splits) == {"random", "sequences"}
     assert "GTI" in report.skipped["gti_to_kitti"]
     # Each patch in a folder of its own: there is no sequence.
     single = PatchSet(patches, labels, [f"{number}/1.png" for number in range(24)])
-    _, report = train_and_judge(single, params=SMALL, seeds=1)
+    _, report = train_and_evaluate(single, params=SMALL, seeds=1)
     assert set(report.splits) == {"random"}
     assert "folder of two or more patches" in report.skipped["sequences"]
     with pytest.raises(InvalidInputError, match="folder of two or more patches; use split_random"):
-        train_and_judge(single, params=SMALL, split="sequences")
+        train_and_evaluate(single, params=SMALL, split="sequences")
 
 
 def test_a_split_without_one_of_the_classes_is_left_out():
     patches, labels = render_patches(24)
     # All vehicles are alone in their folders: the split by sequences tests on the others only.
     names = [f"{number}/1.png" if label else f"others/{number}.png" for number, label in enumerate(labels)]
-    _, report = train_and_judge(PatchSet(patches, labels, names), params=SMALL, seeds=1)
+    _, report = train_and_evaluate(PatchSet(patches, labels, names), params=SMALL, seeds=1)
     assert report.skipped["sequences"] == "one side of the split lacks a class; pass more patches"
 
 
@@ -179,13 +181,13 @@ def test_a_bar_shows_on_a_terminal_alone(patch_set, monkeypatch, capsys):
         def isatty(self):
             return True
 
-    train_and_judge(patch_set[::4], params=SMALL, seeds=1, progress=True)
+    train_and_evaluate(patch_set[::4], params=SMALL, seeds=1, progress=True)
     assert capsys.readouterr().err == ""
     terminal = Terminal()
     monkeypatch.setattr("sys.stderr", terminal)
-    train_and_judge(patch_set[::4], params=SMALL, seeds=1)
+    train_and_evaluate(patch_set[::4], params=SMALL, seeds=1)
     assert terminal.getvalue() == ""
-    train_and_judge(patch_set[::4], params=SMALL, seeds=1, progress=True)
+    train_and_evaluate(patch_set[::4], params=SMALL, seeds=1, progress=True)
     assert "4/4" in terminal.getvalue()  # the two splits that these allow, the probabilities, and the model
 
 
@@ -216,7 +218,7 @@ def test_the_card_tells_data_licence_accuracy_and_limits(judged):
 
 def test_the_card_of_own_patches_says_nothing_of_the_course():
     own = named(*render_patches(24), {True: ("mine", "mine"), False: ("other", "other")})
-    classifier, report = train_and_judge(own, params=SMALL, seeds=1, mirror=False)
+    classifier, report = train_and_evaluate(own, params=SMALL, seeds=1, mirror=False)
     text = model_card(classifier, report)
     for word in ("GTI", "KITTI", "Extras", "CC BY", "```", "Other features"):
         assert word not in text
@@ -241,21 +243,21 @@ def test_the_card_of_own_patches_says_nothing_of_the_course():
 )
 def test_bad_options_are_refused(patch_set, options, message):
     with pytest.raises(InvalidInputError, match=message):
-        train_and_judge(patch_set, params=SMALL, **options)
+        train_and_evaluate(patch_set, params=SMALL, **options)
 
 
 def test_bad_patches_are_refused(patch_set):
     with pytest.raises(
         InvalidInputError, match=r"patch_set must be a PatchSet, got an array .* read one with"
     ):
-        train_and_judge(patch_set.patches)
+        train_and_evaluate(patch_set.patches)
     with pytest.raises(InvalidInputError, match="labels must hold both classes"):
-        train_and_judge(patch_set[patch_set.labels])
+        train_and_evaluate(patch_set[patch_set.labels])
     with pytest.raises(InvalidInputError, match="1 vehicles and 80 others are too few"):
-        train_and_judge(patch_set[79:])
+        train_and_evaluate(patch_set[79:])
     tiny = PatchSet(np.zeros((12, 32, 32, 3), np.uint8), [1, 0] * 6, [f"{n}.png" for n in range(12)])
     with pytest.raises(InvalidInputError, match=r"source must be an \(N, 64, 64, 3\) uint8 RGB array"):
-        train_and_judge(tiny, seeds=1)
+        train_and_evaluate(tiny, seeds=1)
 
 
 # --- the real patches ---
@@ -264,7 +266,7 @@ def test_bad_patches_are_refused(patch_set):
 @pytest.mark.realdata
 def test_a_part_of_the_course_patches(real_data):
     everything = load_training_patches(real_data / "vehicles.zip", real_data / "non-vehicles.zip")
-    classifier, report = train_and_judge(
+    classifier, report = train_and_evaluate(
         everything[::20], params=FeatureParams.preset("luv-2384"), seeds=2, split="sequences"
     )
     assert list(report.splits) == list(SPLITS)
@@ -272,5 +274,5 @@ def test_a_part_of_the_course_patches(real_data):
     assert 0.90 < report.splits["random"].accuracy < 1
     assert 0.90 < report.accuracy < 1
     assert report.splits["gti_to_kitti"].accuracy > 0.7
-    # The patches that were left out, near-copies of those that were not.
+    # The patches that were left out, near duplicates of those that were not.
     assert classifier.score(everything.patches[7::40], everything.labels[7::40]) > 0.9

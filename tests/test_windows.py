@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.test_classifier import random_classifier
+from tests.helpers import random_classifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import extract_features, single_img_features
 from vehicle_detection.params import FeatureParams, PixelBand, SearchParams

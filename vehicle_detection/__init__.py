@@ -36,6 +36,8 @@ if TYPE_CHECKING:
         VideoError,
     )
     from vehicle_detection.evaluation import (
+        LabelledFrames,
+        calibrate_scores,
         calibration_error,
         evaluate_detections,
         evaluate_tracks,
@@ -52,16 +54,21 @@ if TYPE_CHECKING:
         extract_features,
         get_hog_features,
         hog_blocks,
-        hog_picture,
+        hog_image,
         single_img_features,
     )
     from vehicle_detection.heatmap import HeatHistory, add_heat, apply_threshold, bounding_boxes, label_boxes
     from vehicle_detection.images import read_image, write_image
     from vehicle_detection.mixture import MixtureSearch, TemplateMixture, load_model
-    from vehicle_detection.mixture_training import FrameSource, MixtureParams, judge_mixture, train_mixture
+    from vehicle_detection.mixture_training import (
+        FrameDataset,
+        cross_validate_mixture,
+        train_mixture,
+    )
     from vehicle_detection.params import (
         FeatureParams,
         HeatParams,
+        MixtureParams,
         PyramidParams,
         RegionParams,
         SearchBand,
@@ -80,7 +87,7 @@ if TYPE_CHECKING:
         plot_heatmap,
         plot_hog,
         plot_methods,
-        plot_near_copies,
+        plot_near_duplicates,
         plot_parameter,
         plot_patches,
         plot_precision_recall,
@@ -99,11 +106,9 @@ if TYPE_CHECKING:
     from vehicle_detection.search import find_cars
     from vehicle_detection.synthetic import render_drive, render_patches, render_scene
     from vehicle_detection.tracking import Track, Tracker
-    from vehicle_detection.training import train_and_judge
+    from vehicle_detection.training import train_and_evaluate
     from vehicle_detection.tuning import (
-        LabelledFrames,
         ResultTable,
-        calibrate_scores,
         compare_configurations,
         mine_negatives,
         read_results,
@@ -118,8 +123,8 @@ __all__ = [
     "Detections",
     "Explorer",
     "FeatureParams",
+    "FrameDataset",
     "FrameResult",
-    "FrameSource",
     "HeatHistory",
     "HeatParams",
     "HorizonEstimate",
@@ -155,6 +160,7 @@ __all__ = [
     "color_hist",
     "compare_configurations",
     "convert_color",
+    "cross_validate_mixture",
     "describe_image",
     "draw_boxes",
     "draw_diagnostics",
@@ -172,9 +178,8 @@ __all__ = [
     "get_hog_features",
     "group_windows",
     "hog_blocks",
-    "hog_picture",
+    "hog_image",
     "iou_matrix",
-    "judge_mixture",
     "label_boxes",
     "load_classifier",
     "load_frames",
@@ -193,7 +198,7 @@ __all__ = [
     "plot_heatmap",
     "plot_hog",
     "plot_methods",
-    "plot_near_copies",
+    "plot_near_duplicates",
     "plot_parameter",
     "plot_patches",
     "plot_precision_recall",
@@ -225,7 +230,7 @@ __all__ = [
     "split_random",
     "split_sequences",
     "split_sources",
-    "train_and_judge",
+    "train_and_evaluate",
     "train_classifier",
     "train_mixture",
     "write_boxes",
@@ -235,9 +240,7 @@ __all__ = [
 
 _ROOMS = {
     "tuning": (
-        "LabelledFrames",
         "ResultTable",
-        "calibrate_scores",
         "compare_configurations",
         "mine_negatives",
         "read_results",
@@ -255,7 +258,7 @@ _ROOMS = {
         "plot_heatmap",
         "plot_hog",
         "plot_methods",
-        "plot_near_copies",
+        "plot_near_duplicates",
         "plot_parameter",
         "plot_patches",
         "plot_precision_recall",
@@ -272,13 +275,14 @@ _ROOMS = {
     "explorer": ("Explorer",),
     "horizon": ("HorizonEstimate", "estimate_horizon"),
     "mixture": ("MixtureSearch", "TemplateMixture", "load_model"),
-    "mixture_training": ("FrameSource", "MixtureParams", "train_mixture"),
-    "mixture_report": ("judge_mixture",),
-    "training": ("train_and_judge",),
+    "mixture_training": ("FrameDataset", "train_mixture"),
+    "mixture_report": ("cross_validate_mixture",),
+    "training": ("train_and_evaluate",),
     "errors": ("DatasetError", "InvalidInputError", "ModelFileError", "VehicleDetectionError", "VideoError"),
     "params": (
         "FeatureParams",
         "HeatParams",
+        "MixtureParams",
         "PyramidParams",
         "RegionParams",
         "SearchBand",
@@ -296,7 +300,7 @@ _ROOMS = {
         "extract_features",
         "get_hog_features",
         "hog_blocks",
-        "hog_picture",
+        "hog_image",
         "single_img_features",
     ),
     "datasets": (
@@ -322,6 +326,8 @@ _ROOMS = {
     "detector": ("FrameResult", "VehicleDetector"),
     "video": ("VideoReport", "probe_video", "process_video", "read_frames"),
     "evaluation": (
+        "LabelledFrames",
+        "calibrate_scores",
         "calibration_error",
         "evaluate_detections",
         "evaluate_tracks",

@@ -33,13 +33,13 @@ class Distance(NamedTuple):
 
     Attributes
     ----------
-    metres
-        Distance along the road in metres; NaN where it is unknown.
+    meters
+        Distance along the road in meters; NaN where it is unknown.
     error
-        Standard error in metres; infinite where the distance is unknown.
+        Standard error in meters; infinite where the distance is unknown.
     """
 
-    metres: Floats
+    meters: Floats
     error: Floats
 
 
@@ -62,55 +62,55 @@ class Camera:
         Focal length in pixels: the frame's width over ``2 * tan(half the horizontal field of view)``.
     horizon_px
         Row of the horizon.
-    horizon_doubt_px
+    horizon_std_px
         Standard error of `horizon_px` where it is a guess, in pixels of the frame; 0 where it was measured.
         The tracker learns the row from the vehicles it follows as far as this lets it.
     height_m
         Height of the lens above the road.
-    vehicle_width_m, vehicle_width_error_m
+    vehicle_width_m, vehicle_width_std_m
         Width of a vehicle that is not known any better, and its spread.
-    vehicle_length_m, vehicle_length_error_m
+    vehicle_length_m, vehicle_length_std_m
         Length of the flank that a vehicle shows beside the camera's path, as far as it widens the box, and
         its spread.
-    foot_error_px, horizon_error_px
+    bottom_std_px, horizon_error_px
         Standard errors of a box's lower edge and of the horizon (pitch, hills), in pixels of a camera with
         a focal length of ``REFERENCE_FOCAL``. The horizon's stays alike for seconds.
     box_error
-        Standard error of a box's edges as a share of its size, on top of `foot_error_px`.
-    focal_error, height_error_m
+        Standard error of a box's edges as a share of its size, on top of `bottom_std_px`.
+    focal_std, height_std_m
         Standard errors of the focal length, as a share, and of the camera's height; they scale all distances.
 
     Examples
     --------
-    >>> camera = Camera.for_frame((720, 1280), horizon=0.5, focal_error=0.0, height_error_m=0.0)
+    >>> camera = Camera.for_frame((720, 1280), horizon=0.5, focal_std=0.0, height_std_m=0.0)
     >>> round(camera.focal_px), camera.horizon_px
     (1155, 360.0)
     >>> near = distance_from_foot([460.0, 360.0], camera)
-    >>> near.metres.round(1), near.error.round(1)
+    >>> near.meters.round(1), near.error.round(1)
     (array([15., nan]), array([0.6, inf]))
     """
 
     focal_px: float
     horizon_px: float
-    horizon_doubt_px: float = 0.0
+    horizon_std_px: float = 0.0
     height_m: float = 1.3
     vehicle_width_m: float = 1.8
-    vehicle_width_error_m: float = 0.25
+    vehicle_width_std_m: float = 0.25
     vehicle_length_m: float = 4.0
-    vehicle_length_error_m: float = 0.8
-    foot_error_px: float = 2.5
+    vehicle_length_std_m: float = 0.8
+    bottom_std_px: float = 2.5
     horizon_error_px: float = 3.0
     box_error: float = 0.04
-    focal_error: float = 0.08
-    height_error_m: float = 0.1
+    focal_std: float = 0.08
+    height_std_m: float = 0.1
 
     def __post_init__(self) -> None:
         for name in ("focal_px", "height_m", "vehicle_width_m"):
             check_number(getattr(self, name), name, above=0, high=1e6)
         check_number(self.horizon_px, "horizon_px", low=-1e6, high=1e6)
-        errors = ("vehicle_width_error_m", "foot_error_px", "horizon_error_px", "box_error", "focal_error")
-        lengths = ("vehicle_length_m", "vehicle_length_error_m")
-        for name in (*errors, *lengths, "height_error_m", "horizon_doubt_px"):
+        errors = ("vehicle_width_std_m", "bottom_std_px", "horizon_error_px", "box_error", "focal_std")
+        lengths = ("vehicle_length_m", "vehicle_length_std_m")
+        for name in (*errors, *lengths, "height_std_m", "horizon_std_px"):
             check_number(getattr(self, name), name, low=0, high=1e6)
 
     @classmethod
@@ -130,13 +130,13 @@ class Camera:
         shape
             ``(height, width, ...)``, as ``image.shape``.
         horizon
-            Row of the horizon as a share of the height, 0 at the top; with ``horizon_doubt_px`` as a guess.
+            Row of the horizon as a share of the height, 0 at the top; with ``horizon_std_px`` as a guess.
         field_of_view
             Angle in degrees that the frame's longer side sees.
         height_m
-            Height of the lens above the road in metres.
+            Height of the lens above the road in meters.
         **known
-            Other attributes of the class, such as ``focal_error=0.01`` for a calibrated lens.
+            Other attributes of the class, such as ``focal_std=0.01`` for a calibrated lens.
 
         Raises
         ------
@@ -162,16 +162,16 @@ class Camera:
     @property
     def tilt_error_px(self) -> float:
         """Standard error of the horizon's row in pixels of the frame: the doubt, pitch and hills together."""
-        return math.hypot(self.horizon_error_px * self.pixel_scale, self.horizon_doubt_px)
+        return math.hypot(self.horizon_error_px * self.pixel_scale, self.horizon_std_px)
 
     @property
     def foot_scale_error(self) -> float:
         """Standard error, as a share, that all distances from the foot have in common."""
-        return math.hypot(self.focal_error, self.height_error_m / self.height_m)
+        return math.hypot(self.focal_std, self.height_std_m / self.height_m)
 
 
 def distance_from_foot(
-    y_foot: ArrayLike, camera: Camera, *, foot_error_px: ArrayLike | None = None
+    y_foot: ArrayLike, camera: Camera, *, bottom_std_px: ArrayLike | None = None
 ) -> Distance:
     """Distance of points on the road from their rows: ``focal * height / (row - horizon)``.
 
@@ -181,7 +181,7 @@ def distance_from_foot(
         Rows in pixels, any shape: the lower edges of boxes.
     camera
         The camera.
-    foot_error_px
+    bottom_std_px
         Standard error of the rows in pixels; by default the camera's own.
 
     Returns
@@ -191,21 +191,21 @@ def distance_from_foot(
         row's and the horizon's error: the road is out of sight there.
     """
     rows = np.asarray(y_foot, np.float64)
-    own = camera.foot_error_px * camera.pixel_scale if foot_error_px is None else foot_error_px
+    own = camera.bottom_std_px * camera.pixel_scale if bottom_std_px is None else bottom_std_px
     row_error = np.hypot(own, camera.tilt_error_px)
     below = rows - camera.horizon_px
     known = below > row_error
     drop = np.where(known, below, 1.0)
-    metres = np.where(known, camera.focal_px * camera.height_m / drop, np.nan)
-    error = np.where(known, metres * np.hypot(row_error / drop, camera.foot_scale_error), np.inf)
-    return Distance(metres, error)
+    meters = np.where(known, camera.focal_px * camera.height_m / drop, np.nan)
+    error = np.where(known, meters * np.hypot(row_error / drop, camera.foot_scale_error), np.inf)
+    return Distance(meters, error)
 
 
 def distance_from_width(
     width: ArrayLike,
     camera: Camera,
     *,
-    width_error_px: ArrayLike | None = None,
+    width_std_px: ArrayLike | None = None,
     aside_px: ArrayLike = 0.0,
 ) -> Distance:
     """Distance of vehicles from their boxes' width: ``focal * vehicle width / width`` straight ahead.
@@ -220,7 +220,7 @@ def distance_from_width(
         Widths in pixels, any shape.
     camera
         The camera, with the width of a vehicle and its spread.
-    width_error_px
+    width_std_px
         Standard error of the widths in pixels; by default the camera's, for two edges.
     aside_px
         How far the boxes' inner edges lie from the middle of the frame; 0 for boxes across it.
@@ -233,20 +233,20 @@ def distance_from_width(
     widths = np.asarray(width, np.float64)
     known = widths >= 1
     seen = np.where(known, widths, 1.0)
-    own = camera.foot_error_px * camera.pixel_scale
+    own = camera.bottom_std_px * camera.pixel_scale
     edge = np.hypot(own, camera.box_error * seen) * math.sqrt(2)
-    width_error = edge if width_error_px is None else np.asarray(width_error_px, np.float64)
+    width_error = edge if width_std_px is None else np.asarray(width_std_px, np.float64)
     aside = np.asarray(aside_px, np.float64)
     unit = width_times_distance(camera, aside)
-    varied = np.hypot(camera.focal_px * camera.vehicle_width_error_m, aside * camera.vehicle_length_error_m)
-    spread = np.hypot(varied / unit, camera.focal_error)
-    metres = np.where(known, unit / seen, np.nan)
-    error = np.where(known, metres * np.hypot(width_error / seen, spread), np.inf)
-    return Distance(metres, error)
+    varied = np.hypot(camera.focal_px * camera.vehicle_width_std_m, aside * camera.vehicle_length_std_m)
+    spread = np.hypot(varied / unit, camera.focal_std)
+    meters = np.where(known, unit / seen, np.nan)
+    error = np.where(known, meters * np.hypot(width_error / seen, spread), np.inf)
+    return Distance(meters, error)
 
 
 def width_times_distance(camera: Camera, aside_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Width in pixels times distance in metres of a vehicle, whose flank shows if it is aside."""
+    """Width in pixels times distance in meters of a vehicle, whose flank shows if it is aside."""
     return camera.focal_px * camera.vehicle_width_m + camera.vehicle_length_m * aside_px
 
 
@@ -266,20 +266,20 @@ def join_distances(first: Distance, second: Distance) -> Distance:
     --------
     >>> one, two = (Distance(np.array([z]), np.array([e])) for z, e in ((20.0, 1.0), (23.0, 2.0)))
     >>> joined = join_distances(one, two)
-    >>> joined.metres.round(2), joined.error.round(2)
+    >>> joined.meters.round(2), joined.error.round(2)
     (array([20.6]), array([1.2]))
     """
     weights = [
         np.where(np.isfinite(d.error), 1 / np.square(np.maximum(d.error, 1e-9)), 0.0) for d in (first, second)
     ]
-    values = [np.where(np.isfinite(d.error), d.metres, 0.0) for d in (first, second)]
+    values = [np.where(np.isfinite(d.error), d.meters, 0.0) for d in (first, second)]
     total = weights[0] + weights[1]
     known = total > 0
     safe = np.where(known, total, 1.0)
-    metres = (weights[0] * values[0] + weights[1] * values[1]) / safe
-    chi_square = sum(w * np.square(v - metres) for w, v in zip(weights, values))
+    meters = (weights[0] * values[0] + weights[1] * values[1]) / safe
+    chi_square = sum(w * np.square(v - meters) for w, v in zip(weights, values))
     error = np.sqrt(np.maximum(chi_square, 1.0) / safe)
-    return Distance(np.where(known, metres, np.nan), np.where(known, error, np.inf))
+    return Distance(np.where(known, meters, np.nan), np.where(known, error, np.inf))
 
 
 def estimate_distance(boxes: ArrayLike, camera: Camera, shape: tuple[int, ...]) -> Distance:
@@ -297,7 +297,7 @@ def estimate_distance(boxes: ArrayLike, camera: Camera, shape: tuple[int, ...]) 
     Returns
     -------
     Distance
-        ``(N,)`` metres and errors; unknown where neither foot nor width is to be had.
+        ``(N,)`` meters and errors; unknown where neither foot nor width is to be had.
 
     Raises
     ------
@@ -307,27 +307,27 @@ def estimate_distance(boxes: ArrayLike, camera: Camera, shape: tuple[int, ...]) 
     Examples
     --------
     >>> camera = Camera.for_frame((720, 1280))
-    >>> estimate_distance([[600, 400, 700, 490], [0, 300, 90, 719]], camera, (720, 1280)).metres.round(1)
+    >>> estimate_distance([[600, 400, 700, 490], [0, 300, 90, 719]], camera, (720, 1280)).meters.round(1)
     array([18.1,  nan])
     """
     array = check_boxes(boxes).astype(np.float64)
-    cut = cut_edges(array, check_shape(shape))
+    cut = truncated_edges(array, check_shape(shape))
     # Foot and width share the focal length: its error is left out of their weights and added at the end.
-    exact = dataclasses.replace(camera, focal_error=0.0)
+    exact = dataclasses.replace(camera, focal_std=0.0)
     height_error = camera.box_error * (array[:, 3] - array[:, 1])
     foot = distance_from_foot(
         np.where(cut[:, 3], -np.inf, array[:, 3]),
         exact,
-        foot_error_px=np.hypot(camera.foot_error_px * camera.pixel_scale, height_error),
+        bottom_std_px=np.hypot(camera.bottom_std_px * camera.pixel_scale, height_error),
     )
     seen = np.where(cut[:, 0] | cut[:, 2], 0.0, array[:, 2] - array[:, 0])
     width = distance_from_width(seen, exact, aside_px=inner_edges(array, shape))
-    metres, error = join_distances(foot, width)
-    shared = np.where(np.isfinite(error), camera.focal_error * metres, 0.0)
-    return Distance(metres, np.hypot(error, shared))
+    meters, error = join_distances(foot, width)
+    shared = np.where(np.isfinite(error), camera.focal_std * meters, 0.0)
+    return Distance(meters, np.hypot(error, shared))
 
 
-def cut_edges(boxes: NDArray[Any], shape: tuple[int, int]) -> NDArray[np.bool_]:
+def truncated_edges(boxes: NDArray[Any], shape: tuple[int, int]) -> NDArray[np.bool_]:
     """Which edges of ``(N, 4)`` boxes end at the frame's border, as a bool each: there may be more beyond.
 
     A search ends up to a step short of the border, so "at" grows with the box.
@@ -355,7 +355,7 @@ class HorizonEstimate:
     error
         Its standard error, in the same unit: above 0.05 it is a guess.
     camera_height_m
-        Height of the camera over the road in metres, if vehicles are 1.8 m wide.
+        Height of the camera over the road in meters, if vehicles are 1.8 m wide.
     boxes
         Number of boxes that it rests on.
     """
@@ -399,7 +399,7 @@ def estimate_horizon(boxes: ArrayLike, shape: tuple[int, ...], *, random_state: 
     """
     frame = check_shape(shape)
     array = check_boxes(boxes).astype(np.float64)
-    whole = array[~cut_edges(array, frame).any(axis=1)]
+    whole = array[~truncated_edges(array, frame).any(axis=1)]
     width = whole[:, 2] - whole[:, 0]
     if len(whole) < _LEAST_BOXES:
         raise InvalidInputError(

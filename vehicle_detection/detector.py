@@ -212,7 +212,7 @@ class VehicleDetector:
         params = self.search_params
         if isinstance(params, PyramidParams):
             assert isinstance(self._engine, MixtureSearch)
-            least = min(0.0, self.track_params.keep_score, self.track_params.birth_score)
+            least = min(0.0, self.track_params.low_threshold, self.track_params.high_threshold)
             found = self._engine.find(frame, params, least=least)
             windows, vehicles = found.windows, found.vehicles
         elif isinstance(self._engine, BandSearch):
@@ -266,7 +266,9 @@ class VehicleDetector:
         return find_vehicles(found.windows, self._camera_of(found.shape), found.shape, self.region_params)
 
     def _label(self, heat: NDArray[np.float32]) -> Detections:
-        return label_boxes(heat, threshold=self.heat_params.threshold, share=self.heat_params.share)
+        return label_boxes(
+            heat, threshold=self.heat_params.threshold, peak_fraction=self.heat_params.peak_fraction
+        )
 
     def _camera_of(self, shape: tuple[int, int]) -> Camera:
         if self.camera is not None:
@@ -276,7 +278,7 @@ class VehicleDetector:
             return Camera.for_frame(shape)
         # The search allows for a horizon that is off; the tracker learns by how much.
         error = search.horizon_error if isinstance(search, PyramidParams) else _BAND_ERROR
-        return Camera.for_frame(shape, horizon=search.horizon, horizon_doubt_px=_DOUBT * error * shape[0])
+        return Camera.for_frame(shape, horizon=search.horizon, horizon_std_px=_DOUBT * error * shape[0])
 
     def process(self, frame: NDArray[np.uint8], time: float | None = None) -> FrameResult:
         """Search the next frame of a video and follow its vehicles.

@@ -107,10 +107,10 @@ TRACK_COLORS: tuple[Color, ...] = (
     (213, 94, 0),
     (204, 121, 167),
 )
-"""RGB colours that stay apart for colour-blind eyes (Okabe and Ito, *Color Universal Design*, 2008)."""
+"""RGB colors that stay apart for color-blind eyes (Okabe and Ito, *Color Universal Design*, 2008)."""
 
 _VAGUE_SPEED = 3.0
-"""A speed with a greater standard error, in metres a second, is not worth showing."""
+"""A speed with a greater standard error, in meters a second, is not worth showing."""
 
 FIELDS = ("id", "score", "distance", "speed", "errors")
 """What a track's label can show; ``"errors"`` adds standard errors to distance and speed."""
@@ -198,7 +198,7 @@ def draw_labeled_bboxes(image: Image, labels: tuple[NDArray[Any], int]) -> Image
 def draw_tracks(
     image: Image, tracks: Iterable[Track], *, show: Collection[str] = ("id", "distance", "speed")
 ) -> Image:
-    """Draw tracks on a copy of an image, each with a box and a label in its own colour, sized to the image.
+    """Draw tracks on a copy of an image, each with a box and a label in its own color, sized to the image.
 
     Tracks that are not to be shown are left out; one that is not seen in this frame fades.
 
@@ -209,7 +209,7 @@ def draw_tracks(
     tracks
         What `Tracker.update` returned for this frame.
     show
-        What the label holds, out of ``FIELDS``; distances in metres, speeds relative to the camera in metres
+        What the label holds, out of ``FIELDS``; distances in meters, speeds relative to the camera in meters
         a second, positive when moving away. What is unknown is left out.
 
     Returns
@@ -266,12 +266,12 @@ def _put_label(image: Image, track: Track, text: str, scale: float, occupied: li
 
 
 def track_color(track: Track) -> Color:
-    """RGB colour of a track, the same in every frame: by its id, gray while tentative."""
+    """RGB color of a track, the same in every frame: by its id, gray while tentative."""
     return TRACK_COLORS[(track.id - 1) % len(TRACK_COLORS)] if track.id > 0 else _TENTATIVE
 
 
 def _alpha(track: Track) -> float:
-    return max(_FAINTEST, 1 - track.unseen / _FADE_SECONDS * (1 - _FAINTEST))
+    return max(_FAINTEST, 1 - track.time_since_update / _FADE_SECONDS * (1 - _FAINTEST))
 
 
 def track_text(track: Track, show: Collection[str]) -> str:
@@ -282,8 +282,8 @@ def track_text(track: Track, show: Collection[str]) -> str:
     >>> import numpy as np
     >>> track = Track(
     ...     id=3, box=np.array([0.0, 0, 9, 9]), score=1.5, state="confirmed", shown=True, age=1.0, misses=0,
-    ...     unseen=0.0, velocity=(0.0, 0.0), distance_m=23.6, distance_error_m=2.2, speed_mps=-1.25,
-    ...     speed_error_mps=0.5,
+    ...     unseen=0.0, velocity=(0.0, 0.0), distance_m=23.6, distance_std_m=2.2, speed_mps=-1.25,
+    ...     speed_std_mps=0.5,
     ... )
     >>> track_text(track, ("id", "score", "distance", "speed"))
     '#3  1.5  24 m  -1.2 m/s'
@@ -292,10 +292,10 @@ def track_text(track: Track, show: Collection[str]) -> str:
     parts = [f"#{track.id}"] if "id" in show else []
     if "score" in show:
         parts.append(f"{track.score:.1f}")
-    if "distance" in show and track.distance_m is not None and track.distance_error_m is not None:
-        parts.append(f"{track.distance_m:.0f}{f' +-{track.distance_error_m:.0f}' if errors else ''} m")
-    if "speed" in show and track.speed_mps is not None and (track.speed_error_mps or 0) <= _VAGUE_SPEED:
-        parts.append(f"{track.speed_mps:+.1f}{f' +-{track.speed_error_mps or 0:.1f}' if errors else ''} m/s")
+    if "distance" in show and track.distance_m is not None and track.distance_std_m is not None:
+        parts.append(f"{track.distance_m:.0f}{f' +-{track.distance_std_m:.0f}' if errors else ''} m")
+    if "speed" in show and track.speed_mps is not None and (track.speed_std_mps or 0) <= _VAGUE_SPEED:
+        parts.append(f"{track.speed_mps:+.1f}{f' +-{track.speed_std_mps or 0:.1f}' if errors else ''} m/s")
     return "  ".join(parts)
 
 

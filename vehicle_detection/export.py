@@ -17,7 +17,7 @@ from typing import IO, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from vehicle_detection._common import check_choice, check_target, describe, written_whole
+from vehicle_detection._common import atomic_write, check_choice, check_target, describe
 from vehicle_detection.errors import InvalidInputError
 
 BOX_COLUMNS = ("frame", "track_id", "x1", "y1", "x2", "y2", "score")
@@ -273,7 +273,7 @@ def write_boxes(
     if kind in ("parquet", "coco"):
         _write_whole(rows, names, path, kind, BOX_COLUMNS, None)
     else:
-        with written_whole(path, "path") as part, _open_text(part) as file:
+        with atomic_write(path, "path") as part, _open_text(part) as file:
             put = _text_writer(file, kind, BOX_COLUMNS)
             for row in rows:
                 put(row)
@@ -327,7 +327,7 @@ class TrackWriter:
 
     def __enter__(self) -> TrackWriter:
         with contextlib.ExitStack() as stack:
-            part = stack.enter_context(written_whole(self._path, "path"))
+            part = stack.enter_context(atomic_write(self._path, "path"))
             file = stack.enter_context(_open_text(part))
             self._put = _text_writer(file, self._kind, TRACK_COLUMNS)
             self._stack = stack.pop_all()
@@ -423,7 +423,7 @@ def _write_whole(
         _write_parquet(rows, path, columns)
         return
     document = _coco_document(rows, frames, shape)
-    with written_whole(path, "path") as part, _open_text(part) as file:
+    with atomic_write(path, "path") as part, _open_text(part) as file:
         json.dump(document, file, ensure_ascii=False)
 
 
@@ -441,7 +441,7 @@ def _write_parquet(rows: Sequence[Row], path: str | os.PathLike[str], columns: S
         [pyarrow.array([row[place] for row in rows], kind) for place, kind in enumerate(types)],
         names=list(columns),
     )
-    with written_whole(path, "path") as part:
+    with atomic_write(path, "path") as part:
         pyarrow.parquet.write_table(table, part)
 
 

@@ -90,7 +90,7 @@ def apply_threshold(heatmap: NDArray[Any], threshold: float) -> NDArray[np.float
     return heat
 
 
-def label_boxes(heatmap: NDArray[Any], *, threshold: float = 0.0, share: float = 0.0) -> Detections:
+def label_boxes(heatmap: NDArray[Any], *, threshold: float = 0.0, peak_fraction: float = 0.0) -> Detections:
     """Find the connected regions of a heat map and their boxes.
 
     Parameters
@@ -99,7 +99,7 @@ def label_boxes(heatmap: NDArray[Any], *, threshold: float = 0.0, share: float =
         ``(H, W)`` heat.
     threshold
         Heat at or below this belongs to no region.
-    share
+    peak_fraction
         0 gives the box of the whole region, as the course does. In (0, 1), the box of the part around the
         region's peak that reaches this share of the peak's heat: windows spill over the vehicle, and the
         spill is cooler.
@@ -121,15 +121,15 @@ def label_boxes(heatmap: NDArray[Any], *, threshold: float = 0.0, share: float =
     ([[1, 1, 4, 2]], [[2, 1, 4, 2]])
     """
     heat = _check_heat(heatmap)
-    check_number(share, "share", low=0, high=0.99)
+    check_number(peak_fraction, "peak_fraction", low=0, high=0.99)
     boxes, peaks = [], []
     for left, top, region, member in _components(heat > check_number(threshold, "threshold", low=0)):
         part = np.where(member, heat[region], 0)
         peak = float(part.max())
         x1, y1, x2, y2 = left, top, left + part.shape[1], top + part.shape[0]
-        if share > 0:
+        if peak_fraction > 0:
             row, column = np.unravel_index(int(part.argmax()), part.shape)
-            for x, y, inner, around in _components(part >= share * peak):
+            for x, y, inner, around in _components(part >= peak_fraction * peak):
                 rows, columns = inner
                 if rows.start <= row < rows.stop and columns.start <= column < columns.stop:
                     if not around[row - rows.start, column - columns.start]:
@@ -179,7 +179,9 @@ def bounding_boxes(
     [[0, 0, 12, 8]]
     """
     params = params or HeatParams()
-    return label_boxes(frame_heat(shape, windows, params), threshold=params.threshold, share=params.share)
+    return label_boxes(
+        frame_heat(shape, windows, params), threshold=params.threshold, peak_fraction=params.peak_fraction
+    )
 
 
 def frame_heat(shape: tuple[int, ...], windows: Detections, params: HeatParams) -> NDArray[np.float32]:

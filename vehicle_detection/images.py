@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_image, written_whole
+from vehicle_detection._common import atomic_write, check_image
 from vehicle_detection.errors import InvalidInputError
 
 
@@ -102,6 +102,6 @@ def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
         raise InvalidInputError(
             f"path must end in .png, .jpg or another image suffix, got {Path(path).name!r}"
         )
-    with written_whole(path, "path") as part:
+    with atomic_write(path, "path") as part:
         if not cv2.imwrite(str(part), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)):
             raise InvalidInputError(f"{path} could not be written; is the disk full?")

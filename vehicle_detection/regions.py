@@ -87,18 +87,18 @@ def group_windows(windows: Detections, params: RegionParams | None = None) -> Wi
             peaks.append(peak)
             evidence.append(total)
         # Windows of other sizes and offsets on the same vehicle do not found a group of their own.
-        centres = (left.boxes[:, :2] + left.boxes[:, 2:]) / 2
+        centers = (left.boxes[:, :2] + left.boxes[:, 2:]) / 2
         middle, reach = (box[:2] + box[2:]) / 2, params.reach * (box[2:] - box[:2])
-        left = left[~(joined | (np.abs(centres - middle) < reach).all(axis=1))]
+        left = left[~(joined | (np.abs(centers - middle) < reach).all(axis=1))]
     return WindowGroups(np.array(boxes).reshape(-1, 4), np.array(peaks), np.array(evidence))
 
 
 def _mean_box(boxes: NDArray[Any], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weighted mean of centres and of logarithmic sizes, as one box."""
+    """Weighted mean of centers and of logarithmic sizes, as one box."""
     share = weights / weights.sum()
-    centre = share @ ((boxes[:, :2] + boxes[:, 2:]) / 2)
+    center = share @ ((boxes[:, :2] + boxes[:, 2:]) / 2)
     half = np.exp(share @ np.log(boxes[:, 2:] - boxes[:, :2])) / 2
-    return np.concatenate([centre - half, centre + half])
+    return np.concatenate([center - half, center + half])
 
 
 def fit_boxes(
@@ -130,18 +130,20 @@ def fit_boxes(
     """
     params = params or RegionParams()
     size = groups.boxes[:, 2:] - groups.boxes[:, :2]
-    centre = (groups.boxes[:, 2:] + groups.boxes[:, :2]) / 2
+    center = (groups.boxes[:, 2:] + groups.boxes[:, :2]) / 2
     distance = camera.focal_px * camera.vehicle_width_m / (params.face_width * size[:, 0])
-    aside = centre[:, 0] - shape[1] / 2
+    aside = center[:, 0] - shape[1] / 2
     edge = np.clip(np.abs(aside) - size[:, 0] / 2, 0, None)
     flank = edge * params.flank_length_m / (distance + params.flank_length_m)
     face = np.stack([params.face_width * size[:, 0], params.face_height * size[:, 1]], axis=1)
     # The windows agree on a place between the face and the flank, as the patches show a part of it.
-    shift = np.stack([-np.sign(aside) * params.flank_shift * flank, params.drop * size[:, 1]], axis=1)
+    shift = np.stack(
+        [-np.sign(aside) * params.flank_shift * flank, params.face_offset_y * size[:, 1]], axis=1
+    )
     half = (face + np.stack([flank, np.zeros_like(flank)], axis=1)) / 2
-    boxes = np.concatenate([centre + shift - half, centre + shift + half], axis=1)
+    boxes = np.concatenate([center + shift - half, center + shift + half], axis=1)
     boxes = clip_boxes(boxes, shape)
-    faces = clip_boxes(np.concatenate([centre - face / 2, centre + face / 2], axis=1), shape)
+    faces = clip_boxes(np.concatenate([center - face / 2, center + face / 2], axis=1), shape)
     kept = ~_on_other_vehicles(faces, boxes, groups.peaks, params) & (box_areas(boxes) > 0)
     return Detections(boxes[kept], groups.peaks[kept])
 

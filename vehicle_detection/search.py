@@ -2,11 +2,11 @@
 
 Scaler and SVM fold into one affine function of the feature vector (`Template.fold`). A band of the frame is
 resized once so that a window is 64x64; then each part of the vector is a set of planes over the band's
-cells, and each part of the weights is a filter over an 8x8 neighbourhood of cells:
+cells, and each part of the weights is a filter over an 8x8 neighborhood of cells:
 
-- HOG: a plane for each channel, place in the block and orientation, normalised once for all windows.
+- HOG: a plane for each channel, place in the block and orientation, normalized once for all windows.
 - Spatial bins: a plane for each channel and place of a bin in its cell.
-- Colour histogram: the weight of a pixel's value is looked up, so the histogram's share of the score is one
+- Color histogram: the weight of a pixel's value is looked up, so the histogram's share of the score is one
   plane of sums over cells. No histogram is built, but where `hist_sqrt` asks for the roots of its counts:
   these slide over the band.
 - Coarse HOG: planes of its own, of cells averaged by fours at every cell; a window's blocks start two cells
@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import (
     Buffers,
-    Crew,
     Take,
+    ThreadTeam,
     check_image,
     check_number,
     check_type,
@@ -41,7 +41,7 @@ from vehicle_detection._kernels import (
     orientation_cotangents,
     sqrt_gradients,
 )
-from vehicle_detection._kernels import color as _colour_kernels
+from vehicle_detection._kernels import color as _color_kernels
 from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier
@@ -110,7 +110,7 @@ class BandSearch:
     def __init__(self, classifier: VehicleClassifier, *, n_jobs: int | None = None) -> None:
         check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
         self._filters = _Filters(classifier)
-        self._crew = Crew(n_jobs, name="search")
+        self._crew = ThreadTeam(n_jobs, name="search")
         self._local = threading.local()
 
     def __enter__(self) -> BandSearch:
@@ -261,11 +261,11 @@ class _Filters:
         for template, (filters, bias) in enumerate(zip(self.filters, self.biases)):
             scores[template] = bias
             if self.tables is not None:
-                _colour_kernels.histogram_cells(converted, self.tables[template], cell, maps[-1][-1])
+                _color_kernels.histogram_cells(converted, self.tables[template], cell, maps[-1][-1])
             for part, planes in zip(filters, maps):
                 part.add_to(planes, scores[template], take)
         if self.root_weights is not None:
-            _colour_kernels.add_root_histograms(
+            _color_kernels.add_root_histograms(
                 converted, self.bins, self.root_weights, cell, self.cells, scores
             )
         return scores[0] if len(scores) == 1 else np.asarray(scores.max(axis=0))
@@ -287,13 +287,13 @@ class _Filters:
             _hog_kernels.hog_cells(flat, channels, cell, self.cotangents, cells)
         shape = (channels, self.block, self.block, params.orient, rows, columns)
         blocks = take(shape, np.float32, "blocks")
-        _hog_kernels.normalise_blocks(cells, self.block, 1, blocks)
+        _hog_kernels.normalize_blocks(cells, self.block, 1, blocks)
         maps = [blocks.reshape(-1, rows, columns)]
         if self.coarse:
             pooled = take(cells.shape, np.float32, "pooled")
             _hog_kernels.pool_cells(cells, pooled)
             blocks = take(shape, np.float32, "coarse blocks")
-            _hog_kernels.normalise_blocks(pooled, self.block, 2, blocks)
+            _hog_kernels.normalize_blocks(pooled, self.block, 2, blocks)
             maps.append(blocks.reshape(-1, rows, columns))
         return maps
 
@@ -307,7 +307,7 @@ class _Filters:
             size = (columns * per_cell, rows * per_cell)
             whole = converted[: rows * cell, : columns * cell]
             bins = cv2.resize(whole, size, dst=take((size[1], size[0], 3), np.uint8, "bins"))
-            _colour_kernels.spatial_cells(
+            _color_kernels.spatial_cells(
                 bins, per_cell, planes[:count].reshape(3, per_cell, per_cell, rows, columns)
             )
         return planes

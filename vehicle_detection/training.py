@@ -60,13 +60,13 @@ class SplitScore:
     train, test
         Number of patches on either side.
     leakage
-        Share of the test patches with a near-copy among the training patches: `split_leakage` of the first
+        Share of the test patches with a near duplicate among the training patches: `split_leakage` of the first
         seed.
     """
 
     accuracies: tuple[float, ...]
-    missed: float
-    false: float
+    false_negative_rate: float
+    false_positive_rate: float
     train: int
     test: int
     leakage: float
@@ -79,7 +79,7 @@ class SplitScore:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingReport:
-    """What `train_and_judge` found.
+    """What `train_and_evaluate` found.
 
     Attributes
     ----------
@@ -159,7 +159,7 @@ def model_card(
     Parameters
     ----------
     classifier, report
-        What `train_and_judge` returned.
+        What `train_and_evaluate` returned.
     others
         Reports of other features on the same patches, for a table beside them.
     command
@@ -232,7 +232,7 @@ def _data(report: TrainingReport) -> list[str]:
 def _accuracy(report: TrainingReport, others: Sequence[TrainingReport]) -> list[str]:
     how = (
         "Scaler and SVM are fitted on the training part of a split alone and judged on the other. A "
-        "near-copy is a tested patch much like one of the training patches: the correlation of their 16x16 "
+        "near duplicate is a tested patch much like one of the training patches: the correlation of their 16x16 "
         "gray thumbnails is 0.95 or more."
     )
     if "random" in report.splits:
@@ -245,7 +245,7 @@ def _accuracy(report: TrainingReport, others: Sequence[TrainingReport]) -> list[
         "accuracy",
         "missed vehicles",
         "false vehicles",
-        "near-copies",
+        "near duplicates",
     )
     rows = [
         (
@@ -253,8 +253,8 @@ def _accuracy(report: TrainingReport, others: Sequence[TrainingReport]) -> list[
             f"{score.train:,}",
             f"{score.test:,}",
             f"{score.accuracy:.4f}",
-            f"{score.missed:.2%}",
-            f"{score.false:.2%}",
+            f"{score.false_negative_rate:.2%}",
+            f"{score.false_positive_rate:.2%}",
             f"{score.leakage:.1%}",
         )
         for name, score in report.splits.items()
@@ -284,8 +284,8 @@ def _limits(report: TrainingReport) -> list[str]:
     ]
     if "random" in report.splits:
         lines.append(
-            "Neighbouring patches show the same vehicle from one frame to the next: a random split tests on "
-            "near-copies of what it trained on, which flatters."
+            "Neighboring patches show the same vehicle from one frame to the next: a random split tests on "
+            "near duplicates of what it trained on, which flatters."
         )
     if "KITTI_extracted" in report.sources:
         lines.append(
@@ -315,12 +315,12 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-__all__ = ["SPLITS", "SplitScore", "TrainingReport", "model_card", "train_and_judge"]
+__all__ = ["SPLITS", "SplitScore", "TrainingReport", "model_card", "train_and_evaluate"]
 
 _OTHERS = ("KITTI", "Extras")
 
 
-def train_and_judge(
+def train_and_evaluate(
     patch_set: PatchSet,
     *,
     params: FeatureParams | None = None,
@@ -378,7 +378,7 @@ def train_and_judge(
     >>> patches, labels = render_patches(20)
     >>> names = [f"{'vehicles' if label else 'others'}/drawn/{n}.png" for n, label in enumerate(labels)]
     >>> small = FeatureParams(hog_channel=0)
-    >>> classifier, report = train_and_judge(PatchSet(patches, labels, names), params=small, seeds=2)
+    >>> classifier, report = train_and_evaluate(PatchSet(patches, labels, names), params=small, seeds=2)
     >>> sorted(report.splits), len(report.splits["random"].accuracies), report.vehicles
     (['random', 'sequences'], 2, 10)
     """
@@ -505,8 +505,8 @@ def _score(answers: list[tuple[float, float, float]], split: Split, leakage: flo
     accuracies, missed, false = zip(*answers)
     return SplitScore(
         accuracies=accuracies,
-        missed=float(np.mean(missed)),
-        false=float(np.mean(false)),
+        false_negative_rate=float(np.mean(missed)),
+        false_positive_rate=float(np.mean(false)),
         train=len(split.train),
         test=len(split.test),
         leakage=leakage,
@@ -518,9 +518,9 @@ def _facts(report: TrainingReport) -> dict[str, Any]:
     splits = {
         name: {
             "accuracy": round(score.accuracy, 5),
-            "missed": round(score.missed, 5),
-            "false": round(score.false, 5),
-            "near_copies": round(score.leakage, 3),
+            "false_negative_rate": round(score.false_negative_rate, 5),
+            "false_positive_rate": round(score.false_positive_rate, 5),
+            "near_duplicates": round(score.leakage, 3),
             "test": score.test,
             "seeds": len(score.accuracies),
         }

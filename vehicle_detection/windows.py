@@ -53,7 +53,7 @@ def slide_window(
     xy_window
         Width and height of a window.
     xy_overlap
-        Horizontal and vertical share that neighbours have in common, in [0, 1).
+        Horizontal and vertical share that neighbors have in common, in [0, 1).
 
     Returns
     -------
@@ -184,7 +184,7 @@ def _shared_hog_features(
 ) -> NDArray[np.float64]:
     """Features of 64x64 windows on the cell grid, with one scikit-image HOG of the whole image.
 
-    Colours are converted before the windows are cut, as `find_cars` does; it makes no difference.
+    Colors are converted before the windows are cut, as `find_cars` does; it makes no difference.
     """
     params = classifier.params
     cell, blocks = params.pix_per_cell, params.blocks

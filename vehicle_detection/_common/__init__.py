@@ -11,12 +11,13 @@ from vehicle_detection._common.checks import (
     check_patches,
     check_type,
     describe,
+    finite_array,
 )
-from vehicle_detection._common.files import check_target, written_whole
+from vehicle_detection._common.files import atomic_write, check_target
 from vehicle_detection._common.model_file import FORMAT_VERSION, ModelData, read_model, write_model
 from vehicle_detection._common.threads import (
     JOBS_VARIABLE,
-    Crew,
+    ThreadTeam,
     available_cores,
     resolve_jobs,
     single_threaded_opencv,
@@ -27,9 +28,10 @@ __all__ = [
     "FORMAT_VERSION",
     "JOBS_VARIABLE",
     "Buffers",
-    "Crew",
     "ModelData",
     "Take",
+    "ThreadTeam",
+    "atomic_write",
     "available_cores",
     "blur_patches",
     "check_boxes",
@@ -43,6 +45,7 @@ __all__ = [
     "check_type",
     "degrade_patches",
     "describe",
+    "finite_array",
     "mirror_patches",
     "new_array",
     "read_model",
@@ -50,5 +53,4 @@ __all__ = [
     "resolve_jobs",
     "single_threaded_opencv",
     "write_model",
-    "written_whole",
 ]

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-# A degraded patch: times that it is smaller (logarithms), share of its colour (logarithms), JPEG quality.
+# A degraded patch: times that it is smaller (logarithms), share of its color (logarithms), JPEG quality.
 _SHRINK, _COLOUR, _QUALITY = (0.0, 1.6), (-1.5, 0.2), (20.0, 90.0)
 # Another exposure: exponent of the values (its logarithm), and the share of their range that is left.
 _EXPONENT, _RANGE = (-0.7, 0.7), (0.5, 1.0)
@@ -82,9 +82,9 @@ def degrade_patches(images: NDArray[np.uint8], *, mirror: bool = True) -> NDArra
     for image, out in zip(images, degraded):
         rng = _generator(image, 2)
         coarse = _coarse(image, rng, mirror)
-        colour = float(np.exp(rng.uniform(*_COLOUR)))
+        color = float(np.exp(rng.uniform(*_COLOUR)))
         gray = cv2.cvtColor(cv2.cvtColor(coarse, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
-        pale = cv2.addWeighted(coarse, colour, gray, 1 - colour, 0)
+        pale = cv2.addWeighted(coarse, color, gray, 1 - color, 0)
         quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.uniform(*_QUALITY))]
         _, coded = cv2.imencode(".jpg", cv2.cvtColor(pale, cv2.COLOR_RGB2BGR), quality)
         decoded = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), np.uint8)

@@ -38,7 +38,7 @@ def check_image(image: object, name: str = "image") -> NDArray[np.uint8]:
     elif image.ndim == 3 and image.shape[2] == 4:
         remedy = "drop the alpha channel with image[..., :3]"
     elif image.ndim != 3 or image.shape[2] != 3:
-        remedy = "pass one image with three colour channels"
+        remedy = "pass one image with three color channels"
     elif image.shape[0] == 0 or image.shape[1] == 0:
         remedy = "the image is empty"
     elif image.dtype.kind == "f":
@@ -140,3 +140,19 @@ def check_choice(value: object, name: str, choices: Collection[object]) -> None:
     if not (value is None or isinstance(value, (str, int, np.integer))) or value not in choices:
         listed = ", ".join(repr(choice) for choice in choices)
         raise InvalidInputError(f"{name} must be one of {listed}; got {describe(value)}")
+
+
+def finite_array(values: object, name: str, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
+    """Return a float32 copy that cannot be written; None in `shape` stands for any number of entries."""
+    expected = ", ".join("any" if side is None else str(side) for side in shape)
+    try:
+        array = np.array(values, np.float32, order="C")
+    except (TypeError, ValueError):
+        array = np.array(np.nan, np.float32)
+    fits = array.ndim == len(shape) and all(side in (None, n) for side, n in zip(shape, array.shape))
+    if not fits or not array.size or not np.isfinite(array).all():
+        raise InvalidInputError(
+            f"{name} must be finite numbers of shape ({expected}), got {describe(values)}; train again"
+        )
+    array.setflags(write=False)
+    return array

@@ -24,7 +24,7 @@ def check_target(target: str | os.PathLike[str], name: str = "target") -> Path:
 
 
 @contextlib.contextmanager
-def written_whole(target: str | os.PathLike[str], name: str = "target") -> Iterator[Path]:
+def atomic_write(target: str | os.PathLike[str], name: str = "target") -> Iterator[Path]:
     """Yield a temporary path beside `target`; rename it to `target` when the block ends well.
 
     On an error or an interrupt the temporary file is removed and an earlier `target` stays as it was.

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common.checks import describe
-from vehicle_detection._common.files import written_whole
+from vehicle_detection._common.files import atomic_write
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 
 FORMAT = "vehicle-detection-model"
-FORMAT_VERSION = "2"
+FORMAT_VERSION = "3"
 
 SHIPPED = ("default", "highway")
 """Names of the models that the package ships."""
@@ -80,7 +80,7 @@ def write_model(
         "metadata": facts,
     }
     header["sha256"] = _checksum(header, tensors)
-    with written_whole(path, "path") as part:
+    with atomic_write(path, "path") as part:
         part.write_bytes(_with_sorted_header(save(dict(tensors), metadata=header)))
 
 

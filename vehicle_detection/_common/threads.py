@@ -70,7 +70,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=single_threaded_opencv.__init__)  # type: ignore[misc]
 
 
-class Crew:
+class ThreadTeam:
     """Threads that share the parts of one piece of work, with the calling thread as one of them.
 
     Parameters

@@ -1,4 +1,4 @@
-"""The numba kernels of colour: histograms of patches and of all windows of a band, and spatial bins."""
+"""The numba kernels of color: histograms of patches and of all windows of a band, and spatial bins."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def value_counts(image, counts):
 
 @jit
 def patch_histograms(patches, bin_of_value, bins, features):
-    """Colour histogram of each patch, channel by channel.
+    """Color histogram of each patch, channel by channel.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def add_root_histograms(image, bin_of_value, weights, cell, window, scores):
     """Add, to each window's score, the weighted square roots of its histogram's counts.
 
     Counts are kept bin by bin for the last rows of cells, already summed over the width of a window: a step
-    down adds one row and takes one away. Bins without a pixel in those rows, most of them in a colour
+    down adds one row and takes one away. Bins without a pixel in those rows, most of them in a color
     channel, cost nothing more.
 
     Parameters

@@ -1,4 +1,4 @@
-"""The numba kernels of the road features: signed and unsigned orientations, normalised four ways."""
+"""The numba kernels of the road features: signed and unsigned orientations, normalized four ways."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def orientation_sums(channels, cotangents, sums):
 
     The gradients are those of the square roots of the values, ``sqrt(255 * value)``: so the edges of what is
     dark count for more (Dalal and Triggs, CVPR 2005, section 6.1). Of the channels the one with the longest
-    gradient decides (section 6.2). The bins are centred: bin `k` holds the angles within 11.25 degrees of
+    gradient decides (section 6.2). The bins are centerd: bin `k` holds the angles within 11.25 degrees of
     ``22.5 k``, bin ``k + 8`` the opposite ones. So upright and level edges lie in the middle of a bin, and
     the features of a mirrored image are those of the image, mirrored and in another order. A bin's sum is
     the difference of what lies past its two bounds, and these sums stay in registers over the four rows of a
@@ -126,7 +126,7 @@ def orientation_sums(channels, cotangents, sums):
 
 
 @jit
-def spread_cells(sums, scale, cells):
+def pool_bilinear(sums, scale, cells):
     """Add up cells of 2x2 squares and what is around them, the nearer squares with more weight.
 
     The weights 1, 3, 3, 1 along either axis are the bilinear shares of a square's pixels in the cells around
@@ -159,7 +159,7 @@ def spread_cells(sums, scale, cells):
 
 @jit
 def smooth_cells(sums, scale, cells):
-    """Add up cells of one square and a little of its neighbours: 1, 6, 1 along either axis.
+    """Add up cells of one square and a little of its neighbors: 1, 6, 1 along either axis.
 
     These are the bilinear shares of a cell's pixels in itself and in the cells beside it, on average.
 
@@ -168,7 +168,7 @@ def smooth_cells(sums, scale, cells):
     sums
         ``(16, rows, columns)`` float32.
     scale, cells
-        As for `spread_cells`.
+        As for `pool_bilinear`.
     """
     count, rows, columns = cells.shape
     line = np.empty(columns + 2, np.float32)
@@ -186,12 +186,12 @@ def smooth_cells(sums, scale, cells):
 
 
 @jit
-def normalise_four_ways(cells, eps, planes):
-    """Normalise each cell by the four blocks of 2x2 cells that hold it; clip at 0.2.
+def fhog_normalize(cells, eps, planes):
+    """Normalize each cell by the four blocks of 2x2 cells that hold it; clip at 0.2.
 
     Felzenszwalb et al., "Object detection with discriminatively trained part-based models" (PAMI 2010),
-    section 6.2: sums over the normalisations for each of 16 signed and 8 unsigned orientations, and sums over
-    the orientations for each of the four normalisations.
+    section 6.2: sums over the normalizations for each of 16 signed and 8 unsigned orientations, and sums over
+    the orientations for each of the four normalizations.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """The numba kernels of HOG: orientation histograms of cells, blocks of cells, and vectors of patches.
 
 All of them work on row-major arrays. The images are interleaved: a row of an ``(H, W, C)`` image is seen as
-``W * C`` values, and the left and right neighbour of a value lie `C` places away. So three channels cost no
-shuffling, and every inner loop runs over neighbouring values, which the compiler turns into vector
+``W * C`` values, and the left and right neighbor of a value lie `C` places away. So three channels cost no
+shuffling, and every inner loop runs over neighboring values, which the compiler turns into vector
 instructions.
 """
 
@@ -103,7 +103,7 @@ def hog_cells(image, channels, cell, cotangents, cells):
             n = count * span
             sums.fill(zero)
             for y in range(row * cell, (row + 1) * cell):
-                # At the array's border there is no neighbour on one side: the gradient is zero.
+                # At the array's border there is no neighbor on one side: the gradient is zero.
                 low = channels if start == 0 else 0
                 high = n - channels if start + n == width else n
                 inside = 0 < y < height - 1
@@ -213,7 +213,7 @@ def sum_orientations(gx, gy, angles, bounds, channels, cell, cells):
 
 @jit
 def pool_cells(cells, pooled):
-    """Average cells with their neighbours to the right, below and between: cells of twice the side.
+    """Average cells with their neighbors to the right, below and between: cells of twice the side.
 
     Parameters
     ----------
@@ -237,8 +237,8 @@ def pool_cells(cells, pooled):
 
 
 @jit
-def normalise_blocks(cells, block, spread, blocks):
-    """Normalise overlapping blocks of cells by L2-Hys: L2, clip at 0.2, L2 again.
+def normalize_blocks(cells, block, spread, blocks):
+    """Normalize overlapping blocks of cells by L2-Hys: L2, clip at 0.2, L2 again.
 
     Dalal and Triggs, "Histograms of oriented gradients for human detection" (CVPR 2005), section 6.4, with
     the constants of scikit-image.
@@ -316,7 +316,7 @@ def arrange_blocks(planes, places, spread, features):
     Parameters
     ----------
     planes
-        As `normalise_blocks` fills them.
+        As `normalize_blocks` fills them.
     places
         Blocks along a side of the patch.
     spread
@@ -338,15 +338,15 @@ def arrange_blocks(planes, places, spread, features):
 
 @jit
 def write_blocks(cells, block, coarse, planes, features):
-    """Normalise the cells of one patch, and pooled ones where `coarse`, and write them as a vector."""
+    """Normalize the cells of one patch, and pooled ones where `coarse`, and write them as a vector."""
     places = cells.shape[2] - block + 1
-    normalise_blocks(cells, block, 1, planes)
+    normalize_blocks(cells, block, 1, planes)
     fine = cells.shape[0] * places * places * block * block * cells.shape[1]
     arrange_blocks(planes, places, 1, features[:fine])
     if coarse > 0:
         pooled = np.empty_like(cells)
         pool_cells(cells, pooled)
-        normalise_blocks(pooled, block, 2, planes)
+        normalize_blocks(pooled, block, 2, planes)
         arrange_blocks(planes, coarse, 2, features[fine:])
 
 

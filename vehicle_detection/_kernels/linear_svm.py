@@ -61,19 +61,19 @@ def fit_svm(
     Notes
     -----
     Hsieh et al., "A dual coordinate descent method for large-scale linear SVM" (ICML 2008), with its
-    shrinking: the solver of ``LinearSVC(dual=True)``. Rows are centred and scaled as they are read.
+    shrinking: the solver of ``LinearSVC(dual=True)``. Rows are centerd and scaled as they are read.
     """
     chosen = np.arange(len(features)) if rows is None else rows
     mean, scale = _moments(features, chosen)
     scale /= gains
-    centre, squares = mean.astype(np.float32), (scale**-2).astype(np.float32)
+    center, squares = mean.astype(np.float32), (scale**-2).astype(np.float32)
     weights = np.zeros(features.shape[1], np.float32)
     intercept = _descend(
         features,
         chosen,
         2.0 * labels[chosen] - 1,
         0.5 / costs[chosen],
-        centre,
+        center,
         squares,
         weights,
         _TOLERANCE,
@@ -81,8 +81,8 @@ def fit_svm(
         np.random.default_rng(random_state),
     )
     coef = weights * scale
-    # The centre that the solver saw is the mean rounded to float32.
-    return LinearSVM(mean, scale, coef, float(intercept + coef / scale @ (mean - centre)))
+    # The center that the solver saw is the mean rounded to float32.
+    return LinearSVM(mean, scale, coef, float(intercept + coef / scale @ (mean - center)))
 
 
 def _moments(features: NDArray[np.float32], rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
@@ -92,10 +92,10 @@ def _moments(features: NDArray[np.float32], rows: NDArray[np.intp]) -> tuple[Flo
     for piece in pieces:
         mean += features[piece].sum(axis=0, dtype=np.float64)
     mean /= len(rows)
-    centre = mean.astype(np.float32)
+    center = mean.astype(np.float32)
     for piece in pieces:
-        centred = features[piece] - centre
-        squares += np.einsum("ij,ij->j", centred, centred)
+        centerd = features[piece] - center
+        squares += np.einsum("ij,ij->j", centerd, centerd)
     deviation: Floats = np.sqrt(squares / len(rows))
     # What a constant column has is the rounding of its mean.
     deviation[deviation <= 1e-6 * np.maximum(np.abs(mean), 1)] = 1.0
@@ -106,36 +106,36 @@ _reordered = functools.partial(jit, reorder=True)
 
 
 @_reordered
-def _score(row, centre, weights):
+def _score(row, center, weights):
     total = np.float32(0)
     for index in range(row.shape[0]):
-        total += (row[index] - centre[index]) * weights[index]
+        total += (row[index] - center[index]) * weights[index]
     return total
 
 
 @_reordered
-def _length(row, centre, squares):
-    """Squared length of a row that is centred and scaled."""
+def _length(row, center, squares):
+    """Squared length of a row that is centerd and scaled."""
     total = np.float32(0)
     for index in range(row.shape[0]):
-        apart = row[index] - centre[index]
+        apart = row[index] - center[index]
         total += apart * apart * squares[index]
     return total
 
 
 @_reordered
-def _add(step, row, centre, squares, weights):
+def _add(step, row, center, squares, weights):
     for index in range(row.shape[0]):
-        weights[index] += step * ((row[index] - centre[index]) * squares[index])
+        weights[index] += step * ((row[index] - center[index]) * squares[index])
 
 
 @jit
-def _descend(features, rows, signs, ridge, centre, squares, weights, tolerance, most, rng):
-    """Solve the dual; change `weights`, those of centred rows, in place, and return the intercept."""
+def _descend(features, rows, signs, ridge, center, squares, weights, tolerance, most, rng):
+    """Solve the dual; change `weights`, those of centerd rows, in place, and return the intercept."""
     count = rows.shape[0]
     curvature = np.empty(count)
     for index in range(count):
-        curvature[index] = _length(features[rows[index]], centre, squares) + 1.0 + ridge[index]
+        curvature[index] = _length(features[rows[index]], center, squares) + 1.0 + ridge[index]
     multipliers = np.zeros(count)
     intercept = 0.0
     order, active = np.arange(count), count
@@ -149,7 +149,7 @@ def _descend(features, rows, signs, ridge, centre, squares, weights, tolerance, 
         while place < active:
             index = order[place]
             row = features[rows[index]]
-            score = _score(row, centre, weights) + intercept
+            score = _score(row, center, weights) + intercept
             slope = signs[index] * score - 1.0 + ridge[index] * multipliers[index]
             if multipliers[index] == 0.0:
                 if slope > bound:
@@ -163,7 +163,7 @@ def _descend(features, rows, signs, ridge, centre, squares, weights, tolerance, 
                 before = multipliers[index]
                 multipliers[index] = max(before - slope / curvature[index], 0.0)
                 step = (multipliers[index] - before) * signs[index]
-                _add(np.float32(step), row, centre, squares, weights)
+                _add(np.float32(step), row, center, squares, weights)
                 intercept += step
             place += 1
         if highest - lowest <= tolerance:

@@ -57,7 +57,7 @@ def block_adder(block: Block) -> Callable[..., None]:
     -------
     Callable
         For kernels alone. It takes `weights` ``(blocks, depth, rows)``, `planes` ``(depth, N)`` and `sums`,
-        1-D, all float32, and `offsets` ``(blocks, rows)`` intp, all with neighbouring values next to each
+        1-D, all float32, and `offsets` ``(blocks, rows)`` intp, all with neighboring values next to each
         other. Nothing is checked.
     """
     lanes, rows, vectors = block

@@ -16,7 +16,13 @@ import typer
 from typer.core import TyperGroup
 
 from vehicle_detection import __version__
-from vehicle_detection.cli.output import check_apart, codec_messages, complain, output_folder, print_facts
+from vehicle_detection.cli.output import (
+    capture_stderr,
+    check_distinct_paths,
+    output_folder,
+    print_error,
+    print_facts,
+)
 from vehicle_detection.cli.train import fetch, info, train, train_frames
 from vehicle_detection.cli.tune import tune
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
@@ -37,15 +43,15 @@ class _Commands(TyperGroup):
         try:
             return super().invoke(ctx)
         except VehicleDetectionError as error:
-            complain(f"error: {error}")
+            print_error(f"error: {error}")
             raise typer.Exit(BAD_INPUT) from None
         except OSError as error:  # the disk is full, a name is too long
             if error.errno == errno.EPIPE:
                 raise
-            complain(f"error: {error}")
+            print_error(f"error: {error}")
             raise typer.Exit(1) from None
         except KeyboardInterrupt:
-            complain("interrupted")
+            print_error("interrupted")
             raise typer.Exit(INTERRUPTED) from None
 
 
@@ -63,7 +69,7 @@ def main() -> None:
     try:
         app(prog_name="vehicle-detection")
     except KeyboardInterrupt:  # before or after a command
-        complain("interrupted")
+        print_error("interrupted")
         sys.exit(INTERRUPTED)
 
 
@@ -182,10 +188,10 @@ def _detect_each(
     from vehicle_detection.images import read_image, write_image
 
     for path in images:
-        with codec_messages() as messages:
+        with capture_stderr() as messages:
             image = read_image(path)
         for message in messages:
-            complain(f"warning: {path}: {message}")
+            print_error(f"warning: {path}: {message}")
         found = detector.detect(image)
         listed = "".join(
             f"  [{' '.join(f'{side:.0f}' for side in box)}] {score:.2f}"
@@ -244,7 +250,7 @@ def video(
 
     named = {"--tracks": tracks, "--report": report}
     outputs = {name: path for name, path in named.items() if path is not None}
-    check_apart(outputs, {"SOURCE": source, "TARGET": target})
+    check_distinct_paths(outputs, {"SOURCE": source, "TARGET": target})
     with contextlib.ExitStack() as stack:
         writers: list[Callable[[Any], object]] = []
         if tracks is not None:
@@ -297,12 +303,12 @@ def _look_for_horizon(
 ) -> float | None:
     """Estimate the horizon of a video from its vehicles, and say what came of it."""
     from vehicle_detection.detector import VehicleDetector
-    from vehicle_detection.video import clip_horizon
+    from vehicle_detection.video import estimate_video_horizon
 
     with VehicleDetector(model) as detector:
-        found = clip_horizon(source, detector, start=start, end=end)
+        found = estimate_video_horizon(source, detector, start=start, end=end)
     if not quiet and found is None:
-        complain("warning: --horizon auto: the vehicles do not tell the horizon; it is left open")
+        print_error("warning: --horizon auto: the vehicles do not tell the horizon; it is left open")
     elif not quiet and found is not None:
         typer.echo(f"horizon {found.horizon:.3f}, give or take {found.error:.3f}, from {found.boxes} boxes")
     return None if found is None else found.horizon
@@ -324,11 +330,13 @@ def evaluate(
     """Score boxes, and tracks where there are any, against labels."""
     from json import dumps
 
-    from vehicle_detection._common import check_target, written_whole
+    from vehicle_detection._common import atomic_write, check_target
     from vehicle_detection.evaluation import evaluate_detections, evaluate_tracks, read_labels
 
     if json is not None:
-        check_apart({"--json": check_target(json, "--json")}, {"PREDICTIONS": predictions, "LABELS": labels})
+        check_distinct_paths(
+            {"--json": check_target(json, "--json")}, {"PREDICTIONS": predictions, "LABELS": labels}
+        )
     found, true = read_labels(predictions), read_labels(labels)
     scores: dict[str, Any] = {
         "detections": evaluate_detections(found, true, iou=iou, ignored_as_regions=regions)
@@ -337,7 +345,7 @@ def evaluate(
         scores["tracks"] = evaluate_tracks(found, true, iou=iou)
     typer.echo("\n\n".join(each.summary() for each in scores.values()))
     if json is not None:
-        with written_whole(json) as part:
+        with atomic_write(json) as part:
             plain = {name: each.to_dict() for name, each in scores.items()}
             part.write_text(dumps(plain, indent=2) + "\n", encoding="utf-8")
 

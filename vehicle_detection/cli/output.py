@@ -22,7 +22,7 @@ Result = TypeVar("Result")
 _PIPE_WIDTH = 120
 
 
-def complain(message: str) -> None:
+def print_error(message: str) -> None:
     """Write one line to standard error, whatever line breaks the message has."""
     typer.echo(" ".join(message.split()), err=True)
 
@@ -52,7 +52,7 @@ def print_facts(title: str, facts: Mapping[str, Any]) -> None:
         typer.echo(f"  {name:<{width}}  {text}")
 
 
-def check_apart(targets: Mapping[str, Path], sources: Mapping[str, Path]) -> None:
+def check_distinct_paths(targets: Mapping[str, Path], sources: Mapping[str, Path]) -> None:
     """Refuse a target that is a source, or another target."""
     seen = {path.resolve(): f"{name} {path}" for name, path in sources.items()}
     for name, path in targets.items():
@@ -62,7 +62,7 @@ def check_apart(targets: Mapping[str, Path], sources: Mapping[str, Path]) -> Non
 
 
 @contextlib.contextmanager
-def codec_messages() -> Iterator[list[str]]:
+def capture_stderr() -> Iterator[list[str]]:
     """Collect what image codecs, being no Python, write to standard error; the list is filled at the end."""
     lines: list[str] = []
     sys.stderr.flush()

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vehicle_detection.cli.output import (
-    check_apart,
-    codec_messages,
+    capture_stderr,
+    check_distinct_paths,
     interruptible,
     output_folder,
     print_facts,
@@ -57,24 +57,24 @@ def train(
     ] = None,
 ) -> None:
     """Train a model, and judge it on splits of its patches."""
-    from vehicle_detection._common import check_target, written_whole
+    from vehicle_detection._common import atomic_write, check_target
     from vehicle_detection.datasets import load_training_patches
     from vehicle_detection.params import FeatureParams
-    from vehicle_detection.training import model_card, train_and_judge
+    from vehicle_detection.training import model_card, train_and_evaluate
 
     named = {"-o": output, "--report": report, "--card": card}
     targets = {name: check_target(path, name) for name, path in named.items() if path is not None}
-    check_apart({"--non-vehicles": non_vehicles, **targets}, {"--vehicles": vehicles})
+    check_distinct_paths({"--non-vehicles": non_vehicles, **targets}, {"--vehicles": vehicles})
     presets = [FeatureParams.preset(name) for name in (features, *(compare or ()))]
     options: dict[str, Any] = {"C": C, "mirror": not no_mirror, "gamma": gamma}
     options["degraded"] = degraded
     options |= {"random_state": seed, "split": split}
 
-    with codec_messages():
+    with capture_stderr():
         patches = load_training_patches(vehicles, non_vehicles)
 
     def work() -> list[Any]:
-        return [train_and_judge(patches, params=params, progress=True, **options) for params in presets]
+        return [train_and_evaluate(patches, params=params, progress=True, **options) for params in presets]
 
     (classifier, judged), *rest = interruptible(work)
     others = [other for _, other in rest]
@@ -83,7 +83,7 @@ def train(
     classifier.save(output)
     if report is not None:
         plain = judged.to_dict() | {"others": [other.to_dict() for other in others]}
-        with written_whole(report) as part:
+        with atomic_write(report) as part:
             part.write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
     if card is not None:
         words = ["--vehicles", vehicles.name, "--non-vehicles", non_vehicles.name, "--features", features]
@@ -95,7 +95,7 @@ def train(
         text = model_card(
             classifier, judged, others=others, command=shlex.join(["vehicle-detection", "train", *words])
         )
-        with written_whole(card) as part:
+        with atomic_write(card) as part:
             part.write_text(text, encoding="utf-8")
     typer.echo(f"wrote {', '.join(map(str, targets.values()))}")
 
@@ -107,15 +107,23 @@ def _show(report: TrainingReport) -> None:
     print_table(
         f"{report.features}: {report.vehicles:,} vehicles, {report.non_vehicles:,} others, accuracy "
         f"{report.accuracy:.4f} on the split {report.split!r}",
-        ("tested on", "trained", "tested", "accuracy", "missed vehicles", "false vehicles", "near-copies"),
+        (
+            "tested on",
+            "trained",
+            "tested",
+            "accuracy",
+            "missed vehicles",
+            "false vehicles",
+            "near duplicates",
+        ),
         [
             (
                 SPLITS[name],
                 f"{score.train:,}",
                 f"{score.test:,}",
                 f"{score.accuracy:.4f}",
-                f"{score.missed:.2%}",
-                f"{score.false:.2%}",
+                f"{score.false_negative_rate:.2%}",
+                f"{score.false_positive_rate:.2%}",
                 f"{score.leakage:.1%}",
             )
             for name, score in report.splits.items()
@@ -161,9 +169,9 @@ def info(
             + " at the frame's border" * template.border
             for number, template in enumerate(loaded.templates, 1)
         }
-        if loaded.verification is not None:
-            second = loaded.verification
-            shapes["second opinion"] = f"{len(second.weights):,} vectors, share {second.share:g}"
+        if loaded.rescorer is not None:
+            second = loaded.rescorer
+            shapes["second opinion"] = f"{len(second.weights):,} vectors, share {second.blend_weight:g}"
         print_facts(f"{model}: {templates}, threshold {loaded.threshold:.2f} (log-odds)", shapes)
     else:
         print_facts(
@@ -173,7 +181,7 @@ def info(
         scores = values.get("splits") if isinstance(values, dict) else None
         left_out = values.get("left_out") if isinstance(values, dict) else None
         if name == "metrics" and isinstance(scores, dict) and scores.keys() <= SPLITS.keys():
-            columns = ("accuracy", "missed", "false", "near_copies", "test")
+            columns = ("accuracy", "false_negative_rate", "false_positive_rate", "near_duplicates", "test")
             rows = [
                 (title, *(str(scores[split].get(column, "")) for column in columns))
                 for split, title in SPLITS.items()
@@ -231,23 +239,23 @@ def train_frames(
     from vehicle_detection.mixture_training import (
         as_metadata,
         check_sources,
+        cross_validate_mixture,
         drawn_source,
         find_patches,
         find_sources,
-        judge_mixture,
         write_card,
         write_curves,
     )
 
     named = {"-o": output, "--card": card, "--curves": curves}
     targets = {name: check_target(path, name) for name, path in named.items() if path is not None}
-    check_apart(targets, {"DATA": data})
+    check_distinct_paths(targets, {"DATA": data})
     sources = find_sources(data)
     check_sources(sources, least=2)
     patches = find_patches(data)
     always = [drawn_source(random_state=seed)] if drawn else []
     with output_folder(pictures, "--pictures"):
-        trained, scores, held = judge_mixture(
+        trained, scores, held = cross_validate_mixture(
             sources, always=always, patches=patches, random_state=seed, on_step=typer.echo
         )
         sources += always
@@ -266,7 +274,7 @@ def train_frames(
 
 
 def print_road_scores(scores: Mapping[str, Mapping[str, Any]]) -> None:
-    """Print a table of `RoadScore` values, a row for each set of frames."""
+    """Print a table of `FoldScore` values, a row for each set of frames."""
     rows = [
         (
             name,

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vehicle_detection.cli.output import check_apart, interruptible, print_table
+from vehicle_detection.cli.output import check_distinct_paths, interruptible, print_table
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from vehicle_detection.tuning import LabelledFrames, ResultTable
+    from vehicle_detection.evaluation import LabelledFrames
+    from vehicle_detection.tuning import ResultTable
 
 _FIGURES = (".png", ".svg", ".pdf")
 _SHOWN = 15
@@ -67,7 +68,7 @@ def tune(
     for name, path, known in (("--out", out, (".csv", ".jsonl", ".parquet")), ("--plot", plot, _FIGURES)):
         if path is not None and path.suffix.lower() not in known:
             raise InvalidInputError(f"{name} must end in {' or '.join(known)}; got {path.name!r}")
-    check_apart(targets, {"--vehicles": vehicles, "--non-vehicles": non_vehicles})
+    check_distinct_paths(targets, {"--vehicles": vehicles, "--non-vehicles": non_vehicles})
     labelled = _read_frames(frames, labels, horizon)
     whole = out.suffix.lower() == ".parquet"  # Parquet takes no single rows: they are kept beside it.
     options: dict[str, Any] = {"store": out.with_suffix(".jsonl") if whole else out}
@@ -97,8 +98,7 @@ def _read_frames(frames: Path | None, labels: Path | None, horizon: float | None
     if frames is None or labels is None:
         raise InvalidInputError("--frames and --labels go together; name both")
     from vehicle_detection.datasets import load_frames
-    from vehicle_detection.evaluation import read_labels
-    from vehicle_detection.tuning import LabelledFrames
+    from vehicle_detection.evaluation import LabelledFrames, read_labels
 
     return LabelledFrames(frames.name or "frames", load_frames(frames), read_labels(labels), horizon)
 
@@ -130,10 +130,10 @@ def _text(value: float | None, digits: int) -> str:
 def _draw(table: ResultTable, path: Path) -> None:
     from matplotlib.figure import Figure
 
-    from vehicle_detection._common import written_whole
+    from vehicle_detection._common import atomic_write
     from vehicle_detection.plotting import plot_tradeoff
 
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     plot_tradeoff(table, ax=figure.subplots())
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         figure.savefig(part)

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_integer, describe, written_whole
+from vehicle_detection._common import atomic_write, check_integer, describe
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import decode_image
 
@@ -337,7 +337,7 @@ def _fetch(target: Path, address: str, folders: dict[str, int], progress: bool) 
             f"to must be a folder, {target.parent} cannot be made: {error.strerror}; choose another"
         ) from error
     _remove_stale_parts(target)
-    with written_whole(target, "to") as part:
+    with atomic_write(target, "to") as part:
         _log.info("downloading %s", address)
         _download(address, part, progress)
         verify_archive(part, folders, shown=address)

@@ -1,4 +1,4 @@
-"""Near-copies among patches: the frames of a drive show the same car again and again."""
+"""Near duplicates among patches: the frames of a drive show the same car again and again."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ _CHUNK = 512  # Rows compared with all others at a time: the table of products s
 def find_near_duplicates(
     patches: PatchSet | NDArray[np.uint8], *, threshold: float = 0.95
 ) -> NDArray[np.intp]:
-    """Find the patches that have a near-copy among the others.
+    """Find the patches that have a near duplicate among the others.
 
     Patches are compared by the correlation of their 16x16 gray thumbnails, so that brightness and contrast
-    do not count; a patch of one plain colour is a copy of nothing. Labels do not count either.
+    do not count; a patch of one plain color is a copy of nothing. Labels do not count either.
 
     Parameters
     ----------
     patches
         A set, or ``(N, 64, 64, 3)`` uint8 RGB.
     threshold
-        Correlation, in (0, 1], from which two patches are near-copies.
+        Correlation, in (0, 1], from which two patches are near duplicates.
 
     Returns
     -------
     numpy.ndarray
-        ``(M, 2)`` row numbers: each patch that has a near-copy, ascending, and the patch most like it.
+        ``(M, 2)`` row numbers: each patch that has a near duplicate, ascending, and the patch most like it.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def find_nearest(
 
 
 def group_copies(thumbnails: NDArray[np.float32], limit: float) -> NDArray[np.int32]:
-    """Return the number of each patch's group: near-copies, and near-copies of those, are in one."""
+    """Return the number of each patch's group: near duplicates, and near duplicates of those, are in one."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

@@ -1,4 +1,4 @@
-"""The training patches and frames: read, split honestly, and searched for near-copies."""
+"""The training patches and frames: read, split honestly, and searched for near duplicates."""
 
 from __future__ import annotations
 
@@ -19,21 +19,11 @@ from numpy.typing import ArrayLike, NDArray
 from vehicle_detection._common import check_choice, check_patches, describe
 from vehicle_detection.datasets.archives import (
     decode_listings,
-    fetch_patches,
     infer_labels,
     is_image,
     list_patches,
     natural_key,
     parent_folder,
-)
-from vehicle_detection.datasets.near_duplicates import find_near_duplicates
-from vehicle_detection.datasets.splits import (
-    Split,
-    split_groups,
-    split_leakage,
-    split_random,
-    split_sequences,
-    split_sources,
 )
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import read_image
@@ -154,23 +144,6 @@ def check_labels(labels: ArrayLike, name: str) -> NDArray[np.bool_]:
             "labels of -1 and 1 convert with labels > 0"
         )
     return array.astype(np.bool_)
-
-
-__all__ = [
-    "FrameSet",
-    "PatchSet",
-    "Split",
-    "fetch_patches",
-    "find_near_duplicates",
-    "load_frames",
-    "load_patches",
-    "load_training_patches",
-    "split_groups",
-    "split_leakage",
-    "split_random",
-    "split_sequences",
-    "split_sources",
-]
 
 
 def load_patches(

@@ -47,7 +47,7 @@ def split_random(
 ) -> Split:
     """Split at random, with the same share of vehicles on both sides.
 
-    On frames of a drive this tests on near-copies of what was trained on (see `split_leakage`): quote
+    On frames of a drive this tests on near duplicates of what was trained on (see `split_leakage`): quote
     `split_groups`, `split_sequences` or `split_sources` beside it.
 
     Parameters
@@ -141,13 +141,13 @@ def split_sequences(patch_set: PatchSet, *, test_size: float = 0.2) -> Split:
 def split_groups(
     patch_set: PatchSet, *, test_size: float = 0.2, threshold: float = 0.9, random_state: int = 0
 ) -> Split:
-    """Split at random, with near-copies on one side: `split_leakage` at `threshold` is 0.
+    """Split at random, with near duplicates on one side: `split_leakage` at `threshold` is 0.
 
-    Near-copies, and near-copies of those, form a group. In random order, each group is tested on as a whole
+    Near duplicates, and near duplicates of those, form a group. In random order, each group is tested on as a whole
     where it still fits into the share of its folders, and trained on where it does not; so a group of more
     than that share is always trained on.
 
-    Two crops of one car may differ too much to be near-copies. Where a folder is numbered through its drives,
+    Two crops of one car may differ too much to be near duplicates. Where a folder is numbered through its drives,
     as those of GTI are, `split_sequences` keeps more of them together; this split does for
     ``KITTI_extracted``, whose numbers are shuffled.
 
@@ -159,7 +159,7 @@ def split_groups(
         Share of each folder, and of each class in it, to test on, in (0, 1), rounded; large groups may leave
         less.
     threshold
-        Correlation, in (0, 1], from which two patches are near-copies, as in `find_near_duplicates`. Of the
+        Correlation, in (0, 1], from which two patches are near duplicates, as in `find_near_duplicates`. Of the
         course's vehicles, pairs at 0.9 show mostly one car; at 0.85 chance makes a quarter of all patches one
         group.
     random_state
@@ -203,7 +203,7 @@ def split_groups(
             room -= needed
     if not tested.any():
         raise InvalidInputError(
-            f"patch_set holds no group of near-copies that fits into test_size={share:g} of its folders; "
+            f"patch_set holds no group of near duplicates that fits into test_size={share:g} of its folders; "
             "raise test_size or threshold"
         )
     return Split(np.flatnonzero(~tested), np.flatnonzero(tested))
@@ -263,7 +263,7 @@ def split_sources(
 
 
 def split_leakage(patch_set: PatchSet, split: Split, *, threshold: float = 0.95) -> float:
-    """Share of the test patches that have a near-copy among the training patches.
+    """Share of the test patches that have a near duplicate among the training patches.
 
     Parameters
     ----------

@@ -9,10 +9,10 @@ from vehicle_detection.evaluation.detections import (
 )
 from vehicle_detection.evaluation.labels import (
     NO_TRACK,
+    FrameBoxes,
     FrameKey,
     Frames,
     LabelledFrames,
-    Labels,
     check_labels_of,
     keyed_frames,
     keys_of,
@@ -25,10 +25,10 @@ from vehicle_detection.evaluation.tracks import TrackScores, evaluate_tracks
 __all__ = [
     "NO_TRACK",
     "DetectionScores",
+    "FrameBoxes",
     "FrameKey",
     "Frames",
     "LabelledFrames",
-    "Labels",
     "Platt",
     "TrackScores",
     "calibrate_scores",

@@ -1,7 +1,7 @@
 """Detections and tracks against labelled frames: how many are found, how well they fit, who stays who.
 
-The boxes of `Labels` marked ``ignore`` are not scored, and a prediction on them is neither right nor wrong:
-one whose centre lies in a region (``ignore`` with track -1), or that covers an ignored box at the IoU in
+The boxes of `FrameBoxes` marked ``ignore`` are not scored, and a prediction on them is neither right nor wrong:
+one whose center lies in a region (``ignore`` with track -1), or that covers an ignored box at the IoU in
 use. Usable boxes are matched first, so an ignore region over a vehicle does not take its detection away.
 
 Where a box to ignore holds several vehicles, such as cars that touch in a mask of a class, none of them
@@ -22,32 +22,17 @@ from numpy.typing import NDArray
 from vehicle_detection._common import check_number
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation.calibration import calibration_error
-from vehicle_detection.evaluation.labels import FrameKey, Labels
+from vehicle_detection.evaluation.labels import FrameBoxes, FrameKey
 from vehicle_detection.evaluation.matching import (
     Scores,
     as_lines,
     as_text,
-    find_neutral,
+    find_ignored,
     mean,
     prepare_sides,
     rates,
     ratio,
 )
-from vehicle_detection.evaluation.readers import read_labels
-from vehicle_detection.evaluation.tracks import TrackScores, evaluate_tracks
-
-__all__ = [
-    "DetectionScores",
-    "Labels",
-    "SizeScores",
-    "TrackScores",
-    "calibration_error",
-    "evaluate_detections",
-    "evaluate_tracks",
-    "precision_recall_curve",
-    "read_labels",
-]
 
 SIZES = {"small": (0.0, 64.0), "medium": (64.0, 128.0), "large": (128.0, math.inf)}
 """Half-open ranges of box width in pixels."""
@@ -135,8 +120,8 @@ class DetectionScores(Scores):
 
 
 def evaluate_detections(
-    predictions: Labels,
-    labels: Labels,
+    predictions: FrameBoxes,
+    labels: FrameBoxes,
     *,
     iou: float = 0.5,
     frames: Sequence[FrameKey] | None = None,
@@ -171,7 +156,7 @@ def evaluate_detections(
     Raises
     ------
     InvalidInputError
-        If an argument is no `Labels`, `iou` is out of range, a prediction is in none of the `frames`, or
+        If an argument is no `FrameBoxes`, `iou` is out of range, a prediction is in none of the `frames`, or
         predictions and labels name their frames differently.
 
     Examples
@@ -185,7 +170,7 @@ def evaluate_detections(
     predictions, labels, keys = prepare_sides(predictions, labels, frames)
     limit = check_number(iou, "iou", above=0, high=1)
     found = match_detections(predictions, labels, keys, limit, ignored_as_regions=ignored_as_regions)
-    hit, false = found.partner >= 0, (found.partner < 0) & ~found.neutral
+    hit, false = found.partner >= 0, (found.partner < 0) & ~found.ignored
     missed = np.setdiff1d(found.usable, found.partner)
 
     true_widths = _widths(labels)
@@ -203,7 +188,7 @@ def evaluate_detections(
         tp=tp_all,
         fp=fp_all,
         fn=fn_all,
-        ignored=int(found.neutral.sum()),
+        ignored=int(found.ignored.sum()),
         precision=precision,
         recall=recall,
         f1=f1,
@@ -215,7 +200,7 @@ def evaluate_detections(
 
 
 def precision_recall_curve(
-    predictions: Labels, labels: Labels, *, iou: float = 0.5, ignored_as_regions: bool = False
+    predictions: FrameBoxes, labels: FrameBoxes, *, iou: float = 0.5, ignored_as_regions: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Precision and recall for every threshold on the detections' scores.
 
@@ -257,7 +242,7 @@ def precision_recall_curve(
     return _curve(predictions, found)
 
 
-def _widths(labels: Labels) -> NDArray[np.float64]:
+def _widths(labels: FrameBoxes) -> NDArray[np.float64]:
     return labels.boxes[:, 2] - labels.boxes[:, 0]
 
 
@@ -271,7 +256,7 @@ class Matching:
         ``(N,)`` row of the label that each prediction found, -1 for none.
     overlap
         ``(N,)`` IoU of the two.
-    neutral
+    ignored
         ``(N,)`` whether the prediction is neither right nor wrong.
     usable
         Rows of the labels that are scored.
@@ -279,13 +264,13 @@ class Matching:
 
     partner: NDArray[np.intp]
     overlap: NDArray[np.float64]
-    neutral: NDArray[np.bool_]
+    ignored: NDArray[np.bool_]
     usable: NDArray[np.intp]
 
 
 def match_detections(
-    predictions: Labels,
-    labels: Labels,
+    predictions: FrameBoxes,
+    labels: FrameBoxes,
     keys: list[FrameKey],
     limit: float,
     *,
@@ -306,7 +291,7 @@ def match_detections(
     """
     count = len(predictions)
     scores = np.zeros(count) if predictions.scores is None else predictions.scores
-    partner, overlap, neutral = np.full(count, -1, np.intp), np.zeros(count), np.zeros(count, np.bool_)
+    partner, overlap, ignored = np.full(count, -1, np.intp), np.zeros(count), np.zeros(count, np.bool_)
     usable: list[int] = []
     for key in keys:
         here, rows = predictions.rows(key), labels.rows(key)
@@ -320,20 +305,20 @@ def match_detections(
                 partner[here[index]], overlap[here[index]] = targets[target], overlaps[index, target]
                 overlaps[:, target] = -1
         rest = here[partner[here] < 0]
-        neutral[rest] = find_neutral(
+        ignored[rest] = find_ignored(
             predictions.boxes[rest], labels, rows, limit, as_regions=ignored_as_regions
         )
-    return Matching(partner, overlap, neutral, np.array(usable, np.intp))
+    return Matching(partner, overlap, ignored, np.array(usable, np.intp))
 
 
 def _curve(
-    predictions: Labels, found: Matching
+    predictions: FrameBoxes, found: Matching
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Precision, recall and threshold for every distinct score, highest first.
 
     A greedy match depends on higher scores alone, so the match at a threshold is a prefix of the whole.
     """
-    counted = np.flatnonzero(~found.neutral)
+    counted = np.flatnonzero(~found.ignored)
     scores = np.zeros(len(counted)) if predictions.scores is None else predictions.scores[counted]
     order = np.argsort(-scores, kind="stable")
     hits = np.cumsum(found.partner[counted][order] >= 0)

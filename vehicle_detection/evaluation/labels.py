@@ -1,4 +1,4 @@
-"""Boxes in frames as columns; ``evaluation`` shows `Labels` to the users."""
+"""Boxes in frames as columns; ``evaluation`` shows `FrameBoxes` to the users."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _column(values: ArrayLike | None, name: str, rows: int, kinds: str, default:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Labels:
+class FrameBoxes:
     """Boxes in frames, true or predicted, as columns that are checked on construction.
 
     Attributes
@@ -159,7 +159,7 @@ class Labels:
             object.__setattr__(self, name, column)
 
     @classmethod
-    def from_detections(cls, found: Mapping[FrameKey, Detections]) -> Labels:
+    def from_detections(cls, found: Mapping[FrameKey, Detections]) -> FrameBoxes:
         """Predictions out of the detections of each frame; frames without any still count as frames.
 
         Examples
@@ -183,7 +183,7 @@ class Labels:
         boxes, frames = len(self), len(self.frame_keys)
         return f"Labels({boxes} box{'es' * (boxes != 1)} in {frames} frame{'s' * (frames != 1)})"
 
-    def __getitem__(self, rows: slice | NDArray[Any] | list[int]) -> Labels:
+    def __getitem__(self, rows: slice | NDArray[Any] | list[int]) -> FrameBoxes:
         """Take rows by a slice, a mask or a list of indices; all frames stay frames."""
         return self._take(np.arange(len(self))[rows], self.frame_keys)
 
@@ -191,11 +191,11 @@ class Labels:
         """Row numbers of a frame's boxes; none for a frame without boxes."""
         return self._rows.get(key, np.empty(0, np.intp))
 
-    def frame(self, key: FrameKey) -> Labels:
+    def frame(self, key: FrameKey) -> FrameBoxes:
         """Take the boxes of one frame; none for a frame without boxes."""
         return self._take(self.rows(key), (key,))
 
-    def renamed(self, rename: Callable[[Any], FrameKey]) -> Labels:
+    def renamed(self, rename: Callable[[Any], FrameKey]) -> FrameBoxes:
         """Give every frame another key.
 
         Examples
@@ -206,7 +206,7 @@ class Labels:
         frames, keys = ([rename(key) for key in each] for each in (self.frames, self.frame_keys))
         return dataclasses.replace(self, frames=frames, frame_keys=keys)
 
-    def _take(self, rows: NDArray[np.intp], keys: Sequence[FrameKey]) -> Labels:
+    def _take(self, rows: NDArray[np.intp], keys: Sequence[FrameKey]) -> FrameBoxes:
         frames = [self.frames[row] for row in rows.tolist()]
         columns = {name: getattr(self, name) for name in _ARRAYS}
         taken = {name: column[rows] for name, column in columns.items() if column is not None}
@@ -242,9 +242,9 @@ def keys_of(frames: Mapping[FrameKey, NDArray[np.uint8]] | FrameSet) -> tuple[Fr
     return tuple(frames) if isinstance(frames, Mapping) else frames.names
 
 
-def check_labels_of(keys: Sequence[FrameKey], labels: object, name: str = "labels") -> Labels:
+def check_labels_of(keys: Sequence[FrameKey], labels: object, name: str = "labels") -> FrameBoxes:
     """Return `labels` if they know at least one of the frames."""
-    if not isinstance(labels, Labels):
+    if not isinstance(labels, FrameBoxes):
         raise InvalidInputError(
             f"{name} must be Labels, got {describe(labels)}; read a file with read_labels"
         )
@@ -281,7 +281,7 @@ class LabelledFrames:
 
     name: str
     frames: Mapping[FrameKey, NDArray[np.uint8]] | FrameSet
-    labels: Labels
+    labels: FrameBoxes
     horizon: float | None = None
 
     def __post_init__(self) -> None:
@@ -322,7 +322,7 @@ class LabelledFrames:
     def from_video(
         cls,
         path: str | os.PathLike[str],
-        labels: Labels,
+        labels: FrameBoxes,
         *,
         every: int = 1,
         name: str | None = None,
@@ -337,7 +337,7 @@ class LabelledFrames:
         labels
             True boxes.
         every
-            Distance between the chosen frames; neighbours show the same.
+            Distance between the chosen frames; neighbors show the same.
         name
             Name of the set; None takes the file's.
         horizon

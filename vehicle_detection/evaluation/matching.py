@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from vehicle_detection._common import describe
 from vehicle_detection.boxes import box_areas, intersection_matrix, iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation.labels import NO_TRACK, FrameKey, Labels, check_keys, frame_order
+from vehicle_detection.evaluation.labels import NO_TRACK, FrameBoxes, FrameKey, check_keys, frame_order
 
 # Share of a box that lies in an ignored box which is taken as a region.
 _WITHIN = 0.5
@@ -39,11 +39,11 @@ class Scores:
 
 
 def prepare_sides(
-    predictions: Labels, labels: Labels, frames: Sequence[FrameKey] | None
-) -> tuple[Labels, Labels, list[FrameKey]]:
+    predictions: FrameBoxes, labels: FrameBoxes, frames: Sequence[FrameKey] | None
+) -> tuple[FrameBoxes, FrameBoxes, list[FrameKey]]:
     """Check both sides, drop predictions that are to be ignored, and list the frames in order."""
     for name, side in (("predictions", predictions), ("labels", labels)):
-        if not isinstance(side, Labels):
+        if not isinstance(side, FrameBoxes):
             raise InvalidInputError(
                 f"{name} must be Labels, got {describe(side)}; read a file with read_labels or convert the "
                 "Detections of each frame with Labels.from_detections"
@@ -71,7 +71,7 @@ def prepare_sides(
     return predictions, labels, sorted({*predictions.frame_keys, *labels.frame_keys}, key=frame_order)
 
 
-def _given_frames(predictions: Labels, frames: tuple[FrameKey, ...]) -> list[FrameKey]:
+def _given_frames(predictions: FrameBoxes, frames: tuple[FrameKey, ...]) -> list[FrameKey]:
     known = set(frames)
     if len(known) < len(frames):
         twice = next(key for key, count in Counter(frames).items() if count > 1)
@@ -85,22 +85,22 @@ def _given_frames(predictions: Labels, frames: tuple[FrameKey, ...]) -> list[Fra
     return sorted(frames, key=frame_order) if frames and isinstance(frames[0], int) else list(frames)
 
 
-def find_neutral(
+def find_ignored(
     boxes: NDArray[np.float64],
-    labels: Labels,
+    labels: FrameBoxes,
     rows: NDArray[np.intp],
     limit: float,
     *,
     as_regions: bool = False,
 ) -> NDArray[np.bool_]:
-    """Whether each box lies with its centre in a region, or covers an ignored box, of the label `rows`.
+    """Whether each box lies with its center in a region, or covers an ignored box, of the label `rows`.
 
     With `as_regions` also whether half of it or more lies in an ignored box, whatever that is.
     """
     ignored = rows[labels.ignore[rows]]
     regions = labels.boxes[ignored[labels.tracks[ignored] == NO_TRACK]]
-    centre = (boxes[:, :2] + boxes[:, 2:]) / 2
-    inside = (regions[:, :2] <= centre[:, None]) & (centre[:, None] < regions[:, 2:])
+    center = (boxes[:, :2] + boxes[:, 2:]) / 2
+    inside = (regions[:, :2] <= center[:, None]) & (center[:, None] < regions[:, 2:])
     covers = iou_matrix(boxes, labels.boxes[ignored]) >= limit
     if as_regions:
         shared = intersection_matrix(boxes, labels.boxes[ignored])

@@ -17,7 +17,7 @@ import numpy as np
 from vehicle_detection._common import check_choice
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import DatasetError
-from vehicle_detection.evaluation.labels import NO_TRACK, FrameKey, Labels, frame_order
+from vehicle_detection.evaluation.labels import NO_TRACK, FrameBoxes, FrameKey, frame_order
 
 LABEL_COLUMNS = ("frame", "track", "x1", "y1", "x2", "y2", "occluded", "truncated", "ignore")
 PREDICTION_COLUMNS = ("frame", "track_id", "x1", "y1", "x2", "y2", "score")
@@ -291,7 +291,7 @@ def read_labels(
     format: str | None = None,  # noqa: A002
     classes: Collection[str] | None = None,
     shape: tuple[int, ...] | None = None,
-) -> Labels:
+) -> FrameBoxes:
     """Read labelled or predicted boxes from a file or folder.
 
     Parameters
@@ -351,7 +351,7 @@ def read_labels(
     return _assemble(rows, keys, shape)
 
 
-def _assemble(rows: list[Row], keys: list[FrameKey], shape: tuple[int, ...] | None) -> Labels:
+def _assemble(rows: list[Row], keys: list[FrameKey], shape: tuple[int, ...] | None) -> FrameBoxes:
     """Check the rows of any format and make them columns."""
     boxes = np.array([row.box for row in rows], np.float64).reshape(-1, 4)
     scored = [row.score is not None for row in rows]
@@ -380,7 +380,7 @@ def _assemble(rows: list[Row], keys: list[FrameKey], shape: tuple[int, ...] | No
                     "check that shape is (height, width) of these frames"
                 )
     distance, speed = (np.array([getattr(row, name) for row in rows]) for name in ("distance_m", "speed_mps"))
-    return Labels(
+    return FrameBoxes(
         [row.frame for row in rows],
         np.array([row.track for row in rows], np.int64),
         boxes,

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from vehicle_detection._common import check_number
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation.labels import NO_TRACK, FrameKey, Labels
+from vehicle_detection.evaluation.labels import NO_TRACK, FrameBoxes, FrameKey
 from vehicle_detection.evaluation.matching import (
     Scores,
     as_lines,
     as_text,
-    find_neutral,
+    find_ignored,
     mean,
     prepare_sides,
     rates,
@@ -99,7 +99,7 @@ class TrackScores(Scores):
 
 
 def evaluate_tracks(
-    predictions: Labels, labels: Labels, *, iou: float = 0.5, frames: Sequence[FrameKey] | None = None
+    predictions: FrameBoxes, labels: FrameBoxes, *, iou: float = 0.5, frames: Sequence[FrameKey] | None = None
 ) -> TrackScores:
     """Score tracks against labels: CLEAR MOT, identity and steadiness.
 
@@ -198,7 +198,7 @@ class _Frame:
 _History = list[int | None]
 
 
-def _check_tracks(side: Labels, name: str, keys: list[FrameKey]) -> None:
+def _check_tracks(side: FrameBoxes, name: str, keys: list[FrameKey]) -> None:
     wanted = set(keys)
     for row in np.flatnonzero((side.tracks == NO_TRACK) & ~side.ignore).tolist():
         if side.frames[row] in wanted:
@@ -208,7 +208,7 @@ def _check_tracks(side: Labels, name: str, keys: list[FrameKey]) -> None:
             )
 
 
-def _follow(predictions: Labels, labels: Labels, keys: list[FrameKey], limit: float) -> list[_Frame]:
+def _follow(predictions: FrameBoxes, labels: FrameBoxes, keys: list[FrameKey], limit: float) -> list[_Frame]:
     """Match the frames in order, each vehicle with its last track if it can."""
     track_of: dict[int, int] = {}
     followed: list[_Frame] = []
@@ -228,14 +228,14 @@ def _follow(predictions: Labels, labels: Labels, keys: list[FrameKey], limit: fl
         track_of.update((vehicles[i], tracks[j]) for i, j in pairs)
 
         rest = np.delete(here, [j for _, j in pairs])
-        neutral = find_neutral(predictions.boxes[rest], labels, rows, limit)
-        out = set(rest[neutral].tolist())
+        ignored = find_ignored(predictions.boxes[rest], labels, rows, limit)
+        out = set(rest[ignored].tolist())
         followed.append(
             _Frame(
                 tick,
                 [(int(targets[i]), int(here[j]), float(overlap[i, j])) for i, j in pairs],
                 np.delete(targets, [i for i, _ in pairs]).tolist(),
-                rest[~neutral].tolist(),
+                rest[~ignored].tolist(),
                 len(out),
                 [(vehicles[i], tracks[j]) for i, j in np.argwhere(overlap >= limit) if here[j] not in out],
             )
@@ -267,7 +267,7 @@ def _pair_rest(
     return [(int(i), int(j)) for i, j in zip(*chosen) if allowed[i, j]]
 
 
-def _histories(predictions: Labels, labels: Labels, followed: list[_Frame]) -> dict[int, _History]:
+def _histories(predictions: FrameBoxes, labels: FrameBoxes, followed: list[_Frame]) -> dict[int, _History]:
     """Each labelled vehicle's frames in order."""
     histories: dict[int, _History] = defaultdict(list)
     for frame in followed:
@@ -302,7 +302,7 @@ def _identity_hits(followed: list[_Frame]) -> int:
     return int(table[linear_sum_assignment(table, maximize=True)].sum())
 
 
-def _jitter(predictions: Labels, labels: Labels, followed: list[_Frame]) -> float:
+def _jitter(predictions: FrameBoxes, labels: FrameBoxes, followed: list[_Frame]) -> float:
     """Mean absolute change of the edge errors, over vehicles that are matched in two frames in a row.
 
     It goes by vehicle: a jump that comes with another track's box is jitter as well.
@@ -319,7 +319,7 @@ def _jitter(predictions: Labels, labels: Labels, followed: list[_Frame]) -> floa
     return mean(changes)
 
 
-def _longest_false_run(predictions: Labels, followed: list[_Frame]) -> int:
+def _longest_false_run(predictions: FrameBoxes, followed: list[_Frame]) -> int:
     longest = 0
     runs: dict[int, tuple[int, int]] = {}
     for frame in followed:

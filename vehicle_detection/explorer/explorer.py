@@ -38,7 +38,7 @@ Frames = Sequence[Image | str | os.PathLike[str]] | Mapping[str, Image | str | o
 
 Key = TypeVar("Key")
 
-# Score at which a window has the brightest colour.
+# Score at which a window has the brightest color.
 _BRIGHTEST = 2.0
 
 
@@ -255,7 +255,7 @@ class Explorer:
         kind: Regions | None = None,
         *,
         threshold: float | None = None,
-        share: float | None = None,
+        peak_fraction: float | None = None,
         weighting: Literal["score", "count"] | None = None,
         min_peak: float | None = None,
         min_evidence: float | None = None,
@@ -273,7 +273,9 @@ class Explorer:
         """
         if kind is not None:
             check_choice(kind, "kind", ("fitted", "heat"))
-        heat = _replaced(self.heat, {"threshold": threshold, "share": share, "weighting": weighting})
+        heat = _replaced(
+            self.heat, {"threshold": threshold, "peak_fraction": peak_fraction, "weighting": weighting}
+        )
         fit = _replaced(self.fit, {"min_peak": min_peak, "min_evidence": min_evidence})
         self.kind, self.heat, self.fit = kind or self.kind, heat, fit
 
@@ -377,7 +379,7 @@ class Explorer:
             self.set_regions(
                 said["kind"],
                 threshold=said["threshold"],
-                share=said["share"],
+                peak_fraction=said["peak_fraction"],
                 weighting=said["weighting"],
                 min_peak=said["min_peak"],
                 min_evidence=said["min_evidence"],
@@ -399,7 +401,9 @@ class Explorer:
 
     def _find_boxes(self) -> Detections:
         if self.kind == "heat":
-            return label_boxes(self.heat_map(), threshold=self.heat.threshold, share=self.heat.share)
+            return label_boxes(
+                self.heat_map(), threshold=self.heat.threshold, peak_fraction=self.heat.peak_fraction
+            )
         shape = self._image()[0].shape[:2]
         camera = self._camera or Camera.for_frame(shape, horizon=self.search.horizon)
         return find_vehicles(self.windows(), camera, shape, self.fit)
@@ -436,7 +440,7 @@ class Explorer:
         whole = dataclasses.replace(self.search, min_score=_ALL_SCORES)
         parts, numbers = [], []
         for number, band in enumerate(whole.bands):
-            if band.place(image.shape, whole.horizon, whole.overhang) is not None:
+            if band.place(image.shape, whole.horizon, whole.horizontal_padding) is not None:
                 found = self._searcher.find(image, dataclasses.replace(whole, bands=(band,)))
                 parts.append(found)
                 numbers.append(np.full(len(found), number))

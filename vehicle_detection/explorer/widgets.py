@@ -17,7 +17,7 @@ from vehicle_detection.params import HeatParams, RegionParams, SearchParams
 
 _JPEG_QUALITY = 88
 # Controls that matter for one kind of boxes alone.
-_ONLY = {"fitted": ("min_peak", "min_evidence"), "heat": ("threshold", "share", "weighting")}
+_ONLY = {"fitted": ("min_peak", "min_evidence"), "heat": ("threshold", "peak_fraction", "weighting")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,7 @@ def lay_out(
         "min_peak": slider("least peak", fit.min_peak, 0.0, 4.0, 0.05),
         "min_evidence": slider("least evidence", fit.min_evidence, 0.0, 20.0, 0.1),
         "threshold": slider("heat above", heat.threshold, 0.0, 30.0, 0.25),
-        "share": slider("share of peak", heat.share, 0.0, 0.95, 0.05),
+        "peak_fraction": slider("share of peak", heat.peak_fraction, 0.0, 0.95, 0.05),
         "weighting": choice("a window adds", ("score", "count"), heat.weighting),
     }
     picture = widgets.Image(format="jpeg", layout=widgets.Layout(width="100%"))

@@ -9,7 +9,7 @@ from vehicle_detection.features.extract import (
     extract_features,
     get_hog_features,
     hog_blocks,
-    hog_picture,
+    hog_image,
     single_img_features,
 )
 
@@ -24,7 +24,7 @@ __all__ = [
     "extract_features",
     "get_hog_features",
     "hog_blocks",
-    "hog_picture",
+    "hog_image",
     "hog_source",
     "pick_hog_channels",
     "single_img_features",

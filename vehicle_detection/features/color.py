@@ -1,4 +1,4 @@
-"""The channels that features are computed of: colour spaces, and what HOG sees."""
+"""The channels that features are computed of: color spaces, and what HOG sees."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _CODES = {
 def convert_color(
     image: NDArray[np.uint8], color_space: str = "YCrCb", *, out: NDArray[np.uint8] | None = None
 ) -> NDArray[np.uint8]:
-    """Convert an RGB image to another colour space, by OpenCV's 8-bit conventions.
+    """Convert an RGB image to another color space, by OpenCV's 8-bit conventions.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def convert_color(
     Raises
     ------
     InvalidInputError
-        If the image is not uint8 RGB or the colour space is unknown.
+        If the image is not uint8 RGB or the color space is unknown.
 
     Examples
     --------
@@ -68,7 +68,7 @@ def hog_source(image: NDArray[np.uint8], params: FeatureParams) -> NDArray[np.ui
 
 
 def pick_hog_channels(converted: NDArray[np.uint8], params: FeatureParams) -> NDArray[np.uint8]:
-    """Channels that HOG sees, of an image that is already in the colour space; not for ``"GRAY"``."""
+    """Channels that HOG sees, of an image that is already in the color space; not for ``"GRAY"``."""
     if params.hog_channel == "ALL":
         return converted
     return np.ascontiguousarray(converted[..., int(params.hog_channel), None])

@@ -25,7 +25,7 @@ from vehicle_detection._common import (
     resolve_jobs,
 )
 from vehicle_detection._kernels import bin_of_value, degree_bounds, orientation_cotangents, sqrt_gradients
-from vehicle_detection._kernels import color as _colour_kernels
+from vehicle_detection._kernels import color as _color_kernels
 from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features.color import convert_color, hog_source, pick_hog_channels
@@ -46,7 +46,7 @@ def batch_extractor(params: FeatureParams) -> Callable[[NDArray[np.uint8], NDArr
 
     def extract(patches: NDArray[np.uint8], features: NDArray[np.float32]) -> None:
         n = len(patches)
-        # Colour conversion is pixel by pixel: the batch is converted as one tall image.
+        # Color conversion is pixel by pixel: the batch is converted as one tall image.
         tall = np.ascontiguousarray(patches).reshape(n * PATCH_SIZE, PATCH_SIZE, 3)
         converted = convert_color(tall, params.color_space).reshape(patches.shape)
         if params.spatial_feat:
@@ -55,7 +55,7 @@ def batch_extractor(params: FeatureParams) -> Callable[[NDArray[np.uint8], NDArr
                 features[index, :spatial_stop].reshape(3, size, size)[:] = small.transpose(2, 0, 1)
         if params.hist_feat:
             counts = features[:, spatial_stop:hist_stop]
-            _colour_kernels.patch_histograms(converted, bins, params.hist_bins, counts)
+            _color_kernels.patch_histograms(converted, bins, params.hist_bins, counts)
             if params.hist_sqrt:
                 np.sqrt(counts, out=counts)
         if params.hog_feat:
@@ -144,7 +144,7 @@ def get_hog_features(
     *,
     transform_sqrt: bool = False,
 ) -> NDArray[np.float64]:
-    """HOG of one channel as a vector; see `hog_blocks` for the parameters and `hog_picture` for a picture.
+    """HOG of one channel as a vector; see `hog_blocks` for the parameters and `hog_image` for a picture.
 
     Dalal and Triggs, "Histograms of oriented gradients for human detection" (CVPR 2005).
 
@@ -166,7 +166,7 @@ def get_hog_features(
     return hog_blocks(img, orient, pix_per_cell, cell_per_block, transform_sqrt=transform_sqrt).ravel()
 
 
-def hog_picture(
+def hog_image(
     img: NDArray[np.uint8],
     orient: int = 9,
     pix_per_cell: int = 8,
@@ -200,12 +200,12 @@ def hog_picture(
 
 
 def bin_spatial(img: NDArray[np.uint8], size: int | tuple[int, int] = (32, 32)) -> NDArray[np.uint8]:
-    """Colour values of a shrunken image, channel by channel.
+    """Color values of a shrunken image, channel by channel.
 
     Parameters
     ----------
     img
-        ``(H, W, 3)`` uint8 in any colour space.
+        ``(H, W, 3)`` uint8 in any color space.
     size
         Width and height to shrink to.
 
@@ -234,7 +234,7 @@ def color_hist(img: NDArray[np.uint8], nbins: int = 32) -> NDArray[np.int64]:
     Parameters
     ----------
     img
-        ``(H, W, 3)`` uint8 in any colour space.
+        ``(H, W, 3)`` uint8 in any color space.
     nbins
         Bins of each channel.
 

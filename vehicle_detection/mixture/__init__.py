@@ -1,6 +1,15 @@
 """The mixture of templates: a model for any road, and its search."""
 
-from vehicle_detection.mixture.boxes import Refinement, mostly_inside, overlaps, suppress
+from vehicle_detection.mixture.boxes import BoxRegressor, mostly_inside, overlaps, vote_boxes
+from vehicle_detection.mixture.crops import (
+    COLORS,
+    CROP,
+    CROP_LENGTH,
+    EDGES,
+    box_planes,
+    crop_features,
+    crop_views,
+)
 from vehicle_detection.mixture.denoise import without_noise
 from vehicle_detection.mixture.features import (
     COARSE,
@@ -8,54 +17,44 @@ from vehicle_detection.mixture.features import (
     PLANES,
     FeatureMap,
     border_strip,
-    halved,
+    image_pyramid,
     level_maps,
     mirror_planes,
-    pair_levels,
+    pyramid_levels,
     strip_boxes,
 )
 from vehicle_detection.mixture.model import MixtureSearch, TemplateMixture, load_model
-from vehicle_detection.mixture.rescoring import (
-    COLOURS,
-    CROP,
-    CROP_LENGTH,
-    EDGES,
-    Projection,
-    Verification,
-    box_planes,
-    crop_features,
-    crop_views,
-)
+from vehicle_detection.mixture.rescoring import Projection, Rescorer
 from vehicle_detection.mixture.template import MixtureTemplate, smallest_box
 
 __all__ = [
     "COARSE",
-    "COLOURS",
+    "COLORS",
     "CROP",
     "CROP_LENGTH",
     "EDGES",
     "FINE",
     "PLANES",
+    "BoxRegressor",
     "FeatureMap",
     "MixtureSearch",
     "MixtureTemplate",
     "Projection",
-    "Refinement",
+    "Rescorer",
     "TemplateMixture",
-    "Verification",
     "border_strip",
     "box_planes",
     "crop_features",
     "crop_views",
-    "halved",
+    "image_pyramid",
     "level_maps",
     "load_model",
     "mirror_planes",
     "mostly_inside",
     "overlaps",
-    "pair_levels",
+    "pyramid_levels",
     "smallest_box",
     "strip_boxes",
-    "suppress",
+    "vote_boxes",
     "without_noise",
 ]

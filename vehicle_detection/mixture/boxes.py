@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_integer, describe
+from vehicle_detection._common import check_integer, finite_array
 from vehicle_detection.boxes import box_areas, clip_boxes, intersection_matrix
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture.rescoring import CROP_LENGTH, crop_features
+from vehicle_detection.mixture.crops import CROP_LENGTH, crop_features
 
 WEAKEST = -1.0
 """Least value of a template that makes a window a candidate."""
@@ -34,24 +33,8 @@ _MOST_SHIFT, _SETTLED = 0.3, 0.15
 Floats = NDArray[np.float64]
 
 
-def finite_array(values: object, name: str, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
-    """Return a float32 copy that cannot be written; None in `shape` stands for any number of entries."""
-    expected = ", ".join("any" if side is None else str(side) for side in shape)
-    try:
-        array = np.array(values, np.float32, order="C")
-    except (TypeError, ValueError):
-        array = np.array(np.nan, np.float32)
-    fits = array.ndim == len(shape) and all(side in (None, n) for side, n in zip(shape, array.shape))
-    if not fits or not array.size or not np.isfinite(array).all():
-        raise InvalidInputError(
-            f"{name} must be finite numbers of shape ({expected}), got {describe(values)}; train again"
-        )
-    array.setflags(write=False)
-    return array
-
-
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class ScoredWindows:
     """Windows as columns: boxes, values of their templates, numbers of the templates."""
 
     boxes: Floats
@@ -61,16 +44,16 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.boxes)
 
-    def __getitem__(self, rows: NDArray[Any] | slice) -> Candidates:
-        return Candidates(self.boxes[rows], self.scores[rows], self.templates[rows])
+    def __getitem__(self, rows: NDArray[Any] | slice) -> ScoredWindows:
+        return ScoredWindows(self.boxes[rows], self.scores[rows], self.templates[rows])
 
     @classmethod
-    def empty(cls) -> Candidates:
+    def empty(cls) -> ScoredWindows:
         """No window."""
         return cls(np.empty((0, 4)), np.empty(0), np.empty(0, np.intp))
 
     @classmethod
-    def join(cls, parts: Sequence[Candidates], shape: tuple[int, ...]) -> Candidates:
+    def join(cls, parts: Sequence[ScoredWindows], shape: tuple[int, ...]) -> ScoredWindows:
         """Put the windows of several searches together; those that are mostly outside the frame go."""
         parts = [part for part in parts if len(part)] or [cls.empty()]
         both = cls(
@@ -80,7 +63,7 @@ class Candidates:
         )
         return both[np.flatnonzero(mostly_inside(both.boxes, shape))]
 
-    def best(self, most: int) -> Candidates:
+    def best(self, most: int) -> ScoredWindows:
         """Take the best windows, from the best one down; of equals the first."""
         return self[np.argsort(-self.scores, kind="stable")[:most]]
 
@@ -100,7 +83,9 @@ def overlaps(box: Floats, others: Floats) -> tuple[Floats, Floats]:
     )
 
 
-def suppress(windows: Candidates, *, least: float, most: int = _MOST_VEHICLES) -> tuple[Candidates, Floats]:
+def vote_boxes(
+    windows: ScoredWindows, *, least: float, most: int = _MOST_VEHICLES
+) -> tuple[ScoredWindows, Floats]:
     """Keep the best window of each group, at the place for which the windows around it vote.
 
     Parameters
@@ -120,7 +105,7 @@ def suppress(windows: Candidates, *, least: float, most: int = _MOST_VEHICLES) -
     left = np.flatnonzero(windows.scores >= least)
     boxes: list[Floats] = []
     kept: list[int] = []
-    support: list[float] = []
+    vote_mass: list[float] = []
     strengths = np.maximum(windows.scores - _VOTE_FROM, 0)
     weights = strengths**2
     # In columns, and with the areas known: this is done for every group of every frame.
@@ -132,7 +117,7 @@ def suppress(windows: Candidates, *, least: float, most: int = _MOST_VEHICLES) -
         shared = width * height
         iou = shared / np.maximum(areas + areas[best] - shared, 1e-9)
         voters = iou > _VOTE
-        support.append(float(strengths @ voters))
+        vote_mass.append(float(strengths @ voters))
         votes = weights * voters
         votes[best] = max(votes[best], 1e-9)
         boxes.append(votes @ windows.boxes / votes.sum())
@@ -140,11 +125,11 @@ def suppress(windows: Candidates, *, least: float, most: int = _MOST_VEHICLES) -
         left = left[iou[left] <= _VOTE]
         left = left[left != best]
     rows = np.array(kept, np.intp)
-    groups = Candidates(np.array(boxes).reshape(-1, 4), windows.scores[rows], windows.templates[rows])
-    return groups, np.array(support)
+    groups = ScoredWindows(np.array(boxes).reshape(-1, 4), windows.scores[rows], windows.templates[rows])
+    return groups, np.array(vote_mass)
 
 
-def resolve(boxes: Floats, scores: Floats, *, iou: float = _IOU, cover: float = _COVER) -> NDArray[np.intp]:
+def nms(boxes: Floats, scores: Floats, *, iou: float = _IOU, cover: float = _COVER) -> NDArray[np.intp]:
     """Rows of the boxes that stay when the weaker of two on one vehicle goes, from the best one down.
 
     Two boxes are on one vehicle whose IoU is above `iou`, or of which the smaller one is covered by more than
@@ -161,7 +146,7 @@ def resolve(boxes: Floats, scores: Floats, *, iou: float = _IOU, cover: float = 
 
 
 @dataclass(frozen=True, eq=False)
-class Refinement:
+class BoxRegressor:
     """A linear correction of boxes from what they show.
 
     Attributes
@@ -171,23 +156,23 @@ class Refinement:
         `crop_features`.
     bias
         ``(4,)`` float32.
-    looks
+    n_iterations
         How often a box is corrected; from the second time on only those that the last correction moved much.
         A box that is far too small or beside its vehicle shows too little of it at first.
     """
 
     weights: NDArray[np.float32]
     bias: NDArray[np.float32]
-    looks: int = 1
+    n_iterations: int = 1
 
     def __post_init__(self) -> None:
-        check_integer(self.looks, "looks", low=1, high=10)
-        weights = finite_array(self.weights, "refinement.weights", (CROP_LENGTH, 4))
+        check_integer(self.n_iterations, "n_iterations", low=1, high=10)
+        weights = finite_array(self.weights, "box_regressor.weights", (CROP_LENGTH, 4))
         object.__setattr__(self, "weights", weights)
-        object.__setattr__(self, "bias", finite_array(self.bias, "refinement.bias", (4,)))
+        object.__setattr__(self, "bias", finite_array(self.bias, "box_regressor.bias", (4,)))
 
     @classmethod
-    def none(cls) -> Refinement:
+    def none(cls) -> BoxRegressor:
         """Correct nothing."""
         return cls(np.zeros((CROP_LENGTH, 4), np.float32), np.zeros(4, np.float32))
 
@@ -198,18 +183,18 @@ class Refinement:
         shifts = crop_features(image, boxes) @ self.weights + self.bias
         return np.clip(shifts.astype(np.float64), -_MOST_SHIFT, _MOST_SHIFT)
 
-    def apply(self, image: NDArray[np.uint8], windows: Candidates) -> tuple[Floats, Floats]:
+    def apply(self, image: NDArray[np.uint8], windows: ScoredWindows) -> tuple[Floats, Floats]:
         """Correct boxes, clip them to the image and drop those that nearly coincide with a better one."""
         boxes, values = windows.boxes.copy(), windows.scores
         moving = np.ones(len(boxes), np.bool_)
-        for _ in range(self.looks):
+        for _ in range(self.n_iterations):
             # No box turns inside out: of a side, at least two fifths are left.
             sides = np.tile(boxes[moving, 2:] - boxes[moving, :2], 2)
             shifts = self.shifts(image, boxes[moving])
             boxes[moving] += shifts * sides
             moving[moving] = np.abs(shifts).max(axis=1, initial=0) > _SETTLED
             inside = clip_boxes(boxes, image.shape)
-            rows = resolve(inside, values, iou=_SAME, cover=np.inf)
+            rows = nms(inside, values, iou=_SAME, cover=np.inf)
             rows = rows[box_areas(inside[rows]) > 0]
             boxes, values, moving = boxes[rows], values[rows], moving[rows]
         return np.asarray(clip_boxes(boxes, image.shape), np.float64), values

@@ -1,6 +1,6 @@
 """Maps of road features: what a vehicle of any size looks like, cell by cell, on a pyramid of a frame.
 
-A cell holds 16 signed and 8 unsigned orientations of its edges, each normalised by the contrast around it,
+A cell holds 16 signed and 8 unsigned orientations of its edges, each normalized by the contrast around it,
 and four sums that tell how strong they are there: 28 values. Edges are those of the square roots of the
 pixels' values, which shows what is dark. The scheme is that of Felzenszwalb et al., "Object detection with
 discriminatively trained part-based models" (PAMI 2010), section 6, with 8 orientations instead of 9.
@@ -70,9 +70,9 @@ def planes_of_sums(sums: NDArray[np.float32], cell: int, take: Take = new_array)
     if per_cell == 1:
         _fhog_kernels.smooth_cells(sums, np.float32(1 / (64 * cell * cell)), cells)
     else:
-        _fhog_kernels.spread_cells(sums, np.float32(1 / (16 * cell * cell)), cells)
+        _fhog_kernels.pool_bilinear(sums, np.float32(1 / (16 * cell * cell)), cells)
     planes = take((PLANES, *shape), np.float32, "planes")
-    _fhog_kernels.normalise_four_ways(cells, _EPS, planes)
+    _fhog_kernels.fhog_normalize(cells, _EPS, planes)
     return planes
 
 
@@ -122,7 +122,7 @@ class FeatureMap:
     step_y: float
 
 
-def halved(image: NDArray[np.uint8], least: int = 64) -> list[NDArray[np.uint8]]:
+def image_pyramid(image: NDArray[np.uint8], least: int = 64) -> list[NDArray[np.uint8]]:
     """List an image and its halves, quarters and so on, down to sides of `least` pixels."""
     images = [image]
     while min(images[-1].shape[:2]) >= 2 * least:
@@ -151,7 +151,7 @@ class Level:
         return [(pixels, cell) for pixels, cell in both if pixels is not None]
 
 
-def pair_levels(sizes: list[float], *, share: bool = True) -> list[Level]:
+def pyramid_levels(sizes: list[float], *, share: bool = True) -> list[Level]:
     """Choose fine or coarse cells for each size; with `share`, a size and its double use one frame."""
     fine = [size for size in sizes if size < COARSE]
     coarse = [size for size in sizes if size >= COARSE]
@@ -172,7 +172,7 @@ def level_maps(
     Parameters
     ----------
     images
-        The frame and its halves, as `halved` lists them.
+        The frame and its halves, as `image_pyramid` lists them.
     level
         The sizes.
     rows

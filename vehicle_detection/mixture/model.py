@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import (
     Buffers,
-    Crew,
     Take,
+    ThreadTeam,
     check_image,
     check_number,
     check_type,
@@ -33,10 +33,17 @@ from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import KIND as PATCH_KIND
 from vehicle_detection.classifier import VehicleClassifier, build_classifier
 from vehicle_detection.errors import InvalidInputError, ModelFileError
-from vehicle_detection.mixture.boxes import WEAKEST, Candidates, Refinement, resolve, suppress
+from vehicle_detection.mixture.boxes import WEAKEST, BoxRegressor, ScoredWindows, nms, vote_boxes
 from vehicle_detection.mixture.denoise import without_noise
-from vehicle_detection.mixture.features import COARSE, FeatureMap, Level, halved, level_maps, pair_levels
-from vehicle_detection.mixture.rescoring import LEAST_VALUE, Verification
+from vehicle_detection.mixture.features import (
+    COARSE,
+    FeatureMap,
+    Level,
+    image_pyramid,
+    level_maps,
+    pyramid_levels,
+)
+from vehicle_detection.mixture.rescoring import RESCORE_MIN, Rescorer
 from vehicle_detection.mixture.template import MixtureTemplate, smallest_box
 from vehicle_detection.params import PyramidParams
 
@@ -54,18 +61,18 @@ class TemplateMixture:
     ----------
     templates
         One or more `MixtureTemplate`.
-    refinement
+    box_regressor
         Corrects the boxes.
-    verification
+    rescorer
         Gives boxes a second opinion; None leaves their value to the templates.
     slope, offset
         Turn a vehicle's value into log-odds that it is a vehicle: ``slope * value + offset``.
     threshold
         Least log-odds of a vehicle.
-    near_gain
+    size_prior_weight
         Added to a vehicle's value for every doubling of its box's height from a quarter of the frame's on,
         and taken off for every halving: there are more places for what is small.
-    support_gain
+    vote_weight
         Added to a vehicle's value for every factor e in how many windows, and how good ones, agree on it: a
         vehicle is found by many of similar place and size, clutter by one or two. Few windows take as much
         off.
@@ -85,13 +92,13 @@ class TemplateMixture:
     """
 
     templates: tuple[MixtureTemplate, ...]
-    refinement: Refinement
+    box_regressor: BoxRegressor
     slope: float = 1.0
     offset: float = 0.0
     threshold: float = 0.0
-    near_gain: float = 0.0
-    support_gain: float = 0.0
-    verification: Verification | None = None
+    size_prior_weight: float = 0.0
+    vote_weight: float = 0.0
+    rescorer: Rescorer | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -100,14 +107,14 @@ class TemplateMixture:
             raise InvalidInputError("templates must hold at least one template; got none")
         for template in templates:
             check_type(template, "templates", MixtureTemplate, "train_mixture makes them")
-        check_type(self.refinement, "refinement", Refinement, "train_mixture makes one")
-        if self.verification is not None:
-            check_type(self.verification, "verification", Verification, "train_mixture makes one, or None")
+        check_type(self.box_regressor, "box_regressor", BoxRegressor, "train_mixture makes one")
+        if self.rescorer is not None:
+            check_type(self.rescorer, "rescorer", Rescorer, "train_mixture makes one, or None")
         check_number(self.slope, "slope", above=0, high=1e9)
         check_number(self.offset, "offset")
         check_number(self.threshold, "threshold")
-        check_number(self.near_gain, "near_gain", low=0)
-        check_number(self.support_gain, "support_gain", low=0)
+        check_number(self.size_prior_weight, "size_prior_weight", low=0)
+        check_number(self.vote_weight, "vote_weight", low=0)
         object.__setattr__(self, "templates", templates)
 
     def scores(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -119,38 +126,36 @@ class TemplateMixture:
         return (score + self.threshold - self.offset) / self.slope
 
     def vehicles(
-        self, image: NDArray[np.uint8], found: Candidates, *, least: float
+        self, image: NDArray[np.uint8], found: ScoredWindows, *, least: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Boxes and values, `least` or more, of the vehicles to which windows of a frame lead, best first."""
         # What the second opinion will say of a box is not known before.
-        boxes, values = self.proposals(
-            image, found, least=least if self.verification is None else LEAST_VALUE
-        )
-        if self.verification is not None:
-            values = self.verification.apply(image, boxes, values)
-        rows = resolve(boxes, values)
+        boxes, values = self.proposals(image, found, least=least if self.rescorer is None else RESCORE_MIN)
+        if self.rescorer is not None:
+            values = self.rescorer.apply(image, boxes, values)
+        rows = nms(boxes, values)
         rows = rows[values[rows] >= least]
         return boxes[rows], values[rows]
 
     def proposals(
-        self, image: NDArray[np.uint8], found: Candidates, *, least: float
+        self, image: NDArray[np.uint8], found: ScoredWindows, *, least: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Corrected boxes, and values by the templates of `least` or more; several may be on one vehicle."""
         # At most the frame's height, which is two doublings, is gained; of support two steps count as well.
-        least_alone = least - 2 * self.near_gain - 2 * self.support_gain
-        grouped, support = suppress(found, least=least_alone)
-        values = grouped.scores + self.support_gain * np.minimum(np.log1p(support) - 2, 2)
+        least_alone = least - 2 * self.size_prior_weight - 2 * self.vote_weight
+        grouped, vote_mass = vote_boxes(found, least=least_alone)
+        values = grouped.scores + self.vote_weight * np.minimum(np.log1p(vote_mass) - 2, 2)
         # A look makes a box 1.6 times as high at most, which is 0.68 doublings.
-        slack = 0.68 * self.refinement.looks * self.near_gain
+        slack = 0.68 * self.box_regressor.n_iterations * self.size_prior_weight
         most = values + self._gain_of_height(grouped.boxes, image) + slack
         grouped = replace(grouped, scores=values)[most >= least]
-        boxes, values = self.refinement.apply(image, grouped)
+        boxes, values = self.box_regressor.apply(image, grouped)
         values = values + self._gain_of_height(boxes, image)
         kept = values >= least
         return boxes[kept], values[kept]
 
     def _gain_of_height(self, boxes: NDArray[np.float64], image: NDArray[np.uint8]) -> NDArray[np.float64]:
-        return np.asarray(self.near_gain * np.log2(4 * (boxes[:, 3] - boxes[:, 1]) / image.shape[0]))
+        return np.asarray(self.size_prior_weight * np.log2(4 * (boxes[:, 3] - boxes[:, 1]) / image.shape[0]))
 
     def with_metadata(self, metadata: Mapping[str, Any]) -> TemplateMixture:
         """Return the same model with other facts in its file."""
@@ -159,25 +164,25 @@ class TemplateMixture:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the model as a safetensors file: tensors and JSON, nothing that runs when loaded."""
         tensors: dict[str, NDArray[Any]] = {
-            "refinement.weights": self.refinement.weights,
-            "refinement.bias": self.refinement.bias,
+            "box_regressor.weights": self.box_regressor.weights,
+            "box_regressor.bias": self.box_regressor.bias,
         }
         for index, template in enumerate(self.templates):
             tensors[f"{index}.weights"] = template.weights
         params: dict[str, Any] = {
             "biases": [template.bias for template in self.templates],
-            "margins": [template.margin for template in self.templates],
+            "paddings": [template.margin for template in self.templates],
             "borders": [template.border for template in self.templates],
             "slope": self.slope,
             "offset": self.offset,
             "threshold": self.threshold,
-            "near_gain": self.near_gain,
-            "support_gain": self.support_gain,
-            "looks": self.refinement.looks,
+            "size_prior_weight": self.size_prior_weight,
+            "vote_weight": self.vote_weight,
+            "n_iterations": self.box_regressor.n_iterations,
         }
-        if self.verification is not None:
-            tensors |= self.verification.tensors()
-            params["verification"] = self.verification.numbers()
+        if self.rescorer is not None:
+            tensors |= self.rescorer.tensors()
+            params["rescorer"] = self.rescorer.numbers()
         write_model(path, KIND, params, tensors, self.metadata)
 
 
@@ -209,19 +214,21 @@ def load_model(path: str | os.PathLike[str] = "default") -> TemplateMixture | Ve
     params, tensors = model.params, model.tensors
     try:
         borders = params.get("borders", [False] * len(params["biases"]))
-        rows = zip(params["biases"], params["margins"], borders, strict=True)
+        rows = zip(params["biases"], params["paddings"], borders, strict=True)
         templates = tuple(
             MixtureTemplate(
                 tensors[f"{index}.weights"], float(bias), (float(margin[0]), float(margin[1])), border
             )
             for index, (bias, margin, border) in enumerate(rows)
         )
-        looks = params.get("looks", 1)
-        refinement = Refinement(tensors["refinement.weights"], tensors["refinement.bias"], looks)
+        n_iterations = params.get("n_iterations", 1)
+        box_regressor = BoxRegressor(
+            tensors["box_regressor.weights"], tensors["box_regressor.bias"], n_iterations
+        )
         numbers = {name: float(params[name]) for name in ("slope", "offset", "threshold")}
-        numbers |= {name: float(params.get(name, 0.0)) for name in ("near_gain", "support_gain")}
-        second = Verification.build(tensors, params["verification"]) if "verification" in params else None
-        return TemplateMixture(templates, refinement, **numbers, verification=second, metadata=model.metadata)
+        numbers |= {name: float(params.get(name, 0.0)) for name in ("size_prior_weight", "vote_weight")}
+        second = Rescorer.build(tensors, params["rescorer"]) if "rescorer" in params else None
+        return TemplateMixture(templates, box_regressor, **numbers, rescorer=second, metadata=model.metadata)
     except (InvalidInputError, KeyError, IndexError, TypeError, ValueError) as error:
         raise ModelFileError(f"{model.name} does not fit its own parameters: {error}") from error
 
@@ -268,7 +275,7 @@ class MixtureSearch:
     def __init__(self, mixture: TemplateMixture, *, n_jobs: int | None = None) -> None:
         check_type(mixture, "mixture", TemplateMixture, 'load_model("default") or train_mixture make one')
         self.mixture = mixture
-        self._crew = Crew(n_jobs, name="search")
+        self._crew = ThreadTeam(n_jobs, name="search")
         self._local = threading.local()
 
     def close(self) -> None:
@@ -314,7 +321,7 @@ class MixtureSearch:
             Detections(found.boxes[evidence], scores[evidence]), Detections(boxes, mixture.scores(values))
         )
 
-    def candidates(self, image: NDArray[np.uint8], params: PyramidParams) -> Candidates:
+    def candidates(self, image: NDArray[np.uint8], params: PyramidParams) -> ScoredWindows:
         """Windows with their templates' values, the best ones first, weak ones too: they vote for boxes.
 
         The image is taken as it is, noise and all.
@@ -324,27 +331,27 @@ class MixtureSearch:
         least = np.float32(min(WEAKEST, self.mixture.value(params.min_score)))
         shape = image.shape[:2]
         sizes = params.sizes(*smallest_box(self.mixture.templates), shape)
-        levels = pair_levels(sizes, share=params.horizon is None)
+        levels = pyramid_levels(sizes, share=params.horizon is None)
         with single_threaded_opencv():
-            images = halved(image)
+            images = image_pyramid(image)
             parts = self._crew.map(
                 lambda level: self._level(images, level, params, least),
                 levels,
                 cost=lambda level: level.shrink,
             )
-        return Candidates.join(parts, shape).best(_MOST_WINDOWS)
+        return ScoredWindows.join(parts, shape).best(_MOST_WINDOWS)
 
     def _level(
         self, images: list[NDArray[np.uint8]], level: Level, params: PyramidParams, least: np.float32
-    ) -> Candidates:
+    ) -> ScoredWindows:
         """Windows of all templates on one resized frame."""
         shape = images[0].shape[:2]
         templates = {
             pixels: [
                 (index, template)
                 for index, template in enumerate(self.mixture.templates)
-                if template.box_cells[0] * pixels >= params.least_width * 0.999
-                and template.box_cells[1] * pixels <= params.most_height * shape[0]
+                if template.box_cells[0] * pixels >= params.min_width * 0.999
+                and template.box_cells[1] * pixels <= params.max_height * shape[0]
             ]
             for pixels, _ in level.sizes
         }
@@ -355,14 +362,14 @@ class MixtureSearch:
         ]
         rows = min((top for top, _ in reach), default=0), max((bottom for _, bottom in reach), default=0)
         if min(rows[1] - rows[0], shape[1]) * level.shrink < COARSE:
-            return Candidates.empty()
+            return ScoredWindows.empty()
         buffers = self._local.__dict__.setdefault("buffers", Buffers())
         found = [
             self._hits(index, template, features, least, shape[1], buffers.take)
             for pixels, features in level_maps(images, level, rows, buffers.take)
             for index, template in templates[pixels]
         ]
-        return Candidates.join(found, shape)
+        return ScoredWindows.join(found, shape)
 
     @staticmethod
     def _rows(
@@ -384,7 +391,7 @@ class MixtureSearch:
         least: np.float32,
         width: int,
         take: Take,
-    ) -> Candidates:
+    ) -> ScoredWindows:
         if template.border:
             found = [
                 template.border_windows(level, end, left=left, least=float(least), take=take)
@@ -395,4 +402,4 @@ class MixtureSearch:
             scores = template.scores(level.planes, take)
             rows, columns = (scores > least).nonzero()
             boxes, values = template.boxes(level, rows, columns), scores[rows, columns].astype(np.float64)
-        return Candidates(boxes, values, np.full(len(boxes), index, np.intp))
+        return ScoredWindows(boxes, values, np.full(len(boxes), index, np.intp))

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Take, check_number, describe, new_array
+from vehicle_detection._common import Take, check_number, describe, finite_array, new_array
 from vehicle_detection._kernels import Filter
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture.boxes import finite_array
 from vehicle_detection.mixture.features import PLANES, FeatureMap, border_strip, strip_boxes
 
 

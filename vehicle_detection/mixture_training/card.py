@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from vehicle_detection._common import written_whole
+from vehicle_detection._common import atomic_write
 from vehicle_detection.evaluation import precision_recall_curve
 from vehicle_detection.mixture import TemplateMixture
-from vehicle_detection.mixture_training.cross_validation import HeldOut, RoadScore
+from vehicle_detection.mixture_training.cross_validation import FoldDetections, FoldScore
 from vehicle_detection.mixture_training.drawn_frames import DRAWN
-from vehicle_detection.mixture_training.train import FrameSource
+from vehicle_detection.mixture_training.train import FrameDataset
 
 _CARD = """# Model card: {name}
 
@@ -53,7 +53,7 @@ by the frame, seen from the side at close range or under 32 pixels wide are miss
 and shop fronts fire. Use it to explore and to annotate, not to drive.
 """
 _SECOND = """On what they find, a support
-vector machine with a Gaussian kernel ({vectors:,} vectors, edges and colours) has a share of {share:g} in the
+vector machine with a Gaussian kernel ({vectors:,} vectors, edges and colors) has a share of {share:g} in the
 vehicle's value. """
 # What is known of the shipped model's sources; of others the card says nothing.
 _SHIPPED_SOURCES = {"india", "camvid", "indonesia", "course"}
@@ -68,8 +68,8 @@ _OTHER_TERMS = "The terms of these frames hold for the model as well."
 def write_card(
     path: str | os.PathLike[str],
     mixture: TemplateMixture,
-    scores: Sequence[RoadScore],
-    sources: Sequence[FrameSource],
+    scores: Sequence[FoldScore],
+    sources: Sequence[FrameDataset],
     seed: int,
     patches: int = 0,
 ) -> None:
@@ -93,7 +93,7 @@ def write_card(
     )
     if patches:
         data += f"\n- {patches} vehicles on the course's patches"
-    second = mixture.verification
+    second = mixture.rescorer
     known = {source.name for source in sources} - {DRAWN} == _SHIPPED_SOURCES
     text = _CARD.format(
         terms=(_TERMS if known else _OTHER_TERMS) + _PATCH_TERMS * (patches > 0),
@@ -102,12 +102,14 @@ def write_card(
         count=len(mixture.templates),
         seed=seed,
         shapes=shapes,
-        second=_SECOND.format(vectors=len(second.weights), share=second.share) if second is not None else "",
+        second=_SECOND.format(vectors=len(second.weights), share=second.blend_weight)
+        if second is not None
+        else "",
         threshold=mixture.threshold,
         rows=rows,
         data=data,
     )
-    with written_whole(path, "path") as part:
+    with atomic_write(path, "path") as part:
         part.write_text(text, encoding="utf-8")
 
 
@@ -115,9 +117,9 @@ def _or_dash(value: float, digits: int) -> str:
     return "-" if np.isnan(value) else f"{value:.{digits}f}"
 
 
-def write_curves(path: str | os.PathLike[str], held: Sequence[HeldOut]) -> None:
+def write_curves(path: str | os.PathLike[str], held: Sequence[FoldDetections]) -> None:
     """Write precision and recall of every set left out, a row for each threshold."""
-    with written_whole(path, "path") as part, part.open("w", newline="", encoding="utf-8") as file:
+    with atomic_write(path, "path") as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["frames", "value", "precision", "recall"])
         for one in held:

@@ -14,16 +14,16 @@ import vehicle_detection
 from vehicle_detection._common import check_integer, resolve_jobs
 from vehicle_detection.boxes import Detections
 from vehicle_detection.evaluation import (
+    FrameBoxes,
     LabelledFrames,
-    Labels,
     evaluate_detections,
     match_detections,
     precision_recall_curve,
 )
 from vehicle_detection.mixture import MixtureSearch, TemplateMixture, without_noise
 from vehicle_detection.mixture_training.negatives import check_sources
-from vehicle_detection.mixture_training.train import FrameSource, MixtureParams, train_mixture
-from vehicle_detection.params import PyramidParams
+from vehicle_detection.mixture_training.train import FrameDataset, train_mixture
+from vehicle_detection.params import MixtureParams, PyramidParams
 
 Floats = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ _THRESHOLDS = np.arange(-1.0, 1.5, 0.02)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RoadScore:
+class FoldScore:
     """What a mixture finds in a set of frames whose source it was not trained on.
 
     Attributes
@@ -83,7 +83,7 @@ class RoadScore:
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOut:
+class FoldDetections:
     """What models found in the frames of sources that they were not trained on.
 
     Attributes
@@ -98,10 +98,10 @@ class HeldOut:
 
     source: str
     frames: LabelledFrames
-    found: Labels
+    found: FrameBoxes
 
     @property
-    def truth(self) -> Labels:
+    def truth(self) -> FrameBoxes:
         """Labels with all frames as frames."""
         return replace(self.frames.labels, frame_keys=tuple(self.frames.keys))
 
@@ -111,21 +111,21 @@ class HeldOut:
         assert self.found.scores is not None
         return self.found.scores
 
-    def above(self, threshold: float) -> Labels:
+    def above(self, threshold: float) -> FrameBoxes:
         """Boxes from a threshold on."""
         return self.found[self.scores >= threshold]
 
 
-def judge_mixture(
-    sources: Sequence[FrameSource],
+def cross_validate_mixture(
+    sources: Sequence[FrameDataset],
     params: MixtureParams | None = None,
     *,
-    always: Sequence[FrameSource] = (),
+    always: Sequence[FrameDataset] = (),
     patches: Sequence[NDArray[np.uint8]] = (),
     random_state: int = 0,
     n_jobs: int | None = None,
     on_step: Callable[[str], object] | None = None,
-) -> tuple[TemplateMixture, list[RoadScore], list[HeldOut]]:
+) -> tuple[TemplateMixture, list[FoldScore], list[FoldDetections]]:
     """Train a mixture on all sources, calibrated and judged by leaving out one source after the other.
 
     Parameters
@@ -157,7 +157,7 @@ def judge_mixture(
     known = check_sources((*sources, *check_sources(always, least=0)))[len(sources) :]
     check_integer(random_state, "random_state", low=0, high=2**32 - 1)
     tell = on_step or (lambda line: None)
-    held: list[HeldOut] = []
+    held: list[FoldDetections] = []
     for out in sources:
         rest = [source for source in sources if source is not out] + [*known]
         mixture = train_mixture(
@@ -168,7 +168,7 @@ def judge_mixture(
             n_jobs=n_jobs,
             on_step=lambda line: None,
         )
-        held += find_in(mixture, out, n_jobs=n_jobs)
+        held += detect_in_source(mixture, out, n_jobs=n_jobs)
         tell(f"{out.name}: judged by a model that does not know it")
     scores = [
         _score(part, _threshold([other for other in held if other.source != part.source])) for part in held
@@ -187,7 +187,9 @@ def judge_mixture(
     return calibrated, scores, held
 
 
-def find_in(mixture: TemplateMixture, source: FrameSource, *, n_jobs: int | None = None) -> list[HeldOut]:
+def detect_in_source(
+    mixture: TemplateMixture, source: FrameDataset, *, n_jobs: int | None = None
+) -> list[FoldDetections]:
     """Find vehicles in all frames of a source as a detector does that is told nothing, weak ones too."""
     search = MixtureSearch(mixture, n_jobs=1)
     sizes = PyramidParams()
@@ -199,19 +201,19 @@ def find_in(mixture: TemplateMixture, source: FrameSource, *, n_jobs: int | None
 
     with ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
         return [
-            HeldOut(source.name, part, Labels.from_detections(dict(pool.map(boxes_of, part))))
+            FoldDetections(source.name, part, FrameBoxes.from_detections(dict(pool.map(boxes_of, part))))
             for part in source.sets
         ]
 
 
-def _score(part: HeldOut, threshold: float) -> RoadScore:
+def _score(part: FoldDetections, threshold: float) -> FoldScore:
     truth, kept = part.truth, part.above(threshold)
     scores = evaluate_detections(kept, truth)
     lenient = evaluate_detections(kept, truth, ignored_as_regions=True)
     precision, recall, _ = precision_recall_curve(part.found, truth)
     every = evaluate_detections(part.found, truth, ignored_as_regions=True)
     values, empty = _on_empty(part)
-    return RoadScore(
+    return FoldScore(
         name=part.frames.name,
         source=part.source,
         frames=len(part.frames),
@@ -236,39 +238,39 @@ def _f1(precision: Floats, recall: Floats) -> Floats:
     return np.asarray(2 * precision * recall / np.maximum(precision + recall, 1e-9), np.float64)
 
 
-def _on_empty(part: HeldOut) -> tuple[Floats, int]:
+def _on_empty(part: FoldDetections) -> tuple[Floats, int]:
     """Values of the boxes on frames without any label, all of them false, and the number of the frames."""
     empty = [key for key in part.frames.keys if not len(part.frames.labels.rows(key))]
     rows = np.concatenate([np.empty(0, np.intp), *(part.found.rows(key) for key in empty)])
     return part.scores[rows], len(empty)
 
 
-def _threshold(held: Sequence[HeldOut]) -> float:
+def _threshold(held: Sequence[FoldDetections]) -> float:
     """Choose the threshold with the best F1 over all vehicles of these sets together.
 
     A mean of the sets' own F1 would let a few dozen vehicles decide as much as hundreds.
     """
     right, shown, vehicles = np.zeros(len(_THRESHOLDS)), np.zeros(len(_THRESHOLDS)), 0
     for part in held:
-        fate = match_detections(part.found, part.truth, list(part.frames.keys), 0.5)
-        found = part.scores[~fate.neutral][:, None] >= _THRESHOLDS
-        right += found[fate.partner[~fate.neutral] >= 0].sum(axis=0)
+        match = match_detections(part.found, part.truth, list(part.frames.keys), 0.5)
+        found = part.scores[~match.ignored][:, None] >= _THRESHOLDS
+        right += found[match.partner[~match.ignored] >= 0].sum(axis=0)
         shown += found.sum(axis=0)
         vehicles += int((~part.truth.ignore).sum())
     f1 = 2 * right / np.maximum(shown + vehicles, 1)
     return float(_THRESHOLDS[f1.argmax()])
 
 
-def _log_odds(held: Sequence[HeldOut]) -> tuple[float, float]:
+def _log_odds(held: Sequence[FoldDetections]) -> tuple[float, float]:
     """Slope and offset that turn values into log-odds, by what was found in sources left out."""
     from sklearn.linear_model import LogisticRegression
 
     values, right = [], []
     for part in held:
-        fate = match_detections(part.found, part.truth, list(part.frames.keys), 0.5)
-        judged = ~fate.neutral
+        match = match_detections(part.found, part.truth, list(part.frames.keys), 0.5)
+        judged = ~match.ignored
         values += part.scores[judged].tolist()
-        right += (fate.partner[judged] >= 0).tolist()
+        right += (match.partner[judged] >= 0).tolist()
     if len(set(right)) < 2:
         return 1.0, 0.0
     fitted = LogisticRegression(C=1e6).fit(np.array(values)[:, None], right)
@@ -278,7 +280,7 @@ def _log_odds(held: Sequence[HeldOut]) -> tuple[float, float]:
 
 
 def as_metadata(
-    scores: Sequence[RoadScore], sources: Sequence[FrameSource], seed: int, patches: int = 0
+    scores: Sequence[FoldScore], sources: Sequence[FrameDataset], seed: int, patches: int = 0
 ) -> dict[str, Any]:
     """Collect what a model file tells of its training."""
     data = {source.name: sum(len(part) for part in source.sets) for source in sources}

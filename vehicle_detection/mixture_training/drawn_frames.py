@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from vehicle_detection._common import check_integer
-from vehicle_detection.evaluation import FrameKey, LabelledFrames, Labels
-from vehicle_detection.mixture_training.negatives import FrameSource
+from vehicle_detection.evaluation import FrameBoxes, FrameKey, LabelledFrames
+from vehicle_detection.mixture_training.negatives import FrameDataset
 from vehicle_detection.synthetic import Drive, render_drive
 
 DRAWN = "drawn"
@@ -41,7 +41,7 @@ _CUT = 0.2
 _STEP = 5
 
 
-def drawn_source(*, drives: int = 2 * len(_CASES), frames: int = 2, random_state: int = 0) -> FrameSource:
+def drawn_source(*, drives: int = 2 * len(_CASES), frames: int = 2, random_state: int = 0) -> FrameDataset:
     """Draw frames of different roads, lights and sizes, with their vehicles.
 
     Parameters
@@ -55,7 +55,7 @@ def drawn_source(*, drives: int = 2 * len(_CASES), frames: int = 2, random_state
 
     Returns
     -------
-    FrameSource
+    FrameDataset
         A set of frames for each drive.
 
     Raises
@@ -78,7 +78,7 @@ def drawn_source(*, drives: int = 2 * len(_CASES), frames: int = 2, random_state
         options = {name: value for name, value in case.items() if name != "cut"}
         drive = render_drive(frames=_FRAMES, random_state=rng, **options)
         parts.append(_sampled(f"{DRAWN} {number + 1}", drive, taken, cut=case.get("cut", False)))
-    return FrameSource(DRAWN, tuple(parts))
+    return FrameDataset(DRAWN, tuple(parts))
 
 
 def _sampled(name: str, drive: Drive, frames: int, *, cut: bool) -> LabelledFrames:
@@ -89,7 +89,7 @@ def _sampled(name: str, drive: Drive, frames: int, *, cut: bool) -> LabelledFram
     scenes = {index: drive[index] for index in chosen}
     images: dict[FrameKey, Any] = {index: scene.image for index, scene in scenes.items()}
     rows = [(index, row) for index, scene in scenes.items() for row in scene.truth]
-    labels = Labels(
+    labels = FrameBoxes(
         [index for index, _ in rows],
         np.array([row.track for _, row in rows], np.intp),
         np.array([row.box for _, row in rows], np.float64).reshape(-1, 4),

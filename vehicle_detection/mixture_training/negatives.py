@@ -17,17 +17,17 @@ from vehicle_detection.mixture import (
     FeatureMap,
     MixtureTemplate,
     border_strip,
-    halved,
+    image_pyramid,
     level_maps,
     mirror_planes,
     mostly_inside,
     overlaps,
-    pair_levels,
+    pyramid_levels,
     smallest_box,
     strip_boxes,
     without_noise,
 )
-from vehicle_detection.mixture_training.train import MixtureParams, entries
+from vehicle_detection.params import MixtureParams, entries
 
 Floats = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ _HARD, _MOST_HITS = -0.9, 400
 
 
 @dataclass(frozen=True, eq=False)
-class FrameSource:
+class FrameDataset:
     """Labelled frames of one camera or country.
 
     Attributes
@@ -45,7 +45,7 @@ class FrameSource:
         Name of the source.
     sets
         Its frames.
-    complete_from
+    min_labelled_width
         Width in pixels from which on every vehicle is labelled: narrower windows are no negatives.
 
     Raises
@@ -57,13 +57,13 @@ class FrameSource:
     --------
     >>> from vehicle_detection.evaluation.detections import Labels
     >>> road = LabelledFrames("road", [np.zeros((90, 120, 3), np.uint8)], Labels([0], None, [[9, 9, 60, 50]]))
-    >>> FrameSource("camera", [road], complete_from=40).sets
+    >>> FrameDataset("camera", [road], min_labelled_width=40).sets
     (LabelledFrames('road', 1 frame, 1 box),)
     """
 
     name: str
     sets: tuple[LabelledFrames, ...]
-    complete_from: float = 0.0
+    min_labelled_width: float = 0.0
 
     def __post_init__(self) -> None:
         name: object = self.name
@@ -72,16 +72,16 @@ class FrameSource:
         sets = entries(self.sets, "sets")
         for part in sets:
             check_type(part, "sets", LabelledFrames, "pass the frames with their labels as LabelledFrames")
-        check_number(self.complete_from, "complete_from", low=0)
+        check_number(self.min_labelled_width, "min_labelled_width", low=0)
         object.__setattr__(self, "sets", sets)
 
 
-def check_sources(sources: object, *, least: int = 1) -> tuple[FrameSource, ...]:
+def check_sources(sources: object, *, least: int = 1) -> tuple[FrameDataset, ...]:
     """Return sources of different names, `least` or more."""
     if not isinstance(sources, (tuple, list)):
-        raise InvalidInputError(f"sources must be a list of FrameSource, got {describe(sources)}")
+        raise InvalidInputError(f"sources must be a list of FrameDataset, got {describe(sources)}")
     for source in sources:
-        check_type(source, "sources", FrameSource, "name the frames of each camera or country with one")
+        check_type(source, "sources", FrameDataset, "name the frames of each camera or country with one")
     names = [source.name for source in sources]
     if len(names) < least:
         more = "two or more, so that one can be left out" if least > 1 else "one or more"
@@ -106,17 +106,17 @@ class Frame:
         ``(N, 4)`` boxes of the vehicles, inside the frame.
     ignored
         ``(M, 4)`` boxes to ignore.
-    complete_from
+    min_labelled_width
         Width from which on every vehicle is labelled.
     """
 
     image: NDArray[np.uint8]
     boxes: Floats
     ignored: Floats
-    complete_from: float
+    min_labelled_width: float
 
 
-def frames_of(sources: Sequence[FrameSource]) -> list[Frame]:
+def frames_of(sources: Sequence[FrameDataset]) -> list[Frame]:
     """Load all frames of some sources."""
     found = []
     for source in sources:
@@ -124,7 +124,7 @@ def frames_of(sources: Sequence[FrameSource]) -> list[Frame]:
             for key, image in part:
                 labels = part.labels.frame(key)
                 boxes, ignored = labels.boxes[~labels.ignore], labels.boxes[labels.ignore]
-                found.append(Frame(without_noise(image), boxes, ignored, source.complete_from))
+                found.append(Frame(without_noise(image), boxes, ignored, source.min_labelled_width))
     return found
 
 
@@ -149,30 +149,30 @@ def with_mirrored(templates: Sequence[MixtureTemplate], facing: Sequence[bool]) 
 
 def is_negative(boxes: Floats, frame: Frame) -> NDArray[np.bool_]:
     """Tell which windows surely show no vehicle, by the labels."""
-    sure = boxes[:, 2] - boxes[:, 0] >= frame.complete_from
+    sure = boxes[:, 2] - boxes[:, 0] >= frame.min_labelled_width
     if len(frame.boxes):
         sure &= iou_matrix(boxes, frame.boxes).max(axis=1) < 0.3
     if len(frame.ignored):
-        centres = ((boxes[:, :2] + boxes[:, 2:]) / 2)[:, None]
+        centers = ((boxes[:, :2] + boxes[:, 2:]) / 2)[:, None]
         low, high = frame.ignored[None, :, :2], frame.ignored[None, :, 2:]
-        within = np.asarray((centres > low) & (centres < high)).all(axis=2)
+        within = np.asarray((centers > low) & (centers < high)).all(axis=2)
         sure &= ~np.asarray(within).any(axis=1)
         shared = intersection_matrix(boxes, frame.ignored)
         sure &= (shared / box_areas(boxes)[:, None]).max(axis=1) < 0.3
     return np.asarray(sure, np.bool_)
 
 
-Mined = list[tuple[int, tuple[int, ...], NDArray[np.float32]]]
+HardNegatives = list[tuple[int, tuple[int, ...], NDArray[np.float32]]]
 """Template, place in the frame and features of each negative window."""
 
 
-def random_windows(frame: Frame, seed: int, views: Sequence[View], params: MixtureParams) -> Mined:
+def random_windows(frame: Frame, seed: int, views: Sequence[View], params: MixtureParams) -> HardNegatives:
     """Take some windows at random, of one size in seven or so."""
     rng = np.random.default_rng(int(seed))
     return _windows_of(frame, views, params, lambda scores: rng.permutation(scores.size)[: rng.poisson(0.15)])
 
 
-def mine_windows(frame: Frame, views: Sequence[View], params: MixtureParams) -> Mined:
+def mine_windows(frame: Frame, views: Sequence[View], params: MixtureParams) -> HardNegatives:
     """Take the windows that the templates wrongly like best."""
 
     def choose(scores: NDArray[np.float32]) -> NDArray[np.intp]:
@@ -189,18 +189,18 @@ def _windows_of(
     views: Sequence[View],
     params: MixtureParams,
     choose: Callable[[NDArray[np.float32]], NDArray[np.intp]],
-) -> Mined:
+) -> HardNegatives:
     """Windows of a frame that `choose` takes by their scores, and that are no vehicles."""
     shape = frame.image.shape[:2]
     sizes = params.search.sizes(*smallest_box([view.template for view in views]), shape)
     with single_threaded_opencv():
-        images = halved(frame.image)
+        images = image_pyramid(frame.image)
         levels = [
             features
-            for level in pair_levels(sizes)
+            for level in pyramid_levels(sizes)
             for _, features in level_maps(images, level, (0, shape[0]))
         ]
-    mined: Mined = []
+    mined: HardNegatives = []
     for number, view in enumerate(views):
         if view.template.border:
             mined += _windows_at_ends(frame, levels, number, view, params, choose)
@@ -231,17 +231,17 @@ def _windows_at_ends(
     view: View,
     params: MixtureParams,
     choose: Callable[[NDArray[np.float32]], NDArray[np.intp]],
-) -> Mined:
+) -> HardNegatives:
     """Windows next to the borders of a frame, and where it might as well have ended."""
     template, (height, width) = view.template, frame.image.shape[:2]
     columns = template.weights.shape[1]
-    mined: Mined = []
+    mined: HardNegatives = []
     for left, share in itertools.product((False, True), (1.0, *params.cuts)):
         end = round(width * (1 - share if left else share))
         strips = {
             size: (level, strip)
             for size, level in enumerate(levels)
-            if template.box_cells[0] * level.step_x > 0.999 * params.search.least_width
+            if template.box_cells[0] * level.step_x > 0.999 * params.search.min_width
             and (strip := border_strip(level, columns, end, left=left)) is not None
         }
         places, parts, values = [], [np.empty((0, 4))], [np.empty(0)]
@@ -294,7 +294,7 @@ class Negatives:
         self.rows: list[NDArray[np.float32]] = [np.empty((0, length), np.float32) for length in lengths]
         self._known: list[set[tuple[int, ...]]] = [set() for _ in lengths]
 
-    def add(self, mined: Iterable[tuple[int, Mined]]) -> int:
+    def add(self, mined: Iterable[tuple[int, HardNegatives]]) -> int:
         """Take the windows of all frames, in their order; return how many are new."""
         fresh: list[list[NDArray[np.float32]]] = [[] for _ in self.rows]
         for number, windows in mined:

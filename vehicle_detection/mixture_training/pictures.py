@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from vehicle_detection._common import written_whole
+from vehicle_detection._common import atomic_write
 from vehicle_detection.evaluation import precision_recall_curve
-from vehicle_detection.mixture_training.cross_validation import HeldOut, RoadScore
+from vehicle_detection.mixture_training.cross_validation import FoldDetections, FoldScore
 from vehicle_detection.plotting import plot_errors, plot_precision_recall
 
 _KINDS: tuple[Literal["missed", "false"], ...] = ("missed", "false")
@@ -16,7 +16,7 @@ _KINDS: tuple[Literal["missed", "false"], ...] = ("missed", "false")
 _COUNT, _COLUMNS = 20, 5
 
 
-def write_pictures(folder: Path, scores: Sequence[RoadScore], held: Sequence[HeldOut]) -> list[str]:
+def write_pictures(folder: Path, scores: Sequence[FoldScore], held: Sequence[FoldDetections]) -> list[str]:
     """Write ``curves.png``, and for each set of frames ``NAME-missed.png`` and ``NAME-false.png``.
 
     Parameters
@@ -24,7 +24,7 @@ def write_pictures(folder: Path, scores: Sequence[RoadScore], held: Sequence[Hel
     folder
         An existing folder.
     scores, held
-        As `judge_mixture` returns them. Mistakes are those at the threshold of the scores.
+        As `cross_validate_mixture` returns them. Mistakes are those at the threshold of the scores.
 
     Returns
     -------
@@ -34,7 +34,7 @@ def write_pictures(folder: Path, scores: Sequence[RoadScore], held: Sequence[Hel
     from matplotlib.figure import Figure
 
     def save(figure: Figure, name: str) -> str:
-        with written_whole(folder / name) as part:
+        with atomic_write(folder / name) as part:
             figure.savefig(part, dpi=100)
         return name
 

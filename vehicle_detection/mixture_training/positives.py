@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import relight
-from vehicle_detection.mixture import COARSE, FINE, MixtureTemplate, Refinement, box_planes, mirror_planes
+from vehicle_detection.mixture import COARSE, FINE, BoxRegressor, MixtureTemplate, box_planes, mirror_planes
 from vehicle_detection.mixture_training.negatives import Frame
-from vehicle_detection.mixture_training.train import MixtureParams
+from vehicle_detection.params import MixtureParams
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
-Seen = Iterator[tuple[Image, Floats]]
+VehicleSamples = Iterator[tuple[Image, Floats]]
 """Images and the place of a vehicle in each."""
 
 # A vehicle is cut by a border that it comes nearer to than this, in pixels; share of a vehicle that is left
@@ -36,13 +36,15 @@ def window_features(image: Image, box: Floats, template: MixtureTemplate) -> NDA
     return box_planes(image, box.tolist(), inside, (columns, rows), cell)
 
 
-def whole_vehicles(frames: Sequence[Frame], params: MixtureParams, rng: np.random.Generator) -> Seen:
+def whole_vehicles(
+    frames: Sequence[Frame], params: MixtureParams, rng: np.random.Generator
+) -> VehicleSamples:
     """Vehicles where they are, moved a little, and at other exposures."""
     for frame in frames:
-        boxes = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.least_width]
+        boxes = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.min_width]
         for box in boxes:
             for copy in range(params.jitter):
-                shift = rng.uniform(-1, 1, 4) * params.shake * np.tile(box[2:] - box[:2], 2)
+                shift = rng.uniform(-1, 1, 4) * params.jitter_scale * np.tile(box[2:] - box[:2], 2)
                 yield frame.image, box + shift * (copy > 0)
         for _ in range(params.exposures if len(boxes) else 0):
             image = relight(frame.image, rng)
@@ -50,20 +52,22 @@ def whole_vehicles(frames: Sequence[Frame], params: MixtureParams, rng: np.rando
                 yield image, box
 
 
-def cut_vehicles(frames: Sequence[Frame], params: MixtureParams, rng: np.random.Generator) -> Seen:
+def truncated_vehicles(
+    frames: Sequence[Frame], params: MixtureParams, rng: np.random.Generator
+) -> VehicleSamples:
     """Vehicles that the right border cuts, and whole ones in images that are cut through them."""
     for frame in frames:
         width = frame.image.shape[1]
         mirrored = np.ascontiguousarray(frame.image[:, ::-1])
         for image, boxes in (frame.image, frame.boxes), (mirrored, mirror_boxes(frame.boxes, width)):
-            for box in boxes[boxes[:, 2] - boxes[:, 0] >= params.least_width]:
+            for box in boxes[boxes[:, 2] - boxes[:, 0] >= params.min_width]:
                 sides = np.tile(box[2:] - box[:2], 2)
                 if box[2] >= width - _AT_BORDER:
                     for copy in range(params.border_jitter):
-                        x1, y1, _, y2 = box + rng.uniform(-1, 1, 4) * params.shake * sides * (copy > 0)
+                        x1, y1, _, y2 = box + rng.uniform(-1, 1, 4) * params.jitter_scale * sides * (copy > 0)
                         yield image, np.array([x1, y1, width, y2])
                 end = round(box[0] + rng.uniform(*_SHOWN) * sides[0])
-                if box[0] > _AT_BORDER and params.least_width <= end - box[0] and end < width - _AT_BORDER:
+                if box[0] > _AT_BORDER and params.min_width <= end - box[0] and end < width - _AT_BORDER:
                     yield image[:, :end], np.array([*box[:2], end, box[3]])
 
 
@@ -73,7 +77,7 @@ def mirror_boxes(boxes: Floats, width: float) -> Floats:
 
 
 def vehicle_features(
-    vehicles: Seen, templates: Sequence[MixtureTemplate], params: MixtureParams
+    vehicles: VehicleSamples, templates: Sequence[MixtureTemplate], params: MixtureParams
 ) -> list[NDArray[np.float32]]:
     """Features of the vehicles of each template, ``(N, length)``."""
     found: list[list[NDArray[np.float32]]] = [[] for _ in templates]
@@ -87,7 +91,7 @@ def vehicle_features(
 
 def patch_features(
     patches: Sequence[Image],
-    placing: Refinement,
+    placing: BoxRegressor,
     templates: Sequence[MixtureTemplate],
     known: Sequence[NDArray[np.float32]],
     params: MixtureParams,
@@ -126,7 +130,7 @@ def patch_features(
     return _stacked(found, templates)
 
 
-def place_on_patch(image: Image, placing: Refinement) -> Floats:
+def place_on_patch(image: Image, placing: BoxRegressor) -> Floats:
     """Box of the vehicle on a patch: where it is on most of them, corrected twice."""
     size = np.tile(image.shape[1::-1], 2)
     box = _ON_PATCH * size
@@ -164,31 +168,33 @@ def _stacked(
     return [np.array(rows, np.float32).reshape(-1, t.weights.size) for rows, t in zip(found, templates)]
 
 
-def turned(rows: NDArray[np.float32], rng: np.random.Generator, tries: int = 5) -> NDArray[np.float32]:
-    """Choose of each vehicle and its mirror image, which are neighbouring rows, the one like the others.
+def align_mirrored(
+    rows: NDArray[np.float32], rng: np.random.Generator, tries: int = 5
+) -> NDArray[np.float32]:
+    """Choose of each vehicle and its mirror image, which are neighboring rows, the one like the others.
 
     Two clusters that are each other's mirror image, by k-means from a few random starts.
     """
     if not len(rows):
         return rows
     pairs = rows.reshape(len(rows) // 2, 2, -1)
-    centred = pairs - pairs.mean(axis=(0, 1))
+    centerd = pairs - pairs.mean(axis=(0, 1))
     number = np.arange(len(pairs))
     best, length = np.zeros(len(pairs), np.intp), -1.0
     for _ in range(tries):
         chosen = rng.integers(0, 2, len(pairs))
         for _ in range(15):
-            mean = centred[number, chosen].mean(axis=0)
-            chosen = (centred @ mean).argmax(axis=1)
+            mean = centerd[number, chosen].mean(axis=0)
+            chosen = (centerd @ mean).argmax(axis=1)
         if float(np.linalg.norm(mean)) > length:
             best, length = chosen, float(np.linalg.norm(mean))
     return np.ascontiguousarray(pairs[number, best])
 
 
-def moved_boxes(boxes: Floats, rng: np.random.Generator) -> Floats:
+def jitter_boxes(boxes: Floats, rng: np.random.Generator) -> Floats:
     """Boxes as a search may find them: beside their vehicles, too small or too large, of another shape."""
     sides = boxes[:, 2:] - boxes[:, :2]
-    centres = boxes[:, :2] + sides * (0.5 + rng.uniform(-0.2, 0.2, sides.shape))
+    centers = boxes[:, :2] + sides * (0.5 + rng.uniform(-0.2, 0.2, sides.shape))
     size, shape = rng.uniform(-0.45, 0.3, (len(boxes), 1)), rng.uniform(-0.15, 0.15, sides.shape)
     halves = sides / 2 * np.exp(size + shape)
-    return np.concatenate([centres - halves, centres + halves], axis=1)
+    return np.concatenate([centers - halves, centers + halves], axis=1)

@@ -10,26 +10,25 @@ from numpy.typing import NDArray
 
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.mixture import (
-    COLOURS,
+    COLORS,
     CROP,
     EDGES,
     PLANES,
     MixtureSearch,
     Projection,
-    Verification,
+    Rescorer,
     crop_views,
     mirror_planes,
 )
 from vehicle_detection.mixture_training.negatives import Frame, is_negative
-from vehicle_detection.mixture_training.positives import moved_boxes
-from vehicle_detection.mixture_training.train import MixtureParams
-from vehicle_detection.params import PyramidParams
+from vehicle_detection.mixture_training.positives import jitter_boxes
+from vehicle_detection.params import MixtureParams, PyramidParams
 
 Floats = NDArray[np.float64]
 Rows = tuple[NDArray[np.float32], NDArray[np.float32]]
-"""Edges and colours of some crops, as `crop_views` gives them."""
+"""Edges and colors of some crops, as `crop_views` gives them."""
 
-# Principal components that are kept of edges and colours, and the weight of the colours' spread.
+# Principal components that are kept of edges and colors, and the weight of the colors' spread.
 _EDGE_AXES, _COLOUR_AXES, _COLOUR_WEIGHT = 200, 40, 0.5
 # The kernel, where the spread of all edges is 1, and the inverse strength of the regularisation.
 _GAMMA, _C = 0.5, 3.0
@@ -41,13 +40,13 @@ _COPIES, _SHAKE, _BESIDE = 3, 0.06, 2
 _LEAST = -1.1
 
 
-def train_verification(
+def train_rescorer(
     frames: Sequence[Frame],
     search: MixtureSearch,
     params: MixtureParams,
     rng: np.random.Generator,
     pool: ThreadPoolExecutor,
-) -> Verification | None:
+) -> Rescorer | None:
     """Train a second opinion on the boxes that a search finds.
 
     Parameters
@@ -65,7 +64,7 @@ def train_verification(
 
     Returns
     -------
-    Verification or None
+    Rescorer or None
         None where nothing false was found, nor anything right.
 
     Notes
@@ -85,16 +84,19 @@ def train_verification(
         return None
     # Of clutter there is enough: each piece is taken as it is or mirrored.
     shown = _joined([vehicles, _mirrored(vehicles)])
-    turned = rng.random((len(clutter[0]), 1)) < 0.5
-    back_edges, back_colours = _mirrored(clutter)
-    empty = np.where(turned, back_edges, clutter[0]), np.where(turned, back_colours, clutter[1])
+    align_mirrored = rng.random((len(clutter[0]), 1)) < 0.5
+    back_edges, back_colors = _mirrored(clutter)
+    empty = (
+        np.where(align_mirrored, back_edges, clutter[0]),
+        np.where(align_mirrored, back_colors, clutter[1]),
+    )
     is_vehicle = np.repeat([True, False], [len(shown[0]), len(clutter[0])])
-    edges, colours = _joined([shown, empty])
+    edges, colors = _joined([shown, empty])
     seed = int(rng.integers(2**31))
     to_edges = _principal(edges, _EDGE_AXES, 1.0, seed)
-    to_colours = _principal(colours, _COLOUR_AXES, _COLOUR_WEIGHT, seed)
-    points = np.hstack([to_edges(edges), to_colours(colours)])
-    return _fit(to_edges, to_colours, points, is_vehicle, params.verification)
+    to_colors = _principal(colors, _COLOUR_AXES, _COLOUR_WEIGHT, seed)
+    points = np.hstack([to_edges(edges), to_colors(colors)])
+    return _fit(to_edges, to_colors, points, is_vehicle, params.rescorer)
 
 
 def _boxes(
@@ -105,11 +107,11 @@ def _boxes(
     found, _ = search.mixture.proposals(frame.image, windows, least=_LEAST)
     wrong = found[is_negative(found, frame)]
     right = found[iou_matrix(found, frame.boxes).max(axis=1, initial=0) >= _RIGHT]
-    wide = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.least_width]
+    wide = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.min_width]
     copies = np.tile(wide, (_COPIES, 1))
     shifts = rng.uniform(-1, 1, copies.shape) * _SHAKE * np.tile(copies[:, 2:] - copies[:, :2], 2)
     shifts[: len(wide)] = 0
-    beside = moved_boxes(np.tile(wide, (3 * _BESIDE, 1)), rng)
+    beside = jitter_boxes(np.tile(wide, (3 * _BESIDE, 1)), rng)
     overlap = iou_matrix(beside, frame.boxes).max(axis=1, initial=0)
     beside = beside[(overlap > _WRONG[0]) & (overlap < _WRONG[1])][: _BESIDE * len(wide)]
     return np.concatenate([copies + shifts, right]), np.concatenate([wrong, beside])
@@ -117,18 +119,20 @@ def _boxes(
 
 def _joined(parts: Sequence[Rows]) -> Rows:
     edges = np.concatenate([np.empty((0, EDGES), np.float32), *(each for each, _ in parts)])
-    colours = np.concatenate([np.empty((0, COLOURS), np.float32), *(each for _, each in parts)])
-    return edges, colours
+    colors = np.concatenate([np.empty((0, COLORS), np.float32), *(each for _, each in parts)])
+    return edges, colors
 
 
 def _mirrored(rows: Rows) -> Rows:
     """Rows of the mirrored crops."""
-    edges, colours = rows
+    edges, colors = rows
     count = len(edges)
     planes = edges.reshape(count, PLANES, CROP, CROP).transpose(1, 0, 2, 3)
-    turned = mirror_planes(planes.reshape(PLANES, count * CROP, CROP))
-    turned = turned.reshape(PLANES, count, CROP, CROP).transpose(1, 0, 2, 3).reshape(count, EDGES)
-    return turned, colours.reshape(count, 3 * CROP, CROP)[:, :, ::-1].reshape(count, COLOURS)
+    align_mirrored = mirror_planes(planes.reshape(PLANES, count * CROP, CROP))
+    align_mirrored = (
+        align_mirrored.reshape(PLANES, count, CROP, CROP).transpose(1, 0, 2, 3).reshape(count, EDGES)
+    )
+    return align_mirrored, colors.reshape(count, 3 * CROP, CROP)[:, :, ::-1].reshape(count, COLORS)
 
 
 def _principal(rows: NDArray[np.float32], count: int, weight: float, seed: int) -> Projection:
@@ -142,14 +146,16 @@ def _principal(rows: NDArray[np.float32], count: int, weight: float, seed: int) 
 
 def _fit(
     edges: Projection,
-    colours: Projection,
+    colors: Projection,
     points: NDArray[np.float32],
     is_vehicle: NDArray[np.bool_],
-    share: float,
-) -> Verification:
+    blend_weight: float,
+) -> Rescorer:
     """Train the kernel machine."""
     from sklearn.svm import SVC
 
     machine = SVC(C=_C, gamma=_GAMMA, cache_size=2000).fit(points, is_vehicle)
     bias = float(machine.intercept_[0])
-    return Verification(edges, colours, machine.support_vectors_, machine.dual_coef_[0], bias, _GAMMA, share)
+    return Rescorer(
+        edges, colors, machine.support_vectors_, machine.dual_coef_[0], bias, _GAMMA, blend_weight
+    )

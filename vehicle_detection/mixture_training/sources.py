@@ -10,21 +10,21 @@ from numpy.typing import NDArray
 
 from vehicle_detection.datasets import load_frames, load_patches
 from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.evaluation import LabelledFrames, Labels, read_labels
-from vehicle_detection.mixture_training.negatives import FrameSource
+from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, read_labels
+from vehicle_detection.mixture_training.negatives import FrameDataset
 
 COURSE = "course"
 """Source of everything that is not below ``frames``: the images and clips of the course's road."""
 
-# Frames a second of the clips that are trained on; neighbours show the same.
+# Frames a second of the clips that are trained on; neighbors show the same.
 _CLIP_RATE = 3.0
 # Sources that leave small vehicles of the background unlabelled, and the width from which on they do not.
 _COMPLETE_FROM = {"indonesia": 60.0}
-# One of so many of the course's patches are trained on; neighbours show the same car.
+# One of so many of the course's patches are trained on; neighbors show the same car.
 _PATCH_STEP = 6
 
 
-def find_sources(folder: str | os.PathLike[str]) -> list[FrameSource]:
+def find_sources(folder: str | os.PathLike[str]) -> list[FrameDataset]:
     """Find the labelled frames of a folder.
 
     Parameters
@@ -35,7 +35,7 @@ def find_sources(folder: str | os.PathLike[str]) -> list[FrameSource]:
 
     Returns
     -------
-    list of FrameSource
+    list of FrameDataset
         By name, the course last.
 
     Raises
@@ -58,7 +58,7 @@ def find_sources(folder: str | os.PathLike[str]) -> list[FrameSource]:
         try:
             if frames.is_dir():
                 part = LabelledFrames(name, load_frames(frames), labels)
-                sources.append(FrameSource(name, (part,), _COMPLETE_FROM.get(name, 0.0)))
+                sources.append(FrameDataset(name, (part,), _COMPLETE_FROM.get(name, 0.0)))
             elif images.is_dir():
                 course.append(LabelledFrames(name, load_frames(images), labels))
             elif video.is_file():
@@ -69,7 +69,7 @@ def find_sources(folder: str | os.PathLike[str]) -> list[FrameSource]:
                 )
         except InvalidInputError as error:
             raise InvalidInputError(f"{file}: {error}") from error
-    return sources + ([FrameSource(COURSE, tuple(course))] if course else [])
+    return sources + ([FrameDataset(COURSE, tuple(course))] if course else [])
 
 
 def find_patches(folder: str | os.PathLike[str]) -> list[NDArray[np.uint8]]:
@@ -91,7 +91,7 @@ def find_patches(folder: str | os.PathLike[str]) -> list[NDArray[np.uint8]]:
     return []
 
 
-def _sampled(video: Path, labels: Labels) -> LabelledFrames:
+def _sampled(video: Path, labels: FrameBoxes) -> LabelledFrames:
     from vehicle_detection.video import probe_video
 
     every = max(1, round(float(probe_video(video).fps) / _CLIP_RATE))

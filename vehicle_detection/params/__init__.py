@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from vehicle_detection.params.features import COLOR_SPACES, HOG_CHANNELS, PATCH_SIZE, FeatureParams
+from vehicle_detection.params.mixture import MixtureParams, entries
 from vehicle_detection.params.regions import HeatParams, RegionParams
 from vehicle_detection.params.search import (
     REFERENCE_WIDTH,
@@ -20,10 +21,12 @@ __all__ = [
     "REFERENCE_WIDTH",
     "FeatureParams",
     "HeatParams",
+    "MixtureParams",
     "PixelBand",
     "PyramidParams",
     "RegionParams",
     "SearchBand",
     "SearchParams",
     "TrackParams",
+    "entries",
 ]

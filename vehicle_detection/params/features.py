@@ -166,7 +166,7 @@ class FeatureParams:
 
     @property
     def hist_length(self) -> int:
-        """Values from colour histograms."""
+        """Values from color histograms."""
         return self.hist_bins * 3 if self.hist_feat else 0
 
     @property

@@ -20,20 +20,20 @@ class HeatParams:
         Number of last frames whose heat is averaged in a video.
     threshold
         Heat at or below this is no vehicle.
-    share
+    peak_fraction
         A region reaches out to this share of its own peak, in [0, 1); 0 is the plain course way.
     """
 
     weighting: Literal["score", "count"] = "score"
     frames: int = 5
     threshold: float = 2.0
-    share: float = 0.35
+    peak_fraction: float = 0.35
 
     def __post_init__(self) -> None:
         check_choice(self.weighting, "weighting", ("score", "count"))
         check_integer(self.frames, "frames", low=1, high=1000)
         check_number(self.threshold, "threshold", low=0, high=1e9)
-        check_number(self.share, "share", low=0, high=0.99)
+        check_number(self.peak_fraction, "peak_fraction", low=0, high=0.99)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,13 +51,13 @@ class RegionParams:
     power
         A window counts in the mean with this power of its score.
     reach
-        Windows with a centre this near to a group's are used up by it.
+        Windows with a center this near to a group's are used up by it.
     face_width, face_height
         Part of the window that a vehicle's face fills, on the training patches and their like.
-    drop
+    face_offset_y
         How far the face's middle lies below the window's.
     flank_length_m
-        Length of a vehicle's flank in metres, as far as it shows.
+        Length of a vehicle's flank in meters, as far as it shows.
     covered
         A group whose face lies inside the box of a better one by more than this share is no vehicle.
     flank_peak
@@ -74,7 +74,7 @@ class RegionParams:
     reach: float = 0.6
     face_width: float = 0.84
     face_height: float = 0.79
-    drop: float = -0.04
+    face_offset_y: float = -0.04
     flank_length_m: float = 6.0
     flank_shift: float = 0.27
     covered: float = 0.5
@@ -89,5 +89,5 @@ class RegionParams:
         check_number(self.power, "power", low=0, high=20)
         for name in ("reach", "face_width", "face_height", "flank_shift"):
             check_number(getattr(self, name), name, above=0, high=2)
-        check_number(self.drop, "drop", low=-1, high=1)
+        check_number(self.face_offset_y, "face_offset_y", low=-1, high=1)
         check_number(self.flank_length_m, "flank_length_m", low=0, high=100)

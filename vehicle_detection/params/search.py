@@ -55,7 +55,7 @@ class SearchBand:
     x
         Left and right end as shares of the frame's width, 0-1.
     overlap
-        Horizontal and vertical share that neighbouring windows have in common, in [0, 1).
+        Horizontal and vertical share that neighboring windows have in common, in [0, 1).
     """
 
     window: Pair
@@ -74,7 +74,9 @@ class SearchBand:
                     f"{name} must be (start, stop) with start < stop; got {(start, stop)}"
                 )
 
-    def place(self, shape: tuple[int, ...], horizon: float, overhang: float = 0.0) -> PixelBand | None:
+    def place(
+        self, shape: tuple[int, ...], horizon: float, horizontal_padding: float = 0.0
+    ) -> PixelBand | None:
         """Place the band on a frame of `shape` (height, width); None where no window fits."""
         height, width = shape[:2]
         scale = max(height, width) / REFERENCE_WIDTH
@@ -83,7 +85,7 @@ class SearchBand:
         x1, x2 = round(self.x[0] * width), round(self.x[1] * width)
         if min(window_w, window_h) < _LEAST_WINDOW or x2 - x1 < window_w or y2 - y1 < window_h:
             return None
-        beyond = round(overhang * window_w)
+        beyond = round(horizontal_padding * window_w)
         x1 -= beyond if x1 == 0 else 0
         x2 += beyond if x2 == width else 0
         step = (
@@ -105,7 +107,7 @@ class SearchParams:
         Height of the horizon as a share of the frame's height, 0 at the top.
     min_score
         Windows with a score above this count as hits.
-    overhang
+    horizontal_padding
         Share of a window that may lie beyond the frame's left and right edge, where the outermost column
         is repeated: vehicles that are half in the picture are found.
 
@@ -119,7 +121,7 @@ class SearchParams:
     bands: tuple[SearchBand, ...]
     horizon: float = 0.58
     min_score: float = 0.0
-    overhang: float = 0.0
+    horizontal_padding: float = 0.0
 
     def __post_init__(self) -> None:
         bands: object = self.bands
@@ -130,7 +132,7 @@ class SearchParams:
         object.__setattr__(self, "bands", tuple(bands))
         check_number(self.horizon, "horizon", low=0, high=1)
         check_number(self.min_score, "min_score", low=-1e6, high=1e6)
-        check_number(self.overhang, "overhang", low=0, high=0.9)
+        check_number(self.horizontal_padding, "horizontal_padding", low=0, high=0.9)
 
     @classmethod
     def preset(cls, name: str = "default") -> SearchParams:
@@ -164,7 +166,7 @@ class SearchParams:
         return placed
 
     def _place_each(self, shape: tuple[int, ...]) -> Iterator[PixelBand | None]:
-        return (band.place(shape, self.horizon, self.overhang) for band in self.bands)
+        return (band.place(shape, self.horizon, self.horizontal_padding) for band in self.bands)
 
 
 def _check_pair(value: object, name: str, *, low: float, high: float) -> None:
@@ -196,7 +198,7 @@ def _third_system() -> dict[str, Any]:
 def _default_search() -> dict[str, Any]:
     """Windows from 64 px up in even steps of scale, wherever a vehicle on a flat road may stand.
 
-    With the camera `c` metres above the road, the foot of a vehicle whose face fills 0.84 of a window of
+    With the camera `c` meters above the road, the foot of a vehicle whose face fills 0.84 of a window of
     side `s` is ``0.84 * s * c / 1.8`` below the horizon. For cameras from 0.9 to 2 m high that puts the
     window between -0.35 and 0.95 `s`; the margin allows for hills and for a horizon that is not exact.
     """
@@ -205,7 +207,7 @@ def _default_search() -> dict[str, Any]:
     bands = tuple(
         SearchBand(window=(side, side), y=(-0.35 * side - margin, 0.95 * side + margin)) for side in sides
     )
-    return {"bands": bands, "horizon": 0.58, "min_score": 0.0, "overhang": 0.5}
+    return {"bands": bands, "horizon": 0.58, "min_score": 0.0, "horizontal_padding": 0.5}
 
 
 # By how much of the frame's height a horizon that somebody states may be wrong.
@@ -218,9 +220,9 @@ class PyramidParams:
 
     Attributes
     ----------
-    least_width
+    min_width
         Width in pixels of the narrowest vehicle looked for.
-    most_height
+    max_height
         Height of the highest one, as a share of the frame's height.
     per_octave
         Sizes from one to twice of it.
@@ -228,7 +230,7 @@ class PyramidParams:
         Height of the horizon as a share of the frame's height: a vehicle of each size is looked for where a
         flat road would carry it. None: everywhere.
     camera_height_m
-        Heights in metres, least and most, at which the camera may be where the horizon is known.
+        Heights in meters, least and most, at which the camera may be where the horizon is known.
     horizon_error
         By how much of the frame's height the horizon may be wrong; the default holds for any dash-cam.
     min_score
@@ -236,12 +238,12 @@ class PyramidParams:
 
     Examples
     --------
-    >>> [round(size, 2) for size in PyramidParams(least_width=70).sizes(7, 8, (720, 1280))[:6]]
+    >>> [round(size, 2) for size in PyramidParams(min_width=70).sizes(7, 8, (720, 1280))[:6]]
     [10.0, 11.49, 13.2, 15.16, 17.41, 20.0]
     """
 
-    least_width: float = 32.0
-    most_height: float = 0.8
+    min_width: float = 32.0
+    max_height: float = 0.8
     per_octave: int = 5
     horizon: float | None = 0.5
     camera_height_m: tuple[float, float] = (0.9, 2.6)
@@ -249,8 +251,8 @@ class PyramidParams:
     min_score: float = 0.0
 
     def __post_init__(self) -> None:
-        check_number(self.least_width, "least_width", low=16, high=10_000)
-        check_number(self.most_height, "most_height", above=0, high=2)
+        check_number(self.min_width, "min_width", low=16, high=10_000)
+        check_number(self.max_height, "max_height", above=0, high=2)
         check_integer(self.per_octave, "per_octave", low=1, high=32)
         if self.horizon is not None:
             check_number(self.horizon, "horizon", low=0, high=1)
@@ -274,8 +276,8 @@ class PyramidParams:
 
     def sizes(self, columns: float, rows: float, shape: tuple[int, ...]) -> list[float]:
         """Pixels a cell of each level, for boxes of `columns` by `rows` cells in a frame of `shape`."""
-        least = self.least_width / columns
-        most = max(self.most_height * shape[0] / rows, least)
+        least = self.min_width / columns
+        most = max(self.max_height * shape[0] / rows, least)
         count = math.floor(self.per_octave * math.log2(most / least)) + 1
         return [least * 2 ** (step / self.per_octave) for step in range(count)]
 

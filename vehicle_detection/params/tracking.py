@@ -20,10 +20,10 @@ class TrackParams:
         system); ``"nearest"``: the box moves a share of the way to the new one (its first system).
     memory
         Time constant in which the running mean of a track's scores forgets.
-    birth_score
+    high_threshold
         Detections below this score start no track.
-    keep_score
-        Detections from this score on, where they are below `birth_score`, keep a track alive that found no
+    low_threshold
+        Detections from this score on, where they are below `high_threshold`, keep a track alive that found no
         better one; a believed track only where they are half as far off as `gate` allows. Of less the tracker
         knows nothing.
     confirm_score
@@ -48,7 +48,7 @@ class TrackParams:
     max_gap
         A longer gap between two frames ends all tracks.
     gate
-        Farthest that a detection's centre may lie from the predicted one, in box widths and heights.
+        Farthest that a detection's center may lie from the predicted one, in box widths and heights.
     max_overlap, max_cover
         A second box on one vehicle: IoU with a track, and share of the smaller of the two boxes that both
         cover, above which a detection starts no track of its own.
@@ -56,12 +56,12 @@ class TrackParams:
         Standard error of a detection's edges.
     box_noise_seconds
         Time over which that error stays alike, so that twice the frames are not twice the evidence.
-    agility, growth
-        Process noise of the centre and of the size: their speeds wander by this share of the size a second,
+    process_noise_position, growth
+        Process noise of the center and of the size: their speeds wander by this share of the size a second,
         in a second.
     history
         Length of the mean of the smoother ``"history"``.
-    nearest_share
+    nearest_weight
         Share of the way that the smoother ``"nearest"`` moves in 0.04 seconds, in (0, 1].
 
     Examples
@@ -76,8 +76,8 @@ class TrackParams:
 
     smoother: Literal["kalman", "history", "nearest"] = "kalman"
     memory: float = 0.3
-    birth_score: float = -0.3
-    keep_score: float = -1.5
+    high_threshold: float = -0.3
+    low_threshold: float = -1.5
     confirm_score: float = 0.2
     confirm_hits: int = 4
     confirm_seconds: float = 0.12
@@ -91,10 +91,10 @@ class TrackParams:
     max_cover: float = 0.7
     box_noise: float = 0.07
     box_noise_seconds: float = 0.04
-    agility: float = 0.18
+    process_noise_position: float = 0.18
     growth: float = 0.1
     history: float = 0.4
-    nearest_share: float = 0.3
+    nearest_weight: float = 0.3
 
     def __post_init__(self) -> None:
         check_choice(self.smoother, "smoother", ("kalman", "history", "nearest"))
@@ -102,15 +102,15 @@ class TrackParams:
             check_number(getattr(self, name), name, above=0, high=3600)
         for name in ("confirm_seconds", "tentative_coast", "show_coast", "max_coast", "box_noise_seconds"):
             check_number(getattr(self, name), name, low=0, high=3600)
-        for name in ("birth_score", "keep_score", "confirm_score", "start_score"):
+        for name in ("high_threshold", "low_threshold", "confirm_score", "start_score"):
             check_number(getattr(self, name), name, low=-1e6, high=1e6)
-        for name in ("gate", "agility", "growth"):
+        for name in ("gate", "process_noise_position", "growth"):
             check_number(getattr(self, name), name, above=0, high=100)
         for name in ("max_overlap", "max_cover"):
             check_number(getattr(self, name), name, low=0, high=1)
         check_integer(self.confirm_hits, "confirm_hits", low=1, high=10_000)
         check_number(self.box_noise, "box_noise", above=0, high=1)
-        check_number(self.nearest_share, "nearest_share", above=0, high=1)
+        check_number(self.nearest_weight, "nearest_weight", above=0, high=1)
         if self.show_coast > self.max_coast:
             raise InvalidInputError(
                 f"show_coast must be at most max_coast, as a track that ended is not drawn; "

@@ -5,7 +5,7 @@ A function that draws one panel takes ``ax=None`` and returns the Axes; None mak
 SubFigure, and returns it; None makes a figure that pyplot does not keep: a notebook shows it as the value of
 its cell, and ``savefig`` writes it. Nothing else is kept from one call to the next.
 
-The colours are Okabe and Ito's, which stay apart for colour-blind eyes, and matplotlib's perceptually
+The colors are Okabe and Ito's, which stay apart for color-blind eyes, and matplotlib's perceptually
 uniform maps.
 """
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from vehicle_detection.plotting.features import plot_channels, plot_features, plot_hog
 from vehicle_detection.plotting.images import ImageFacts, describe_image, plot_methods, show_images
-from vehicle_detection.plotting.patches import plot_balance, plot_near_copies, plot_patches
+from vehicle_detection.plotting.patches import plot_balance, plot_near_duplicates, plot_patches
 from vehicle_detection.plotting.quality import (
     plot_errors,
     plot_f1,
@@ -44,7 +44,7 @@ __all__ = [
     "plot_heatmap",
     "plot_hog",
     "plot_methods",
-    "plot_near_copies",
+    "plot_near_duplicates",
     "plot_parameter",
     "plot_patches",
     "plot_precision_recall",

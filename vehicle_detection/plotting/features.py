@@ -1,4 +1,4 @@
-"""Figures of the features: colours, HOG, and the vector before and after scaling."""
+"""Figures of the features: colors, HOG, and the vector before and after scaling."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def put_glyphs(
     peak
         Value of the brightest line; None takes the greatest.
     cmap
-        Colours from nothing to `peak`; its first one is the ground.
+        Colors from nothing to `peak`; its first one is the ground.
     """
     from matplotlib import colormaps
     from matplotlib.collections import LineCollection
@@ -119,7 +119,7 @@ _PAIRS = ((0, 1), (0, 2), (1, 2))
 
 
 def channel_names(color_space: str) -> tuple[str, ...]:
-    """Names of a colour space's channels."""
+    """Names of a color space's channels."""
     return _CHANNELS.get(color_space, tuple(color_space))
 
 
@@ -140,7 +140,7 @@ def plot_channels(
     random_state: int = 0,
     figure: Sheet | None = None,
 ) -> Sheet:
-    """Plot how the pixels of images lie in a colour space: each channel by itself, and pairs of channels.
+    """Plot how the pixels of images lie in a color space: each channel by itself, and pairs of channels.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def plot_channels(
     labels
         ``(N,)`` 1 for a vehicle, 0 for anything else: the classes are drawn apart. Those of a set are known.
     points
-        Pixels of each class, drawn at random, in the lower panels; without classes each has its own colour.
+        Pixels of each class, drawn at random, in the lower panels; without classes each has its own color.
     random_state
         Seed of that draw.
     figure
@@ -166,7 +166,7 @@ def plot_channels(
     Raises
     ------
     InvalidInputError
-        If an image is malformed, the colour space unknown, or the labels do not fit.
+        If an image is malformed, the color space unknown, or the labels do not fit.
 
     Examples
     --------
@@ -211,7 +211,7 @@ def _reach(channel: list[NDArray[np.uint8]]) -> tuple[float, float]:
 
 
 def _pixels_of(images: object, labels: ArrayLike | None) -> list[tuple[str | None, Any, Image]]:
-    """Name, colour and ``(N, 3)`` RGB pixels of each class; without classes, of all."""
+    """Name, color and ``(N, 3)`` RGB pixels of each class; without classes, of all."""
     if isinstance(images, np.ndarray) and images.ndim == 3:
         listed = [images]
     elif isinstance(images, PatchSet):
@@ -245,7 +245,7 @@ def plot_hog(
 ) -> Sheet:
     """Draw the HOG of each channel at several cell sizes, image beside image.
 
-    What is drawn are the normalised histograms that the SVM sees: of each cell, the mean over the blocks it
+    What is drawn are the normalized histograms that the SVM sees: of each cell, the mean over the blocks it
     belongs to. The lines run along the edges, across the gradients. Dalal and Triggs (CVPR 2005).
 
     Parameters
@@ -254,7 +254,7 @@ def plot_hog(
         One ``(H, W, 3)`` uint8 RGB image or several, such as a vehicle and a non-vehicle; a mapping gives the
         titles.
     params
-        Colour space, channels, orientations and block; the default is ``FeatureParams()``.
+        Color space, channels, orientations and block; the default is ``FeatureParams()``.
     pix_per_cell
         Cell sizes, a row of panels each.
     titles
@@ -416,7 +416,7 @@ def part_bounds(params: FeatureParams) -> dict[str, tuple[int, int]]:
     """First and last feature, half-open, of each part of the vector."""
     lengths = {
         "spatial bins": params.spatial_length,
-        "colour histogram": params.hist_length,
+        "color histogram": params.hist_length,
         "HOG": params.hog_length - params.coarse_length,
         "coarse HOG": params.coarse_length,
     }

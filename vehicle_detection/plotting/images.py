@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from vehicle_detection._common import check_image, check_integer, describe
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import Labels
+from vehicle_detection.evaluation import FrameBoxes
 from vehicle_detection.plotting.style import (
     SKY,
     TRUTH,
@@ -29,7 +29,7 @@ from vehicle_detection.plotting.style import (
 )
 
 Image = NDArray[np.uint8]
-Boxes = Detections | Labels | ArrayLike
+Boxes = Detections | FrameBoxes | ArrayLike
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +127,7 @@ def show_images(
     titles
         One for each image.
     boxes
-        Boxes to draw on each image, or None for none: `Detections`, `Labels` or ``(N, 4)``.
+        Boxes to draw on each image, or None for none: `Detections`, `FrameBoxes` or ``(N, 4)``.
     truth
         Labelled boxes in the same way, drawn with dashes.
     columns

@@ -1,4 +1,4 @@
-"""Figures of the training patches: what they show, how many there are, which are near-copies."""
+"""Figures of the training patches: what they show, how many there are, which are near duplicates."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def plot_patches(
     scores: ArrayLike | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Show patches on a grid, each with a caption, in an edge of its class's colour.
+    """Show patches on a grid, each with a caption, in an edge of its class's color.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def _check_set(patch_set: PatchSet) -> None:
         raise InvalidInputError(f"patch_set must hold patches, got none; {_REMEDY}")
 
 
-def plot_near_copies(
+def plot_near_duplicates(
     patch_set: PatchSet,
     pairs: NDArray[Any],
     *,
@@ -201,7 +201,7 @@ def plot_near_copies(
     count: int = 10,
     ax: Axes | None = None,
 ) -> Axes:
-    """Show pairs of patches that are near-copies: each patch, and under it the one most like it.
+    """Show pairs of patches that are near duplicates: each patch, and under it the one most like it.
 
     Parameters
     ----------
@@ -220,7 +220,7 @@ def plot_near_copies(
     -------
     matplotlib.axes.Axes
         With two pictures and two texts a pair: the source, and the correlation of the two. The title tells
-        which share of the patches has a near-copy, or which share of the tested ones one to train on.
+        which share of the patches has a near duplicate, or which share of the tested ones one to train on.
 
     Raises
     ------
@@ -232,8 +232,8 @@ def plot_near_copies(
     >>> patches = np.random.default_rng(0).integers(0, 256, (4, 64, 64, 3), np.uint8)
     >>> patches[3] = patches[1] // 2
     >>> drawn = PatchSet(patches, [1, 1, 1, 1], [f"vehicles/drawn/{row}.png" for row in range(4)])
-    >>> plot_near_copies(drawn, np.array([[1, 3], [3, 1]])).get_title()
-    '2 of 4 patches have a near-copy (50.0%)'
+    >>> plot_near_duplicates(drawn, np.array([[1, 3], [3, 1]])).get_title()
+    '2 of 4 patches have a near duplicate (50.0%)'
     """
     _check_set(patch_set)
     rows = np.asarray(pairs)
@@ -242,7 +242,7 @@ def plot_near_copies(
             f"pairs must be (M, 2) row numbers of the {len(patch_set)} patches, got {describe(rows)}; "
             "pass what find_near_duplicates returns for this set"
         )
-    whole, title = len(patch_set), "patches have a near-copy"
+    whole, title = len(patch_set), "patches have a near duplicate"
     if split is not None:
         check_type(split, "split", Split, "make one with split_random or the like")
         tested = np.zeros(len(patch_set), np.bool_)

@@ -14,9 +14,9 @@ from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import (
     DetectionScores,
+    FrameBoxes,
     FrameKey,
     LabelledFrames,
-    Labels,
     match_detections,
     prepare_sides,
 )
@@ -188,7 +188,7 @@ def plot_f1(
 
 def plot_errors(
     frames: LabelledFrames,
-    predictions: Labels,
+    predictions: FrameBoxes,
     *,
     kind: Literal["missed", "false"] = "missed",
     iou: float = 0.5,
@@ -203,7 +203,7 @@ def plot_errors(
     frames
         Frames with their true boxes.
     predictions
-        Detected boxes, with scores; `Labels.from_detections` makes them.
+        Detected boxes, with scores; `FrameBoxes.from_detections` makes them.
     kind
         ``"missed"``: labelled vehicles without a detection, the largest first, each with the overlap of the
         nearest one. ``"false"``: detections that are no vehicle, the best score first.
@@ -248,7 +248,7 @@ def plot_errors(
         sizes = side.boxes[rows, 2:] - side.boxes[rows, :2]
         order = np.argsort(-sizes.prod(axis=1), kind="stable")
     else:
-        side, rows = predictions, np.flatnonzero((found.partner < 0) & ~found.neutral)
+        side, rows = predictions, np.flatnonzero((found.partner < 0) & ~found.ignored)
         title = f"{len(rows):,} of {len(predictions):,} detections are no vehicle"
         order = np.arange(len(rows)) if side.scores is None else np.argsort(-side.scores[rows], kind="stable")
     shown = rows[order[:most]]
@@ -299,7 +299,9 @@ def _crop(image: NDArray[np.uint8], box: NDArray[Any]) -> tuple[NDArray[np.uint8
     return image[y1 : max(y2, y1 + 1), x1 : max(x2, x1 + 1)], (x1, y1)
 
 
-def _caption(side: Labels, row: int, key: FrameKey, predictions: Labels, labels: Labels, kind: str) -> str:
+def _caption(
+    side: FrameBoxes, row: int, key: FrameKey, predictions: FrameBoxes, labels: FrameBoxes, kind: str
+) -> str:
     name = str(key).rpartition(".")[0] or str(key) if isinstance(key, str) else f"frame {key}"
     width, height = (side.boxes[row, 2:] - side.boxes[row, :2]).round().astype(int)
     if kind == "missed":

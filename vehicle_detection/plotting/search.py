@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from vehicle_detection._common import check_image, check_number, check_type, describe
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import Labels
+from vehicle_detection.evaluation import FrameBoxes
 from vehicle_detection.heatmap import apply_threshold, frame_heat, label_boxes
 from vehicle_detection.params import HeatParams, PixelBand, SearchParams
 from vehicle_detection.plotting.style import (
@@ -42,11 +42,11 @@ def plot_windows(
     image: Image,
     windows: Detections | ArrayLike,
     *,
-    truth: Detections | Labels | ArrayLike | None = None,
+    truth: Detections | FrameBoxes | ArrayLike | None = None,
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw windows on a frame, coloured by their scores.
+    """Draw windows on a frame, colored by their scores.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def plot_windows(
         ``(H, W, 3)`` uint8 RGB.
     windows
         `Detections`, such as those of `find_cars`; or ``(N, 4)`` boxes without scores, such as those of
-        `slide_window`, drawn in one colour.
+        `slide_window`, drawn in one color.
     truth
         Labelled boxes, drawn with dashes.
     title
@@ -339,7 +339,7 @@ def plot_heatmap(
     Returns
     -------
     matplotlib.figure.Figure or SubFigure
-        Three panels: frame with windows; heat with its scale; frame with each labelled region in a colour
+        Three panels: frame with windows; heat with its scale; frame with each labelled region in a color
         of its own and the boxes of `label_boxes`, which are the panel's one collection.
 
     Raises
@@ -366,7 +366,7 @@ def plot_heatmap(
             f"heat must be an array of the frame's size {picture.shape[:2]}, got {describe(given)}; "
             "add it up with add_heat"
         )
-    found = label_boxes(warm, threshold=params.threshold, share=params.share)
+    found = label_boxes(warm, threshold=params.threshold, peak_fraction=params.peak_fraction)
     height, width = picture.shape[:2]
     sheet = new_figure(figure, 15, 5 * height / width + 0.5, layout="compressed")
     first, second, third = panels(sheet, 1, 3)[0]
@@ -398,7 +398,7 @@ def _count(number: int, name: str) -> str:
 
 
 def paint_regions(image: Image, heat: NDArray[Any], threshold: float) -> Image:
-    """Lay a colour over each connected region above the threshold, on a copy of a gray frame."""
+    """Lay a color over each connected region above the threshold, on a copy of a gray frame."""
     from scipy import ndimage
 
     labels, _ = ndimage.label(apply_threshold(heat, threshold) > 0, structure=np.ones((3, 3)))

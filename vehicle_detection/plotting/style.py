@@ -1,4 +1,4 @@
-"""What all figures share: where they are drawn, colours, pictures, boxes and grids of tiles."""
+"""What all figures share: where they are drawn, colors, pictures, boxes and grids of tiles."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vehicle_detection._common import check_boxes, check_image, check_type, desc
 from vehicle_detection.boxes import Detections
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import Labels
+from vehicle_detection.evaluation import FrameBoxes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,17 +29,17 @@ Sheet: TypeAlias = Union["Figure", "SubFigure"]
 Paint = tuple[float, float, float]
 
 COLORS: tuple[Paint, ...] = tuple((r / 255, g / 255, b / 255) for r, g, b in TRACK_COLORS)
-"""Okabe and Ito's colours as matplotlib takes them, in the order of the tracks'."""
+"""Okabe and Ito's colors as matplotlib takes them, in the order of the tracks'."""
 
 LINE_COLORS: tuple[Paint, ...] = tuple(COLORS[index] for index in (4, 5, 2, 6, 0, 1))
 """The same for lines on white, on which yellow is not seen."""
 
 ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = COLORS
 VEHICLE, OTHER = VERMILION, BLUE
-"""Colours of the two classes."""
+"""Colors of the two classes."""
 
 TRUTH = (1.0, 1.0, 1.0)
-"""Colour of labelled boxes on a picture; their dashes have a dark edge."""
+"""Color of labelled boxes on a picture; their dashes have a dark edge."""
 
 DASHES = ("-", "--", "-.", ":")
 
@@ -47,7 +47,7 @@ _PIXELATED = 200
 
 
 def line_looks() -> Iterator[tuple[Paint, str]]:
-    """Colours and dashes of one line after the other: lines of one colour differ in their dashes."""
+    """Colors and dashes of one line after the other: lines of one color differ in their dashes."""
     looks = [(color, dash) for dash in DASHES for color in LINE_COLORS]
     return itertools.cycle(looks)
 
@@ -132,11 +132,11 @@ def check_count(values: Sequence[object] | None, name: str, count: int, of: str)
     return list(values)
 
 
-def boxes_of(boxes: Detections | Labels | ArrayLike, name: str = "boxes") -> NDArray[Any]:
+def boxes_of(boxes: Detections | FrameBoxes | ArrayLike, name: str = "boxes") -> NDArray[Any]:
     """Boxes of detections, of labels that are not ignored, or as they are."""
     if isinstance(boxes, Detections):
         return boxes.boxes
-    if isinstance(boxes, Labels):
+    if isinstance(boxes, FrameBoxes):
         return boxes.boxes[~boxes.ignore]
     return check_boxes(boxes, name)
 

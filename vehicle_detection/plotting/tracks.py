@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vehicle_detection._common import check_number, check_type, describe
 from vehicle_detection.detector import FrameResult
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import NO_TRACK, Labels
+from vehicle_detection.evaluation import NO_TRACK, FrameBoxes
 from vehicle_detection.plotting.style import (
     COLORS,
     DASHES,
@@ -54,14 +54,14 @@ class _Course(NamedTuple):
 
 
 def plot_tracks(
-    results: Iterable[FrameResult] | Labels,
+    results: Iterable[FrameResult] | FrameBoxes,
     *,
-    truth: Labels | Sequence[Sequence[VehicleTruth]] | None = None,
+    truth: FrameBoxes | Sequence[Sequence[VehicleTruth]] | None = None,
     fps: float = 25.0,
     least: int = 1,
     figure: Sheet | None = None,
 ) -> Sheet:
-    """Plot place, size, distance and speed of each track over time, in the colours of the video.
+    """Plot place, size, distance and speed of each track over time, in the colors of the video.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def plot_tracks(
     """
     rate = check_number(fps, "fps", above=0, high=1e6)
     shortest = check_number(least, "least", low=1)
-    if isinstance(results, Labels):
+    if isinstance(results, FrameBoxes):
         courses = _courses_of_labels(results, rate, "results")
     else:
         courses = _courses_of_results(results, rate)
@@ -131,7 +131,7 @@ def plot_tracks(
 
 
 def _look(track: int) -> tuple[Paint, str]:
-    """Colour of a track as in the video, and dashes that tell those of one colour apart."""
+    """Color of a track as in the video, and dashes that tell those of one color apart."""
     turn, place = divmod(track - 1, len(COLORS))
     color = _DARK_YELLOW if COLORS[place] == YELLOW else COLORS[place]
     return color, DASHES[turn % len(DASHES)]
@@ -144,9 +144,9 @@ def _put_truth(axes: NDArray[Any], courses: Mapping[int, _Course]) -> None:
             panel.plot(course.time, course.values[name], "k.", markersize=2, label=label)
 
 
-def _truth_labels(truth: object) -> Labels:
+def _truth_labels(truth: object) -> FrameBoxes:
     """Labels that are not to be ignored, out of labels or the rows of each frame of a drawn drive."""
-    if isinstance(truth, Labels):
+    if isinstance(truth, FrameBoxes):
         return truth[~truth.ignore]
     if not isinstance(truth, Sequence) or not all(
         isinstance(row, VehicleTruth) for rows in truth for row in rows
@@ -156,7 +156,7 @@ def _truth_labels(truth: object) -> Labels:
             "read a file with read_labels or pass drive.truth"
         )
     listed = [(frame, row) for frame, rows in enumerate(truth) for row in rows if not row.ignore]
-    return Labels(
+    return FrameBoxes(
         [frame for frame, _ in listed],
         np.array([row.track for _, row in listed], np.int64),
         np.array([row.box for _, row in listed], np.float64).reshape(-1, 4),
@@ -177,7 +177,7 @@ def _courses_of_results(results: object, rate: float) -> dict[int, _Course]:
         time = result.index / rate if result.time is None else result.time
         for track in result.shown:
             x1, _, x2, _ = track.box.tolist()
-            known = (track.distance_m, track.distance_error_m, track.speed_mps, track.speed_error_mps)
+            known = (track.distance_m, track.distance_std_m, track.speed_mps, track.speed_std_mps)
             told = (math.nan if value is None else value for value in known)
             rows.setdefault(track.id, []).append((time, (x1 + x2) / 2, x2 - x1, *told))
     courses = {}
@@ -191,7 +191,7 @@ def _courses_of_results(results: object, rate: float) -> dict[int, _Course]:
     return courses
 
 
-def _courses_of_labels(labels: Labels, rate: float, name: str) -> dict[int, _Course]:
+def _courses_of_labels(labels: FrameBoxes, rate: float, name: str) -> dict[int, _Course]:
     if any(isinstance(key, str) for key in labels.frame_keys):
         raise InvalidInputError(
             f"{name} must number its frames, got names such as {labels.frame_keys[0]!r}; "

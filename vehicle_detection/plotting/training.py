@@ -58,7 +58,7 @@ def plot_weights(classifier: VehicleClassifier, *, template: int = 0, figure: Sh
     matplotlib.figure.Figure or SubFigure
         A row for each channel: HOG for and against, fine and coarse, weights of the spatial bins and of the
         histogram as far as the model has them. With spatial bins the last column shows the mean patch in
-        colour, and moved towards and away from what the SVM takes for a vehicle.
+        color, and moved towards and away from what the SVM takes for a vehicle.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def plot_weights(classifier: VehicleClassifier, *, template: int = 0, figure: Sh
     columns += ["coarse HOG for", "coarse HOG against"] if params.coarse_length else []
     columns += ["spatial bins"] if params.spatial_feat else []
     columns += ["histogram"] if params.hist_feat else []
-    columns += ["in colour"] if params.spatial_feat else []
+    columns += ["in color"] if params.spatial_feat else []
     sheet = new_figure(figure, min(2.6 * len(columns), 15), 7.2)
     grid = panels(sheet, 3, len(columns))
     for title, panel in zip(columns, grid[0]):
@@ -93,9 +93,9 @@ def plot_weights(classifier: VehicleClassifier, *, template: int = 0, figure: Sh
         _put_hog_weights(grid[:, 2:4], parts["coarse HOG"], params, params.coarse_blocks)
     if params.spatial_feat:
         _put_spatial_weights(grid[:, columns.index("spatial bins")], parts["spatial bins"], params, names)
-        _put_colour(grid[:, -1], known, params)
+        _put_color(grid[:, -1], known, params)
     if params.hist_feat:
-        weights = parts["colour histogram"].reshape(3, -1)
+        weights = parts["color histogram"].reshape(3, -1)
         top = 1.1 * float(np.abs(weights).max()) or 1.0
         for panel, channel, name in zip(grid[:, columns.index("histogram")], weights, names):
             panel.stairs(channel, np.linspace(0, 256, params.hist_bins + 1), fill=True, color="0.45")
@@ -136,7 +136,7 @@ def _put_spatial_weights(
         bar.ax.tick_params(labelsize=6)
 
 
-def _put_colour(column: NDArray[Any], template: Template, params: FeatureParams) -> None:
+def _put_color(column: NDArray[Any], template: Template, params: FeatureParams) -> None:
     """Show the mean patch, and how it looks when it is moved along the weights of the spatial bins."""
     stop, size = params.spatial_length, params.spatial_size
     direction = template.coef[:stop] * template.scale[:stop]
@@ -236,12 +236,12 @@ def _edges(values: NDArray[Any], limit: float, count: int) -> NDArray[np.float64
 
 
 def plot_split_scores(report: TrainingReport, *, ax: Axes | None = None) -> Axes:
-    """Plot what a model gets wrong on each split, with its accuracy and the share of near-copies.
+    """Plot what a model gets wrong on each split, with its accuracy and the share of near duplicates.
 
     Parameters
     ----------
     report
-        What `train_and_judge` returns.
+        What `train_and_evaluate` returns.
     ax
         Where to draw; None makes a new figure.
 
@@ -257,15 +257,15 @@ def plot_split_scores(report: TrainingReport, *, ax: Axes | None = None) -> Axes
 
     Examples
     --------
-    >>> from vehicle_detection import render_patches, train_and_judge
+    >>> from vehicle_detection import render_patches, train_and_evaluate
     >>> from vehicle_detection.datasets.patches import PatchSet
     >>> patches, labels = render_patches(20)
     >>> drawn = PatchSet(patches, labels, [f"vehicles/drawn/{number}.png" for number in range(20)])
-    >>> _, report = train_and_judge(drawn, params=FeatureParams(hog_channel=0), seeds=1)
+    >>> _, report = train_and_evaluate(drawn, params=FeatureParams(hog_channel=0), seeds=1)
     >>> [text.get_text().splitlines()[0] for text in plot_split_scores(report).get_yticklabels()]
     ['random fifth']
     """
-    check_type(report, "report", TrainingReport, "pass the second value that train_and_judge returns")
+    check_type(report, "report", TrainingReport, "pass the second value that train_and_evaluate returns")
     axes = new_axes(ax, 8, 1.2 + 0.75 * len(report.splits))
     places = np.arange(len(report.splits))
     for offset, name, color, label in (
@@ -276,7 +276,7 @@ def plot_split_scores(report: TrainingReport, *, ax: Axes | None = None) -> Axes
         bars = axes.barh(places + offset, shares, 0.36, color=color, label=label)
         axes.bar_label(bars, fmt="%.2f%%", padding=3, fontsize=8)
     names = [
-        f"{SPLITS[name]}\naccuracy {score.accuracy:.4f}, near-copies {score.leakage:.1%}"
+        f"{SPLITS[name]}\naccuracy {score.accuracy:.4f}, near duplicates {score.leakage:.1%}"
         for name, score in report.splits.items()
     ]
     axes.set_yticks(places, names, fontsize=9)

@@ -1,4 +1,4 @@
-"""Style and script of the report, and the colours of its two schemes."""
+"""Style and script of the report, and the colors of its two schemes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LIGHT = {
     "c5": "#b84e00",
     "c6": "#ad5285",
 }
-"""Colours on white; ``c0`` to ``c6`` are those of `draw_tracks`, darker where they would not be seen."""
+"""Colors on white; ``c0`` to ``c6`` are those of `draw_tracks`, darker where they would not be seen."""
 
 DARK = {
     "ground": "#101418",
@@ -34,7 +34,7 @@ DARK = {
     "c5": "#e8701a",
     "c6": "#cc79a7",
 }
-"""Colours on black."""
+"""Colors on black."""
 
 
 def _variables(colors: dict[str, str]) -> str:
@@ -170,10 +170,10 @@ function tell(frame) {
   time.textContent = clock(frame / data.fps) + (there.length ? "" : " no vehicle");
   told.replaceChildren(time, ...there.map(track => {
     const point = Math.floor(frame / data.step) - track.first, name = document.createElement("span");
-    const metres = track.distance[point], speed = track.speed[point];
+    const meters = track.distance[point], speed = track.speed[point];
     name.className = "c" + track.color;
     name.textContent = "#" + track.id;
-    if (metres != null) name.textContent += " " + metres.toFixed(0) + " m";
+    if (meters != null) name.textContent += " " + meters.toFixed(0) + " m";
     if (speed != null) {
       const sign = speed > 0 ? "+" : speed < 0 ? "\u2212" : "";
       name.textContent += " " + sign + Math.abs(speed).toFixed(1) + " m/s";

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection.report.history import Floats, TrackHistory, binned, runs
-from vehicle_detection.report.page import clock, tag, text
+from vehicle_detection.report.html import clock, tag, text
 
 COLORS = 7
-"""Number of colours, as many as `draw_tracks` has; classes ``c0``, ``c1``, ..."""
+"""Number of colors, as many as `draw_tracks` has; classes ``c0``, ``c1``, ..."""
 
 ROWS = 14
 """Tracks that have a row each; more of them share rows."""

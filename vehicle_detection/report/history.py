@@ -17,7 +17,7 @@ from vehicle_detection.errors import InvalidInputError
 
 Floats = NDArray[np.float64]
 
-COLUMNS = ("distance_m", "distance_error_m", "speed_mps", "speed_error_mps", "score")
+COLUMNS = ("distance_m", "distance_std_m", "speed_mps", "speed_std_mps", "score")
 """What is kept of a track in each frame; NaN where it is unknown."""
 
 NEAREST_SECONDS = 1 / 3
@@ -27,10 +27,10 @@ _BOUND = 1e9
 
 
 class Nearest(NamedTuple):
-    """How near a vehicle came: in which frame, metres, and their standard error (NaN if unknown)."""
+    """How near a vehicle came: in which frame, meters, and their standard error (NaN if unknown)."""
 
     frame: int
-    metres: float
+    meters: float
     error: float
 
 
@@ -73,16 +73,16 @@ class TrackHistory:
 
     def nearest(self, fps: float) -> Nearest | None:
         """Return the least distance, as a median over ``NEAREST_SECONDS``; None where none is known."""
-        metres, errors = self.columns["distance_m"], self.columns["distance_error_m"]
-        known = np.flatnonzero(np.isfinite(metres))
+        meters, errors = self.columns["distance_m"], self.columns["distance_std_m"]
+        known = np.flatnonzero(np.isfinite(meters))
         if not known.size:
             return None
         width = min(max(round(NEAREST_SECONDS * fps), 1), known.size)
-        medians = np.median(np.lib.stride_tricks.sliding_window_view(metres[known], width), axis=1)
+        medians = np.median(np.lib.stride_tricks.sliding_window_view(meters[known], width), axis=1)
         start = int(np.argmin(medians))
         window = known[start : start + width]
         # The frame of the window that is most like its median, where the video is to stop.
-        place = window[int(np.argmin(np.abs(metres[window] - medians[start])))]
+        place = window[int(np.argmin(np.abs(meters[window] - medians[start])))]
         return Nearest(int(self.frames[place]), float(medians[start]), float(np.median(errors[window])))
 
 

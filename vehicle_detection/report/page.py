@@ -5,11 +5,9 @@ from __future__ import annotations
 import base64
 import dataclasses
 import hashlib
-import html
 import json
 import math
-import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -33,96 +31,12 @@ from vehicle_detection.report.charts import (
     steps,
 )
 from vehicle_detection.report.history import TrackHistory, TrackLog, binned
+from vehicle_detection.report.html import amount, clock, facts, file_name, table, tag, text
 from vehicle_detection.training import SPLITS
 from vehicle_detection.video import VideoReport
 
-_VOID = {"link", "meta", "source"}
-
-
-def text(value: object) -> str:
-    """Escape a value for HTML; what UTF-8 cannot hold, as in the name of a file, becomes a question mark."""
-    plain = str(value).encode("utf-8", "replace").decode("utf-8")
-    return html.escape(plain)
-
-
-def tag(name: str, *content: str, **attributes: object) -> str:
-    """Write an element.
-
-    Parameters
-    ----------
-    name
-        Its name.
-    *content
-        What it holds: HTML, already escaped.
-    **attributes
-        Values of any kind, escaped here; None leaves one out and True writes its name alone. A trailing
-        underscore keeps clear of Python's words, others become hyphens.
-
-    Examples
-    --------
-    >>> tag("p", text("a < b"), class_="note", aria_label='say "hi"')
-    '<p class="note" aria-label="say &quot;hi&quot;">a &lt; b</p>'
-    >>> tag("video", controls=True, poster=None)
-    '<video controls></video>'
-    """
-    words = [name]
-    for key, value in attributes.items():
-        label = key.rstrip("_").replace("_", "-")
-        if value is True:
-            words.append(label)
-        elif value is not None:
-            words.append(f'{label}="{text(value)}"')
-    start = f"<{' '.join(words)}>"
-    return start if name in _VOID else f"{start}{''.join(content)}</{name}>"
-
-
-def file_name(path: str | os.PathLike[str]) -> str:
-    """Write the name of a file; letters that turn the direction of writing stay inside it."""
-    return tag("bdi", text(os.path.basename(path)))
-
-
-def facts(values: Mapping[str, str], *, class_: str = "facts") -> str:
-    """Write names and values (HTML) side by side."""
-    rows = (tag("div", tag("dt", text(name)), tag("dd", value)) for name, value in values.items())
-    return tag("dl", *rows, class_=class_)
-
-
-def table(heads: Sequence[str], rows: Iterable[Sequence[str]], *, label: str, id_: str | None = None) -> str:
-    """Write a table of HTML cells, of which the first of a row is its head; it scrolls if it is too large."""
-    head = tag("tr", *(tag("th", text(name), scope="col") for name in heads))
-    body = (tag("tr", tag("th", row[0], scope="row"), *(tag("td", cell) for cell in row[1:])) for row in rows)
-    whole = tag("table", tag("thead", head), tag("tbody", *body), id_=id_)
-    return tag("div", whole, class_="scroll", role="region", aria_label=label, tabindex=0)
-
-
-def clock(seconds: float, *, tenths: bool = True) -> str:
-    """Write a time of a video.
-
-    Examples
-    --------
-    >>> clock(3.24), clock(75, tenths=False), clock(3725.96)
-    ('0:03.2', '1:15', '1:02:06.0')
-    """
-    whole = round(seconds, 1 if tenths else 0)
-    minutes, rest = divmod(whole, 60)
-    hours, minutes = divmod(int(minutes), 60)
-    end = f"{rest:04.1f}" if tenths else f"{int(rest):02d}"
-    return f"{hours}:{minutes:02d}:{end}" if hours else f"{minutes}:{end}"
-
-
-def amount(count: int, noun: str) -> str:
-    """Write a number of things.
-
-    Examples
-    --------
-    >>> amount(1, "vehicle"), amount(1200, "frame")
-    ('1 vehicle', '1,200 frames')
-    """
-    return f"{count:,} {noun}{'s' * (count != 1)}"
-
-
 _TIMES = "\N{NO-BREAK SPACE}\N{MULTIPLICATION SIGN}\N{NO-BREAK SPACE}"
-_SCORES = ("accuracy", "missed", "false", "near_copies", "test")
+_SCORES = ("accuracy", "false_negative_rate", "false_positive_rate", "near_duplicates", "test")
 
 
 def settings_part(detector: Any, shape: tuple[int, ...]) -> str:
@@ -293,7 +207,7 @@ def _plain(value: Any) -> str:
 
 
 VAGUE_SPEED = 3.0
-"""A speed with a greater standard error, in metres a second, is not drawn, as in the video."""
+"""A speed with a greater standard error, in meters a second, is not drawn, as in the video."""
 
 _HEIGHT = 150
 _COUNT_STEPS = (1, 2, 5, 10, 15, 30, 60, 120, 300)
@@ -417,7 +331,7 @@ def _counts(tracks: Sequence[TrackHistory], log: TrackLog, report: VideoReport) 
     if tracks:
         longest = max(tracks, key=lambda track: len(track.frames))
         values["Longest track"] = f"#{longest.id}, {len(longest.frames) / fps:.1f} s"
-    near = [(found.metres, track.id) for track in tracks if (found := track.nearest(fps)) is not None]
+    near = [(found.meters, track.id) for track in tracks if (found := track.nearest(fps)) is not None]
     if near:
         values["Nearest"] = "{:.0f} m, #{}".format(*min(near))
     return facts({name: text(value) for name, value in values.items()})
@@ -490,14 +404,14 @@ def _count_chart(log: TrackLog, axis: Clock) -> str:
 
 
 def _distance_chart(tracks: Sequence[TrackHistory], axis: Clock) -> str:
-    name, band = "distance_m", "distance_error_m"
+    name, band = "distance_m", "distance_std_m"
     values = [track.columns[name] for track in tracks]
     known = np.concatenate([column[np.isfinite(column)] for column in values])
     if not known.size:
         return tag("p", "No distance is known.")
     scale = Scale.around(0, float(known.max()), _HEIGHT)
     curves = "".join(curve(track, name, axis, scale, band=band) for track in tracks)
-    label = f"Lines: distance of each track, from {known.min():.0f} to {known.max():.0f} metres."
+    label = f"Lines: distance of each track, from {known.min():.0f} to {known.max():.0f} meters."
     ends = [end for track in tracks if (end := end_label(track, name, axis, scale)) is not None]
     graph = chart(
         curves, axis, scale, label=f"{label} The table of tracks has the nearest ones.", labels=ends
@@ -514,7 +428,7 @@ def _speed_chart(tracks: Sequence[TrackHistory], axis: Clock) -> str:
     scale = Scale.around(min(float(known.min()), 0.0), max(float(known.max()), 0.0), _HEIGHT)
     curves = "".join(curve(track, name, axis, scale) for track in tracks)
     label = (
-        f"Lines: relative speed of each track, from {known.min():.1f} to {known.max():.1f} metres a second."
+        f"Lines: relative speed of each track, from {known.min():.1f} to {known.max():.1f} meters a second."
     )
     ends = [end for track in tracks if (end := end_label(track, name, axis, scale)) is not None]
     note = f"Metres a second, above 0 when moving away; known to {VAGUE_SPEED:g} m/s or better"
@@ -522,7 +436,7 @@ def _speed_chart(tracks: Sequence[TrackHistory], axis: Clock) -> str:
 
 
 def _without_vague_speeds(track: TrackHistory) -> TrackHistory:
-    vague = track.columns["speed_error_mps"] > VAGUE_SPEED
+    vague = track.columns["speed_std_mps"] > VAGUE_SPEED
     speeds = np.where(vague, np.nan, track.columns["speed_mps"])
     return dataclasses.replace(track, columns={**track.columns, "speed_mps": speeds})
 
@@ -533,10 +447,10 @@ def _track_table(tracks: Sequence[TrackHistory], fps: float) -> str:
     rows = []
     for track in tracks:
         near = track.nearest(fps)
-        metres, when = "\N{EN DASH}", "\N{EN DASH}"
+        meters, when = "\N{EN DASH}", "\N{EN DASH}"
         if near is not None:
             error = f" \N{PLUS-MINUS SIGN} {near.error:.1f}" if math.isfinite(near.error) else ""
-            metres, when = f"{near.metres:.1f}{error} m", _seek(near.frame, fps, track)
+            meters, when = f"{near.meters:.1f}{error} m", _seek(near.frame, fps, track)
         scores = track.columns["score"][np.isfinite(track.columns["score"])]
         rows.append(
             (
@@ -544,7 +458,7 @@ def _track_table(tracks: Sequence[TrackHistory], fps: float) -> str:
                 _seek(track.first, fps, track),
                 text(clock((track.last + 1) / fps)),
                 f"{len(track.frames):,}",
-                metres,
+                meters,
                 when,
                 f"{scores.mean():.2f}" if scores.size else "\N{EN DASH}",
             )

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any
 
-from vehicle_detection._common import check_integer, check_target, check_type, describe, written_whole
+from vehicle_detection._common import atomic_write, check_integer, check_target, check_type, describe
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.report.history import TrackLog
 from vehicle_detection.report.page import Film, page
@@ -125,7 +125,7 @@ class ReportWriter:
         film = self._film()
         before, after = page(self._log, report, film=film, source=self._source, detector=self._detector)
         with (
-            written_whole(self._path, "path") as part,
+            atomic_write(self._path, "path") as part,
             part.open("w", encoding="utf-8", newline="\n") as file,
         ):
             file.write(before)

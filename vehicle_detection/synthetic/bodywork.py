@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection.synthetic.camera_light import Floats
-from vehicle_detection.synthetic.vehicles import profile_at
+from vehicle_detection.synthetic.shapes import profile_at
 
 if TYPE_CHECKING:
     from vehicle_detection.synthetic.camera_light import Floats
@@ -23,7 +23,7 @@ Outline = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A painted surface: ``(H, W, 4)`` premultiplied RGBA, 0-255, and the metres of its upper left corner."""
+    """A painted surface: ``(H, W, 4)`` premultiplied RGBA, 0-255, and the meters of its upper left corner."""
 
     rgba: Floats
     left: float
@@ -70,7 +70,7 @@ class Cover:
 
 
 class Easel:
-    """A sheet in metres, `left`..`right` by `low`..`top`, to paint polygons on."""
+    """A sheet in meters, `left`..`right` by `low`..`top`, to paint polygons on."""
 
     def __init__(self, left: float, right: float, low: float, top: float) -> None:
         ppm = PIXELS_PER_METRE
@@ -86,7 +86,7 @@ class Easel:
         self.alpha: Floats = np.zeros(self.size, np.float32)
 
     def mask(self, points: ArrayLike, *, soften: float = 0.0) -> Cover:
-        """Cover of a polygon of ``(x, y)`` points, its edge softened by some metres."""
+        """Cover of a polygon of ``(x, y)`` points, its edge softened by some meters."""
         corners = (np.asarray(points, np.float64) - (self.left, self.top)) * (1, -1) * PIXELS_PER_METRE - 0.5
         margin = 2 + int(3 * soften * PIXELS_PER_METRE)
         x1, y1 = np.maximum(np.floor(corners.min(0)).astype(int) - margin, 0).tolist()
@@ -107,7 +107,7 @@ class Easel:
         return self.mask(rounded(corners, round_by))
 
     def paint(self, cover: Cover, color: ArrayLike, strength: float = 1.0) -> None:
-        """Lay a colour, or a sheet of colours, over what is there."""
+        """Lay a color, or a sheet of colors, over what is there."""
         paint = np.asarray(color, np.float32)
         if paint.ndim == 3:
             paint = np.broadcast_to(paint, self.color.shape)[cover.place]
@@ -196,7 +196,7 @@ def _paint_plate(car: Car, easel: Easel, y: float) -> None:
 
 
 def _lamp(car: Car, easel: Easel, outline: Outline, color: tuple[int, int, int], shine: float) -> None:
-    """Paint a lamp glass: its colour, darker at the rim, lit from within by `shine`."""
+    """Paint a lamp glass: its color, darker at the rim, lit from within by `shine`."""
     cover = easel.mask(outline)
     day = 0.45 if car.light.dark else car.light.ambient + 0.4 * car.light.sun
     easel.paint(easel.mask(outline, soften=0.012), (26, 16, 16), 0.55)
@@ -445,14 +445,14 @@ def paint_flank(car: Car, easel: Easel, mirrored: Floats) -> None:
         color = (160, 24, 26) if car.facing == "rear" else (190, 194, 198)
         easel.paint(easel.mask(rounded(lamp, 0.03)), np.array(color) * max(day, car.light.lamps), 0.9)
     for hub in hubs:
-        centre = np.array([hub, d.wheel])
-        arch = easel.mask(centre + ring * (d.wheel + 0.06))
+        center = np.array([hub, d.wheel])
+        arch = easel.mask(center + ring * (d.wheel + 0.06))
         easel.paint(arch, dark * 0.7)
-        tyre = easel.mask(centre + ring * d.wheel)
+        tyre = easel.mask(center + ring * d.wheel)
         easel.show(tyre)
         easel.paint(tyre, dark * 1.4)
-        rim = easel.mask(centre + ring * d.wheel * 0.64)
+        rim = easel.mask(center + ring * d.wheel * 0.64)
         easel.paint(rim, np.full(3, looks.rims * 0.85 * day))
         for angle in np.arange(5) * 2 * np.pi / 5 + looks.seed % 3:
-            spoke = centre + np.array([np.cos(angle), np.sin(angle)]) * d.wheel * 0.42
+            spoke = center + np.array([np.cos(angle), np.sin(angle)]) * d.wheel * 0.42
             easel.paint(easel.mask(spoke + ring * d.wheel * 0.13), dark, 0.85)

@@ -23,7 +23,7 @@ _FRINGE = 0.0005
 class Pinhole:
     """A pinhole camera over a flat road, looking along it.
 
-    A point `x` metres to the right, `y` metres above the road and `z` metres ahead is seen in column
+    A point `x` meters to the right, `y` meters above the road and `z` meters ahead is seen in column
     ``center_px + focal_px * x / z`` and row
     ``horizon_px + focal_px * (height_m - y) / z``.
 
@@ -36,7 +36,7 @@ class Pinhole:
     horizon_px
         Row of the horizon, in pixels.
     height_m
-        Height of the camera over the road, in metres.
+        Height of the camera over the road, in meters.
 
     Examples
     --------
@@ -51,7 +51,7 @@ class Pinhole:
     height_m: float
 
     def foot_row(self, distance: float) -> float:
-        """Row where something `distance` metres ahead touches the road."""
+        """Row where something `distance` meters ahead touches the road."""
         return self.horizon_px + self.focal_px * self.height_m / distance
 
     def distance(self, row: float) -> float:
@@ -59,7 +59,7 @@ class Pinhole:
         return self.focal_px * self.height_m / (row - self.horizon_px)
 
     def project(self, x: ArrayLike, y: ArrayLike, z: ArrayLike) -> NDArray[np.float64]:
-        """Columns and rows, ``(..., 2)``, of points in metres with ``z > 0``."""
+        """Columns and rows, ``(..., 2)``, of points in meters with ``z > 0``."""
         right, up, ahead = np.broadcast_arrays(*(np.asarray(value, np.float64) for value in (x, y, z)))
         return np.stack(
             [
@@ -77,13 +77,13 @@ class Light:
     Attributes
     ----------
     sky_top, sky_low
-        Colours of the sky overhead and at the horizon.
+        Colors of the sky overhead and at the horizon.
     ambient, sun
         Gain of a surface from all around and from the sun, if it faces it.
     to_sun
         Unit vector towards the sun: right, up, ahead.
     tint
-        Gain of each colour channel.
+        Gain of each color channel.
     lamps
         0-1, how brightly the vehicles' lamps shine.
     visibility
@@ -107,15 +107,15 @@ class Light:
 
     @property
     def haze(self) -> Floats:
-        """Colour of the far distance."""
+        """Color of the far distance."""
         return np.asarray(self.sky_low, np.float32) * (1.0 if self.dark else 0.92)
 
     def clarity(self, distance: float) -> float:
-        """Share of the contrast left at a distance in metres."""
+        """Share of the contrast left at a distance in meters."""
         return float(np.exp(-max(distance, 0.0) / self.visibility))
 
     def on(self, color: ArrayLike, ahead: float = 0.0) -> NDArray[np.float64]:
-        """Return a colour in this light, through the haze of `ahead` metres."""
+        """Return a color in this light, through the haze of `ahead` meters."""
         gain = (self.ambient + 0.6 * self.sun) * (0.5 if self.dark else 1.0) * self.reach(ahead)
         clear = self.clarity(ahead)
         return np.asarray(color, np.float64) * (gain * clear) + self.haze * (1 - clear)
@@ -261,7 +261,7 @@ class Sensor:
         return np.asarray(cv2.GaussianBlur(sheet, (3, 3), 0.7), np.uint8)
 
     def _develop(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Add the film's contrast and the lens's colour fringes: red is drawn larger, blue smaller."""
+        """Add the film's contrast and the lens's color fringes: red is drawn larger, blue smaller."""
         channels = list(cv2.split(cv2.LUT(image, _TONES)))
         height, width = image.shape[:2]
         for channel, grow in ((0, _FRINGE), (2, -_FRINGE)):

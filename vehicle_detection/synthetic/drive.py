@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_choice, check_integer, check_number, describe, written_whole
+from vehicle_detection._common import atomic_write, check_choice, check_integer, check_number, describe
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.synthetic.camera_light import Pinhole
 from vehicle_detection.synthetic.patches import draw_patches
 from vehicle_detection.synthetic.render import Placed, VehicleTruth
 from vehicle_detection.synthetic.scene import RandomState, Scene, Studio, View, make_generator, make_view
 from vehicle_detection.synthetic.scenery import LANE, Road
-from vehicle_detection.synthetic.vehicles import DESIGNS, KIND_SHARES, PAINT_SHARES, PAINTS, Car, draw_share
+from vehicle_detection.synthetic.shapes import DESIGNS, KIND_SHARES, PAINT_SHARES, PAINTS, draw_share
+from vehicle_detection.synthetic.vehicles import Car
 
 SCENARIOS = ("highway", "overtaking", "crossing", "occlusion", "empty")
 
@@ -42,11 +42,11 @@ class Mover:
     kind, paint, facing, seed
         What it looks like; `facing` is the end that the camera sees, ``"rear"`` or ``"front"``.
     start, speed
-        Distance in metres at time 0 and speed away from the camera in m/s.
+        Distance in meters at time 0 and speed away from the camera in m/s.
     sway, period, phase
-        Amplitude in metres, period in seconds and phase of a slow closing and falling back.
+        Amplitude in meters, period in seconds and phase of a slow closing and falling back.
     lane_from, lane_to
-        Lateral positions in metres before and after a lane change.
+        Lateral positions in meters before and after a lane change.
     change_at, change_for
         Middle and duration of the lane change in seconds.
     oncoming
@@ -166,19 +166,6 @@ def _oncoming(road: Road, duration: float, rng: np.random.Generator, first: int)
             time += float(rng.uniform(1.0, 3.5))
     return movers
 
-
-__all__ = [
-    "LABEL_COLUMNS",
-    "Drive",
-    "Pinhole",
-    "Scene",
-    "SceneVehicle",
-    "VehicleTruth",
-    "render_drive",
-    "render_patches",
-    "render_scene",
-    "write_labels",
-]
 
 _CAMERA_SPEED = 27.0
 
@@ -485,7 +472,7 @@ def write_labels(
     InvalidInputError
         If the folder does not exist or is read-only.
     """
-    with written_whole(path, "path") as part, part.open("w", newline="", encoding="utf-8") as file:
+    with atomic_write(path, "path") as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(LABEL_COLUMNS)
         for frame, rows in frames:

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from vehicle_detection.synthetic.camera_light import Pinhole, Sensor, make_light
 from vehicle_detection.synthetic.render import Image, Placed, draw_one
 from vehicle_detection.synthetic.scenery import LANE, Canvas, Road, Scenery
-from vehicle_detection.synthetic.vehicles import KIND_SHARES, PAINT_SHARES, PAINTS, Car, draw_share
+from vehicle_detection.synthetic.shapes import KIND_SHARES, PAINT_SHARES, PAINTS, draw_share
+from vehicle_detection.synthetic.vehicles import Car
 
 _SHAPE = (720, 1280)
 _PER_SCENE = 80
@@ -122,7 +123,7 @@ class _Stand:
         if rng.random() < 0.25:
             sigma = float(rng.uniform(0.4, 1.3)) * size / 64
             patch = np.asarray(cv2.GaussianBlur(patch, (0, 0), sigma), np.float32)
-        # Cameras differ in exposure, contrast and colour.
+        # Cameras differ in exposure, contrast and color.
         gain, flat = rng.uniform(0.6, 1.3), rng.uniform(-0.2, 0.25)
         patch = patch * (gain * rng.uniform(0.94, 1.06, 3)).astype(np.float32)
         patch += (patch.mean() - patch) * np.float32(flat)

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from vehicle_detection.synthetic.bodywork import PIXELS_PER_METRE, Surface
 from vehicle_detection.synthetic.camera_light import Floats, Light, Pinhole
 from vehicle_detection.synthetic.scenery import Canvas, Scenery
-from vehicle_detection.synthetic.vehicles import Car, profile_at
+from vehicle_detection.synthetic.shapes import profile_at
+from vehicle_detection.synthetic.vehicles import Car
 
 NEAR_PLANE = 1.0
 """Metres ahead of the camera from which on anything is drawn."""
@@ -38,7 +39,7 @@ class _Sheet:
         self.rgba: Floats = np.zeros(((bottom - top) * fine, (right - left) * fine, 4), np.float32)
 
     def columns(self, x: NDArray[np.float64], z: NDArray[np.float64]) -> slice:
-        """Find the samples between the outermost of some points in metres, and a few more."""
+        """Find the samples between the outermost of some points in meters, and a few more."""
         seen = (self.camera.project(x, 0.0, z)[..., 0] - self.left) * self.fine
         first, last = np.clip([seen.min() - 3, seen.max() + 4], 0, self.rgba.shape[1])
         return slice(int(first), int(last))
@@ -94,7 +95,7 @@ def full_box(car: Car, camera: Pinhole, lateral: float, distance: float) -> NDAr
 def draw_sprite(
     car: Car, camera: Pinhole, lateral: float, distance: float, shape: tuple[int, int]
 ) -> Sprite | None:
-    """Draw a vehicle whose nearer tyres stand `distance` metres ahead and its middle `lateral` metres right.
+    """Draw a vehicle whose nearer tyres stand `distance` meters ahead and its middle `lateral` meters right.
 
     Returns None when no part of it can be in a picture of `shape`.
     """
@@ -255,7 +256,7 @@ class VehicleTruth:
         Metres along the road from the camera to where the nearer tyres stand; below 0 beside and behind it.
         The row where they stand is ``horizon + focal * camera height / distance_m``.
     speed_mps
-        How fast the distance grows, in metres per second.
+        How fast the distance grows, in meters per second.
     hidden
         Share in [0, 1] of the vehicle's pixels that nearer vehicles and the barrier cover.
     occluded

@@ -16,7 +16,8 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.synthetic.camera_light import LIGHTS, Light, Pinhole, Sensor, make_light
 from vehicle_detection.synthetic.render import Image, Placed, VehicleTruth, stage
 from vehicle_detection.synthetic.scenery import Road, Scenery
-from vehicle_detection.synthetic.vehicles import PAINTS, Car
+from vehicle_detection.synthetic.shapes import PAINTS
+from vehicle_detection.synthetic.vehicles import Car
 
 RandomState = int | np.random.Generator | None
 

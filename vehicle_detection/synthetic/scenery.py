@@ -17,7 +17,7 @@ from vehicle_detection.synthetic.background import draw_backdrop
 from vehicle_detection.synthetic.camera_light import Floats, Light, Pinhole, wrapped_noise
 
 LANE = 3.6
-"""Width of a lane in metres."""
+"""Width of a lane in meters."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Road:
 
     @property
     def left(self) -> float:
-        """Where the leftmost lane ends, in metres right of the camera."""
+        """Where the leftmost lane ends, in meters right of the camera."""
         return -(self.own + 0.5) * LANE
 
     @property
@@ -214,7 +214,7 @@ class _Strip(NamedTuple):
 
 
 class Hedge:
-    """Shrubs at `lateral` metres beside the road, between `low` and `high` metres tall."""
+    """Shrubs at `lateral` meters beside the road, between `low` and `high` meters tall."""
 
     def __init__(
         self,
@@ -268,7 +268,7 @@ class Hedge:
         )
 
     def draw(self, image: NDArray[np.uint8], travel: float) -> None:
-        """Draw the hedge, `travel` metres into the drive, in place."""
+        """Draw the hedge, `travel` meters into the drive, in place."""
         for columns, rows, map_x, map_y, sheet, clear in self._strips:
             shift = np.float32(travel % _HEDGE_PERIOD / _HEDGE_PERIOD * sheet.shape[1])
             # The sheet repeats along the road; above its top and below its foot it is empty.
@@ -391,7 +391,7 @@ class Canvas:
 
 @dataclass(frozen=True, eq=False)
 class _Prop:
-    """Something upright beside the road that comes again: a picture, its place and size in metres."""
+    """Something upright beside the road that comes again: a picture, its place and size in meters."""
 
     rgba: Floats
     lateral: float
@@ -417,7 +417,7 @@ class Scenery:
         self._props = self._plant(dry, rng)
 
     def render(self, travel: float) -> NDArray[np.uint8]:
-        """Draw the road without vehicles and without the barrier, `travel` metres into the drive."""
+        """Draw the road without vehicles and without the barrier, `travel` meters into the drive."""
         image = self._backdrop.copy()
         ground = image[self._ground.first :]
         if len(ground):

@@ -33,7 +33,7 @@ def overlap_matrices(first: Floats, second: Floats) -> tuple[Floats, Floats, Flo
 def match_boxes(predicted: Floats, measured: Floats, gate: Floats) -> list[tuple[int, int]]:
     """Assign measured boxes to predicted ones so that the sum of the costs is least.
 
-    The cost joins IoU, the distance of the centres in box sizes and the ratio of the areas. The assignment is
+    The cost joins IoU, the distance of the centers in box sizes and the ratio of the areas. The assignment is
     the Hungarian one (Kuhn, *Naval Research Logistics Quarterly*, 1955).
 
     Parameters
@@ -41,7 +41,7 @@ def match_boxes(predicted: Floats, measured: Floats, gate: Floats) -> list[tuple
     predicted, measured
         ``(N, 4)`` and ``(M, 4)`` boxes.
     gate
-        ``(N,)`` farthest distance of the centres, in mean widths and heights.
+        ``(N,)`` farthest distance of the centers, in mean widths and heights.
 
     Returns
     -------
@@ -51,7 +51,7 @@ def match_boxes(predicted: Floats, measured: Floats, gate: Floats) -> list[tuple
     if not len(predicted) or not len(measured):
         return []
     iou = overlap_matrices(predicted, measured)[0]
-    distance = _centre_distances(predicted, measured) / gate[:, None]
+    distance = _center_distances(predicted, measured) / gate[:, None]
     areas, others = (np.log(np.maximum(box_areas(boxes), 1.0)) for boxes in (predicted, measured))
     ratio = np.abs(areas[:, None] - others[None])
     cost = (1 - iou) + distance + 0.3 * ratio
@@ -61,9 +61,9 @@ def match_boxes(predicted: Floats, measured: Floats, gate: Floats) -> list[tuple
 
 
 def match_nearest(predicted: Floats, measured: Floats, gate: Floats) -> list[tuple[int, int]]:
-    """Pair boxes by the distance of their centres alone, nearest first (the course's first system)."""
+    """Pair boxes by the distance of their centers alone, nearest first (the course's first system)."""
     pairs: list[tuple[int, int]] = []
-    distance = _centre_distances(predicted, measured) / gate[:, None]
+    distance = _center_distances(predicted, measured) / gate[:, None]
     for flat in np.argsort(distance, axis=None, kind="stable"):
         row, column = divmod(int(flat), len(measured))
         if distance[row, column] <= 1 and all(row != r and column != c for r, c in pairs):
@@ -71,8 +71,8 @@ def match_nearest(predicted: Floats, measured: Floats, gate: Floats) -> list[tup
     return pairs
 
 
-def _centre_distances(first: Floats, second: Floats) -> Floats:
-    """``(N, M)`` distances of the centres, in mean widths and heights of the two boxes."""
+def _center_distances(first: Floats, second: Floats) -> Floats:
+    """``(N, M)`` distances of the centers, in mean widths and heights of the two boxes."""
     sides, others = (np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0) for boxes in (first, second))
     apart = (first[:, :2] + first[:, 2:])[:, None] - (second[:, :2] + second[:, 2:])[None]
     # Sums of both edges over sums of both sides: the halves cancel.

@@ -63,7 +63,7 @@ class HorizonFilter:
         dt
             Seconds since the last frame.
         """
-        if not self.given.horizon_doubt_px or not len(boxes):
+        if not self.given.horizon_std_px or not len(boxes):
             return
         camera, scale = self.camera, self.given.pixel_scale
         sides = boxes[:, 2:] - boxes[:, :2]
@@ -71,14 +71,14 @@ class HorizonFilter:
         straight = camera.focal_px * camera.vehicle_width_m
         width = sides[:, 0] * straight / width_times_distance(camera, inner_edges(boxes, frame))
         slope = camera.height_m / camera.vehicle_width_m
-        edge = np.hypot(camera.foot_error_px * scale, camera.box_error * sides)
+        edge = np.hypot(camera.bottom_std_px * scale, camera.box_error * sides)
         variance = (
             np.square(edge[:, 1])
             + 2 * np.square(slope * edge[:, 0])
             + np.square(camera.horizon_error_px * scale)
         )
         off = boxes[:, 3] - (camera.horizon_px + slope * width)
-        allowed = variance + camera.horizon_doubt_px**2 + np.square(self._slope_errors()[1] * width)
+        allowed = variance + camera.horizon_std_px**2 + np.square(self._slope_errors()[1] * width)
         good = np.square(off) < _FAR_OFF**2 * allowed
         # Where most vehicles do not fit what is remembered, it is that which is wrong.
         strange = 1 - float(good.mean())
@@ -104,8 +104,8 @@ class HorizonFilter:
         """Spread of the slope that all vehicles have in common, and that of one vehicle's."""
         camera = self.given
         slope = camera.height_m / camera.vehicle_width_m
-        common = slope * camera.height_error_m / camera.height_m
-        own = slope * camera.vehicle_width_error_m / camera.vehicle_width_m
+        common = slope * camera.height_std_m / camera.height_m
+        own = slope * camera.vehicle_width_std_m / camera.vehicle_width_m
         return common, math.hypot(common, own)
 
     def _solve(self) -> None:
@@ -124,12 +124,12 @@ class HorizonFilter:
             ]
         )
         vector = np.array([(y - x * xy * left).sum(), (xy - xx * xy * left).sum()])
-        prior = np.array([1 / camera.horizon_doubt_px**2, 1 / max(common, 1e-6) ** 2])
+        prior = np.array([1 / camera.horizon_std_px**2, 1 / max(common, 1e-6) ** 2])
         matrix[[0, 1], [0, 1]] += prior
         vector += prior * (camera.horizon_px, slope)
         spread = np.linalg.inv(matrix)
         horizon = float((spread @ vector)[0])
         error = max(math.sqrt(max(float(spread[0, 0]), 0.0)), _SUREST * camera.pixel_scale)
         self.camera = dataclasses.replace(
-            camera, horizon_px=horizon, horizon_doubt_px=min(error, camera.horizon_doubt_px)
+            camera, horizon_px=horizon, horizon_std_px=min(error, camera.horizon_std_px)
         )

@@ -3,7 +3,7 @@
 The box's state is ``[cx, cy, w, h]`` and their speeds a second, moved on at constant velocity and corrected
 by the measured edges (Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Tracking and
 Navigation*, chapter 6; on boxes: Bewley et al., *Simple Online and Realtime Tracking*, ICIP 2016). Edges, not
-centres, are measured, since one edge may be hidden by the frame's border while the others are seen.
+centers, are measured, since one edge may be hidden by the frame's border while the others are seen.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _FOUR = np.arange(4)
 # Standard errors beyond which an edge is far off, and that count at most; the share of a lasting error that
 # the place of an edge is then uncertain by.
 _FAR_OFF, _MOST, _DOUBT = 2.5, 6.0, 0.25
-# Speeds of a new box, in box sizes a second: of its centre, of its size.
+# Speeds of a new box, in box sizes a second: of its center, of its size.
 _START_SPEEDS = np.array([1.0, 0.6, 0.35, 0.35])
 
 
@@ -42,7 +42,7 @@ def boxes_of(mean: Floats) -> Floats:
 
 
 def state_of(box: Floats) -> Floats:
-    """Centre and size ``[cx, cy, w, h]`` of one box."""
+    """Center and size ``[cx, cy, w, h]`` of one box."""
     return np.asarray(_STATES @ box)
 
 
@@ -158,7 +158,7 @@ _NEAREST, _FARTHEST, _FAR_SPREAD = 1.0, 500.0, 1e3
 
 def range_start(camera: Camera) -> tuple[Floats, Floats]:
     """State ``(3,)`` and covariance ``(3, 3)`` of a vehicle about which nothing is known."""
-    spread = np.array([_FAR_SPREAD, _SPEED_SPREAD, camera.vehicle_width_error_m / camera.vehicle_width_m])
+    spread = np.array([_FAR_SPREAD, _SPEED_SPREAD, camera.vehicle_width_std_m / camera.vehicle_width_m])
     return np.array([30.0, 0.0, 0.0]), np.diag(np.square(spread))
 
 
@@ -169,7 +169,7 @@ def range_predict(mean: Floats, cov: Floats, dt: float, camera: Camera) -> tuple
     moved = mean @ step.T
     moved[:, 0] = np.clip(moved[:, 0], _NEAREST, _FARTHEST)
     noise = np.array([[dt**3 / 3, dt**2 / 2, 0], [dt**2 / 2, dt, 0], [0, 0, 0]]) * _ACCELERATION**2
-    noise[2, 2] = (camera.vehicle_width_error_m / camera.vehicle_width_m) ** 2 * dt / _WIDTH_SECONDS
+    noise[2, 2] = (camera.vehicle_width_std_m / camera.vehicle_width_m) ** 2 * dt / _WIDTH_SECONDS
     return moved, step @ cov @ step.T + noise
 
 
@@ -202,7 +202,7 @@ def range_update(
     """
     mean = mean.copy()
     sides = np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0)
-    edge = np.hypot(camera.foot_error_px * camera.pixel_scale, camera.box_error * sides)
+    edge = np.hypot(camera.bottom_std_px * camera.pixel_scale, camera.box_error * sides)
     tilt = camera.tilt_error_px
     fast, slow = max(1.0, alike / dt), max(1.0, _PITCH_SECONDS / dt)
     below = boxes[:, 3] - camera.horizon_px
@@ -220,7 +220,7 @@ def range_update(
 
     # Pixels below the horizon: drop / distance.
     expected = drop / mean[:, 0]
-    lasting = tilt**2 + np.square(expected * camera.height_error_m / camera.height_m)
+    lasting = tilt**2 + np.square(expected * camera.height_std_m / camera.height_m)
     variance = np.square(edge[:, 1]) * fast + lasting * slow
     slope = np.zeros_like(mean)
     slope[:, 0] = -expected / mean[:, 0]
@@ -229,7 +229,7 @@ def range_update(
 
     # Logarithm of the width in pixels: log(unit) + log(width) - log(distance).
     off = np.log(sides[:, 0] / unit) - mean[:, 2] + np.log(mean[:, 0])
-    flank = np.square(aside * camera.vehicle_length_error_m / unit)
+    flank = np.square(aside * camera.vehicle_length_std_m / unit)
     variance = np.square(edge[:, 0] / sides[:, 0]) * 2 * fast + flank * slow
     slope[:, 0], slope[:, 2] = -1 / mean[:, 0], 1.0
     mean, cov = _scalar_update(mean, cov, slope, off, np.where(width_seen, variance, np.inf))

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection.camera import Camera, cut_edges, inner_edges
+from vehicle_detection.camera import Camera, inner_edges, truncated_edges
 from vehicle_detection.params import TrackParams
 from vehicle_detection.tracking import kalman_filter as _kalman
 
@@ -41,11 +41,11 @@ class Track:
     misses, unseen
         Frames and seconds since the last detection.
     velocity
-        Velocity of the box's centre in pixels a second, right and down.
-    distance_m, distance_error_m
-        Distance along the road in metres and its standard error; None where it is unknown.
-    speed_mps, speed_error_mps
-        Speed relative to the camera in metres a second, positive when moving away, and its standard error;
+        Velocity of the box's center in pixels a second, right and down.
+    distance_m, distance_std_m
+        Distance along the road in meters and its standard error; None where it is unknown.
+    speed_mps, speed_std_mps
+        Speed relative to the camera in meters a second, positive when moving away, and its standard error;
         None where it is unknown.
     """
 
@@ -56,12 +56,12 @@ class Track:
     shown: bool
     age: float
     misses: int
-    unseen: float
+    time_since_update: float
     velocity: tuple[float, float]
     distance_m: float | None = None
-    distance_error_m: float | None = None
+    distance_std_m: float | None = None
     speed_mps: float | None = None
-    speed_error_mps: float | None = None
+    speed_std_mps: float | None = None
 
 
 Frame = tuple[int, int]
@@ -72,7 +72,7 @@ OUTWARDS = np.array([-1.0, -1.0, 1.0, 1.0])
 TINY = 1e-6
 """Seconds by which sums of frame times may miss a limit."""
 
-# Seconds in which an unseen vehicle forgets the speed of its centre, and of its size.
+# Seconds in which an unseen vehicle forgets the speed of its center, and of its size.
 _DAMPING = np.array([1.5, 1.5, 0.5, 0.5])
 # Time, and weight from frame to frame, of the memory for errors that last.
 _DRIFT_SECONDS, _DRIFT_KEPT = 0.15, 0.75
@@ -83,7 +83,7 @@ _MOST_GROWTH = 1.5
 # A box that the frame's border cuts is thought to be this wide for its height, give or take a share.
 _CUT_ASPECT, _CUT_ERROR = 1.5, 0.3
 # A distance is told while its error is below this share and it is unseen for less than these seconds; a speed
-# while its error is below these metres a second.
+# while its error is below these meters a second.
 _DISTANCE_LIMIT, _DISTANCE_SECONDS, _SPEED_LIMIT = 0.4, 0.5, 6.0
 
 
@@ -104,7 +104,7 @@ class Vehicle:
     sure
         Whether its first detection is reason enough to believe it.
     past
-        Age, and centre and size, at the last detections, for the smoother ``"history"``.
+        Age, and center and size, at the last detections, for the smoother ``"history"``.
     """
 
     score: float
@@ -112,7 +112,7 @@ class Vehicle:
     hits: int = 1
     misses: int = 0
     age: float = 0.0
-    unseen: float = 0.0
+    time_since_update: float = 0.0
     idle: float = 0.0
     credit: float = 0.0
     hidden: bool = False
@@ -126,7 +126,7 @@ class Vehicle:
         if not self.id or self.astray:
             return False
         # Behind another vehicle it is drawn for as long as it was seen.
-        known = 2 * self.unseen < self.age + TINY if self.hidden else self.credit > -TINY
+        known = 2 * self.time_since_update < self.age + TINY if self.hidden else self.credit > -TINY
         return self.misses == 0 or known
 
     def live(self, score: float | None, dt: float, params: TrackParams) -> None:
@@ -137,10 +137,10 @@ class Vehicle:
         self.hidden = self.astray = False
         if score is None:
             self.misses += 1
-            self.unseen += dt
+            self.time_since_update += dt
         else:
             self.hits += 1
-            self.misses, self.unseen, self.idle = 0, 0.0, 0.0
+            self.misses, self.time_since_update, self.idle = 0, 0.0, 0.0
             self.credit = min(self.credit + dt, params.show_coast) if self.id else 0.0
 
     def wait(self, hidden: bool, dt: float, astray: bool = False) -> None:
@@ -163,7 +163,7 @@ class Vehicle:
         """Whether it has been unseen for too long."""
         if self.id:
             return self.idle > params.max_coast + TINY
-        return self.unseen > params.tentative_coast + TINY
+        return self.time_since_update > params.tentative_coast + TINY
 
 
 class Filters(NamedTuple):
@@ -210,7 +210,7 @@ class Filters(NamedTuple):
 def start_filters(box: Floats, frame: Frame, dt: float, camera: Camera, params: TrackParams) -> Filters:
     """Start the filters of one vehicle at its first detection."""
     width, height = box[2:] - box[:2]
-    cut = cut_edges(box[None], frame)
+    cut = truncated_edges(box[None], frame)
     whole, error = box.copy(), np.array([width, height, width, height]) * params.box_noise
     if params.smoother == "kalman" and cut[0, 0] != cut[0, 2]:
         # Think of the part outside from the start: then the inner edge's motion is not taken for growth.
@@ -227,31 +227,33 @@ def start_filters(box: Floats, frame: Frame, dt: float, camera: Camera, params: 
 
 
 def predict_filters(
-    filters: Filters, unseen: NDArray[np.bool_], dt: float, camera: Camera, params: TrackParams
+    filters: Filters, time_since_update: NDArray[np.bool_], dt: float, camera: Camera, params: TrackParams
 ) -> Filters:
-    """Move vehicles `dt` seconds on, seen ones at constant speed on the road; `unseen` ones slow down."""
+    """Move vehicles `dt` seconds on, seen ones at constant speed on the road; `time_since_update` ones slow down."""
     mean, cov = filters.mean, filters.cov
     if params.smoother == "kalman":
         # At constant speed on the road, what grows in the image moves there ever faster: v' = 2 v w'/w.
         growth = np.clip((mean[:, 6:] / mean[:, 2:4]).mean(axis=1), -_MOST_GROWTH, _MOST_GROWTH)
-        rates = np.where(unseen[:, None], -1 / _DAMPING, 2 * growth[:, None])
+        rates = np.where(time_since_update[:, None], -1 / _DAMPING, 2 * growth[:, None])
         faster = np.concatenate((np.ones_like(rates), np.exp(dt * rates)), axis=1)
         # An error of a speed grows as the speed does, and that of a growth by what it adds to itself as well.
         spread = faster.copy()
-        spread[:, 6:] *= 1 + dt * np.maximum(2 * growth[:, None], 0) * ~unseen[:, None]
+        spread[:, 6:] *= 1 + dt * np.maximum(2 * growth[:, None], 0) * ~time_since_update[:, None]
         mean = mean * faster
         cov = cov * spread[:, :, None] * spread[:, None, :]
-        wander = np.array([params.agility, params.agility, params.growth, params.growth])
+        wander = np.array(
+            [params.process_noise_position, params.process_noise_position, params.growth, params.growth]
+        )
         mean, cov = _kalman.predict(mean, cov, dt, np.square(mean[:, [2, 3, 2, 3]] * wander))
         cov = _kalman.bound(mean, cov)
     ranges = _kalman.range_predict(filters.range_mean, filters.range_cov, dt, camera)
     return Filters(mean, cov, filters.drift, *ranges)
 
 
-def moved_unseen(mean: Floats, unseen: Floats) -> Floats:
+def moved_unseen(mean: Floats, time_since_update: Floats) -> Floats:
     """Sizes by which vehicles have moved since they were last seen, at the speeds that are slowing down."""
     pace = np.abs(mean[:, 4:6] / mean[:, 2:4]).max(axis=1)
-    return np.asarray(pace * _DAMPING[0] * np.expm1(unseen / _DAMPING[0]))
+    return np.asarray(pace * _DAMPING[0] * np.expm1(time_since_update / _DAMPING[0]))
 
 
 def correct_filters(
@@ -265,7 +267,7 @@ def correct_filters(
 ) -> Filters:
     """Correct vehicles by a box each; `partly` where the box shows another vehicle too."""
     mean, cov, drift = filters.mean, filters.cov, filters.drift
-    cut = cut_edges(boxes, frame)
+    cut = truncated_edges(boxes, frame)
     if params.smoother == "kalman":
         # An edge at the border says only that the vehicle reaches it: right if it is thought to.
         beyond = cut & ((_kalman.boxes_of(mean) - boxes) * OUTWARDS >= 0)
@@ -290,7 +292,7 @@ def follow_box(vehicle: Vehicle, mean: Floats, box: Floats, dt: float, params: T
     """Move a state ``(8,)`` to a box as the course's systems did, without a model of its motion."""
     measured = _kalman.state_of(box)
     if params.smoother == "nearest":
-        share = 1 - (1 - params.nearest_share) ** (dt / 0.04)
+        share = 1 - (1 - params.nearest_weight) ** (dt / 0.04)
         new = mean[:4] + share * (measured - mean[:4])
     else:
         vehicle.past.append((vehicle.age, measured))
@@ -303,15 +305,15 @@ def follow_box(vehicle: Vehicle, mean: Floats, box: Floats, dt: float, params: T
 
 
 def known_ranges(
-    filters: Filters, unseen: Floats, camera: Camera
+    filters: Filters, time_since_update: Floats, camera: Camera
 ) -> list[tuple[float | None, float | None, float | None, float | None]]:
     """Distance, its error, speed and its error of each vehicle; None where they are too uncertain to tell."""
     distance, speed = filters.range_mean[:, 0], filters.range_mean[:, 1]
     variance, speed_variance = filters.range_cov[:, 0, 0], filters.range_cov[:, 1, 1]
     # The focal length scales all measurements alike, so that no filter averages its error out.
-    error = np.hypot(np.sqrt(np.maximum(variance, 0)), distance * camera.focal_error)
-    speed_error = np.hypot(np.sqrt(np.maximum(speed_variance, 0)), speed * camera.focal_error)
-    near = (error <= _DISTANCE_LIMIT * distance) & (unseen <= _DISTANCE_SECONDS)
+    error = np.hypot(np.sqrt(np.maximum(variance, 0)), distance * camera.focal_std)
+    speed_error = np.hypot(np.sqrt(np.maximum(speed_variance, 0)), speed * camera.focal_std)
+    near = (error <= _DISTANCE_LIMIT * distance) & (time_since_update <= _DISTANCE_SECONDS)
     steady = near & (speed_error <= _SPEED_LIMIT)
     columns = (distance, near), (error, near), (speed, steady), (speed_error, steady)
     told = [[v if known else None for v, known in zip(c.tolist(), k.tolist())] for c, k in columns]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import check_number, describe
 from vehicle_detection.boxes import Detections, box_areas
-from vehicle_detection.camera import Camera, check_shape, cut_edges
+from vehicle_detection.camera import Camera, check_shape, truncated_edges
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import TrackParams
 from vehicle_detection.tracking.association import (
@@ -166,12 +166,12 @@ class Tracker:
         if dt == 0:
             return self._tracks
         boxes, scores = _inside(detections, frame)
-        known = scores >= min(self.params.birth_score, self.params.keep_score)
+        known = scores >= min(self.params.high_threshold, self.params.low_threshold)
         boxes, scores = boxes[known], scores[known]
         free = np.ones(len(boxes), np.bool_)
         if self._vehicles:
-            unseen = np.array([vehicle.misses > 0 for vehicle in self._vehicles])
-            self._filters = predict_filters(self._filters, unseen, dt, self.camera, self.params)
+            time_since_update = np.array([vehicle.misses > 0 for vehicle in self._vehicles])
+            self._filters = predict_filters(self._filters, time_since_update, dt, self.camera, self.params)
             free = self._correct(boxes, scores, frame, dt)
         self._end(frame, dt)
         self._begin(boxes[free], scores[free], frame, dt)
@@ -229,12 +229,12 @@ class Tracker:
         predicted = _clip(self._filters.boxes(), frame)
         # The longer unseen, the farther off it may be; clutter that leaps about shall not pass for a vehicle.
         near = (1.0 if v.id else _TENTATIVE_GATE for v in self._vehicles)
-        gate = np.array([self.params.gate * (n + v.unseen) for n, v in zip(near, self._vehicles)])
+        gate = np.array([self.params.gate * (n + v.time_since_update) for n, v in zip(near, self._vehicles)])
         match = match_nearest if self.params.smoother == "nearest" else match_boxes
         # Believed tracks come first in the list, and choose first.
         believed = sum(v.id > 0 for v in self._vehicles)
         # Detections come the best one first; weak ones are for tracks that found no other.
-        clear = int((scores >= self.params.birth_score).sum())
+        clear = int((scores >= self.params.high_threshold).sum())
         own = dict(match(predicted[:believed], boxes[:clear], gate[:believed]))
         merged, region = merged_regions(predicted[:believed], boxes[:clear], own)
         lost = [row for row in range(believed) if row not in own and row not in region]
@@ -263,9 +263,9 @@ class Tracker:
             front = np.array([v.id > 0 and v.misses == 0 for v in vehicles])
             nearer = whole[None, :, 3] > whole[:, None, 3]
             hiding = (overlap_matrices(inside, inside)[1] > _HIDDEN) & nearer & front
-            unseen = np.array([v.unseen for v in vehicles])
-            far = moved_unseen(self._filters.mean, unseen) > _BLIND
-            far |= unseen > self.params.max_coast + TINY
+            time_since_update = np.array([v.time_since_update for v in vehicles])
+            far = moved_unseen(self._filters.mean, time_since_update) > _BLIND
+            far |= time_since_update > self.params.max_coast + TINY
             for vehicle, unseen_behind, lost in zip(vehicles, hiding.any(axis=1).tolist(), far.tolist()):
                 if vehicle.misses:
                     vehicle.wait(vehicle.hidden or unseen_behind, dt, lost)
@@ -291,7 +291,9 @@ class Tracker:
         taken = _clip(self._filters.boxes()[known], frame)
         for index in np.argsort(-scores, kind="stable"):
             box, score = boxes[index], float(scores[index])
-            if score < params.birth_score or same_vehicle(box, taken, params.max_overlap, params.max_cover):
+            if score < params.high_threshold or same_vehicle(
+                box, taken, params.max_overlap, params.max_cover
+            ):
                 continue
             taken = np.vstack((taken, box))
             filters = start_filters(box, frame, dt, self.camera, params)
@@ -318,7 +320,7 @@ class Tracker:
         """Learn the horizon from the vehicles that are seen whole."""
         boxes = self._filters.boxes()
         seen = np.array([v.id > 0 and v.misses == 0 for v in self._vehicles], np.bool_)
-        seen &= ~cut_edges(boxes, frame).any(axis=1)
+        seen &= ~truncated_edges(boxes, frame).any(axis=1)
         ids = np.array([v.id for v in self._vehicles], np.int64)
         self._horizon.take(ids[seen], boxes[seen], frame, dt)
 
@@ -326,8 +328,8 @@ class Tracker:
         """Describe the tracks as they stand now."""
         boxes = _clip(self._filters.boxes(), frame)
         boxes.setflags(write=False)
-        unseen = np.array([v.unseen for v in self._vehicles])
-        ranges = known_ranges(self._filters, unseen, self.camera)
+        time_since_update = np.array([v.time_since_update for v in self._vehicles])
+        ranges = known_ranges(self._filters, time_since_update, self.camera)
         speeds = self._filters.mean[:, 4:6].tolist()
         return tuple(
             Track(
@@ -338,19 +340,19 @@ class Tracker:
                 shown=vehicle.shown,
                 age=vehicle.age,
                 misses=vehicle.misses,
-                unseen=vehicle.unseen,
+                time_since_update=vehicle.time_since_update,
                 velocity=(speed[0], speed[1]),
                 distance_m=told[0],
-                distance_error_m=told[1],
+                distance_std_m=told[1],
                 speed_mps=told[2],
-                speed_error_mps=told[3],
+                speed_std_mps=told[3],
             )
             for vehicle, box, speed, told in zip(self._vehicles, boxes, speeds, ranges)
         )
 
 
 def _guess_camera(frame: Frame) -> Camera:
-    return Camera.for_frame(frame, horizon_doubt_px=_HORIZON_DOUBT * frame[0])
+    return Camera.for_frame(frame, horizon_std_px=_HORIZON_DOUBT * frame[0])
 
 
 def _inside(detections: Detections, frame: Frame) -> tuple[Floats, Floats]:

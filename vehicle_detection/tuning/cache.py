@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_number, check_patches, written_whole
+from vehicle_detection._common import atomic_write, check_number, check_patches
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import extract_features
 from vehicle_detection.params import PATCH_SIZE, FeatureParams
@@ -127,7 +127,7 @@ class FeatureCache:
     def _save(self, features: NDArray[np.float32], params: FeatureParams, mirrored: bool) -> None:
         path = self._path(params, mirrored)
         if path is not None:
-            with written_whole(path, "cache") as part, part.open("wb") as file:
+            with atomic_write(path, "cache") as part, part.open("wb") as file:
                 np.save(file, features, allow_pickle=False)
 
     def _load(self, params: FeatureParams, mirrored: bool) -> NDArray[np.float32] | None:

@@ -12,14 +12,14 @@ from vehicle_detection._common import check_integer, check_number
 from vehicle_detection.boxes import Detections, intersection_matrix, non_max_suppression
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.datasets import PatchSet
-from vehicle_detection.evaluation import Frames, Labels, check_labels_of, keyed_frames, keys_of, pairs_of
+from vehicle_detection.evaluation import FrameBoxes, Frames, check_labels_of, keyed_frames, keys_of, pairs_of
 from vehicle_detection.params import PATCH_SIZE, SearchParams
 from vehicle_detection.search import BandSearch
 
 
 def mine_negatives(
     frames: Frames,
-    labels: Labels,
+    labels: FrameBoxes,
     classifier: VehicleClassifier,
     *,
     search: SearchParams | None = None,

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_target, describe, written_whole
+from vehicle_detection._common import atomic_write, check_target, describe
 from vehicle_detection.errors import DatasetError, InvalidInputError
 
 Cell = str | int | float | bool | None
@@ -169,7 +169,7 @@ class ResultTable:
             return
         lines = [_csv_line(self.columns)] if suffix == ".csv" else []
         lines += [_line_of(row, self.columns, suffix) for row in self]
-        with written_whole(path, "path") as part:
+        with atomic_write(path, "path") as part:
             part.write_text("".join(lines), encoding="utf-8", newline="")
 
     def to_pandas(self) -> Any:
@@ -365,5 +365,5 @@ def _write_parquet(table: ResultTable, path: str | os.PathLike[str]) -> None:
             numeric = kinds <= {int, float}
             values = [None if value is None else float(value) if numeric else str(value) for value in values]
         columns[name] = values
-    with written_whole(path, "path") as part:
+    with atomic_write(path, "path") as part:
         pyarrow.parquet.write_table(pyarrow.table(columns), part)

@@ -30,19 +30,18 @@ from vehicle_detection.datasets import (
     split_sources,
 )
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import LabelledFrames, Platt, calibrate_scores
+from vehicle_detection.evaluation import LabelledFrames
 from vehicle_detection.params import RegionParams, SearchParams
 from vehicle_detection.tuning.cache import FeatureCache
 from vehicle_detection.tuning.grid import (
     Configuration,
     describe_params,
     expand_grid,
-    parse_grid,
     read_configurations,
 )
-from vehicle_detection.tuning.mining import mine_negatives
-from vehicle_detection.tuning.results import ResultTable, RowStore, read_results
-from vehicle_detection.tuning.trials import COLUMNS, Bench, Ledger, Recipe
+from vehicle_detection.tuning.results import ResultTable, RowStore
+from vehicle_detection.tuning.runner import Ledger
+from vehicle_detection.tuning.trials import COLUMNS, Bench, Recipe
 
 _FEWEST_PATCHES = 300  # With fewer, chance decides who stays.
 
@@ -50,7 +49,7 @@ _FEWEST_PATCHES = 300  # With fewer, chance decides who stays.
 def make_folds(patch_set: PatchSet, split: str, folds: int, seed: int) -> NDArray[np.intp]:
     """Fold of each patch, 0 to ``folds - 1``: each fold is what the split tests on, out of the rest.
 
-    So ``"sequences"`` cuts each folder into runs of file numbers, and ``"groups"`` keeps near-copies
+    So ``"sequences"`` cuts each folder into runs of file numbers, and ``"groups"`` keeps near duplicates
     together; groups too large for a fold come into the last one.
     """
     fold_of = np.full(len(patch_set), folds - 1, np.intp)
@@ -150,23 +149,8 @@ def halve(
     return list(dict.fromkeys(ranked))
 
 
-__all__ = [
-    "SPLITS",
-    "FeatureCache",
-    "LabelledFrames",
-    "Platt",
-    "ResultTable",
-    "calibrate_scores",
-    "compare_configurations",
-    "expand_grid",
-    "mine_negatives",
-    "parse_grid",
-    "read_results",
-    "search_parameters",
-]
-
 SPLITS = ("sequences", "groups", "sources", "sources-reversed", "random")
-"""Splits by name; the last one leaks near-copies, as the course's does."""
+"""Splits by name; the last one leaks near duplicates, as the course's does."""
 
 _SEEDED = ("groups", "random")
 

@@ -7,7 +7,7 @@ import logging
 import math
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,81 +20,17 @@ from vehicle_detection.classifier import DEFAULT_C, Template, VehicleClassifier,
 from vehicle_detection.datasets import PatchSet, Split
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import LabelledFrames, Labels, evaluate_detections, precision_recall_curve
+from vehicle_detection.evaluation import (
+    FrameBoxes,
+    LabelledFrames,
+    evaluate_detections,
+    precision_recall_curve,
+)
 from vehicle_detection.params import FeatureParams, RegionParams, SearchParams
 from vehicle_detection.search import BandSearch
 from vehicle_detection.tuning.cache import FeatureCache, digest_of
-from vehicle_detection.tuning.grid import Candidate
-from vehicle_detection.tuning.results import ResultTable, RowStore
 
 _LOGGER = logging.getLogger(__name__)
-
-
-class Ledger:
-    """Runs trials on a bench and writes down every result at once.
-
-    Parameters
-    ----------
-    bench
-        Where the trials run.
-    store
-        Results of this and earlier runs.
-    bar
-        A progress bar with an ``update``, or None.
-    """
-
-    def __init__(self, bench: Bench, store: RowStore, bar: Any = None) -> None:
-        self.bench = bench
-        self.rows: list[Mapping[str, Any]] = []
-        self._store = store
-        self._bar = bar
-
-    def table(self) -> ResultTable:
-        """Return the rows so far, in the order they were asked for."""
-        return ResultTable(self.rows)
-
-    def run(
-        self,
-        recipe: Recipe,
-        split: Split,
-        seed: int,
-        *,
-        name: str,
-        split_name: str,
-        stage: str,
-        on_frames: bool = True,
-    ) -> Mapping[str, Any]:
-        """Return the row of a trial, measured now or earlier."""
-        trial = self.bench.trial(recipe, split, seed, on_frames=on_frames)
-        words = {"stage": stage, "configuration": name, "split": split_name, "seed": seed}
-        if trial in self._store:
-            row = _row({**self._store[trial], **words})
-        else:
-            measured = self.bench.measure(recipe, split, seed, on_frames=on_frames)
-            row = _row({**measured, **recipe.to_cells(), **words, "trial": trial})
-            self._store.add(row)
-            _LOGGER.info("%s, C=%g, %s: %s", name, recipe.C, split_name, row["accuracy"] or row["message"])
-        self._keep(row)
-        return row
-
-    def refuse(self, candidate: Candidate, *, stage: str) -> None:
-        """Write down a combination that is impossible."""
-        trial = digest_of(dict(candidate.options), candidate.fault)
-        words = {"status": "refused", "message": candidate.fault, "configuration": candidate.name}
-        row = _row({**candidate.options, **words, "stage": stage, "trial": trial})
-        if trial not in self._store:
-            self._store.add(row)
-            _LOGGER.warning("%s is refused: %s", candidate.name, candidate.fault)
-        self._keep(row)
-
-    def _keep(self, row: Mapping[str, Any]) -> None:
-        self.rows.append(row)
-        if self._bar is not None:
-            self._bar.update()
-
-
-def _row(cells: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: cells.get(name) for name in COLUMNS}
 
 
 FEATURE_FIELDS = tuple(field.name for field in dataclasses.fields(FeatureParams))
@@ -252,7 +188,7 @@ class Bench:
     def _score_set(self, classifier: VehicleClassifier, frames: LabelledFrames) -> dict[str, float]:
         options: dict[str, Any] = {"search": self.search, "fit": self.region_params}
         with VehicleDetector(classifier, horizon=frames.horizon, **options) as detector:
-            found = Labels.from_detections({key: detector.detect(image) for key, image in frames})
+            found = FrameBoxes.from_detections({key: detector.detect(image) for key, image in frames})
         scores = evaluate_detections(found, frames.labels, frames=frames.keys)
         return {
             "frame_f1": scores.f1,
@@ -276,7 +212,7 @@ class Bench:
         return self._milliseconds[classifier.params]
 
 
-def best_f1(found: Labels, labels: Labels) -> float:
+def best_f1(found: FrameBoxes, labels: FrameBoxes) -> float:
     """F1 at the threshold on the score that makes it best; NaN where no vehicle is labelled."""
     precision, recall, _ = precision_recall_curve(found, labels)
     total = precision + recall

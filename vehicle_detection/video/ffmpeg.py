@@ -53,7 +53,7 @@ class VideoInfo:
     pixel_format
         ffmpeg's name of how pixels are stored, as ``"yuv420p"``; empty where it is not known.
     coding
-        How the numbers of a pixel mean colours.
+        How the numbers of a pixel mean colors.
     audio_track, audio_codec
         Number among the audio tracks, and codec (``"aac"``), of the first that can be decoded; else None.
     """
@@ -109,7 +109,7 @@ def _probe(path: Path) -> VideoInfo:
     first_time, width, height = frame[1], int(frame[4]), int(frame[5])
     pixel = int(frame[2]), int(frame[3])
     pixels = re.search(r"n: *0 .*? fmt:(\w+)", decoded)
-    colours = re.search(r"color_range:(\w+) color_space:(\w+)", decoded)
+    colors = re.search(r"color_range:(\w+) color_space:(\w+)", decoded)
     number = re.search(r"Stream #0:(\d+)", decoded)
     stream = _stream_lines(header, int(number[1]) if number else 0)
     fps, constant = _frame_rate(decoded, stream)
@@ -132,7 +132,7 @@ def _probe(path: Path) -> VideoInfo:
         first_time=float(first_time) if constant and first_time[-1].isdigit() else 0.0,
         pixel_aspect=Fraction(*pixel) if all(pixel) else Fraction(1),
         pixel_format=pixels[1] if pixels else "",
-        coding=Coding(colours[2], colours[1] == "pc") if colours else Coding(),
+        coding=Coding(colors[2], colors[1] == "pc") if colors else Coding(),
         audio_track=track,
         audio_codec=None if track is None else codecs[track],
     )

@@ -15,14 +15,14 @@ from vehicle_detection.video.process import read_frames
 LARGEST_ERROR = 0.05
 """Standard error, as a share of the frame's height, above which an estimate is a guess."""
 
-# Heights in metres at which a camera may be: what vehicles tell that are seen from the side, or all about as
+# Heights in meters at which a camera may be: what vehicles tell that are seen from the side, or all about as
 # far away, lies outside.
 _LOWEST, _HIGHEST = 0.6, 4.0
 # Seconds from one frame that is looked at to the next; frames and boxes that are enough.
 _EVERY, _FRAMES, _BOXES = 0.5, 60, 150
 
 
-def clip_horizon(
+def estimate_video_horizon(
     source: Path, detector: VehicleDetector, *, start: float | None = None, end: float | None = None
 ) -> HorizonEstimate | None:
     """Estimate the horizon of a video from the vehicles in its first half minute, two frames a second.

@@ -20,13 +20,13 @@ from pathlib import Path
 from typing import Any
 
 from vehicle_detection._common import (
+    atomic_write,
     check_choice,
     check_integer,
     check_number,
     check_target,
     describe,
     single_threaded_opencv,
-    written_whole,
 )
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video.ffmpeg import VideoInfo, probe
@@ -306,7 +306,7 @@ def _whole_video(
     target: Path, info: VideoInfo, preset: str, audio: AudioSource | None
 ) -> Iterator[FrameWriter]:
     """Open a video to write that appears whole or not at all."""
-    with written_whole(target) as part, FrameWriter(part, info, preset=preset, audio=audio) as writer:
+    with atomic_write(target) as part, FrameWriter(part, info, preset=preset, audio=audio) as writer:
         yield writer
 
 

@@ -47,7 +47,7 @@ class FrameReader:
         self._path, self._first, self._count = path, first, count
         # A stream may change its size on the way; frames keep that of the first.
         filters = [f"scale={info.width}:{info.height}:flags=bicubic"]
-        if info.constant_rate:  # half a frame early: rounding cannot hit the neighbour
+        if info.constant_rate:  # half a frame early: rounding cannot hit the neighbor
             seek = float((first - Fraction(1, 2)) / info.fps) + info.first_time if first else 0.0
         else:  # some seconds early: the frame that is still shown at the start may be an old one
             early = min(first, math.ceil(_LONGEST_STILL * info.fps))

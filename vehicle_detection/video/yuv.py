@@ -17,7 +17,7 @@ from vehicle_detection._kernels import channels_from_planes, planes_from_channel
 FORMATS = ("yuv420p", "yuvj420p")
 """ffmpeg's names of the pixel formats that are read as planes."""
 
-# Weights of red and blue in luma, by ffmpeg's name of the colour space; of green the rest.
+# Weights of red and blue in luma, by ffmpeg's name of the color space; of green the rest.
 _BT_601 = (0.299, 0.114)
 _LUMA = {
     "unknown": _BT_601,
@@ -33,12 +33,12 @@ Planes = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Coding:
-    """How the numbers of a video mean colours.
+    """How the numbers of a video mean colors.
 
     Attributes
     ----------
     space
-        ffmpeg's name of the colour space: ``"bt709"``, ``"bt470bg"``, ``"smpte170m"``, ``"bt2020nc"``, or
+        ffmpeg's name of the color space: ``"bt709"``, ``"bt470bg"``, ``"smpte170m"``, ``"bt2020nc"``, or
         ``"unknown"``, which is taken for BT.601.
     full
         Whether luma uses 0-255, as phones have it; else 16-235.
@@ -70,7 +70,7 @@ def _parts(planes: Planes) -> tuple[Planes, Planes, Planes]:
 
 
 def rgb_from_planes(planes: Planes, coding: Coding, channels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Make a frame from its planes; a chroma value colours four pixels.
+    """Make a frame from its planes; a chroma value colors four pixels.
 
     Parameters
     ----------

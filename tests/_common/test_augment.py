@@ -1,0 +1,68 @@
+import cv2
+import numpy as np
+import pytest
+
+from vehicle_detection._common import blur_patches, degrade_patches, relight
+from vehicle_detection.synthetic import render_patches
+
+
+@pytest.fixture(scope="module")
+def patches():
+    return render_patches(24, random_state=2)[0]
+
+
+def sharpness(images):
+    gray = np.array([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images], float)
+    return np.abs(np.diff(gray, axis=2)).mean(axis=(1, 2))
+
+
+def color(images):
+    return (images.max(axis=3).astype(float) - images.min(axis=3)).mean(axis=(1, 2))
+
+
+@pytest.mark.parametrize("change", [blur_patches, degrade_patches])
+@pytest.mark.parametrize("mirror", [False, True])
+def test_each_patch_decides_for_itself(patches, change, mirror):
+    before = patches.copy()
+    changed = change(patches, mirror=mirror)
+    np.testing.assert_array_equal(patches, before)
+    assert (changed.shape, changed.dtype) == (patches.shape, np.uint8)
+    np.testing.assert_array_equal(change(patches[::-3], mirror=mirror), changed[::-3])
+
+
+def test_blurred_patches_are_coarser_and_as_colorful(patches):
+    blurred = blur_patches(patches, mirror=False)
+    assert (sharpness(blurred) <= sharpness(patches) * 1.01).all()
+    assert sharpness(blurred).mean() < 0.8 * sharpness(patches).mean()
+    np.testing.assert_allclose(blurred.mean(axis=(1, 2)), patches.mean(axis=(1, 2)), atol=3)
+
+
+def test_degraded_patches_are_paler_and_as_bright(patches):
+    degraded = degrade_patches(patches, mirror=False)
+    assert color(degraded).mean() < 0.8 * color(patches).mean()
+    np.testing.assert_allclose(degraded.mean(axis=(1, 2)).mean(), patches.mean(), atol=3)
+
+
+def test_about_half_are_mirrored(patches):
+    left = np.zeros_like(patches)
+    left[:, :, :32] = np.arange(len(patches))[:, None, None, None] + 100  # no two are alike
+    for change in (blur_patches, degrade_patches):
+        bright = change(left)[:, :, :16].mean(axis=(1, 2, 3)) > 50
+        assert 4 < bright.sum() < 20
+        assert (change(left, mirror=False)[:, :, :16].mean(axis=(1, 2, 3)) > 50).all()
+
+
+def test_another_exposure_keeps_the_order_of_values_and_takes_contrast():
+    ramp = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
+    rng = np.random.default_rng(0)
+    found = [relight(ramp, rng) for _ in range(40)]
+    for image in found:
+        assert (image.shape, image.dtype) == (ramp.shape, np.uint8)
+        values = image[0].astype(int)
+        assert (np.diff(values, axis=0) >= 0).all()
+        assert 126 <= values[-1, 0] - values[0, 0] <= 255
+    middle = [int(image[0, 128, 0]) for image in found]
+    assert min(middle) < 90
+    assert max(middle) > 160
+    np.testing.assert_array_equal(relight(ramp, np.random.default_rng(0)), found[0])
+    assert (ramp[0, :, 0] == np.arange(256)).all()

@@ -1,0 +1,213 @@
+import math
+import re
+
+import numpy as np
+import pytest
+
+from vehicle_detection._common import (
+    check_boxes,
+    check_channel,
+    check_choice,
+    check_image,
+    check_integer,
+    check_number,
+    check_patches,
+    check_type,
+    describe,
+)
+from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
+
+IMAGE = np.zeros((4, 6, 3), np.uint8)
+PATCH = np.zeros((64, 64, 3), np.uint8)
+
+
+def test_bad_input_is_a_value_error_and_an_error_of_the_library():
+    assert issubclass(InvalidInputError, ValueError)
+    assert issubclass(InvalidInputError, VehicleDetectionError)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (np.zeros((2, 3), np.float32), "an array of shape (2, 3) and dtype float32"),
+        ("road", "'road' (str)"),
+        (None, "None (NoneType)"),
+        (7, "7 (int)"),
+    ],
+)
+def test_describe(value, text):
+    assert describe(value) == text
+
+
+@pytest.mark.parametrize("value", ["x" * 500, list(range(500)), [np.zeros((3, 3))], "two\nlines"])
+def test_describe_stays_short_and_on_one_line(value):
+    assert len(describe(value)) < 100
+    assert "\n" not in describe(value)
+
+
+def test_check_image_returns_the_same_array():
+    assert check_image(IMAGE) is IMAGE
+    assert check_image(IMAGE[::2, ::-1]).shape == (2, 6, 3)
+
+
+@pytest.mark.parametrize(
+    ("image", "remedy"),
+    [
+        ("road.png", "read files with vehicle_detection.read_image"),
+        ([[1, 2, 3]], "read files with vehicle_detection.read_image"),
+        (None, "read files with vehicle_detection.read_image"),
+        (IMAGE[..., 0], "COLOR_GRAY2RGB"),
+        (IMAGE[..., :1], "COLOR_GRAY2RGB"),
+        (np.zeros((4, 6, 4), np.uint8), "drop the alpha channel"),
+        (np.zeros((2, 4, 6, 3), np.uint8), "pass one image"),
+        (np.zeros((4, 6, 2), np.uint8), "three color channels"),
+        (np.zeros(3, np.uint8), "three color channels"),
+        (np.zeros((0, 6, 3), np.uint8), "the image is empty"),
+        (np.zeros((4, 0, 3), np.uint8), "the image is empty"),
+        (IMAGE / 255, r"\(image \* 255\)"),
+        (IMAGE.astype(np.float32), r"\(image \* 255\)"),
+        (IMAGE.astype(np.uint16), "image // 257"),
+        (IMAGE.astype(np.int64), "0-255"),
+        (IMAGE.astype(bool), "0-255"),
+    ],
+)
+def test_check_image_says_how_to_convert(image, remedy):
+    with pytest.raises(InvalidInputError, match=rf"^frame must be an \(H, W, 3\) uint8 RGB array.*{remedy}"):
+        check_image(image, "frame")
+
+
+def test_check_channel():
+    assert check_channel(IMAGE[..., 0]).shape == (4, 6)
+
+
+@pytest.mark.parametrize("channel", [IMAGE, IMAGE[..., 0].astype(float), np.zeros((0, 3), np.uint8), "r"])
+def test_check_channel_refuses(channel):
+    with pytest.raises(InvalidInputError, match=r"^img must be one \(H, W\) uint8 channel, got .* pick a"):
+        check_channel(channel)
+
+
+def test_check_patches_passes_an_array_and_stacks_a_list():
+    batch = np.stack([PATCH, PATCH + 1])
+    assert check_patches(batch, 64) is batch
+    np.testing.assert_array_equal(check_patches([PATCH, PATCH + 1], 64), batch)
+    np.testing.assert_array_equal(check_patches((PATCH, PATCH + 1), 64), batch)
+    assert check_patches([], 64).shape == (0, 64, 64, 3)
+    assert check_patches(np.empty((0, 32, 32, 3), np.uint8), 32).dtype == np.uint8
+
+
+@pytest.mark.parametrize(
+    ("patches", "message"),
+    [
+        (PATCH, r"patches must be an \(N, 64, 64, 3\) uint8 RGB array .*got an array of shape \(64, 64, 3\)"),
+        (np.zeros((2, 32, 32, 3), np.uint8), r"\(N, 64, 64, 3\)"),
+        (np.zeros((2, 64, 64, 3)), "dtype float64; read a folder"),
+        ("vehicles.zip", "vehicle_detection.load_patches"),
+        ([PATCH, IMAGE], r"patches\[1\] must be 64x64 pixels, got 6x4; resize it with cv2.resize"),
+        ([PATCH, PATCH[..., 0]], r"patches\[1\] must be an \(H, W, 3\)"),
+    ],
+)
+def test_check_patches_refuses(patches, message):
+    with pytest.raises(InvalidInputError, match=message):
+        check_patches(patches, 64)
+
+
+@pytest.mark.parametrize("empty", [[], np.empty((0, 4)), np.empty(0), (), np.empty((0, 4), np.int64)])
+def test_check_boxes_knows_no_boxes(empty):
+    assert check_boxes(empty).shape == (0, 4)
+
+
+def test_check_boxes_keeps_dtype_and_values():
+    boxes = np.array([[0, 1, 2, 3], [5, 5, 5, 5]], np.int16)
+    assert check_boxes(boxes) is boxes
+    assert check_boxes([[0.5, 1, 2, 3]]).dtype == np.float64
+
+
+@pytest.mark.parametrize(
+    ("boxes", "message"),
+    [
+        ([0, 1, 2, 3], "wrap a single box in a list"),
+        ([[0, 1, 2]], r"an \(N, 4\) number array"),
+        ([[[0, 1, 2, 3]]], r"an \(N, 4\) number array"),
+        ([["a", "b", "c", "d"]], r"an \(N, 4\) number array"),
+        ([[True, True, True, True]], r"an \(N, 4\) number array"),
+        ([[0, 0, 1, 1], [0, 0, 1]], r"an \(N, 4\) number array"),
+        (None, r"an \(N, 4\) number array"),
+        ([[0, 0, math.nan, 1]], "must be finite"),
+        ([[0, 0, math.inf, 1]], "must be finite"),
+        ([[0, 0, 1, 1], [10, 10, 5, 20]], r"got \[10, 10, 5, 20\] in row 1; .* x \+ width"),
+        ([[10, 10, 20, 5]], "in row 0"),
+    ],
+)
+def test_check_boxes_refuses(boxes, message):
+    with pytest.raises(InvalidInputError, match=f"^windows .*{message}"):
+        check_boxes(boxes, "windows")
+
+
+def test_check_boxes_compares_unsigned_numbers_rightly():
+    with pytest.raises(InvalidInputError, match="row 0"):
+        check_boxes(np.array([[10, 10, 5, 20]], np.uint8))
+
+
+def test_check_type():
+    check_type(True, "n", int, "count them")
+    with pytest.raises(InvalidInputError, match=r"^n must be a int, got 'a' \(str\); count them$"):
+        check_type("a", "n", int, "count them")
+
+
+@pytest.mark.parametrize("value", [0, 1, 0.5, np.float32(0.5), np.int64(1)])
+def test_check_number_takes_numbers_in_range(value):
+    number = check_number(value, "share", low=0, high=1)
+    assert type(number) is float
+    assert number == value
+
+
+def test_check_number_bounds():
+    assert check_number(1e300, "x") == 1e300
+    assert check_number(1e-300, "x", above=0) == 1e-300
+
+
+@pytest.mark.parametrize("value", [-0.01, 1.01, math.nan, math.inf, -math.inf, "0.5", None, True, [0.5], 1j])
+def test_check_number_refuses(value):
+    expected = re.escape(f"share must be a number, at least 0 and at most 1; got {describe(value)}")
+    with pytest.raises(InvalidInputError, match=expected):
+        check_number(value, "share", low=0, high=1)
+
+
+def test_check_number_names_an_open_bound():
+    with pytest.raises(InvalidInputError, match=r"fps must be a number, greater than 0; got 0 \(int\)"):
+        check_number(0, "fps", above=0)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_check_number_wants_finite_numbers(value):
+    with pytest.raises(InvalidInputError, match="threshold must be a number, finite"):
+        check_number(value, "threshold")
+
+
+@pytest.mark.parametrize("value", [1, 5, np.int8(3), np.uint64(4)])
+def test_check_integer_takes_integers_in_range(value):
+    assert type(check_integer(value, "n", low=1, high=5)) is int
+
+
+@pytest.mark.parametrize("value", [0, 6, 2.0, "2", True, None, math.nan])
+def test_check_integer_refuses(value):
+    with pytest.raises(InvalidInputError, match="n must be an integer from 1 to 5; got"):
+        check_integer(value, "n", low=1, high=5)
+
+
+def test_check_integer_without_an_upper_bound():
+    assert check_integer(10**12, "n", low=1) == 10**12
+    with pytest.raises(InvalidInputError, match=r"n must be an integer at least 1; got -3 \(int\)"):
+        check_integer(-3, "n", low=1)
+
+
+def test_check_choice():
+    check_choice("a", "mode", ("a", "b"))
+    check_choice(0, "mode", (0, "b"))
+
+
+@pytest.mark.parametrize("value", ["c", None, ["a"], {}, np.zeros(3), np.array(["a", "b"])])
+@pytest.mark.parametrize("choices", [("a", "b"), {"a": 1, "b": 2}])
+def test_check_choice_lists_the_choices(value, choices):
+    with pytest.raises(InvalidInputError, match=r"mode must be one of 'a', 'b'; got"):
+        check_choice(value, "mode", choices)

@@ -1,0 +1,869 @@
+import errno
+import functools
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import vehicle_detection
+from tests.helpers import SMALL_MIXTURE, drawn, write_frame_set
+from vehicle_detection import classifier, detector, training
+from vehicle_detection._common import files as _files
+from vehicle_detection.boxes import Detections
+from vehicle_detection.camera import HorizonEstimate
+from vehicle_detection.classifier import VehicleClassifier, load_classifier
+from vehicle_detection.cli.app import app
+from vehicle_detection.cli.demo import FILES, SHEET, draw_clip
+from vehicle_detection.cli.output import interruptible, output_folder
+from vehicle_detection.datasets import patches as datasets
+from vehicle_detection.errors import DatasetError, InvalidInputError
+from vehicle_detection.images import read_image, write_image
+from vehicle_detection.mixture import load_model
+from vehicle_detection.mixture_training import cross_validation as mixture_report
+from vehicle_detection.mixture_training import drawn_frames as _drawn_frames
+from vehicle_detection.synthetic import render_drive, render_patches
+from vehicle_detection.video import horizon as _clip_horizon
+from vehicle_detection.video import probe_video, read_frames
+
+COMMANDS = ("demo", "detect", "video", "evaluate", "train", "train-frames", "tune", "fetch", "info")
+HEADER = "frame,track_id,x1,y1,x2,y2,score"
+
+
+def run(*words):
+    """Run a command in this process; what it should not raise, it raises here."""
+    result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
+    assert "\x1b" not in result.output, "no colors where there is no terminal"
+    return result
+
+
+def succeed(*words):
+    result = run(*words)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def refuse(*words, code=2):
+    """Run a command that must fail with one line on standard error; return the line."""
+    result = run(*words)
+    assert result.exit_code == code, result.output
+    assert re.fullmatch(r"error: [^\n]+\n", result.stderr), result.stderr
+    return result.stderr
+
+
+def start(*words, **options):
+    return subprocess.Popen(
+        [sys.executable, "-m", "vehicle_detection", *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        **options,
+    )
+
+
+def finish(process):
+    out, errors = process.communicate(timeout=60)
+    return process.returncode, out, errors
+
+
+def contents(folder):
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
+
+
+@pytest.fixture(scope="module")
+def material(tmp_path_factory):
+    """Return a folder with a clip and its labels, a picture, patches and damaged copies."""
+    folder = tmp_path_factory.mktemp("material")
+    drive = render_drive(frames=10, shape=(270, 480), scenario="overtaking")
+    draw_clip(drive, folder / "clip.mp4", folder / "labels.csv")
+    write_image(folder / "road.png", drive[6].image)
+    patches, labels = render_patches(40, random_state=3)
+    for number, (patch, label) in enumerate(zip(patches, labels)):
+        home = folder / ("vehicles" if label else "non-vehicles") / "drawn"
+        home.mkdir(parents=True, exist_ok=True)
+        write_image(home / f"{number}.png", patch)
+    for name in ("clip.mp4", "road.png"):
+        data = (folder / name).read_bytes()
+        (folder / f"cut_{name}").write_bytes(data[: len(data) // 2])
+    for name in ("text.mp4", "text.png", "text.safetensors"):
+        (folder / name).write_text("not what the name says")
+    (folder / "empty").mkdir()
+    return folder
+
+
+@pytest.fixture
+def picture(material):
+    return material / "road.png"
+
+
+@pytest.fixture
+def clip(material):
+    return material / "clip.mp4"
+
+
+# --- the program as it is started ---
+
+
+def test_help_is_there_for_every_command_and_loads_nothing_heavy():
+    code = (
+        "import sys, json\n"
+        "from typer.testing import CliRunner\n"
+        "from vehicle_detection.cli.app import app\n"
+        "pages = [[], *([command] for command in sys.argv[1:])]\n"
+        "results = [CliRunner().invoke(app, [*words, '--help']) for words in pages]\n"
+        "roots = sorted({name.split('.')[0] for name in sys.modules})\n"
+        "print(json.dumps([[r.exit_code, r.stdout] for r in results] + [roots]))"
+    )
+    out = subprocess.run([sys.executable, "-c", code, *COMMANDS], capture_output=True, text=True, check=True)
+    assert out.stderr == ""
+    *pages, loaded = json.loads(out.stdout)
+    assert not set(loaded) & {"numpy", "numba", "cv2", "sklearn", "moviepy", "matplotlib", "pandas", "scipy"}
+    assert [code for code, _ in pages] == [0] * len(pages)
+    for command, (_, page) in zip(COMMANDS, pages[1:]):
+        assert command in pages[0][1]
+        assert re.search(rf"Usage: \S+ {command}", page)
+
+
+def test_module_runs_as_a_program(picture, tmp_path):
+    # All at once: most of the time goes into starting.
+    runs = [
+        start("detect", picture, "-o", tmp_path / "out", env={**os.environ, "NO_COLOR": "1"}),
+        start("detect", tmp_path / "missing.png"),
+        start("detect", tmp_path),
+        start("--version"),
+        start("detect", "--nonsense"),
+    ]
+    (found, missing, folder, version, usage) = (finish(process) for process in runs)
+    assert found[0] == 0
+    assert found[2] == ""
+    assert re.match(rf"{re.escape(str(picture))}: \d+ vehicles?( |$)", found[1])
+    assert contents(tmp_path) == ["out", "out/road.png"]
+    assert missing[:2] == (2, "")
+    assert re.fullmatch(r"error: IMAGE \S+missing.png does not exist; check the path\n", missing[2])
+    assert folder[0] == 2
+    assert re.fullmatch(r"error: IMAGE \S+ is a folder; name the files in it, such as \S+\n", folder[2])
+    assert version == (0, f"{vehicle_detection.__version__}\n", "")
+    assert usage[0] == 2
+    assert "--nonsense" in usage[2]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signal")
+def test_ctrl_c_leaves_nothing_behind(tmp_path, material):
+    long = tmp_path / "long.mp4"
+    draw_clip(render_drive(frames=1, shape=(270, 480), scenario="empty"), long, tmp_path / "labels.csv")
+    slow = (
+        "import time, sys\n"
+        "from vehicle_detection import {module}\n"
+        "{module}.{name} = lambda *a, **k: (print('now', flush=True), time.sleep(60))\n"
+        "sys.argv = ['vehicle-detection', *sys.argv[1:]]\n"
+        "from vehicle_detection.cli.app import main; main()"
+    )
+    out, patches = tmp_path / "out", (material / "vehicles", material / "non-vehicles")
+    runs = {
+        ("video", "process_video"): ["video", long, out / "x.mp4", "--tracks", out / "x.csv"],
+        ("_demo", "draw_clip"): ["demo", "-o", tmp_path / "demo" / "deep"],
+        ("training", "train_and_evaluate"): [
+            "train", "--vehicles", patches[0], "--non-vehicles", patches[1], "-o", out / "x.safetensors",
+        ],
+    }  # fmt: skip
+    out.mkdir()
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", slow.format(module=module, name=name), *map(str, words)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        for (module, name), words in runs.items()
+    ]
+    for process in processes:
+        assert process.stdout.readline() == "now\n"
+        os.killpg(process.pid, signal.SIGINT)
+        assert finish(process) == (130, "", "interrupted\n")
+    assert contents(out) == []
+    assert not (tmp_path / "demo").exists()
+
+
+def test_an_interrupt_inside_a_command(monkeypatch, picture, tmp_path):
+    def interrupt(self, image):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(detector.VehicleDetector, "detect", interrupt)
+    result = run("detect", picture, "-o", tmp_path / "a" / "b", "--boxes", tmp_path / "boxes.csv")
+    assert (result.exit_code, result.stdout, result.stderr) == (130, "", "interrupted\n")
+    assert contents(tmp_path) == []
+
+
+def test_a_full_disk_is_one_line(monkeypatch, picture, tmp_path):
+    def fill(source, target, *rest, **options):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", fill)
+    assert "No space left" in refuse("detect", picture, "--boxes", tmp_path / "boxes.csv", code=1)
+    assert contents(tmp_path) == []
+
+
+def test_unexpected_errors_keep_their_traceback(monkeypatch, picture):
+    def fail(self, image):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(detector.VehicleDetector, "detect", fail)
+    with pytest.raises(RuntimeError, match="a bug"):
+        run("detect", picture)
+
+
+# --- detect ---
+
+
+def test_detect_writes_pictures_and_boxes(monkeypatch, picture, tmp_path):
+    found = [Detections([[10, 20, 60.4, 70], [100, 50, 180, 120]], [1.5, 0.25]), Detections.empty()]
+    answers = iter(found)
+    monkeypatch.setattr(detector.VehicleDetector, "detect", lambda self, image: next(answers))
+    other, folder, boxes = tmp_path / "other.jpg", tmp_path / "new" / "out", tmp_path / "boxes.csv"
+    write_image(other, read_image(picture))
+    out = succeed("detect", picture, other, "-o", folder, "--boxes", boxes)
+    assert out.splitlines() == [
+        f"{picture}: 2 vehicles  [10 20 60 70] 1.50  [100 50 180 120] 0.25",
+        f"{other}: 0 vehicles",
+        f"wrote 2 boxes to {boxes}",
+    ]
+    assert boxes.read_text().splitlines() == [
+        HEADER,
+        "road.png,,10.00,20.00,60.40,70.00,1.5000",
+        "road.png,,100.00,50.00,180.00,120.00,0.2500",
+    ]
+    assert contents(tmp_path / "new") == ["out", "out/other.jpg", "out/road.png"]
+    changed = (read_image(folder / "road.png") != read_image(picture)).any(axis=2)
+    assert changed[20, 10:60].all()
+    assert changed[50:120, 100].all()
+    assert not changed[130:].any()
+
+
+def test_detect_takes_every_kind_of_image(picture, tmp_path):
+    image = cv2.imread(str(picture))
+    gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    kinds = {
+        "rgba.png": cv2.cvtColor(image, cv2.COLOR_BGR2BGRA),
+        "deep.png": image.astype(np.uint16) * 257,
+        "gray.png": gray,
+        "gray_deep.png": gray.astype(np.uint16) * 257,
+        "plain.bmp": image,
+    }
+    for name, pixels in kinds.items():
+        assert cv2.imwrite(str(tmp_path / name), pixels)
+    out = succeed("detect", picture, *(tmp_path / name for name in kinds), "-o", tmp_path / "out")
+    found = {Path(line.partition(": ")[0]).name: line.partition(": ")[2] for line in out.splitlines()}
+    assert list(found) == ["road.png", *kinds]
+    assert found["rgba.png"] == found["deep.png"] == found["plain.bmp"] == found["road.png"]
+    assert found["gray.png"] == found["gray_deep.png"]
+    assert contents(tmp_path / "out") == sorted(found)
+
+
+def test_detect_gives_a_suffix_to_a_picture_that_has_none(picture, tmp_path):
+    shutil.copy(picture, tmp_path / "frame7")
+    succeed("detect", tmp_path / "frame7", "-o", tmp_path / "out")
+    assert contents(tmp_path / "out") == ["frame7.png"]
+
+
+def test_a_damaged_image_that_can_be_read_is_warned_of(picture, tmp_path):
+    write_image(tmp_path / "road.jpg", read_image(picture))
+    data = bytearray((tmp_path / "road.jpg").read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 40] = bytes(40)
+    (tmp_path / "road.jpg").write_bytes(data)
+    result = run("detect", tmp_path / "road.jpg")
+    assert result.exit_code == 0
+    assert re.fullmatch(r"(warning: \S+road.jpg: Corrupt JPEG data[^\n]*\n)+", result.stderr)
+
+
+def bad_images(material, tmp):
+    tiny = tmp / "tiny.png"
+    write_image(tiny, np.zeros((12, 12, 3), np.uint8))
+    floats = tmp / "floats.tiff"
+    assert cv2.imwrite(str(floats), np.zeros((90, 160, 3), np.float32))
+    (tmp / "nothing.png").touch()
+    (tmp / "twin").mkdir()
+    shutil.copy(material / "road.png", tmp / "twin")
+    road = material / "road.png"
+    return {
+        r"IMAGE \S+missing.png does not exist; check the path": [tmp / "missing.png"],
+        r"IMAGE \S+empty is a folder; name the files in it": [material / "empty"],
+        r"text.png must be a whole image file": [material / "text.png"],
+        r"cut_road.png must be a whole image file": [material / "cut_road.png"],
+        r"nothing.png must be a whole image file": [tmp / "nothing.png"],
+        r"floats.tiff must be a whole image file": [floats],
+        r"image of 12x12 pixels holds no search window": [tiny, "--model", "highway"],
+        r"horizon must be a number, at least 0 and at most 1; got 2": [road, "--horizon", 2],
+        r"horizon must be a number, .* got nan": [road, "--horizon", "nan"],
+        r"-o \S+ is the folder of road.png, which would be overwritten": [road, "-o", material],
+        r"-o must be a folder, \S+ cannot be made: File exists": [road, "-o", road],
+        r"have the same name, by which results go": [road, tmp / "twin" / "road.png", "-o", tmp / "out"],
+        r"--boxes \S+road.png is one of the images": [road, "--boxes", road],
+        r"path must end in .csv, .* got 'boxes.doc'": [road, "--boxes", tmp / "boxes.doc"],
+        r"path needs an existing folder, \S+none is none": [road, "--boxes", tmp / "none" / "boxes.csv"],
+        r"model file \S+none.safetensors does not exist": [road, "--model", tmp / "none.safetensors"],
+        r"model file motorway does not exist; .* a shipped model: default, h": [road, "--model", "motorway"],
+        r"model file \S+empty is a folder": [road, "--model", material / "empty"],
+        r"text.safetensors is no whole safetensors": [road, "--model", material / "text.safetensors"],
+    }
+
+
+def test_detect_refuses_bad_input_and_loses_nothing(material, tmp_path):
+    cases = bad_images(material, tmp_path)
+    before = contents(tmp_path), contents(material)
+    original = (material / "road.png").read_bytes()
+    for message, words in cases.items():
+        assert re.search(message, refuse("detect", *words)), message
+    assert (contents(tmp_path), contents(material)) == before
+    assert (material / "road.png").read_bytes() == original
+
+
+def test_a_bad_image_among_good_ones_leaves_no_table(picture, material, tmp_path):
+    (tmp_path / "boxes.csv").write_text("earlier")
+    result = run("detect", picture, material / "cut_road.png", "--boxes", tmp_path / "boxes.csv")
+    assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
+    assert (tmp_path / "boxes.csv").read_text() == "earlier"
+    assert contents(tmp_path) == ["boxes.csv"]
+
+
+def test_damaged_models_are_refused(picture, tmp_path):
+    whole = tmp_path / "whole.safetensors"
+    model = load_classifier()
+    model.save(whole)
+    data = whole.read_bytes()
+    assert succeed("info", whole).startswith(f"{whole}: {model.params.length} features")
+    swapped = bytearray(data)
+    swapped[-5] ^= 255
+    other = data.replace(b'\\"spatial_size\\": 32', b'\\"spatial_size\\": 16')
+    assert len(other) == len(data)
+    assert other != data
+    damaged = {
+        "cut": (data[: len(data) // 2], "is no whole safetensors model"),
+        "edited": (bytes(swapped), "was changed after it was written"),
+        "other": (other, "was changed after it was written"),
+    }
+    for name, (content, message) in damaged.items():
+        path = tmp_path / f"{name}.safetensors"
+        path.write_bytes(content)
+        assert message in refuse("detect", picture, "--model", path)
+        assert message in refuse("info", path)
+        assert message in refuse("video", tmp_path / "x.mp4", tmp_path / "y.mp4", "--model", path)
+
+
+def test_a_model_of_other_parameters_is_refused(picture, tmp_path, monkeypatch):
+    model = load_classifier()
+    monkeypatch.setattr(VehicleClassifier, "__post_init__", lambda self: None)
+    VehicleClassifier(replace(model.params, spatial_size=16), model.templates).save(
+        tmp_path / "m.safetensors"
+    )
+    monkeypatch.undo()
+    message = refuse("detect", picture, "--model", tmp_path / "m.safetensors")
+    assert re.search(r"does not fit its own parameters: templates must have \d+ weights", message)
+
+
+# --- video ---
+
+
+def test_video_writes_an_annotated_copy_and_tracks(clip, tmp_path):
+    target, tracks = tmp_path / "out.mp4", tmp_path / "tracks.csv"
+    out = succeed("video", clip, target, "--tracks", tracks, "--preset", "ultrafast", "--profile")
+    lines = out.splitlines()
+    assert re.match(
+        r"10 frames of 480x270 in \d+\.\d s: .* frames/s, .* times real time, \d+ vehicle", lines[0]
+    )
+    assert lines[1].split() == ["stage", "ms", "a", "frame", "share"]
+    assert [line.split()[0] for line in lines[2:-1]] == [
+        "decode", "search", "regions", "track", "draw", "encode"
+    ]  # fmt: skip
+    assert lines[-1] == f"wrote {target} and {tracks}"
+    assert tracks.read_text().splitlines()[0] == f"{HEADER},distance_m,speed_mps"
+    written, source = probe_video(target), probe_video(clip)
+    assert (written.shape, written.fps, written.frames) == (source.shape, source.fps, source.frames)
+    assert contents(tmp_path) == ["out.mp4", "tracks.csv"]
+
+
+def test_video_writes_a_page_and_diagnostics(clip, tmp_path):
+    target, tracks, page = tmp_path / "out.mp4", tmp_path / "tracks.csv", tmp_path / "page.html"
+    words = ["--report", page, "--tracks", tracks, "--diagnostics", "--preset", "ultrafast"]
+    out = succeed("video", clip, target, *words)
+    assert out.splitlines()[-1] == f"wrote {target} and {tracks} and {page}"
+    text = page.read_text(encoding="utf-8")
+    assert "data:video/mp4;base64," in text
+    assert clip.name in text
+    with read_frames(target) as frames:
+        mosaic = next(frames)[2]
+    # The heat map of an empty corner of the road is black, which no frame of the clip is.
+    assert mosaic[-8:, :8].max() < 40
+
+
+def test_video_can_be_quiet_and_take_a_part(clip, tmp_path):
+    target = tmp_path / "out.mov"
+    words = ["--start", 0.08, "--end", 0.2, "--horizon", 0.56, "--no-audio", "--quiet"]
+    assert run("video", clip, target, *words).output == ""
+    assert probe_video(target).frames == 3
+    out = succeed("video", clip, target, *words, "--profile")
+    assert out.startswith("3 frames of 480x270")
+    assert "wrote" not in out
+
+
+def test_video_looks_for_the_horizon_first(clip, tmp_path, monkeypatch):
+    words = ["video", clip, tmp_path / "out.mp4", "--end", 0.12, "--horizon", "auto"]
+    found = HorizonEstimate(horizon=0.551, error=0.012, camera_height_m=1.3, boxes=40)
+    monkeypatch.setattr(_clip_horizon, "estimate_video_horizon", lambda *_, **__: found)
+    assert "horizon 0.551, give or take 0.012, from 40 boxes" in succeed(*words)
+    monkeypatch.setattr(_clip_horizon, "estimate_video_horizon", lambda *_, **__: None)
+    result = run(*words)
+    assert result.exit_code == 0
+    assert "warning: --horizon auto: the vehicles do not tell the horizon" in result.stderr
+    assert run(*words, "--quiet").output == ""
+
+
+def bad_videos(material, tmp):
+    clip, target = material / "clip.mp4", tmp / "out.mp4"
+    tiny = tmp / "tiny.mp4"
+    fourcc = cv2.VideoWriter.fourcc(*"mp4v")
+    for path, size, frames in ((tiny, (32, 32), 3), (tmp / "none.mp4", (64, 64), 0)):
+        writer = cv2.VideoWriter(str(path), fourcc, 25, size)
+        for _ in range(frames):
+            writer.write(np.zeros((*size, 3), np.uint8))
+        writer.release()
+    return {
+        r"source \S+missing.mp4 does not exist": [tmp / "missing.mp4", target],
+        r"source \S+empty is a folder": [material / "empty", target],
+        r"text.mp4 is no video that ffmpeg can read": [material / "text.mp4", target],
+        r"cut_clip.mp4 is no video .*its index is missing": [material / "cut_clip.mp4", target],
+        r"none.mp4 (has no|is no video)": [tmp / "none.mp4", target],
+        r"image of 32x32 pixels holds no search window": [tiny, target, "--model", "highway"],
+        r"target \S+clip.mp4 is the source itself": [clip, clip],
+        r"target needs an existing folder, \S+none is none": [clip, tmp / "none" / "out.mp4"],
+        r"target must end in .mp4, .* got 'out.gif'": [clip, tmp / "out.gif"],
+        r"target must be a file, got the folder": [clip, tmp],
+        r"start must be before end, got start=3 and end=2": [clip, target, "--start", 3, "--end", 2],
+        r"start must lie inside the video": [clip, target, "--start", 3],
+        r"start must be a number, at least 0": [clip, target, "--start", -1],
+        r"end must be a number, .* got nan": [clip, target, "--end", "nan"],
+        r"preset must be one of 'ultrafast'": [clip, target, "--preset", "hasty"],
+        r"horizon must be a number": [clip, target, "--horizon", -0.5],
+        r"--horizon must be a share .* or auto; got 'high'": [clip, target, "--horizon", "high"],
+        r"path must end in .csv, .*got 'tracks.doc'": [clip, target, "--tracks", tmp / "tracks.doc"],
+        r"path needs an existing folder": [clip, target, "--tracks", tmp / "none" / "tracks.csv"],
+        r"path must end in .html, .*got 'page.pdf'": [clip, target, "--report", tmp / "page.pdf"],
+        r"--report \S+ is TARGET \S+ as well": [clip, target, "--report", target],
+        r"--tracks \S+ is SOURCE \S+ as well": [tmp / "a.csv", target, "--tracks", tmp / "a.csv"],
+    }
+
+
+def test_video_refuses_bad_input_and_loses_nothing(material, tmp_path):
+    cases = bad_videos(material, tmp_path)
+    before = contents(tmp_path), contents(material)
+    original = (material / "clip.mp4").read_bytes()
+    for message, words in cases.items():
+        assert re.search(message, refuse("video", *words, "--quiet")), message
+    assert (contents(tmp_path), contents(material)) == before
+    assert (material / "clip.mp4").read_bytes() == original
+
+
+def test_read_only_folders_are_refused(monkeypatch, material, clip, picture, tmp_path):
+    # As the superuser may write anywhere, the question is answered for the system.
+    monkeypatch.setattr(_files.os, "access", lambda path, mode: not (mode & os.W_OK))
+    read_only = r"needs a writable folder, \S+ is read-only; choose another"
+    for words in (
+        ["video", clip, tmp_path / "out.mp4"],
+        ["video", clip, tmp_path / "out.mp4", "--tracks", tmp_path / "tracks.csv"],
+        ["detect", picture, "--boxes", tmp_path / "boxes.csv"],
+        ["evaluate", material / "labels.csv", material / "labels.csv", "--json", tmp_path / "scores.json"],
+        ["train", "--vehicles", "v", "--non-vehicles", "n", "-o", tmp_path / "m.safetensors"],
+    ):
+        assert re.search(read_only, refuse(*words))
+    result = run("detect", picture, "-o", tmp_path / "out")
+    assert (result.exit_code, bool(re.search(read_only, result.stderr))) == (2, True)
+    assert contents(tmp_path) == []
+
+
+# --- demo ---
+
+
+def test_demo_draws_annotates_and_scores(tmp_path):
+    out = succeed("demo", "-o", tmp_path / "shown", "--frames", 5, "--seed", 4)
+    assert out.startswith("5 drawn frames of 1280x720")
+    for name in ("F1", "mean IoU", "MOTA", "identity switches"):
+        assert re.search(rf"^  {name} +(-?\d\S*|nan)\s*$", out, re.MULTILINE), out
+    assert re.search(r"speed +\d+\.\d frames/s", out)
+    assert contents(tmp_path / "shown") == sorted(FILES)
+    for name in ("clip.mp4", "annotated.mp4"):
+        info = probe_video(tmp_path / "shown" / name)
+        assert (info.shape, info.frames, float(info.fps)) == ((720, 1280, 3), 5, 25.0)
+    assert read_image(tmp_path / "shown" / "contact_sheet.png").shape == (SHEET[0] * 360, SHEET[1] * 640, 3)
+    words = [tmp_path / "shown" / "tracks.csv", tmp_path / "shown" / "labels.csv"]
+    assert "Detections in" in succeed("evaluate", *words)
+
+
+def test_demo_refuses_bad_input(tmp_path, picture):
+    assert "frames must be an integer at least 1" in refuse("demo", "-o", tmp_path / "a" / "b", "--frames", 0)
+    assert "random_state must be" in refuse("demo", "-o", tmp_path / "a", "--seed", -1)
+    assert "-o must be a folder" in refuse("demo", "-o", picture)
+    assert contents(tmp_path) == []
+
+
+# --- evaluate ---
+
+
+def test_evaluate_scores_boxes_and_tracks(tmp_path):
+    labels, tracks = tmp_path / "labels.csv", tmp_path / "tracks.csv"
+    labels.write_text(
+        "frame,track,x1,y1,x2,y2,occluded,truncated,ignore\n0,1,10,10,60,50,0,0,0\n1,1,12,10,62,50,0,0,0\n"
+    )
+    tracks.write_text(f"{HEADER}\n0,4,10,10,60,50,1.5\n1,4,12,10,62,50,1.5\n1,5,300,10,350,50,0.5\n")
+    out = succeed("evaluate", tracks, labels, "--json", tmp_path / "scores.json")
+    assert "Detections in 2 frames at IoU 0.5" in out
+    assert "2 tracks of 1 vehicles in 2 frames" in out
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    assert (scores["detections"]["tp"], scores["detections"]["fp"], scores["tracks"]["mota"]) == (2, 1, 0.5)
+    stills = tmp_path / "stills.csv"
+    stills.write_text(f"{HEADER}\n0,,10,10,60,50,1.5\n1,,12,10,62,50,1.5\n")
+    assert "tracks of" not in succeed("evaluate", stills, labels, "--iou", 0.9)
+    labels.write_text(
+        "frame,track,x1,y1,x2,y2,occluded,truncated,ignore\n0,1,0,0,900,500,0,0,1\n1,1,12,10,62,50,0,0,0\n"
+    )
+    assert "1 found, 0 missed, 1 false, 0 ignored" in succeed("evaluate", stills, labels)
+    assert "1 found, 0 missed, 0 false, 1 ignored" in succeed("evaluate", stills, labels, "--regions")
+
+
+def test_evaluate_refuses_bad_input(material, tmp_path):
+    labels = material / "labels.csv"
+    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
+    cases = {
+        r"missing.csv does not exist": [tmp_path / "missing.csv", labels],
+        r"other.csv lacks the columns": [tmp_path / "other.csv", labels],
+        r"iou must be a number, greater than 0 and at most 1": [labels, labels, "--iou", 0],
+        r"--json needs an existing folder": [labels, labels, "--json", tmp_path / "none" / "s.json"],
+        r"--json \S+ is LABELS \S+ as well": [tmp_path / "other.csv", labels, "--json", labels],
+    }
+    original = labels.read_bytes()
+    for message, words in cases.items():
+        assert re.search(message, refuse("evaluate", *words)), message
+    assert labels.read_bytes() == original
+    assert contents(tmp_path) == ["other.csv"]
+
+
+# --- train, fetch, info ---
+
+
+def patches_of(folder):
+    return ["--vehicles", folder / "vehicles", "--non-vehicles", folder / "non-vehicles"]
+
+
+def test_train_writes_model_report_and_card(material, tmp_path):
+    with zipfile.ZipFile(tmp_path / "vehicles.zip", "w") as archive:
+        for path in sorted((material / "vehicles").rglob("*.png")):
+            archive.write(path, path.relative_to(material))
+    patches = ["--vehicles", tmp_path / "vehicles.zip", "--non-vehicles", material / "non-vehicles"]
+    model, report, card = (tmp_path / name for name in ("m.safetensors", "r.json", "c.md"))
+    words = ["--features", "luv-2384", "--compare", "ycrcb-6156", "--split", "sequences", "--seed", 2]
+    out = succeed("train", *patches, "-o", model, *words, "--report", report, "--card", card)
+    assert "luv-2384: 20 vehicles, 20 others, accuracy" in out
+    assert "left out 'KITTI and Extras, trained on GTI': train must name sources of patch_set" in out
+    assert out.endswith(f"wrote {model}, {report}, {card}\n")
+    told = json.loads(report.read_text())
+    assert set(told["splits"]) == {"random", "sequences"}
+    assert told["params"]["color_space"] == "LUV"
+    assert told["others"][0]["features"] == "ycrcb-6156"
+    assert {"features", "calibration", "random", "sequences", "leakage", "final"} == set(told["seconds"])
+    text = card.read_text()
+    assert (
+        "vehicle-detection train --vehicles vehicles.zip --non-vehicles non-vehicles --features luv-2384 "
+        "--split sequences --C 0.0001 --seed 2 --compare ycrcb-6156 -o m.safetensors --card c.md\n"
+    ) in text
+    assert str(tmp_path) not in text
+    again = tmp_path / "again.safetensors"
+    succeed("train", *patches_of(material), "-o", again, *words)
+    assert again.read_bytes() == model.read_bytes()
+    out = succeed("info", model)
+    assert out.startswith(f"{model}: 2384 features, 1 template\n")
+    for line in (r"color_space +LUV", r"C +0.0001", r"sources +drawn 40", r"last fifth of each folder +\d"):
+        assert re.search(line, out), line
+    assert load_classifier(model).metadata["training"]["random_state"] == 2
+
+
+def bad_training(material, tmp):
+    (tmp / "small" / "vehicles").mkdir(parents=True)
+    write_image(tmp / "small" / "vehicles" / "1.png", np.zeros((32, 32, 3), np.uint8))
+    (tmp / "cut").mkdir()
+    shutil.copy(material / "cut_road.png", tmp / "cut")
+    shutil.copy(material / "vehicles" / "drawn" / "0.png", tmp / "small.zip")
+    (tmp / "one").mkdir()
+    shutil.copy(material / "vehicles" / "drawn" / "0.png", tmp / "one")
+    good, vehicles, others = patches_of(material), material / "vehicles", material / "non-vehicles"
+    model = ["-o", tmp / "m.safetensors"]
+    return {
+        r"vehicles \S+none does not exist; check the path": [
+            "--vehicles", tmp / "none", "--non-vehicles", others, *model],
+        r"non_vehicles \S+empty holds no PNG or JPEG patches": [
+            "--vehicles", vehicles, "--non-vehicles", material / "empty", *model],
+        r"1.png of \S+small is 32x32 pixels, expected 64x64": [
+            "--vehicles", tmp / "small", "--non-vehicles", others, *model],
+        r"cut_road.png of \S+ must be a whole image file": [
+            "--vehicles", tmp / "cut", "--non-vehicles", others, *model],
+        r"small.zip is not a zip": ["--vehicles", tmp / "small.zip", "--non-vehicles", others, *model],
+        r"--non-vehicles \S+ is --vehicles \S+ as well": [
+            "--vehicles", vehicles, "--non-vehicles", vehicles, *model],
+        r"cannot be split at test_size=0.2: 1 vehicles": [
+            "--vehicles", tmp / "one", "--non-vehicles", others, *model],
+        r"-o needs an existing folder": [*good, "-o", tmp / "none" / "m.safetensors"],
+        r"-o must be a file, got the folder": [*good, "-o", tmp],
+        r"-o \S+small.zip is --vehicles \S+ as well": [
+            "--vehicles", tmp / "small.zip", "--non-vehicles", others, "-o", tmp / "small.zip"],
+        r"--report \S+ is -o \S+ as well": [*good, *model, "--report", tmp / "m.safetensors"],
+        r"--card needs an existing folder": [*good, *model, "--card", tmp / "none" / "card.md"],
+        r"preset must be one of 'luv-2384'": [*good, *model, "--features", "hog"],
+        r"preset must be one of 'luv-2384', .* got 'sift'": [*good, *model, "--compare", "sift"],
+        r"split must be one of 'random', 'sequences'": [*good, *model, "--split", "half"],
+        r"C must be a number, greater than 0": [*good, *model, "--C", 0],
+        r"C must be a number, .* got nan": [*good, *model, "--C", "nan"],
+        r"random_state must be an integer from 0": [*good, *model, "--seed", -1],
+    }  # fmt: skip
+
+
+def test_train_refuses_bad_input_and_writes_nothing(material, tmp_path):
+    cases = bad_training(material, tmp_path)
+    before, original = contents(tmp_path), (tmp_path / "small.zip").read_bytes()
+    for message, words in cases.items():
+        assert re.search(message, refuse("train", *words)), message
+    assert contents(tmp_path) == before
+    assert (tmp_path / "small.zip").read_bytes() == original
+
+
+def test_defaults_are_those_of_the_library(monkeypatch, material, tmp_path):
+    given = {}
+
+    def note(patches, **options):
+        given.update(options)
+        raise InvalidInputError("enough")
+
+    monkeypatch.setattr(training, "train_and_evaluate", note)
+    refuse("train", *patches_of(material), "-o", tmp_path / "m.safetensors")
+    assert given["C"] == classifier.DEFAULT_C
+    assert given["params"] == load_classifier().params
+    assert (given["mirror"], given["random_state"], given["split"]) == (True, 0, "random")
+
+
+def test_fetch_tells_where_the_patches_are(monkeypatch, tmp_path):
+    monkeypatch.setattr(
+        datasets, "fetch_patches", lambda to, progress: (to / "vehicles.zip", to / "non-vehicles.zip")
+    )
+    assert succeed("fetch", "--to", tmp_path).split() == [
+        str(tmp_path / "vehicles.zip"),
+        str(tmp_path / "non-vehicles.zip"),
+    ]
+
+
+def test_fetch_refuses_a_file_as_its_folder(picture):
+    assert "--to must be a folder" in refuse("fetch", "--to", picture)
+
+
+def test_fetch_that_fails_leaves_no_folder(monkeypatch, tmp_path):
+    def fail(to, progress):
+        raise DatasetError("the server cannot\nbe reached")
+
+    monkeypatch.setattr(datasets, "fetch_patches", fail)
+    assert refuse("fetch", "--to", tmp_path / "new") == "error: the server cannot be reached\n"
+    assert contents(tmp_path) == []
+
+
+def test_info_of_the_shipped_models():
+    out = succeed("info", "highway")
+    model = load_classifier()
+    assert out.startswith(f"highway: {model.params.length} features, 1 template\n")
+    assert re.search(rf"color_space +{model.params.color_space}\s", out)
+    assert re.search(r"numpy +\d", out)
+    out = succeed("info", "default")
+    assert succeed("info") == out
+    default = load_model()
+    assert out.startswith(f"default: 6 templates, threshold {default.threshold:.2f} (log-odds)\n")
+    assert re.search(r"box of 7x6 cells\s*\n", out)
+    assert "box of 6x6 cells at the frame's border" in out
+    assert re.search(r"second opinion\W+[\d,]+ vectors, share 0.4", out)
+    for name, scores in default.metadata["metrics"]["left_out"].items():
+        assert re.search(rf"{name} .*{scores['f1']:.3f}", out)
+
+
+def test_info_of_a_model_whose_scores_are_not_all_known(tmp_path):
+    model, path = load_model(), tmp_path / "m.safetensors"
+    model.with_metadata({"metrics": {"left_out": {"road": {"f1": 0.25}}}}).save(path)
+    assert re.search(r"road\W+0\.250", succeed("info", path))
+
+
+def test_info_of_what_is_no_model(material):
+    assert "model file motorway does not exist; check the path" in refuse("info", "motorway")
+    assert "is a folder; name a file in it" in refuse("info", material / "empty")
+
+
+def test_models_by_name(picture):
+    assert re.search(r": \d+ vehicle", succeed("detect", picture))
+    assert succeed("detect", picture, "--model", "default") == succeed("detect", picture)
+    assert re.search(r": \d+ vehicle", succeed("detect", picture, "--model", "highway"))
+
+
+# --- train-frames ---
+
+
+@pytest.fixture
+def small_training(monkeypatch):
+    """Train with the few windows that a handful of drawn frames has."""
+    judge = functools.partial(mixture_report.cross_validate_mixture, params=SMALL_MIXTURE)
+    monkeypatch.setattr(mixture_report, "cross_validate_mixture", judge)
+
+
+@pytest.fixture(scope="module")
+def drawn_roads(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("roads")
+    write_frame_set(folder, "town", drawn(range(6)))
+    write_frame_set(folder, "stills", drawn(range(6, 10)), place=".")
+    cars = folder / "vehicles" / "cars"
+    cars.mkdir(parents=True)
+    for number, patch in enumerate(render_patches(14, random_state=0)[0][:7]):
+        write_image(cars / f"{number}.png", patch)
+    return folder
+
+
+PICTURES = ("curves", "town-missed", "town-false", "stills-missed", "stills-false")
+
+
+def test_train_frames(drawn_roads, small_training, tmp_path):
+    names = [tmp_path / f"road.{suffix}" for suffix in ("safetensors", "md", "csv")]
+    words = [
+        "train-frames",
+        drawn_roads,
+        "-o",
+        names[0],
+        "--card",
+        names[1],
+        "--curves",
+        names[2],
+        "--seed",
+        5,
+        "--no-drawn",
+        "--pictures",
+        tmp_path / "pictures",
+    ]
+    out = succeed(*words)
+    pictures = [tmp_path / "pictures" / f"{name}.png" for name in PICTURES]
+    assert "town: judged by a model that does not know it" in out
+    assert "on sources left out of training, IoU 0.5" in out
+    assert out.endswith(f"wrote {', '.join(map(str, names + pictures))}\n")
+    assert [picture.read_bytes()[:4] for picture in pictures] == 5 * [b"\x89PNG"]
+    model = load_model(names[0])
+    assert [template.box_cells for template in model.templates] == [(6, 5)]
+    assert model.metadata["training"] == {"random_state": 5}
+    assert model.metadata["data"] == {"town": 6, "course": 4, "patches": 2}
+    assert "- 2 vehicles on the course's patches" in names[1].read_text()
+    assert "KITTI (CC BY-NC-SA 3.0)" in names[1].read_text()
+    assert names[1].read_text().startswith("# Model card: road")
+    assert names[2].read_text().startswith("frames,value,precision,recall\ntown,")
+    shown = succeed("info", names[0])
+    assert re.search(r"town\W+\d\.\d{3}", shown)
+    first = names[0].read_bytes()
+    succeed(*words)
+    assert names[0].read_bytes() == first
+
+
+def test_train_frames_draws_some_itself(drawn_roads, small_training, tmp_path, monkeypatch):
+    few = functools.partial(_drawn_frames.drawn_source, drives=1, frames=1)
+    monkeypatch.setattr(_drawn_frames, "drawn_source", few)
+    card = tmp_path / "m.md"
+    succeed("train-frames", drawn_roads, "-o", tmp_path / "m.safetensors", "--card", card)
+    data = load_model(tmp_path / "m.safetensors").metadata["data"]
+    assert data == {"town": 6, "course": 4, "drawn": 1, "patches": 2}
+    assert "- drawn: 1 frames" in card.read_text()
+
+
+def test_train_frames_refuses_bad_input_before_it_trains(drawn_roads, tmp_path, monkeypatch):
+    monkeypatch.setattr(mixture_report, "train_mixture", None)
+    one = tmp_path / "one"
+    write_frame_set(one, "town", drawn(range(2)))
+    model = tmp_path / "m.safetensors"
+    (tmp_path / "empty").mkdir()
+    cases = {
+        r"folder \S+none does not exist; name the folder of the labelled": [tmp_path / "none", "-o", model],
+        r"folder \S+empty has no labels/NAME.csv": [tmp_path / "empty", "-o", model],
+        r"sources must be two or more, .*; got 1": [one, "-o", model],
+        r"-o needs an existing folder": [drawn_roads, "-o", tmp_path / "none" / "m.safetensors"],
+        r"-o must be a file, got the folder": [drawn_roads, "-o", tmp_path],
+        r"--card needs an existing folder": [drawn_roads, "-o", model, "--card", tmp_path / "none" / "m.md"],
+        r"--curves \S+ is -o \S+ as well": [drawn_roads, "-o", model, "--curves", model],
+        r"--pictures must be a folder, .* cannot be made": [
+            drawn_roads,
+            "-o",
+            model,
+            "--pictures",
+            one / "labels" / "town.csv" / "x",
+        ],
+        r"random_state must be an integer from 0": [drawn_roads, "-o", model, "--seed", -1],
+    }
+    for message, words in cases.items():
+        assert re.search(message, refuse("train-frames", *words)), message
+    assert not model.exists()
+
+
+def test_info_of_a_model_with_other_metadata(tmp_path):
+    model, path = load_classifier(), tmp_path / "m.safetensors"
+    VehicleClassifier(model.params, model.templates, {"metrics": 0.5, "by": "hand", "n": {"a": 1}}).save(path)
+    assert succeed("info", path).endswith("by\n    hand\nmetrics\n    0.5\nn\n  a  1\n")
+
+
+# --- helpers ---
+
+
+def test_interruptible_hands_on_results_and_errors():
+    assert interruptible(lambda: 5) == 5
+    with pytest.raises(InvalidInputError, match="wrong"):
+        interruptible(lambda: (_ for _ in ()).throw(InvalidInputError("wrong")))
+
+
+def test_a_folder_with_something_in_it_stays(tmp_path):
+    def fill(folder):
+        with output_folder(folder, "-o"):
+            (folder.parent / "kept").touch()
+            raise ValueError("stop")
+
+    with pytest.raises(ValueError, match="stop"):
+        fill(tmp_path / "a" / "b")
+    assert contents(tmp_path) == ["a", "a/kept"]
+
+
+# --- the real thing ---
+
+
+@pytest.mark.realdata
+def test_the_course_images_by_command(real_data, tmp_path):
+    images = sorted((real_data / "test_images").glob("*.jpg"))
+    succeed("detect", *images, "--boxes", tmp_path / "boxes.csv")
+    labels = real_data / "labels" / "test_images.csv"
+    assert "9 found, 0 missed, 0 false" in succeed("evaluate", tmp_path / "boxes.csv", labels)
+
+
+@pytest.mark.realdata
+def test_the_course_clip_by_command(real_data, tmp_path):
+    source, target = real_data / "videos" / "test_video.mp4", tmp_path / "out.mp4"
+    began = time.perf_counter()
+    succeed("video", source, target, "--tracks", tmp_path / "tracks.csv", "--preset", "ultrafast")
+    assert time.perf_counter() - began < 60
+    assert probe_video(target).has_audio
+    labels = real_data / "labels" / "test_video.csv"
+    scores = tmp_path / "scores.json"
+    succeed("evaluate", tmp_path / "tracks.csv", labels, "--json", scores)
+    told = json.loads(scores.read_text())
+    assert told["tracks"]["f1"] == 1.0
+    assert told["tracks"]["mean_iou"] >= 0.7

@@ -1,0 +1,141 @@
+import re
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from vehicle_detection.cli.app import app
+from vehicle_detection.images import read_image, write_image
+from vehicle_detection.synthetic import render_patches, render_scene, write_labels
+from vehicle_detection.tuning import read_results
+from vehicle_detection.tuning import search as tuning
+
+SMALL = "spatial_size=8 hist_bins=8 pix_per_cell=16 hog_channel=0 mirror=no"
+
+
+def run(*words):
+    return CliRunner().invoke(app, ["tune", *map(str, words)], catch_exceptions=False)
+
+
+def refuse(*words):
+    """Run a command that must fail with one line on standard error; return the line."""
+    result = run(*words)
+    assert result.exit_code == 2, result.output
+    assert re.fullmatch(r"error: [^\n]+\n", result.stderr.rpartition("\r")[2]), result.stderr
+    return result.stderr
+
+
+@pytest.fixture(scope="module")
+def material(tmp_path_factory):
+    """Return a folder with patches of both classes, and a frame with its labels."""
+    folder = tmp_path_factory.mktemp("material")
+    patches, labels = render_patches(80)
+    for row, (patch, label) in enumerate(zip(patches, labels)):
+        home = folder / ("vehicles" if label else "non-vehicles") / "drawn"
+        home.mkdir(parents=True, exist_ok=True)
+        write_image(home / f"{row}.png", patch)
+    (folder / "road").mkdir()
+    scene = render_scene(shape=(360, 640), vehicles=2, random_state=1)
+    write_image(folder / "road" / "1.png", scene.image)
+    write_labels(folder / "road.csv", [("1.png", scene.truth)])
+    return folder
+
+
+@pytest.fixture
+def patches(material):
+    return ("--vehicles", material / "vehicles", "--non-vehicles", material / "non-vehicles")
+
+
+def test_a_grid_becomes_a_table_and_a_figure(patches, tmp_path, monkeypatch):
+    out, plot = tmp_path / "table.csv", tmp_path / "plot.png"
+    words = (*patches, "--grid", f"orient=3,0,4 {SMALL}", "--out", out, "--plot", plot)
+    result = run(*words)
+    assert result.exit_code == 0, result.output
+    table = read_results(out)
+    assert table.column("orient") == [3, 0, 4]
+    assert table.column("status") == ["ok", "refused", "ok"]
+    assert table.column("split") == ["sequences", None, "sequences"]
+    assert re.search(r"2 measured; \* nothing is both more accurate and faster", result.stdout)
+    assert re.search(r"(?m)^ *\* +\S.*orient=\d", result.stdout)
+    assert re.search(r"orient=0.* refused: orient must be an integer from 1 to 180", result.stdout)
+    assert result.stdout.endswith(f"wrote {out}, {plot}\n")
+    assert np.ptp(read_image(plot)) == 255
+    # The same command again has nothing left to measure.
+    text = out.read_text()
+    monkeypatch.setattr("vehicle_detection.tuning.trials.Bench.measure", None)
+    assert run(*words).exit_code == 0
+    assert out.read_text() == text
+
+
+@pytest.mark.parametrize("split", ["sequences", "groups", "random"])
+def test_halving_shows_its_finalists(patches, tmp_path, split):
+    out = tmp_path / "table.jsonl"
+    grid = f"orient=3,4 C=1e-4,1e-2 {SMALL}"
+    result = run(*patches, "--grid", grid, "--out", out, "--halving", "--finalists", 2, "--split", split)
+    assert result.exit_code == 0, result.output
+    assert "2 measured" in result.stdout
+    table = read_results(out)
+    assert table.where(stage="final").column("split") == [split] * 2
+    assert len(table.where(stage="halving")) == 4 * 3
+
+
+def test_frames_are_scored(patches, material, tmp_path):
+    out = tmp_path / "table.parquet"
+    words = (
+        "--frames",
+        material / "road",
+        "--labels",
+        material / "road.csv",
+        "--cache",
+        tmp_path / "features",
+    )
+    result = run(*patches, "--grid", f"orient=3 {SMALL}", "--out", out, *words)
+    assert result.exit_code == 0, result.output
+    assert re.search(r"frames F1 +at best", result.stdout)
+    assert out.exists()
+    (row,) = read_results(tmp_path / "table.jsonl")
+    assert row["frame_f1_each"].startswith("road ")
+    assert len(list((tmp_path / "features").glob("*.npy"))) == 1
+
+
+def test_an_interrupt_keeps_what_is_measured(patches, tmp_path, monkeypatch):
+    measure = tuning.Bench.measure
+    done = []
+
+    def interrupted(self, *arguments, **options):
+        if done:
+            raise KeyboardInterrupt
+        done.append(1)
+        return measure(self, *arguments, **options)
+
+    monkeypatch.setattr(tuning.Bench, "measure", interrupted)
+    result = run(*patches, "--grid", f"orient=3,4 {SMALL}", "--out", tmp_path / "table.csv")
+    assert result.exit_code == 130
+    assert read_results(tmp_path / "table.csv").column("orient") == [3]
+
+
+def test_commands_that_make_no_sense(patches, material, tmp_path):
+    table, grid = ("--out", tmp_path / "table.csv"), ("--grid", f"orient=3 {SMALL}")
+    assert "grid knows no 'color'" in refuse(*patches, *table, "--grid", "color=LAB")
+    assert "grid must be like 'orient=8,9" in refuse(*patches, *table, "--grid", "orient")
+    assert "--split must be one of 'sequences'" in refuse(*patches, *table, *grid, "--split", "half")
+    assert "--out must end in .csv or .jsonl or .parquet" in refuse(
+        *patches, *grid, "--out", tmp_path / "table.xls"
+    )
+    assert "--out needs an existing folder" in refuse(
+        *patches, *grid, "--out", tmp_path / "none" / "table.csv"
+    )
+    assert "--plot must end in .png or" in refuse(*patches, *grid, *table, "--plot", tmp_path / "plot.jpg")
+    assert "--plot needs an existing folder" in refuse(
+        *patches, *grid, *table, "--plot", tmp_path / "none" / "p.png"
+    )
+    assert "--frames and --labels go together" in refuse(
+        *patches, *grid, *table, "--frames", material / "road"
+    )
+    missing = ("--vehicles", tmp_path / "missing.zip", *patches[2:])
+    assert "does not exist" in refuse(*missing, *grid, *table)
+    (tmp_path / "table.csv").write_text("a,b\n1,2\n")
+    assert "has other columns than this release writes" in refuse(*patches, *grid, *table)
+    same = ("--vehicles", tmp_path / "table.csv", *patches[2:])
+    assert "is --vehicles" in refuse(*same, *grid, *table)
+    assert (tmp_path / "table.csv").read_text() == "a,b\n1,2\n"

@@ -1,0 +1,618 @@
+import dataclasses
+import zipfile
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.base import clone
+from sklearn.model_selection import GridSearchCV
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+from sklearn.svm import LinearSVC
+from sklearn.utils import estimator_checks
+from sklearn.utils.estimator_checks import check_estimator
+
+from vehicle_detection._kernels import bin_of_value, degree_bounds, orientation_cotangents, sqrt_gradients
+from vehicle_detection._kernels import hog as _hog_kernels
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.features import (
+    PatchFeatures,
+    bin_spatial,
+    color_hist,
+    convert_color,
+    extract_features,
+    get_hog_features,
+    hog_blocks,
+    hog_image,
+    single_img_features,
+)
+from vehicle_detection.images import decode_image, write_image
+from vehicle_detection.params import COLOR_SPACES, HOG_CHANNELS, FeatureParams
+from vehicle_detection.synthetic import render_patches
+
+PRESETS = sorted(FeatureParams.PRESETS)
+BLANK = np.zeros((64, 64, 3), np.uint8)
+# The kernels work in float32, the reference in float64; HOG values lie in 0-1.
+TOLERANCE = 1e-5
+
+
+def make_patches():
+    """Noise of several grains, flat patches, hard edges, ramps and blurred shapes: like and unlike photos."""
+    rng = np.random.default_rng(7)
+    noise = rng.integers(0, 256, (6, 64, 64, 3), dtype=np.uint8)
+    flat = [np.full((64, 64, 3), value, np.uint8) for value in (0, 255, (10, 200, 90))]
+    smooth = [cv2.GaussianBlur(patch, (0, 0), sigma) for patch, sigma in zip(noise, (1, 2, 4, 8))]
+    ramp = np.arange(64, dtype=np.uint8)
+    ramps = [
+        np.broadcast_to((ramp * 4)[:, None, None], (64, 64, 3)),
+        np.broadcast_to((255 - ramp * 4)[None, :, None], (64, 64, 3)),
+        # Both gradients are equal everywhere: 45 and 135 degrees, on the bounds of 4, 8 and 12 bins.
+        np.repeat((ramp[:, None] + ramp[None, :])[..., None], 3, axis=2),
+        np.repeat((ramp[:, None] + ramp[None, ::-1])[..., None], 3, axis=2),
+    ]
+    few_values = rng.choice(np.array([0, 1, 4, 9, 64, 255], np.uint8), (3, 64, 64, 3))
+    checks = np.kron(rng.integers(0, 2, (8, 8, 1)), np.ones((8, 8, 3))).astype(np.uint8) * 255
+    drawn = np.full((64, 64, 3), 120, np.uint8)
+    cv2.rectangle(drawn, (8, 20), (56, 50), (180, 20, 30), -1)
+    cv2.circle(drawn, (18, 50), 7, (15, 15, 15), -1)
+    cv2.circle(drawn, (46, 50), 7, (15, 15, 15), -1)
+    cv2.line(drawn, (12, 20), (24, 8), (230, 230, 240), 2, cv2.LINE_AA)
+    photo = np.clip(smooth[2].astype(int) // 2 + rng.normal(60, 6, (64, 64, 3)), 0, 255).astype(np.uint8)
+    return np.stack([*noise[4:], *flat, *smooth, *ramps, *few_values, checks, drawn, photo])
+
+
+PATCHES = make_patches()
+
+
+def assert_equals_the_reference(patches, params):
+    fast = extract_features(patches, params)
+    reference = np.stack([single_img_features(patch, params) for patch in patches])
+    assert fast.dtype == np.float32
+    assert fast.shape == reference.shape == (len(patches), params.length)
+    counted = params.spatial_length + params.hist_length
+    np.testing.assert_array_equal(fast[:, :counted], reference[:, :counted].astype(np.float32))
+    np.testing.assert_allclose(fast[:, counted:], reference[:, counted:], rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize(
+    ("preset", "length"), [("luv-2384", 2384), ("ycrcb-6156", 6156), ("ycrcb-8460", 8460)]
+)
+def test_the_known_lengths(preset, length):
+    params = FeatureParams.preset(preset)
+    assert single_img_features(BLANK, params).shape == (length,)
+    assert extract_features([BLANK], params).shape == (1, length)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_the_presets_equal_the_reference(preset):
+    assert_equals_the_reference(PATCHES, FeatureParams.preset(preset))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"orient": 1},
+        {"orient": 2},
+        {"orient": 4},
+        {"orient": 12},
+        {"orient": 180, "cell_per_block": 1, "hog_channel": 0},
+        {"pix_per_cell": 16},
+        {"pix_per_cell": 7, "cell_per_block": 3},
+        {"pix_per_cell": 64, "cell_per_block": 1},
+        {"pix_per_cell": 2, "cell_per_block": 1, "hog_channel": 1},
+        {"cell_per_block": 1},
+        {"cell_per_block": 8},
+        {"hog_channel": "GRAY", "color_space": "HSV"},
+        {"hog_channel": "GRAY", "transform_sqrt": True},
+        {"hog_channel": 2, "color_space": "HLS"},
+        {"transform_sqrt": True},
+        {"transform_sqrt": True, "orient": 4},
+        {"transform_sqrt": True, "orient": 180, "cell_per_block": 1, "hog_channel": 0},
+        {"spatial_size": 64},
+        {"spatial_size": 1},
+        {"spatial_size": 24, "hist_bins": 7},
+        {"hist_bins": 256},
+        {"hist_bins": 1},
+        {"spatial_feat": False, "hist_feat": False},
+        {"hog_feat": False},
+        {"hog_feat": False, "spatial_feat": False},
+        {"hist_sqrt": True},
+        {"hist_sqrt": True, "hist_bins": 256, "hog_feat": False},
+        {"coarse_hog": True},
+        {"coarse_hog": True, "hog_channel": "GRAY", "transform_sqrt": True},
+        {"coarse_hog": True, "pix_per_cell": 7, "cell_per_block": 3},
+        {"coarse_hog": True, "pix_per_cell": 2, "cell_per_block": 1, "hog_channel": 1},
+        {"coarse_hog": True, "hog_feat": False},
+    ],
+    ids=str,
+)
+def test_other_parameters_equal_the_reference(changes):
+    assert_equals_the_reference(PATCHES[::2], dataclasses.replace(FeatureParams(), **changes))
+
+
+@pytest.mark.parametrize("color_space", COLOR_SPACES)
+def test_every_color_space_equals_the_reference(color_space):
+    assert_equals_the_reference(PATCHES[::3], FeatureParams(color_space=color_space))
+
+
+@st.composite
+def feature_params(draw):
+    parts = draw(
+        st.sampled_from([(True, True, True), (True, False, True), (False, True, True), (False,) * 2])
+    )
+    cell = draw(st.integers(4, 64))
+    block = draw(st.integers(1, min(4, 64 // cell)))
+    return FeatureParams(
+        color_space=draw(st.sampled_from(COLOR_SPACES)),
+        spatial_feat=parts[0],
+        hist_feat=parts[1],
+        hog_feat=True,
+        spatial_size=draw(st.integers(1, 64)),
+        hist_bins=draw(st.integers(1, 256)),
+        orient=draw(st.integers(1, 20)),
+        pix_per_cell=cell,
+        cell_per_block=block,
+        hog_channel=draw(st.sampled_from(HOG_CHANNELS)),
+        transform_sqrt=draw(st.booleans()),
+        hist_sqrt=draw(st.booleans()),
+        coarse_hog=64 // cell // 2 >= block and draw(st.booleans()),
+    )
+
+
+@given(feature_params(), st.integers(0, len(PATCHES) - 1), st.integers(0, 2**32 - 1))
+@settings(max_examples=30)
+def test_any_parameters_equal_the_reference(params, row, seed):
+    noise = np.random.default_rng(seed).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    assert_equals_the_reference(np.stack([PATCHES[row], noise]), params)
+
+
+def test_drawn_patches_equal_the_reference():
+    patches, _ = render_patches(12, random_state=3)
+    for preset in PRESETS:
+        assert_equals_the_reference(patches, FeatureParams.preset(preset))
+
+
+def sample_of_real_patches(folder, each):
+    for name in ("vehicles.zip", "non-vehicles.zip"):
+        with zipfile.ZipFile(folder / name) as archive:
+            names = sorted(n for n in archive.namelist() if n.endswith(".png") and "__MACOSX" not in n)
+            for place in np.linspace(0, len(names) - 1, each).astype(int):
+                yield decode_image(archive.read(names[place]), names[place])
+
+
+@pytest.mark.realdata
+def test_real_patches_equal_the_reference(real_data):
+    patches = np.stack(list(sample_of_real_patches(real_data, 160)))
+    assert len(patches) >= 300
+    for preset in ("luv-2384", "ycrcb-6156"):
+        assert_equals_the_reference(patches, FeatureParams.preset(preset))
+    for preset in PRESETS:
+        assert_equals_the_reference(patches[::8], FeatureParams.preset(preset))
+
+
+def all_gradients():
+    """Image ``(3 * 511, 3 * 511)`` in 3x3 tiles whose middles have every pair of uint8 gradients once."""
+    differences = np.arange(-255, 256)
+    low, high = np.maximum(-differences, 0), np.maximum(differences, 0)
+    image = np.zeros((511, 3, 511, 3), np.uint8)
+    image[:, 1, :, 0], image[:, 1, :, 2] = low[None, :], high[None, :]
+    image[:, 0, :, 1], image[:, 2, :, 1] = low[:, None], high[:, None]
+    gy, gx = np.meshgrid(differences, differences, indexing="ij")
+    return image, gx, gy
+
+
+def reference_bins(gx, gy, orient):
+    """Orientation bin of gradients, as scikit-image's histogram loop decides it."""
+    degrees = np.rad2deg(np.arctan2(gy.astype(float), gx.astype(float))) % 180
+    bounds = degree_bounds(orient)
+    bins = np.full(gx.shape, -1)
+    for k in range(orient):
+        bins[(degrees >= bounds[k]) & (degrees < bounds[k + 1])] = k
+    return bins
+
+
+@pytest.mark.parametrize("orient", [1, 2, 3, 4, 5, 6, 8, 9, 12, 16, 18, 36, 180])
+def test_every_uint8_gradient_falls_into_the_references_bin(orient):
+    # The comparison of `_hog_kernels.hog_cells`, operation by operation.
+    _, gx, gy = all_gradients()
+    some = (gx != 0) | (gy != 0)
+    gx, gy = gx[some], gy[some]
+    expected = reference_bins(gx, gy, orient)
+    horizontal, vertical = gx.astype(np.float32), gy.astype(np.float32)
+    infinite = np.full(gx.shape, np.inf, np.float32)
+    quotient = np.divide(horizontal, vertical, out=infinite, where=vertical != 0)
+    cotangents = orientation_cotangents(orient)
+    found = np.zeros(gx.shape, int)
+    for k in range(1, orient):
+        past = quotient <= cotangents[k]
+        found[past] = k
+        # The kernel's sums are cumulative: what is past a bound is past those before it as well.
+        assert not (past & (expected < k)).any()
+    wrong = found != expected
+    assert not wrong.any(), list(zip(gx[wrong], gy[wrong]))[:5]
+
+
+@pytest.mark.parametrize("orient", [4, 6, 8, 9, 12])
+def test_the_kernel_puts_every_uint8_gradient_into_the_references_bin(orient):
+    image, gx, gy = all_gradients()
+    expected = reference_bins(gx, gy, orient)
+    length = np.hypot(gx, gy)
+    cotangents = orientation_cotangents(orient)
+    for start in range(0, 511, 73):
+        tiles = np.ascontiguousarray(image[start : start + 73].reshape(73 * 3, 511 * 3))
+        cells = np.empty((1, orient, *tiles.shape), np.float32)
+        _hog_kernels.hog_cells(tiles, 1, 1, cotangents, cells)
+        middles = cells[0, :, 1::3, 1::3]
+        rows = slice(start, start + 73)
+        np.testing.assert_allclose(middles.sum(axis=0), length[rows], rtol=1e-6)
+        filled = length[rows] > 0
+        np.testing.assert_array_equal(middles.argmax(axis=0)[filled], expected[rows][filled])
+        assert ((middles != 0).sum(axis=0) == filled).all()
+
+
+def test_reference_bins_are_those_of_scikit_image():
+    rng = np.random.default_rng(0)
+    channel = rng.choice(np.array([0, 10, 20, 200], np.uint8), (66, 66))
+    for orient in (4, 9, 12):
+        # A block of one cell is normalized on its own: which bins are filled is all that is left.
+        found = hog_blocks(channel, orient, 2, 1)[:, :, 0, 0] > 0
+        values = channel.astype(int)
+        gx, gy = np.zeros_like(values), np.zeros_like(values)
+        gx[:, 1:-1] = values[:, 2:] - values[:, :-2]
+        gy[1:-1] = values[2:] - values[:-2]
+        bins = np.where((gx != 0) | (gy != 0), reference_bins(gx, gy, orient), -1)
+        cells = bins.reshape(33, 2, 33, 2).transpose(0, 2, 1, 3).reshape(33, 33, 4)
+        expected = (cells[..., None] == np.arange(orient)).any(axis=2)
+        np.testing.assert_array_equal(found, expected)
+
+
+@given(st.integers(1, 256))
+def test_bin_of_value_is_that_of_numpy(bins):
+    values = np.arange(256)
+    expected = [int(np.histogram([value], bins=bins, range=(0, 256))[0].argmax()) for value in values[::5]]
+    assert bin_of_value(bins)[::5].tolist() == expected
+    counts = np.histogram(values, bins=bins, range=(0, 256))[0]
+    np.testing.assert_array_equal(np.bincount(bin_of_value(bins), minlength=bins), counts)
+
+
+def test_sqrt_gradients_are_zero_at_the_border():
+    gx, gy, angles = sqrt_gradients(PATCHES[0][..., :1])
+    root = np.sqrt(PATCHES[0][..., 0].astype(float))
+    np.testing.assert_array_equal(gx[:, 1:-1], root[:, 2:] - root[:, :-2])
+    np.testing.assert_array_equal(gy[1:-1], root[2:] - root[:-2])
+    assert not gx[:, [0, -1]].any()
+    assert not gy[[0, -1]].any()
+    np.testing.assert_array_equal(angles, np.arctan2(gy, gx))
+
+
+@pytest.mark.parametrize("preset", ["luv-2384", "ycrcb-6156"])
+def test_threads_do_not_change_the_features(preset):
+    params = FeatureParams.preset(preset)
+    # More than two of the chunks that threads take.
+    patches = np.random.default_rng(3).integers(0, 256, (600, 64, 64, 3), dtype=np.uint8)
+    one = extract_features(patches, params, n_jobs=1)
+    for n_jobs in (2, 3):
+        np.testing.assert_array_equal(extract_features(patches, params, n_jobs=n_jobs), one)
+    np.testing.assert_array_equal(extract_features(patches[590:], params), one[590:])
+
+
+def test_array_list_generator_and_paths_give_the_same(tmp_path):
+    patches = PATCHES[:5]
+    expected = extract_features(patches)
+    paths = [tmp_path / f"{index}.png" for index in range(5)]
+    for path, patch in zip(paths, patches):
+        write_image(path, patch)
+    sources = {
+        "list": list(patches),
+        "tuple": tuple(patches),
+        "views": [patch[::-1][::-1] for patch in patches],
+        "generator": (patch for patch in patches),
+        "paths": paths,
+        "strings": map(str, paths),
+        "mixed": [paths[0], *patches[1:]],
+        "strided": np.repeat(patches, 2, axis=0)[::2],
+        "reversed": np.ascontiguousarray(patches[:, :, ::-1])[:, :, ::-1],
+    }
+    for name, source in sources.items():
+        np.testing.assert_array_equal(extract_features(source), expected, err_msg=name)
+
+
+@pytest.mark.parametrize("empty", [[], np.empty((0, 64, 64, 3), np.uint8), iter(())])
+def test_no_patches_have_no_features(empty):
+    assert extract_features(empty).shape == (0, 6156)
+
+
+def test_png_and_jpeg_have_the_same_range(tmp_path):
+    # matplotlib's imread gives 0-1 for PNG and 0-255 for JPEG: the classic trap.
+    patch = cv2.GaussianBlur(PATCHES[0], (0, 0), 6)
+    write_image(tmp_path / "a.png", patch)
+    write_image(tmp_path / "a.jpg", patch)
+    params = FeatureParams(color_space="RGB", hog_feat=False, hist_feat=False)
+    png, jpg = extract_features([tmp_path / "a.png", tmp_path / "a.jpg"], params)
+    assert png.max() > 100
+    assert np.abs(png - jpg).max() < 12
+    assert np.abs(png - jpg).mean() < 3
+
+
+def test_extracting_changes_nothing(capsys):
+    before = PATCHES.copy()
+    extract_features(PATCHES)
+    single_img_features(PATCHES[0])
+    np.testing.assert_array_equal(PATCHES, before)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_progress_goes_to_standard_error(capsys):
+    features = extract_features(PATCHES, progress=True)
+    np.testing.assert_array_equal(features, extract_features(PATCHES))
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert f"{len(PATCHES)}/{len(PATCHES)}" in err
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        (BLANK, r"source must be an \(N, 64, 64, 3\) uint8 RGB array"),
+        (PATCHES / 255, "source must be .* dtype float64"),
+        (PATCHES[:, :32, :32], r"source must be an \(N, 64, 64, 3\)"),
+        ([BLANK[:32]], r"source\[0\] must be 64x64 pixels, got 64x32"),
+        ([BLANK, BLANK[..., 0]], r"source\[1\] must be .*COLOR_GRAY2RGB"),
+        ("vehicles", "source must be patches or a list of paths, got 'vehicles'"),
+        (3, r"source must be patches or a list of paths, got 3 \(int\)"),
+        (None, "source must be patches or a list of paths, got None"),
+        (["missing.png"], "image file missing.png does not exist"),
+    ],
+)
+def test_extract_features_refuses(source, message):
+    with pytest.raises(InvalidInputError, match=message):
+        extract_features(source)
+
+
+def test_a_file_of_another_size_is_refused(tmp_path):
+    write_image(tmp_path / "a.png", BLANK[:32])
+    with pytest.raises(InvalidInputError, match=r"source\[0\] must be 64x64 pixels, got 64x32"):
+        extract_features([tmp_path / "a.png"])
+
+
+def test_single_img_features_refuses():
+    with pytest.raises(InvalidInputError, match=r"image\[0\] must be 64x64 pixels, got 64x32"):
+        single_img_features(BLANK[:32])
+    with pytest.raises(InvalidInputError, match=r"image\[0\] must be an \(H, W, 3\)"):
+        single_img_features(BLANK / 255)
+
+
+@pytest.mark.parametrize("params", ["luv-2384", {"orient": 9}, FeatureParams, 5, False])
+def test_parameters_of_another_kind_are_refused(params):
+    for extract in (lambda: extract_features(PATCHES, params), lambda: single_img_features(BLANK, params)):
+        with pytest.raises(InvalidInputError, match=r"params must be a FeatureParams, got .*; pass Feature"):
+            extract()
+
+
+def test_the_vector_is_spatial_then_histogram_then_hog():
+    params = FeatureParams(color_space="RGB", spatial_size=8, hist_bins=4, orient=6, hog_channel=1)
+    patch = PATCHES[-1]
+    vector = single_img_features(patch, params)
+    np.testing.assert_array_equal(vector[:192], bin_spatial(patch, 8))
+    np.testing.assert_array_equal(vector[192:204], color_hist(patch, 4))
+    np.testing.assert_array_equal(vector[204:], get_hog_features(patch[..., 1], 6))
+
+
+def test_the_coarse_hog_is_that_of_larger_cells():
+    fine = FeatureParams(hog_channel=0, orient=8)
+    params = dataclasses.replace(fine, coarse_hog=True)
+    patch = PATCHES[-1]
+    coarse = get_hog_features(convert_color(patch)[..., 0], 8, 16)
+    for extract in (single_img_features, lambda patch, params: extract_features([patch], params)[0]):
+        vector = extract(patch, params)
+        np.testing.assert_array_equal(vector[: fine.length], extract(patch, fine))
+        np.testing.assert_allclose(vector[fine.length :], coarse, atol=TOLERANCE)
+
+
+def test_roots_of_the_histogram():
+    plain = FeatureParams(spatial_feat=False, hog_feat=False)
+    counts = extract_features(PATCHES, plain)
+    roots = extract_features(PATCHES, dataclasses.replace(plain, hist_sqrt=True))
+    np.testing.assert_allclose(roots**2, counts, rtol=1e-6)
+    # Every patch has as many pixels: the roots of a channel's counts have one length.
+    np.testing.assert_allclose((roots**2).sum(axis=1), 3 * 64 * 64, rtol=1e-6)
+
+
+@pytest.mark.parametrize("color_space", COLOR_SPACES)
+def test_convert_color(color_space):
+    patch = PATCHES[0]
+    before = patch.copy()
+    converted = convert_color(patch, color_space)
+    assert converted.shape == patch.shape
+    assert converted.dtype == np.uint8
+    assert not np.shares_memory(converted, patch)
+    np.testing.assert_array_equal(convert_color(patch, f"RGB2{color_space}"), converted)
+    out = np.empty_like(patch)
+    assert np.shares_memory(convert_color(patch, color_space, out=out), out)
+    np.testing.assert_array_equal(out, converted)
+    np.testing.assert_array_equal(patch, before)
+    # A part of an image, and one that is turned, converts as the whole does.
+    np.testing.assert_array_equal(convert_color(patch[8:40, ::-2], color_space), converted[8:40, ::-2])
+
+
+def test_convert_color_knows_what_red_is():
+    red = np.full((1, 1, 3), (255, 0, 0), np.uint8)
+    assert convert_color(red, "HSV")[0, 0].tolist() == [0, 255, 255]
+    assert convert_color(red, "HLS")[0, 0].tolist() == [0, 128, 255]
+    assert convert_color(red, "YCrCb")[0, 0].tolist() == [76, 255, 85]
+    assert convert_color(red, "RGB")[0, 0].tolist() == [255, 0, 0]
+
+
+def test_convert_color_refuses():
+    with pytest.raises(InvalidInputError, match=r"color_space must be one of 'RGB', .*; got 'BGR'"):
+        convert_color(BLANK, "BGR")
+    with pytest.raises(InvalidInputError, match="image must be an"):
+        convert_color(BLANK / 255)
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "orient", "cell", "block"),
+    [(64, 64, 9, 8, 2), (64, 128, 6, 8, 3), (50, 70, 9, 8, 2), (16, 16, 4, 8, 2), (20, 33, 5, 4, 1)],
+)
+def test_the_shape_of_hog(height, width, orient, cell, block):
+    channel = np.zeros((height, width), np.uint8)
+    rows, columns = height // cell - block + 1, width // cell - block + 1
+    blocks = hog_blocks(channel, orient, cell, block)
+    assert blocks.shape == (rows, columns, block, block, orient)
+    assert get_hog_features(channel, orient, cell, block).shape == (rows * columns * block * block * orient,)
+
+
+def test_hog_is_a_share_and_ignores_contrast_and_brightness():
+    channel = cv2.GaussianBlur(PATCHES[0][..., 0] // 3, (0, 0), 2)
+    values = get_hog_features(channel)
+    assert ((values >= 0) & (values <= 1)).all()
+    np.testing.assert_allclose(get_hog_features(channel + 50), values, atol=1e-9)
+    np.testing.assert_allclose(get_hog_features(channel * 2), values, atol=1e-4)
+
+
+def test_one_edge_fills_one_orientation():
+    vertical = np.zeros((64, 64), np.uint8)
+    vertical[:, 32:] = 200
+    by_orientation = hog_blocks(vertical, 9).sum(axis=(0, 1, 2, 3))
+    assert by_orientation.argmax() == 0
+    assert np.count_nonzero(by_orientation) == 1
+    horizontal = hog_blocks(vertical.T, 9).sum(axis=(0, 1, 2, 3))
+    assert horizontal.argmax() == 4
+
+
+def test_hog_of_nothing_is_nothing():
+    assert not get_hog_features(BLANK[..., 0]).any()
+    assert not extract_features([BLANK], FeatureParams(spatial_feat=False, hist_feat=False)).any()
+
+
+@pytest.mark.parametrize("function", [hog_blocks, get_hog_features, hog_image])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"img": BLANK}, r"img must be one \(H, W\) uint8 channel"),
+        ({"img": BLANK[..., 0] / 255}, r"img must be one \(H, W\) uint8 channel"),
+        ({"orient": 0}, "orient must be an integer at least 1"),
+        ({"pix_per_cell": 0}, "pix_per_cell must be an integer at least 1"),
+        ({"pix_per_cell": 65}, "img must be at least one block large"),
+    ],
+)
+def test_hog_refuses(function, arguments, message):
+    with pytest.raises(InvalidInputError, match=message):
+        function(**{"img": BLANK[..., 0], **arguments})
+
+
+def test_the_exact_size_that_hog_takes():
+    assert get_hog_features(np.zeros((24, 24), np.uint8), 9, 8, 3).shape == (81,)
+    with pytest.raises(InvalidInputError, match=r"at least one block large \(24x24 pixels\); got 24x23"):
+        get_hog_features(np.zeros((23, 24), np.uint8), 9, 8, 3)
+    with pytest.raises(InvalidInputError, match="cell_per_block must be an integer at least 1"):
+        hog_blocks(BLANK[..., 0], 9, 8, 0)
+
+
+def test_hog_picture_draws_where_edges_are():
+    channel = np.zeros((64, 64), np.uint8)
+    channel[:, 20:] = 200
+    picture = hog_image(channel)
+    assert picture.shape == (64, 64)
+    assert picture[:, 16:24].sum() > 0
+    assert picture[:, 40:].sum() == 0
+
+
+def test_bin_spatial_goes_channel_by_channel():
+    image = np.zeros((64, 64, 3), np.uint8)
+    image[..., 1] = 7
+    assert bin_spatial(image, 2).tolist() == [0] * 4 + [7] * 4 + [0] * 4
+    np.testing.assert_array_equal(bin_spatial(PATCHES[0], 64), PATCHES[0].transpose(2, 0, 1).ravel())
+    np.testing.assert_array_equal(bin_spatial(PATCHES[0], (32, 32)), bin_spatial(PATCHES[0]))
+    np.testing.assert_array_equal(bin_spatial(PATCHES[0], np.int64(32)), bin_spatial(PATCHES[0]))
+    assert bin_spatial(PATCHES[0], (4, 2)).shape == (24,)
+
+
+@pytest.mark.parametrize("size", [0, (32, 0), (1, 2, 3), 1.5, "32", None])
+def test_bin_spatial_refuses_a_size(size):
+    with pytest.raises(InvalidInputError, match="size must be"):
+        bin_spatial(PATCHES[0], size)
+
+
+def test_color_hist_counts_every_pixel():
+    counts = color_hist(PATCHES[0], 10)
+    assert counts.shape == (30,)
+    assert counts.dtype.kind == "i"
+    assert counts.reshape(3, 10).sum(axis=1).tolist() == [64 * 64] * 3
+    image = np.array([[[0, 127, 255]]], np.uint8)
+    assert color_hist(image, 2).tolist() == [1, 0, 1, 0, 0, 1]
+    with pytest.raises(InvalidInputError, match="nbins must be an integer from 1 to 256"):
+        color_hist(image, 0)
+    with pytest.raises(InvalidInputError, match="img must be an"):
+        color_hist(image / 255)
+
+
+def test_the_transformer_is_extract_features():
+    transformer = PatchFeatures(color_space="LUV", orient=6, n_jobs=1)
+    params = FeatureParams(color_space="LUV", orient=6)
+    assert transformer.to_params() == params
+    expected = extract_features(PATCHES, params)
+    np.testing.assert_array_equal(transformer.transform(PATCHES), expected)
+    np.testing.assert_array_equal(transformer.fit_transform(list(PATCHES)), expected)
+    assert transformer.fit(PATCHES) is transformer
+
+
+def test_the_transformer_has_the_arguments_and_defaults_of_the_parameters():
+    arguments = PatchFeatures().get_params()
+    assert arguments.pop("n_jobs") is None
+    assert arguments == dataclasses.asdict(FeatureParams())
+
+
+def test_the_transformer_can_be_cloned_and_set():
+    transformer = PatchFeatures(orient=6)
+    copy = clone(transformer)
+    assert copy is not transformer
+    assert copy.get_params() == transformer.get_params()
+    assert copy.set_params(orient=7).to_params().orient == 7
+
+
+def test_the_transformer_checks_when_it_is_fitted():
+    transformer = PatchFeatures(color_space="BGR")
+    with pytest.raises(InvalidInputError, match="color_space must be one of"):
+        transformer.fit(PATCHES)
+    with pytest.raises(InvalidInputError, match="source must be an"):
+        PatchFeatures().fit_transform(PATCHES / 255)
+
+
+def test_the_transformer_names_its_features():
+    transformer = PatchFeatures(spatial_size=2, hist_bins=2, orient=4, pix_per_cell=32, hog_channel=0)
+    names = transformer.get_feature_names_out()
+    assert len(names) == transformer.to_params().length
+    assert names[0] == "spatial0"
+    assert names[12] == "hist0"
+    assert names[-1] == "hog15"
+
+
+@pytest.mark.filterwarnings("ignore:Can't test estimator:sklearn.exceptions.SkipTestWarning")
+def test_the_transformer_is_an_estimator():
+    # scikit-learn feeds tables of numbers to most of its checks; those that need none remain.
+    check_estimator(PatchFeatures())
+    for check in (
+        estimator_checks.check_parameters_default_constructible,
+        estimator_checks.check_no_attributes_set_in_init,
+        estimator_checks.check_get_params_invariance,
+        estimator_checks.check_set_params,
+    ):
+        check("PatchFeatures", PatchFeatures())
+
+
+def test_the_transformer_in_a_grid_search():
+    patches = np.concatenate([PATCHES[:4]] * 2 + [PATCHES[5:9]] * 2)
+    labels = np.repeat([1, 0], 8)
+    pipeline = make_pipeline(
+        PatchFeatures(spatial_size=8, hist_bins=8, n_jobs=1),
+        StandardScaler(),
+        LinearSVC(C=1e-3, random_state=0),
+    )
+    grid = {"patchfeatures__orient": [4, 6], "patchfeatures__hog_channel": [0, "GRAY"]}
+    search = GridSearchCV(pipeline, grid, cv=2, error_score="raise").fit(patches, labels)
+    assert len(search.cv_results_["params"]) == 4
+    assert search.predict(patches).shape == (16,)
+    assert search.best_estimator_.score(patches, labels) > 0.9

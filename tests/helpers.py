@@ -1,0 +1,139 @@
+"""Helpers shared by the tests."""
+
+import functools
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+
+from vehicle_detection.classifier import Template, VehicleClassifier
+from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
+from vehicle_detection.images import write_image
+from vehicle_detection.params import MixtureParams, PyramidParams
+from vehicle_detection.synthetic import render_scene
+
+ROOT = Path(__file__).parents[1]
+"""Root of the repository."""
+
+
+def random_template(params, seed=0, *, bias=0.0):
+    """A template whose scores are of the order of one, on features of the usual sizes."""
+    rng = np.random.default_rng(seed)
+    hist = (params.hist_length, 8, 8) if params.hist_sqrt else (params.hist_length, 128, 100)
+    parts = ((params.spatial_length, 128, 60), hist, (params.hog_length, 0.1, 0.1))
+    mean = np.concatenate([np.full(count, mean) for count, mean, _ in parts])
+    scale = np.concatenate([scale * rng.uniform(0.5, 2, count) for count, _, scale in parts])
+    coef = rng.normal(0, params.length**-0.5, params.length)
+    return Template(mean, scale, coef, bias)
+
+
+def random_classifier(params, seed=0, *, templates=1, bias=0.0):
+    """A classifier that was never trained: its scores are as good as any for comparing two searches."""
+    return VehicleClassifier(
+        params, tuple(random_template(params, seed + index, bias=bias) for index in range(templates))
+    )
+
+
+SMALL_MIXTURE = MixtureParams(
+    shapes=((6, 5),),
+    facing=(False,),
+    border_shapes=(),
+    size_prior_weight=0.0,
+    vote_weight=0.0,
+    C=5e-3,
+    border_C=5e-3,
+    vehicles=100.0,
+    rounds=(0.5, 1.0, 1.0),
+    per_frame=20,
+    search=PyramidParams(min_width=28),
+)
+
+
+@functools.cache
+def scene_of(seed):
+    return render_scene(shape=(200, 356), focal=420, vehicles=3, random_state=seed)
+
+
+def drawn(seeds, name="road"):
+    """Drawn scenes with the boxes of their vehicles; narrow or half hidden ones are to be ignored."""
+    scenes = [scene_of(seed) for seed in seeds]
+    keys, boxes, ignore = [], [], []
+    for key, scene in enumerate(scenes):
+        for vehicle in scene.truth:
+            x1, _, x2, _ = vehicle.box
+            keys.append(key)
+            boxes.append(vehicle.box)
+            ignore.append(bool(x2 - x1 < 28 or vehicle.hidden > 0.4 or vehicle.truncated > 0.4))
+    return LabelledFrames(
+        name, [scene.image for scene in scenes], FrameBoxes(keys, None, boxes, ignore=ignore)
+    )
+
+
+def write_frame_set(folder, name, frames, *, place="frames"):
+    """Write drawn frames and their labels as a set of a data folder."""
+    target = folder / place / name
+    target.mkdir(parents=True)
+    (folder / "labels").mkdir(exist_ok=True)
+    lines = ["frame,track,x1,y1,x2,y2,occluded,truncated,ignore"]
+    for key, image in frames:
+        write_image(target / f"{key:03d}.png", image)
+        part = frames.labels.frame(key)
+        for box, ignore in zip(part.boxes.tolist(), part.ignore.tolist()):
+            lines.append(f"{key:03d}.png,-1,{','.join(map(str, box))},0,0,{int(ignore)}")
+    (folder / "labels" / f"{name}.csv").write_text("\n".join(lines) + "\n")
+
+
+SHAPE = (720, 1280)
+
+
+def boxes_on_a_road(horizon, camera_height, count=40, seed=0, noise=0.0):
+    rng = np.random.default_rng(seed)
+    width = rng.uniform(30, 200, count)
+    foot = horizon * SHAPE[0] + width * camera_height / 1.8 + rng.normal(0, noise, count) * width
+    center = rng.uniform(300, 980, count)
+    return np.stack([center - width / 2, foot - 0.8 * width, center + width / 2, foot], axis=1)
+
+
+@dataclass(frozen=True)
+class Result:
+    index: int
+    brightness: float
+    time: float
+    tracks: tuple = ()
+    seconds: dict = field(default_factory=lambda: {"search": 0.0, "heat": 0.001, "track": 0.002})
+
+
+TENTATIVE = SimpleNamespace(id=0, shown=False)
+
+
+class StubDetector:
+    """Stands in for the detector: the brightness of a frame is what it finds."""
+
+    def __init__(self, *, pause=0.0):
+        self.index, self.pause, self.fps = 0, pause, None
+        self.shapes = set()
+
+    def reset(self, *, fps):
+        self.index, self.fps = 0, fps
+
+    def search(self, frame):
+        if self.pause:  # the later a frame, the sooner it is done: the order is not for free
+            time.sleep(self.pause / (1 + self.index))
+        return float(frame.mean())
+
+    def follow(self, windows, shape, *, time):
+        self.shapes.add(shape)
+        confirmed = SimpleNamespace(id=1 + self.index // 6, shown=True)
+        result = Result(self.index, windows, time, (confirmed, TENTATIVE))
+        self.index += 1
+        return result
+
+    def annotate(self, frame, result):
+        drawn = frame.copy()
+        drawn[:6, :6] = 255
+        return drawn
+
+    def __call__(self, frame):
+        return self.annotate(frame, self.follow(self.search(frame), frame.shape, time=None))

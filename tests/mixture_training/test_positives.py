@@ -1,0 +1,197 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.helpers import SMALL_MIXTURE, drawn, scene_of
+from vehicle_detection.boxes import iou_matrix
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.mixture import PLANES, BoxRegressor, MixtureTemplate, mirror_planes
+from vehicle_detection.mixture_training import FrameDataset, train_mixture
+from vehicle_detection.mixture_training.negatives import Frame, frames_of
+from vehicle_detection.mixture_training.positives import (
+    align_mirrored,
+    jitter_boxes,
+    patch_features,
+    place_on_patch,
+    truncated_vehicles,
+    vehicle_features,
+    whole_vehicles,
+    window_features,
+)
+
+
+@pytest.fixture(scope="module")
+def source():
+    return FrameDataset("drawn", (drawn(range(12)),))
+
+
+def blank(columns=8, rows=7):
+    return MixtureTemplate(np.zeros((rows, columns, PLANES)), 0.0, (1.0, 1.0))
+
+
+def test_vehicles_are_taken_at_other_exposures_too(drawn_source):
+    frames = frames_of([source])
+    wide = [box for frame in frames for box in frame.boxes if box[2] - box[0] >= SMALL_MIXTURE.min_width]
+    for exposures in (0, 2):
+        params = dataclasses.replace(SMALL_MIXTURE, jitter=3, exposures=exposures)
+        seen = list(whole_vehicles(frames, params, np.random.default_rng(0)))
+        assert len(seen) == (3 + exposures) * len(wide)
+        others = [box for image, box in seen if not any(image is frame.image for frame in frames)]
+        assert len(others) == exposures * len(wide)
+        assert {tuple(box) for box in others} == ({tuple(box) for box in wide} if exposures else set())
+
+
+@given(seed=st.integers(0, 1000), count=st.integers(0, 8))
+def test_moved_boxes_still_show_their_vehicles(seed, count):
+    rng = np.random.default_rng(seed)
+    corners = rng.uniform(0, 500, (count, 2))
+    boxes = np.hstack([corners, corners + rng.uniform(20, 200, (count, 2))])
+    moved = jitter_boxes(boxes, rng)
+    assert moved.shape == boxes.shape
+    if count:
+        assert (np.diag(iou_matrix(boxes, moved)) > 0.15).all()
+        ratio = (moved[:, 2:] - moved[:, :2]) / (boxes[:, 2:] - boxes[:, :2])
+        assert (ratio > np.exp(-0.6) - 1e-9).all()
+        assert (ratio < np.exp(0.45) + 1e-9).all()
+
+
+def test_what_is_learnt_at_the_border_ends_there(drawn_source):
+    params = dataclasses.replace(SMALL_MIXTURE, border_shapes=((4, 5),))
+    frames = frames_of([source])
+    seen = list(truncated_vehicles(frames, params, np.random.default_rng(0)))
+    assert len(seen) > len(frames)
+    for image, box in seen:
+        assert box[2] == image.shape[1]
+        assert box[2] - box[0] >= params.min_width * (1 - params.jitter_scale)
+
+
+def test_a_vehicle_that_the_border_cuts_is_shown_in_several_places():
+    cut = Frame(np.zeros((90, 160, 3), np.uint8), np.array([[110.0, 20, 160, 60]]), np.empty((0, 4)), 0.0)
+    for copies in (1, 5):
+        params = dataclasses.replace(SMALL_MIXTURE, border_jitter=copies)
+        seen = [
+            box for _, box in truncated_vehicles([cut], params, np.random.default_rng(0)) if box[2] == 160
+        ]
+        assert len(seen) == copies
+        assert seen[0].tolist() == [110, 20, 160, 60]
+        assert len({tuple(box) for box in seen}) == len(seen)
+
+
+def test_turned_vehicles_face_the_same_way():
+    rng = np.random.default_rng(5)
+    side = rng.normal(0, 1, (4, 6, PLANES)).astype(np.float32)
+    mirrored = mirror_planes(side.transpose(2, 0, 1)).transpose(1, 2, 0)
+    views = np.stack([side.ravel(), mirrored.ravel()])
+    flipped = rng.integers(0, 2, 60)
+    pairs = np.stack([views[[flip, 1 - flip]] for flip in flipped])
+    rows = (pairs + rng.normal(0, 0.5, pairs.shape)).astype(np.float32).reshape(120, -1)
+    chosen = align_mirrored(rows, np.random.default_rng(0))
+    assert chosen.shape == (60, side.size)
+    nearer = np.array([np.linalg.norm(chosen - view, axis=1) for view in views]).argmin(axis=0)
+    assert len(set(nearer.tolist())) == 1
+    for index, row in enumerate(chosen):
+        assert any((row == pair).all() for pair in rows[2 * index : 2 * index + 2])
+    assert align_mirrored(np.empty((0, 8), np.float32), rng).shape == (0, 8)
+
+
+# Patches.
+
+
+def patch_of(seed):
+    """Cut a square around the widest vehicle of a scene; return its box on it as well, None if it is cut."""
+    scene = scene_of(seed)
+    box = np.array(max((v.box for v in scene.truth), key=lambda box: box[2] - box[0], default=(0, 0, 0, 0)))
+    side = round(1.1 * max(box[2] - box[0], box[3] - box[1]))
+    left, top = np.round((box[:2] + box[2:] - side) / 2).astype(int)
+    inside = left >= 0 and top >= 0 and left + side <= 356 and top + side <= 200
+    if side < 45 or not inside:
+        return None
+    return scene.image[top : top + side, left : left + side], box - np.tile([left, top], 2)
+
+
+def test_a_vehicle_is_placed_on_its_patch(drawn_source):
+    model = train_mixture([source], dataclasses.replace(SMALL_MIXTURE, rounds=(0.2,)), n_jobs=1)
+    found = [patch for patch in map(patch_of, range(100, 140)) if patch is not None]
+    assert len(found) > 5
+    before, after = (
+        [iou_matrix([place_on_patch(image, placing)], [box])[0, 0] for image, box in found]
+        for placing in (BoxRegressor.none(), model.box_regressor)
+    )
+    assert np.mean(after) > np.mean(before)
+    assert np.mean(after) > 0.75
+    image, _ = found[0]
+    inside = place_on_patch(image, model.box_regressor)
+    assert (inside[:2] >= 0).all()
+    assert (inside[2:] <= image.shape[1::-1]).all()
+
+
+def test_around_a_patch_the_template_sees_what_it_sees_on_the_average():
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (60, 80, 3), np.uint8)
+    template, none = blank(), BoxRegressor.none()
+    known = rng.normal(0, 1, (5, template.weights.size)).astype(np.float32)
+    (rows,) = patch_features([image], none, [template], [known], SMALL_MIXTURE)
+    plain, mirrored = rows.reshape(2, 7, 8, PLANES)
+    mean = known.mean(axis=0).reshape(7, 8, PLANES)
+    # The box leaves 5% of the width at the sides, a third of a cell; above and below there is nearly a cell.
+    ring = np.zeros((7, 8), bool)
+    ring[:, [0, -1]] = True
+    np.testing.assert_allclose(plain[ring], mean[ring], rtol=1e-6)
+    own = window_features(image, place_on_patch(image, none), template).transpose(1, 2, 0)
+    np.testing.assert_array_equal(plain[~ring], own[~ring])
+    back = mirror_planes(mirrored.transpose(2, 0, 1)).transpose(1, 2, 0)
+    np.testing.assert_array_equal(back, plain)
+
+
+def test_a_patch_with_room_around_its_vehicle_shows_it_all():
+    image = np.random.default_rng(0).integers(0, 256, (200, 200, 3), np.uint8)
+    # A correction that makes every box smaller.
+    shrink = BoxRegressor(np.zeros_like(BoxRegressor.none().weights), [0.2, 0.2, -0.2, -0.2])
+    known = np.zeros((1, blank().weights.size), np.float32)
+    (rows,) = patch_features([image], shrink, [blank()], [known], SMALL_MIXTURE)
+    own = window_features(image, place_on_patch(image, shrink), blank())
+    np.testing.assert_array_equal(rows[0], own.transpose(1, 2, 0).ravel())
+
+
+def test_patches_train_the_templates_of_their_shape(drawn_source):
+    frames, params = frames_of([source]), dataclasses.replace(SMALL_MIXTURE, near=0.0)
+    templates = [blank(8, 7), blank(5, 12)]
+    known = vehicle_features(whole_vehicles(frames, params, np.random.default_rng(0)), templates, params)
+    known = [
+        rows if len(rows) else np.zeros((1, t.weights.size), np.float32) for t, rows in zip(templates, known)
+    ]
+    image = np.zeros((64, 64, 3), np.uint8)
+    counts = [len(rows) for rows in patch_features([image], BoxRegressor.none(), templates, known, params)]
+    assert counts == [2, 0]
+
+
+@pytest.mark.parametrize(
+    ("patches", "message"),
+    [
+        (5, "patches must be"),
+        ([np.zeros((64, 64), np.uint8)], "patches must be"),
+        ([np.zeros((64, 64, 3))], "patches must be"),
+    ],
+    ids=["number", "gray", "float"],
+)
+def test_what_is_no_patch_is_refused(drawn_source, patches, message):
+    with pytest.raises(InvalidInputError, match=message):
+        train_mixture([source], SMALL_MIXTURE, patches=patches, n_jobs=1)
+
+
+def test_patches_are_further_vehicles(drawn_source):
+    patches = [patch[0] for patch in map(patch_of, range(100, 140)) if patch is not None]
+    params = dataclasses.replace(SMALL_MIXTURE, rounds=(0.2,))
+    lines = []
+    models = [
+        train_mixture([source], params, patches=given, n_jobs=jobs, on_step=lines.append)
+        for given, jobs in (((), 1), (patches, 1), (patches, 2))
+    ]
+    plain, one, two = (model.templates[0].weights for model in models)
+    assert (plain != one).any()
+    np.testing.assert_array_equal(one, two)
+    counts = [int(line.split("]")[0][1:]) for line in lines if line.endswith(" vehicles")]
+    assert counts[1] - counts[0] == 2 * len(patches)

@@ -1,0 +1,73 @@
+"""Frames out of the planes of video, and back."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vehicle_detection.video.yuv import Coding, planes_from_rgb, rgb_from_planes
+
+VALUES = st.integers(0, 255)
+SIZES = st.integers(1, 9)
+
+
+def planes_of(frame):
+    height, width = (side + side % 2 for side in frame.shape[:2])
+    planes = np.empty((height * 3 // 2, width), np.uint8)
+    planes_from_rgb(frame, planes, np.empty((3, height, width), np.uint8))
+    return planes
+
+
+def frame_of(planes, coding):
+    height, width = planes.shape[0] * 2 // 3, planes.shape[1]
+    return rgb_from_planes(planes, coding, np.empty((3, height, width), np.uint8))
+
+
+@given(SIZES, SIZES, VALUES, VALUES, VALUES)
+def test_planes_hold_the_color_of_video(half_height, half_width, red, green, blue):
+    planes = planes_of(np.full((half_height * 2, half_width * 2, 3), (red, green, blue), np.uint8))
+    luma = 0.299 * red + 0.587 * green + 0.114 * blue
+    expected = (
+        16 + 219 / 255 * luma,
+        128 + 224 / 255 * (blue - luma) / 1.772,
+        128 + 224 / 255 * (red - luma) / 1.402,
+    )
+    count = half_height * half_width
+    values = planes.reshape(-1)
+    for plane, level in zip(np.split(values, [4 * count, 5 * count]), expected, strict=True):
+        assert np.abs(plane - level).max() <= 0.51
+
+
+@given(VALUES, VALUES, VALUES, st.sampled_from(["unknown", "bt470bg", "bt709", "bt2020nc"]), st.booleans())
+def test_frames_follow_the_formula_of_their_coding(luma, blue, red, space, full):
+    planes = np.array([[luma] * 2] * 2 + [[blue, red]], np.uint8)
+    frame = frame_of(planes, Coding(space, full))
+    kr, kb = {"bt709": (0.2126, 0.0722), "bt2020nc": (0.2627, 0.0593)}.get(space, (0.299, 0.114))
+    y = luma / 255 if full else (luma - 16) / 219
+    u, v = ((value - 128) / (255 if full else 224) for value in (blue, red))
+    r, b = y + 2 * (1 - kr) * v, y + 2 * (1 - kb) * u
+    g = (y - kr * r - kb * b) / (1 - kr - kb)
+    expected = 255 * np.clip([r, g, b], 0, 1)
+    assert np.abs(frame.reshape(4, 3) - expected).max() <= 0.6
+
+
+@given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**32 - 1))
+def test_gray_survives_the_way_out_and_back(height, width, seed):
+    gray = np.random.default_rng(seed).integers(0, 256, (height, width, 1), np.uint8).repeat(3, axis=2)
+    back = frame_of(planes_of(gray), Coding())
+    assert np.abs(back[:height, :width].astype(int) - gray).max() <= 2
+    # An odd side grows by its last column or row.
+    assert (back[height:] == back[height - 1 : height]).all()
+    assert (back[:, width:] == back[:, width - 1 : width]).all()
+
+
+def test_thin_lines_keep_their_color():
+    # The color of one pixel in four would be either red or black in every other column.
+    lines = np.zeros((16, 16, 3), np.uint8)
+    lines[:, 1::2] = (255, 0, 0)
+    assert planes_of(lines)[16:].reshape(2, 8, 8)[1].mean() == pytest.approx(128 + 112 / 2, abs=1.5)
+
+
+def test_a_coding_of_an_unknown_color_space_says_so():
+    assert Coding("bt709").known
+    assert not Coding("ycgco").known
