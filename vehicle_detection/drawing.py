@@ -282,7 +282,7 @@ def track_text(track: Track, show: Collection[str]) -> str:
     >>> import numpy as np
     >>> track = Track(
     ...     id=3, box=np.array([0.0, 0, 9, 9]), score=1.5, state="confirmed", shown=True, age=1.0, misses=0,
-    ...     unseen=0.0, velocity=(0.0, 0.0), distance_m=23.6, distance_std_m=2.2, speed_mps=-1.25,
+    ...     time_since_update=0.0, velocity=(0.0, 0.0), distance_m=23.6, distance_std_m=2.2, speed_mps=-1.25,
     ...     speed_std_mps=0.5,
     ... )
     >>> track_text(track, ("id", "score", "distance", "speed"))
