@@ -119,14 +119,14 @@ class StubDetector:
         self.index, self.fps = 0, fps
 
     def search(self, frame):
+        self.shapes.add(frame.shape)
         if self.pause:  # the later a frame, the sooner it is done: the order is not for free
             time.sleep(self.pause / (1 + self.index))
         return float(frame.mean())
 
-    def follow(self, windows, shape, *, time):
-        self.shapes.add(shape)
+    def track(self, found, *, time):
         confirmed = SimpleNamespace(id=1 + self.index // 6, shown=True)
-        result = Result(self.index, windows, time, (confirmed, TENTATIVE))
+        result = Result(self.index, found, time, (confirmed, TENTATIVE))
         self.index += 1
         return result
 
@@ -136,4 +136,4 @@ class StubDetector:
         return drawn
 
     def __call__(self, frame):
-        return self.annotate(frame, self.follow(self.search(frame), frame.shape, time=None))
+        return self.annotate(frame, self.track(self.search(frame), time=None))

@@ -256,12 +256,12 @@ def test_a_search_is_used_again_and_again():
     fresh = [find_cars(image, classifier, search, n_jobs=1) for image in images]
     with BandSearch(classifier, n_jobs=2) as bands:
         for image, expected in zip(images * 2, fresh * 2):
-            found = bands.find(image, search)
+            found = bands.find_windows(image, search)
             np.testing.assert_array_equal(found.boxes, expected.boxes)
             np.testing.assert_array_equal(found.scores, expected.scores)
         bands.close()
         # A closed search starts its threads again.
-        assert len(bands.find(images[0], search)) == len(fresh[0])
+        assert len(bands.find_windows(images[0], search)) == len(fresh[0])
 
 
 def test_a_score_map_is_the_callers_own():
@@ -292,7 +292,7 @@ def test_many_threads_share_one_search(monkeypatch):
 
         def find(image):
             together.wait(10)
-            return bands.find(image, search)
+            return bands.find_windows(image, search)
 
         for found, expected in zip(callers.map(find, images), fresh):
             np.testing.assert_array_equal(found.scores, expected.scores)

@@ -19,6 +19,9 @@ for HOG; Felzenszwalb et al. (PAMI 2010), section 3, for linear templates as fil
 from __future__ import annotations
 
 import threading
+import time
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -48,6 +51,61 @@ from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import convert_color, hog_source, pick_hog_channels
 from vehicle_detection.params import PATCH_SIZE, FeatureParams, PixelBand, SearchParams
+from vehicle_detection.windows import band_windows, search_windows
+
+_THUMBNAIL_SHAPE = (18, 32)
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """The result of searching one frame; it depends on no other frame.
+
+    Attributes
+    ----------
+    windows
+        Windows with a score above the search's minimum.
+    vehicles
+        Vehicle boxes, if the model predicts them; None if they are derived from the windows. Scores below 0
+        are kept for tracking only.
+    shape
+        ``(height, width)`` of the frame.
+    thumbnail
+        ``(18, 32)`` float32 gray copy of the frame, for detecting scene cuts.
+    seconds
+        Duration of the search.
+    """
+
+    windows: Detections
+    vehicles: Detections | None
+    shape: tuple[int, int]
+    thumbnail: NDArray[np.float32]
+    seconds: float
+
+    @classmethod
+    def of(
+        cls, frame: NDArray[np.uint8], windows: Detections, vehicles: Detections | None, *, start: float
+    ) -> SearchResult:
+        """Build the result of a search of `frame` that began at ``time.perf_counter() == start``."""
+        height, width = frame.shape[:2]
+        # Subsampling is enough to detect a cut.
+        rows = np.linspace(0, height - 1, _THUMBNAIL_SHAPE[0]).astype(int)
+        columns = np.linspace(0, width - 1, _THUMBNAIL_SHAPE[1]).astype(int)
+        thumbnail = frame[np.ix_(rows, columns)].mean(axis=2, dtype=np.float32)
+        return cls(windows, vehicles, (height, width), thumbnail, time.perf_counter() - start)
+
+
+class FrameSearch(Protocol):
+    """What ``model.open_search()`` returns, for either kind of model."""
+
+    def find(
+        self, frame: NDArray[np.uint8], params: Any = None, *, min_vehicle_score: float = 0.0
+    ) -> SearchResult:
+        """Search a frame; thread-safe."""
+        ...
+
+    def close(self) -> None:
+        """Stop the threads; they start again on the next search."""
+        ...
 
 
 def find_cars(
@@ -91,7 +149,7 @@ def find_cars(
     """
     search = search or SearchParams.preset()
     with BandSearch(classifier, n_jobs=n_jobs) as bands:
-        return bands.find(image, search)
+        return bands.find_windows(image, search)
 
 
 class BandSearch:
@@ -110,7 +168,7 @@ class BandSearch:
     def __init__(self, classifier: VehicleClassifier, *, n_jobs: int | None = None) -> None:
         check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
         self._filters = _Filters(classifier)
-        self._crew = ThreadTeam(n_jobs, name="search")
+        self._team = ThreadTeam(n_jobs, name="search")
         self._local = threading.local()
 
     def __enter__(self) -> BandSearch:
@@ -121,16 +179,28 @@ class BandSearch:
 
     def close(self) -> None:
         """End the threads."""
-        self._crew.close()
+        self._team.close()
 
-    def find(self, image: NDArray[np.uint8], search: SearchParams) -> Detections:
+    def find(
+        self,
+        frame: NDArray[np.uint8],
+        params: SearchParams | None = None,
+        *,
+        min_vehicle_score: float = 0.0,
+    ) -> SearchResult:
+        """Search a frame; `min_vehicle_score` has no effect because vehicles are derived from the windows."""
+        start = time.perf_counter()
+        windows = self.find_windows(frame, params or SearchParams.preset())
+        return SearchResult.of(frame, windows, None, start=start)
+
+    def find_windows(self, image: NDArray[np.uint8], search: SearchParams) -> Detections:
         """Windows of all bands that score above ``search.min_score``."""
         check_image(image)
         check_type(search, "search", SearchParams, 'pass SearchParams.preset("default")')
         bands = search.place(image.shape)
         least = check_number(search.min_score, "min_score")
         with single_threaded_opencv():
-            parts = self._crew.map(
+            parts = self._team.map(
                 lambda band: _hits(self.score_map(image, band), band, self._filters, least), bands, cost=_cost
             )
         boxes, scores = zip(*parts)
@@ -147,6 +217,36 @@ class BandSearch:
         """
         buffers = self._local.__dict__.setdefault("buffers", Buffers())
         return self._filters.score_map(resize_band(image, band, buffers.take), buffers.take)
+
+
+class ReferenceSearch:
+    """The search of the same bands by `search_windows`, one patch per window: readable, slow and exact."""
+
+    def __init__(self, classifier: VehicleClassifier, *, n_jobs: int | None = None) -> None:
+        check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
+        self._classifier, self._n_jobs = classifier, n_jobs
+
+    def find(
+        self,
+        frame: NDArray[np.uint8],
+        params: SearchParams | None = None,
+        *,
+        min_vehicle_score: float = 0.0,
+    ) -> SearchResult:
+        """Search a frame; see `BandSearch.find`."""
+        start = time.perf_counter()
+        params = params or SearchParams.preset()
+        check_image(frame, "frame")
+        windows = np.concatenate([band_windows(band) for band in params.place(frame.shape)])
+        # Windows that extend beyond the frame have no pixels there for a patch.
+        windows = windows[(windows[:, 0] >= 0) & (windows[:, 2] <= frame.shape[1])]
+        found = search_windows(
+            frame, windows, self._classifier, min_score=params.min_score, n_jobs=self._n_jobs
+        )
+        return SearchResult.of(frame, found, None, start=start)
+
+    def close(self) -> None:
+        """Nothing to release."""
 
 
 def resized_shape(band: PixelBand) -> tuple[int, int]:

@@ -314,7 +314,7 @@ def test_a_known_horizon_limits_where_vehicles_stand(horizon):
     boxes = boxes[(boxes[:, 1] >= 0) & (boxes[:, 3] <= 360)]
     assert len(boxes) > 100
     width, foot = boxes[:, 2] - boxes[:, 0], boxes[:, 3]
-    slack, cell = 360 * params.horizon_error, width / 7
+    slack, cell = 360 * params.horizon_tolerance, width / 7
     low, high = (share * width / 1.8 + horizon * 360 for share in params.camera_height_m)
     assert (foot >= low - slack - 2 * cell).all()
     assert (foot <= high + slack + 2 * cell).all()
@@ -351,21 +351,21 @@ def test_frames_and_parameters_that_are_refused():
     with pytest.raises(InvalidInputError, match="method must be 'shared' for a mixture"):
         VehicleDetector(random_mixture(), method="windows")
     with pytest.raises(InvalidInputError, match="search must be a PyramidParams, got SearchParams"):
-        VehicleDetector(random_mixture(), search=SearchParams.preset())
+        VehicleDetector(random_mixture(), search_params=SearchParams.preset())
     with pytest.raises(InvalidInputError, match="search must be a SearchParams, got PyramidParams"):
-        VehicleDetector(load_classifier(), search=PyramidParams())
+        VehicleDetector(load_classifier(), search_params=PyramidParams())
 
 
 def test_the_detector_hands_out_what_the_search_finds():
     model = random_mixture()
     params = PyramidParams(min_width=60)
     expected = search_once(model, ROAD, params)
-    with VehicleDetector(model, search=params, n_jobs=1) as detector:
+    with VehicleDetector(model, search_params=params, n_jobs=1) as detector:
         found = detector.search(ROAD)
         assert found.windows.scores.tolist() == expected.windows.scores.tolist()
         assert detector.detect(ROAD).boxes.tolist() == expected.vehicles.boxes.tolist()
-        assert detector.process(ROAD).regions.boxes.tolist() == expected.vehicles.boxes.tolist()
-    with VehicleDetector(model, regions="heat", horizon=0.6, n_jobs=1) as detector:
+        assert detector.process(ROAD).detections.boxes.tolist() == expected.vehicles.boxes.tolist()
+    with VehicleDetector(model, region_params=HeatParams(), horizon=0.6, n_jobs=1) as detector:
         assert detector.search_params.horizon == 0.6
         assert detector.detect(ROAD).boxes.shape[1] == 4
 

@@ -334,7 +334,7 @@ def test_a_mixture_of_templates_tells_what_it_reaches_on_other_roads(tmp_path):
 
 
 def test_settings_of_the_course_s_way(tmp_path):
-    with VehicleDetector(n_jobs=1, regions="heat", horizon=0.5) as detector:
+    with VehicleDetector(n_jobs=1, region_params=HeatParams(), horizon=0.5) as detector:
         page = written(tmp_path, FRAMES, detector=detector)
     assert "<summary>Regions (heat map)</summary>" in page
     assert "<dt>threshold</dt><dd>2</dd>" in page

@@ -235,7 +235,7 @@ def test_frames_are_scored_as_the_detector_does(patch_set, frames, labels):
     classifier = train_classifier(train.patches, train.labels, params=FeatureParams(**SMALL), C=0.1)
     scores = []
     for each in (frames, other):
-        with VehicleDetector(classifier, search=SEARCH, horizon=each.horizon) as detector:
+        with VehicleDetector(classifier, search_params=SEARCH, horizon=each.horizon) as detector:
             found = FrameBoxes.from_detections({key: detector.detect(image) for key, image in each})
         scores.append(evaluate_detections(found, each.labels, frames=each.keys))
     assert row["frame_f1"] == pytest.approx(np.nanmean([score.f1 for score in scores]))

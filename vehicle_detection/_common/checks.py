@@ -20,10 +20,11 @@ def describe(value: object) -> str:
     return f"{text if len(text) <= 80 else text[:77] + '...'} ({type(value).__name__})"
 
 
-def check_type(value: object, name: str, kind: type, remedy: str) -> None:
-    """Raise unless `value` is a `kind`."""
+def check_type(value: object, name: str, kind: type | tuple[type, ...], remedy: str) -> None:
+    """Raise unless `value` is a `kind`, or one of several."""
     if not isinstance(value, kind):
-        raise InvalidInputError(f"{name} must be a {kind.__name__}, got {describe(value)}; {remedy}")
+        names = " or ".join(each.__name__ for each in (kind if isinstance(kind, tuple) else (kind,)))
+        raise InvalidInputError(f"{name} must be a {names}, got {describe(value)}; {remedy}")
 
 
 def check_image(image: object, name: str = "image") -> NDArray[np.uint8]:

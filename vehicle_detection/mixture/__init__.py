@@ -23,8 +23,9 @@ from vehicle_detection.mixture.features import (
     pyramid_levels,
     strip_boxes,
 )
-from vehicle_detection.mixture.model import MixtureSearch, TemplateMixture, load_model
+from vehicle_detection.mixture.model import TemplateMixture, load_model
 from vehicle_detection.mixture.rescoring import Projection, Rescorer
+from vehicle_detection.mixture.search import MixtureSearch
 from vehicle_detection.mixture.template import MixtureTemplate, smallest_box
 
 __all__ = [

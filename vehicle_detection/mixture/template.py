@@ -25,30 +25,30 @@ class MixtureTemplate:
         ``(rows, columns, 28)`` float32.
     bias
         Added to the weighted sum.
-    margin
+    padding
         Cells around the vehicle's box at the left and right, and above and below.
     border
         Whether it shows what is seen of a vehicle that the frame's right border cuts: it ends there, without
-        a margin, and is searched for at the border alone; at the left one it is mirrored.
+        a padding, and is searched for at the border alone; at the left one it is mirrored.
     """
 
     weights: NDArray[np.float32]
     bias: float
-    margin: tuple[float, float]
+    padding: tuple[float, float]
     border: bool = False
 
     def __post_init__(self) -> None:
         weights = finite_array(self.weights, "weights", (None, None, PLANES))
         check_number(self.bias, "bias")
         rows, columns = weights.shape[:2]
-        margin: object = self.margin
-        if not isinstance(margin, tuple) or len(margin) != 2:
-            raise InvalidInputError(f"margin must be two numbers of cells, got {describe(margin)}")
-        for cells, side in zip(margin, (columns, rows)):
+        padding: object = self.padding
+        if not isinstance(padding, tuple) or len(padding) != 2:
+            raise InvalidInputError(f"padding must be two numbers of cells, got {describe(padding)}")
+        for cells, side in zip(padding, (columns, rows)):
             # Above half a side nothing would be left for the box.
-            if not check_number(cells, "margin", low=-1) < side / 2:
+            if not check_number(cells, "padding", low=-1) < side / 2:
                 raise InvalidInputError(
-                    f"margin must leave cells for the box of {columns}x{rows} cells, got {describe(margin)}"
+                    f"padding must leave cells for the box of {columns}x{rows} cells, got {describe(padding)}"
                 )
         border: object = self.border
         if not isinstance(border, bool):
@@ -59,9 +59,9 @@ class MixtureTemplate:
     def box_cells(self) -> tuple[float, float]:
         """Columns and rows of cells that the vehicle's box fills."""
         rows, columns = self.weights.shape[:2]
-        return columns - self.margin[0] * (1 if self.border else 2), rows - 2 * self.margin[1]
+        return columns - self.padding[0] * (1 if self.border else 2), rows - 2 * self.padding[1]
 
-    def scores(self, planes: NDArray[np.float32], take: Take = new_array) -> NDArray[np.float32]:
+    def margins(self, planes: NDArray[np.float32], take: Take = new_array) -> NDArray[np.float32]:
         """Score of every window of a map, ``(rows, columns)`` float32; empty where none fits."""
         rows, columns = self.weights.shape[:2]
         shape = max(planes.shape[1] - rows + 1, 0), max(planes.shape[2] - columns + 1, 0)
@@ -87,18 +87,18 @@ class MixtureTemplate:
     ) -> NDArray[np.float64]:
         """Boxes, in pixels of the frame, of the windows that start at these cells of a map."""
         width, height = self.box_cells
-        left = level.left + (columns + self.margin[0]) * level.step_x
-        top = level.top + (rows + self.margin[1]) * level.step_y
+        left = level.left + (columns + self.padding[0]) * level.step_x
+        top = level.top + (rows + self.padding[1]) * level.step_y
         return np.stack([left, top, left + width * level.step_x, top + height * level.step_y], axis=1)
 
     def border_windows(
-        self, level: FeatureMap, end: float, *, left: bool, least: float, take: Take = new_array
+        self, level: FeatureMap, end: float, *, left: bool, min_margin: float, take: Take = new_array
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Boxes and scores, above the least, of the windows that end at a border at this pixel."""
         strip = border_strip(level, self.weights.shape[1], end, left=left)
-        scores = self.scores(strip, take)[:, 0] if strip is not None else np.empty(0, np.float32)
-        hits = np.flatnonzero(scores > least)
-        boxes = strip_boxes(level, hits, end, left=left, cells=self.box_cells, above=self.margin[1])
+        scores = self.margins(strip, take)[:, 0] if strip is not None else np.empty(0, np.float32)
+        hits = np.flatnonzero(scores > min_margin)
+        boxes = strip_boxes(level, hits, end, left=left, cells=self.box_cells, above=self.padding[1])
         return boxes, scores[hits].astype(np.float64)
 
 

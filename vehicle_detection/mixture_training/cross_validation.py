@@ -20,10 +20,10 @@ from vehicle_detection.evaluation import (
     match_detections,
     precision_recall_curve,
 )
-from vehicle_detection.mixture import MixtureSearch, TemplateMixture, without_noise
+from vehicle_detection.mixture import TemplateMixture
 from vehicle_detection.mixture_training.negatives import check_sources
 from vehicle_detection.mixture_training.train import FrameDataset, train_mixture
-from vehicle_detection.params import MixtureParams, PyramidParams
+from vehicle_detection.params import MixtureParams
 
 Floats = NDArray[np.float64]
 
@@ -190,18 +190,17 @@ def cross_validate_mixture(
 def detect_in_source(
     mixture: TemplateMixture, source: FrameDataset, *, n_jobs: int | None = None
 ) -> list[FoldDetections]:
-    """Find vehicles in all frames of a source as a detector does that is told nothing, weak ones too."""
-    search = MixtureSearch(mixture, n_jobs=1)
-    sizes = PyramidParams()
+    """Detect vehicles in all frames of a source, including weak ones; scores are margins."""
+    with mixture.open_search(n_jobs=1) as search, ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
 
-    def boxes_of(pair: tuple[Any, NDArray[np.uint8]]) -> tuple[Any, Detections]:
-        key, image = pair[0], without_noise(pair[1])
-        found = search.candidates(image, sizes)
-        return key, Detections(*mixture.vehicles(image, found, least=_LOWEST))
+        def detect(pair: tuple[Any, NDArray[np.uint8]]) -> tuple[Any, Detections]:
+            # An uncalibrated mixture has slope 1 and offset 0, so its scores are margins.
+            found = search.find(pair[1], min_vehicle_score=_LOWEST).vehicles
+            assert found is not None
+            return pair[0], found
 
-    with ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
         return [
-            FoldDetections(source.name, part, FrameBoxes.from_detections(dict(pool.map(boxes_of, part))))
+            FoldDetections(source.name, part, FrameBoxes.from_detections(dict(pool.map(detect, part))))
             for part in source.sets
         ]
 

@@ -207,7 +207,7 @@ def _windows_of(
             continue
         places, parts, values = [], [], []
         for size, level in enumerate(levels):
-            scores = view.template.scores(level.planes)
+            scores = view.template.margins(level.planes)
             rows, columns = np.divmod(choose(scores.ravel()), max(scores.shape[1], 1))
             parts.append(view.template.boxes(level, rows, columns))
             values.append(scores[rows, columns].astype(np.float64))
@@ -246,10 +246,10 @@ def _windows_at_ends(
         }
         places, parts, values = [], [np.empty((0, 4))], [np.empty(0)]
         for size, (level, strip) in strips.items():
-            scores = template.scores(strip).ravel()
+            scores = template.margins(strip).ravel()
             rows = choose(scores)
             parts.append(
-                strip_boxes(level, rows, end, left=left, cells=template.box_cells, above=template.margin[1])
+                strip_boxes(level, rows, end, left=left, cells=template.box_cells, above=template.padding[1])
             )
             values.append(scores[rows].astype(np.float64))
             places += [(size, row) for row in rows.tolist()]

@@ -32,7 +32,7 @@ def window_features(image: Image, box: Floats, template: MixtureTemplate) -> NDA
     cell = FINE if np.sqrt(step_x * step_y) < COARSE else COARSE
     if template.border:
         # The window ends with the box: its margin is part of what is warped.
-        box, inside = box - [template.margin[0] * step_x, 0, 0, 0], (float(columns), inside[1])
+        box, inside = box - [template.padding[0] * step_x, 0, 0, 0], (float(columns), inside[1])
     return box_planes(image, box.tolist(), inside, (columns, rows), cell)
 
 
@@ -143,7 +143,7 @@ def _beyond(image: Image, box: Floats, template: MixtureTemplate) -> NDArray[np.
     """Which cells of a template lie beyond the image by more than a part of a cell, ``(rows, columns)``."""
     outside = []
     for axis, (cells, margin, inside) in enumerate(
-        zip(template.weights.shape[1::-1], template.margin, template.box_cells)
+        zip(template.weights.shape[1::-1], template.padding, template.box_cells)
     ):
         step = (box[axis + 2] - box[axis]) / inside
         start = (box[axis] + (np.arange(cells) - margin) * step) / step

@@ -103,8 +103,8 @@ def _boxes(
     frame: Frame, search: MixtureSearch, params: MixtureParams, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
     """Boxes of a frame that show a vehicle, and boxes that do not."""
-    windows = search.candidates(frame.image, PyramidParams())
-    found, _ = search.mixture.proposals(frame.image, windows, least=_LEAST)
+    windows = search.score_windows(frame.image, PyramidParams())
+    found, _ = search.model.propose_boxes(frame.image, windows, min_margin=_LEAST)
     wrong = found[is_negative(found, frame)]
     right = found[iou_matrix(found, frame.boxes).max(axis=1, initial=0) >= _RIGHT]
     wide = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.min_width]

@@ -291,7 +291,7 @@ def _fit_box_regressor(
             return np.empty((0, CROP_LENGTH), np.float32), np.empty((0, 4))
         found = np.empty((0, 4))
         if search is not None:
-            found = vote_boxes(search.candidates(frame.image, params.search), least=-1.0)[0].boxes
+            found = vote_boxes(search.score_windows(frame.image, params.search), min_margin=-1.0)[0].boxes
         overlap = iou_matrix(found, frame.boxes)
         near = overlap.max(axis=1) >= 0.4
         wide = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.min_width]

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from vehicle_detection._common import check_choice, check_integer, check_number, describe
 from vehicle_detection.errors import InvalidInputError
@@ -118,6 +118,9 @@ class SearchParams:
     PixelBand(x1=0, y1=400, x2=1280, y2=656, window=(64, 64), step=(8, 8))
     """
 
+    horizon_tolerance: ClassVar[float] = 0.1
+    """Fraction of the frame's height by which the horizon of bands may be wrong."""
+
     bands: tuple[SearchBand, ...]
     horizon: float = 0.58
     min_score: float = 0.0
@@ -133,6 +136,11 @@ class SearchParams:
         check_number(self.horizon, "horizon", low=0, high=1)
         check_number(self.min_score, "min_score", low=-1e6, high=1e6)
         check_number(self.horizontal_padding, "horizontal_padding", low=0, high=0.9)
+
+    @classmethod
+    def default(cls) -> SearchParams:
+        """Parameters for searching when none are given: the preset ``"default"``."""
+        return cls.preset()
 
     @classmethod
     def preset(cls, name: str = "default") -> SearchParams:
@@ -231,7 +239,7 @@ class PyramidParams:
         flat road would carry it. None: everywhere.
     camera_height_m
         Heights in meters, least and most, at which the camera may be where the horizon is known.
-    horizon_error
+    horizon_tolerance
         By how much of the frame's height the horizon may be wrong; the default holds for any dash-cam.
     min_score
         Least score of a window that is told, in log-odds above the model's threshold.
@@ -247,7 +255,7 @@ class PyramidParams:
     per_octave: int = 5
     horizon: float | None = 0.5
     camera_height_m: tuple[float, float] = (0.9, 2.6)
-    horizon_error: float = 0.15
+    horizon_tolerance: float = 0.15
     min_score: float = 0.0
 
     def __post_init__(self) -> None:
@@ -265,14 +273,19 @@ class PyramidParams:
         if low > high:
             raise InvalidInputError(f"camera_height_m must be the least one first; got {describe(heights)}")
         object.__setattr__(self, "camera_height_m", (low, high))
-        check_number(self.horizon_error, "horizon_error", low=0, high=1)
+        check_number(self.horizon_tolerance, "horizon_tolerance", low=0, high=1)
         check_number(self.min_score, "min_score")
+
+    @classmethod
+    def default(cls) -> PyramidParams:
+        """Parameters for searching when none are given."""
+        return cls()
 
     def with_horizon(self, horizon: float | None) -> PyramidParams:
         """Return the same for a horizon that is known to 6% of the height; None changes nothing."""
         if horizon is None:
             return self
-        return dataclasses.replace(self, horizon=horizon, horizon_error=_KNOWN)
+        return dataclasses.replace(self, horizon=horizon, horizon_tolerance=_KNOWN)
 
     def sizes(self, columns: float, rows: float, shape: tuple[int, ...]) -> list[float]:
         """Pixels a cell of each level, for boxes of `columns` by `rows` cells in a frame of `shape`."""
@@ -290,7 +303,7 @@ class PyramidParams:
         if self.horizon is None:
             return 0, shape[0]
         near, far = (share * width / 1.8 for share in self.camera_height_m)
-        slack = self.horizon_error * shape[0]
+        slack = self.horizon_tolerance * shape[0]
         top = (self.horizon * shape[0]) + near - slack - height
         bottom = (self.horizon * shape[0]) + far + slack
         return max(0, math.floor(top)), min(shape[0], math.ceil(bottom))

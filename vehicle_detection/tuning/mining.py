@@ -89,7 +89,7 @@ def mine_negatives(
     names: list[str] = []
     with BandSearch(classifier, n_jobs=n_jobs) as bands:
         for key, image in pairs_of(images):
-            windows = _false_windows(bands.find(image, wanted), known.boxes[known.rows(key)])
+            windows = _false_windows(bands.find_windows(image, wanted), known.boxes[known.rows(key)])
             kept = windows[non_max_suppression(windows.boxes, windows.scores, threshold=overlap)]
             for box in np.rint(kept.boxes[:most]).astype(np.int64):
                 patches.append(cut_patch(image, box))

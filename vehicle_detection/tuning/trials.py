@@ -186,7 +186,7 @@ class Bench:
         return {**cells, "frame_f1_each": "; ".join(each)}
 
     def _score_set(self, classifier: VehicleClassifier, frames: LabelledFrames) -> dict[str, float]:
-        options: dict[str, Any] = {"search": self.search, "fit": self.region_params}
+        options: dict[str, Any] = {"search_params": self.search, "region_params": self.region_params}
         with VehicleDetector(classifier, horizon=frames.horizon, **options) as detector:
             found = FrameBoxes.from_detections({key: detector.detect(image) for key, image in frames})
         scores = evaluate_detections(found, frames.labels, frames=frames.keys)
