@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Take, new_array
+from vehicle_detection._common import NEW_ARRAYS, Workspace
 from vehicle_detection._kernels.jit import jit
 from vehicle_detection._kernels.vector import block_adder, host_block
 
@@ -47,7 +47,7 @@ class Filter:
         self._across[: len(cells)], self._down[: len(cells)] = places
 
     def add_to(
-        self, planes: NDArray[np.float32], scores: NDArray[np.float32], take: Take = new_array
+        self, planes: NDArray[np.float32], scores: NDArray[np.float32], workspace: Workspace = NEW_ARRAYS
     ) -> None:
         """Add, to each window's score, the products of its cells.
 
@@ -57,14 +57,14 @@ class Filter:
             ``(planes, rows, columns)`` float32, C-contiguous.
         scores
             Changed in place, ``(window rows, window columns)`` float32; at most as many as fit the map.
-        take
-            Hands out the memory.
+        workspace
+            Provides the scratch arrays.
         """
         down, across = self._reach
         _, rows, columns = planes.shape
         stride = columns + across + _COLUMNS
         # Sums also of windows that hang over on any side: so no product needs to ask.
-        sums = take((rows + down, stride), np.float32, "window sums")
+        sums = workspace.take((rows + down, stride), np.float32, "window sums")
         offsets = (down - self._down) * stride + across - self._across
         _correlate(planes, self._weights, offsets.reshape(-1, _ROWS), sums)
         height, width = scores.shape

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Take, new_array
+from vehicle_detection._common import NEW_ARRAYS, Workspace
 from vehicle_detection._kernels import fhog as _fhog_kernels
 
 PLANES = 28
@@ -39,17 +39,19 @@ _COTANGENTS = (np.cos(_BOUNDS) / np.sin(_BOUNDS)).astype(np.float32)
 _EPS = np.float32(2)
 
 
-def edge_sums(image: NDArray[np.uint8], take: Take = new_array) -> NDArray[np.float32]:
+def edge_sums(image: NDArray[np.uint8], workspace: Workspace = NEW_ARRAYS) -> NDArray[np.float32]:
     """Sum the edges of an image, by orientation, over squares of 4x4 pixels: ``(16, H // 4, W // 4)``."""
     height, width = image.shape[:2]
-    channels = take((3, height, width), np.uint8, "channels")
+    channels = workspace.take((3, height, width), np.uint8, "channels")
     cv2.split(image, list(channels))
-    sums = take((16, height // FINE, width // FINE), np.float32, "sums")
+    sums = workspace.take((16, height // FINE, width // FINE), np.float32, "sums")
     _fhog_kernels.orientation_sums(channels, _COTANGENTS, sums)
     return sums
 
 
-def planes_of_sums(sums: NDArray[np.float32], cell: int, take: Take = new_array) -> NDArray[np.float32]:
+def planes_of_sums(
+    sums: NDArray[np.float32], cell: int, workspace: Workspace = NEW_ARRAYS
+) -> NDArray[np.float32]:
     """Turn the edge sums of an image into the features of fine or coarse cells.
 
     Parameters
@@ -66,17 +68,19 @@ def planes_of_sums(sums: NDArray[np.float32], cell: int, take: Take = new_array)
     """
     per_cell = cell // FINE
     shape = sums.shape[1] // per_cell, sums.shape[2] // per_cell
-    cells = take((16, *shape), np.float32, "cells")
+    cells = workspace.take((16, *shape), np.float32, "cells")
     if per_cell == 1:
         _fhog_kernels.smooth_cells(sums, np.float32(1 / (64 * cell * cell)), cells)
     else:
         _fhog_kernels.pool_bilinear(sums, np.float32(1 / (16 * cell * cell)), cells)
-    planes = take((PLANES, *shape), np.float32, "planes")
+    planes = workspace.take((PLANES, *shape), np.float32, "planes")
     _fhog_kernels.fhog_normalize(cells, _EPS, planes)
     return planes
 
 
-def feature_planes(image: NDArray[np.uint8], cell: int, take: Take = new_array) -> NDArray[np.float32]:
+def feature_planes(
+    image: NDArray[np.uint8], cell: int, workspace: Workspace = NEW_ARRAYS
+) -> NDArray[np.float32]:
     """Compute the road features of an image.
 
     Parameters
@@ -85,15 +89,15 @@ def feature_planes(image: NDArray[np.uint8], cell: int, take: Take = new_array) 
         ``(H, W, 3)`` uint8, at least one cell high and wide; what is left of its sides is not used.
     cell
         Side of a cell in pixels, `FINE` or `COARSE`.
-    take
-        Hands out the memory.
+    workspace
+        Provides the scratch arrays.
 
     Returns
     -------
     numpy.ndarray
         ``(28, H // cell, W // cell)`` float32.
     """
-    return planes_of_sums(edge_sums(image, take), cell, take)
+    return planes_of_sums(edge_sums(image, workspace), cell, workspace)
 
 
 def mirror_planes(planes: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -165,7 +169,7 @@ def pyramid_levels(sizes: list[float], *, share: bool = True) -> list[Level]:
 
 
 def level_maps(
-    images: list[NDArray[np.uint8]], level: Level, rows: tuple[int, int], take: Take = new_array
+    images: list[NDArray[np.uint8]], level: Level, rows: tuple[int, int], workspace: Workspace = NEW_ARRAYS
 ) -> Iterator[tuple[float, FeatureMap]]:
     """Compute the maps of a frame, or of some of its rows, for each size of cells of a level.
 
@@ -177,8 +181,8 @@ def level_maps(
         The sizes.
     rows
         First row and the one after the last.
-    take
-        Hands out the memory: then a map is valid until the next one is asked for.
+    workspace
+        Provides the scratch arrays; a map is then valid until the next one is computed.
 
     Yields
     ------
@@ -195,18 +199,20 @@ def level_maps(
     strip = source[first:last]
     top, bottom = first * height / count, last * height / count
     size = max(round(width * level.shrink), COARSE), max(round((bottom - top) * level.shrink), COARSE)
-    small = np.asarray(cv2.resize(strip, size, dst=take((size[1], size[0], 3), np.uint8, "strip")), np.uint8)
+    small = np.asarray(
+        cv2.resize(strip, size, dst=workspace.take((size[1], size[0], 3), np.uint8, "strip")), np.uint8
+    )
     # Rows of the frame next to the wanted ones are in them already: only its own border is made up.
     border = BORDER if level.fine is not None else WIDE_BORDER
     above, below = (border if at_border else 0 for at_border in (first == 0, last == count))
     padding = (above, below + -(size[1] + above + below) % COARSE, border, border + -size[0] % COARSE)
     shape = (size[1] + padding[0] + padding[1], size[0] + padding[2] + padding[3], 3)
-    memory = take(shape, np.uint8, "padded")
+    memory = workspace.take(shape, np.uint8, "padded")
     padded = np.asarray(cv2.copyMakeBorder(small, *padding, cv2.BORDER_REPLICATE, dst=memory), np.uint8)
-    sums = edge_sums(padded, take)
+    sums = edge_sums(padded, workspace)
     pixel_x, pixel_y = width / size[0], (bottom - top) / size[1]
     for pixels, cell in level.sizes:
-        planes = planes_of_sums(sums, cell, take)
+        planes = planes_of_sums(sums, cell, workspace)
         yield (
             pixels,
             FeatureMap(planes, -border * pixel_x, top - above * pixel_y, cell * pixel_x, cell * pixel_y),

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import (
-    Buffers,
-    Take,
+    Workspace,
     ThreadTeam,
     check_image,
     check_number,
@@ -141,10 +140,10 @@ class MixtureSearch:
         rows = min((top for top, _ in reach), default=0), max((bottom for _, bottom in reach), default=0)
         if min(rows[1] - rows[0], shape[1]) * level.shrink < COARSE:
             return ScoredWindows.empty()
-        buffers = self._local.__dict__.setdefault("buffers", Buffers())
+        workspace = self._local.__dict__.setdefault("workspace", Workspace())
         found = [
-            self._hits(index, template, features, min_margin, shape[1], buffers.take)
-            for pixels, features in level_maps(images, level, rows, buffers.take)
+            self._hits(index, template, features, min_margin, shape[1], workspace)
+            for pixels, features in level_maps(images, level, rows, workspace)
             for index, template in templates[pixels]
         ]
         return ScoredWindows.join(found, shape)
@@ -168,16 +167,18 @@ class MixtureSearch:
         level: FeatureMap,
         min_margin: np.float32,
         width: int,
-        take: Take,
+        workspace: Workspace,
     ) -> ScoredWindows:
         if template.border:
             found = [
-                template.border_windows(level, end, left=left, min_margin=float(min_margin), take=take)
+                template.border_windows(
+                    level, end, left=left, min_margin=float(min_margin), workspace=workspace
+                )
                 for left, end in ((True, 0.0), (False, float(width)))
             ]
             boxes, margins = (np.concatenate(part) for part in zip(*found))
         else:
-            grid = template.margins(level.planes, take)
+            grid = template.margins(level.planes, workspace)
             rows, columns = (grid > min_margin).nonzero()
             boxes = template.boxes(level, rows, columns)
             margins = grid[rows, columns].astype(np.float64)

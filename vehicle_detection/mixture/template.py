@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Take, check_number, describe, finite_array, new_array
+from vehicle_detection._common import NEW_ARRAYS, Workspace, check_number, describe, finite_array
 from vehicle_detection._kernels import Filter
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture.features import PLANES, FeatureMap, border_strip, strip_boxes
@@ -61,7 +61,7 @@ class MixtureTemplate:
         rows, columns = self.weights.shape[:2]
         return columns - self.padding[0] * (1 if self.border else 2), rows - 2 * self.padding[1]
 
-    def margins(self, planes: NDArray[np.float32], take: Take = new_array) -> NDArray[np.float32]:
+    def margins(self, planes: NDArray[np.float32], workspace: Workspace = NEW_ARRAYS) -> NDArray[np.float32]:
         """Score of every window of a map, ``(rows, columns)`` float32; empty where none fits."""
         rows, columns = self.weights.shape[:2]
         shape = max(planes.shape[1] - rows + 1, 0), max(planes.shape[2] - columns + 1, 0)
@@ -69,9 +69,9 @@ class MixtureTemplate:
         if scores.shape[1] == 1:
             # Of a strip, the places of its windows are put side by side: they are worked on together.
             line = np.ascontiguousarray(planes.transpose(0, 2, 1)).reshape(-1, 1, planes.shape[1])
-            self._strip_filter.add_to(line, scores.reshape(1, -1), take)
+            self._strip_filter.add_to(line, scores.reshape(1, -1), workspace)
         elif scores.size:
-            self._filter.add_to(planes, scores, take)
+            self._filter.add_to(planes, scores, workspace)
         return scores
 
     @functools.cached_property
@@ -92,11 +92,17 @@ class MixtureTemplate:
         return np.stack([left, top, left + width * level.step_x, top + height * level.step_y], axis=1)
 
     def border_windows(
-        self, level: FeatureMap, end: float, *, left: bool, min_margin: float, take: Take = new_array
+        self,
+        level: FeatureMap,
+        end: float,
+        *,
+        left: bool,
+        min_margin: float,
+        workspace: Workspace = NEW_ARRAYS,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Boxes and scores, above the least, of the windows that end at a border at this pixel."""
         strip = border_strip(level, self.weights.shape[1], end, left=left)
-        scores = self.margins(strip, take)[:, 0] if strip is not None else np.empty(0, np.float32)
+        scores = self.margins(strip, workspace)[:, 0] if strip is not None else np.empty(0, np.float32)
         hits = np.flatnonzero(scores > min_margin)
         boxes = strip_boxes(level, hits, end, left=left, cells=self.box_cells, above=self.padding[1])
         return boxes, scores[hits].astype(np.float64)
