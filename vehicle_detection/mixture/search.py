@@ -177,7 +177,9 @@ def _score_template(
     """Windows of one template above `min_margin` on the feature map of a frame of `width` pixels."""
     if template.border:
         found = [
-            template.border_windows(feature_map, x, left=left, min_margin=float(min_margin), take=workspace)
+            template.border_windows(
+                feature_map, x, left=left, min_margin=float(min_margin), workspace=workspace
+            )
             for left, x in ((True, 0.0), (False, float(width)))
         ]
         boxes, margins = (np.concatenate(part) for part in zip(*found))
