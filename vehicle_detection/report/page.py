@@ -7,7 +7,7 @@ import dataclasses
 import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
@@ -93,8 +93,8 @@ class ModelSummary:
 
     title: str
     license: str
-    tables: list[Table] = field(default_factory=list)
-    groups: list[Group] = field(default_factory=list)
+    tables: list[Table]
+    groups: list[Group]
 
 
 def render_page(
