@@ -39,15 +39,15 @@ def random_classifier(params, seed=0, *, templates=1, bias=0.0):
 
 SMALL_MIXTURE = MixtureParams(
     shapes=((6, 5),),
-    facing=(False,),
+    mirrored=(False,),
     border_shapes=(),
     size_prior_weight=0.0,
     vote_weight=0.0,
     C=5e-3,
     border_C=5e-3,
-    vehicles=100.0,
-    rounds=(0.5, 1.0, 1.0),
-    per_frame=20,
+    positive_weight=100.0,
+    mining_schedule=(0.5, 1.0, 1.0),
+    max_per_frame=20,
     search=PyramidParams(min_width=28),
 )
 

@@ -118,16 +118,21 @@ def vote_boxes(
 
 
 def nms(
-    boxes: Floats, scores: Floats, *, iou: float = _NMS_IOU, cover: float = _NMS_COVER
+    boxes: Floats,
+    scores: Floats,
+    *,
+    iou: float = _NMS_IOU,
+    cover: float = _NMS_COVER,
+    max_boxes: int | None = None,
 ) -> NDArray[np.intp]:
-    """Rows of the boxes that greedy suppression keeps, best first.
+    """Rows of the boxes that greedy suppression keeps, best first, at most `max_boxes`.
 
     A box is removed by a better one at an IoU above `iou`, or if more than `cover` of the smaller one is
     covered.
     """
     remaining = np.argsort(-scores, kind="stable")
     kept: list[int] = []
-    while len(remaining):
+    while len(remaining) and len(kept) != max_boxes:
         best, remaining = remaining[0], remaining[1:]
         kept.append(best)
         overlap, covered = overlaps(boxes[best], boxes[remaining])
