@@ -300,10 +300,10 @@ def bad_images(material, tmp):
     return {
         r"IMAGE \S+missing.png does not exist; check the path": [tmp / "missing.png"],
         r"IMAGE \S+empty is a folder; name the files in it": [material / "empty"],
-        r"text.png must be a whole image file": [material / "text.png"],
-        r"cut_road.png must be a whole image file": [material / "cut_road.png"],
-        r"nothing.png must be a whole image file": [tmp / "nothing.png"],
-        r"floats.tiff must be a whole image file": [floats],
+        r"text.png must be a complete image file": [material / "text.png"],
+        r"cut_road.png must be a complete image file": [material / "cut_road.png"],
+        r"nothing.png must be a complete image file": [tmp / "nothing.png"],
+        r"floats.tiff must be a complete image file": [floats],
         r"image of 12x12 pixels holds no search window": [tiny, "--model", "highway"],
         r"horizon must be a number, at least 0 and at most 1; got 2": [road, "--horizon", 2],
         r"horizon must be a number, .* got nan": [road, "--horizon", "nan"],
@@ -614,7 +614,7 @@ def bad_training(material, tmp):
             "--vehicles", vehicles, "--non-vehicles", material / "empty", *model],
         r"1.png of \S+small is 32x32 pixels, expected 64x64": [
             "--vehicles", tmp / "small", "--non-vehicles", others, *model],
-        r"cut_road.png of \S+ must be a whole image file": [
+        r"cut_road.png of \S+ must be a complete image file": [
             "--vehicles", tmp / "cut", "--non-vehicles", others, *model],
         r"small.zip is not a zip": ["--vehicles", tmp / "small.zip", "--non-vehicles", others, *model],
         r"--non-vehicles \S+ is --vehicles \S+ as well": [

@@ -479,7 +479,7 @@ def _seek(frame: int, fps: float, track: TrackHistory) -> str:
 
 
 def _stages(report: VideoReport) -> str:
-    shares = report.shares
+    shares = report.stage_fractions
     each = 1e3 / max(report.frames, 1)
     rows = [
         (text(name), f"{seconds:.2f}", f"{seconds * each:.2f}", f"{share:.1%}{share_bar(share)}")
