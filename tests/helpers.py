@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
 from vehicle_detection.images import write_image
@@ -72,7 +73,7 @@ SMALL_MIXTURE = MixtureParams(
 
 @functools.cache
 def scene_of(seed):
-    return render_scene(shape=(200, 356), focal=420, vehicles=3, random_state=seed)
+    return render_scene(shape=(200, 356), focal_px=420, vehicles=3, random_state=seed)
 
 
 def drawn(seeds, name="road"):
@@ -84,10 +85,36 @@ def drawn(seeds, name="road"):
             x1, _, x2, _ = vehicle.box
             keys.append(key)
             boxes.append(vehicle.box)
-            ignore.append(bool(x2 - x1 < 28 or vehicle.hidden > 0.4 or vehicle.truncated > 0.4))
+            ignore.append(bool(x2 - x1 < 28 or vehicle.occluded_fraction > 0.4 or vehicle.truncated > 0.4))
     return LabelledFrames(
         name, [scene.image for scene in scenes], FrameBoxes(keys, None, boxes, ignore=ignore)
     )
+
+
+def check_truth(scene):
+    """Assert that the ground truth of a drawn scene is consistent with itself and with the image."""
+    height, width = scene.image.shape[:2]
+    for row in scene.truth:
+        x1, y1, x2, y2 = row.box
+        assert 0 <= x1 < x2 <= width
+        assert 0 <= y1 < y2 <= height
+        full = row.full_box
+        assert full[0] <= x1
+        assert full[1] <= y1
+        assert full[2] >= x2
+        assert full[3] >= y2
+        np.testing.assert_allclose(clip_boxes([full], (height, width))[0], row.box, atol=1.0)
+        assert 0 <= row.truncated < 1
+        assert 0 <= row.occluded_fraction <= 1
+        assert row.occluded == (2 if row.occluded_fraction > 0.5 else int(row.occluded_fraction >= 0.1))
+        assert row.ignore >= (row.occluded == 2 or x2 - x1 < 40 or row.truncated > 0.7)
+        pixels = np.argwhere(scene.instance_map == row.track)
+        if row.occluded_fraction == 0:
+            # Nothing hides the vehicle, so its visible pixels span its box exactly.
+            assert (*pixels.min(0)[::-1], *(pixels.max(0)[::-1] + 1)) == row.box
+        elif len(pixels):
+            assert (pixels.min(0)[::-1] >= [x1, y1]).all()
+            assert (pixels.max(0)[::-1] < [x2, y2]).all()
 
 
 def write_frame_set(folder, name, frames, *, place="frames"):

@@ -374,7 +374,7 @@ def train_and_evaluate(
 
     Examples
     --------
-    >>> from vehicle_detection.synthetic.drive import render_patches
+    >>> from vehicle_detection.synthetic import render_patches
     >>> patches, labels = render_patches(20)
     >>> names = [f"{'vehicles' if label else 'others'}/drawn/{n}.png" for n, label in enumerate(labels)]
     >>> small = FeatureParams(hog_channel=0)

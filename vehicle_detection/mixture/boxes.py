@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer, finite_array
 from vehicle_detection.boxes import box_areas, clip_boxes, intersection_matrix
-from vehicle_detection.mixture.crops import CROP_LENGTH, crop_features
+from vehicle_detection.mixture.crops import N_REGRESSION_FEATURES, regression_features
 
 MIN_MARGIN = -1.0
 """Minimum margin of a window that takes part in the voting."""
 
-# A window votes for a box at an IoU above the first; of two boxes on one vehicle, the weaker one is removed at
-# an IoU above the second or if more than the third of the smaller one is covered.
+# A window votes for a box at an IoU above the first; of two boxes on one vehicle, the weaker one is removed
+# at an IoU above the second or if more than the third of the smaller one is covered.
 _VOTE_IOU, _NMS_IOU, _NMS_COVER = 0.5, 0.35, 0.75
 # IoU above which two regressed boxes are duplicates.
 _DUPLICATE_IOU = 0.7
@@ -25,8 +25,8 @@ _DUPLICATE_IOU = 0.7
 _VOTE_MARGIN = -1.1
 _MAX_VEHICLES = 60
 _MIN_VISIBLE_FRACTION = 0.35
-# Largest shift of an edge per regression step, as a fraction of the box's side; a box is regressed again if one
-# of its edges moved by more than the second.
+# Largest shift of an edge per regression step, as a fraction of the box's side; a box is regressed again if
+# one of its edges moved by more than the second.
 _MAX_SHIFT, _SETTLED_SHIFT = 0.3, 0.15
 
 Floats = NDArray[np.float64]
@@ -87,8 +87,8 @@ def vote_boxes(
 ) -> tuple[ScoredWindows, Floats]:
     """Keep the best window of each group, with the weighted mean box of the windows that overlap it.
 
-    `windows` are sorted, best first; those below `min_margin` vote but are not kept. Also returns the vote mass
-    of each kept window: the sum of the voters' margins above `_VOTE_MARGIN`.
+    `windows` are sorted, best first; those below `min_margin` vote but are not kept. Also returns the vote
+    mass of each kept window: the sum of the voters' margins above `_VOTE_MARGIN`.
     """
     remaining = np.flatnonzero(windows.margins >= min_margin)
     boxes: list[Floats] = []
@@ -122,7 +122,8 @@ def nms(
 ) -> NDArray[np.intp]:
     """Rows of the boxes that greedy suppression keeps, best first.
 
-    A box is removed by a better one at an IoU above `iou`, or if more than `cover` of the smaller one is covered.
+    A box is removed by a better one at an IoU above `iou`, or if more than `cover` of the smaller one is
+    covered.
     """
     remaining = np.argsort(-scores, kind="stable")
     kept: list[int] = []
@@ -139,8 +140,8 @@ class BoxRegressor:
     """A linear regression of the shifts of a box's edges from the features of its crop.
 
     `weights` ``(length, 4)`` and `bias` ``(4,)`` float32 give shifts as fractions of the box's sides, from
-    `crop_features`. The regression runs `n_iterations` times; from the second time on only for boxes whose last
-    shift was large, because the crop of a misplaced box shows too little of its vehicle.
+    `regression_features`. The regression runs `n_iterations` times; from the second time on only for boxes
+    whose last shift was large, because the crop of a misplaced box shows too little of its vehicle.
     """
 
     weights: NDArray[np.float32]
@@ -149,20 +150,20 @@ class BoxRegressor:
 
     def __post_init__(self) -> None:
         check_integer(self.n_iterations, "n_iterations", low=1, high=10)
-        weights = finite_array(self.weights, "box_regressor.weights", (CROP_LENGTH, 4))
+        weights = finite_array(self.weights, "box_regressor.weights", (N_REGRESSION_FEATURES, 4))
         object.__setattr__(self, "weights", weights)
         object.__setattr__(self, "bias", finite_array(self.bias, "box_regressor.bias", (4,)))
 
     @classmethod
     def none(cls) -> BoxRegressor:
         """Return a regressor that shifts nothing."""
-        return cls(np.zeros((CROP_LENGTH, 4), np.float32), np.zeros(4, np.float32))
+        return cls(np.zeros((N_REGRESSION_FEATURES, 4), np.float32), np.zeros(4, np.float32))
 
     def shifts(self, image: NDArray[np.uint8], boxes: Floats) -> Floats:
         """Shifts of the edges of each box, ``(N, 4)``, as fractions of the box's sides."""
         if not len(boxes):
             return np.empty((0, 4))
-        shifts = crop_features(image, boxes) @ self.weights + self.bias
+        shifts = regression_features(image, boxes) @ self.weights + self.bias
         return np.clip(shifts.astype(np.float64), -_MAX_SHIFT, _MAX_SHIFT)
 
     def apply(self, image: NDArray[np.uint8], windows: ScoredWindows) -> tuple[Floats, Floats]:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import (
-    Workspace,
     ThreadTeam,
+    Workspace,
     check_image,
     check_number,
     check_type,
@@ -18,13 +18,13 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.boxes import Detections
 from vehicle_detection.mixture.boxes import MIN_MARGIN, ScoredWindows
-from vehicle_detection.mixture.denoise import without_noise
+from vehicle_detection.mixture.denoise import denoise
 from vehicle_detection.mixture.features import (
     COARSE,
     FeatureMap,
-    Level,
+    PyramidLevel,
+    feature_maps,
     image_pyramid,
-    level_maps,
     pyramid_levels,
 )
 from vehicle_detection.mixture.model import TemplateMixture
@@ -36,7 +36,7 @@ _MAX_WINDOWS = 2000
 
 
 class MixtureSearch:
-    """A search with threads and buffers kept from frame to frame; thread-safe."""
+    """A search with threads and workspace kept from frame to frame; thread-safe."""
 
     def __init__(self, model: TemplateMixture, *, n_jobs: int | None = None) -> None:
         check_type(model, "model", TemplateMixture, 'load_model("default") or train_mixture return one')
@@ -89,7 +89,7 @@ class MixtureSearch:
         check_image(frame, "frame")
         model = self.model
         with single_threaded_opencv():
-            image = without_noise(frame)
+            image = denoise(frame)
             found = self.score_windows(image, params)
             boxes, margins = model.detect_vehicles(
                 image, found, min_margin=model.margin_of(min_vehicle_score)
@@ -114,72 +114,78 @@ class MixtureSearch:
             parts = self._team.map(
                 lambda level: self._search_level(images, level, params, min_margin),
                 levels,
-                cost=lambda level: level.shrink,
+                cost=lambda level: level.scale,
             )
         return ScoredWindows.join(parts, shape).best(_MAX_WINDOWS)
 
     def _search_level(
-        self, images: list[NDArray[np.uint8]], level: Level, params: PyramidParams, min_margin: np.float32
+        self,
+        images: list[NDArray[np.uint8]],
+        level: PyramidLevel,
+        params: PyramidParams,
+        min_margin: np.float32,
     ) -> ScoredWindows:
         """Windows of all templates on one resized frame."""
         shape = images[0].shape[:2]
         templates = {
-            pixels: [
+            size: [
                 (index, template)
                 for index, template in enumerate(self.model.templates)
-                if template.box_cells[0] * pixels >= params.min_width * 0.999
-                and template.box_cells[1] * pixels <= params.max_height * shape[0]
+                if template.box_cells[0] * size >= params.min_width * 0.999
+                and template.box_cells[1] * size <= params.max_height * shape[0]
             ]
-            for pixels, _ in level.sizes
+            for size, _ in level.sizes
         }
-        reach = [
-            self._rows(template, pixels, params, shape)
-            for pixels, those in templates.items()
-            for _, template in those
+        ranges = [
+            _row_range(template, size, params, shape)
+            for size, used in templates.items()
+            for _, template in used
         ]
-        rows = min((top for top, _ in reach), default=0), max((bottom for _, bottom in reach), default=0)
-        if min(rows[1] - rows[0], shape[1]) * level.shrink < COARSE:
+        rows = min((top for top, _ in ranges), default=0), max((bottom for _, bottom in ranges), default=0)
+        if min(rows[1] - rows[0], shape[1]) * level.scale < COARSE:
             return ScoredWindows.empty()
         workspace = self._local.__dict__.setdefault("workspace", Workspace())
         found = [
-            self._hits(index, template, features, min_margin, shape[1], workspace)
-            for pixels, features in level_maps(images, level, rows, workspace)
-            for index, template in templates[pixels]
+            _score_template(index, template, feature_map, min_margin, shape[1], workspace)
+            for size, feature_map in feature_maps(images, level, rows, workspace)
+            for index, template in templates[size]
         ]
         return ScoredWindows.join(found, shape)
 
-    @staticmethod
-    def _rows(
-        template: MixtureTemplate, pixels: float, params: PyramidParams, shape: tuple[int, ...]
-    ) -> tuple[int, int]:
-        width, height = (cells * pixels for cells in template.box_cells)
-        if template.border:
-            # A truncated vehicle is wider than its visible part.
-            width = max(width, height)
-        top, bottom = params.rows(width, height, shape)
-        padding = round(template.padding[1] * pixels)
-        return max(0, top - padding), min(shape[0], bottom + padding)
 
-    @staticmethod
-    def _hits(
-        index: int,
-        template: MixtureTemplate,
-        level: FeatureMap,
-        min_margin: np.float32,
-        width: int,
-        workspace: Workspace,
-    ) -> ScoredWindows:
-        if template.border:
-            found = [
-                template.border_windows(
-                    level, end, left=left, min_margin=float(min_margin), workspace=workspace
-                )
-                for left, end in ((True, 0.0), (False, float(width)))
-            ]
-            boxes, margins = (np.concatenate(part) for part in zip(*found))
-        else:
-            grid = template.margins(level.planes, workspace)
-            rows, columns = (grid > min_margin).nonzero()
-            boxes = template.boxes(level, rows, columns)
-            margins = grid[rows, columns].astype(np.float64)
-        return ScoredWindows(boxes, margins, np.full(len(boxes), index, np.intp))
+def _row_range(
+    template: MixtureTemplate, size: float, params: PyramidParams, shape: tuple[int, ...]
+) -> tuple[int, int]:
+    """Rows of the frame that a template with cells of `size` pixels covers, as a half-open range."""
+    width, height = (cells * size for cells in template.box_cells)
+    if template.border:
+        # A truncated vehicle is wider than its visible part.
+        width = max(width, height)
+    top, bottom = params.rows(width, height, shape)
+    padding = round(template.padding[1] * size)
+    return max(0, top - padding), min(shape[0], bottom + padding)
+
+
+def _score_template(
+    index: int,
+    template: MixtureTemplate,
+    feature_map: FeatureMap,
+    min_margin: np.float32,
+    width: int,
+    workspace: Workspace,
+) -> ScoredWindows:
+    """Windows of one template above `min_margin` on the feature map of a frame of `width` pixels."""
+    if template.border:
+        found = [
+            template.border_windows(
+                feature_map, x, left=left, min_margin=float(min_margin), workspace=workspace
+            )
+            for left, x in ((True, 0.0), (False, float(width)))
+        ]
+        boxes, margins = (np.concatenate(part) for part in zip(*found))
+    else:
+        grid = template.margins(feature_map.channels, workspace)
+        rows, columns = (grid > min_margin).nonzero()
+        boxes = template.boxes(feature_map, rows, columns)
+        margins = grid[rows, columns].astype(np.float64)
+    return ScoredWindows(boxes, margins, np.full(len(boxes), index, np.intp))
