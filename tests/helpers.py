@@ -1,6 +1,8 @@
 """Helpers shared by the tests."""
 
 import functools
+import signal
+import subprocess
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +19,23 @@ from vehicle_detection.synthetic import render_scene
 
 ROOT = Path(__file__).parents[1]
 """Root of the repository."""
+
+
+def start_interruptible(*command, **options):
+    """Start a program that SIGINT interrupts, even if pytest is a background job, which ignores SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return subprocess.Popen(
+            [str(word) for word in command],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            **options,
+        )
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def random_template(params, seed=0, *, bias=0.0):
