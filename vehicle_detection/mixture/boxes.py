@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer, finite_array
-from vehicle_detection.boxes import box_areas, clip_boxes, intersection_matrix
+from vehicle_detection.boxes import box_areas, clip_boxes, greedy_nms, iter_nms, overlap_matrices
 from vehicle_detection.mixture.crops import CROP_LENGTH, crop_features
 
 WEAKEST = -1.0
@@ -76,11 +77,8 @@ def mostly_inside(boxes: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 def overlaps(box: Floats, others: Floats) -> tuple[Floats, Floats]:
     """IoU of a box with others, and the share of the smaller of both that they share."""
-    shared = intersection_matrix(box[None], others)[0]
-    area, areas = float(box_areas(box[None])[0]), box_areas(others)
-    return shared / np.maximum(area + areas - shared, 1e-9), shared / np.maximum(
-        np.minimum(area, areas), 1e-9
-    )
+    iou, coverage = overlap_matrices(box[None], others)
+    return iou[0], coverage[0]
 
 
 def vote_boxes(
@@ -102,28 +100,19 @@ def vote_boxes(
     numpy.ndarray
         Support of each: the sum of what the windows that vote for it exceed -1.1 by.
     """
-    left = np.flatnonzero(windows.scores >= least)
+    order = np.flatnonzero(windows.scores >= least)
     boxes: list[Floats] = []
     kept: list[int] = []
     vote_mass: list[float] = []
     strengths = np.maximum(windows.scores - _VOTE_FROM, 0)
     weights = strengths**2
-    # In columns, and with the areas known: this is done for every group of every frame.
-    columns, areas = np.ascontiguousarray(windows.boxes.T), box_areas(windows.boxes)
-    while len(left) and len(kept) < most:
-        best = int(left[0])
-        low = np.maximum(columns[:2], columns[:2, best, None])
-        width, height = np.maximum(np.minimum(columns[2:], columns[2:, best, None]) - low, 0)
-        shared = width * height
-        iou = shared / np.maximum(areas + areas[best] - shared, 1e-9)
+    for best, iou in islice(iter_nms(windows.boxes, order, max_iou=_VOTE), most):
         voters = iou > _VOTE
         vote_mass.append(float(strengths @ voters))
         votes = weights * voters
         votes[best] = max(votes[best], 1e-9)
         boxes.append(votes @ windows.boxes / votes.sum())
         kept.append(best)
-        left = left[iou[left] <= _VOTE]
-        left = left[left != best]
     rows = np.array(kept, np.intp)
     groups = ScoredWindows(np.array(boxes).reshape(-1, 4), windows.scores[rows], windows.templates[rows])
     return groups, np.array(vote_mass)
@@ -135,14 +124,7 @@ def nms(boxes: Floats, scores: Floats, *, iou: float = _IOU, cover: float = _COV
     Two boxes are on one vehicle whose IoU is above `iou`, or of which the smaller one is covered by more than
     `cover`.
     """
-    left = np.argsort(-scores, kind="stable")
-    kept: list[int] = []
-    while len(left):
-        best, left = left[0], left[1:]
-        kept.append(best)
-        overlap, covered = overlaps(boxes[best], boxes[left])
-        left = left[(overlap <= iou) & (covered <= cover)]
-    return np.array(kept, np.intp)
+    return greedy_nms(boxes, scores, max_iou=iou, max_coverage=cover)
 
 
 @dataclass(frozen=True, eq=False)
