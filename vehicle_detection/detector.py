@@ -317,7 +317,7 @@ class VehicleDetector:
         self._tracker.set_camera(self._camera_of(found.shape))
         if self._is_cut(found):
             self._history.clear()
-            self._tracker.cut()
+            self._tracker.end_tracks()
         self._thumbnail = found.thumbnail
         if self.regions == "heat":
             heat = self._history.add(frame_heat(found.shape, found.windows, self.heat_params))

@@ -420,7 +420,7 @@ def test_video_can_be_quiet_and_take_a_part(clip, tmp_path):
 
 def test_video_looks_for_the_horizon_first(clip, tmp_path, monkeypatch):
     words = ["video", clip, tmp_path / "out.mp4", "--end", 0.12, "--horizon", "auto"]
-    found = HorizonEstimate(horizon=0.551, error=0.012, camera_height_m=1.3, boxes=40)
+    found = HorizonEstimate(horizon=0.551, horizon_std=0.012, camera_height_m=1.3, n_boxes=40)
     monkeypatch.setattr(_clip_horizon, "estimate_video_horizon", lambda *_, **__: found)
     assert "horizon 0.551, give or take 0.012, from 40 boxes" in succeed(*words)
     monkeypatch.setattr(_clip_horizon, "estimate_video_horizon", lambda *_, **__: None)

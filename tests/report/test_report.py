@@ -305,10 +305,10 @@ def test_an_hour_of_video_is_a_small_page(tmp_path):
 
 def test_settings_and_model_are_those_of_the_detector(tmp_path):
     camera = Camera.for_frame((720, 1280), height_m=1.75)
-    options = {"camera": camera, "track": TrackParams(gate=0.625)}
+    options = {"camera": camera, "track": TrackParams(max_distance=0.625)}
     with VehicleDetector(load_classifier(), n_jobs=1, **options) as detector:
         page = written(tmp_path, FRAMES, detector=detector)
-    assert "<dt>gate</dt><dd>0.625</dd>" in page
+    assert "<dt>max distance</dt><dd>0.625</dd>" in page
     assert "<dt>height m</dt><dd>1.75</dd>" in page
     assert "<summary>Camera</summary>" in page
     assert "<summary>Regions (fitted boxes)</summary>" in page

@@ -310,7 +310,8 @@ def _look_for_horizon(
     if not quiet and found is None:
         print_error("warning: --horizon auto: the vehicles do not tell the horizon; it is left open")
     elif not quiet and found is not None:
-        typer.echo(f"horizon {found.horizon:.3f}, give or take {found.error:.3f}, from {found.boxes} boxes")
+        std, count = found.horizon_std, found.n_boxes
+        typer.echo(f"horizon {found.horizon:.3f}, give or take {std:.3f}, from {count} boxes")
     return None if found is None else found.horizon
 
 

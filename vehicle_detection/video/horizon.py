@@ -59,5 +59,5 @@ def estimate_video_horizon(
         found = estimate_horizon(np.concatenate(boxes), shape)
     except InvalidInputError:
         return None
-    likely = found.error <= LARGEST_ERROR and _LOWEST <= found.camera_height_m <= _HIGHEST
+    likely = found.horizon_std <= LARGEST_ERROR and _LOWEST <= found.camera_height_m <= _HIGHEST
     return found if likely and 0 <= found.horizon <= 1 else None
