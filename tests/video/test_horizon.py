@@ -36,7 +36,7 @@ def test_two_frames_a_second_tell_the_horizon(clip):
     found = estimate_video_horizon(clip, finder)
     assert finder.frames == 6
     assert found.horizon == pytest.approx(0.55, abs=0.01)
-    assert estimate_video_horizon(clip, finder, start=1, end=2).boxes == 40
+    assert estimate_video_horizon(clip, finder, start=1, end=2).n_boxes == 40
 
 
 def test_no_more_frames_than_it_takes(clip):
