@@ -1,4 +1,3 @@
-import json
 import logging
 import math
 import shutil
@@ -28,9 +27,6 @@ from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation import (
     FrameBoxes,
     LabelledFrames,
-    Platt,
-    calibrate_scores,
-    calibration_error,
     evaluate_detections,
     read_labels,
 )
@@ -38,7 +34,7 @@ from vehicle_detection.features import extract_features
 from vehicle_detection.params import FeatureParams, SearchBand, SearchParams
 from vehicle_detection.plotting import plot_tradeoff
 from vehicle_detection.search import find_cars
-from vehicle_detection.synthetic import render_drive, render_patches, render_scene
+from vehicle_detection.synthetic import render_patches, render_scene
 from vehicle_detection.tuning import (
     FeatureCache,
     ResultTable,
@@ -243,16 +239,6 @@ def test_frames_are_scored_as_the_detector_does(patch_set, frames, labels):
     assert row["frame_f1"] <= row["frame_best_f1"] + 1e-12
     assert row["frame_f1_each"].split()[::2] == ["drawn", "again"]
     assert row["search_ms"] > 0
-
-
-def test_the_best_f1_chooses_its_threshold(labels):
-    # Two right and sure, one wrong and unsure: without the last one the F1 is 1.
-    boxes = labels.boxes[~labels.ignore][:1]
-    found = FrameBoxes([0, 0], None, np.concatenate([boxes, [[600, 0, 630, 20]]]), scores=[2.0, 0.5])
-    true = FrameBoxes([0], None, boxes)
-    assert evaluate_detections(found, true).f1 == pytest.approx(2 / 3)
-    assert _trials.best_f1(found, true) == 1.0
-    assert _trials.best_f1(FrameBoxes([], None, []), true) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -969,126 +955,6 @@ def test_real_frames_are_mined_beside_their_labels(real_data, careless):
         boxes = labels.boxes[labels.rows(frame)]
         inside = np.minimum(boxes[:, 2:], box[2:]) - np.maximum(boxes[:, :2], box[:2])
         assert not (inside > 1).all(axis=1).any()
-
-
-# Labelled frames
-
-
-def test_labelled_frames_say_what_they_are(frames, labels, scenes):
-    assert repr(frames) == f"LabelledFrames('drawn', 2 frames, {len(labels)} boxes)"
-    assert (len(frames), frames.keys) == (2, (0, 1))
-    assert [image.shape for _, image in frames] == [(360, 640, 3)] * 2
-    one = LabelledFrames("one", {1: scenes[1].image}, labels)
-    assert set(one.labels.frames) == {1}
-
-
-def test_labelled_frames_of_a_video(tmp_path, labels):
-    import imageio_ffmpeg
-
-    drive = render_drive(frames=7, shape=(96, 160))
-    path = tmp_path / "drive.mp4"
-    writer = imageio_ffmpeg.write_frames(str(path), (160, 96), fps=25, macro_block_size=1)
-    writer.send(None)
-    for scene in drive:
-        writer.send(scene.image.tobytes())
-    writer.close()
-    taken = LabelledFrames.from_video(path, labels, every=3, horizon=0.5)
-    assert (taken.name, taken.keys, taken.horizon) == ("drive", (0, 3, 6), 0.5)
-    assert set(taken.labels.frames) == {0}
-    with pytest.raises(InvalidInputError, match="every must be an integer at least 1"):
-        LabelledFrames.from_video(path, labels, every=0)
-
-
-def test_labelled_frames_that_make_no_sense(frames, labels):
-    images = [image for _, image in frames]
-    for arguments, message in (
-        (("", images, labels), "name must be a word for the frames"),
-        (("a", [], labels), "frames must hold at least one image"),
-        (("a", images, labels, 1.5), "horizon must be a number, at least 0 and at most 1"),
-        (("a", images, labels.renamed(lambda key: key + 10)), "labels know none of the frames"),
-        (("a", "frames", labels), "frames must be a list of images"),
-    ):
-        with pytest.raises(InvalidInputError, match=message):
-            LabelledFrames(*arguments)
-
-
-# Calibration
-
-
-def drawn_scores(a, b, count=4000, seed=0):
-    rng = np.random.default_rng(seed)
-    scores = rng.normal(0, 2, count)
-    return scores, rng.random(count) < 1 / (1 + np.exp(a * scores + b))
-
-
-@pytest.mark.parametrize(("a", "b"), [(-2.0, 0.5), (-0.1, -1.0), (1.0, 0.0)])
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
-def test_the_sigmoid_is_found_again(a, b, scale):
-    scores, truth = drawn_scores(a, b)
-    platt = calibrate_scores(scores * scale, truth)
-    assert platt.a * scale == pytest.approx(a, rel=0.15, abs=0.05)
-    assert platt.b == pytest.approx(b, rel=0.15, abs=0.1)
-    assert calibration_error(platt.probability(scores * scale), truth) < 0.025
-
-
-def test_the_sigmoid_is_that_of_scikit_learn():
-    from sklearn.calibration import CalibratedClassifierCV
-    from sklearn.frozen import FrozenEstimator
-    from sklearn.svm import LinearSVC
-
-    scores, truth = drawn_scores(-1.5, 0.3, count=300)
-    svm = LinearSVC().fit(scores[:, None], truth)
-    theirs = CalibratedClassifierCV(FrozenEstimator(svm), method="sigmoid").fit(scores[:, None], truth)
-    values = svm.decision_function(scores[:, None])
-    ours = calibrate_scores(values, truth).probability(values)
-    np.testing.assert_allclose(ours, theirs.predict_proba(scores[:, None])[:, 1], atol=1e-3)
-
-
-def test_separable_scores_stay_unsure():
-    platt = calibrate_scores([-1.0, -1.0, 1.0, 1.0], [0, 0, 1, 1])
-    # Platt's prior: two of two is 3/4.
-    assert platt.probability([-1.0, 1.0]) == pytest.approx([0.25, 0.75], abs=1e-4)
-    level = calibrate_scores([0.3, 0.3], [0, 1])
-    assert level.probability(0.3) == pytest.approx(0.5, abs=1e-6)
-
-
-@given(
-    scores=st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=20),
-    a=st.floats(-100, -1e-3),
-    b=st.floats(-10, 10),
-)
-def test_probabilities_rise_with_the_score(scores, a, b):
-    platt = Platt(a, b)
-    probabilities = platt.probability(sorted(scores))
-    assert ((probabilities >= 0) & (probabilities <= 1)).all()
-    assert (np.diff(probabilities) >= 0).all()
-
-
-@given(probability=st.floats(0.001, 0.999), a=st.floats(-10, -0.1), b=st.floats(-5, 5))
-def test_a_threshold_has_its_probability(probability, a, b):
-    platt = Platt(a, b)
-    assert platt.probability(platt.score(probability)) == pytest.approx(probability)
-    assert Platt(**json.loads(json.dumps(platt.to_dict()))) == platt
-
-
-def test_calibrating_what_makes_no_sense():
-    for scores, truth, message in (
-        ([], [], "scores must be a one-dimensional array of numbers"),
-        ([[1.0]], [1], "scores must be a one-dimensional array of numbers"),
-        ([math.inf, 0], [1, 0], "scores must be finite"),
-        ([0.5, 1.0], [1], "labels must be 0 or 1 for each of the 2 scores"),
-        ([0.5, 1.0], [1, -1], "labels of -1 and 1 convert with labels > 0"),
-        ([0.5, 1.0], [1, 1], "labels must hold both classes"),
-    ):
-        with pytest.raises(InvalidInputError, match=message):
-            calibrate_scores(scores, truth)
-    with pytest.raises(InvalidInputError, match="a must be a number"):
-        Platt(math.nan, 0.0)
-    with pytest.raises(InvalidInputError, match="scores must be numbers without NaN"):
-        Platt(-1.0, 0.0).probability([math.nan])
-    for platt, probability in ((Platt(-1.0, 0.0), 1.0), (Platt(0.0, 0.0), 0.5)):
-        with pytest.raises(InvalidInputError, match=r"probability must lie in \(0, 1\) and a must not be 0"):
-            platt.score(probability)
 
 
 # The course's tables

@@ -13,7 +13,7 @@ from vehicle_detection._common.checks import (
     describe,
     finite_array,
 )
-from vehicle_detection._common.files import atomic_write, check_target
+from vehicle_detection._common.files import atomic_write, check_target, write_parquet
 from vehicle_detection._common.model_file import FORMAT_VERSION, ModelData, read_model, write_model
 from vehicle_detection._common.threads import (
     JOBS_VARIABLE,
@@ -53,4 +53,5 @@ __all__ = [
     "resolve_jobs",
     "single_threaded_opencv",
     "write_model",
+    "write_parquet",
 ]

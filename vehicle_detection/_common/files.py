@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from vehicle_detection.errors import InvalidInputError
 
@@ -44,3 +45,22 @@ def atomic_write(target: str | os.PathLike[str], name: str = "target") -> Iterat
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def write_parquet(
+    path: str | os.PathLike[str], table: Any, *, types: Mapping[str, str] | None = None
+) -> None:
+    """Write a pandas table, or a mapping of column names to lists of values, as a Parquet file.
+
+    `types` names the Arrow type of each column, such as ``"int64"``; None infers them from the values.
+    """
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise InvalidInputError(
+            "a .parquet file needs pyarrow; pip install 'vehicle-detection[parquet]', or write .csv"
+        ) from None
+    schema = None if types is None else pyarrow.schema(list(types.items()))
+    with atomic_write(path, "path") as part:
+        pyarrow.parquet.write_table(pyarrow.table(table, schema=schema), part)

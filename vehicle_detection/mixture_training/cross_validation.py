@@ -253,7 +253,7 @@ def _threshold(held: Sequence[FoldDetections]) -> float:
     for part in held:
         match = match_detections(part.found, part.truth, list(part.frames.keys), 0.5)
         found = part.scores[~match.ignored][:, None] >= _THRESHOLDS
-        right += found[match.partner[~match.ignored] >= 0].sum(axis=0)
+        right += found[match.match[~match.ignored] >= 0].sum(axis=0)
         shown += found.sum(axis=0)
         vehicles += int((~part.truth.ignore).sum())
     f1 = 2 * right / np.maximum(shown + vehicles, 1)
@@ -269,7 +269,7 @@ def _log_odds(held: Sequence[FoldDetections]) -> tuple[float, float]:
         match = match_detections(part.found, part.truth, list(part.frames.keys), 0.5)
         judged = ~match.ignored
         values += part.scores[judged].tolist()
-        right += (match.partner[judged] >= 0).tolist()
+        right += (match.match[judged] >= 0).tolist()
     if len(set(right)) < 2:
         return 1.0, 0.0
     fitted = LogisticRegression(C=1e6).fit(np.array(values)[:, None], right)

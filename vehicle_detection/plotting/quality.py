@@ -17,8 +17,9 @@ from vehicle_detection.evaluation import (
     FrameBoxes,
     FrameKey,
     LabelledFrames,
+    best_f1,
     match_detections,
-    prepare_sides,
+    prepare_evaluation,
 )
 from vehicle_detection.plotting.style import (
     LINE_COLORS,
@@ -85,10 +86,9 @@ def plot_precision_recall(
     axes = new_axes(ax, 6.5, 6)
     _add_f1_lines(axes)
     for (name, (precision, recall, thresholds)), (color, dash) in zip(checked.items(), line_styles()):
-        total = precision + recall
-        f1 = np.divide(2 * precision * recall, total, out=np.zeros_like(total), where=total > 0)
-        best = int(f1.argmax())
-        text = f"best F1 {f1[best]:.2f} at {thresholds[best]:.2f}"
+        f1, best_threshold = best_f1(precision, recall, thresholds)
+        best = int(np.argmax(thresholds == best_threshold))
+        text = f"best F1 {f1:.2f} at {best_threshold:.2f}"
         label = f"{name}: {text}" if name else text
         axes.plot(recall, precision, color=color, linestyle=dash, linewidth=1.8, label=label, zorder=3)
         axes.plot(recall[best], precision[best], "o", color=color, zorder=4)
@@ -239,14 +239,14 @@ def plot_errors(
     check_choice(kind, "kind", ("missed", "false"))
     min_iou = check_number(iou, "iou", above=0, high=1)
     max_count = check_integer(count, "count", low=1, high=1000)
-    predictions, labels, keys = prepare_sides(predictions, frames.labels, frames.keys)
+    predictions, labels, keys = prepare_evaluation(predictions, frames.labels, frames.keys)
     matches = match_detections(predictions, labels, keys, min_iou)
     if kind == "missed":
-        side, rows = labels, np.setdiff1d(matches.usable, matches.partner)
+        side, rows = labels, np.setdiff1d(matches.usable, matches.match)
         title = f"{len(rows):,} of {len(matches.usable):,} vehicles missed"
         order = np.argsort(-box_areas(side.boxes[rows]), kind="stable")
     else:
-        side, rows = predictions, np.flatnonzero((matches.partner < 0) & ~matches.ignored)
+        side, rows = predictions, np.flatnonzero((matches.match < 0) & ~matches.ignored)
         title = f"{len(rows):,} of {len(predictions):,} detections are false positives"
         order = np.arange(len(rows)) if side.scores is None else np.argsort(-side.scores[rows], kind="stable")
     shown = rows[order[:max_count]].tolist()

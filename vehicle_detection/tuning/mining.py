@@ -12,7 +12,14 @@ from vehicle_detection._common import check_integer, check_number
 from vehicle_detection.boxes import Detections, intersection_matrix, non_max_suppression
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.datasets import PatchSet
-from vehicle_detection.evaluation import FrameBoxes, Frames, check_labels_of, keyed_frames, keys_of, pairs_of
+from vehicle_detection.evaluation import (
+    FrameBoxes,
+    Frames,
+    check_frame_boxes,
+    iterate_frames,
+    keyed_frames,
+    keys_of,
+)
 from vehicle_detection.params import PATCH_SIZE, SearchParams
 from vehicle_detection.search import BandSearch
 
@@ -80,7 +87,7 @@ def mine_negatives(
     PatchSet(0 patches of 64x64 pixels, 0 of them vehicles)
     """
     images = keyed_frames(frames)
-    known = check_labels_of(keys_of(images), labels)
+    known = check_frame_boxes(keys_of(images), labels)
     least = check_number(min_score, "min_score")
     overlap = check_number(max_overlap, "max_overlap", low=0, high=1)
     most = None if per_frame is None else check_integer(per_frame, "per_frame", low=1)
@@ -88,7 +95,7 @@ def mine_negatives(
     patches: list[NDArray[np.uint8]] = []
     names: list[str] = []
     with BandSearch(classifier, n_jobs=n_jobs) as bands:
-        for key, image in pairs_of(images):
+        for key, image in iterate_frames(images):
             windows = _false_windows(bands.find_windows(image, wanted), known.boxes[known.rows(key)])
             kept = windows[non_max_suppression(windows.boxes, windows.scores, threshold=overlap)]
             for box in np.rint(kept.boxes[:most]).astype(np.int64):

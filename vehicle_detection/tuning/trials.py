@@ -23,6 +23,7 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import (
     FrameBoxes,
     LabelledFrames,
+    best_f1,
     evaluate_detections,
     precision_recall_curve,
 )
@@ -192,7 +193,7 @@ class Bench:
         scores = evaluate_detections(found, frames.labels, frames=frames.keys)
         return {
             "frame_f1": scores.f1,
-            "frame_best_f1": best_f1(found, frames.labels),
+            "frame_best_f1": best_f1(*precision_recall_curve(found, frames.labels))[0],
             "frame_average_precision": scores.average_precision,
             "frame_iou": scores.mean_iou,
         }
@@ -210,14 +211,6 @@ class Bench:
                     seconds.append(time.perf_counter() - began)
             self._milliseconds[classifier.params] = round(min(seconds) * 1000, 3)
         return self._milliseconds[classifier.params]
-
-
-def best_f1(found: FrameBoxes, labels: FrameBoxes) -> float:
-    """F1 at the threshold on the score that makes it best; NaN where no vehicle is labelled."""
-    precision, recall, _ = precision_recall_curve(found, labels)
-    total = precision + recall
-    curve = np.divide(2 * precision * recall, total, out=np.zeros_like(total), where=total > 0)
-    return float(curve.max(initial=0))
 
 
 def fit_features(
