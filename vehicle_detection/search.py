@@ -27,12 +27,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import (
-    Buffers,
-    Take,
+    NEW_ARRAYS,
     ThreadTeam,
+    Workspace,
     check_image,
     check_type,
-    new_array,
     single_threaded_opencv,
 )
 from vehicle_detection._kernels import (
@@ -150,7 +149,7 @@ def find_cars(
 
 
 class BandSearch:
-    """The fast search, with filters and buffers kept from frame to frame; thread-safe."""
+    """The fast search, with filters and workspace kept from frame to frame; thread-safe."""
 
     def __init__(self, classifier: VehicleClassifier, *, n_jobs: int | None = None) -> None:
         check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
@@ -199,8 +198,8 @@ class BandSearch:
         Entry ``[i, j]`` is the window that starts at row `i` and column `j` of the resized band's cells. With
         several templates, it is the maximum of their scores.
         """
-        buffers = self._local.__dict__.setdefault("buffers", Buffers())
-        return self._filters.score_map(resize_band(image, band, buffers.take), buffers.take)
+        workspace = self._local.__dict__.setdefault("workspace", Workspace())
+        return self._filters.score_map(resize_band(image, band, workspace), workspace)
 
 
 class ReferenceSearch:
@@ -240,7 +239,9 @@ def resized_shape(band: PixelBand) -> tuple[int, int]:
     return max(height, PATCH_SIZE), max(width, PATCH_SIZE)
 
 
-def resize_band(image: NDArray[np.uint8], band: PixelBand, take: Take = new_array) -> NDArray[np.uint8]:
+def resize_band(
+    image: NDArray[np.uint8], band: PixelBand, workspace: Workspace = NEW_ARRAYS
+) -> NDArray[np.uint8]:
     """Crop a band and resize it so that its windows are 64x64; columns beyond the frame are replicated."""
     height, width = resized_shape(band)
     scale = PATCH_SIZE / band.window[0]
@@ -249,12 +250,12 @@ def resize_band(image: NDArray[np.uint8], band: PixelBand, take: Take = new_arra
     strip = image[band.y1 : band.y2, max(0, band.x1) : band.x2]
     size = (width - left - right, height)
     if size != (strip.shape[1], strip.shape[0]):
-        memory = take((size[1], size[0], 3), np.uint8, "strip")
+        memory = workspace.take((size[1], size[0], 3), np.uint8, "strip")
         strip = np.asarray(cv2.resize(strip, size, dst=memory), np.uint8)
     if not left and not right:
         return strip
     # Replication adds no gradient at the frame's border.
-    memory = take((height, width, 3), np.uint8, "band")
+    memory = workspace.take((height, width, 3), np.uint8, "band")
     padded = cv2.copyMakeBorder(strip, 0, 0, left, right, cv2.BORDER_REPLICATE, dst=memory)
     return np.asarray(padded, np.uint8)
 
@@ -329,14 +330,16 @@ class _Filters:
             values.append(np.ones((cells, cells, 1)))
         return [*filters, Filter(np.concatenate(values, axis=2))] if values else filters
 
-    def score_map(self, band: NDArray[np.uint8], take: Take) -> NDArray[np.float32]:
+    def score_map(self, band: NDArray[np.uint8], workspace: Workspace) -> NDArray[np.float32]:
         """Scores of all windows of a resized band as a new ``(rows, columns)`` float32 array."""
         params, cell = self.params, self.params.pix_per_cell
         rows, columns = band.shape[0] // cell, band.shape[1] // cell
-        converted = convert_color(band, params.color_space, out=take(band.shape, np.uint8, "converted"))
-        maps = self._hog_maps(band, converted, take) if params.hog_feat else []
+        converted = convert_color(
+            band, params.color_space, out=workspace.take(band.shape, np.uint8, "converted")
+        )
+        maps = self._hog_maps(band, converted, workspace) if params.hog_feat else []
         if params.spatial_feat or self.hist_lookup:
-            maps.append(self._value_map(converted, take))
+            maps.append(self._value_map(converted, workspace))
         shape = (len(self.filters), rows - self.cells + 1, columns - self.cells + 1)
         scores = np.empty(shape, np.float32)
         for template, (filters, bias) in enumerate(zip(self.filters, self.biases)):
@@ -344,7 +347,7 @@ class _Filters:
             if self.tables is not None:
                 _color_kernels.histogram_cells(converted, self.tables[template], cell, maps[-1][-1])
             for template_filter, channels in zip(filters, maps):
-                template_filter.add_to(channels, scores[template], take)
+                template_filter.add_to(channels, scores[template], workspace)
         if self.root_weights is not None:
             _color_kernels.add_root_histograms(
                 converted, self.bins, self.root_weights, cell, self.cells, scores
@@ -352,7 +355,7 @@ class _Filters:
         return scores[0] if len(scores) == 1 else np.asarray(scores.max(axis=0))
 
     def _hog_maps(
-        self, band: NDArray[np.uint8], converted: NDArray[np.uint8], take: Take
+        self, band: NDArray[np.uint8], converted: NDArray[np.uint8], workspace: Workspace
     ) -> list[NDArray[np.float32]]:
         """Compute the blocks of HOG and, if used, of coarse HOG; each ``(channels, rows, columns)``."""
         params, channels = self.params, self.params.hog_channels
@@ -360,34 +363,34 @@ class _Filters:
         rows, columns = band.shape[0] // cell, band.shape[1] // cell
         gray = params.hog_channel == "GRAY"
         source = hog_source(band, params) if gray else pick_hog_channels(converted, params)
-        cells = take((channels, params.orient, rows, columns), np.float32, "cells")
+        cells = workspace.take((channels, params.orient, rows, columns), np.float32, "cells")
         if params.transform_sqrt:
             _hog_kernels.sum_orientations(*sqrt_gradients(source), self.bounds, channels, cell, cells)
         else:
             flat = np.ascontiguousarray(source).reshape(source.shape[0], -1)
             _hog_kernels.hog_cells(flat, channels, cell, self.cotangents, cells)
         shape = (channels, self.block, self.block, params.orient, rows, columns)
-        blocks = take(shape, np.float32, "blocks")
+        blocks = workspace.take(shape, np.float32, "blocks")
         _hog_kernels.normalize_blocks(cells, self.block, 1, blocks)
         maps = [blocks.reshape(-1, rows, columns)]
         if self.coarse:
-            pooled = take(cells.shape, np.float32, "pooled")
+            pooled = workspace.take(cells.shape, np.float32, "pooled")
             _hog_kernels.pool_cells(cells, pooled)
-            blocks = take(shape, np.float32, "coarse blocks")
+            blocks = workspace.take(shape, np.float32, "coarse blocks")
             _hog_kernels.normalize_blocks(pooled, self.block, 2, blocks)
             maps.append(blocks.reshape(-1, rows, columns))
         return maps
 
-    def _value_map(self, converted: NDArray[np.uint8], take: Take) -> NDArray[np.float32]:
+    def _value_map(self, converted: NDArray[np.uint8], workspace: Workspace) -> NDArray[np.float32]:
         """Spatial bins of each cell ``(channels, rows, columns)`` and, last, a channel for the histogram."""
         cell, per_cell = self.params.pix_per_cell, self.per_cell
         rows, columns = converted.shape[0] // cell, converted.shape[1] // cell
         count = 3 * per_cell**2 if self.params.spatial_feat else 0
-        channels = take((count + int(self.hist_lookup), rows, columns), np.float32, "values")
+        channels = workspace.take((count + int(self.hist_lookup), rows, columns), np.float32, "values")
         if count:
             size = (columns * per_cell, rows * per_cell)
             whole = converted[: rows * cell, : columns * cell]
-            bins = cv2.resize(whole, size, dst=take((size[1], size[0], 3), np.uint8, "bins"))
+            bins = cv2.resize(whole, size, dst=workspace.take((size[1], size[0], 3), np.uint8, "bins"))
             cells = channels[:count].reshape(3, per_cell, per_cell, rows, columns)
             _color_kernels.spatial_cells(bins, per_cell, cells)
         return channels

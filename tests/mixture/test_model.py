@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from vehicle_detection import VehicleDetector
 from vehicle_detection._common import FORMAT_VERSION
-from vehicle_detection._common.model_file import FORMAT, _checksum
+from vehicle_detection._common.model_file import FORMAT, checksum
 from vehicle_detection.boxes import box_areas, clip_boxes, iou_matrix
 from vehicle_detection.classifier import VehicleClassifier, load_classifier
 from vehicle_detection.errors import InvalidInputError, ModelFileError
@@ -512,7 +512,7 @@ def test_other_metadata():
 
 
 def test_metadata_that_is_no_json_is_refused(tmp_path):
-    with pytest.raises(InvalidInputError, match="metadata must hold JSON values only"):
+    with pytest.raises(InvalidInputError, match="metadata must contain JSON values only"):
         random_mixture(metadata={"when": object()}).save(tmp_path / "m.safetensors")
     assert not list(tmp_path.iterdir())
 
@@ -546,7 +546,7 @@ def write_file(path, tensors=None, params=None, *, params_text=None, **changes):
         "metadata": "{}",
         **changes,
     }
-    header.setdefault("sha256", _checksum(header, whole))
+    header.setdefault("sha256", checksum(header, whole))
     path.write_bytes(save(whole, metadata=header))
     return path
 
@@ -591,7 +591,7 @@ def test_files_that_do_not_fit(tmp_path, tensors, params, message):
     [
         ({"kind": "forest"}, "holds a model of the unknown kind 'forest'; train one"),
         ({"kind": "patches"}, "does not fit its own parameters"),
-        ({"format": "other"}, "no model of this library"),
+        ({"format": "other"}, "not a model of this library"),
         ({"format_version": "1"}, f"has format version 1, this release reads {FORMAT_VERSION}; train again"),
         ({"sha256": "0"}, r"was changed after it was written \(checksum differs\)"),
         ({"params_text": "{"}, "has no readable parameters"),
@@ -609,7 +609,7 @@ def test_damaged_files(tmp_path):
     data = path.read_bytes()
     for damaged in (b"", data[:7], data[: len(data) // 2], data[:-1], b"x" * 500):
         path.write_bytes(damaged)
-        with pytest.raises(ModelFileError, match="is no whole safetensors model"):
+        with pytest.raises(ModelFileError, match="is not a complete safetensors file"):
             load_model(path)
     path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
     with pytest.raises(ModelFileError, match="was changed after it was written"):
@@ -621,7 +621,7 @@ def test_paths_that_name_no_model(tmp_path):
         ModelFileError, match="does not exist; check the path, or name a shipped model: default"
     ):
         load_model("defualt")
-    with pytest.raises(ModelFileError, match="is a folder; name a file in it"):
+    with pytest.raises(ModelFileError, match="is a folder; choose a file in it"):
         load_model(tmp_path)
     for path in (None, 5):
         with pytest.raises(
@@ -639,7 +639,7 @@ def test_the_shipped_models():
     assert highway.metadata == load_classifier().metadata
     with pytest.raises(
         ModelFileError,
-        match=re.escape("shipped model 'default' holds a model of the kind 'mixture', not 'patches'"),
+        match=re.escape("shipped model 'default' contains a model of kind 'mixture', not 'patches'"),
     ):
         load_classifier("default")
 

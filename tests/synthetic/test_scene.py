@@ -177,7 +177,7 @@ def test_jpeg_changes_the_image_slightly():
         ({"shape": (20, 640)}, r"shape\[0\] must be an integer from 64"),
         ({"shape": (640.5, 640)}, r"shape\[0\] must be an integer"),
         ({"vehicles": -1}, "vehicles must be an integer from 0 to 60"),
-        ({"vehicles": [20]}, r"vehicles\[0\] must be a SceneVehicle, got 20 \(int\); make one with"),
+        ({"vehicles": [20]}, r"vehicles\[0\] must be a SceneVehicle, got 20; make one with"),
         ({"lane": 3}, "lane must be an integer from 0 to 2"),
         ({"horizon": 1.2}, "horizon must be a number, at least 0.1 and at most 0.9"),
         ({"camera_height_m": 0.0}, "camera_height_m must be a number"),

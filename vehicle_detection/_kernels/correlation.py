@@ -11,7 +11,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Take, new_array
+from vehicle_detection._common import NEW_ARRAYS, Workspace
 from vehicle_detection._kernels.jit import jit
 from vehicle_detection._kernels.vector import block_adder, host_block
 
@@ -46,7 +46,7 @@ class Filter:
         self._cell_columns[: len(cells)], self._cell_rows[: len(cells)] = positions
 
     def add_to(
-        self, channels: NDArray[np.float32], scores: NDArray[np.float32], take: Take = new_array
+        self, channels: NDArray[np.float32], scores: NDArray[np.float32], workspace: Workspace = NEW_ARRAYS
     ) -> None:
         """Add each window's weighted sum of channels to its score, in place.
 
@@ -56,7 +56,7 @@ class Filter:
         _, rows, columns = channels.shape
         stride = columns + self._last_column + _COLUMNS
         # The sums include windows that extend beyond the map, so that no product needs a bounds check.
-        sums = take((rows + self._last_row, stride), np.float32, "window sums")
+        sums = workspace.take((rows + self._last_row, stride), np.float32, "window sums")
         offsets = (self._last_row - self._cell_rows) * stride + self._last_column - self._cell_columns
         _kernel()(channels, self._weights, offsets.reshape(-1, _ROWS), sums)
         height, width = scores.shape

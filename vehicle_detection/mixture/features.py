@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Take, new_array
+from vehicle_detection._common import NEW_ARRAYS, Workspace
 from vehicle_detection._kernels import fhog as _fhog_kernels
 
 N_CHANNELS = 28
@@ -39,33 +39,37 @@ _COTANGENTS = (np.cos(_BIN_BOUNDS) / np.sin(_BIN_BOUNDS)).astype(np.float32)
 _EPS = np.float32(2)
 
 
-def orientation_sums(image: NDArray[np.uint8], take: Take = new_array) -> NDArray[np.float32]:
+def orientation_sums(image: NDArray[np.uint8], workspace: Workspace = NEW_ARRAYS) -> NDArray[np.float32]:
     """Gradient magnitudes by signed orientation, summed over 4x4 pixels; ``(16, H // 4, W // 4)``."""
     height, width = image.shape[:2]
-    channels = take((3, height, width), np.uint8, "channels")
+    channels = workspace.take((3, height, width), np.uint8, "channels")
     cv2.split(image, list(channels))
-    sums = take((16, height // FINE, width // FINE), np.float32, "sums")
+    sums = workspace.take((16, height // FINE, width // FINE), np.float32, "sums")
     _fhog_kernels.orientation_sums(channels, _COTANGENTS, sums)
     return sums
 
 
-def channels_from_sums(sums: NDArray[np.float32], cell: int, take: Take = new_array) -> NDArray[np.float32]:
+def channels_from_sums(
+    sums: NDArray[np.float32], cell: int, workspace: Workspace = NEW_ARRAYS
+) -> NDArray[np.float32]:
     """FHOG channels of `FINE` or `COARSE` cells from `orientation_sums`; ``(28, H // cell, W // cell)``."""
     per_cell = cell // FINE
     shape = sums.shape[1] // per_cell, sums.shape[2] // per_cell
-    cells = take((16, *shape), np.float32, "cells")
+    cells = workspace.take((16, *shape), np.float32, "cells")
     if per_cell == 1:
         _fhog_kernels.smooth_cells(sums, np.float32(1 / (64 * cell * cell)), cells)
     else:
         _fhog_kernels.pool_bilinear(sums, np.float32(1 / (16 * cell * cell)), cells)
-    channels = take((N_CHANNELS, *shape), np.float32, "fhog")
+    channels = workspace.take((N_CHANNELS, *shape), np.float32, "fhog")
     _fhog_kernels.fhog_normalize(cells, _EPS, channels)
     return channels
 
 
-def fhog_channels(image: NDArray[np.uint8], cell: int, take: Take = new_array) -> NDArray[np.float32]:
+def fhog_channels(
+    image: NDArray[np.uint8], cell: int, workspace: Workspace = NEW_ARRAYS
+) -> NDArray[np.float32]:
     """FHOG channels of an image of at least one cell, ``(28, H // cell, W // cell)`` float32."""
-    return channels_from_sums(orientation_sums(image, take), cell, take)
+    return channels_from_sums(orientation_sums(image, workspace), cell, workspace)
 
 
 def mirror_channels(channels: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -127,12 +131,15 @@ def pyramid_levels(sizes: list[float], *, share: bool = True) -> list[PyramidLev
 
 
 def feature_maps(
-    images: list[NDArray[np.uint8]], level: PyramidLevel, rows: tuple[int, int], take: Take = new_array
+    images: list[NDArray[np.uint8]],
+    level: PyramidLevel,
+    rows: tuple[int, int],
+    workspace: Workspace = NEW_ARRAYS,
 ) -> Iterator[tuple[float, FeatureMap]]:
     """Yield each cell size of a level, in pixels of the frame, with the feature map of a range of rows.
 
     `images` is the `image_pyramid` of the frame, `rows` a half-open range in the frame. With reused memory
-    (`take`), a map is valid until the next one.
+    (`workspace`), a map is valid until the next one.
     """
     height, width = images[0].shape[:2]
     octave = min(max(int(math.log2(1 / level.scale)), 0), len(images) - 1)
@@ -144,17 +151,19 @@ def feature_maps(
     strip = source[first:last]
     top, bottom = first * height / count, last * height / count
     size = max(round(width * level.scale), COARSE), max(round((bottom - top) * level.scale), COARSE)
-    small = np.asarray(cv2.resize(strip, size, dst=take((size[1], size[0], 3), np.uint8, "strip")), np.uint8)
+    small = np.asarray(
+        cv2.resize(strip, size, dst=workspace.take((size[1], size[0], 3), np.uint8, "strip")), np.uint8
+    )
     # Only the frame's own border is replicated: `rows` already includes the context of the windows.
     border = BORDER if level.fine is not None else WIDE_BORDER
     above, below = (border if at_border else 0 for at_border in (first == 0, last == count))
     padding = (above, below + -(size[1] + above + below) % COARSE, border, border + -size[0] % COARSE)
     shape = (size[1] + padding[0] + padding[1], size[0] + padding[2] + padding[3], 3)
-    memory = take(shape, np.uint8, "padded")
+    memory = workspace.take(shape, np.uint8, "padded")
     padded = np.asarray(cv2.copyMakeBorder(small, *padding, cv2.BORDER_REPLICATE, dst=memory), np.uint8)
-    sums = orientation_sums(padded, take)
+    sums = orientation_sums(padded, workspace)
     pixel_x, pixel_y = width / size[0], (bottom - top) / size[1]
     left, top = -border * pixel_x, top - above * pixel_y
     for cell_size, cell in level.sizes:
-        channels = channels_from_sums(sums, cell, take)
+        channels = channels_from_sums(sums, cell, workspace)
         yield cell_size, FeatureMap(channels, left, top, cell * pixel_x, cell * pixel_y)

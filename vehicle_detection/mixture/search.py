@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import (
-    Buffers,
-    Take,
     ThreadTeam,
+    Workspace,
     check_image,
     check_number,
     check_type,
@@ -37,7 +36,7 @@ _MAX_WINDOWS = 2000
 
 
 class MixtureSearch:
-    """A search with threads and buffers kept from frame to frame; thread-safe."""
+    """A search with threads and workspace kept from frame to frame; thread-safe."""
 
     def __init__(self, model: TemplateMixture, *, n_jobs: int | None = None) -> None:
         check_type(model, "model", TemplateMixture, 'load_model("default") or train_mixture return one')
@@ -145,10 +144,10 @@ class MixtureSearch:
         rows = min((top for top, _ in ranges), default=0), max((bottom for _, bottom in ranges), default=0)
         if min(rows[1] - rows[0], shape[1]) * level.scale < COARSE:
             return ScoredWindows.empty()
-        buffers = self._local.__dict__.setdefault("buffers", Buffers())
+        workspace = self._local.__dict__.setdefault("workspace", Workspace())
         found = [
-            _score_template(index, template, feature_map, min_margin, shape[1], buffers.take)
-            for size, feature_map in feature_maps(images, level, rows, buffers.take)
+            _score_template(index, template, feature_map, min_margin, shape[1], workspace)
+            for size, feature_map in feature_maps(images, level, rows, workspace)
             for index, template in templates[size]
         ]
         return ScoredWindows.join(found, shape)
@@ -173,17 +172,19 @@ def _score_template(
     feature_map: FeatureMap,
     min_margin: np.float32,
     width: int,
-    take: Take,
+    workspace: Workspace,
 ) -> ScoredWindows:
     """Windows of one template above `min_margin` on the feature map of a frame of `width` pixels."""
     if template.border:
         found = [
-            template.border_windows(feature_map, x, left=left, min_margin=float(min_margin), take=take)
+            template.border_windows(
+                feature_map, x, left=left, min_margin=float(min_margin), workspace=workspace
+            )
             for left, x in ((True, 0.0), (False, float(width)))
         ]
         boxes, margins = (np.concatenate(part) for part in zip(*found))
     else:
-        grid = template.margins(feature_map.channels, take)
+        grid = template.margins(feature_map.channels, workspace)
         rows, columns = (grid > min_margin).nonzero()
         boxes = template.boxes(feature_map, rows, columns)
         margins = grid[rows, columns].astype(np.float64)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Take, check_number, describe, finite_array, new_array
+from vehicle_detection._common import NEW_ARRAYS, Workspace, check_number, describe, finite_array
 from vehicle_detection._kernels import Filter
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture.features import N_CHANNELS, FeatureMap, mirror_channels
@@ -62,7 +62,9 @@ class MixtureTemplate:
     def _strip_filter(self) -> Filter:
         return Filter(self.weights.transpose(0, 2, 1).reshape(1, len(self.weights), -1))
 
-    def margins(self, channels: NDArray[np.float32], take: Take = new_array) -> NDArray[np.float32]:
+    def margins(
+        self, channels: NDArray[np.float32], workspace: Workspace = NEW_ARRAYS
+    ) -> NDArray[np.float32]:
         """Margin of every window of FHOG channels, ``(rows, columns)``; empty if no window fits."""
         rows, columns = self.weights.shape[:2]
         shape = max(channels.shape[1] - rows + 1, 0), max(channels.shape[2] - columns + 1, 0)
@@ -70,9 +72,9 @@ class MixtureTemplate:
         if margins.shape[1] == 1:
             # A strip as wide as the template: place its windows side by side, which vectorizes better.
             line = np.ascontiguousarray(channels.transpose(0, 2, 1)).reshape(-1, 1, channels.shape[1])
-            self._strip_filter.add_to(line, margins.reshape(1, -1), take)
+            self._strip_filter.add_to(line, margins.reshape(1, -1), workspace)
         elif margins.size:
-            self._filter.add_to(channels, margins, take)
+            self._filter.add_to(channels, margins, workspace)
         return margins
 
     def boxes(self, feature_map: FeatureMap, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Floats:
@@ -90,11 +92,11 @@ class MixtureTemplate:
         *,
         left: bool,
         min_margin: float,
-        take: Take = new_array,
+        workspace: Workspace = NEW_ARRAYS,
     ) -> tuple[Floats, Floats]:
         """Boxes and margins above `min_margin` of the windows at the left or right border of the frame."""
         strip = self.border_strip(feature_map, border_x, left=left)
-        margins = self.margins(strip, take)[:, 0] if strip is not None else np.empty(0, np.float32)
+        margins = self.margins(strip, workspace)[:, 0] if strip is not None else np.empty(0, np.float32)
         rows = np.flatnonzero(margins > min_margin)
         return self.border_boxes(feature_map, rows, border_x, left=left), margins[rows].astype(np.float64)
 
