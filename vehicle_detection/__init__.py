@@ -108,9 +108,10 @@ if TYPE_CHECKING:
     from vehicle_detection.tracking import Track, Tracker
     from vehicle_detection.training import train_and_evaluate
     from vehicle_detection.tuning import (
-        ResultTable,
+        TrialOptions,
         compare_configurations,
         mine_negatives,
+        pareto_front,
         read_results,
         search_parameters,
     )
@@ -137,7 +138,6 @@ __all__ = [
     "PyramidParams",
     "RegionParams",
     "ReportWriter",
-    "ResultTable",
     "SearchBand",
     "SearchParams",
     "TemplateMixture",
@@ -145,6 +145,7 @@ __all__ = [
     "TrackParams",
     "TrackWriter",
     "Tracker",
+    "TrialOptions",
     "VehicleClassifier",
     "VehicleDetectionError",
     "VehicleDetector",
@@ -188,6 +189,7 @@ __all__ = [
     "load_training_patches",
     "mine_negatives",
     "non_max_suppression",
+    "pareto_front",
     "plot_balance",
     "plot_bands",
     "plot_channels",
@@ -240,9 +242,10 @@ __all__ = [
 
 _ROOMS = {
     "tuning": (
-        "ResultTable",
+        "TrialOptions",
         "compare_configurations",
         "mine_negatives",
+        "pareto_front",
         "read_results",
         "search_parameters",
     ),

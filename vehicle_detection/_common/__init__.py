@@ -15,6 +15,7 @@ from vehicle_detection._common.checks import (
 )
 from vehicle_detection._common.files import atomic_write, check_target
 from vehicle_detection._common.model_file import FORMAT_VERSION, ModelData, read_model, write_model
+from vehicle_detection._common.progress import progress_bar
 from vehicle_detection._common.threads import (
     JOBS_VARIABLE,
     ThreadTeam,
@@ -48,6 +49,7 @@ __all__ = [
     "finite_array",
     "mirror_patches",
     "new_array",
+    "progress_bar",
     "read_model",
     "relight",
     "resolve_jobs",

@@ -31,13 +31,11 @@ from vehicle_detection.plotting.style import (
     put_tiles,
     tile_axes,
 )
-from vehicle_detection.tuning import ResultTable
+from vehicle_detection.tuning import numeric_column, pareto_front
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    from pandas import DataFrame
 
 Curve = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
@@ -340,7 +338,7 @@ _ROOM = 60
 
 
 def plot_tradeoff(
-    table: ResultTable,
+    table: DataFrame,
     *,
     quality: str = "accuracy",
     cost: str = "search_ms",
@@ -375,22 +373,22 @@ def plot_tradeoff(
 
     Examples
     --------
-    >>> table = ResultTable([{"accuracy": 0.98, "search_ms": 4.0}, {"accuracy": 0.99, "search_ms": 9.0}])
+    >>> import pandas as pd
+    >>> table = pd.DataFrame({"accuracy": [0.98, 0.99], "search_ms": [4.0, 9.0]})
     >>> plot_tradeoff(table, label=None).get_xlabel()
     'search ms'
     """
-    front = table.front(quality, cost)
+    front = pareto_front(table, quality, cost)
     if not len(front):
         raise InvalidInputError(f"table has no row with both {quality} and {cost}; measure them first")
     axes = new_axes(ax)
-    x, y = table.numbers(cost), table.numbers(quality)
+    x, y = numeric_column(table, cost), numeric_column(table, quality)
     shown = ~np.isnan(x) & ~np.isnan(y)
     axes.scatter(x[shown], y[shown], s=24, color="0.6", label="measured", zorder=2)
-    axes.plot(front.numbers(cost), front.numbers(quality), "o-", color="C0", label="best front", zorder=3)
+    axes.plot(front[cost], front[quality], "o-", color="C0", label="best front", zorder=3)
     if label is not None:
-        for row in front:
-            place = (row[cost], row[quality])
-            axes.annotate(str(row.get(label)), place, (4, 6), textcoords="offset points", fontsize=8)
+        for place in zip(front[cost], front[quality], front[label]):
+            axes.annotate(str(place[2]), place[:2], (4, 6), textcoords="offset points", fontsize=8)
     axes.set_xlabel(cost.replace("_", " "))
     axes.set_ylabel(quality.replace("_", " "))
     axes.margins(0.12)
@@ -400,7 +398,7 @@ def plot_tradeoff(
 
 
 def plot_parameter(
-    table: ResultTable,
+    table: DataFrame,
     parameter: str,
     *,
     quality: str = "accuracy",
@@ -436,29 +434,34 @@ def plot_parameter(
 
     Examples
     --------
-    >>> table = ResultTable([{"C": 1e-4, "accuracy": 0.99}, {"C": 1.0, "accuracy": 0.98}])
+    >>> import pandas as pd
+    >>> table = pd.DataFrame({"C": [1e-4, 1.0], "accuracy": [0.99, 0.98]})
     >>> plot_parameter(table, "C").get_xscale()
     'log'
     """
-    keys = [parameter] if by is None else [by, parameter]
-    means = table.summarize(keys, [quality])
-    means = ResultTable([row for row in means if row.get(parameter) is not None])
-    if not len(means):
+    measured = table[~np.isnan(numeric_column(table, quality))]
+    for name in [parameter] if by is None else [parameter, by]:
+        if name not in table.columns:
+            raise InvalidInputError(
+                f"table has no column {name!r}; its columns are {', '.join(table.columns)}"
+            )
+        measured = measured[measured[name].notna()]
+    if measured.empty:
         raise InvalidInputError(f"table has no row with both {parameter} and {quality}; measure them first")
     axes = new_axes(ax)
-    values = means.column(parameter)
+    values = measured[parameter].unique().tolist()
     numeric = all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
-    listed = sorted(set(values)) if numeric else list(dict.fromkeys(values))
+    listed = sorted(values) if numeric else values
     place = {value: value if numeric else index for index, value in enumerate(listed)}
-    groups: dict[Any, list[Any]] = {}
-    for row in means:
-        groups.setdefault(None if by is None else row[by], []).append(row)
-    for (name, rows), (color, dash) in zip(groups.items(), line_looks()):
-        ordered = sorted(rows, key=lambda row: place[row[parameter]])
+    groups = [(None, measured)] if by is None else measured.groupby(by, sort=False)
+    for (name, rows), (color, dash) in zip(groups, line_looks()):
+        runs = rows.groupby(parameter, sort=False)[quality].agg(["mean", "std"])
+        runs.index = runs.index.map(place)
+        runs = runs.sort_index()
         axes.errorbar(
-            [place[row[parameter]] for row in ordered],
-            [row[quality] for row in ordered],
-            yerr=[row[f"{quality}_std"] or np.nan for row in ordered],
+            runs.index,
+            runs["mean"],
+            yerr=runs["std"],
             fmt="o",
             linestyle=dash,
             color=color,

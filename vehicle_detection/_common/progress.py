@@ -1,0 +1,28 @@
+"""The progress bar of long operations."""
+
+from __future__ import annotations
+
+import contextlib
+from types import SimpleNamespace
+from typing import Any
+
+_HIDDEN = SimpleNamespace(update=lambda n=1: None, set_description=lambda text: None)
+
+
+def progress_bar(
+    show: bool,
+    total: int | None = None,
+    *,
+    unit: str,
+    desc: str | None = None,
+    terminal_only: bool = False,
+) -> Any:
+    """Context manager of a tqdm bar on standard error with ``update(n=1)`` and ``set_description(text)``.
+
+    Nothing is shown if `show` is False or, with `terminal_only`, if standard error is not a terminal.
+    """
+    if not show:
+        return contextlib.nullcontext(_HIDDEN)
+    from tqdm.auto import tqdm
+
+    return tqdm(total=total, unit=unit, desc=desc, disable=None if terminal_only else False)
