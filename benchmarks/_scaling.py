@@ -78,7 +78,7 @@ def _milliseconds(
     frame: NDArray[np.uint8], classifier: VehicleClassifier, params: SearchParams, jobs: int | None
 ) -> float:
     with BandSearch(classifier, n_jobs=jobs) as bands:
-        return median_seconds(lambda: bands.find(frame, params), CALLS) * 1e3
+        return median_seconds(lambda: bands.find_windows(frame, params), CALLS) * 1e3
 
 
 def _default_cost(frame: NDArray[np.uint8], classifier: VehicleClassifier) -> tuple[float, int]:
@@ -90,7 +90,7 @@ def _default_cost(frame: NDArray[np.uint8], classifier: VehicleClassifier) -> tu
 def count_windows(frame: NDArray[np.uint8], classifier: VehicleClassifier, params: SearchParams) -> int:
     """Count the windows of a search: all of them are hits if any score will do."""
     with BandSearch(classifier, n_jobs=1) as bands:
-        return len(bands.find(frame, dataclasses.replace(params, min_score=-1e6)))
+        return len(bands.find_windows(frame, dataclasses.replace(params, min_score=-1e6)))
 
 
 def _cost_of_windows(frame: NDArray[np.uint8], classifier: VehicleClassifier) -> dict[int, float]:
@@ -177,11 +177,11 @@ def stage_seconds(
     runs: list[dict[str, float]] = []
     with BandSearch(classifier, n_jobs=1) as bands:
         for _ in range(3):
-            bands.find(frame, params)
+            bands.find_windows(frame, params)
         for _ in range(calls):
             clock = _Clock()
             with _watch(clock):
-                whole = seconds_of(lambda: bands.find(frame, params))
+                whole = seconds_of(lambda: bands.find_windows(frame, params))
             runs.append({**clock.seconds, "rest": whole - sum(clock.seconds.values())})
     return {name: median_of(one[name] for one in runs) for name in runs[0]}
 

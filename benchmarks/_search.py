@@ -49,7 +49,7 @@ def compare_searches(
         searches = {1: one, 2: two}
         for ready in searches.values():
             for _ in range(3):  # Kernels, threads and buffers are there from then on.
-                ready.find(frame, search)
+                ready.find_windows(frame, search)
         for _ in range(rounds):
             course: CourseSearch | None = None
 
@@ -65,7 +65,7 @@ def compare_searches(
                     ours[jobs].append(seconds_of(functools.partial(ready.find, frame, search)))
         assert course is not None
         agreement = check_agreement(frame, one, search, course)
-        assert_same(one.find(frame, search), two.find(frame, search))
+        assert_same(one.find_windows(frame, search), two.find_windows(frame, search))
 
     medians = {jobs: median_of(seconds) for jobs, seconds in ours.items()}
     course_median, hog_median = median_of(course_seconds), median_of(hog_seconds)
@@ -115,11 +115,11 @@ def check_agreement(
 
     Our hits are looked up by their boxes among all windows; one that is none of them counts as disputed.
     """
-    windows = ours.find(frame, dataclasses.replace(search, min_score=-1e6))
+    windows = ours.find_windows(frame, dataclasses.replace(search, min_score=-1e6))
     if windows.boxes.shape != course.boxes.shape or not np.allclose(windows.boxes, course.boxes, atol=1e-6):
         raise AssertionError(f"the {len(windows)} windows are not the course's {len(course.boxes)}")
     difference = float(np.abs(windows.scores - course.scores).max())
-    hits = {tuple(box) for box in ours.find(frame, search).boxes.tolist()}
+    hits = {tuple(box) for box in ours.find_windows(frame, search).boxes.tolist()}
     found = np.array([tuple(box) in hits for box in windows.boxes.tolist()])
     expected = course.scores > search.min_score
     clear = np.abs(course.scores - search.min_score) >= TOLERANCE

@@ -139,14 +139,14 @@ def other_roads(count: int = 8) -> list[vd.LabelledFrames]:
         return [_thinned(name, 3 * count) for name in ("camvid", "india", "indonesia")]
     return [
         labelled("cars from behind", _queue(count, CARS)),
-        labelled("cars from the front", _queue(count, CARS, facing="front")),
+        labelled("cars from the front", _queue(count, CARS, view="front")),
         labelled("vans and trucks", _queue(count, HEAVY)),
         labelled("rain at dusk", _queue(count, CARS + HEAVY, light="dusk", rain=0.8)),
         labelled("night", _queue(count, CARS + HEAVY, light="night")),
     ]
 
 
-def _queue(count: int, kinds: Sequence[str], *, facing: str = "rear", **options: Any) -> list[Any]:
+def _queue(count: int, kinds: Sequence[str], *, view: str = "rear", **options: Any) -> list[Any]:
     """Draw scenes with a vehicle in each of three lanes."""
     rng = np.random.default_rng(0)
     drawn = []
@@ -156,7 +156,7 @@ def _queue(count: int, kinds: Sequence[str], *, facing: str = "rear", **options:
                 distance_m=float(rng.uniform(9, 30)),
                 lateral_m=lateral + float(rng.uniform(-0.3, 0.3)),
                 kind=str(rng.choice(kinds)),
-                facing=facing,
+                view=view,
             )
             for lateral in (-3.6, 0.0, 3.6)
         ]

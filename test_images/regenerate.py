@@ -1,6 +1,6 @@
-"""Draw the test images again and write their true boxes: ``python test_images/regenerate.py``.
+"""Render the test images and write their labels: ``python test_images/regenerate.py``.
 
-The pictures are drawn by the project itself, so nobody else's licence applies to them.
+The images are rendered by the project itself, so no other license applies to them.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import cv2
 
 from vehicle_detection.synthetic import Scene, SceneVehicle, render_scene, write_labels
 
-QUALITY = 88
+JPEG_QUALITY = 88
 FOLDER = Path(__file__).parent
 
 
-def _car(distance_m: float, lane: float, kind: str, paint: str) -> SceneVehicle:
-    return SceneVehicle(distance_m=distance_m, lateral_m=3.6 * lane, kind=kind, paint=paint)
+def _car(distance_m: float, lane: float, kind: str, color: str) -> SceneVehicle:
+    return SceneVehicle(distance_m=distance_m, lateral_m=3.6 * lane, kind=kind, color=color)
 
 
 SCENES: dict[str, dict[str, Any]] = {
@@ -58,21 +58,21 @@ SCENES: dict[str, dict[str, Any]] = {
         "random_state": 2,
     },
 }
-"""Options of each picture; lanes are counted from the camera's, to the right."""
+"""Options of each image; lanes of the cars are relative to that of the camera, positive to the right."""
 
 
 def draw(name: str) -> Scene:
-    """Draw one of the pictures."""
+    """Render one of the images."""
     return render_scene(**SCENES[name])
 
 
 def main(folder: Path) -> None:
-    """Write all pictures and ``labels.csv`` to a folder."""
+    """Write all images and ``labels.csv`` to a folder."""
     truth = []
     for name in SCENES:
         scene = draw(name)
         pixels = cv2.cvtColor(scene.image, cv2.COLOR_RGB2BGR)
-        cv2.imwrite(str(folder / name), pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        cv2.imwrite(str(folder / name), pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         truth.append((name, scene.truth))
     write_labels(folder / "labels.csv", truth)
 

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
 from vehicle_detection.images import write_image
@@ -53,7 +54,7 @@ SMALL_MIXTURE = MixtureParams(
 
 @functools.cache
 def scene_of(seed):
-    return render_scene(shape=(200, 356), focal=420, vehicles=3, random_state=seed)
+    return render_scene(shape=(200, 356), focal_px=420, vehicles=3, random_state=seed)
 
 
 def drawn(seeds, name="road"):
@@ -65,10 +66,36 @@ def drawn(seeds, name="road"):
             x1, _, x2, _ = vehicle.box
             keys.append(key)
             boxes.append(vehicle.box)
-            ignore.append(bool(x2 - x1 < 28 or vehicle.hidden > 0.4 or vehicle.truncated > 0.4))
+            ignore.append(bool(x2 - x1 < 28 or vehicle.occluded_fraction > 0.4 or vehicle.truncated > 0.4))
     return LabelledFrames(
         name, [scene.image for scene in scenes], FrameBoxes(keys, None, boxes, ignore=ignore)
     )
+
+
+def check_truth(scene):
+    """Assert that the ground truth of a drawn scene is consistent with itself and with the image."""
+    height, width = scene.image.shape[:2]
+    for row in scene.truth:
+        x1, y1, x2, y2 = row.box
+        assert 0 <= x1 < x2 <= width
+        assert 0 <= y1 < y2 <= height
+        full = row.full_box
+        assert full[0] <= x1
+        assert full[1] <= y1
+        assert full[2] >= x2
+        assert full[3] >= y2
+        np.testing.assert_allclose(clip_boxes([full], (height, width))[0], row.box, atol=1.0)
+        assert 0 <= row.truncated < 1
+        assert 0 <= row.occluded_fraction <= 1
+        assert row.occluded == (2 if row.occluded_fraction > 0.5 else int(row.occluded_fraction >= 0.1))
+        assert row.ignore >= (row.occluded == 2 or x2 - x1 < 40 or row.truncated > 0.7)
+        pixels = np.argwhere(scene.instance_map == row.track)
+        if row.occluded_fraction == 0:
+            # Nothing hides the vehicle, so its visible pixels span its box exactly.
+            assert (*pixels.min(0)[::-1], *(pixels.max(0)[::-1] + 1)) == row.box
+        elif len(pixels):
+            assert (pixels.min(0)[::-1] >= [x1, y1]).all()
+            assert (pixels.max(0)[::-1] < [x2, y2]).all()
 
 
 def write_frame_set(folder, name, frames, *, place="frames"):
@@ -119,14 +146,14 @@ class StubDetector:
         self.index, self.fps = 0, fps
 
     def search(self, frame):
+        self.shapes.add(frame.shape)
         if self.pause:  # the later a frame, the sooner it is done: the order is not for free
             time.sleep(self.pause / (1 + self.index))
         return float(frame.mean())
 
-    def follow(self, windows, shape, *, time):
-        self.shapes.add(shape)
+    def track(self, found, *, time):
         confirmed = SimpleNamespace(id=1 + self.index // 6, shown=True)
-        result = Result(self.index, windows, time, (confirmed, TENTATIVE))
+        result = Result(self.index, found, time, (confirmed, TENTATIVE))
         self.index += 1
         return result
 
@@ -136,4 +163,4 @@ class StubDetector:
         return drawn
 
     def __call__(self, frame):
-        return self.annotate(frame, self.follow(self.search(frame), frame.shape, time=None))
+        return self.annotate(frame, self.track(self.search(frame), time=None))

@@ -13,7 +13,7 @@ from sklearn.svm import LinearSVC
 
 from tests.helpers import random_classifier, random_template
 from vehicle_detection._common import FORMAT_VERSION, blur_patches, degrade_patches, mirror_patches
-from vehicle_detection._common.model_file import FORMAT, _checksum
+from vehicle_detection._common.model_file import FORMAT, checksum
 from vehicle_detection._kernels import fit_svm
 from vehicle_detection.classifier import (
     KIND,
@@ -392,7 +392,7 @@ def test_saving_and_loading_keeps_every_bit(tmp_path, params, templates):
 
 def test_metadata_that_is_no_json_is_refused(tmp_path):
     model = VehicleClassifier(SMALL, random_classifier(SMALL).templates, {"when": object()})
-    with pytest.raises(InvalidInputError, match="metadata must hold JSON values only"):
+    with pytest.raises(InvalidInputError, match="metadata must contain JSON values only"):
         model.save(tmp_path / "model.safetensors")
     assert not list(tmp_path.iterdir())
 
@@ -429,7 +429,7 @@ def write_model(path, tensors=None, **changes):
         **changes,
     }
     header = {name: text for name, text in header.items() if text is not None}
-    header.setdefault("sha256", _checksum(header, whole))
+    header.setdefault("sha256", checksum(header, whole))
     path.write_bytes(save(whole, metadata=header))
     return path
 
@@ -468,21 +468,21 @@ def test_tensors_that_do_not_fit(tmp_path, tensors, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"format": "other"}, "is a safetensors file, but no model of this library"),
-        ({"format": None}, "is a safetensors file, but no model of this library"),
+        ({"format": "other"}, "is a safetensors file, but not a model of this library"),
+        ({"format": None}, "is a safetensors file, but not a model of this library"),
         ({"format_version": "99"}, f"has format version 99, this release reads {FORMAT_VERSION}; train"),
         ({"format_version": None}, "has format version None"),
         ({"sha256": "0" * 64}, r"was changed after it was written \(checksum differs\)"),
         ({"params": '{"orient": 0}'}, "does not fit its own parameters: orient must be an integer"),
         ({"params": '{"color": 1}'}, "does not fit its own parameters"),
         ({"params": "[]"}, "does not fit its own parameters"),
-        ({"params": "{"}, r"has no readable parameters \(.*\); get it again"),
+        ({"params": "{"}, r"has no readable parameters \(.*\); download it again"),
         ({"params": "5"}, r"has no readable parameters"),
         ({"params": None}, r"has no readable parameters \('params'\)"),
         ({"metadata": None}, r"has no readable parameters \('metadata'\)"),
         ({"metadata": "nonsense"}, "has no readable parameters"),
-        ({"kind": "mixture"}, "holds a model of the kind 'mixture', not 'patches'; load it with load_model"),
-        ({"kind": None}, "holds a model of the kind None, not 'patches'"),
+        ({"kind": "mixture"}, "contains a model of kind 'mixture', not 'patches'; load it with load_model"),
+        ({"kind": None}, "contains a model of kind None, not 'patches'"),
         ({"params": '{"spatial_size": 16}'}, "does not fit its own parameters: templates must have 6156"),
     ],
 )
@@ -496,7 +496,7 @@ def test_a_safetensors_file_without_metadata(tmp_path):
     from safetensors.numpy import save
 
     (tmp_path / "m.safetensors").write_bytes(save({"a": np.zeros(3)}))
-    with pytest.raises(ModelFileError, match="is no whole safetensors model"):
+    with pytest.raises(ModelFileError, match="is not a complete safetensors file"):
         load_classifier(tmp_path / "m.safetensors")
 
 
@@ -505,7 +505,7 @@ def test_a_tensor_of_a_type_that_numpy_lacks(tmp_path):
         {"__metadata__": {"format": FORMAT}, "a": {"dtype": "BF16", "shape": [1], "data_offsets": [0, 2]}}
     ).encode()
     (tmp_path / "m.safetensors").write_bytes(struct.pack("<Q", len(header)) + header + bytes(2))
-    with pytest.raises(ModelFileError, match=r"model file .*(no whole safetensors model|changed after)"):
+    with pytest.raises(ModelFileError, match=r"model file .*(not a complete safetensors file|changed after)"):
         load_classifier(tmp_path / "m.safetensors")
 
 
@@ -514,10 +514,12 @@ def test_a_cut_model_file(tmp_path):
     data = path.read_bytes()
     for size in (0, 4, 8, 100, len(data) // 2, len(data) - 1):
         path.write_bytes(data[:size])
-        with pytest.raises(ModelFileError, match=r"is no whole safetensors model .* get it again or train"):
+        with pytest.raises(
+            ModelFileError, match=r"is not a complete safetensors file .* download it again or train"
+        ):
             load_classifier(path)
     path.write_bytes(data + b"x")
-    with pytest.raises(ModelFileError, match="is no whole safetensors model"):
+    with pytest.raises(ModelFileError, match="is not a complete safetensors file"):
         load_classifier(path)
 
 
@@ -550,14 +552,14 @@ def test_a_flipped_byte_in_the_header(tmp_path):
 def test_another_kind_of_file(tmp_path, content):
     path = tmp_path / "svc.pickle"
     path.write_bytes(content)
-    with pytest.raises(ModelFileError, match=r"svc.pickle is no whole safetensors model"):
+    with pytest.raises(ModelFileError, match=r"svc.pickle is not a complete safetensors file"):
         load_classifier(path)
 
 
 def test_a_missing_model_file(tmp_path, monkeypatch):
     with pytest.raises(ModelFileError, match=r"model file .*nothing does not exist; check the path"):
         load_classifier(tmp_path / "nothing")
-    with pytest.raises(ModelFileError, match=r"model file .* is a folder; name a file in it"):
+    with pytest.raises(ModelFileError, match=r"model file .* is a folder; choose a file in it"):
         load_classifier(tmp_path)
 
     def refuse(self):

@@ -63,8 +63,9 @@ def moved(box, x, y=0):
     return [box[0] + x, box[1] + y, box[2] + x, box[3] + y]
 
 
-def make(**options):
-    options = {"search": SEARCH, "fit": FIT, "heat": HEAT, "n_jobs": 1, **options}
+def make(*, regions="fitted", **options):
+    region_params = FIT if regions == "fitted" else HEAT
+    options = {"search_params": SEARCH, "region_params": region_params, "n_jobs": 1, **options}
     return VehicleDetector(CLASSIFIER, **options)
 
 
@@ -82,7 +83,7 @@ def ids_of(result):
 def assert_same(one, other):
     assert one.index == other.index
     assert one.time == other.time
-    for name in ("windows", "regions"):
+    for name in ("windows", "detections"):
         np.testing.assert_array_equal(getattr(one, name).boxes, getattr(other, name).boxes)
         np.testing.assert_array_equal(getattr(one, name).scores, getattr(other, name).scores)
     assert len(one.tracks) == len(other.tracks)
@@ -146,7 +147,7 @@ def test_a_result_tells_what_was_found():
     last = results[-1]
     assert isinstance(last, FrameResult)
     assert (last.index, last.time) == (7, 0.28)
-    assert len(last.windows) > len(last.regions) == 1
+    assert len(last.windows) > len(last.detections) == 1
     assert (last.windows.scores > SEARCH.min_score).all()
     assert last.shown == tuple(track for track in last.tracks if track.shown)
     assert last.shown[0].age == pytest.approx(0.28)
@@ -169,11 +170,11 @@ def test_what_is_too_weak_for_a_still_is_for_the_tracker_alone():
         assert weak.max() == pytest.approx(-0.2)
         assert weak.min() >= -1.5
         result = detector.process(road)
-        assert len(result.regions) == 0
+        assert len(result.detections) == 0
         assert [track.state for track in result.tracks].count("tentative") > 0
-    assert len(clear.regions) == len(scores)
+    assert len(clear.detections) == len(scores)
     blunt = TrackParams(low_threshold=0.0, high_threshold=0.0)
-    with VehicleDetector(strict, track=blunt, n_jobs=1) as detector:
+    with VehicleDetector(strict, track_params=blunt, n_jobs=1) as detector:
         assert len(detector.search(road).vehicles) == 0
         assert detector.process(road).tracks == ()
 
@@ -188,9 +189,7 @@ def test_search_in_any_order_and_follow_in_order_is_process(regions):
     random.Random(0).shuffle(order)
     with make(regions=regions, n_jobs=2) as split, ThreadPoolExecutor(4) as pool:
         found = dict(zip(order, pool.map(lambda index: split.search(frames[index]), order)))
-        results = [
-            split.follow(found[index], frames[index].shape, time=index / 30) for index in range(len(frames))
-        ]
+        results = [split.track(found[index], time=index / 30) for index in range(len(frames))]
     assert_same_drive(results, expected)
 
 
@@ -242,7 +241,7 @@ def test_a_cut_to_an_empty_road_leaves_no_heat():
     detector = make(regions="heat")
     for _ in range(5):
         detector.process(frame_with(CAR))
-    assert len(detector.process(frame_with(light=200)).regions) == 0
+    assert len(detector.process(frame_with(light=200)).detections) == 0
 
 
 def test_a_change_of_light_is_no_cut():
@@ -261,10 +260,10 @@ def test_a_time_that_goes_back_ends_the_tracks():
 
 def test_heat_is_the_mean_of_the_last_frames():
     detector = make(regions="heat")
-    single = make(regions="heat").process(frame_with(CAR)).regions.scores[0]
+    single = make(regions="heat").process(frame_with(CAR)).detections.scores[0]
     peaks = []
     for boxes in ([CAR], [CAR], [], [], []):
-        regions = detector.process(frame_with(*boxes)).regions
+        regions = detector.process(frame_with(*boxes)).detections
         peaks.append(regions.scores[0] if len(regions) else 0.0)
     expected = [single, single, single * 2 / 3, single / 3, 0]
     expected = [peak if peak > HEAT.threshold else 0.0 for peak in expected]
@@ -454,14 +453,14 @@ def test_features_that_cannot_be_shared_are_searched_window_by_window():
     params = FeatureParams(color_space="RGB", spatial_size=6, hist_feat=False, hog_feat=False)
     odd = VehicleClassifier(params, (Template(np.zeros(108), np.ones(108), np.ones(108), 0.0),))
     with pytest.raises(InvalidInputError, match="spatial_size=6 has none; use search_windows"):
-        VehicleDetector(odd, search=SEARCH)
-    detector = VehicleDetector(odd, method="windows", search=SEARCH)
+        VehicleDetector(odd, search_params=SEARCH)
+    detector = VehicleDetector(odd, method="windows", search_params=SEARCH)
     assert len(detector.search(GOOD).windows) > 0
 
 
 def test_the_default_is_the_shipped_model():
     detector = VehicleDetector()
-    assert detector.classifier.threshold == load_model("default").threshold
+    assert detector.model.threshold == load_model("default").threshold
     gray = np.full((720, 1280, 3), 90, np.uint8)
     assert len(detector.detect(gray)) == 0
     assert detector.process(gray).tracks == ()

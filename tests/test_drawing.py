@@ -8,13 +8,13 @@ from scipy import ndimage
 
 from vehicle_detection.boxes import Detections
 from vehicle_detection.drawing import (
-    FIELDS,
+    LABEL_FIELDS,
     TRACK_COLORS,
+    blend,
     draw_boxes,
     draw_diagnostics,
     draw_labeled_bboxes,
     draw_tracks,
-    draw_tracks_onto,
     track_color,
     track_text,
 )
@@ -38,7 +38,7 @@ def track(box=(600, 400, 700, 490), **changes):
         "shown": True,
         "age": 2.0,
         "misses": 0,
-        "unseen": 0.0,
+        "time_since_update": 0.0,
         "velocity": (3.0, 0.0),
         "distance_m": 23.6,
         "distance_std_m": 2.2,
@@ -48,8 +48,8 @@ def track(box=(600, 400, 700, 490), **changes):
     return Track(**(attributes | changes))
 
 
-def touched(drawn, image):
-    """Bounding box ``[x1, y1, x2, y2]`` of the pixels that were changed; None where there are none."""
+def changed_box(drawn, image):
+    """Bounding box ``[x1, y1, x2, y2]`` of the pixels that differ; None if there are none."""
     rows, columns = np.nonzero((drawn != image).any(axis=2))
     return [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1] if len(rows) else None
 
@@ -58,7 +58,7 @@ class TestBoxes:
     def test_lines_lie_inside_the_half_open_box(self):
         image = blank(50, 60, 0)
         drawn = draw_boxes(image, [[10, 5, 40, 35]], thickness=2)
-        assert touched(drawn, image) == [10, 5, 40, 35]
+        assert changed_box(drawn, image) == [10, 5, 40, 35]
         assert drawn[5:7, 10:40].tolist() == [[BLUE] * 30] * 2
         assert not drawn[7:33, 12:38].any()
         assert int(drawn.any(axis=2).sum()) == 30 * 30 - 26 * 26
@@ -70,7 +70,7 @@ class TestBoxes:
         assert drawn.shape == image.shape
         assert drawn[5, 10].tolist() == [255, 0, 0]
 
-    def test_takes_the_corner_pairs_of_the_course(self):
+    def test_accepts_the_corner_pairs_of_the_course(self):
         image = blank(50, 60, 0)
         expected = draw_boxes(image, [[10, 5, 40, 35], [0, 0, 9, 9]], thickness=1)
         for pairs in ([((10, 5), (40, 35)), ((0, 0), (9, 9))], [((40, 35), (10, 5)), ((9, 0), (0, 9))]):
@@ -86,7 +86,7 @@ class TestBoxes:
         st.integers(2, 60),
         st.integers(2, 60),
     )
-    def test_any_box_may_lie_partly_or_wholly_outside(self, corners, thickness, height, width):
+    def test_boxes_may_lie_partly_or_wholly_outside(self, corners, thickness, height, width):
         image = blank(height, width)
         boxes = [[min(a, c), min(b, d), max(a, c), max(b, d)] for a, b, c, d in corners]
         drawn = draw_boxes(image, boxes, thickness=thickness)
@@ -94,7 +94,7 @@ class TestBoxes:
         colors = {tuple(pixel) for pixel in drawn.reshape(-1, 3).tolist()}
         assert colors <= {(90, 90, 90), (0, 0, 255)}
 
-    def test_refuses_malformed_arguments(self):
+    def test_rejects_malformed_arguments(self):
         with pytest.raises(InvalidInputError, match=r"image must be an \(H, W, 3\) uint8 RGB array"):
             draw_boxes(np.zeros((5, 5, 3)), [])
         with pytest.raises(InvalidInputError, match=r"boxes must be an \(N, 4\) number array"):
@@ -116,7 +116,7 @@ class TestLabels:
         np.testing.assert_array_equal(drawn, draw_boxes(image, [[30, 20, 80, 40], [120, 60, 190, 90]]))
         assert not image.any()
 
-    def test_a_label_that_was_removed_is_left_out(self):
+    def test_a_missing_label_is_skipped(self):
         labels = np.array([[1, 0, 3, 3]] * 4)
         image = blank(4, 4, 0)
         expected = draw_boxes(image, [[0, 0, 1, 4], [2, 0, 4, 4]])
@@ -126,7 +126,7 @@ class TestLabels:
         image = blank(10, 10)
         np.testing.assert_array_equal(draw_labeled_bboxes(image, ndimage.label(np.zeros((10, 10)))), image)
 
-    def test_refuses_malformed_labels(self):
+    def test_rejects_malformed_labels(self):
         with pytest.raises(InvalidInputError, match=r"labels must be the pair .*scipy.ndimage.label returns"):
             draw_labeled_bboxes(blank(), np.zeros((720, 1280), int))
         with pytest.raises(InvalidInputError, match=r"labels\[0\] must be integers of the image's shape"):
@@ -136,25 +136,25 @@ class TestLabels:
 
 
 class TestTracks:
-    def test_draws_on_a_copy_and_onto_the_image_itself(self):
+    def test_draws_on_a_copy(self):
         image = blank()
+        image.setflags(write=False)
         drawn = draw_tracks(image, [track()])
         np.testing.assert_array_equal(image, blank())
-        assert draw_tracks_onto(image, [track()]) is None
-        np.testing.assert_array_equal(drawn, image)
+        assert drawn.flags.writeable
 
     def test_box_and_label_have_the_tracks_color(self):
         drawn = draw_tracks(blank(), [track(id=3)])
         assert tuple(drawn[489, 650].tolist()) == TRACK_COLORS[2]
         assert tuple(drawn[399, 601].tolist()) == TRACK_COLORS[2]
 
-    def test_colors_stay_with_the_id_and_repeat_after_the_palette(self):
+    def test_colors_follow_the_id_and_repeat_after_the_palette(self):
         count = len(TRACK_COLORS)
         assert [track_color(track(id=1 + k)) for k in range(count)] == list(TRACK_COLORS)
         assert track_color(track(id=1 + count)) == TRACK_COLORS[0]
         assert track_color(track(id=0, state="tentative")) not in TRACK_COLORS
 
-    def test_colors_are_apart_in_brightness_or_hue_for_color_blind_eyes(self):
+    def test_color_blind_viewers_can_tell_the_colors_apart(self):
         """Machado et al. (2009), full protanopia, deuteranopia and tritanopia."""
         simulations = [
             [
@@ -175,28 +175,28 @@ class TestTracks:
         ]
         linear = (np.array(TRACK_COLORS) / 255) ** 2.2
         for matrix in simulations:
-            seen = np.clip(linear @ np.array(matrix).T, 0, 1) ** (1 / 2.2) * 255
-            nearest = min(np.linalg.norm(a - b) for a, b in itertools.combinations(seen, 2))
+            simulated = np.clip(linear @ np.array(matrix).T, 0, 1) ** (1 / 2.2) * 255
+            nearest = min(np.linalg.norm(a - b) for a, b in itertools.combinations(simulated, 2))
             assert nearest > 25
 
-    def test_tracks_that_are_not_shown_are_left_out(self):
+    def test_tracks_that_are_not_shown_are_not_drawn(self):
         drawn = draw_tracks(blank(), [track(shown=False), track(id=0, state="tentative", shown=False)])
         np.testing.assert_array_equal(drawn, blank())
 
     def test_a_coasting_track_fades(self):
-        strength = []
+        contrast = []
         for time_since_update in (0.0, 0.1, 0.3, 5.0):
             drawn = draw_tracks(
                 blank(), [track(time_since_update=time_since_update, misses=int(time_since_update * 25))]
             )
-            strength.append(np.abs(drawn[489, 650].astype(int) - 90).sum())
-        assert strength[0] > strength[1] > strength[2] > strength[3] > 0
+            contrast.append(np.abs(drawn[489, 650].astype(int) - 90).sum())
+        assert contrast[0] > contrast[1] > contrast[2] > contrast[3] > 0
 
     @pytest.mark.parametrize(("height", "width"), SIZES)
     def test_the_label_grows_with_the_image_and_lies_above_its_box(self, height, width):
         image = blank(height, width)
         box = np.array([0.4, 0.5, 0.5, 0.6]) * [width, height, width, height]
-        left, top, _, bottom = touched(draw_tracks(image, [track(box)]), image)
+        left, top, _, bottom = changed_box(draw_tracks(image, [track(box)]), image)
         label = round(box[1]) - top
         assert left == round(box[0])
         assert bottom == round(box[3])
@@ -205,7 +205,7 @@ class TestTracks:
 
     @pytest.mark.parametrize(("height", "width"), SIZES)
     @pytest.mark.parametrize("corner", [(0, 0), (0, 1), (1, 0), (1, 1)])
-    def test_labels_stay_inside_the_picture(self, height, width, corner):
+    def test_labels_stay_inside_the_image(self, height, width, corner):
         side_x, side_y = width // 12, height // 12
         sizes = []
         for x, y in (
@@ -214,13 +214,13 @@ class TestTracks:
         ):
             tracks = [track((x, y, x + side_x, y + side_y))]
             bare = draw_tracks(blank(height, width), tracks, show=())
-            x1, y1, x2, y2 = touched(draw_tracks(blank(height, width), tracks), bare)
+            x1, y1, x2, y2 = changed_box(draw_tracks(blank(height, width), tracks), bare)
             sizes.append((x2 - x1, y2 - y1))
-        # A label on its own box's lines has their color: only so much may seem to be missing.
+        # A label has the color of its box's lines, so a part over them does not differ.
         line = max(2, round(np.sqrt(height * width) / 320))
         assert np.abs(np.subtract(*sizes)).max() <= line
 
-    def test_labels_of_neighbors_do_not_hide_each_other(self):
+    def test_labels_of_neighbors_do_not_overlap(self):
         image = blank()
         pair = [track((600, 400, 700, 490)), track((610, 402, 712, 495), id=2)]
         bare = draw_tracks(image, pair, show=())
@@ -231,13 +231,13 @@ class TestTracks:
         both = int((draw_tracks(image, pair) != bare).any(axis=2).sum())
         assert both > 0.9 * sum(areas)
 
-    def test_a_long_label_shrinks_to_a_narrow_picture(self):
+    def test_a_long_label_shrinks_to_fit_a_narrow_image(self):
         image = blank(200, 60)
-        box = touched(draw_tracks(image, [track((10, 80, 50, 120))], show=FIELDS), image)
+        box = changed_box(draw_tracks(image, [track((10, 80, 50, 120))], show=LABEL_FIELDS), image)
         assert box[0] >= 0
         assert box[2] <= 60
 
-    def test_nearer_vehicles_are_drawn_over_farther_ones(self):
+    def test_near_vehicles_are_drawn_over_far_ones(self):
         near, far = track((600, 400, 700, 500)), track((650, 380, 750, 470), id=2)
         for order in ([near, far], [far, near]):
             drawn = draw_tracks(blank(), order, show=())
@@ -251,17 +251,17 @@ class TestTracks:
         st.integers(1, 300),
         st.floats(0, 2),
     )
-    def test_tracks_may_lie_partly_outside_any_picture(self, corners, height, width, time_since_update):
+    def test_tracks_may_lie_partly_outside_the_image(self, corners, height, width, time_since_update):
         image = blank(height, width)
         tracks = [
             track([min(a, c), min(b, d), max(a, c), max(b, d)], id=index, time_since_update=time_since_update)
             for index, (a, b, c, d) in enumerate(corners, 1)
         ]
-        drawn = draw_tracks(image, tracks, show=FIELDS)
+        drawn = draw_tracks(image, tracks, show=LABEL_FIELDS)
         assert drawn.shape == image.shape
         assert drawn.dtype == np.uint8
 
-    def test_refuses_malformed_arguments(self):
+    def test_rejects_malformed_arguments(self):
         with pytest.raises(InvalidInputError, match="show must be one of 'id', 'score'"):
             draw_tracks(blank(), [], show=("name",))
         with pytest.raises(
@@ -270,31 +270,37 @@ class TestTracks:
             draw_tracks(blank(), [[1, 2, 3, 4]])
         with pytest.raises(InvalidInputError, match="tracks must be Track objects"):
             draw_tracks(blank(), None)
-        frozen = blank()
-        frozen.setflags(write=False)
-        with pytest.raises(InvalidInputError, match=r"image must be writeable.*use draw_tracks"):
-            draw_tracks_onto(frozen, [])
-        assert draw_tracks(frozen, [track()]).flags.writeable
+
+
+class TestBlend:
+    @pytest.mark.parametrize("dtype", [np.uint8, np.float64])
+    def test_mixes_an_image_with_a_color_or_an_image(self, dtype):
+        image = np.full((4, 6, 3), 100, dtype)
+        mixed = blend(image, (200, 100, 0), 0.25)
+        assert mixed.dtype == dtype
+        assert (mixed == [125, 100, 75]).all()
+        np.testing.assert_array_equal(mixed, blend(image, np.full_like(image, (200, 100, 0)), 0.25))
+        assert (image == 100).all()
 
 
 class TestText:
-    def test_says_what_is_asked_for_and_known(self):
+    def test_shows_the_requested_and_known_fields(self):
         assert track_text(track(), ("id", "distance", "speed")) == "#1  24 m  -1.8 m/s"
-        assert track_text(track(), ("distance", "errors")) == "24 +-2 m"
-        assert track_text(track(), FIELDS) == "#1  1.2  24 +-2 m  -1.8 +-0.5 m/s"
+        assert track_text(track(), ("distance", "std")) == "24 +-2 m"
+        assert track_text(track(), LABEL_FIELDS) == "#1  1.2  24 +-2 m  -1.8 +-0.5 m/s"
         assert track_text(track(), ()) == ""
 
-    def test_leaves_out_what_is_unknown(self):
+    def test_omits_unknown_values(self):
         unknown = track(distance_m=None, distance_std_m=None, speed_mps=None, speed_std_mps=None)
-        assert track_text(unknown, FIELDS) == "#1  1.2"
+        assert track_text(unknown, LABEL_FIELDS) == "#1  1.2"
 
-    def test_is_plain_ascii_as_the_font_has_no_more(self):
-        assert track_text(track(), FIELDS).isascii()
+    def test_is_ascii_as_the_font_has_no_other_characters(self):
+        assert track_text(track(), LABEL_FIELDS).isascii()
 
 
 class TestDiagnostics:
     @pytest.mark.parametrize(("height", "width"), [(720, 1280), (361, 481), (1920, 1080), (4, 5)])
-    def test_is_of_the_frames_shape(self, height, width):
+    def test_has_the_shape_of_the_frame(self, height, width):
         heat = np.zeros((height, width), np.float32)
         mosaic = draw_diagnostics(blank(height, width), np.empty((0, 4)), heat, [])
         assert mosaic.shape == (height, width, 3)
@@ -318,11 +324,11 @@ class TestDiagnostics:
         for heat in (np.zeros((90, 160)), np.ones((90, 160), int), np.ones((9, 16), bool), -np.ones((9, 16))):
             assert draw_diagnostics(blank(), [], heat, []).shape == (720, 1280, 3)
 
-    def test_refuses_malformed_arguments(self):
+    def test_rejects_malformed_arguments(self):
         heat = np.zeros((720, 1280))
         with pytest.raises(InvalidInputError, match=r"frame must be an \(H, W, 3\)"):
             draw_diagnostics(heat, [], heat, [])
-        with pytest.raises(InvalidInputError, match="frame must have 4x4 pixels or more"):
+        with pytest.raises(InvalidInputError, match="frame must be at least 4x4 pixels"):
             draw_diagnostics(blank(3, 9), [], heat, [])
         with pytest.raises(InvalidInputError, match=r"heat must be an \(h, w\) array of numbers"):
             draw_diagnostics(blank(), [], blank(), [])

@@ -267,7 +267,7 @@ def test_a_writer_can_be_used_again_but_only_inside_its_block(tmp_path):
     for _ in range(2):
         with writer as write:
             write(ROWS[0])
-        with pytest.raises(InvalidInputError, match="must be inside its with block"):
+        with pytest.raises(InvalidInputError, match="must be called inside its with block"):
             write(ROWS[0])
         assert len(read_csv(tmp_path / "t.csv")) == writer.rows == 1
 

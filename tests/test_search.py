@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.helpers import random_classifier
-from vehicle_detection._common import Buffers
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import COLOR_SPACES, FeatureParams, PixelBand, SearchBand, SearchParams
@@ -256,12 +255,12 @@ def test_a_search_is_used_again_and_again():
     fresh = [find_cars(image, classifier, search, n_jobs=1) for image in images]
     with BandSearch(classifier, n_jobs=2) as bands:
         for image, expected in zip(images * 2, fresh * 2):
-            found = bands.find(image, search)
+            found = bands.find_windows(image, search)
             np.testing.assert_array_equal(found.boxes, expected.boxes)
             np.testing.assert_array_equal(found.scores, expected.scores)
         bands.close()
         # A closed search starts its threads again.
-        assert len(bands.find(images[0], search)) == len(fresh[0])
+        assert len(bands.find_windows(images[0], search)) == len(fresh[0])
 
 
 def test_a_score_map_is_the_callers_own():
@@ -292,7 +291,7 @@ def test_many_threads_share_one_search(monkeypatch):
 
         def find(image):
             together.wait(10)
-            return bands.find(image, search)
+            return bands.find_windows(image, search)
 
         for found, expected in zip(callers.map(find, images), fresh):
             np.testing.assert_array_equal(found.scores, expected.scores)
@@ -461,17 +460,3 @@ def test_a_strided_frame_gives_the_same():
         assert not view.flags.c_contiguous
         found = find_cars(view, classifier, small_search())
         np.testing.assert_array_equal(found.scores, expected.scores)
-
-
-def test_frames_of_many_sizes_share_the_memory_of_the_largest():
-    buffers = Buffers()
-    large = buffers.take((40, 60, 3), np.uint8, "band")
-    large[:] = 7
-    for side in range(10, 40):
-        small = buffers.take((side, side, 3), np.uint8, "band")
-        assert small.shape == (side, side, 3)
-        assert small.flags.c_contiguous
-        assert np.shares_memory(small, large)
-    assert not np.shares_memory(buffers.take((40, 60, 3), np.uint8, "strip"), large)
-    assert not np.shares_memory(buffers.take((40, 60, 3), np.float32, "band"), large)
-    assert buffers.take((80, 60, 3), np.uint8, "band").shape == (80, 60, 3)

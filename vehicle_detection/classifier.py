@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,7 @@ import vehicle_detection
 from vehicle_detection._common import (
     ModelData,
     blur_patches,
+    check_choice,
     check_integer,
     check_number,
     check_patches,
@@ -26,10 +27,12 @@ from vehicle_detection._common import (
 from vehicle_detection._kernels import fit_svm
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.features import extract_features
-from vehicle_detection.params import PATCH_SIZE, FeatureParams
+from vehicle_detection.params import PATCH_SIZE, FeatureParams, SearchParams
 
 if TYPE_CHECKING:
     from sklearn.pipeline import Pipeline
+
+    from vehicle_detection.search import FrameSearch
 
 KIND = "patches"
 """Value of ``kind`` in the model files of patch classifiers."""
@@ -94,6 +97,8 @@ class VehicleClassifier:
     >>> classifier.predict(np.zeros((2, 64, 64, 3), np.uint8)).tolist()
     [0, 0]
     """
+
+    search_params_type: ClassVar[type[SearchParams]] = SearchParams
 
     params: FeatureParams
     templates: tuple[Template, ...]
@@ -233,6 +238,36 @@ class VehicleClassifier:
         svm.n_features_in_ = self.params.length
         features = PatchFeatures(**asdict(self.params))
         return Pipeline([("features", features), ("scaler", scaler), ("svm", svm)])
+
+    def open_search(
+        self, n_jobs: int | None = None, method: Literal["shared", "windows"] = "shared"
+    ) -> FrameSearch:
+        """Open a search of frames with this model.
+
+        Parameters
+        ----------
+        n_jobs
+            Threads; the result does not depend on them.
+        method
+            ``"shared"``: the fast search, features shared by all windows. ``"windows"``: the reference, one
+            patch per window.
+
+        Raises
+        ------
+        InvalidInputError
+            If `method` is unknown, or the features cannot be shared by windows.
+        """
+        from vehicle_detection.search import BandSearch, ReferenceSearch
+
+        check_choice(method, "method", ("shared", "windows"))
+        search = BandSearch if method == "shared" else ReferenceSearch
+        return search(self, n_jobs=n_jobs)
+
+    def summary(self) -> tuple[str, dict[str, str]]:
+        """Describe the model for display: a title, and named facts."""
+        count = len(self.templates)
+        title = f"{self.params.length} features, {count} template{'s' * (count > 1)}"
+        return title, {name: str(value) for name, value in asdict(self.params).items()}
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the model as a safetensors file (tensors and JSON, no pickle).

@@ -1,7 +1,8 @@
-"""`VehicleDetector`: search, regions and tracking put together; the only state that outlives a frame."""
+"""`VehicleDetector`: search, detection and tracking combined; with `tracking`, the only state between frames."""
 
 from __future__ import annotations
 
+import os
 import time as clock
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -10,80 +11,52 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_choice, check_image, check_number, check_type
+from vehicle_detection._common import check_image, check_number, check_type
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import VehicleClassifier
-from vehicle_detection.drawing import draw_diagnostics, draw_tracks
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.drawing import draw_boxes, draw_diagnostics, draw_tracks
 from vehicle_detection.heatmap import HeatHistory, frame_heat, label_boxes
-from vehicle_detection.mixture import MixtureSearch, TemplateMixture, load_model
+from vehicle_detection.images import read_image
+from vehicle_detection.mixture import TemplateMixture, load_model
 from vehicle_detection.params import HeatParams, PyramidParams, RegionParams, SearchParams, TrackParams
 from vehicle_detection.regions import find_vehicles
-from vehicle_detection.search import BandSearch
+from vehicle_detection.search import FrameSearch, SearchResult
 from vehicle_detection.tracking import Track, Tracker
-from vehicle_detection.windows import band_windows, search_windows
 
-_THUMBNAIL = (32, 18)
-
-# By how much of the frame's height the horizon of search bands may be wrong, and the share of such an error
-# that is its standard error.
-_BAND_ERROR, _DOUBT = 0.1, 0.4
+Path = str | os.PathLike[str]
 
 CUT_DIFFERENCE = 40.0
-"""Mean change of a thumbnail's values, 0-255, from one frame to the next that is another scene."""
+"""Mean absolute difference of consecutive thumbnails, 0-255, above which the scene has been cut."""
 
-
-@dataclass(frozen=True, eq=False)
-class FoundWindows:
-    """What the search of one frame hands to the sequential pass; it needs no other frame.
-
-    Attributes
-    ----------
-    windows
-        Windows that score above the search's least score.
-    vehicles
-        Boxes of the vehicles, where the model tells them, and of what may be some: scores below 0 are for the
-        tracker alone. None where they follow from the windows.
-    shape
-        ``(height, width)`` of the frame.
-    thumbnail
-        ``(18, 32)`` float32 gray copy of the frame, by which a cut is noticed.
-    seconds
-        Time the search took.
-    """
-
-    windows: Detections
-    vehicles: Detections | None
-    shape: tuple[int, int]
-    thumbnail: NDArray[np.float32]
-    seconds: float
+# Standard error of the horizon as a fraction of the search's horizon tolerance.
+_HORIZON_STD = 0.4
 
 
 @dataclass(frozen=True, eq=False)
 class FrameResult:
-    """What was found in one frame of a video.
+    """The result of one frame of a video.
 
     Attributes
     ----------
     index
         Number of the frame since the last reset, from 0.
     time
-        Time of the frame in seconds, None where it is not known.
+        Time of the frame in seconds; None if unknown.
     windows
         Positive windows of this frame.
-    regions
+    detections
         Boxes of this frame, before tracking.
     tracks
         All tracks; those with ``track.shown`` are vehicles to draw.
     seconds
-        Time spent by stage: ``"search"``, ``"regions"``, ``"track"``.
+        Time spent per stage: ``"search"``, ``"regions"``, ``"track"``.
     """
 
     index: int
     time: float | None
     windows: Detections
-    regions: Detections
+    detections: Detections
     tracks: tuple[Track, ...]
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -94,32 +67,38 @@ class FrameResult:
 
 
 class VehicleDetector:
-    """Find the vehicles of stills, and follow those of a video.
+    """Detect the vehicles of images, and track those of a video.
 
     Parameters
     ----------
-    classifier
-        The trained model: a `TemplateMixture`, for any road, or a `VehicleClassifier` of patches, such as
-        ``load_model("highway")``; None loads ``load_model("default")``.
+    model
+        A name (``"default"`` for any road, ``"highway"``), the path of a model file, or a model.
     method
-        ``"shared"``: the fast search, features shared by all windows. ``"windows"``: the reference, each
-        window by its own patch, any step; for classifiers of patches.
-    regions
-        ``"fitted"``: a box from each group of agreeing windows. ``"heat"``: the course's way, regions of a
-        heat map over the last frames.
-    search
-        `PyramidParams` for a mixture, `SearchParams` for a classifier of patches.
-    heat, fit, track
-        Parameters of the stages; by default those of the project.
+        ``"shared"``: the fast search, features shared by all windows. ``"windows"``: the reference, one patch
+        per window; for classifiers of patches.
+    search_params
+        Where windows are searched: `PyramidParams` for a mixture, `SearchParams` for a classifier of patches.
+    region_params
+        How windows become boxes, unless the model predicts boxes: `RegionParams` for one box per group of
+        agreeing windows; `HeatParams` for the course's heat map over the last frames (any model).
+    track_params
+        Parameters of the tracker.
     camera
-        The camera, for distances and boxes; by default a dash-cam with the search's horizon, as a guess that
-        the vehicles of a video correct.
+        The camera, for distances and boxes; by default a dash-cam with the search's horizon, as an estimate
+        that tracking refines.
     horizon
-        Height of the horizon as a share of the frame's height; overrides the one of `search`.
+        Height of the horizon as a fraction of the frame's height; overrides that of `search_params`.
     n_jobs
         Threads of the search of one frame.
     diagnostics
         `annotate` shows the frame, its positive windows, the heat map and the tracks side by side.
+
+    Raises
+    ------
+    ModelFileError
+        If the model file is missing or damaged.
+    InvalidInputError
+        If an argument is malformed, or `search_params` or `method` do not fit the model.
 
     Examples
     --------
@@ -131,53 +110,36 @@ class VehicleDetector:
 
     def __init__(
         self,
-        classifier: VehicleClassifier | TemplateMixture | None = None,
+        model: Path | VehicleClassifier | TemplateMixture = "default",
         *,
         method: Literal["shared", "windows"] = "shared",
-        regions: Literal["fitted", "heat"] = "fitted",
-        search: SearchParams | PyramidParams | None = None,
-        heat: HeatParams | None = None,
-        fit: RegionParams | None = None,
-        track: TrackParams | None = None,
+        search_params: SearchParams | PyramidParams | None = None,
+        region_params: RegionParams | HeatParams | None = None,
+        track_params: TrackParams | None = None,
         camera: Camera | None = None,
         horizon: float | None = None,
         n_jobs: int | None = None,
         diagnostics: bool = False,
     ) -> None:
-        check_choice(method, "method", ("shared", "windows"))
-        check_choice(regions, "regions", ("fitted", "heat"))
+        self.model = _load(model)
         for name, value, kind in (
-            ("heat", heat, HeatParams),
-            ("fit", fit, RegionParams),
-            ("track", track, TrackParams),
+            ("search_params", search_params, self.model.search_params_type),
+            ("region_params", region_params, (RegionParams, HeatParams)),
+            ("track_params", track_params, TrackParams),
             ("camera", camera, Camera),
         ):
             if value is not None:
-                check_type(value, name, kind, "leave it out for the project's own")
-        self.classifier = load_model() if classifier is None else classifier
-        self.method = method
-        self.regions = regions
-        self.search_params = _search_params(self.classifier, search).with_horizon(horizon)
-        self.heat_params = heat or HeatParams()
-        self.region_params = fit or RegionParams()
-        self.track_params = track or TrackParams()
+                check_type(value, name, kind, "omit it for the default")
+        chosen = search_params or self.model.search_params_type.default()
+        self.search_params: SearchParams | PyramidParams = chosen.with_horizon(horizon)
+        self.region_params = region_params or RegionParams()
+        self.track_params = track_params or TrackParams()
         self.camera = camera
         self.diagnostics = diagnostics
-        self._n_jobs = n_jobs
-        self._engine = self._open_engine()
-        self._history = HeatHistory(self.heat_params.frames)
+        self._search: FrameSearch = self.model.open_search(n_jobs, method)
+        self._heat_params = region_params if isinstance(region_params, HeatParams) else None
+        self._heat_history = HeatHistory((self._heat_params or HeatParams()).frames)
         self.reset()
-
-    def _open_engine(self) -> MixtureSearch | BandSearch | None:
-        """Search of the model's kind; None where windows are looked at one by one."""
-        if isinstance(self.classifier, TemplateMixture):
-            if self.method == "windows":
-                raise InvalidInputError(
-                    "method must be 'shared' for a mixture of templates, got 'windows'; "
-                    'pass load_model("highway")'
-                )
-            return MixtureSearch(self.classifier, n_jobs=self._n_jobs)
-        return BandSearch(self.classifier, n_jobs=self._n_jobs) if self.method == "shared" else None
 
     def reset(self, *, fps: float = 25.0) -> None:
         """Forget all frames, before the first frame of another video.
@@ -185,7 +147,7 @@ class VehicleDetector:
         Parameters
         ----------
         fps
-            Frame rate, for frames that come without a time.
+            Frame rate, for frames without a time.
 
         Raises
         ------
@@ -195,55 +157,30 @@ class VehicleDetector:
         self._fps = check_number(fps, "fps", above=0, high=1e6)
         self._index = 0
         self._thumbnail: NDArray[np.float32] | None = None
-        self._history.clear()
+        self._heat_history.clear()
         self._tracker: Tracker | None = None
 
-    def search(self, frame: NDArray[np.uint8]) -> FoundWindows:
-        """Search one frame for windows that look like vehicles: needs no other frame, and any thread may.
+    def search(self, frame: NDArray[np.uint8]) -> SearchResult:
+        """Search one frame for windows and vehicles; needs no other frame, and is thread-safe.
 
         Raises
         ------
         InvalidInputError
-            If the frame is no ``(H, W, 3)`` uint8 RGB image or too small for a window.
+            If the frame is not an ``(H, W, 3)`` uint8 RGB image, or is too small for a window.
         """
-        began = clock.perf_counter()
         check_image(frame, "frame")
-        vehicles = None
-        params = self.search_params
-        if isinstance(params, PyramidParams):
-            assert isinstance(self._engine, MixtureSearch)
-            least = min(0.0, self.track_params.low_threshold, self.track_params.high_threshold)
-            found = self._engine.find(frame, params, least=least)
-            windows, vehicles = found.windows, found.vehicles
-        elif isinstance(self._engine, BandSearch):
-            windows = self._engine.find(frame, params)
-        else:
-            windows = self._search_one_by_one(frame, params)
-        height, width = frame.shape[:2]
-        # Every n-th pixel is enough to notice a cut, and costs nothing.
-        rows = np.linspace(0, height - 1, _THUMBNAIL[1]).astype(int)
-        columns = np.linspace(0, width - 1, _THUMBNAIL[0]).astype(int)
-        thumbnail = frame[np.ix_(rows, columns)].mean(axis=2, dtype=np.float32)
-        seconds = clock.perf_counter() - began
-        return FoundWindows(windows, vehicles, (height, width), thumbnail, seconds)
+        # Low scores are for the tracker, which continues confirmed tracks with them.
+        track = self.track_params
+        min_score = min(0.0, track.low_threshold, track.high_threshold)
+        return self._search.find(frame, self.search_params, min_vehicle_score=min_score)
 
-    def _search_one_by_one(self, frame: NDArray[np.uint8], search: SearchParams) -> Detections:
-        assert isinstance(self.classifier, VehicleClassifier)
-        bands = [band_windows(band) for band in search.place(frame.shape)]
-        # Windows of an overhang need pixels beyond the frame; the reference does without them.
-        windows = np.concatenate(bands)
-        windows = windows[(windows[:, 0] >= 0) & (windows[:, 2] <= frame.shape[1])]
-        return search_windows(
-            frame, windows, self.classifier, min_score=search.min_score, n_jobs=self._n_jobs
-        )
-
-    def detect(self, image: NDArray[np.uint8]) -> Detections:
-        """Find the vehicles of a still; the state of a video is neither used nor changed.
+    def detect(self, image: NDArray[np.uint8] | Path) -> Detections:
+        """Detect the vehicles of a single image; the state of a video is neither used nor changed.
 
         Parameters
         ----------
         image
-            ``(H, W, 3)`` uint8 RGB.
+            ``(H, W, 3)`` uint8 RGB, or the path of an image file.
 
         Returns
         -------
@@ -253,35 +190,36 @@ class VehicleDetector:
         Raises
         ------
         InvalidInputError
-            If the image is malformed or too small for a window.
+            If the image is malformed, unreadable or too small for a window.
         """
-        found = self.search(image)
-        if self.regions == "heat":
-            return self._label(frame_heat(found.shape, found.windows, self.heat_params))
-        return _sure(self._fit(found))
+        frame = read_image(image) if isinstance(image, (str, os.PathLike)) else image
+        found = self.search(frame)
+        if self._heat_params is not None:
+            return self._label(frame_heat(found.shape, found.windows, self._heat_params), self._heat_params)
+        return _positive(self._fit_boxes(found))
 
-    def _fit(self, found: FoundWindows) -> Detections:
+    def _fit_boxes(self, found: SearchResult) -> Detections:
         if found.vehicles is not None:
             return found.vehicles
+        assert isinstance(self.region_params, RegionParams)
         return find_vehicles(found.windows, self._camera_of(found.shape), found.shape, self.region_params)
 
-    def _label(self, heat: NDArray[np.float32]) -> Detections:
-        return label_boxes(
-            heat, threshold=self.heat_params.threshold, peak_fraction=self.heat_params.peak_fraction
-        )
+    @staticmethod
+    def _label(heat: NDArray[np.float32], params: HeatParams) -> Detections:
+        return label_boxes(heat, threshold=params.threshold, peak_fraction=params.peak_fraction)
 
     def _camera_of(self, shape: tuple[int, int]) -> Camera:
         if self.camera is not None:
             return self.camera
-        search = self.search_params
-        if search.horizon is None:
+        params = self.search_params
+        if params.horizon is None:
             return Camera.for_frame(shape)
-        # The search allows for a horizon that is off; the tracker learns by how much.
-        error = search.horizon_error if isinstance(search, PyramidParams) else _BAND_ERROR
-        return Camera.for_frame(shape, horizon=search.horizon, horizon_std_px=_DOUBT * error * shape[0])
+        # The search tolerates a wrong horizon; the tracker estimates by how much it is wrong.
+        std = _HORIZON_STD * params.horizon_tolerance * shape[0]
+        return Camera.for_frame(shape, horizon=params.horizon, horizon_std_px=std)
 
     def process(self, frame: NDArray[np.uint8], time: float | None = None) -> FrameResult:
-        """Search the next frame of a video and follow its vehicles.
+        """Search the next frame of a video and track its vehicles.
 
         Parameters
         ----------
@@ -290,81 +228,79 @@ class VehicleDetector:
         time
             Time of the frame in seconds; None: one frame after the last one.
         """
-        found = self.search(frame)
-        return self.follow(found, found.shape, time=time)
+        return self.track(self.search(frame), time=time)
 
-    def follow(
-        self, found: FoundWindows, shape: tuple[int, ...], *, time: float | None = None
-    ) -> FrameResult:
-        """Take the searched windows of the next frame: regions and tracks, strictly in the frames' order.
+    def track(self, found: SearchResult, *, time: float | None = None) -> FrameResult:
+        """Update the tracks with the search result of the next frame, in frame order.
 
         Parameters
         ----------
         found
             Result of `search` for this frame.
-        shape
-            ``(height, width, ...)`` of the frame.
         time
             Time of the frame in seconds; None: one frame after the last one.
 
         Notes
         -----
-        A cut to another scene, a frame of another size and a time that goes back end all tracks.
+        A cut to another scene, a frame of another size and a time that goes backwards end all tracks.
         """
-        began = clock.perf_counter()
+        start = clock.perf_counter()
         if self._tracker is None:
             self._tracker = Tracker(self.track_params, fps=self._fps)
         self._tracker.set_camera(self._camera_of(found.shape))
         if self._is_cut(found):
-            self._history.clear()
+            self._heat_history.clear()
             self._tracker.cut()
         self._thumbnail = found.thumbnail
-        if self.regions == "heat":
-            heat = self._history.add(frame_heat(found.shape, found.windows, self.heat_params))
-            regions = self._label(heat)
+        if self._heat_params is not None:
+            heat = self._heat_history.add(frame_heat(found.shape, found.windows, self._heat_params))
+            detections = self._label(heat, self._heat_params)
         else:
-            regions = self._fit(found)
-        fitted = clock.perf_counter()
-        tracks = self._tracker.update(regions, shape, time=time)
+            detections = self._fit_boxes(found)
+        detected = clock.perf_counter()
+        tracks = self._tracker.update(detections, found.shape, time=time)
         seconds = {
             "search": found.seconds,
-            "regions": fitted - began,
-            "track": clock.perf_counter() - fitted,
+            "regions": detected - start,
+            "track": clock.perf_counter() - detected,
         }
-        result = FrameResult(self._index, time, found.windows, _sure(regions), tracks, seconds)
+        result = FrameResult(self._index, time, found.windows, _positive(detections), tracks, seconds)
         self._index += 1
         return result
 
-    def _is_cut(self, found: FoundWindows) -> bool:
+    def _is_cut(self, found: SearchResult) -> bool:
         if self._thumbnail is None:
             return False
-        return (
-            float(cv2.norm(self._thumbnail, found.thumbnail, cv2.NORM_L1))
-            > CUT_DIFFERENCE * found.thumbnail.size
-        )
+        difference = float(cv2.norm(self._thumbnail, found.thumbnail, cv2.NORM_L1))
+        return difference > CUT_DIFFERENCE * found.thumbnail.size
 
     def annotate(self, frame: NDArray[np.uint8], result: FrameResult) -> NDArray[np.uint8]:
         """Draw the vehicles of a result on a copy of its frame."""
         if self.diagnostics:
-            heat = frame_heat(frame.shape, result.windows, self.heat_params)
+            heat = frame_heat(frame.shape, result.windows, self._heat_params or HeatParams())
             return draw_diagnostics(frame, result.windows, heat, result.tracks)
         return draw_tracks(frame, result.tracks)
 
-    def __call__(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Process the next frame and return it annotated: ``clip.image_transform(detector)`` in moviepy."""
+    def __call__(self, frame: NDArray[np.uint8] | Path) -> NDArray[np.uint8]:
+        """Return the next frame annotated: ``clip.image_transform(detector)`` in moviepy.
+
+        The path of an image file gives that image with the vehicles of `detect` drawn; tracks are unchanged.
+        """
+        if isinstance(frame, (str, os.PathLike)):
+            image = read_image(frame)
+            return draw_boxes(image, self.detect(image).boxes)
         return self.annotate(frame, self.process(frame))
 
     def warm_up(self, shape: tuple[int, int] = (720, 1280)) -> None:
-        """Compile the kernels and set up the buffers for frames of `shape`, so that no frame waits for it.
+        """Compile the kernels and allocate the buffers for frames of `shape`, before the first frame.
 
-        Compiled kernels are kept on disk: only the first use after an installation takes seconds.
+        Compiled kernels are cached on disk: only the first use after an installation takes seconds.
         """
         self.detect(np.zeros((*shape, 3), np.uint8))
 
     def close(self) -> None:
-        """End the search's threads; the detector starts them again when it is used."""
-        if self._engine is not None:
-            self._engine.close()
+        """Stop the search's threads; the detector starts them again when it is used."""
+        self._search.close()
 
     def __enter__(self) -> VehicleDetector:
         return self
@@ -373,27 +309,14 @@ class VehicleDetector:
         self.close()
 
 
-def _sure(vehicles: Detections) -> Detections:
-    """Leave out what is for the tracker alone."""
+def _positive(vehicles: Detections) -> Detections:
+    """Keep the vehicles to show: negative scores are for the tracker only."""
     return vehicles[vehicles.scores >= 0]
 
 
-def _search_params(
-    model: VehicleClassifier | TemplateMixture, search: SearchParams | PyramidParams | None
-) -> SearchParams | PyramidParams:
-    """Check that model and search belong together, or choose the search of the model's kind."""
-    if isinstance(model, TemplateMixture):
-        if search is not None:
-            check_type(
-                search,
-                "search",
-                PyramidParams,
-                "leave it out: a mixture of templates is searched for on a pyramid",
-            )
-        return search or PyramidParams()
-    check_type(model, "classifier", VehicleClassifier, "load_model and load_classifier load one")
-    if search is not None:
-        check_type(
-            search, "search", SearchParams, "leave it out: a classifier of patches is searched for in bands"
-        )
-    return search or SearchParams.preset()
+def _load(model: object) -> VehicleClassifier | TemplateMixture:
+    if isinstance(model, (str, os.PathLike)):
+        return load_model(model)
+    kinds = VehicleClassifier, TemplateMixture
+    check_type(model, "model", kinds, "pass a name, the path of a model file, or what load_model returns")
+    return model  # type: ignore[return-value]

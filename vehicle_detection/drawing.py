@@ -1,4 +1,4 @@
-"""Pixels on a copy of a frame: boxes, labelled regions, tracks with what is known of them, diagnostics."""
+"""Drawing on images: boxes, labeled regions, tracks with their labels, and a diagnostic mosaic."""
 
 from __future__ import annotations
 
@@ -21,83 +21,6 @@ Image = NDArray[np.uint8]
 Color = tuple[int, int, int]
 Rectangle = tuple[int, int, int, int]
 
-BLACK, WHITE = (0, 0, 0), (255, 255, 255)
-
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
-
-
-def line_width(image: Image) -> int:
-    """Width of a box's lines in pixels."""
-    return max(2, round(math.sqrt(image.shape[0] * image.shape[1]) / 320))
-
-
-def text_scale(image: Image) -> float:
-    """Scale of the font, whose capitals are 22 pixels high at 1."""
-    return min(max(math.sqrt(image.shape[0] * image.shape[1]) / 1600, 0.36), 4.0)
-
-
-def rounded(box: NDArray[Any]) -> Rectangle:
-    """Whole pixels, as Python's integers: a box far outside must not overflow."""
-    x1, y1, x2, y2 = (math.floor(float(value) + 0.5) for value in box)
-    return x1, y1, x2, y2
-
-
-def touch(first: Rectangle, second: Rectangle) -> bool:
-    """Whether two rectangles have a pixel in common."""
-    across = first[0] < second[2] and second[0] < first[2]
-    return across and first[1] < second[3] and second[1] < first[3]
-
-
-def frame_box(image: Image, box: Rectangle, color: Color, width: int, alpha: float = 1.0) -> None:
-    """Draw the four sides of a box, `width` pixels inwards from its edge."""
-    x1, y1, x2, y2 = box
-    if x2 <= x1 or y2 <= y1:
-        return
-    thick_x, thick_y = min(width, (x2 - x1 + 1) // 2), min(width, (y2 - y1 + 1) // 2)
-    low, high = y1 + thick_y, y2 - thick_y
-    _fill(image, (x1, y1, x2, low), color, alpha)
-    _fill(image, (x1, max(high, low), x2, y2), color, alpha)
-    _fill(image, (x1, low, x1 + thick_x, high), color, alpha)
-    _fill(image, (max(x2 - thick_x, x1 + thick_x), low, x2, high), color, alpha)
-
-
-def put_text(
-    image: Image, text: str, ink: Color, x: int, y: int, scale: float, ground: Color, alpha: float
-) -> Rectangle:
-    """Write text on a ground whose upper left corner is ``(x, y)``; return the ground's rectangle."""
-    width, height, margin = text_size(text, scale)
-    rectangle = (x, y, x + width, y + height)
-    _fill(image, rectangle, ground, alpha)
-    foot = (x + margin, y + height - margin)
-    cv2.putText(image, text, foot, _FONT, scale, ink, _text_weight(scale), cv2.LINE_AA)
-    return rectangle
-
-
-def text_size(text: str, scale: float) -> tuple[int, int, int]:
-    """Width, height and margin of a label in pixels."""
-    (width, height), _ = cv2.getTextSize(text, _FONT, scale, _text_weight(scale))
-    margin = max(2, round(8 * scale))
-    return width + 2 * margin, height + 2 * margin, margin
-
-
-def _fill(image: Image, rectangle: Rectangle, color: Color, alpha: float = 1.0) -> None:
-    """Blend a rectangle into an image, as far as it lies inside."""
-    x1, y1, x2, y2 = rectangle
-    view = image[max(y1, 0) : max(y2, 0), max(x1, 0) : max(x2, 0)]
-    if not view.size:
-        return
-    if alpha < 1:
-        paint = np.empty_like(view)
-        paint[:] = color
-        view[:] = cv2.addWeighted(view, 1 - alpha, paint, alpha, 0)
-    else:
-        view[:] = color
-
-
-def _text_weight(scale: float) -> int:
-    return max(1, round(1.6 * scale))
-
-
 TRACK_COLORS: tuple[Color, ...] = (
     (230, 159, 0),
     (86, 180, 233),
@@ -107,17 +30,18 @@ TRACK_COLORS: tuple[Color, ...] = (
     (213, 94, 0),
     (204, 121, 167),
 )
-"""RGB colors that stay apart for color-blind eyes (Okabe and Ito, *Color Universal Design*, 2008)."""
+"""RGB colors that color-blind viewers can tell apart (Okabe and Ito, *Color Universal Design*, 2008)."""
 
-_VAGUE_SPEED = 3.0
-"""A speed with a greater standard error, in meters a second, is not worth showing."""
+MAX_SPEED_STD = 3.0
+"""Speeds with a larger standard error, in m/s, are not shown."""
 
-FIELDS = ("id", "score", "distance", "speed", "errors")
-"""What a track's label can show; ``"errors"`` adds standard errors to distance and speed."""
+LABEL_FIELDS = ("id", "score", "distance", "speed", "std")
+"""Fields of a track's label; ``"std"`` adds standard errors to distance and speed."""
 
-_TENTATIVE: Color = (160, 160, 160)
-# Seconds in which a track that is not seen fades, and how far.
-_FADE_SECONDS, _FAINTEST = 0.5, 0.35
+_BLACK, _WHITE, _TENTATIVE_COLOR = (0, 0, 0), (255, 255, 255), (160, 160, 160)
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+# The opacity of a coasting track falls from 1 to the minimum within these seconds.
+_FADE_SECONDS, _MIN_ALPHA = 0.5, 0.35
 
 
 def draw_boxes(image: Image, boxes: ArrayLike, *, color: Color = (0, 0, 255), thickness: int = 6) -> Image:
@@ -129,7 +53,7 @@ def draw_boxes(image: Image, boxes: ArrayLike, *, color: Color = (0, 0, 255), th
         ``(H, W, 3)`` uint8 RGB.
     boxes
         ``(N, 4)`` boxes ``[x1, y1, x2, y2]``, or a list of ``((x1, y1), (x2, y2))`` as in the course; parts
-        outside the image are left out.
+        outside the image are clipped.
     color
         RGB, 0-255 each.
     thickness
@@ -155,12 +79,12 @@ def draw_boxes(image: Image, boxes: ArrayLike, *, color: Color = (0, 0, 255), th
     result = check_image(image).copy()
     rgb, width = _check_color(color), check_integer(thickness, "thickness", low=1, high=10_000)
     for box in _corner_array(boxes):
-        frame_box(result, rounded(box), rgb, width)
+        _draw_outline(result, _round_box(box), rgb, width)
     return result
 
 
 def draw_labeled_bboxes(image: Image, labels: tuple[NDArray[Any], int]) -> Image:
-    """Draw the bounding box of each labelled region on a copy of an image, as the course does.
+    """Draw the bounding box of each labeled region on a copy of an image, as the course does.
 
     Parameters
     ----------
@@ -177,7 +101,7 @@ def draw_labeled_bboxes(image: Image, labels: tuple[NDArray[Any], int]) -> Image
     Raises
     ------
     InvalidInputError
-        If `labels` is no such pair, or its array does not have the image's height and width.
+        If `labels` is not such a pair, or its array does not have the image's height and width.
 
     Examples
     --------
@@ -189,10 +113,10 @@ def draw_labeled_bboxes(image: Image, labels: tuple[NDArray[Any], int]) -> Image
     >>> np.argwhere(drawn.any(axis=2)).min(axis=0).tolist()
     [10, 20]
     """
-    picture = check_image(image)
-    array, count = _check_labels(labels, picture.shape[:2])
-    regions = [found for found in ndimage.find_objects(array, max_label=count) if found is not None]
-    return draw_boxes(picture, [[x.start, y.start, x.stop, y.stop] for y, x in regions])
+    checked = check_image(image)
+    array, count = _check_labels(labels, checked.shape[:2])
+    regions = [region for region in ndimage.find_objects(array, max_label=count) if region is not None]
+    return draw_boxes(checked, [[x.start, y.start, x.stop, y.stop] for y, x in regions])
 
 
 def draw_tracks(
@@ -200,7 +124,7 @@ def draw_tracks(
 ) -> Image:
     """Draw tracks on a copy of an image, each with a box and a label in its own color, sized to the image.
 
-    Tracks that are not to be shown are left out; one that is not seen in this frame fades.
+    Only tracks with ``track.shown`` are drawn; coasting tracks fade.
 
     Parameters
     ----------
@@ -209,8 +133,8 @@ def draw_tracks(
     tracks
         What `Tracker.update` returned for this frame.
     show
-        What the label holds, out of ``FIELDS``; distances in meters, speeds relative to the camera in meters
-        a second, positive when moving away. What is unknown is left out.
+        Fields of the label: ``"id"``, ``"score"``, ``"distance"`` (m), ``"speed"`` (m/s relative to the
+        camera, positive when moving away) and ``"std"`` (adds standard errors). Unknown values are omitted.
 
     Returns
     -------
@@ -223,80 +147,20 @@ def draw_tracks(
         If the image is malformed, `tracks` holds something else, or `show` names an unknown field.
     """
     result = check_image(image).copy()
-    draw_tracks_onto(result, tracks, show=show)
-    return result
-
-
-def draw_tracks_onto(
-    image: Image, tracks: Iterable[Track], *, show: Collection[str] = ("id", "distance", "speed")
-) -> None:
-    """Draw tracks as `draw_tracks` does, into `image` itself: for a loop that owns its frames."""
-    picture = check_image(image)
-    if not picture.flags.writeable:
-        raise InvalidInputError("image must be writeable to be drawn on; use draw_tracks, or pass a copy")
     for name in (show,) if isinstance(show, str) else show:
-        check_choice(name, "show", FIELDS)
-    drawn = sorted((track for track in _check_tracks(tracks) if track.shown), key=lambda track: track.box[3])
-    scale = text_scale(picture)
+        check_choice(name, "show", LABEL_FIELDS)
+    shown = sorted((track for track in _check_tracks(tracks) if track.shown), key=lambda track: track.box[3])
+    scale = _text_scale(result)
+    width = max(2, round(math.sqrt(result.shape[0] * result.shape[1]) / 320))
+    # Far to near: the boxes of near vehicles cover those behind them.
+    for track in shown:
+        _draw_outline(result, _round_box(track.box), track_color(track), width, _alpha(track))
     occupied: list[Rectangle] = []
-    # Near vehicles last: their boxes lie over those of the ones behind them.
-    for track in drawn:
-        frame_box(picture, rounded(track.box), track_color(track), line_width(picture), _alpha(track))
-    for track in reversed(drawn):
+    for track in reversed(shown):
         text = track_text(track, show)
         if text:
-            _put_label(picture, track, text, scale, occupied)
-
-
-def _put_label(image: Image, track: Track, text: str, scale: float, occupied: list[Rectangle]) -> None:
-    """Write a label above its box, or below, or inside: where it hides no other one and fits."""
-    rows, columns = image.shape[:2]
-    box, color = rounded(track.box), track_color(track)
-    while scale > 0.2 and text_size(text, scale)[0] > columns:
-        scale *= 0.9
-    width, height, _ = text_size(text, scale)
-    x = min(max(box[0], 0), max(columns - width, 0))
-    places = [min(max(y, 0), max(rows - height, 0)) for y in (box[1] - height, box[3], box[1])]
-    rectangles = [(x, y, x + width, y + height) for y in places]
-    free = [one for one in rectangles if not any(touch(one, other) for other in occupied)]
-    x, y, *_ = (free or rectangles)[0]
-    red, green, blue = color
-    ink = BLACK if 0.299 * red + 0.587 * green + 0.114 * blue > 110 else WHITE
-    occupied.append(put_text(image, text, ink, x, y, scale, color, _alpha(track)))
-
-
-def track_color(track: Track) -> Color:
-    """RGB color of a track, the same in every frame: by its id, gray while tentative."""
-    return TRACK_COLORS[(track.id - 1) % len(TRACK_COLORS)] if track.id > 0 else _TENTATIVE
-
-
-def _alpha(track: Track) -> float:
-    return max(_FAINTEST, 1 - track.time_since_update / _FADE_SECONDS * (1 - _FAINTEST))
-
-
-def track_text(track: Track, show: Collection[str]) -> str:
-    """Text of a track's label; empty where nothing of `show` is known.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> track = Track(
-    ...     id=3, box=np.array([0.0, 0, 9, 9]), score=1.5, state="confirmed", shown=True, age=1.0, misses=0,
-    ...     time_since_update=0.0, velocity=(0.0, 0.0), distance_m=23.6, distance_std_m=2.2, speed_mps=-1.25,
-    ...     speed_std_mps=0.5,
-    ... )
-    >>> track_text(track, ("id", "score", "distance", "speed"))
-    '#3  1.5  24 m  -1.2 m/s'
-    """
-    errors = "errors" in show
-    parts = [f"#{track.id}"] if "id" in show else []
-    if "score" in show:
-        parts.append(f"{track.score:.1f}")
-    if "distance" in show and track.distance_m is not None and track.distance_std_m is not None:
-        parts.append(f"{track.distance_m:.0f}{f' +-{track.distance_std_m:.0f}' if errors else ''} m")
-    if "speed" in show and track.speed_mps is not None and (track.speed_std_mps or 0) <= _VAGUE_SPEED:
-        parts.append(f"{track.speed_mps:+.1f}{f' +-{track.speed_std_mps or 0:.1f}' if errors else ''} m/s")
-    return "  ".join(parts)
+            occupied.append(_draw_label(result, track, text, scale, occupied))
+    return result
 
 
 def draw_diagnostics(
@@ -309,57 +173,176 @@ def draw_diagnostics(
     frame
         ``(H, W, 3)`` uint8 RGB.
     windows
-        Positive windows, as `Detections` or boxes in any form that `draw_boxes` takes.
+        Positive windows, as `Detections` or boxes in any form that `draw_boxes` accepts.
     heat
-        ``(h, w)`` finite numbers, of the frame's size or smaller; drawn from black (0) to yellow (its peak).
+        ``(h, w)`` finite numbers, of the frame's size or smaller; drawn from black (0) to yellow (maximum).
     tracks
         The tracks of this frame.
 
     Returns
     -------
     numpy.ndarray
-        ``(H, W, 3)`` uint8 RGB, of the frame's shape: an odd side has a black line at its end.
+        ``(H, W, 3)`` uint8 RGB, of the frame's shape; an odd side ends with a black line.
 
     Raises
     ------
     InvalidInputError
         If an argument is malformed, or the frame is smaller than 4x4 pixels.
     """
-    picture = check_image(frame, "frame")
-    height, width = (side // 2 for side in picture.shape[:2])
+    checked = check_image(frame, "frame")
+    height, width = (side // 2 for side in checked.shape[:2])
     if min(height, width) < 2:
         raise InvalidInputError(
-            f"frame must have 4x4 pixels or more, got {describe(frame)}; pass a larger one"
+            f"frame must be at least 4x4 pixels, got {describe(frame)}; pass a larger image"
         )
-    # Drawn at the panels' size, so that lines and text stay sharp.
-    small = np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-    shrink = np.array([width, height, width, height]) / np.array(picture.shape[:2] * 2)[[1, 0, 1, 0]]
+    # Draw at the panels' size, so that lines and text stay sharp.
+    small = np.asarray(cv2.resize(checked, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    scale = np.array([width, height, width, height]) / np.array(checked.shape[:2] * 2)[[1, 0, 1, 0]]
     boxes = check_boxes(windows.boxes) if isinstance(windows, Detections) else _corner_array(windows)
-    followed = [dataclasses.replace(track, box=track.box * shrink) for track in _check_tracks(tracks)]
+    scaled = [dataclasses.replace(track, box=track.box * scale) for track in _check_tracks(tracks)]
     panels = [
         ("frame", small),
-        ("windows", draw_boxes(small, boxes * shrink, color=TRACK_COLORS[1], thickness=1)),
-        ("heat", np.asarray(cv2.resize(_heat_picture(heat), (width, height)), np.uint8)),
-        ("tracks", draw_tracks(small, followed, show=("id", "distance"))),
+        ("windows", draw_boxes(small, boxes * scale, color=TRACK_COLORS[1], thickness=1)),
+        ("heat", np.asarray(cv2.resize(heat_image(heat), (width, height)), np.uint8)),
+        ("tracks", draw_tracks(small, scaled, show=("id", "distance"))),
     ]
-    mosaic = np.zeros_like(picture)
+    mosaic = np.zeros_like(checked)
     for index, (title, panel) in enumerate(panels):
         top, left = index // 2 * height, index % 2 * width
         view = mosaic[top : top + height, left : left + width]
         view[:] = panel
-        put_text(view, title, WHITE, 0, 0, text_scale(view), BLACK, 0.6)
+        _draw_text(view, title, _WHITE, 0, 0, _text_scale(view), _BLACK, 0.6)
     return mosaic
 
 
-def _heat_picture(heat: NDArray[Any]) -> Image:
+def blend(image: NDArray[Any], overlay: ArrayLike, alpha: float) -> NDArray[Any]:
+    """Return ``(1 - alpha) * image + alpha * overlay``; `overlay` is a color or an image of that shape."""
+    return np.asarray(cv2.addWeighted(image, 1 - alpha, np.full_like(image, overlay), alpha, 0))
+
+
+def heat_image(heat: NDArray[Any]) -> Image:
+    """Color an ``(h, w)`` heat map from black (0) to yellow (its maximum), as ``(h, w, 3)`` uint8 RGB."""
     values = _check_heat(heat)
-    if not np.isfinite(values).all():
-        raise InvalidInputError("heat must be finite, got NaN or infinity; build it with add_heat")
     peak = float(values.max())
     gray = np.clip(values * (255 / peak if peak > 0 else 0.0), 0, 255).astype(np.uint8)
     return np.asarray(
         cv2.cvtColor(cv2.applyColorMap(gray, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB), np.uint8
     )
+
+
+def track_color(track: Track) -> Color:
+    """RGB color of a track, chosen by its id; gray for a tentative track."""
+    return TRACK_COLORS[(track.id - 1) % len(TRACK_COLORS)] if track.id > 0 else _TENTATIVE_COLOR
+
+
+def track_text(track: Track, show: Collection[str]) -> str:
+    """Text of a track's label; empty if no field of `show` is known.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> track = Track(
+    ...     id=3, box=np.array([0.0, 0, 9, 9]), score=1.5, state="confirmed", shown=True, age=1.0, misses=0,
+    ...     time_since_update=0.0, velocity=(0.0, 0.0), distance_m=23.6, distance_std_m=2.2, speed_mps=-1.25,
+    ...     speed_std_mps=0.5,
+    ... )
+    >>> track_text(track, ("id", "score", "distance", "speed"))
+    '#3  1.5  24 m  -1.2 m/s'
+    """
+    with_std = "std" in show
+    parts = [f"#{track.id}"] if "id" in show else []
+    if "score" in show:
+        parts.append(f"{track.score:.1f}")
+    if "distance" in show and track.distance_m is not None and track.distance_std_m is not None:
+        parts.append(f"{track.distance_m:.0f}{f' +-{track.distance_std_m:.0f}' if with_std else ''} m")
+    if "speed" in show and track.speed_mps is not None and (track.speed_std_mps or 0) <= MAX_SPEED_STD:
+        parts.append(f"{track.speed_mps:+.1f}{f' +-{track.speed_std_mps or 0:.1f}' if with_std else ''} m/s")
+    return "  ".join(parts)
+
+
+def _alpha(track: Track) -> float:
+    """Opacity of a track, which decreases while it coasts."""
+    return max(_MIN_ALPHA, 1 - track.time_since_update / _FADE_SECONDS * (1 - _MIN_ALPHA))
+
+
+def _draw_label(
+    image: Image, track: Track, text: str, scale: float, occupied: Sequence[Rectangle]
+) -> Rectangle:
+    """Write a label above, below or inside the track's box, where no other label is; return its rectangle."""
+    rows, columns = image.shape[:2]
+    box, color = _round_box(track.box), track_color(track)
+    while scale > 0.2 and _text_size(text, scale)[0] > columns:
+        scale *= 0.9
+    width, height, _ = _text_size(text, scale)
+    x = min(max(box[0], 0), max(columns - width, 0))
+    tops = [min(max(y, 0), max(rows - height, 0)) for y in (box[1] - height, box[3], box[1])]
+    rectangles = [(x, y, x + width, y + height) for y in tops]
+    free = [one for one in rectangles if not any(_intersect(one, other) for other in occupied)]
+    x, y, *_ = (free or rectangles)[0]
+    red, green, blue = color
+    ink = _BLACK if 0.299 * red + 0.587 * green + 0.114 * blue > 110 else _WHITE
+    return _draw_text(image, text, ink, x, y, scale, color, _alpha(track))
+
+
+def _draw_text(
+    image: Image, text: str, color: Color, x: int, y: int, scale: float, background: Color, alpha: float
+) -> Rectangle:
+    """Write text on a filled rectangle whose upper left corner is ``(x, y)``; return the rectangle."""
+    width, height, margin = _text_size(text, scale)
+    rectangle = (x, y, x + width, y + height)
+    _fill(image, rectangle, background, alpha)
+    origin = (x + margin, y + height - margin)
+    cv2.putText(image, text, origin, _FONT, scale, color, _text_thickness(scale), cv2.LINE_AA)
+    return rectangle
+
+
+def _text_size(text: str, scale: float) -> tuple[int, int, int]:
+    """Width, height and margin of a label in pixels."""
+    (width, height), _ = cv2.getTextSize(text, _FONT, scale, _text_thickness(scale))
+    margin = max(2, round(8 * scale))
+    return width + 2 * margin, height + 2 * margin, margin
+
+
+def _text_scale(image: Image) -> float:
+    """Font scale for an image; at scale 1, capitals are 22 pixels high."""
+    return min(max(math.sqrt(image.shape[0] * image.shape[1]) / 1600, 0.36), 4.0)
+
+
+def _text_thickness(scale: float) -> int:
+    return max(1, round(1.6 * scale))
+
+
+def _draw_outline(image: Image, box: Rectangle, color: Color, width: int, alpha: float = 1.0) -> None:
+    """Draw the four sides of a box, `width` pixels inwards from its edge."""
+    x1, y1, x2, y2 = box
+    if x2 <= x1 or y2 <= y1:
+        return
+    width_x, width_y = min(width, (x2 - x1 + 1) // 2), min(width, (y2 - y1 + 1) // 2)
+    top, bottom = y1 + width_y, y2 - width_y
+    _fill(image, (x1, y1, x2, top), color, alpha)
+    _fill(image, (x1, max(bottom, top), x2, y2), color, alpha)
+    _fill(image, (x1, top, x1 + width_x, bottom), color, alpha)
+    _fill(image, (max(x2 - width_x, x1 + width_x), top, x2, bottom), color, alpha)
+
+
+def _fill(image: Image, rectangle: Rectangle, color: Color, alpha: float) -> None:
+    """Blend a rectangle into an image, clipped to the image."""
+    x1, y1, x2, y2 = rectangle
+    view = image[max(y1, 0) : max(y2, 0), max(x1, 0) : max(x2, 0)]
+    if view.size:
+        view[:] = blend(view, color, alpha) if alpha < 1 else color
+
+
+def _round_box(box: NDArray[Any]) -> Rectangle:
+    """Round to Python integers, which do not overflow for boxes far outside the image."""
+    x1, y1, x2, y2 = (math.floor(float(value) + 0.5) for value in box)
+    return x1, y1, x2, y2
+
+
+def _intersect(first: Rectangle, second: Rectangle) -> bool:
+    """Whether two rectangles have a pixel in common."""
+    overlap_x = first[0] < second[2] and second[0] < first[2]
+    return overlap_x and first[1] < second[3] and second[1] < first[3]
 
 
 def _check_color(color: object) -> Color:
@@ -389,7 +372,10 @@ def _check_heat(heat: object) -> NDArray[np.float32]:
         raise InvalidInputError(
             f"heat must be an (h, w) array of numbers, got {describe(heat)}; pass a heat map"
         )
-    return heat.astype(np.float32)
+    values = heat.astype(np.float32)
+    if not np.isfinite(values).all():
+        raise InvalidInputError("heat must be finite, got NaN or infinity; build it with add_heat")
+    return values
 
 
 def _check_tracks(tracks: object) -> list[Track]:
@@ -402,7 +388,7 @@ def _check_tracks(tracks: object) -> list[Track]:
 
 
 def _corner_array(boxes: ArrayLike) -> NDArray[Any]:
-    """Boxes as ``(N, 4)``; the course's pairs of corners may come in any order."""
+    """Boxes as ``(N, 4)``; the course's pairs of corners may be in any order."""
     if isinstance(boxes, Sequence) and len(boxes) and np.shape(boxes)[1:] == (2, 2):
         corners = np.asarray(boxes)
         return check_boxes(np.concatenate((corners.min(axis=1), corners.max(axis=1)), axis=1))

@@ -1,7 +1,7 @@
-"""Results to files: CSV, JSON Lines, Parquet, MOT challenge and COCO.
+"""Write results to files: CSV, JSON Lines, Parquet, MOTChallenge text and COCO JSON.
 
-Every table has the columns ``frame,track_id,x1,y1,x2,y2,score``, that of tracks has ``distance_m,speed_mps``
-as well.
+Every table has the columns ``frame,track_id,x1,y1,x2,y2,score``; tables of tracks also have
+``distance_m,speed_mps``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import IO, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from vehicle_detection._common import atomic_write, check_choice, check_target, describe
+from vehicle_detection._common import atomic_write, check_choice, check_target, describe, write_parquet
 from vehicle_detection.errors import InvalidInputError
 
 BOX_COLUMNS = ("frame", "track_id", "x1", "y1", "x2", "y2", "score")
@@ -28,7 +28,7 @@ DIGITS = dict(zip(TRACK_COLUMNS[2:], (2, 2, 2, 2, 4, 2, 2)))
 
 
 class Row(NamedTuple):
-    """A box of one frame, as it is written."""
+    """One box of one frame, with rounded values."""
 
     frame: int | str
     track_id: int | None
@@ -42,8 +42,8 @@ class Row(NamedTuple):
 
 
 def check_items(items: object) -> Iterator[Any]:
-    """Return an iterator over results or rows; a pandas table gives its rows."""
-    if hasattr(items, "to_dict") and hasattr(items, "columns"):  # a pandas table
+    """Iterate over results or rows; a pandas table gives its rows as mappings."""
+    if hasattr(items, "to_dict") and hasattr(items, "columns"):
         return iter(items.to_dict("records"))
     if isinstance(items, (str, bytes, Mapping)) or not isinstance(items, Iterable):
         raise InvalidInputError(
@@ -53,24 +53,29 @@ def check_items(items: object) -> Iterator[Any]:
 
 
 def is_result(item: Any) -> bool:
-    """Whether this is a frame's result rather than a row (a tuple has an ``index``, too)."""
+    """Whether `item` is a frame's result rather than a row (a tuple has an ``index`` method, too)."""
     return hasattr(item, "tracks") and hasattr(item, "index") and not isinstance(item, (Mapping, Sequence))
 
 
-def rows_of(item: Any, number: int) -> list[Row]:
-    """Turn a frame's result into rows, one for each track that is shown; a row stays one."""
+def shown_tracks(result: Any) -> list[Any]:
+    """Tracks of a frame's result that are drawn and written."""
+    return [track for track in result.tracks if getattr(track, "shown", True)]
+
+
+def _rows_of(item: Any, number: int) -> list[Row]:
+    """Rows of a frame's result, one per shown track; a row stays one row."""
     if not is_result(item):
-        return [as_row(item, number)]
+        return [_check_row(item, number)]
     return [
-        as_row(
+        _check_row(
             (item.index, track.id, *track.box, track.score, track.distance_m, track.speed_mps), number + place
         )
-        for place, track in enumerate(track for track in item.tracks if getattr(track, "shown", True))
+        for place, track in enumerate(shown_tracks(item))
     ]
 
 
-def as_row(item: Any, number: int, *, stills: bool = False) -> Row:
-    """Check one row; a message counts rows from 0."""
+def _check_row(item: Any, number: int, *, stills: bool = False) -> Row:
+    """Check and round one row; `number` counts rows from 0 for the error message."""
     columns = BOX_COLUMNS if stills else TRACK_COLUMNS
     if isinstance(item, Mapping):
         missing = [name for name in BOX_COLUMNS if name not in item and not (stills and name == "track_id")]
@@ -88,8 +93,8 @@ def as_row(item: Any, number: int, *, stills: bool = False) -> Row:
             f"row {number} must be a FrameResult or the values {', '.join(columns)}, got {describe(item)}"
         )
     frame = _file_name(values[0], number) if stills else _whole_number(values[0], number, "frame", low=0)
-    free = stills and _is_missing(values[1])
-    track = None if free else _whole_number(values[1], number, "track_id")
+    untracked = stills and _is_missing(values[1])
+    track = None if untracked else _whole_number(values[1], number, "track_id")
     x1, y1, x2, y2, score = (_number(value, number, name) for name, value in zip(columns[2:], values[2:7]))
     if x2 < x1 or y2 < y1:
         raise InvalidInputError(
@@ -113,16 +118,20 @@ def _file_name(value: Any, number: int) -> str:
 
 
 def _is_missing(value: Any) -> bool:
-    """Whether a value is unknown: None, or what pandas makes of it."""
+    """Whether a value is None, NaN or pandas.NA."""
     if isinstance(value, (float, np.floating)):
         return math.isnan(value)
     return value is None or str(value) == "<NA>"
 
 
+def _is_number(value: Any) -> bool:
+    is_number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    return is_number and math.isfinite(value)
+
+
 def _whole_number(value: Any, number: int, name: str, *, low: float = -math.inf) -> int:
-    # A column of pandas that misses a value holds floats.
-    whole = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-    if not whole or not math.isfinite(value) or value != int(value) or value < low:
+    # A pandas column with missing values holds whole numbers as floats.
+    if not _is_number(value) or value != int(value) or value < low:
         expected = "a whole number" if low < 0 else f"a whole number of at least {low:g}"
         raise InvalidInputError(
             f"row {number}: {name} must be {expected}, got {describe(value)}; drop the row"
@@ -131,12 +140,11 @@ def _whole_number(value: Any, number: int, name: str, *, low: float = -math.inf)
 
 
 def _number(value: Any, number: int, name: str) -> float:
-    is_number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-    if not is_number or not math.isfinite(value):
+    if not _is_number(value):
         raise InvalidInputError(
             f"row {number}: {name} must be a finite number, got {describe(value)}; drop the row"
         )
-    return round(float(value), DIGITS[name]) + 0.0  # + 0.0: no minus zero
+    return round(float(value), DIGITS[name]) + 0.0  # + 0.0 turns -0.0 into 0.0
 
 
 Format: TypeAlias = Literal["csv", "jsonl", "parquet", "mot", "coco"]
@@ -148,32 +156,32 @@ FORMATS: dict[str, Format] = {
     ".txt": "mot",
     ".json": "coco",
 }
-"""The format that each suffix stands for."""
+"""Format of each file name suffix."""
 
 
 def write_tracks(
     results: Iterable[Any],
     path: str | os.PathLike[str],
     *,
-    format: Format | None = None,  # noqa: A002 - the word that pandas and Pillow use
+    format: Format | None = None,  # noqa: A002 - the name that pandas and Pillow use
     shape: tuple[int, ...] | None = None,
 ) -> int:
-    """Write the tracks of a video to a file, which appears whole or not at all.
+    """Write the tracks of a video to a file; the file appears only when it is complete.
 
     Parameters
     ----------
     results
-        One :class:`FrameResult` for each frame, of which the tracks that are shown are written; or rows, each
-        a mapping or a sequence of ``frame, track_id, x1, y1, x2, y2, score[, distance_m, speed_mps]``; or a
-        pandas table of them.
+        One :class:`FrameResult` for each frame, of which the shown tracks are written; or rows, each a
+        mapping or a sequence of ``frame, track_id, x1, y1, x2, y2, score[, distance_m, speed_mps]``; or a
+        pandas table of such rows.
     path
         File to write.
     format
-        ``"csv"``, ``"jsonl"`` (a JSON object in each line), ``"parquet"`` (needs pyarrow), ``"mot"`` (the
-        text of the MOT challenge) or ``"coco"`` (JSON). None: by the suffix .csv, .jsonl, .ndjson, .parquet,
-        .txt or .json.
+        ``"csv"``, ``"jsonl"`` (one JSON object per line), ``"parquet"`` (needs pyarrow), ``"mot"``
+        (MOTChallenge text) or ``"coco"`` (JSON). None: chosen by the suffix .csv, .jsonl, .ndjson,
+        .parquet, .txt or .json.
     shape
-        ``(height, width, ...)`` of a frame, which COCO viewers ask for.
+        ``(height, width, ...)`` of a frame, which COCO viewers need.
 
     Returns
     -------
@@ -187,9 +195,9 @@ def write_tracks(
 
     Notes
     -----
-    ``frame`` counts from 0, the first frame that was processed; boxes are half-open pixels with two decimals.
-    Unknown distances and speeds are empty in CSV, null elsewhere. MOT counts frames and pixels from 1, as its
-    own tools do, and has width and height.
+    ``frame`` counts from 0, the first processed frame; boxes are half-open pixels with two decimals.
+    Unknown distances and speeds are empty in CSV and null elsewhere. MOT files count frames and pixels from
+    1, as the MOTChallenge tools do, and hold width and height.
 
     Examples
     --------
@@ -209,11 +217,11 @@ def write_tracks(
                 write(item)
         return write.rows
     rows: list[Row] = []
-    frames: list[int | str] = []  # a frame without a vehicle is a picture of a COCO file as well
+    frames: list[int | str] = []  # a COCO file also lists the frames without a vehicle
     for item in check_items(results):
         frames += [int(item.index)] if is_result(item) else []
-        rows += rows_of(item, len(rows))
-    _write_whole(rows, frames, path, kind, TRACK_COLUMNS, shape)
+        rows += _rows_of(item, len(rows))
+    _write_rows(rows, frames, path, kind, TRACK_COLUMNS, shape)
     return len(rows)
 
 
@@ -223,7 +231,7 @@ def write_boxes(
     *,
     format: Format | None = None,  # noqa: A002
 ) -> int:
-    """Write the boxes found in stills to a file, which appears whole or not at all.
+    """Write the boxes found in images to a file; the file appears only when it is complete.
 
     Parameters
     ----------
@@ -234,7 +242,7 @@ def write_boxes(
     path
         File to write.
     format
-        ``"csv"``, ``"jsonl"``, ``"parquet"`` or ``"coco"``; None: by the suffix, as in `write_tracks`.
+        ``"csv"``, ``"jsonl"``, ``"parquet"`` or ``"coco"``; None: chosen by the suffix, as in `write_tracks`.
 
     Returns
     -------
@@ -265,32 +273,26 @@ def write_boxes(
             name, found = item
             names.append(str(name))
             rows += [
-                as_row((str(name), None, *box, score), len(rows), stills=True)
+                _check_row((str(name), None, *box, score), len(rows), stills=True)
                 for box, score in zip(found.boxes, found.scores)
             ]
         else:
-            rows.append(as_row(item, len(rows), stills=True))
-    if kind in ("parquet", "coco"):
-        _write_whole(rows, names, path, kind, BOX_COLUMNS, None)
-    else:
-        with atomic_write(path, "path") as part, _open_text(part) as file:
-            put = _text_writer(file, kind, BOX_COLUMNS)
-            for row in rows:
-                put(row)
+            rows.append(_check_row(item, len(rows), stills=True))
+    _write_rows(rows, names, path, kind, BOX_COLUMNS, None)
     return len(rows)
 
 
 class TrackWriter:
     """Write the tracks of a video while it is processed, in constant memory.
 
-    The file appears when the ``with`` block ends well, else an earlier one stays.
+    The file appears when the ``with`` block ends without an error; otherwise an existing file is kept.
 
     Parameters
     ----------
     path
         File to write.
     format
-        ``"csv"``, ``"jsonl"`` or ``"mot"``; None: by the suffix .csv, .jsonl, .ndjson or .txt.
+        ``"csv"``, ``"jsonl"`` or ``"mot"``; None: chosen by the suffix .csv, .jsonl, .ndjson or .txt.
 
     Attributes
     ----------
@@ -322,14 +324,14 @@ class TrackWriter:
         self._kind = _check_format(path, format, ("csv", "jsonl", "mot"))
         self._path = path
         self._stack = contextlib.ExitStack()
-        self._put: Callable[[Row], None] | None = None
+        self._write_row: Callable[[Row], object] | None = None
         self.rows = 0
 
     def __enter__(self) -> TrackWriter:
         with contextlib.ExitStack() as stack:
             part = stack.enter_context(atomic_write(self._path, "path"))
             file = stack.enter_context(_open_text(part))
-            self._put = _text_writer(file, self._kind, TRACK_COLUMNS)
+            self._write_row = _row_writer(file, self._kind, TRACK_COLUMNS)
             self._stack = stack.pop_all()
         self.rows = 0
         return self
@@ -340,19 +342,19 @@ class TrackWriter:
         Raises
         ------
         InvalidInputError
-            If the result is malformed, or the writer is not inside its ``with`` block.
+            If the result is malformed, or the writer is called outside its ``with`` block.
         """
-        if self._put is None:
+        if self._write_row is None:
             raise InvalidInputError(
-                "TrackWriter must be inside its with block to write, got a call outside; use "
+                "TrackWriter must be called inside its with block, got a call outside; use "
                 "with TrackWriter(path) as write: ..."
             )
-        for row in rows_of(result, self.rows):
-            self._put(row)
+        for row in _rows_of(result, self.rows):
+            self._write_row(row)
             self.rows += 1
 
     def __exit__(self, *error: Any) -> None:
-        self._put = None
+        self._write_row = None
         self._stack.__exit__(*error)
 
 
@@ -381,36 +383,30 @@ def _open_text(path: Path) -> IO[str]:
     return path.open("w", encoding="utf-8", newline="")
 
 
-def _text_writer(file: IO[str], kind: Format, columns: Sequence[str]) -> Callable[[Row], None]:
-    """Return the function that writes one row as text."""
+def _row_writer(file: IO[str], kind: Format, columns: Sequence[str]) -> Callable[[Row], object]:
+    """Write the header, and return the function that writes one row as text."""
+    if kind == "csv":
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(columns)
+        return lambda row: table.writerow(_csv_cells(row, columns))
     if kind == "jsonl":
-        return lambda row: _put_line(file, json.dumps(dict(zip(columns, row)), ensure_ascii=False))
-    if kind == "mot":
-        return lambda row: _put_line(file, _mot_line(row))
-    table = csv.writer(file, lineterminator="\n")
-    table.writerow(columns)
-
-    def put(row: Row) -> None:
-        numbers = (
-            "" if value is None else f"{value:.{DIGITS[name]}f}" for name, value in zip(columns[2:], row[2:])
-        )
-        table.writerow([*row[:2], *numbers])
-
-    return put
+        return lambda row: file.write(json.dumps(dict(zip(columns, row)), ensure_ascii=False) + "\n")
+    return lambda row: file.write(_mot_line(row) + "\n")
 
 
-def _put_line(file: IO[str], line: str) -> None:
-    file.write(line + "\n")
+def _csv_cells(row: Row, columns: Sequence[str]) -> list[Any]:
+    numbers = zip(columns[2:], row[2:])
+    return [*row[:2], *("" if value is None else f"{value:.{DIGITS[name]}f}" for name, value in numbers)]
 
 
 def _mot_line(row: Row) -> str:
-    """Write a row as the MOT challenge has it: all counts from 1, no place in the world."""
+    """MOTChallenge text of a row: frame, id, left, top, width, height, score and no world position."""
     frame = int(row.frame) + 1
     size = f"{row.x2 - row.x1:.2f},{row.y2 - row.y1:.2f}"
     return f"{frame},{row.track_id},{row.x1 + 1:.2f},{row.y1 + 1:.2f},{size},{row.score:.4f},-1,-1,-1"
 
 
-def _write_whole(
+def _write_rows(
     rows: Sequence[Row],
     frames: Sequence[int | str],
     path: str | os.PathLike[str],
@@ -418,42 +414,30 @@ def _write_whole(
     columns: Sequence[str],
     shape: tuple[int, ...] | None,
 ) -> None:
-    """Write a format that needs all rows at once."""
+    """Write all rows at once, in any format."""
     if kind == "parquet":
-        _write_parquet(rows, path, columns)
+        frame = "string" if columns == BOX_COLUMNS else "int64"
+        types = {"frame": frame, "track_id": "int64"} | dict.fromkeys(columns[2:], "double")
+        write_parquet(path, {name: [getattr(row, name) for row in rows] for name in columns}, types=types)
         return
-    document = _coco_document(rows, frames, shape)
     with atomic_write(path, "path") as part, _open_text(part) as file:
-        json.dump(document, file, ensure_ascii=False)
-
-
-def _write_parquet(rows: Sequence[Row], path: str | os.PathLike[str], columns: Sequence[str]) -> None:
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise InvalidInputError(
-            "format 'parquet' needs pyarrow; pip install 'vehicle-detection[parquet]', or write .csv"
-        ) from None
-    frame = pyarrow.string() if columns == BOX_COLUMNS else pyarrow.int64()
-    types = [frame, pyarrow.int64(), *[pyarrow.float64()] * (len(columns) - 2)]
-    table = pyarrow.table(
-        [pyarrow.array([row[place] for row in rows], kind) for place, kind in enumerate(types)],
-        names=list(columns),
-    )
-    with atomic_write(path, "path") as part:
-        pyarrow.parquet.write_table(table, part)
+        if kind == "coco":
+            json.dump(_coco_document(rows, frames, shape), file, ensure_ascii=False)
+        else:
+            write_row = _row_writer(file, kind, columns)
+            for row in rows:
+                write_row(row)
 
 
 def _coco_document(
     rows: Sequence[Row], frames: Sequence[int | str], shape: tuple[int, ...] | None
 ) -> dict[str, Any]:
-    """Build a COCO data set: every frame an image, every row an annotation with its score."""
+    """COCO data set: every frame is an image, every row an annotation with its score."""
     keys = list(dict.fromkeys([*frames, *(row.frame for row in rows)]))
     keys.sort(key=lambda key: (isinstance(key, str), key))
     size = {} if shape is None else {"height": int(shape[0]), "width": int(shape[1])}
-    # Images of a video have no file of their own: the frame's number stands for it.
     numbers = {key: place for place, key in enumerate(keys, start=1)}
+    # Video frames have no file, so their number serves as the file name.
     images = [
         {"id": numbers[key], "file_name": key if isinstance(key, str) else f"{key:06d}", **size}
         | ({} if isinstance(key, str) else {"frame": key})
@@ -471,8 +455,10 @@ def _coco_document(
             "iscrowd": 0,
             "score": row.score,
         }
-        named = {"track_id": row.track_id, "distance_m": row.distance_m, "speed_mps": row.speed_mps}
-        annotations.append(annotation | {name: value for name, value in named.items() if value is not None})
+        optional = {"track_id": row.track_id, "distance_m": row.distance_m, "speed_mps": row.speed_mps}
+        annotations.append(
+            annotation | {name: value for name, value in optional.items() if value is not None}
+        )
     return {
         "images": images,
         "annotations": annotations,

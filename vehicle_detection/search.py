@@ -1,37 +1,37 @@
-"""The fast search: features shared by all windows of a band, the SVM as a filter over them.
+"""The fast search: features shared by all windows of a band, with the SVM as a filter over them.
 
 Scaler and SVM fold into one affine function of the feature vector (`Template.fold`). A band of the frame is
-resized once so that a window is 64x64; then each part of the vector is a set of planes over the band's
-cells, and each part of the weights is a filter over an 8x8 neighborhood of cells:
+resized once so that a window is 64x64; then each part of the vector becomes channels over the band's cells,
+and each part of the weights a filter over 8x8 cells:
 
-- HOG: a plane for each channel, place in the block and orientation, normalized once for all windows.
-- Spatial bins: a plane for each channel and place of a bin in its cell.
-- Color histogram: the weight of a pixel's value is looked up, so the histogram's share of the score is one
-  plane of sums over cells. No histogram is built, but where `hist_sqrt` asks for the roots of its counts:
-  these slide over the band.
-- Coarse HOG: planes of its own, of cells averaged by fours at every cell; a window's blocks start two cells
-  apart.
+- HOG: a channel for each color channel, position in the block and orientation, normalized once for all
+windows.
+- Spatial bins: a channel for each color channel and position of a bin in its cell.
+- Color histogram: one channel, the sum of the looked-up weights of a cell's pixel values; no histogram is
+  computed. With `hist_sqrt`, which is not linear in the counts, histograms slide over the band instead.
+- Coarse HOG: channels of cells averaged over 2x2 at every cell; the filter has a dilation of two cells.
 
-The correlation of the planes with the filters makes the scores of all windows. Dalal and Triggs (CVPR 2005)
-for HOG; Felzenszwalb et al. (PAMI 2010), section 3, for linear templates as filters over a feature map.
+The correlation of channels and filters gives the scores of all windows. Dalal and Triggs (CVPR 2005) for HOG;
+Felzenszwalb et al. (PAMI 2010), section 3, for linear templates as filters over a feature map.
 """
 
 from __future__ import annotations
 
 import threading
+import time
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import (
-    Buffers,
-    Take,
+    NEW_ARRAYS,
     ThreadTeam,
+    Workspace,
     check_image,
-    check_number,
     check_type,
-    new_array,
     single_threaded_opencv,
 )
 from vehicle_detection._kernels import (
@@ -48,18 +48,73 @@ from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import convert_color, hog_source, pick_hog_channels
 from vehicle_detection.params import PATCH_SIZE, FeatureParams, PixelBand, SearchParams
+from vehicle_detection.windows import band_windows, search_windows
+
+_THUMBNAIL_SHAPE = (18, 32)
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """The result of searching one frame; it depends on no other frame.
+
+    Attributes
+    ----------
+    windows
+        Windows with a score above the search's minimum.
+    vehicles
+        Vehicle boxes, if the model predicts them; None if they are derived from the windows. Scores below 0
+        are kept for tracking only.
+    shape
+        ``(height, width)`` of the frame.
+    thumbnail
+        ``(18, 32)`` float32 gray copy of the frame, for detecting scene cuts.
+    seconds
+        Duration of the search.
+    """
+
+    windows: Detections
+    vehicles: Detections | None
+    shape: tuple[int, int]
+    thumbnail: NDArray[np.float32]
+    seconds: float
+
+    @classmethod
+    def of(
+        cls, frame: NDArray[np.uint8], windows: Detections, vehicles: Detections | None, *, start: float
+    ) -> SearchResult:
+        """Build the result of a search of `frame` that began at ``time.perf_counter() == start``."""
+        height, width = frame.shape[:2]
+        # Subsampling is enough to detect a cut.
+        rows = np.linspace(0, height - 1, _THUMBNAIL_SHAPE[0]).astype(int)
+        columns = np.linspace(0, width - 1, _THUMBNAIL_SHAPE[1]).astype(int)
+        thumbnail = frame[np.ix_(rows, columns)].mean(axis=2, dtype=np.float32)
+        return cls(windows, vehicles, (height, width), thumbnail, time.perf_counter() - start)
+
+
+class FrameSearch(Protocol):
+    """Interface of what ``model.open_search()`` returns, for either kind of model."""
+
+    def find(
+        self, frame: NDArray[np.uint8], params: Any = None, *, min_vehicle_score: float = 0.0
+    ) -> SearchResult:
+        """Search a frame; thread-safe."""
+        ...
+
+    def close(self) -> None:
+        """Stop the threads; they start again on the next search."""
+        ...
 
 
 def find_cars(
     image: NDArray[np.uint8],
     classifier: VehicleClassifier,
-    search: SearchParams | None = None,
+    params: SearchParams | None = None,
     *,
     n_jobs: int | None = None,
 ) -> Detections:
     """Find the windows of a frame that look like vehicles.
 
-    Scores equal those of `search_windows` with ``border="image"`` on each resized band, to 1e-4.
+    Scores equal those of `search_windows` with ``border="image"`` on each resized band within 1e-4.
 
     Parameters
     ----------
@@ -67,21 +122,21 @@ def find_cars(
         ``(H, W, 3)`` uint8 RGB.
     classifier
         The trained model.
-    search
-        Bands and least score; the default is ``SearchParams.preset("default")``. Steps between windows
+    params
+        Bands and minimum score; the default is ``SearchParams.preset("default")``. Steps between windows
         are rounded to whole cells, at least one.
     n_jobs
-        Threads, each works on a band; the result is the same for any number.
+        Threads, each of which searches a band; the result does not depend on them.
 
     Returns
     -------
     Detections
-        Float boxes in pixels of the image and scores, band by band, row by row.
+        Float boxes in pixels of the image and scores, ordered by band and row.
 
     Raises
     ------
     InvalidInputError
-        If the image is malformed or smaller than a window, or the features cannot be shared by windows.
+        If the image is malformed or smaller than a window, or windows cannot share the features exactly.
 
     Examples
     --------
@@ -89,28 +144,17 @@ def find_cars(
     >>> len(find_cars(np.zeros((720, 1280, 3), np.uint8), load_classifier()))
     0
     """
-    search = search or SearchParams.preset()
-    with BandSearch(classifier, n_jobs=n_jobs) as bands:
-        return bands.find(image, search)
+    with BandSearch(classifier, n_jobs=n_jobs) as search:
+        return search.find_windows(image, SearchParams.preset() if params is None else params)
 
 
 class BandSearch:
-    """The search with its weights laid out and its buffers kept from frame to frame.
-
-    Thread-safe: buffers belong to the thread that uses them.
-
-    Parameters
-    ----------
-    classifier
-        The trained model.
-    n_jobs
-        Threads that share the bands of a frame.
-    """
+    """The fast search, with filters and workspace kept from frame to frame; thread-safe."""
 
     def __init__(self, classifier: VehicleClassifier, *, n_jobs: int | None = None) -> None:
         check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
         self._filters = _Filters(classifier)
-        self._crew = ThreadTeam(n_jobs, name="search")
+        self._team = ThreadTeam(n_jobs, name="search")
         self._local = threading.local()
 
     def __enter__(self) -> BandSearch:
@@ -121,62 +165,99 @@ class BandSearch:
 
     def close(self) -> None:
         """End the threads."""
-        self._crew.close()
+        self._team.close()
 
-    def find(self, image: NDArray[np.uint8], search: SearchParams) -> Detections:
-        """Windows of all bands that score above ``search.min_score``."""
+    def find(
+        self,
+        frame: NDArray[np.uint8],
+        params: SearchParams | None = None,
+        *,
+        min_vehicle_score: float = 0.0,
+    ) -> SearchResult:
+        """Search a frame; `min_vehicle_score` has no effect because vehicles are derived from the windows."""
+        start = time.perf_counter()
+        windows = self.find_windows(frame, params or SearchParams.preset())
+        return SearchResult.of(frame, windows, None, start=start)
+
+    def find_windows(self, image: NDArray[np.uint8], params: SearchParams) -> Detections:
+        """Windows of all bands that score above ``params.min_score``."""
         check_image(image)
-        check_type(search, "search", SearchParams, 'pass SearchParams.preset("default")')
-        bands = search.place(image.shape)
-        least = check_number(search.min_score, "min_score")
+        check_type(params, "params", SearchParams, 'pass SearchParams.preset("default")')
+        bands = params.place(image.shape)
+        cell, min_score = self._filters.params.pix_per_cell, float(params.min_score)
         with single_threaded_opencv():
-            parts = self._crew.map(
-                lambda band: _hits(self.score_map(image, band), band, self._filters, least), bands, cost=_cost
+            parts = self._team.map(
+                lambda band: _hits(self.score_map(image, band), band, cell, min_score), bands, cost=_cost
             )
         boxes, scores = zip(*parts)
         return Detections(np.concatenate(boxes), np.concatenate(scores))
 
     def score_map(self, image: NDArray[np.uint8], band: PixelBand) -> NDArray[np.float32]:
-        """Score of every window of a band at a step of one cell.
+        """Score of every window of a band at a step of one cell, ``(rows, columns)`` float32.
 
-        Returns
-        -------
-        numpy.ndarray
-            ``(rows, columns)`` float32: entry ``[i, j]`` is the window whose first cell is row `i`, column
-            `j` of the resized band. With several templates, the best of them.
+        Entry ``[i, j]`` is the window that starts at row `i` and column `j` of the resized band's cells. With
+        several templates, it is the maximum of their scores.
         """
-        buffers = self._local.__dict__.setdefault("buffers", Buffers())
-        return self._filters.score_map(resize_band(image, band, buffers.take), buffers.take)
+        workspace = self._local.__dict__.setdefault("workspace", Workspace())
+        return self._filters.score_map(resize_band(image, band, workspace), workspace)
+
+
+class ReferenceSearch:
+    """The reference search: the windows of the same bands by `search_windows`, one patch per window."""
+
+    def __init__(self, classifier: VehicleClassifier, *, n_jobs: int | None = None) -> None:
+        check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
+        self._classifier, self._n_jobs = classifier, n_jobs
+
+    def find(
+        self,
+        frame: NDArray[np.uint8],
+        params: SearchParams | None = None,
+        *,
+        min_vehicle_score: float = 0.0,
+    ) -> SearchResult:
+        """Search a frame; see `BandSearch.find`."""
+        start = time.perf_counter()
+        params = params or SearchParams.preset()
+        check_image(frame, "frame")
+        windows = np.concatenate([band_windows(band) for band in params.place(frame.shape)])
+        # `search_windows` needs windows inside the frame.
+        windows = windows[(windows[:, 0] >= 0) & (windows[:, 2] <= frame.shape[1])]
+        found = search_windows(
+            frame, windows, self._classifier, min_score=params.min_score, n_jobs=self._n_jobs
+        )
+        return SearchResult.of(frame, found, None, start=start)
+
+    def close(self) -> None:
+        """Nothing to release."""
 
 
 def resized_shape(band: PixelBand) -> tuple[int, int]:
-    """Height and width of a band once its windows are 64x64."""
+    """Height and width of a band after resizing its windows to 64x64."""
     width = round((band.x2 - band.x1) * PATCH_SIZE / band.window[0])
     height = round((band.y2 - band.y1) * PATCH_SIZE / band.window[1])
     return max(height, PATCH_SIZE), max(width, PATCH_SIZE)
 
 
-def resize_band(image: NDArray[np.uint8], band: PixelBand, take: Take = new_array) -> NDArray[np.uint8]:
-    """Cut a band out and resize it so that a window is 64x64; `take` hands out the memory."""
+def resize_band(
+    image: NDArray[np.uint8], band: PixelBand, workspace: Workspace = NEW_ARRAYS
+) -> NDArray[np.uint8]:
+    """Crop a band and resize it so that its windows are 64x64; columns beyond the frame are replicated."""
     height, width = resized_shape(band)
     scale = PATCH_SIZE / band.window[0]
-    left, right = (round(beyond * scale) for beyond in _overhang(image, band))
+    left = round(max(0, -band.x1) * scale)
+    right = round(max(0, band.x2 - image.shape[1]) * scale)
     strip = image[band.y1 : band.y2, max(0, band.x1) : band.x2]
     size = (width - left - right, height)
     if size != (strip.shape[1], strip.shape[0]):
-        memory = take((size[1], size[0], 3), np.uint8, "strip")
+        memory = workspace.take((size[1], size[0], 3), np.uint8, "strip")
         strip = np.asarray(cv2.resize(strip, size, dst=memory), np.uint8)
     if not left and not right:
         return strip
-    # Beyond the frame the outermost column goes on: no gradient is made up there.
-    memory = take((height, width, 3), np.uint8, "band")
+    # Replication adds no gradient at the frame's border.
+    memory = workspace.take((height, width, 3), np.uint8, "band")
     padded = cv2.copyMakeBorder(strip, 0, 0, left, right, cv2.BORDER_REPLICATE, dst=memory)
     return np.asarray(padded, np.uint8)
-
-
-def _overhang(image: NDArray[np.uint8], band: PixelBand) -> tuple[int, int]:
-    """Pixels by which a band reaches beyond the frame's left and right edge."""
-    return max(0, -band.x1), max(0, band.x2 - image.shape[1])
 
 
 def _cost(band: PixelBand) -> float:
@@ -185,26 +266,27 @@ def _cost(band: PixelBand) -> float:
 
 
 def _hits(
-    scores: NDArray[np.float32], band: PixelBand, filters: _Filters, least: float
+    scores: NDArray[np.float32], band: PixelBand, cell: int, min_score: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Boxes, in pixels of the frame, and scores of the windows of a score map above `least`."""
+    """Boxes in pixels of the frame and scores of the windows of a score map above `min_score`."""
     height, width = resized_shape(band)
-    wide, high = (band.x2 - band.x1) / width, (band.y2 - band.y1) / height
-    cell = filters.params.pix_per_cell
+    scale_x, scale_y = (band.x2 - band.x1) / width, (band.y2 - band.y1) / height
     # Steps in pixels of the frame become whole cells of the resized band.
-    across, down = (max(1, round(step / (cell * scale))) for step, scale in zip(band.step, (wide, high)))
-    grid = scores[::down, ::across]
-    rows, columns = (grid > least).nonzero()
+    step_x, step_y = (
+        max(1, round(step / (cell * scale))) for step, scale in zip(band.step, (scale_x, scale_y))
+    )
+    grid = scores[::step_y, ::step_x]
+    rows, columns = (grid > min_score).nonzero()
     boxes = np.empty((len(rows), 4))
-    boxes[:, 0] = columns * (across * cell) * wide + band.x1
-    boxes[:, 1] = rows * (down * cell) * high + band.y1
-    boxes[:, 2] = boxes[:, 0] + wide * PATCH_SIZE
-    boxes[:, 3] = boxes[:, 1] + high * PATCH_SIZE
+    boxes[:, 0] = columns * (step_x * cell) * scale_x + band.x1
+    boxes[:, 1] = rows * (step_y * cell) * scale_y + band.y1
+    boxes[:, 2] = boxes[:, 0] + scale_x * PATCH_SIZE
+    boxes[:, 3] = boxes[:, 1] + scale_y * PATCH_SIZE
     return boxes, grid[rows, columns].astype(np.float64)
 
 
 class _Filters:
-    """The folded weights of a classifier, laid out as filters over planes of cells."""
+    """The folded weights of a classifier as filters over the channels of cells."""
 
     def __init__(self, classifier: VehicleClassifier) -> None:
         self.params = params = classifier.params
@@ -212,58 +294,60 @@ class _Filters:
         self.cells = params.cells
         self.block = params.cell_per_block
         self.per_cell = params.spatial_size // params.cells
-        self.roots = params.hist_feat and params.hist_sqrt
-        self.looks_up = params.hist_feat and not params.hist_sqrt
+        self.hist_roots = params.hist_feat and params.hist_sqrt
+        self.hist_lookup = params.hist_feat and not params.hist_sqrt
         self.coarse = params.coarse_blocks if params.hog_feat else 0
         self.cotangents = orientation_cotangents(params.orient)
         self.bounds = degree_bounds(params.orient)
         self.bins = bin_of_value(params.hist_bins)
         folded = [template.fold() for template in classifier.templates]
         self.biases = [bias for _, bias in folded]
-        self.filters = [self._lay_out(weights) for weights, _ in folded]
+        self.filters = [self._build_filters(weights) for weights, _ in folded]
         hist = slice(params.spatial_length, params.spatial_length + params.hist_length)
-        # Each template with a histogram has a weight table, and so a plane, of its own.
+        # Every template has its own table of weights by pixel value, and so its own histogram channel.
         by_bin = np.array([weights[hist] for weights, _ in folded], np.float32).reshape(len(folded), 3, -1)
-        self.tables = by_bin[:, :, self.bins] if self.looks_up else None
-        self.root_weights = by_bin if self.roots else None
+        self.tables = by_bin[:, :, self.bins] if self.hist_lookup else None
+        self.root_weights = by_bin if self.hist_roots else None
 
-    def _lay_out(self, weights: NDArray[np.float64]) -> list[Filter]:
-        """Lay out a template as filters over the planes of HOG, of coarse HOG and of the cells' values."""
+    def _build_filters(self, weights: NDArray[np.float64]) -> list[Filter]:
+        """Build the filters of one template: over HOG, over coarse HOG, over spatial bins and histogram."""
         params, cells = self.params, self.cells
         filters = []
         if params.hog_feat:
             start, stop = params.length - params.hog_length, params.length - params.coarse_length
-            for places, part, spread in (
+            for positions, part, dilation in (
                 (params.blocks, weights[start:stop], 1),
                 (self.coarse, weights[stop:], 2),
             ):
-                if places:
-                    blocks = part.reshape(params.hog_channels, places, places, -1).transpose(1, 2, 0, 3)
-                    filters.append(Filter(blocks.reshape(places, places, -1), spread=spread))
+                if positions:
+                    blocks = part.reshape(params.hog_channels, positions, positions, -1).transpose(1, 2, 0, 3)
+                    filters.append(Filter(blocks.reshape(positions, positions, -1), dilation=dilation))
         values = []
         if params.spatial_feat:
             part = weights[: params.spatial_length].reshape(3, cells, self.per_cell, cells, self.per_cell)
             values.append(part.transpose(1, 3, 0, 2, 4).reshape(cells, cells, -1))
-        if self.looks_up:
+        if self.hist_lookup:
             values.append(np.ones((cells, cells, 1)))
         return [*filters, Filter(np.concatenate(values, axis=2))] if values else filters
 
-    def score_map(self, band: NDArray[np.uint8], take: Take) -> NDArray[np.float32]:
-        """Scores of all windows of a resized band, ``(rows, columns)`` float32, as a new array."""
+    def score_map(self, band: NDArray[np.uint8], workspace: Workspace) -> NDArray[np.float32]:
+        """Scores of all windows of a resized band as a new ``(rows, columns)`` float32 array."""
         params, cell = self.params, self.params.pix_per_cell
         rows, columns = band.shape[0] // cell, band.shape[1] // cell
-        converted = convert_color(band, params.color_space, out=take(band.shape, np.uint8, "converted"))
-        maps = self._hog_maps(band, converted, take) if params.hog_feat else []
-        if params.spatial_feat or self.looks_up:
-            maps.append(self._value_map(converted, take))
+        converted = convert_color(
+            band, params.color_space, out=workspace.take(band.shape, np.uint8, "converted")
+        )
+        maps = self._hog_maps(band, converted, workspace) if params.hog_feat else []
+        if params.spatial_feat or self.hist_lookup:
+            maps.append(self._value_map(converted, workspace))
         shape = (len(self.filters), rows - self.cells + 1, columns - self.cells + 1)
         scores = np.empty(shape, np.float32)
         for template, (filters, bias) in enumerate(zip(self.filters, self.biases)):
             scores[template] = bias
             if self.tables is not None:
                 _color_kernels.histogram_cells(converted, self.tables[template], cell, maps[-1][-1])
-            for part, planes in zip(filters, maps):
-                part.add_to(planes, scores[template], take)
+            for template_filter, channels in zip(filters, maps):
+                template_filter.add_to(channels, scores[template], workspace)
         if self.root_weights is not None:
             _color_kernels.add_root_histograms(
                 converted, self.bins, self.root_weights, cell, self.cells, scores
@@ -271,59 +355,58 @@ class _Filters:
         return scores[0] if len(scores) == 1 else np.asarray(scores.max(axis=0))
 
     def _hog_maps(
-        self, band: NDArray[np.uint8], converted: NDArray[np.uint8], take: Take
+        self, band: NDArray[np.uint8], converted: NDArray[np.uint8], workspace: Workspace
     ) -> list[NDArray[np.float32]]:
-        """Compute the blocks of HOG and, if asked for, of coarse HOG: ``(planes, rows, columns)``."""
+        """Compute the blocks of HOG and, if used, of coarse HOG; each ``(channels, rows, columns)``."""
         params, channels = self.params, self.params.hog_channels
         cell = params.pix_per_cell
         rows, columns = band.shape[0] // cell, band.shape[1] // cell
         gray = params.hog_channel == "GRAY"
         source = hog_source(band, params) if gray else pick_hog_channels(converted, params)
-        cells = take((channels, params.orient, rows, columns), np.float32, "cells")
+        cells = workspace.take((channels, params.orient, rows, columns), np.float32, "cells")
         if params.transform_sqrt:
             _hog_kernels.sum_orientations(*sqrt_gradients(source), self.bounds, channels, cell, cells)
         else:
             flat = np.ascontiguousarray(source).reshape(source.shape[0], -1)
             _hog_kernels.hog_cells(flat, channels, cell, self.cotangents, cells)
         shape = (channels, self.block, self.block, params.orient, rows, columns)
-        blocks = take(shape, np.float32, "blocks")
+        blocks = workspace.take(shape, np.float32, "blocks")
         _hog_kernels.normalize_blocks(cells, self.block, 1, blocks)
         maps = [blocks.reshape(-1, rows, columns)]
         if self.coarse:
-            pooled = take(cells.shape, np.float32, "pooled")
+            pooled = workspace.take(cells.shape, np.float32, "pooled")
             _hog_kernels.pool_cells(cells, pooled)
-            blocks = take(shape, np.float32, "coarse blocks")
+            blocks = workspace.take(shape, np.float32, "coarse blocks")
             _hog_kernels.normalize_blocks(pooled, self.block, 2, blocks)
             maps.append(blocks.reshape(-1, rows, columns))
         return maps
 
-    def _value_map(self, converted: NDArray[np.uint8], take: Take) -> NDArray[np.float32]:
-        """Map of the spatial bins of each cell and, last, room for its looked-up histogram."""
+    def _value_map(self, converted: NDArray[np.uint8], workspace: Workspace) -> NDArray[np.float32]:
+        """Spatial bins of each cell ``(channels, rows, columns)`` and, last, a channel for the histogram."""
         cell, per_cell = self.params.pix_per_cell, self.per_cell
         rows, columns = converted.shape[0] // cell, converted.shape[1] // cell
         count = 3 * per_cell**2 if self.params.spatial_feat else 0
-        planes = take((count + int(self.looks_up), rows, columns), np.float32, "values")
+        channels = workspace.take((count + int(self.hist_lookup), rows, columns), np.float32, "values")
         if count:
             size = (columns * per_cell, rows * per_cell)
             whole = converted[: rows * cell, : columns * cell]
-            bins = cv2.resize(whole, size, dst=take((size[1], size[0], 3), np.uint8, "bins"))
-            _color_kernels.spatial_cells(
-                bins, per_cell, planes[:count].reshape(3, per_cell, per_cell, rows, columns)
-            )
-        return planes
+            bins = cv2.resize(whole, size, dst=workspace.take((size[1], size[0], 3), np.uint8, "bins"))
+            cells = channels[:count].reshape(3, per_cell, per_cell, rows, columns)
+            _color_kernels.spatial_cells(bins, per_cell, cells)
+        return channels
 
 
 def _check_shareable(params: FeatureParams) -> None:
-    """Refuse features that windows cannot share exactly, and name the search that takes them."""
+    """Reject features that windows cannot share exactly."""
     remedy = "use search_windows, the reference search, or other parameters"
     if params.cells * params.pix_per_cell != PATCH_SIZE:
         raise InvalidInputError(
-            f"find_cars needs whole HOG cells in a {PATCH_SIZE} pixel window; pix_per_cell="
-            f"{params.pix_per_cell} leaves a rest; {remedy}"
+            f"find_cars needs whole HOG cells in a window of {PATCH_SIZE} pixels, got "
+            f"pix_per_cell={params.pix_per_cell}; {remedy}"
         )
     size = params.spatial_size
     if params.spatial_feat and (size % params.cells or PATCH_SIZE % size):
         raise InvalidInputError(
-            f"find_cars needs whole spatial bins in a cell of {params.pix_per_cell} pixels; "
-            f"spatial_size={size} has none; {remedy}"
+            f"find_cars needs whole spatial bins in a cell of {params.pix_per_cell} pixels, got "
+            f"spatial_size={size}; {remedy}"
         )

@@ -1,4 +1,4 @@
-"""The reference search: one window after the other, readable and slow."""
+"""The reference search: one window after another, simple and slow."""
 
 from __future__ import annotations
 
@@ -47,24 +47,23 @@ def slide_window(
     Parameters
     ----------
     image
-        ``(H, W, 3)`` uint8 RGB; only its shape counts.
+        ``(H, W, 3)`` uint8 RGB; only its shape is used.
     x_start_stop, y_start_stop
-        Half-open pixel range of the region; None stands for the image's border.
+        Half-open pixel range of the region; None means the image's border.
     xy_window
         Width and height of a window.
     xy_overlap
-        Horizontal and vertical share that neighbors have in common, in [0, 1).
+        Horizontal and vertical overlap of neighboring windows as a fraction of their size, in [0, 1).
 
     Returns
     -------
     numpy.ndarray
-        ``(N, 4)`` int64 ``[x1, y1, x2, y2]``, row by row. Every window of the grid that fits into the
-        region is there, the last one included.
+        ``(N, 4)`` int64 ``[x1, y1, x2, y2]``, row by row: every window of the grid that fits into the region.
 
     Raises
     ------
     InvalidInputError
-        If the region leaves the image, or the window or overlap make no sense.
+        If the region exceeds the image, or a window size or overlap is out of range.
 
     Examples
     --------
@@ -80,14 +79,14 @@ def slide_window(
     for index, side in enumerate(xy_window):
         check_integer(side, f"xy_window[{index}]", low=1)
         overlap = check_number(xy_overlap[index], f"xy_overlap[{index}]", low=0, high=0.999)
-        # The course truncates the step; the tiny term keeps 64 * (1 - 0.9) from losing a pixel to rounding.
+        # The step is truncated as in the course; the small term compensates rounding, as in 50 * (1 - 0.9).
         steps.append(max(1, int(side * (1 - overlap) + 1e-9)))
     band = PixelBand(x1, y1, x2, y2, (int(xy_window[0]), int(xy_window[1])), (steps[0], steps[1]))
     return band_windows(band)
 
 
 def band_windows(band: PixelBand) -> NDArray[np.int64]:
-    """List all windows of a placed band, ``(N, 4)`` int64, row by row."""
+    """All windows of a band, ``(N, 4)`` int64, row by row."""
     width, height = band.window
     xs = np.arange(band.x1, band.x2 - width + 1, band.step[0])
     ys = np.arange(band.y1, band.y2 - height + 1, band.step[1])
@@ -96,7 +95,7 @@ def band_windows(band: PixelBand) -> NDArray[np.int64]:
 
 
 def _check_range(limits: Range, size: int, name: str) -> tuple[int, int]:
-    """Replace None by the image's border and check that the range lies inside."""
+    """Replace None by the image's border and check that the range is inside."""
     pair: Any = limits
     numbers = (int, np.integer, type(None))
     if np.shape(pair) != (2,) or not all(isinstance(limit, numbers) for limit in pair):
@@ -117,7 +116,7 @@ def search_windows(
     min_score: float | None = 0.0,
     n_jobs: int | None = None,
 ) -> Detections:
-    """Classify each window of a list, any size, by its own patch.
+    """Classify each window of a list, of any size, as a patch.
 
     Parameters
     ----------
@@ -126,33 +125,34 @@ def search_windows(
     windows
         ``(N, 4)`` whole-pixel boxes inside the image, from `slide_window` or elsewhere.
     classifier
-        Gives the score of a window that is cut out and resized to 64x64.
+        Scores the windows, cropped and resized to 64x64.
     border
-        Where gradients are zero: ``"window"``, at the window's own border, as on a training patch;
-        ``"image"``, at the image's border only, as in a search that shares HOG between windows. The
-        latter is the reference for `find_cars`; its windows must be 64x64 and lie on the cell grid.
+        Where HOG gradients are zero: ``"window"``, at the window's border, as on a training patch;
+        ``"image"``, at the image's border only, as in a search that shares HOG between windows. The latter is
+        the reference for `find_cars` and needs windows of 64x64 pixels on the cell grid.
     min_score
-        Windows with a score above this are returned; None returns all.
+        Minimum score of the returned windows (exclusive); None returns all.
     n_jobs
         Threads.
 
     Returns
     -------
     Detections
-        Boxes as they came in, with scores, in the same order.
+        The windows and their scores, in the same order.
 
     Raises
     ------
     InvalidInputError
-        If a window leaves the image, is empty, or does not lie on the grid that `border` asks for.
+        If a window exceeds the image, is empty, or is not on the grid that `border` requires.
     """
     check_image(image)
     check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
     check_choice(border, "border", ("window", "image"))
     given = check_boxes(windows, "windows")
     boxes = given.astype(np.int64)
-    if (boxes != given).any():
-        row = int(np.argmax((boxes != given).any(1)))
+    fractional = (boxes != given).any(1)
+    if fractional.any():
+        row = int(np.argmax(fractional))
         raise InvalidInputError(
             f"windows must be whole pixels; got {given[row].tolist()} in row {row}; round them first"
         )
@@ -160,12 +160,12 @@ def search_windows(
         check_number(min_score, "min_score")
     height, width = image.shape[:2]
     inside = (boxes[:, :2] >= 0).all(1) & (boxes[:, 2] <= width) & (boxes[:, 3] <= height)
-    filled = (boxes[:, 2:] > boxes[:, :2]).all(1)
-    if not (inside & filled).all():
-        row = int(np.argmin(inside & filled))
+    valid = inside & (boxes[:, 2:] > boxes[:, :2]).all(1)
+    if not valid.all():
+        row = int(np.argmin(valid))
         raise InvalidInputError(
-            f"windows must be filled boxes inside the {width}x{height} image; got {boxes[row].tolist()} in "
-            f"row {row}; use slide_window, or clip_boxes and drop the empty ones"
+            f"windows must be non-empty boxes inside the {width}x{height} image; got {boxes[row].tolist()} "
+            f"in row {row}; use slide_window, or clip_boxes and drop empty boxes"
         )
     if border == "window":
         patches = np.empty((len(boxes), PATCH_SIZE, PATCH_SIZE, 3), np.uint8)
@@ -182,10 +182,7 @@ def search_windows(
 def _shared_hog_features(
     image: NDArray[np.uint8], boxes: NDArray[np.int64], classifier: VehicleClassifier
 ) -> NDArray[np.float64]:
-    """Features of 64x64 windows on the cell grid, with one scikit-image HOG of the whole image.
-
-    Colors are converted before the windows are cut, as `find_cars` does; it makes no difference.
-    """
+    """Features of 64x64 windows on the cell grid, with one scikit-image HOG of the whole image."""
     params = classifier.params
     cell, blocks = params.pix_per_cell, params.blocks
     sizes = boxes[:, 2:] - boxes[:, :2]
@@ -195,22 +192,13 @@ def _shared_hog_features(
             "resize the image so that the window is 64x64"
         )
     converted = convert_color(image, params.color_space)
-    hog = []
+    hog: list[NDArray[Any]] = []
+    coarse: list[NDArray[Any]] = []
     if params.hog_feat:
         source = hog_source(image, params)
-        hog = [
-            hog_blocks(
-                source[..., channel],
-                params.orient,
-                cell,
-                params.cell_per_block,
-                transform_sqrt=params.transform_sqrt,
-            )
-            for channel in range(params.hog_channels)
-        ]
-    coarse = []
-    if params.hog_feat and params.coarse_hog:
-        coarse = [_coarse_blocks(source[..., channel], params) for channel in range(params.hog_channels)]
+        planes = [source[..., channel] for channel in range(params.hog_channels)]
+        hog = [_hog_blocks(plane, cell, params) for plane in planes]
+        coarse = [_coarse_blocks(plane, params) for plane in planes] if params.coarse_hog else []
     span = 2 * params.coarse_blocks
     features = np.empty((len(boxes), params.length))
     for row, (x1, y1, x2, y2) in enumerate(boxes):
@@ -226,23 +214,24 @@ def _shared_hog_features(
     return features
 
 
+def _hog_blocks(channel: NDArray[np.uint8], cell: int, params: FeatureParams) -> NDArray[np.float64]:
+    """HOG of one channel with cells of `cell` pixels; see `hog_blocks`."""
+    return hog_blocks(
+        channel, params.orient, cell, params.cell_per_block, transform_sqrt=params.transform_sqrt
+    )
+
+
 def _coarse_blocks(channel: NDArray[np.uint8], params: FeatureParams) -> NDArray[np.float64]:
     """HOG of double-sized cells at every cell: ``[y, x]`` is the block that starts at cell ``[y, x]``.
 
-    For odd cells the image is shifted by one, and what comes in is its reflection: the gradient across an
-    edge between an image and its reflection is zero, as it is at the image's border.
+    For odd cells the image is shifted by one cell. The new border is a reflection: the gradient between an
+    image and its reflection is zero, as at the image's border.
     """
     cell, block = params.pix_per_cell, params.cell_per_block
     rows, columns = (side // cell for side in channel.shape)
     found = np.zeros((rows, columns, block, block, params.orient))
     for odd_y, odd_x in itertools.product((0, 1), repeat=2):
         shifted = cv2.copyMakeBorder(channel, odd_y * cell, 0, odd_x * cell, 0, cv2.BORDER_REFLECT_101)
-        blocks = hog_blocks(
-            np.asarray(shifted, np.uint8),
-            params.orient,
-            2 * cell,
-            block,
-            transform_sqrt=params.transform_sqrt,
-        )[odd_y:, odd_x:]
+        blocks = _hog_blocks(np.asarray(shifted, np.uint8), 2 * cell, params)[odd_y:, odd_x:]
         found[odd_y::2, odd_x::2][: len(blocks), : blocks.shape[1]] = blocks
     return found

@@ -22,7 +22,7 @@ def color(images):
 
 @pytest.mark.parametrize("change", [blur_patches, degrade_patches])
 @pytest.mark.parametrize("mirror", [False, True])
-def test_each_patch_decides_for_itself(patches, change, mirror):
+def test_the_result_depends_only_on_the_patch(patches, change, mirror):
     before = patches.copy()
     changed = change(patches, mirror=mirror)
     np.testing.assert_array_equal(patches, before)
@@ -30,29 +30,29 @@ def test_each_patch_decides_for_itself(patches, change, mirror):
     np.testing.assert_array_equal(change(patches[::-3], mirror=mirror), changed[::-3])
 
 
-def test_blurred_patches_are_coarser_and_as_colorful(patches):
+def test_blurred_patches_lose_sharpness_and_keep_their_color(patches):
     blurred = blur_patches(patches, mirror=False)
     assert (sharpness(blurred) <= sharpness(patches) * 1.01).all()
     assert sharpness(blurred).mean() < 0.8 * sharpness(patches).mean()
     np.testing.assert_allclose(blurred.mean(axis=(1, 2)), patches.mean(axis=(1, 2)), atol=3)
 
 
-def test_degraded_patches_are_paler_and_as_bright(patches):
+def test_degraded_patches_lose_saturation_and_keep_their_brightness(patches):
     degraded = degrade_patches(patches, mirror=False)
     assert color(degraded).mean() < 0.8 * color(patches).mean()
     np.testing.assert_allclose(degraded.mean(axis=(1, 2)).mean(), patches.mean(), atol=3)
 
 
-def test_about_half_are_mirrored(patches):
+def test_about_half_of_the_patches_are_mirrored(patches):
     left = np.zeros_like(patches)
-    left[:, :, :32] = np.arange(len(patches))[:, None, None, None] + 100  # no two are alike
+    left[:, :, :32] = np.arange(len(patches))[:, None, None, None] + 100  # all different
     for change in (blur_patches, degrade_patches):
         bright = change(left)[:, :, :16].mean(axis=(1, 2, 3)) > 50
         assert 4 < bright.sum() < 20
         assert (change(left, mirror=False)[:, :, :16].mean(axis=(1, 2, 3)) > 50).all()
 
 
-def test_another_exposure_keeps_the_order_of_values_and_takes_contrast():
+def test_relight_is_monotonic_and_reduces_contrast():
     ramp = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
     rng = np.random.default_rng(0)
     found = [relight(ramp, rng) for _ in range(40)]

@@ -21,7 +21,7 @@ IMAGE = np.zeros((4, 6, 3), np.uint8)
 PATCH = np.zeros((64, 64, 3), np.uint8)
 
 
-def test_bad_input_is_a_value_error_and_an_error_of_the_library():
+def test_invalid_input_is_a_value_error_and_an_error_of_the_library():
     assert issubclass(InvalidInputError, ValueError)
     assert issubclass(InvalidInputError, VehicleDetectionError)
 
@@ -30,9 +30,12 @@ def test_bad_input_is_a_value_error_and_an_error_of_the_library():
     ("value", "text"),
     [
         (np.zeros((2, 3), np.float32), "an array of shape (2, 3) and dtype float32"),
-        ("road", "'road' (str)"),
-        (None, "None (NoneType)"),
-        (7, "7 (int)"),
+        ("road", "'road'"),
+        (None, "None"),
+        (7, "7"),
+        (0.5, "0.5"),
+        ((1, 2), "(1, 2) (tuple)"),
+        (range(3), "range(0, 3) (range)"),
     ],
 )
 def test_describe(value, text):
@@ -71,7 +74,7 @@ def test_check_image_returns_the_same_array():
         (IMAGE.astype(bool), "0-255"),
     ],
 )
-def test_check_image_says_how_to_convert(image, remedy):
+def test_check_image_explains_the_conversion(image, remedy):
     with pytest.raises(InvalidInputError, match=rf"^frame must be an \(H, W, 3\) uint8 RGB array.*{remedy}"):
         check_image(image, "frame")
 
@@ -86,7 +89,7 @@ def test_check_channel_refuses(channel):
         check_channel(channel)
 
 
-def test_check_patches_passes_an_array_and_stacks_a_list():
+def test_check_patches_keeps_an_array_and_stacks_a_list():
     batch = np.stack([PATCH, PATCH + 1])
     assert check_patches(batch, 64) is batch
     np.testing.assert_array_equal(check_patches([PATCH, PATCH + 1], 64), batch)
@@ -112,7 +115,7 @@ def test_check_patches_refuses(patches, message):
 
 
 @pytest.mark.parametrize("empty", [[], np.empty((0, 4)), np.empty(0), (), np.empty((0, 4), np.int64)])
-def test_check_boxes_knows_no_boxes(empty):
+def test_check_boxes_accepts_no_boxes(empty):
     assert check_boxes(empty).shape == (0, 4)
 
 
@@ -143,20 +146,20 @@ def test_check_boxes_refuses(boxes, message):
         check_boxes(boxes, "windows")
 
 
-def test_check_boxes_compares_unsigned_numbers_rightly():
+def test_check_boxes_compares_unsigned_coordinates():
     with pytest.raises(InvalidInputError, match="row 0"):
         check_boxes(np.array([[10, 10, 5, 20]], np.uint8))
 
 
 def test_check_type():
     check_type(True, "n", int, "count them")
-    with pytest.raises(InvalidInputError, match=r"^n must be a int, got 'a' \(str\); count them$"):
+    with pytest.raises(InvalidInputError, match=r"^n must be a int, got 'a'; count them$"):
         check_type("a", "n", int, "count them")
 
 
 @pytest.mark.parametrize("value", [0, 1, 0.5, np.float32(0.5), np.int64(1)])
-def test_check_number_takes_numbers_in_range(value):
-    number = check_number(value, "share", low=0, high=1)
+def test_check_number_accepts_numbers_in_range(value):
+    number = check_number(value, "fraction", low=0, high=1)
     assert type(number) is float
     assert number == value
 
@@ -168,24 +171,24 @@ def test_check_number_bounds():
 
 @pytest.mark.parametrize("value", [-0.01, 1.01, math.nan, math.inf, -math.inf, "0.5", None, True, [0.5], 1j])
 def test_check_number_refuses(value):
-    expected = re.escape(f"share must be a number, at least 0 and at most 1; got {describe(value)}")
+    expected = re.escape(f"fraction must be a number, at least 0 and at most 1; got {describe(value)}")
     with pytest.raises(InvalidInputError, match=expected):
-        check_number(value, "share", low=0, high=1)
+        check_number(value, "fraction", low=0, high=1)
 
 
-def test_check_number_names_an_open_bound():
-    with pytest.raises(InvalidInputError, match=r"fps must be a number, greater than 0; got 0 \(int\)"):
+def test_check_number_describes_an_open_bound():
+    with pytest.raises(InvalidInputError, match=r"fps must be a number, greater than 0; got 0$"):
         check_number(0, "fps", above=0)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_check_number_wants_finite_numbers(value):
+def test_check_number_refuses_infinite_numbers(value):
     with pytest.raises(InvalidInputError, match="threshold must be a number, finite"):
         check_number(value, "threshold")
 
 
 @pytest.mark.parametrize("value", [1, 5, np.int8(3), np.uint64(4)])
-def test_check_integer_takes_integers_in_range(value):
+def test_check_integer_accepts_integers_in_range(value):
     assert type(check_integer(value, "n", low=1, high=5)) is int
 
 
@@ -197,7 +200,7 @@ def test_check_integer_refuses(value):
 
 def test_check_integer_without_an_upper_bound():
     assert check_integer(10**12, "n", low=1) == 10**12
-    with pytest.raises(InvalidInputError, match=r"n must be an integer at least 1; got -3 \(int\)"):
+    with pytest.raises(InvalidInputError, match=r"n must be an integer at least 1; got -3$"):
         check_integer(-3, "n", low=1)
 
 

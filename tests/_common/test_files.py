@@ -25,7 +25,7 @@ def test_check_target_refuses_a_folder(tmp_path):
 
 def test_check_target_refuses_a_missing_folder(tmp_path):
     with pytest.raises(
-        InvalidInputError, match=r"target needs an existing folder, .*nowhere is none; create"
+        InvalidInputError, match=r"target needs an existing folder, .*nowhere is not one; create"
     ):
         check_target(tmp_path / "nowhere" / "out.csv")
     (tmp_path / "file").touch()
@@ -43,13 +43,13 @@ def test_check_target_refuses_a_read_only_folder(tmp_path):
         tmp_path.chmod(0o700)
 
 
-def test_check_target_refuses_where_the_system_says_read_only(tmp_path, monkeypatch):
+def test_check_target_refuses_a_folder_that_the_system_calls_read_only(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: not mode & os.W_OK)
     with pytest.raises(InvalidInputError, match=r"target needs a writable folder, .* is read-only; choose"):
         check_target(tmp_path / "out.csv")
 
 
-def test_the_file_appears_when_the_block_ends(tmp_path):
+def test_the_file_exists_after_the_block(tmp_path):
     target = tmp_path / "out.csv"
     with atomic_write(target) as part:
         assert part.parent == tmp_path
@@ -62,7 +62,7 @@ def test_the_file_appears_when_the_block_ends(tmp_path):
 
 @pytest.mark.parametrize("interrupt", [KeyboardInterrupt, SystemExit, OSError, GeneratorExit, MemoryError])
 @pytest.mark.parametrize("earlier", [None, "earlier"])
-def test_an_interrupt_leaves_nothing_and_keeps_the_earlier_file(tmp_path, interrupt, earlier):
+def test_an_interrupt_leaves_no_temporary_file_and_keeps_the_existing_one(tmp_path, interrupt, earlier):
     target = tmp_path / "out.csv"
     if earlier:
         target.write_text(earlier)
@@ -78,7 +78,7 @@ def test_an_interrupt_leaves_nothing_and_keeps_the_earlier_file(tmp_path, interr
     assert not earlier or target.read_text() == earlier
 
 
-def test_a_failed_rename_leaves_nothing(tmp_path, monkeypatch):
+def test_a_failed_rename_leaves_no_file(tmp_path, monkeypatch):
     def refuse(self, target):
         raise PermissionError("not yours")
 
@@ -89,7 +89,7 @@ def test_a_failed_rename_leaves_nothing(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("umask", [0o022, 0o077, 0o027])
-def test_permissions_are_those_of_any_new_file(tmp_path, umask):
+def test_permissions_equal_those_of_any_new_file(tmp_path, umask):
     before = os.umask(umask)
     try:
         with atomic_write(tmp_path / "out.csv") as part:
@@ -100,14 +100,14 @@ def test_permissions_are_those_of_any_new_file(tmp_path, umask):
         os.umask(before)
 
 
-def test_a_name_as_long_as_the_system_allows(tmp_path):
+def test_a_file_name_of_maximum_length(tmp_path):
     target = tmp_path / f"{'n' * 251}.csv"
     with atomic_write(target) as part:
         part.write_text("whole")
     assert target.read_text() == "whole"
 
 
-def test_writers_of_one_file_do_not_mix(tmp_path):
+def test_concurrent_writers_of_one_file_do_not_mix(tmp_path):
     target = tmp_path / "out.txt"
     together = threading.Barrier(4)
 

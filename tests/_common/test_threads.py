@@ -23,39 +23,39 @@ def three_threads():
     cv2.setNumThreads(before)
 
 
-def test_all_cores_by_default(monkeypatch):
+def test_the_default_is_all_cores(monkeypatch):
     monkeypatch.delenv(JOBS_VARIABLE, raising=False)
     assert resolve_jobs() == available_cores() >= 1
     monkeypatch.setenv(JOBS_VARIABLE, "")
     assert resolve_jobs(None) == available_cores()
 
 
-def test_the_environment_decides(monkeypatch):
+def test_the_environment_variable_sets_the_number_of_threads(monkeypatch):
     monkeypatch.setenv(JOBS_VARIABLE, "7")
     assert resolve_jobs() == 7
 
 
-def test_the_argument_beats_the_environment(monkeypatch):
+def test_the_argument_overrides_the_environment_variable(monkeypatch):
     monkeypatch.setenv(JOBS_VARIABLE, "7")
     assert resolve_jobs(3) == 3
     assert resolve_jobs(np.int64(3)) == 3
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "two", "1.5", " 2", "²", "1e3"])
-def test_a_bad_environment_is_named(monkeypatch, text):
+def test_an_invalid_environment_variable(monkeypatch, text):
     monkeypatch.setenv(JOBS_VARIABLE, text)
-    with pytest.raises(InvalidInputError, match=f"^{JOBS_VARIABLE} must be a whole number of threads from 1"):
+    with pytest.raises(InvalidInputError, match=f"^{JOBS_VARIABLE} must be a number of threads, at least 1"):
         resolve_jobs()
 
 
 @pytest.mark.parametrize("n_jobs", [0, -1, 1025, 2.0, "2", True])
-def test_a_bad_argument_is_named(n_jobs):
+def test_an_invalid_number_of_threads(n_jobs):
     with pytest.raises(InvalidInputError, match=r"^n_jobs must be an integer from 1 to 1024; got"):
         resolve_jobs(n_jobs)
 
 
 @pytest.mark.usefixtures("three_threads")
-def test_opencv_is_held_and_let_go():
+def test_opencv_has_one_thread_inside_nested_contexts():
     with single_threaded_opencv():
         assert cv2.getNumThreads() == 1
         with single_threaded_opencv():
@@ -65,14 +65,14 @@ def test_opencv_is_held_and_let_go():
 
 
 @pytest.mark.usefixtures("three_threads")
-def test_opencv_is_let_go_after_an_error():
+def test_opencv_threads_are_restored_after_an_error():
     with pytest.raises(KeyError, match="oops"), single_threaded_opencv():
         raise KeyError("oops")
     assert cv2.getNumThreads() == 3
 
 
 @pytest.mark.usefixtures("three_threads")
-def test_opencv_is_held_until_the_last_thread_leaves():
+def test_opencv_has_one_thread_until_the_last_thread_leaves():
     inside, leave = threading.Event(), threading.Event()
 
     def other():
@@ -84,16 +84,16 @@ def test_opencv_is_held_until_the_last_thread_leaves():
     with single_threaded_opencv():
         thread.start()
         assert inside.wait(10)
-    # The first to enter has left; the other is still at work.
-    held = cv2.getNumThreads()
+    # The first thread has left the context; the other one has not.
+    inside_count = cv2.getNumThreads()
     leave.set()
     thread.join()
-    assert held == 1
+    assert inside_count == 1
     assert cv2.getNumThreads() == 3
 
 
 @pytest.mark.usefixtures("three_threads")
-def test_opencv_is_restored_after_many_threads_come_and_go():
+def test_opencv_threads_are_restored_after_many_threads():
     def work():
         for _ in range(50):
             with single_threaded_opencv():
@@ -107,38 +107,38 @@ def test_opencv_is_restored_after_many_threads_come_and_go():
     assert cv2.getNumThreads() == 3
 
 
-# --- sharing work ---
+# --- thread team ---
 
 
 @pytest.mark.parametrize("jobs", [1, 2, 5])
 @pytest.mark.parametrize("count", [0, 1, 2, 17])
-def test_a_crew_returns_results_in_the_items_order(jobs, count):
-    crew = ThreadTeam(jobs, name="crew")
+def test_a_team_returns_results_in_the_order_of_the_items(jobs, count):
+    team = ThreadTeam(jobs, name="team")
     try:
-        assert crew.map(lambda item: item * 10, range(count), cost=float) == [10 * n for n in range(count)]
+        assert team.map(lambda item: item * 10, range(count), cost=float) == [10 * n for n in range(count)]
     finally:
-        crew.close()
-    assert not [thread for thread in threading.enumerate() if thread.name.startswith("crew")]
+        team.close()
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("team")]
 
 
-def test_a_crew_takes_the_costly_items_first():
+def test_a_team_processes_expensive_items_first():
     taken = []
-    ThreadTeam(1, name="crew").map(taken.append, [3, 9, 1, 5], cost=float)
+    ThreadTeam(1, name="team").map(taken.append, [3, 9, 1, 5], cost=float)
     assert taken == [9, 5, 3, 1]
 
 
-def test_a_crew_works_on_all_threads():
+def test_a_team_uses_all_threads():
     together = threading.Barrier(3)
-    crew = ThreadTeam(3, name="crew")
-    names = crew.map(lambda _: (together.wait(10), threading.current_thread().name)[1], range(3), cost=float)
-    crew.close()
+    team = ThreadTeam(3, name="team")
+    names = team.map(lambda _: (together.wait(10), threading.current_thread().name)[1], range(3), cost=float)
+    team.close()
     assert len(set(names)) == 3
     assert threading.current_thread().name in names
 
 
 @pytest.mark.parametrize("failing", [0, 3, 6])
-def test_an_error_of_one_item_is_the_crews(failing):
-    crew = ThreadTeam(2, name="crew")
+def test_a_team_raises_the_error_of_an_item(failing):
+    team = ThreadTeam(2, name="team")
 
     def work(item):
         if item == failing:
@@ -146,29 +146,29 @@ def test_an_error_of_one_item_is_the_crews(failing):
         return item
 
     with pytest.raises(ZeroDivisionError, match=str(failing)):
-        crew.map(work, range(7), cost=float)
-    assert crew.map(abs, [-1, -2], cost=float) == [1, 2]
-    crew.close()
+        team.map(work, range(7), cost=float)
+    assert team.map(abs, [-1, -2], cost=float) == [1, 2]
+    team.close()
 
 
-def test_callers_beside_each_other_work_alone():
-    crew = ThreadTeam(2, name="crew")
+def test_the_second_of_two_callers_has_no_helpers():
+    team = ThreadTeam(2, name="team")
     inside = threading.Barrier(2)
     names = {}
 
     def call(caller):
         def work(item):
             if item == 0:
-                inside.wait(10)  # both callers are at work
+                inside.wait(10)  # until both callers are here
             return threading.current_thread().name
 
-        # The first item is the costly one: whoever came second has no helper.
-        names[caller] = crew.map(work, range(4), cost=lambda item: -item)
+        # The first item is the most expensive one, so each caller processes its own.
+        names[caller] = team.map(work, range(4), cost=lambda item: -item)
 
     callers = [threading.Thread(target=call, args=(n,), name=f"caller-{n}") for n in range(2)]
     for caller in callers:
         caller.start()
     for caller in callers:
         caller.join()
-    crew.close()
+    team.close()
     assert any(set(names[n]) == {f"caller-{n}"} for n in range(2))

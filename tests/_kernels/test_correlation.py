@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vehicle_detection._common import Buffers
+from vehicle_detection._common import Workspace
 from vehicle_detection._kernels import Filter
 from vehicle_detection._kernels.vector import Block, block_adder, host_block
 
@@ -61,11 +61,11 @@ def test_fewer_windows_than_fit_are_the_first_ones():
 
 def test_memory_that_was_used_before_does_not_show():
     weights, planes = drawn(4, 4, 6, 12, 60)
-    buffers = Buffers()
+    workspace = Workspace()
     first, second = np.zeros((2, 9, 57), np.float32)
-    Filter(weights).add_to(planes, first, buffers.take)
-    Filter(-weights).add_to(100 * planes, np.zeros((9, 57), np.float32), buffers.take)
-    Filter(weights).add_to(planes, second, buffers.take)
+    Filter(weights).add_to(planes, first, workspace)
+    Filter(-weights).add_to(100 * planes, np.zeros((9, 57), np.float32), workspace)
+    Filter(weights).add_to(planes, second, workspace)
     np.testing.assert_array_equal(first, second)
 
 

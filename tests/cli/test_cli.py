@@ -316,7 +316,7 @@ def bad_images(material, tmp):
         r"model file \S+none.safetensors does not exist": [road, "--model", tmp / "none.safetensors"],
         r"model file motorway does not exist; .* a shipped model: default, h": [road, "--model", "motorway"],
         r"model file \S+empty is a folder": [road, "--model", material / "empty"],
-        r"text.safetensors is no whole safetensors": [road, "--model", material / "text.safetensors"],
+        r"text.safetensors is not a complete safetensors": [road, "--model", material / "text.safetensors"],
     }
 
 
@@ -350,7 +350,7 @@ def test_damaged_models_are_refused(picture, tmp_path):
     assert len(other) == len(data)
     assert other != data
     damaged = {
-        "cut": (data[: len(data) // 2], "is no whole safetensors model"),
+        "cut": (data[: len(data) // 2], "is not a complete safetensors file"),
         "edited": (bytes(swapped), "was changed after it was written"),
         "other": (other, "was changed after it was written"),
     }

@@ -58,7 +58,7 @@ def test_it_finds_what_the_detector_finds(explorer, scenes, kind, min_score):
     for number, scene in enumerate(scenes):
         explorer.set_frame(number)
         expected = VehicleDetector(
-            load_classifier(), regions=kind, search=SearchParams(bands=explorer.search.bands, horizon=0.56,
+            load_classifier(), region_params=HeatParams() if kind == "heat" else None, search_params=SearchParams(bands=explorer.search.bands, horizon=0.56,
                                               min_score=min_score, horizontal_padding=0.5), n_jobs=1
         )  # fmt: skip
         windows = expected.search(scene).windows

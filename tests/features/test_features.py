@@ -361,7 +361,7 @@ def test_progress_goes_to_standard_error(capsys):
         ([BLANK[:32]], r"source\[0\] must be 64x64 pixels, got 64x32"),
         ([BLANK, BLANK[..., 0]], r"source\[1\] must be .*COLOR_GRAY2RGB"),
         ("vehicles", "source must be patches or a list of paths, got 'vehicles'"),
-        (3, r"source must be patches or a list of paths, got 3 \(int\)"),
+        (3, r"source must be patches or a list of paths, got 3"),
         (None, "source must be patches or a list of paths, got None"),
         (["missing.png"], "image file missing.png does not exist"),
     ],

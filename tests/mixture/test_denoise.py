@@ -67,8 +67,12 @@ def test_the_search_looks_at_the_smoothed_frame():
     search = MixtureSearch(model, n_jobs=1)
     found = search.find(image).vehicles
     smooth = without_noise(image)
-    boxes, values = model.vehicles(smooth, search.candidates(smooth, PyramidParams()), least=model.value(0.0))
+    boxes, values = model.detect_vehicles(
+        smooth, search.score_windows(smooth, PyramidParams()), min_margin=model.margin_of(0.0)
+    )
     np.testing.assert_array_equal(found.boxes, boxes)
     np.testing.assert_array_equal(found.scores, model.scores(values))
-    boxes, _ = model.vehicles(image, search.candidates(image, PyramidParams()), least=model.value(0.0))
+    boxes, _ = model.detect_vehicles(
+        image, search.score_windows(image, PyramidParams()), min_margin=model.margin_of(0.0)
+    )
     assert not np.array_equal(found.boxes, boxes)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vehicle_detection._common import Buffers
+from vehicle_detection._common import Workspace
 from vehicle_detection._kernels import fhog as _fhog_kernels
 from vehicle_detection.mixture import (
     COARSE,
@@ -303,12 +303,12 @@ def test_the_border_goes_on():
 
 
 def test_memory_that_is_used_again_changes_nothing():
-    buffers = Buffers()
+    workspace = Workspace()
     for seed, shape in enumerate([(90, 160), (50, 70), (120, 100)]):
         images = image_pyramid(noise(shape, seed))
         for level in (Level(3.0, 6.0), Level(None, 9.0)):
             fresh = {size: found.planes for size, found in level_maps(images, level, (0, shape[0]))}
-            for size, found in level_maps(images, level, (0, shape[0]), buffers.take):
+            for size, found in level_maps(images, level, (0, shape[0]), workspace):
                 np.testing.assert_array_equal(found.planes, fresh[size])
 
 

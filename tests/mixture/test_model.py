@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from vehicle_detection import VehicleDetector
 from vehicle_detection._common import FORMAT_VERSION
-from vehicle_detection._common.model_file import FORMAT, _checksum
+from vehicle_detection._common.model_file import FORMAT, checksum
 from vehicle_detection.boxes import box_areas, clip_boxes, iou_matrix
 from vehicle_detection.classifier import VehicleClassifier, load_classifier
 from vehicle_detection.errors import InvalidInputError, ModelFileError
@@ -89,7 +89,7 @@ def test_the_mirrored_template_scores_the_mirrored_map_alike():
     planes = np.random.default_rng(1).uniform(0, 0.4, (PLANES, 12, 20)).astype(np.float32)
     template = random_template()
     weights = mirror_planes(template.weights.transpose(2, 0, 1)).transpose(1, 2, 0)
-    mirrored = MixtureTemplate(weights, template.bias, template.margin)
+    mirrored = MixtureTemplate(weights, template.bias, template.padding)
     np.testing.assert_allclose(
         mirrored.scores(mirror_planes(planes)), template.scores(planes)[:, ::-1], atol=1e-5
     )
@@ -122,11 +122,11 @@ def test_both_borders_are_searched_alike(seed, columns, rows):
     level = FeatureMap(planes, 0.0, 4.0, 8.0, 8.0)
     align_mirrored = dataclasses.replace(level, planes=mirror_planes(planes))
     template, width = border_template(), columns * 8.0
-    boxes, values = template.border_windows(level, width, left=False, least=-9.0)
+    boxes, values = template.border_windows(level, width, left=False, min_margin=-9.0)
     assert len(boxes) == (rows - 5 if columns >= 5 and rows >= 6 else 0)
     assert (boxes[:, 2] == width).all()
     assert (boxes[:, 2:] - boxes[:, :2] == 32).all()
-    others, same = template.border_windows(align_mirrored, 0.0, left=True, least=-9.0)
+    others, same = template.border_windows(align_mirrored, 0.0, left=True, min_margin=-9.0)
     np.testing.assert_array_equal(same, values)
     np.testing.assert_array_equal(others[:, [1, 3]], boxes[:, [1, 3]])
     np.testing.assert_array_equal(others[:, [0, 2]], width - boxes[:, [2, 0]])
@@ -141,25 +141,25 @@ def test_windows_of_a_template_at_the_border_end_there():
         templates=(random_template(bias=-0.5), dataclasses.replace(border_template(), bias=1.0)),
     )
     search = MixtureSearch(model, n_jobs=1)
-    found = search.candidates(ROAD, PyramidParams())
+    found = search.score_windows(ROAD, PyramidParams())
     at_border = found.boxes[found.templates == 1]
     assert (at_border[:, 0] == 0).any()
     assert (at_border[:, 2] == 640).any()
     assert ((at_border[:, 0] == 0) | (at_border[:, 2] == 640)).all()
     # The other templates' sizes stay what they are without it.
     alone = dataclasses.replace(model, templates=model.templates[:1])
-    expected = MixtureSearch(alone, n_jobs=1).candidates(ROAD, PyramidParams())
+    expected = MixtureSearch(alone, n_jobs=1).score_windows(ROAD, PyramidParams())
     others = found.boxes[found.templates == 0]
     np.testing.assert_array_equal(others, expected.boxes[: len(others)])
 
 
 def test_nearer_vehicles_gain():
     model = random_mixture()
-    found = MixtureSearch(model, n_jobs=1).candidates(ROAD, PyramidParams())
+    found = MixtureSearch(model, n_jobs=1).score_windows(ROAD, PyramidParams())
     least = float(np.quantile(found.scores, 0.2))
-    boxes, values = model.vehicles(ROAD, found, least=least)
+    boxes, values = model.vehicles(ROAD, found, min_margin=least)
     gained = dataclasses.replace(model, size_prior_weight=0.1)
-    others, more = gained.vehicles(ROAD, found, least=least)
+    others, more = gained.vehicles(ROAD, found, min_margin=least)
     before = {tuple(box): value for box, value in zip(boxes, values)}
     both = [row for row, box in enumerate(others) if tuple(box) in before]
     assert len(both) > 3
@@ -175,15 +175,15 @@ def test_what_many_windows_agree_on_gains():
     vehicle, twins = [100.0, 100.0, 200.0, 180.0], 30
     boxes = np.array([[400.0, 100.0, 500.0, 180.0], *[vehicle] * twins])
     windows = ScoredWindows(boxes, np.array([0.5, *[0.4] * twins]), np.zeros(twins + 1, np.intp))
-    assert model.vehicles(ROAD, windows, least=0.0)[1].tolist() == [0.5, 0.4]
+    assert model.vehicles(ROAD, windows, min_margin=0.0)[1].tolist() == [0.5, 0.4]
     gained = dataclasses.replace(model, vote_weight=0.1)
-    found, values = gained.vehicles(ROAD, windows, least=0.0)
+    found, values = gained.vehicles(ROAD, windows, min_margin=0.0)
     assert found.tolist() == [vehicle, boxes[0].tolist()]
     # Of 30 windows that exceed -1.1 by 1.5 each, e^4 count.
     np.testing.assert_allclose(values, [0.4 + 0.1 * (np.log(46) - 2), 0.5 + 0.1 * (np.log(2.6) - 2)])
-    assert len(gained.vehicles(ROAD, windows, least=0.5)[0]) == 1
+    assert len(gained.vehicles(ROAD, windows, min_margin=0.5)[0]) == 1
     more = ScoredWindows(np.array([vehicle] * 90), np.full(90, 0.4), np.zeros(90, np.intp))
-    np.testing.assert_allclose(gained.vehicles(ROAD, more, least=0.0)[1], [0.6])
+    np.testing.assert_allclose(gained.vehicles(ROAD, more, min_margin=0.0)[1], [0.6])
 
 
 def test_a_template_keeps_a_copy_that_cannot_be_changed():
@@ -314,7 +314,7 @@ def test_a_known_horizon_limits_where_vehicles_stand(horizon):
     boxes = boxes[(boxes[:, 1] >= 0) & (boxes[:, 3] <= 360)]
     assert len(boxes) > 100
     width, foot = boxes[:, 2] - boxes[:, 0], boxes[:, 3]
-    slack, cell = 360 * params.horizon_error, width / 7
+    slack, cell = 360 * params.horizon_tolerance, width / 7
     low, high = (share * width / 1.8 + horizon * 360 for share in params.camera_height_m)
     assert (foot >= low - slack - 2 * cell).all()
     assert (foot <= high + slack + 2 * cell).all()
@@ -351,21 +351,21 @@ def test_frames_and_parameters_that_are_refused():
     with pytest.raises(InvalidInputError, match="method must be 'shared' for a mixture"):
         VehicleDetector(random_mixture(), method="windows")
     with pytest.raises(InvalidInputError, match="search must be a PyramidParams, got SearchParams"):
-        VehicleDetector(random_mixture(), search=SearchParams.preset())
+        VehicleDetector(random_mixture(), search_params=SearchParams.preset())
     with pytest.raises(InvalidInputError, match="search must be a SearchParams, got PyramidParams"):
-        VehicleDetector(load_classifier(), search=PyramidParams())
+        VehicleDetector(load_classifier(), search_params=PyramidParams())
 
 
 def test_the_detector_hands_out_what_the_search_finds():
     model = random_mixture()
     params = PyramidParams(min_width=60)
     expected = search_once(model, ROAD, params)
-    with VehicleDetector(model, search=params, n_jobs=1) as detector:
+    with VehicleDetector(model, search_params=params, n_jobs=1) as detector:
         found = detector.search(ROAD)
         assert found.windows.scores.tolist() == expected.windows.scores.tolist()
         assert detector.detect(ROAD).boxes.tolist() == expected.vehicles.boxes.tolist()
-        assert detector.process(ROAD).regions.boxes.tolist() == expected.vehicles.boxes.tolist()
-    with VehicleDetector(model, regions="heat", horizon=0.6, n_jobs=1) as detector:
+        assert detector.process(ROAD).detections.boxes.tolist() == expected.vehicles.boxes.tolist()
+    with VehicleDetector(model, region_params=HeatParams(), horizon=0.6, n_jobs=1) as detector:
         assert detector.search_params.horizon == 0.6
         assert detector.detect(ROAD).boxes.shape[1] == 4
 
@@ -392,11 +392,14 @@ def windows_of(count, seed):
 
 
 @given(
-    count=st.integers(0, 40), seed=st.integers(0, 1000), least=st.floats(-1.5, 1.5), most=st.integers(1, 9)
+    count=st.integers(0, 40),
+    seed=st.integers(0, 1000),
+    min_margin=st.floats(-1.5, 1.5),
+    max_boxes=st.integers(1, 9),
 )
 def test_suppression(count, seed, least, most):
     windows = windows_of(count, seed)
-    kept, vote_mass = vote_boxes(windows, least=least, most=most)
+    kept, vote_mass = vote_boxes(windows, min_margin=least, max_boxes=most)
     assert len(kept) <= most
     assert kept.boxes.shape == (len(kept), 4)
     assert (kept.scores >= least).all()
@@ -408,7 +411,7 @@ def test_suppression(count, seed, least, most):
         assert (kept.boxes <= windows.boxes.max(axis=0) + 1e-9).all()
         # The weaker windows change no score and take none away: they vote for places only.
         strong = windows[windows.scores >= least]
-        again, less = vote_boxes(strong, least=least, most=most)
+        again, less = vote_boxes(strong, min_margin=least, max_boxes=most)
         assert again.scores.tolist() == kept.scores.tolist()
         # A window supports itself, and the more there are the better.
         assert (vote_mass >= np.maximum(kept.scores + 1.1, 0) - 1e-9).all()
@@ -418,7 +421,7 @@ def test_suppression(count, seed, least, most):
 def test_neighbors_vote():
     boxes = np.array([[0.0, 0, 40, 40], [4, 0, 44, 40], [200, 0, 240, 40]])
     windows = ScoredWindows(boxes, np.array([1.0, 1.0, 0.5]), np.array([0, 1, 2]))
-    kept, vote_mass = vote_boxes(windows, least=0.0)
+    kept, vote_mass = vote_boxes(windows, min_margin=0.0)
     np.testing.assert_allclose(kept.boxes, [[2, 0, 42, 40], [200, 0, 240, 40]])
     np.testing.assert_allclose(vote_mass, [4.2, 1.6])
     assert kept.templates.tolist() == [0, 2]
@@ -509,7 +512,7 @@ def test_other_metadata():
 
 
 def test_metadata_that_is_no_json_is_refused(tmp_path):
-    with pytest.raises(InvalidInputError, match="metadata must hold JSON values only"):
+    with pytest.raises(InvalidInputError, match="metadata must contain JSON values only"):
         random_mixture(metadata={"when": object()}).save(tmp_path / "m.safetensors")
     assert not list(tmp_path.iterdir())
 
@@ -543,7 +546,7 @@ def write_file(path, tensors=None, params=None, *, params_text=None, **changes):
         "metadata": "{}",
         **changes,
     }
-    header.setdefault("sha256", _checksum(header, whole))
+    header.setdefault("sha256", checksum(header, whole))
     path.write_bytes(save(whole, metadata=header))
     return path
 
@@ -588,7 +591,7 @@ def test_files_that_do_not_fit(tmp_path, tensors, params, message):
     [
         ({"kind": "forest"}, "holds a model of the unknown kind 'forest'; train one"),
         ({"kind": "patches"}, "does not fit its own parameters"),
-        ({"format": "other"}, "no model of this library"),
+        ({"format": "other"}, "not a model of this library"),
         ({"format_version": "1"}, f"has format version 1, this release reads {FORMAT_VERSION}; train again"),
         ({"sha256": "0"}, r"was changed after it was written \(checksum differs\)"),
         ({"params_text": "{"}, "has no readable parameters"),
@@ -606,7 +609,7 @@ def test_damaged_files(tmp_path):
     data = path.read_bytes()
     for damaged in (b"", data[:7], data[: len(data) // 2], data[:-1], b"x" * 500):
         path.write_bytes(damaged)
-        with pytest.raises(ModelFileError, match="is no whole safetensors model"):
+        with pytest.raises(ModelFileError, match="is not a complete safetensors file"):
             load_model(path)
     path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
     with pytest.raises(ModelFileError, match="was changed after it was written"):
@@ -618,7 +621,7 @@ def test_paths_that_name_no_model(tmp_path):
         ModelFileError, match="does not exist; check the path, or name a shipped model: default"
     ):
         load_model("defualt")
-    with pytest.raises(ModelFileError, match="is a folder; name a file in it"):
+    with pytest.raises(ModelFileError, match="is a folder; choose a file in it"):
         load_model(tmp_path)
     for path in (None, 5):
         with pytest.raises(
@@ -636,7 +639,7 @@ def test_the_shipped_models():
     assert highway.metadata == load_classifier().metadata
     with pytest.raises(
         ModelFileError,
-        match=re.escape("shipped model 'default' holds a model of the kind 'mixture', not 'patches'"),
+        match=re.escape("shipped model 'default' contains a model of kind 'mixture', not 'patches'"),
     ):
         load_classifier("default")
 

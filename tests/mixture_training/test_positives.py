@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from tests.helpers import SMALL_MIXTURE, drawn, scene_of
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture import PLANES, BoxRegressor, MixtureTemplate, mirror_planes
+from vehicle_detection.mixture import N_CHANNELS, BoxRegressor, MixtureTemplate, mirror_channels
 from vehicle_detection.mixture_training import FrameDataset, train_mixture
 from vehicle_detection.mixture_training.negatives import Frame, frames_of
 from vehicle_detection.mixture_training.positives import (
@@ -29,7 +29,7 @@ def source():
 
 
 def blank(columns=8, rows=7):
-    return MixtureTemplate(np.zeros((rows, columns, PLANES)), 0.0, (1.0, 1.0))
+    return MixtureTemplate(np.zeros((rows, columns, N_CHANNELS)), 0.0, (1.0, 1.0))
 
 
 def test_vehicles_are_taken_at_other_exposures_too(drawn_source):
@@ -82,8 +82,8 @@ def test_a_vehicle_that_the_border_cuts_is_shown_in_several_places():
 
 def test_turned_vehicles_face_the_same_way():
     rng = np.random.default_rng(5)
-    side = rng.normal(0, 1, (4, 6, PLANES)).astype(np.float32)
-    mirrored = mirror_planes(side.transpose(2, 0, 1)).transpose(1, 2, 0)
+    side = rng.normal(0, 1, (4, 6, N_CHANNELS)).astype(np.float32)
+    mirrored = mirror_channels(side.transpose(2, 0, 1)).transpose(1, 2, 0)
     views = np.stack([side.ravel(), mirrored.ravel()])
     flipped = rng.integers(0, 2, 60)
     pairs = np.stack([views[[flip, 1 - flip]] for flip in flipped])
@@ -134,15 +134,15 @@ def test_around_a_patch_the_template_sees_what_it_sees_on_the_average():
     template, none = blank(), BoxRegressor.none()
     known = rng.normal(0, 1, (5, template.weights.size)).astype(np.float32)
     (rows,) = patch_features([image], none, [template], [known], SMALL_MIXTURE)
-    plain, mirrored = rows.reshape(2, 7, 8, PLANES)
-    mean = known.mean(axis=0).reshape(7, 8, PLANES)
+    plain, mirrored = rows.reshape(2, 7, 8, N_CHANNELS)
+    mean = known.mean(axis=0).reshape(7, 8, N_CHANNELS)
     # The box leaves 5% of the width at the sides, a third of a cell; above and below there is nearly a cell.
     ring = np.zeros((7, 8), bool)
     ring[:, [0, -1]] = True
     np.testing.assert_allclose(plain[ring], mean[ring], rtol=1e-6)
     own = window_features(image, place_on_patch(image, none), template).transpose(1, 2, 0)
     np.testing.assert_array_equal(plain[~ring], own[~ring])
-    back = mirror_planes(mirrored.transpose(2, 0, 1)).transpose(1, 2, 0)
+    back = mirror_channels(mirrored.transpose(2, 0, 1)).transpose(1, 2, 0)
     np.testing.assert_array_equal(back, plain)
 
 

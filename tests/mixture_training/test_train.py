@@ -7,7 +7,7 @@ from tests.helpers import SMALL_MIXTURE, drawn
 from vehicle_detection.boxes import intersection_matrix, iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, evaluate_detections
-from vehicle_detection.mixture import PLANES, MixtureSearch, MixtureTemplate, mirror_planes
+from vehicle_detection.mixture import N_CHANNELS, MixtureSearch, MixtureTemplate, mirror_channels
 from vehicle_detection.mixture_training import FrameDataset, train_mixture
 from vehicle_detection.mixture_training import train as mixture_training
 from vehicle_detection.mixture_training.negatives import (
@@ -58,7 +58,7 @@ def test_a_template_that_shows_a_side_gets_a_mirrored_one(drawn_source):
     found = train_mixture([drawn_source], params, n_jobs=1, on_step=lines.append)
     assert [template.box_cells for template in found.templates] == [(6, 5), (8, 5), (8, 5)]
     _, side, mirrored = found.templates
-    expected = mirror_planes(side.weights.transpose(2, 0, 1)).transpose(1, 2, 0)
+    expected = mirror_channels(side.weights.transpose(2, 0, 1)).transpose(1, 2, 0)
     np.testing.assert_array_equal(mirrored.weights, expected)
     assert mirrored.bias == side.bias
     assert lines[0].endswith(" vehicles")
@@ -115,7 +115,7 @@ def frames_with_ignored():
 @pytest.mark.parametrize("facing", [False, True])
 def test_negatives_show_no_vehicle(facing):
     params = dataclasses.replace(SMALL_MIXTURE, facing=(facing,))
-    weights = np.random.default_rng(0).normal(0, 0.05, (7, 8, PLANES))
+    weights = np.random.default_rng(0).normal(0, 0.05, (7, 8, N_CHANNELS))
     views = with_mirrored([MixtureTemplate(weights, 0.0, (1.0, 1.0))], params.facing)
     total = 0
     for frame in frames_with_ignored():
@@ -128,7 +128,7 @@ def test_negatives_show_no_vehicle(facing):
 
 
 def test_negatives_at_the_border_show_no_part_of_a_vehicle():
-    weights = np.random.default_rng(0).normal(0, 0.05, (7, 6, PLANES))
+    weights = np.random.default_rng(0).normal(0, 0.05, (7, 6, N_CHANNELS))
     views = with_mirrored([MixtureTemplate(weights, 0.0, (1.0, 1.0), True)], (False,))
     total = 0
     for frame in frames_with_ignored():
@@ -189,9 +189,9 @@ def test_a_negative_is_kept_once():
 
 
 def test_the_easiest_negatives_go_for_good():
-    template = MixtureTemplate(np.ones((1, 1, PLANES)), 0.0, (0.0, 0.0))
-    negatives = Negatives([PLANES])
-    windows = [(0, (0, 0, 0, number), np.full(PLANES, number, np.float32)) for number in (3, 1, 4, 2)]
+    template = MixtureTemplate(np.ones((1, 1, N_CHANNELS)), 0.0, (0.0, 0.0))
+    negatives = Negatives([N_CHANNELS])
+    windows = [(0, (0, 0, 0, number), np.full(N_CHANNELS, number, np.float32)) for number in (3, 1, 4, 2)]
     negatives.add([(0, windows)])
     negatives.trim([template], 2)
     assert negatives.rows[0][:, 0].tolist() == [3, 4]

@@ -324,7 +324,7 @@ def test_the_third_systems_windows_at_a_step_of_one_cell():
         ({"max_height": 0}, "max_height must be a number, greater than 0"),
         ({"per_octave": 2.5}, "per_octave must be an integer"),
         ({"horizon": 1.5}, "horizon must be a number, at least 0 and at most 1"),
-        ({"horizon_error": -0.1}, "horizon_error must be a number"),
+        ({"horizon_tolerance": -0.1}, "horizon_tolerance must be a number"),
         ({"min_score": None}, "min_score must be a number"),
     ],
 )
@@ -351,7 +351,7 @@ def test_rows_of_a_flat_road():
     everywhere = PyramidParams(horizon=None)
     assert everywhere.rows(90, 80, (720, 1280)) == (0, 720)
     assert everywhere.with_horizon(None) is everywhere
-    known = PyramidParams(horizon=0.5, camera_height_m=[1.0, 2.0], horizon_error=0.05)
+    known = PyramidParams(horizon=0.5, camera_height_m=[1.0, 2.0], horizon_tolerance=0.05)
     assert known.camera_height_m == (1.0, 2.0)
     # 90 px are 1.8 m: the foot of a vehicle is 50 to 100 px below the horizon, which may be 36 px wrong.
     assert known.rows(90, 80, (720, 1280)) == (360 + 50 - 36 - 80, 360 + 100 + 36)

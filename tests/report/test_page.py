@@ -177,7 +177,7 @@ class Script:
     def search(self, frame):
         return None
 
-    def follow(self, windows, shape, *, time):
+    def track(self, found, *, time):
         self.index += 1
         box = np.array([100.0 + self.index, 120, 180 + self.index, 180])
         first = Track(

@@ -833,7 +833,7 @@ def hand_over(truth, shape, *, seed, misses=0.1, clutter=0.3):
             box = np.array(row.box, float)
             if (
                 box[2] - box[0] < 32 * pixel
-                or row.hidden > 0.5
+                or row.occluded_fraction > 0.5
                 or row.truncated > 0.65
                 or rng.random() < misses
             ):

@@ -78,7 +78,7 @@ def test_frames_are_scored_like_the_detector(patch_set, frames, labels):
     classifier = train_classifier(train.patches, train.labels, params=PARAMS, C=0.1)
     scores = []
     for each in (frames, other):
-        with VehicleDetector(classifier, search=SEARCH, horizon=each.horizon) as detector:
+        with VehicleDetector(classifier, search_params=SEARCH, horizon=each.horizon) as detector:
             found = FrameBoxes.from_detections({key: detector.detect(image) for key, image in each})
         scores.append(evaluate_detections(found, each.labels, frames=each.keys))
     assert row["frame_f1"] == pytest.approx(np.nanmean([score.f1 for score in scores]))
@@ -86,16 +86,6 @@ def test_frames_are_scored_like_the_detector(patch_set, frames, labels):
     assert row["frame_f1"] <= row["frame_best_f1"] + 1e-12
     assert row["frame_f1_by_set"].split()[::2] == ["drawn", "again"]
     assert row["search_ms"] > 0
-
-
-def test_best_f1_chooses_the_threshold(labels):
-    # A true positive with a high score and a false positive with a low one: without the latter F1 is 1.
-    boxes = labels.boxes[~labels.ignore][:1]
-    found = FrameBoxes([0, 0], None, np.concatenate([boxes, [[600, 0, 630, 20]]]), scores=[2.0, 0.5])
-    truth = FrameBoxes([0], None, boxes)
-    assert evaluate_detections(found, truth).f1 == pytest.approx(2 / 3)
-    assert trials.best_f1(found, truth) == 1.0
-    assert trials.best_f1(FrameBoxes([], None, []), truth) == 0.0
 
 
 def test_invalid_options(patch_set, frames):

@@ -1,4 +1,4 @@
-"""Helpers of every layer: argument checks, files, threads, model files and augmentation."""
+"""Helpers for all packages: argument checks, files, threads, progress bars, model files, augmentation."""
 
 from vehicle_detection._common.augment import blur_patches, degrade_patches, mirror_patches, relight
 from vehicle_detection._common.checks import (
@@ -13,7 +13,7 @@ from vehicle_detection._common.checks import (
     describe,
     finite_array,
 )
-from vehicle_detection._common.files import atomic_write, check_target
+from vehicle_detection._common.files import atomic_write, check_target, write_parquet
 from vehicle_detection._common.model_file import FORMAT_VERSION, ModelData, read_model, write_model
 from vehicle_detection._common.progress import progress_bar
 from vehicle_detection._common.threads import (
@@ -23,15 +23,15 @@ from vehicle_detection._common.threads import (
     resolve_jobs,
     single_threaded_opencv,
 )
-from vehicle_detection._common.workspace import Buffers, Take, new_array
+from vehicle_detection._common.workspace import NEW_ARRAYS, Workspace
 
 __all__ = [
     "FORMAT_VERSION",
     "JOBS_VARIABLE",
-    "Buffers",
+    "NEW_ARRAYS",
     "ModelData",
-    "Take",
     "ThreadTeam",
+    "Workspace",
     "atomic_write",
     "available_cores",
     "blur_patches",
@@ -48,11 +48,11 @@ __all__ = [
     "describe",
     "finite_array",
     "mirror_patches",
-    "new_array",
     "progress_bar",
     "read_model",
     "relight",
     "resolve_jobs",
     "single_threaded_opencv",
     "write_model",
+    "write_parquet",
 ]

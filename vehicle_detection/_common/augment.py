@@ -1,4 +1,4 @@
-"""Variants of training images: mirrored, of another brightness, and as a worse camera takes them."""
+"""Augmentation of training images: mirroring, brightness, and the loss of quality of another camera."""
 
 from __future__ import annotations
 
@@ -8,123 +8,79 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-# A degraded patch: times that it is smaller (logarithms), share of its color (logarithms), JPEG quality.
-_SHRINK, _COLOUR, _QUALITY = (0.0, 1.6), (-1.5, 0.2), (20.0, 90.0)
-# Another exposure: exponent of the values (its logarithm), and the share of their range that is left.
-_EXPONENT, _RANGE = (-0.7, 0.7), (0.5, 1.0)
+# Ranges of degraded patches: log of the downscaling factor, log of the saturation factor, JPEG quality.
+_LOG_SHRINK, _LOG_SATURATION, _JPEG_QUALITY = (0.0, 1.6), (-1.5, 0.2), (20.0, 90.0)
+# Ranges of `relight`: log of the gamma exponent, and contrast as a fraction of the original.
+_LOG_EXPONENT, _CONTRAST = (-0.7, 0.7), (0.5, 1.0)
 
 
 def mirror_patches(images: NDArray[np.uint8], *, gamma: float = 0.0) -> NDArray[np.uint8]:
-    """Mirror each patch left to right and give it another brightness.
+    """Mirror ``(N, H, W, 3)`` patches left to right and change their brightness, in a new array.
 
-    A value `v` becomes ``255 * (v / 255)**e``, with ``log(e)`` spread evenly over ``[-gamma, gamma]``. A
-    patch's own pixels, by their CRC-32, decide on its `e`: it is the same in any set and any order.
-
-    Parameters
-    ----------
-    images
-        ``(N, H, W, 3)`` uint8.
-    gamma
-        Largest logarithm of the exponent; 0 keeps the brightness.
-
-    Returns
-    -------
-    numpy.ndarray
-        A new array of the same shape, uint8.
+    A value `v` becomes ``255 * (v / 255)**e``, with ``log(e)`` uniform in ``[-gamma, gamma]``. The CRC-32 of
+    a patch's pixels determines its `e`, which therefore does not depend on the other patches or their order.
     """
     mirrored = np.ascontiguousarray(images[:, :, ::-1])
     if gamma:
         values = np.arange(256) / 255
         for image in mirrored:
-            share = zlib.crc32(image) / (2**32 - 1)
-            exponent = np.exp(gamma * (2 * share - 1))
+            uniform = zlib.crc32(image) / (2**32 - 1)
+            exponent = np.exp(gamma * (2 * uniform - 1))
             image[:] = np.round(255 * values**exponent).astype(np.uint8)[image]
     return mirrored
 
 
 def blur_patches(images: NDArray[np.uint8], *, mirror: bool = True) -> NDArray[np.uint8]:
-    """Make each patch as coarse as if it had been taken from further away, up to five times.
+    """Downscale ``(N, H, W, 3)`` patches by up to 5 and enlarge them again, in a new array.
 
-    Parameters
-    ----------
-    images
-        ``(N, H, W, 3)`` uint8.
-    mirror
-        Mirror half of them left to right.
-
-    Returns
-    -------
-    numpy.ndarray
-        A new array of the same shape, uint8. A patch's own pixels decide how coarse it becomes.
+    A patch's own pixels seed its random numbers. `mirror` flips half of the patches left to right.
     """
     blurred = np.empty_like(images)
     for image, out in zip(images, blurred):
-        out[:] = _coarse(image, _generator(image, 1), mirror)
+        out[:] = _rescale(image, _seeded_generator(image, 1), mirror)
     return blurred
 
 
 def degrade_patches(images: NDArray[np.uint8], *, mirror: bool = True) -> NDArray[np.uint8]:
-    """Make each patch coarse, pale and compressed, as another camera may take it.
+    """Blur ``(N, H, W, 3)`` RGB patches, reduce their saturation and compress them as JPEG, in a new array.
 
-    Parameters
-    ----------
-    images
-        ``(N, H, W, 3)`` uint8 RGB.
-    mirror
-        Mirror half of them left to right.
-
-    Returns
-    -------
-    numpy.ndarray
-        A new array of the same shape, uint8. A patch's own pixels decide on what becomes of it.
+    A patch's own pixels seed its random numbers. `mirror` flips half of the patches left to right.
     """
     degraded = np.empty_like(images)
     for image, out in zip(images, degraded):
-        rng = _generator(image, 2)
-        coarse = _coarse(image, rng, mirror)
-        color = float(np.exp(rng.uniform(*_COLOUR)))
-        gray = cv2.cvtColor(cv2.cvtColor(coarse, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
-        pale = cv2.addWeighted(coarse, color, gray, 1 - color, 0)
-        quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.uniform(*_QUALITY))]
-        _, coded = cv2.imencode(".jpg", cv2.cvtColor(pale, cv2.COLOR_RGB2BGR), quality)
-        decoded = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), np.uint8)
+        rng = _seeded_generator(image, 2)
+        blurred = _rescale(image, rng, mirror)
+        saturation = float(np.exp(rng.uniform(*_LOG_SATURATION)))
+        gray = cv2.cvtColor(cv2.cvtColor(blurred, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
+        pale = cv2.addWeighted(blurred, saturation, gray, 1 - saturation, 0)
+        quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.uniform(*_JPEG_QUALITY))]
+        _, encoded = cv2.imencode(".jpg", cv2.cvtColor(pale, cv2.COLOR_RGB2BGR), quality)
+        decoded = np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), np.uint8)
         out[:] = cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
     return degraded
 
 
 def relight(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Give an image another exposure and less contrast.
+    """Change the exposure of an image and reduce its contrast, in a new array.
 
-    A value `v` becomes ``255 * (r * (v / 255)**e + a)``: the exponent, the range that is left and where it
-    lies are drawn once for the whole image.
-
-    Parameters
-    ----------
-    image
-        ``(H, W, 3)`` uint8.
-    rng
-        Draws three numbers.
-
-    Returns
-    -------
-    numpy.ndarray
-        A new array of the same shape, uint8.
+    A value `v` becomes ``255 * (c * (v / 255)**e + b)``, with one contrast `c`, exponent `e` and offset `b`
+    for the whole image.
     """
-    exponent, left = float(np.exp(rng.uniform(*_EXPONENT))), rng.uniform(*_RANGE)
-    values = left * (np.arange(256) / 255) ** exponent + rng.uniform(0, 1 - left)
+    exponent, contrast = float(np.exp(rng.uniform(*_LOG_EXPONENT))), rng.uniform(*_CONTRAST)
+    values = contrast * (np.arange(256) / 255) ** exponent + rng.uniform(0, 1 - contrast)
     return np.asarray(cv2.LUT(image, np.round(255 * values).astype(np.uint8)), np.uint8)
 
 
-def _generator(image: NDArray[np.uint8], kind: int) -> np.random.Generator:
+def _seeded_generator(image: NDArray[np.uint8], kind: int) -> np.random.Generator:
     return np.random.default_rng((kind, zlib.crc32(image.tobytes())))
 
 
-def _coarse(image: NDArray[np.uint8], rng: np.random.Generator, mirror: bool) -> NDArray[np.uint8]:
-    """Shrink and enlarge again."""
-    factor, side = float(np.exp(rng.uniform(*_SHRINK))), rng.random()
-    if mirror and side < 0.5:
+def _rescale(image: NDArray[np.uint8], rng: np.random.Generator, mirror: bool) -> NDArray[np.uint8]:
+    """Downscale by a random factor and enlarge to the same size; mirror with probability 1/2 if asked to."""
+    factor, uniform = float(np.exp(rng.uniform(*_LOG_SHRINK))), rng.random()
+    if mirror and uniform < 0.5:
         image = image[:, ::-1]
     height, width = image.shape[:2]
     small = max(round(width / factor), 1), max(round(height / factor), 1)
-    shrunken = cv2.resize(np.ascontiguousarray(image), small, interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.resize(shrunken, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
+    downscaled = cv2.resize(np.ascontiguousarray(image), small, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(downscaled, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)

@@ -1,4 +1,4 @@
-"""Argument checks: each message names the argument, what was expected, what came, and the remedy."""
+"""Argument checks: each message names the argument, the expectation, the value and the remedy."""
 
 from __future__ import annotations
 
@@ -13,21 +13,24 @@ from vehicle_detection.errors import InvalidInputError
 
 
 def describe(value: object) -> str:
-    """Say in a few words what a value is: an array's shape and dtype, or the value itself."""
+    """Describe a value in a message: an array's shape and dtype, or the value, with its type if not obvious."""
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape} and dtype {value.dtype}"
     text = " ".join(repr(value).split())
-    return f"{text if len(text) <= 80 else text[:77] + '...'} ({type(value).__name__})"
+    text = text if len(text) <= 80 else text[:77] + "..."
+    obvious = value is None or type(value) in (str, int, float, bool)
+    return text if obvious else f"{text} ({type(value).__name__})"
 
 
-def check_type(value: object, name: str, kind: type, remedy: str) -> None:
-    """Raise unless `value` is a `kind`."""
+def check_type(value: object, name: str, kind: type | tuple[type, ...], remedy: str) -> None:
+    """Raise unless `value` is an instance of `kind`, or of one of several."""
     if not isinstance(value, kind):
-        raise InvalidInputError(f"{name} must be a {kind.__name__}, got {describe(value)}; {remedy}")
+        names = " or ".join(each.__name__ for each in (kind if isinstance(kind, tuple) else (kind,)))
+        raise InvalidInputError(f"{name} must be a {names}, got {describe(value)}; {remedy}")
 
 
 def check_image(image: object, name: str = "image") -> NDArray[np.uint8]:
-    """Return `image` if it is ``(H, W, 3)`` uint8, else say how to convert it."""
+    """Return `image` if it is ``(H, W, 3)`` uint8; the error says how to convert other arrays."""
     if not isinstance(image, np.ndarray):
         raise InvalidInputError(
             f"{name} must be an (H, W, 3) uint8 RGB array, got {describe(image)}; "
@@ -143,7 +146,7 @@ def check_choice(value: object, name: str, choices: Collection[object]) -> None:
 
 
 def finite_array(values: object, name: str, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
-    """Return a float32 copy that cannot be written; None in `shape` stands for any number of entries."""
+    """Return a read-only float32 copy; None in `shape` stands for any number of entries."""
     expected = ", ".join("any" if side is None else str(side) for side in shape)
     try:
         array = np.array(values, np.float32, order="C")

@@ -1,4 +1,4 @@
-"""Model files: safetensors with what the tensors mean in the header, and a checksum over both."""
+"""Model files: safetensors with parameters, metadata and a checksum of everything in the header."""
 
 from __future__ import annotations
 
@@ -29,22 +29,10 @@ Tensors = Mapping[str, NDArray[Any]]
 
 @dataclass(frozen=True, eq=False)
 class ModelData:
-    """What a model file holds, checked but not yet understood.
+    """The verified content of a model file; the model class interprets it."""
 
-    Attributes
-    ----------
-    name
-        The file, in words for a message.
-    kind
-        What sort of model it is.
-    params, metadata
-        JSON values.
-    tensors
-        Arrays by name.
-    """
-
-    name: str
-    kind: str
+    name: str  # how messages refer to the file
+    kind: str  # which model class wrote it
     params: dict[str, Any]
     metadata: dict[str, Any]
     tensors: Tensors
@@ -57,43 +45,37 @@ def write_model(
     tensors: Tensors,
     metadata: Mapping[str, Any],
 ) -> None:
-    """Write a model file: the same model gives the same bytes.
-
-    Raises
-    ------
-    InvalidInputError
-        If the folder is missing or read-only, or the metadata holds more than JSON values.
-    """
+    """Write a model file; equal models give identical bytes."""
     from safetensors.numpy import save
 
     try:
-        facts = json.dumps(dict(metadata), sort_keys=True)
+        metadata_json = json.dumps(dict(metadata), sort_keys=True)
     except (TypeError, ValueError) as error:
         raise InvalidInputError(
-            f"metadata must hold JSON values only: {error}; convert numbers of numpy with .item()"
+            f"metadata must contain JSON values only: {error}; convert NumPy numbers with .item()"
         ) from error
     header = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "kind": kind,
         "params": json.dumps(dict(params), sort_keys=True),
-        "metadata": facts,
+        "metadata": metadata_json,
     }
-    header["sha256"] = _checksum(header, tensors)
+    header["sha256"] = checksum(header, tensors)
     with atomic_write(path, "path") as part:
         part.write_bytes(_with_sorted_header(save(dict(tensors), metadata=header)))
 
 
 def _with_sorted_header(data: bytes) -> bytes:
-    """Sort the header's keys: safetensors writes the metadata in an order that is never the same."""
+    """Sort the header's keys: safetensors writes the metadata in random order."""
     stop = 8 + int.from_bytes(data[:8], "little")
     header = json.dumps(json.loads(data[8:stop]), sort_keys=True, separators=(",", ":")).encode()
     header += b" " * (-len(header) % 8)
     return len(header).to_bytes(8, "little") + header + data[stop:]
 
 
-def _checksum(header: Mapping[str, str], tensors: Tensors) -> str:
-    """Hash everything a model file says, so that an edited one is noticed."""
+def checksum(header: Mapping[str, str], tensors: Tensors) -> str:
+    """SHA-256 of the header and the tensors, to detect edited files."""
     digest = hashlib.sha256()
     for key in sorted(header):
         if key != "sha256":
@@ -105,22 +87,7 @@ def _checksum(header: Mapping[str, str], tensors: Tensors) -> str:
 
 
 def read_model(path: str | os.PathLike[str], kind: str | None = None) -> ModelData:
-    """Read and check a model file, or a shipped model by its name.
-
-    Parameters
-    ----------
-    path
-        A file, or one of `SHIPPED`.
-    kind
-        The kind wanted; None takes any.
-
-    Raises
-    ------
-    ModelFileError
-        If the file is missing, cut, edited, or of another kind or version.
-    InvalidInputError
-        If `path` is neither a path nor a name.
-    """
+    """Read and verify a model file, or a shipped model by its name; `kind` None accepts every kind."""
     if not isinstance(path, (str, os.PathLike)):
         raise InvalidInputError(
             f"path must be a model file or one of {', '.join(map(repr, SHIPPED))}; got {describe(path)}"
@@ -138,14 +105,14 @@ def read_model(path: str | os.PathLike[str], kind: str | None = None) -> ModelDa
             f"model file {file} does not exist; check the path, or name a shipped model: {', '.join(SHIPPED)}"
         ) from None
     except IsADirectoryError:
-        raise ModelFileError(f"model file {file} is a folder; name a file in it") from None
+        raise ModelFileError(f"model file {file} is a folder; choose a file in it") from None
     except OSError as error:
         raise ModelFileError(f"model file {file} cannot be read: {error.strerror}") from error
     return _parse(data, f"model file {file}", kind)
 
 
 def _parse(data: bytes, name: str, kind: str | None) -> ModelData:
-    """Check the bytes of a model file."""
+    """Verify and decode the bytes of a model file."""
     from safetensors import SafetensorError
     from safetensors.numpy import load
 
@@ -155,23 +122,23 @@ def _parse(data: bytes, name: str, kind: str | None) -> ModelData:
         header = json.loads(data[8 : 8 + length])["__metadata__"]
     except (SafetensorError, ValueError, KeyError) as error:
         raise ModelFileError(
-            f"{name} is no whole safetensors model ({error}); get it again or train"
+            f"{name} is not a complete safetensors file ({error}); download it again or train a model"
         ) from error
     if header.get("format") != FORMAT:
-        raise ModelFileError(f"{name} is a safetensors file, but no model of this library; train one")
+        raise ModelFileError(f"{name} is a safetensors file, but not a model of this library; train one")
     if header.get("format_version") != FORMAT_VERSION:
         raise ModelFileError(
             f"{name} has format version {header.get('format_version')}, this release reads "
             f"{FORMAT_VERSION}; train again or install the release that wrote it"
         )
-    if header.get("sha256") != _checksum(header, tensors):
-        raise ModelFileError(f"{name} was changed after it was written (checksum differs); get it again")
+    if header.get("sha256") != checksum(header, tensors):
+        raise ModelFileError(f"{name} was changed after it was written (checksum differs); download it again")
     if kind is not None and header.get("kind") != kind:
         raise ModelFileError(
-            f"{name} holds a model of the kind {header.get('kind')!r}, not {kind!r}; load it with load_model"
+            f"{name} contains a model of kind {header.get('kind')!r}, not {kind!r}; load it with load_model"
         )
     try:
         params, metadata = json.loads(header["params"]), json.loads(header["metadata"])
         return ModelData(name, str(header["kind"]), dict(params), dict(metadata), tensors)
     except (KeyError, TypeError, ValueError) as error:
-        raise ModelFileError(f"{name} has no readable parameters ({error}); get it again") from error
+        raise ModelFileError(f"{name} has no readable parameters ({error}); download it again") from error

@@ -8,7 +8,7 @@ from vehicle_detection._kernels.hog import (
     sqrt_gradients,
 )
 from vehicle_detection._kernels.linear_svm import fit_svm
-from vehicle_detection._kernels.matmul import product
+from vehicle_detection._kernels.matmul import matmul
 from vehicle_detection._kernels.yuv import channels_from_planes, planes_from_channels
 
 __all__ = [
@@ -17,8 +17,8 @@ __all__ = [
     "channels_from_planes",
     "degree_bounds",
     "fit_svm",
+    "matmul",
     "orientation_cotangents",
     "planes_from_channels",
-    "product",
     "sqrt_gradients",
 ]

@@ -1,4 +1,4 @@
-"""The numba kernels of color: histograms of patches and of all windows of a band, and spatial bins."""
+"""Numba kernels of color: histograms of patches and of all windows of a band, and spatial bins."""
 
 from __future__ import annotations
 
@@ -20,18 +20,9 @@ def value_counts(image, counts):
 
 @jit
 def patch_histograms(patches, bin_of_value, bins, features):
-    """Color histogram of each patch, channel by channel.
+    """Color histograms of ``(N, side, side, 3)`` uint8 patches, channel by channel.
 
-    Parameters
-    ----------
-    patches
-        ``(N, side, side, 3)`` uint8.
-    bin_of_value
-        ``(256,)`` intp, the bin of each value.
-    bins
-        Number of bins.
-    features
-        Output, ``(N, 3 * bins)`` float32.
+    `bin_of_value` is ``(256,)`` intp, and `features` the output ``(N, 3 * bins)`` float32.
     """
     counts = np.empty((3, 256), np.int64)
     for index in range(len(patches)):
@@ -45,18 +36,10 @@ def patch_histograms(patches, bin_of_value, bins, features):
 
 @jit
 def histogram_cells(image, table, cell, cells):
-    """Sum, over each cell, the table's weights of the pixel values of all channels.
+    """Sum, over each cell, the weights of the pixel values of all channels.
 
-    Parameters
-    ----------
-    image
-        ``(H, W, 3)`` uint8.
-    table
-        ``(3, 256)`` float32, the weight of each value.
-    cell
-        Side of a cell in pixels.
-    cells
-        Output, ``(cell rows, cell columns)`` float32.
+    `image` is ``(H, W, 3)`` uint8, `table` ``(3, 256)`` float32 the weight of each value, `cell` the side of
+    a cell in pixels, and `cells` the output ``(cell rows, cell columns)`` float32.
     """
     rows, columns = cells.shape
     for row in range(rows):
@@ -77,34 +60,23 @@ def histogram_cells(image, table, cell, cells):
 
 @jit
 def add_root_histograms(image, bin_of_value, weights, cell, window, scores):
-    """Add, to each window's score, the weighted square roots of its histogram's counts.
+    """Add, to each window's score, the weighted square roots of its histogram's counts, in place.
 
-    Counts are kept bin by bin for the last rows of cells, already summed over the width of a window: a step
-    down adds one row and takes one away. Bins without a pixel in those rows, most of them in a color
-    channel, cost nothing more.
+    `image` is ``(H, W, 3)`` uint8, `bin_of_value` ``(256,)`` intp, `weights` ``(templates, 3, bins)``
+    float32, `cell` the side of a cell in pixels, `window` the side of a window in cells (a power of two, at
+    most 64 pixels), and `scores` ``(templates, cell rows - window + 1, cell columns - window + 1)`` float32.
 
-    Parameters
-    ----------
-    image
-        ``(H, W, 3)`` uint8.
-    bin_of_value
-        ``(256,)`` intp, the bin of each value.
-    weights
-        ``(templates, 3, bins)`` float32, of a count's root.
-    cell
-        Side of a cell in pixels.
-    window
-        Side of a window in cells, a power of two, of at most 64 pixels.
-    scores
-        Changed in place, ``(templates, cell rows - window + 1, cell columns - window + 1)`` float32.
+    The counts of the last `window` rows of cells are stored by bin, summed over the width of a window: moving
+    down by a row of cells adds one row and subtracts another. Bins without a pixel in those rows, which are
+    most of them, are skipped.
     """
     templates, bins = len(weights), weights.shape[2]
     rows, width = scores.shape[1] + window - 1, scores.shape[2]
     columns = width + window - 1
-    # A window of 64x64 pixels counts to 4096: 16 bits hold it.
+    # A window has at most 64x64 pixels, so 16 bits are enough.
     counts = np.empty((3 * bins, columns), np.uint16)
     flat = counts.reshape(-1)
-    # Where a bin's counts start; unsigned, or each access would ask whether it counts from the end.
+    # Start of each bin's counts. Unsigned indices avoid the check for negative ones.
     first, second, third = (
         np.empty(256, np.uintp),
         np.empty(256, np.uintp),
@@ -126,24 +98,24 @@ def add_root_histograms(image, bin_of_value, weights, cell, window, scores):
         for y in range(row * cell, (row + 1) * cell):
             line = image[y]
             for column in range(columns):
-                at = np.uintp(column)
+                offset = np.uintp(column)
                 for x in range(column * cell, (column + 1) * cell):
-                    flat[first[line[x, 0]] + at] += one
-                    flat[second[line[x, 1]] + at] += one
-                    flat[third[line[x, 2]] + at] += one
+                    flat[first[line[x, 0]] + offset] += one
+                    flat[second[line[x, 1]] + offset] += one
+                    flat[third[line[x, 2]] + offset] += one
         slot = row % window
         for k in range(3 * bins):
             count = counts[k]
-            some = np.uint16(0)
+            any_count = np.uint16(0)
             for x in range(columns):
-                some |= count[x]
+                any_count |= count[x]
             total, last = sums[k], recent[slot, k]
             if filled[slot, k]:
                 for x in range(width):
                     total[x] -= last[x]
-            filled[slot, k] = some > 0
-            if some > 0:
-                # Sums of two cells, of four, of eight, until they are as wide as a window.
+            filled[slot, k] = any_count > 0
+            if any_count > 0:
+                # Sums of two cells, of four, of eight, up to the width of a window.
                 span = 1
                 while span < window:
                     reach = columns - span
@@ -171,16 +143,10 @@ def add_root_histograms(image, bin_of_value, weights, cell, window, scores):
 
 @jit
 def spatial_cells(bins, per_cell, cells):
-    """Deal the spatial bins of a band out to planes: one plane for each place of a bin in its cell.
+    """Split the spatial bins of a band into one channel for each position of a bin in its cell.
 
-    Parameters
-    ----------
-    bins
-        ``(H, W, 3)`` uint8, the band resized to the bin grid.
-    per_cell
-        Bins along a cell's side.
-    cells
-        Output, ``(3, per_cell, per_cell, cell rows, cell columns)`` float32.
+    `bins` is ``(H, W, 3)`` uint8, the band resized to the bin grid, `per_cell` the number of bins along a
+    cell's side, and `cells` the output ``(3, per_cell, per_cell, cell rows, cell columns)`` float32.
     """
     rows, columns = cells.shape[3], cells.shape[4]
     for channel in range(3):

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import functools
+import logging
+from collections.abc import Callable
+from typing import Any, cast
+
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Take, new_array
+from vehicle_detection._common import NEW_ARRAYS, Workspace
 from vehicle_detection._kernels.jit import jit
 from vehicle_detection._kernels.vector import block_adder, host_block
 
@@ -15,17 +21,10 @@ _add_products = block_adder(_BLOCK)
 
 
 class Filter:
-    """The weights of a template's cells, laid out for the processor.
+    """The weights of a template, arranged for the processor's vector registers.
 
-    Parameters
-    ----------
-    weights
-        ``(rows, columns, planes)``: what each cell of a window adds to its score.
-    spread
-        Cells from one cell of a window to the next.
+    `weights` is ``(rows, columns, channels)``; neighboring cells of a window are `dilation` cells apart.
 
-    Examples
-    --------
     >>> scores = np.zeros((2, 3), np.float32)
     >>> Filter(np.ones((2, 2, 1))).add_to(np.ones((1, 3, 4), np.float32), scores)
     >>> scores
@@ -33,66 +32,65 @@ class Filter:
            [4., 4., 4.]], dtype=float32)
     """
 
-    def __init__(self, weights: NDArray[np.floating], *, spread: int = 1) -> None:
+    def __init__(self, weights: NDArray[np.floating], *, dilation: int = 1) -> None:
         rows, columns, depth = weights.shape
-        # Down the columns: cells above each other add to different rows of scores, and nobody waits.
+        # Column-major order: consecutive cells update different rows of sums, which avoids store-load stalls.
         cells = weights.swapaxes(0, 1).reshape(rows * columns, depth)
         blocks = -(-len(cells) // _ROWS)
         padded = np.zeros((blocks * _ROWS, depth), np.float32)
         padded[: len(cells)] = cells
         self._weights = np.ascontiguousarray(padded.reshape(blocks, _ROWS, depth).swapaxes(1, 2))
-        self._reach = (rows - 1) * spread, (columns - 1) * spread
-        places = np.indices((columns, rows)).reshape(2, -1) * spread
-        self._across, self._down = np.zeros((2, blocks * _ROWS), np.intp)
-        self._across[: len(cells)], self._down[: len(cells)] = places
+        self._last_row, self._last_column = (rows - 1) * dilation, (columns - 1) * dilation
+        self._cell_rows, self._cell_columns = np.zeros((2, blocks * _ROWS), np.intp)
+        positions = np.indices((columns, rows)).reshape(2, -1) * dilation
+        self._cell_columns[: len(cells)], self._cell_rows[: len(cells)] = positions
 
     def add_to(
-        self, planes: NDArray[np.float32], scores: NDArray[np.float32], take: Take = new_array
+        self, channels: NDArray[np.float32], scores: NDArray[np.float32], workspace: Workspace = NEW_ARRAYS
     ) -> None:
-        """Add, to each window's score, the products of its cells.
+        """Add each window's weighted sum of channels to its score, in place.
 
-        Parameters
-        ----------
-        planes
-            ``(planes, rows, columns)`` float32, C-contiguous.
-        scores
-            Changed in place, ``(window rows, window columns)`` float32; at most as many as fit the map.
-        take
-            Hands out the memory.
+        `channels` is ``(channels, rows, columns)`` and C-contiguous, `scores`
+        ``(window rows, window columns)`` with at most as many windows as fit.
         """
-        down, across = self._reach
-        _, rows, columns = planes.shape
-        stride = columns + across + _COLUMNS
-        # Sums also of windows that hang over on any side: so no product needs to ask.
-        sums = take((rows + down, stride), np.float32, "window sums")
-        offsets = (down - self._down) * stride + across - self._across
-        _correlate(planes, self._weights, offsets.reshape(-1, _ROWS), sums)
+        _, rows, columns = channels.shape
+        stride = columns + self._last_column + _COLUMNS
+        # The sums include windows that extend beyond the map, so that no product needs a bounds check.
+        sums = workspace.take((rows + self._last_row, stride), np.float32, "window sums")
+        offsets = (self._last_row - self._cell_rows) * stride + self._last_column - self._cell_columns
+        _kernel()(channels, self._weights, offsets.reshape(-1, _ROWS), sums)
         height, width = scores.shape
-        scores += sums[down : down + height, across : across + width]
+        top, left = self._last_row, self._last_column
+        scores += sums[top : top + height, left : left + width]
+
+
+@functools.cache
+def _kernel() -> Callable[..., None]:
+    """Return the block kernel, or plain loops if the block kernel does not compile."""
+    floats, kernel = numba.float32, cast("Any", _correlate_blocks)
+    try:
+        kernel.compile((floats[:, :, ::1], floats[:, :, ::1], numba.intp[:, ::1], floats[:, ::1]))
+    except numba.core.errors.NumbaError as error:
+        logging.getLogger(__name__).warning("correlation uses plain, slower loops: %s", error)
+        return _correlate_plain
+    return _correlate_blocks
 
 
 @jit
-def _correlate(planes, weights, offsets, sums):
-    """Add the products of every cell to the sums of the windows that hold it.
+def _correlate_blocks(channels, weights, offsets, sums):
+    """Add the products of every cell to the sums of the windows that contain it.
 
-    Parameters
-    ----------
-    planes
-        ``(depth, rows, columns)`` float32.
-    weights, offsets
-        ``(blocks, depth, rows of a block)`` float32, and for each row the place of its window, relative to
-        the cell's in `sums`.
-    sums
-        Output, ``(more than rows, more than columns)`` float32.
+    `channels` is ``(depth, rows, columns)``, `weights` ``(blocks, depth, rows of a block)``. `offsets`
+    ``(blocks, rows of a block)`` is the position of each weight's window relative to the cell's in `sums`.
     """
-    depth, rows, columns = planes.shape
+    depth, rows, columns = channels.shape
     total = rows * columns
-    flat = planes.reshape(depth, total)
+    flat = channels.reshape(depth, total)
     stride = sums.shape[1]
     out = sums.reshape(-1)
-    for place in range(len(out)):
-        out[place] = np.float32(0)
-    # What lies behind the last cell is read, and added where no window is.
+    for position in range(len(out)):
+        out[position] = np.float32(0)
+    # A block may read beyond the last cell of a row; those products are added where no window is.
     tail = np.zeros((depth, _COLUMNS), np.float32)
     for y in range(rows):
         for x in range(0, columns, _COLUMNS):
@@ -101,8 +99,27 @@ def _correlate(planes, weights, offsets, sums):
                 for block in range(len(weights)):
                     _add_products(weights, block, flat, first, out, offsets, y * stride + x)
             else:
-                for plane in range(depth):
-                    for place in range(first, total):
-                        tail[plane, place - first] = flat[plane, place]
+                for channel in range(depth):
+                    for position in range(first, total):
+                        tail[channel, position - first] = flat[channel, position]
                 for block in range(len(weights)):
                     _add_products(weights, block, tail, 0, out, offsets, y * stride + x)
+
+
+@jit
+def _correlate_plain(channels, weights, offsets, sums):
+    """`_correlate_blocks` without vector intrinsics."""
+    depth, rows, columns = channels.shape
+    stride = sums.shape[1]
+    out = sums.reshape(-1)
+    for position in range(len(out)):
+        out[position] = np.float32(0)
+    for y in range(rows):
+        for block in range(len(weights)):
+            for row in range(weights.shape[2]):
+                first = y * stride + offsets[block, row]
+                line = out[first : first + columns]
+                for channel in range(depth):
+                    weight, values = weights[block, channel, row], channels[channel, y]
+                    for x in range(columns):
+                        line[x] += weight * values[x]

@@ -1,9 +1,8 @@
-"""The numba kernels of HOG: orientation histograms of cells, blocks of cells, and vectors of patches.
+"""Numba kernels of HOG: orientation histograms of cells, blocks of cells, and the vectors of patches.
 
-All of them work on row-major arrays. The images are interleaved: a row of an ``(H, W, C)`` image is seen as
-``W * C`` values, and the left and right neighbor of a value lie `C` places away. So three channels cost no
-shuffling, and every inner loop runs over neighboring values, which the compiler turns into vector
-instructions.
+All arrays are row-major and images interleaved: a row of an ``(H, W, C)`` image is ``W * C`` values, in which
+the left and right neighbors of a value are `C` positions away. Every inner loop runs over adjacent values,
+which the compiler vectorizes, for any number of channels.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from vehicle_detection._kernels.jit import jit
 def orientation_cotangents(orient: int) -> NDArray[np.float32]:
     """Cotangent of the lower bound of each orientation bin, infinite for the first."""
     angles = np.arange(orient) * (np.pi / orient)
-    # Rounding makes the bound at 90 degrees exact, so that a vertical edge falls where it should.
+    # Rounding makes the cotangent of 90 degrees exactly zero.
     cosines, sines = np.cos(angles).round(15), np.sin(angles)
     cotangents = np.full(orient, np.inf)
     np.divide(cosines, sines, out=cotangents, where=sines > 0)
@@ -35,17 +34,10 @@ def bin_of_value(bins: int) -> NDArray[np.intp]:
 
 
 def sqrt_gradients(source: NDArray[np.uint8]) -> tuple[NDArray[np.float64], ...]:
-    """Gradients of the square root of images, and their arctangent, as scikit-image computes them.
+    """Gradients of the square root of images, and their arctangents, as scikit-image computes them.
 
-    Parameters
-    ----------
-    source
-        ``(..., H, W, C)`` uint8.
-
-    Returns
-    -------
-    tuple of numpy.ndarray
-        ``gx``, ``gy`` and ``arctan2(gy, gx)``, each ``(..., H, W * C)`` float64.
+    `source` is ``(..., H, W, C)`` uint8. Returns ``gx``, ``gy`` and ``arctan2(gy, gx)``, ``(..., H, W * C)``
+    float64.
     """
     root = np.sqrt(np.arange(256.0))[source]
     gx, gy = np.zeros_like(root), np.zeros_like(root)
@@ -55,7 +47,7 @@ def sqrt_gradients(source: NDArray[np.uint8]) -> tuple[NDArray[np.float64], ...]
     return gx.reshape(shape), gy.reshape(shape), np.arctan2(gy, gx).reshape(shape)
 
 
-# A tile of gradients and its histograms (10 rows of floats) stays in the first-level cache.
+# Columns of a tile: its gradients and histograms (10 rows of floats) fit into the first-level cache.
 _TILE = 768
 
 
@@ -63,25 +55,15 @@ _TILE = 768
 def hog_cells(image, channels, cell, cotangents, cells):
     """Sum gradient magnitudes into the orientation histograms of cells.
 
-    The reference is ``skimage.feature.hog``: central differences without halving, zero at the array's
-    border, unsigned orientation, hard binning. Orientation `k` starts at ``k * 180 / orient`` degrees, and an
-    angle in (0, 180) lies past that bound where ``gx / gy`` is at most its cotangent: one division and no
-    arctangent, and a gradient and its opposite are one. The quotients of whole numbers up to 255 are too far
-    from the cotangents for rounding to matter. The sums are kept cumulative over the bounds and are
-    differenced at the end.
+    `image` is ``(H, W * channels)`` uint8 and at least as large as the cells, `cell` their side in pixels,
+    `cotangents` ``(orient,)`` float32 those of the orientations' lower bounds (infinite for the first), and
+    `cells` the output ``(channels, orient, cell rows, cell columns)`` float32, means over the cells' pixels.
 
-    Parameters
-    ----------
-    image
-        ``(H, W * channels)`` uint8, at least as large as the cells.
-    channels
-        Number of interleaved channels.
-    cell
-        Side of a cell in pixels.
-    cotangents
-        ``(orient,)`` float32, of the orientations' lower bounds, infinite for the first.
-    cells
-        Output, ``(channels, orient, cell rows, cell columns)`` float32; mean over the cell's pixels.
+    The reference is ``skimage.feature.hog``: central differences without halving, zero at the array's border,
+    unsigned orientation, hard binning. Orientation `k` starts at ``k * 180 / orient`` degrees; an angle in
+    (0, 180) is beyond that bound if ``gx / gy`` is at most its cotangent. This needs one division and no
+    arctangent, and is equal for opposite gradients. The quotients of integers up to 255 are too far from the
+    cotangents for rounding to matter. Sums are cumulative over the bounds and differenced at the end.
     """
     height, width = image.shape
     orient, rows, columns = cells.shape[1], cells.shape[2], cells.shape[3]
@@ -103,7 +85,7 @@ def hog_cells(image, channels, cell, cotangents, cells):
             n = count * span
             sums.fill(zero)
             for y in range(row * cell, (row + 1) * cell):
-                # At the array's border there is no neighbor on one side: the gradient is zero.
+                # The gradient at the array's border is zero.
                 low = channels if start == 0 else 0
                 high = n - channels if start + n == width else n
                 inside = 0 < y < height - 1
@@ -120,12 +102,12 @@ def hog_cells(image, channels, cell, cotangents, cells):
                     gx = quotient[i]
                     gy = np.float32(below[i]) - np.float32(above[i])
                     magnitude[i] = np.sqrt(gx * gx + gy * gy)
-                    # A gradient along the row has angle 0, whichever way it points.
+                    # A horizontal gradient has angle 0, for either sign.
                     quotient[i] = gx / gy if gy != zero else infinite
                 total = sums[0]
                 for i in range(n):
                     total[i] += magnitude[i]
-                # Four bounds at a time: a quotient that is loaded is compared four times.
+                # Four bounds at a time: each loaded quotient is compared four times.
                 single = 1 + (orient - 1) // 4 * 4
                 for k in range(1, single, 4):
                     c0, c1 = cotangents[k], cotangents[k + 1]
@@ -141,7 +123,8 @@ def hog_cells(image, channels, cell, cotangents, cells):
                     c0, t0 = cotangents[k], sums[k]
                     for i in range(n):
                         t0[i] += magnitude[i] if quotient[i] <= c0 else zero
-            # A cell's columns: sums of four and of eight for all values at once; one in `span` is wanted.
+            # Sums over a cell's columns: of four and eight columns at every position, of which one in `span`
+            # is used.
             ahead = n - 3 * channels
             for k in range(orient):
                 total = sums[k]
@@ -177,19 +160,11 @@ def hog_cells(image, channels, cell, cotangents, cells):
 
 @jit
 def sum_orientations(gx, gy, angles, bounds, channels, cell, cells):
-    """Sum gradient magnitudes into the orientation histograms of cells, from angles that are known.
+    """Sum gradient magnitudes into the orientation histograms of cells, from known angles.
 
-    The way for square-rooted images: their gradients often lie exactly on a bound, and only the same
-    arctangent as the reference's rounds them into the same bin.
-
-    Parameters
-    ----------
-    gx, gy, angles
-        ``(H, W * channels)`` float64 gradients and their arctangents in radians.
-    bounds
-        ``(orient + 1,)`` float64, the bounds of the bins in degrees.
-    channels, cell, cells
-        As for `hog_cells`.
+    `gx`, `gy` and `angles` (radians) are ``(H, W * channels)`` float64, `bounds` ``(orient + 1,)`` float64 in
+    degrees; the rest is as for `hog_cells`. This is for square-rooted images: their gradients are often
+    exactly on a bound, where only the reference's own arctangent gives the reference's bin.
     """
     orient, rows, columns = cells.shape[1], cells.shape[2], cells.shape[3]
     cells[:] = 0
@@ -213,15 +188,10 @@ def sum_orientations(gx, gy, angles, bounds, channels, cell, cells):
 
 @jit
 def pool_cells(cells, pooled):
-    """Average cells with their neighbors to the right, below and between: cells of twice the side.
+    """Average each cell with its neighbors to the right, below and diagonally: cells of twice the side.
 
-    Parameters
-    ----------
-    cells
-        ``(channels, orient, cell rows, cell columns)`` float32.
-    pooled
-        Output of the same shape: ``[c, k, y, x]`` is the mean of ``cells[c, k, y : y + 2, x : x + 2]``. The
-        last row and column become zero.
+    ``pooled[c, k, y, x]`` is the mean of ``cells[c, k, y : y + 2, x : x + 2]``; the last row and column are
+    zero.
     """
     channels, orient, rows, columns = cells.shape
     quarter = np.float32(0.25)
@@ -237,32 +207,24 @@ def pool_cells(cells, pooled):
 
 
 @jit
-def normalize_blocks(cells, block, spread, blocks):
+def normalize_blocks(cells, block, dilation, blocks):
     """Normalize overlapping blocks of cells by L2-Hys: L2, clip at 0.2, L2 again.
+
+    `block` is the side of a block in cells and `dilation` the distance of its cells: 1, or 2 for
+    `pool_cells`. `blocks` is the output ``(channels, block, block, orient, cell rows, cell columns)``
+    float32: ``blocks[c, i, j, k, y, x]`` is the value of cell ``[y + i * dilation, x + j * dilation]`` in the
+    block that starts at cell ``[y, x]``. The last ``(block - 1) * dilation`` rows and columns start no block
+    and are zero.
 
     Dalal and Triggs, "Histograms of oriented gradients for human detection" (CVPR 2005), section 6.4, with
     the constants of scikit-image.
-
-    Parameters
-    ----------
-    cells
-        ``(channels, orient, cell rows, cell columns)`` float32.
-    block
-        Side of a block in cells.
-    spread
-        Distance of a block's cells: 1, or 2 for cells of `pool_cells`.
-    blocks
-        Output, ``(channels, block, block, orient, cell rows, cell columns)`` float32: plane
-        ``[c, i, j, k]`` holds at ``[y, x]`` the value of cell ``[y + i * spread, x + j * spread]`` in the
-        block that starts at cell ``[y, x]``. The last ``(block - 1) * spread`` rows and columns start no
-        block and become zero.
     """
     channels, orient, rows, columns = cells.shape
-    height = rows - (block - 1) * spread
+    height = rows - (block - 1) * dilation
     eps = np.float32(1e-10)
     clip = np.float32(0.2)
     one = np.float32(1)
-    width = columns - (block - 1) * spread
+    width = columns - (block - 1) * dilation
     energy = np.empty((rows, columns), np.float32)
     scale = np.empty(width, np.float32)
     clipped = np.empty(width, np.float32)
@@ -278,7 +240,7 @@ def normalize_blocks(cells, block, spread, blocks):
             scale.fill(eps)
             for i in range(block):
                 for j in range(block):
-                    line = energy[y + i * spread, j * spread : j * spread + width]
+                    line = energy[y + i * dilation, j * dilation : j * dilation + width]
                     for x in range(width):
                         scale[x] += line[x]
             for x in range(width):
@@ -287,7 +249,7 @@ def normalize_blocks(cells, block, spread, blocks):
             for i in range(block):
                 for j in range(block):
                     for k in range(orient):
-                        line = cells[channel, k, y + i * spread, j * spread : j * spread + width]
+                        line = cells[channel, k, y + i * dilation, j * dilation : j * dilation + width]
                         out = blocks[channel, i, j, k, y]
                         for x in range(width):
                             value = min(line[x] * scale[x], clip)
@@ -310,79 +272,61 @@ def normalize_blocks(cells, block, spread, blocks):
 
 
 @jit
-def arrange_blocks(planes, places, spread, features):
-    """Write the block planes of one patch as a vector in scikit-image's order.
+def arrange_blocks(blocks, positions, dilation, features):
+    """Write the blocks of one patch (see `normalize_blocks`) as a 1-D vector in scikit-image's order.
 
-    Parameters
-    ----------
-    planes
-        As `normalize_blocks` fills them.
-    places
-        Blocks along a side of the patch.
-    spread
-        Cells between the starts of two blocks.
-    features
-        Output, 1-D float32: channel, block row, block column, cell row, cell column, orientation.
+    The order is channel, block row, block column, cell row, cell column, orientation, with `positions` blocks
+    along each side of the patch, `dilation` cells apart.
     """
-    channels, block, orient = planes.shape[0], planes.shape[1], planes.shape[3]
-    position = 0
+    channels, block, orient = blocks.shape[0], blocks.shape[1], blocks.shape[3]
+    index = 0
     for channel in range(channels):
-        for y in range(places):
-            for x in range(places):
+        for y in range(positions):
+            for x in range(positions):
                 for i in range(block):
                     for j in range(block):
                         for k in range(orient):
-                            features[position] = planes[channel, i, j, k, y * spread, x * spread]
-                            position += 1
+                            features[index] = blocks[channel, i, j, k, y * dilation, x * dilation]
+                            index += 1
 
 
 @jit
-def write_blocks(cells, block, coarse, planes, features):
-    """Normalize the cells of one patch, and pooled ones where `coarse`, and write them as a vector."""
-    places = cells.shape[2] - block + 1
-    normalize_blocks(cells, block, 1, planes)
-    fine = cells.shape[0] * places * places * block * block * cells.shape[1]
-    arrange_blocks(planes, places, 1, features[:fine])
+def normalize_patch(cells, block, coarse, blocks, features):
+    """Write the normalized blocks of one patch as a vector, followed by `coarse` x `coarse` pooled blocks."""
+    positions = cells.shape[2] - block + 1
+    normalize_blocks(cells, block, 1, blocks)
+    fine = cells.shape[0] * positions * positions * block * block * cells.shape[1]
+    arrange_blocks(blocks, positions, 1, features[:fine])
     if coarse > 0:
         pooled = np.empty_like(cells)
         pool_cells(cells, pooled)
-        normalize_blocks(pooled, block, 2, planes)
-        arrange_blocks(planes, coarse, 2, features[fine:])
+        normalize_blocks(pooled, block, 2, blocks)
+        arrange_blocks(blocks, coarse, 2, features[fine:])
 
 
 @jit
 def patch_hog(patches, channels, cell, block, coarse, cotangents, features):
-    """HOG of each patch.
+    """HOG of each patch ``(N, side, side * channels)`` uint8; see `hog_cells`.
 
-    Parameters
-    ----------
-    patches
-        ``(N, side, side * channels)`` uint8.
-    channels, cell, cotangents
-        As for `hog_cells`.
-    block
-        Side of a block in cells.
-    coarse
-        Block positions of the coarse HOG along a side of the patch, 0 for none.
-    features
-        Output, ``(N, channels * (blocks**2 + coarse**2) * block**2 * orient)`` float32.
+    `coarse` is the number of block positions of the coarse HOG along a side, 0 for none. `features` is the
+    output ``(N, channels * (positions**2 + coarse**2) * block**2 * orient)`` float32.
     """
     orient = len(cotangents)
     side = patches.shape[1] // cell
     cells = np.empty((channels, orient, side, side), np.float32)
-    planes = np.empty((channels, block, block, orient, side, side), np.float32)
+    blocks = np.empty((channels, block, block, orient, side, side), np.float32)
     for index in range(len(patches)):
         hog_cells(patches[index], channels, cell, cotangents, cells)
-        write_blocks(cells, block, coarse, planes, features[index])
+        normalize_patch(cells, block, coarse, blocks, features[index])
 
 
 @jit
-def patch_hog_of_angles(gx, gy, angles, bounds, channels, cell, block, coarse, features):
+def patch_hog_from_angles(gx, gy, angles, bounds, channels, cell, block, coarse, features):
     """HOG of each patch from known gradients ``(N, side, side * channels)``; see `sum_orientations`."""
     orient = len(bounds) - 1
     side = gx.shape[1] // cell
     cells = np.empty((channels, orient, side, side), np.float32)
-    planes = np.empty((channels, block, block, orient, side, side), np.float32)
+    blocks = np.empty((channels, block, block, orient, side, side), np.float32)
     for index in range(len(gx)):
         sum_orientations(gx[index], gy[index], angles[index], bounds, channels, cell, cells)
-        write_blocks(cells, block, coarse, planes, features[index])
+        normalize_patch(cells, block, coarse, blocks, features[index])

@@ -1,6 +1,6 @@
-"""How the numba kernels are compiled: without the GIL, and once, into a cache on disk.
+"""Compilation of the numba kernels: without the GIL, once, into a cache on disk.
 
-Kernels that call each other best stand in one file: the cache notices a change of a kernel's own file alone.
+The cache notices changes of a kernel's own file only, so kernels that call each other are in one file.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import numba
 
 
 def jit(function: Callable[..., Any], *, reorder: bool = False) -> Callable[..., Any]:
-    """Compile a kernel when it is first called, into a cache on disk wherever one can be kept.
+    """Compile a kernel on its first call, cached on disk where possible.
 
-    With `reorder`, sums may be taken in another order: a long one fills a vector register.
+    With `reorder`, the terms of sums may be added in another order, which allows vectorization.
     """
     compiler = functools.partial(
         numba.njit,
@@ -27,5 +27,5 @@ def jit(function: Callable[..., Any], *, reorder: bool = False) -> Callable[...,
     try:
         return compiler(cache=True)(function)  # type: ignore[no-any-return]
     except RuntimeError:
-        # Neither the package's folder nor the user's cache can be written: compile in every process.
+        # Neither the package's folder nor the user's cache is writable: compile in every process.
         return compiler()(function)  # type: ignore[no-any-return]

@@ -1,4 +1,4 @@
-"""A linear SVM of standardised features, without a copy of them: dual coordinate descent."""
+"""A linear SVM on standardized features by dual coordinate descent, without a copy of the features."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from vehicle_detection._kernels.jit import jit
 
 Floats = NDArray[np.float64]
 
-# Rows that are looked at in one piece for their mean and spread.
+# Rows per chunk when computing means and standard deviations.
 _CHUNK = 1024
-# As liblinear's: the largest difference of two projected gradients, and the most sweeps.
-_TOLERANCE, _MOST_SWEEPS = 0.002, 300
+# As in liblinear: maximum difference of two projected gradients, and maximum number of sweeps.
+_TOLERANCE, _MAX_SWEEPS = 0.002, 300
 
 
 class LinearSVM(NamedTuple):
-    """``score = (x - mean) / scale @ coef + intercept``, each ``(length,)`` float64 but for the last."""
+    """``score = (x - mean) / scale @ coef + intercept``; the arrays are ``(length,)`` float64."""
 
     mean: Floats
     scale: Floats
@@ -36,7 +36,7 @@ def fit_svm(
     gains: Floats | float = 1.0,
     random_state: int = 0,
 ) -> LinearSVM:
-    """Fit a scaler and a linear SVM with squared hinge loss on some rows.
+    """Fit a scaler and a linear SVM with squared hinge loss; the same input and seed give the same result.
 
     Parameters
     ----------
@@ -45,23 +45,19 @@ def fit_svm(
     labels
         ``(N,)`` zeros and ones.
     costs
-        ``(N,)`` positive: what an error of each row costs, the `C` of ``LinearSVC`` times its weight.
+        ``(N,)`` positive: the `C` of ``LinearSVC`` times the weight of each row.
     rows
-        Rows to fit, each once; all if None. The others are not looked at.
+        Distinct rows to fit; all if None.
     gains
         Factor of each scaled feature.
     random_state
         Seed of the order in which rows are visited.
 
-    Returns
-    -------
-    LinearSVM
-        The same for the same input and seed. The intercept is regularised as ``LinearSVC``'s is.
-
     Notes
     -----
-    Hsieh et al., "A dual coordinate descent method for large-scale linear SVM" (ICML 2008), with its
-    shrinking: the solver of ``LinearSVC(dual=True)``. Rows are centerd and scaled as they are read.
+    Hsieh et al., "A dual coordinate descent method for large-scale linear SVM" (ICML 2008), with shrinking:
+    the solver of ``LinearSVC(dual=True)``, which regularizes the intercept too. Rows are standardized as they
+    are read.
     """
     chosen = np.arange(len(features)) if rows is None else rows
     mean, scale = _moments(features, chosen)
@@ -77,27 +73,27 @@ def fit_svm(
         squares,
         weights,
         _TOLERANCE,
-        _MOST_SWEEPS,
+        _MAX_SWEEPS,
         np.random.default_rng(random_state),
     )
     coef = weights * scale
-    # The center that the solver saw is the mean rounded to float32.
+    # The solver used the mean rounded to float32.
     return LinearSVM(mean, scale, coef, float(intercept + coef / scale @ (mean - center)))
 
 
 def _moments(features: NDArray[np.float32], rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Mean and standard deviation of each column, which is 1 where a column is constant."""
-    pieces = [rows[start : start + _CHUNK] for start in range(0, len(rows), _CHUNK)]
+    """Mean and standard deviation of each column; the deviation of a constant column is 1."""
+    chunks = [rows[start : start + _CHUNK] for start in range(0, len(rows), _CHUNK)]
     mean, squares = np.zeros(features.shape[1]), np.zeros(features.shape[1])
-    for piece in pieces:
-        mean += features[piece].sum(axis=0, dtype=np.float64)
+    for chunk in chunks:
+        mean += features[chunk].sum(axis=0, dtype=np.float64)
     mean /= len(rows)
     center = mean.astype(np.float32)
-    for piece in pieces:
-        centerd = features[piece] - center
-        squares += np.einsum("ij,ij->j", centerd, centerd)
+    for chunk in chunks:
+        centered = features[chunk] - center
+        squares += np.einsum("ij,ij->j", centered, centered)
     deviation: Floats = np.sqrt(squares / len(rows))
-    # What a constant column has is the rounding of its mean.
+    # The deviation of a constant column is the rounding error of its mean.
     deviation[deviation <= 1e-6 * np.maximum(np.abs(mean), 1)] = 1.0
     return mean, deviation
 
@@ -114,12 +110,12 @@ def _score(row, center, weights):
 
 
 @_reordered
-def _length(row, center, squares):
-    """Squared length of a row that is centerd and scaled."""
+def _squared_norm(row, center, squares):
+    """Squared norm of the standardized row."""
     total = np.float32(0)
     for index in range(row.shape[0]):
-        apart = row[index] - center[index]
-        total += apart * apart * squares[index]
+        difference = row[index] - center[index]
+        total += difference * difference * squares[index]
     return total
 
 
@@ -130,32 +126,32 @@ def _add(step, row, center, squares, weights):
 
 
 @jit
-def _descend(features, rows, signs, ridge, center, squares, weights, tolerance, most, rng):
-    """Solve the dual; change `weights`, those of centerd rows, in place, and return the intercept."""
+def _descend(features, rows, signs, ridge, center, squares, weights, tolerance, max_sweeps, rng):
+    """Solve the dual problem: update `weights`, those of centered rows, in place and return the intercept."""
     count = rows.shape[0]
     curvature = np.empty(count)
     for index in range(count):
-        curvature[index] = _length(features[rows[index]], center, squares) + 1.0 + ridge[index]
+        curvature[index] = _squared_norm(features[rows[index]], center, squares) + 1.0 + ridge[index]
     multipliers = np.zeros(count)
     intercept = 0.0
     order, active = np.arange(count), count
     bound = np.inf
-    for _ in range(most):
+    for _ in range(max_sweeps):
         highest, lowest = -np.inf, np.inf
-        for place in range(active - 1):
-            other = place + int(rng.random() * (active - place))
-            order[place], order[other] = order[other], order[place]
-        place = 0
-        while place < active:
-            index = order[place]
+        for position in range(active - 1):
+            other = position + int(rng.random() * (active - position))
+            order[position], order[other] = order[other], order[position]
+        position = 0
+        while position < active:
+            index = order[position]
             row = features[rows[index]]
             score = _score(row, center, weights) + intercept
             slope = signs[index] * score - 1.0 + ridge[index] * multipliers[index]
             if multipliers[index] == 0.0:
                 if slope > bound:
-                    # Right by far: left alone until the others are done.
+                    # Shrinking: skip this row until the others have converged.
                     active -= 1
-                    order[place], order[active] = order[active], order[place]
+                    order[position], order[active] = order[active], order[position]
                     continue
                 slope = min(slope, 0.0)
             highest, lowest = max(highest, slope), min(lowest, slope)
@@ -165,7 +161,7 @@ def _descend(features, rows, signs, ridge, center, squares, weights, tolerance, 
                 step = (multipliers[index] - before) * signs[index]
                 _add(np.float32(step), row, center, squares, weights)
                 intercept += step
-            place += 1
+            position += 1
         if highest - lowest <= tolerance:
             if active == count:
                 break

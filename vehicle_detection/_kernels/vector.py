@@ -1,6 +1,6 @@
-"""Sums of products in vector registers: the innermost step of the correlation, written for the processor.
+"""Sums of products in vector registers: the innermost step of the correlation, as an LLVM intrinsic.
 
-A compiler keeps at most a vector or two of a sum in registers and loads and stores them for every few
+A compiler keeps at most a vector or two of a sum in registers, and loads and stores them for every few
 products. Here a block of sums stays in registers over the whole depth of the product (Goto and van de Geijn,
 "Anatomy of high-performance matrix multiplication", ACM TOMS 2008), which is two to three times as fast.
 """
@@ -16,7 +16,7 @@ from numba.extending import intrinsic
 
 
 class Block(NamedTuple):
-    """How many sums a processor keeps in its registers: rows of vectors of lanes."""
+    """Sums that a processor keeps in its registers: rows of vectors of lanes."""
 
     lanes: int
     rows: int
@@ -31,8 +31,8 @@ class Block(NamedTuple):
 def host_block() -> Block:
     """Choose the block for this processor's vector registers.
 
-    AVX-512 has 32 registers of 16 numbers, NEON 32 of 4, AVX 16 of 8 and SSE 16 of 4. A few of them hold what
-    is multiplied.
+    AVX-512 has 32 registers of 16 floats, NEON 32 of 4, AVX 16 of 8 and SSE 16 of 4. A few of them hold the
+    factors.
     """
     features = binding.get_host_cpu_features()
     if features.get("avx512f"):
@@ -43,40 +43,37 @@ def host_block() -> Block:
 
 
 def block_adder(block: Block) -> Callable[..., None]:
-    """Make the step ``add_products(weights, number, planes, first, sums, offsets, place)`` for kernels.
+    """Build ``add_products(weights, index, channels, first, sums, offsets, position)`` for use in kernels.
 
-    For each row `r` of the block it adds ``weights[number, :, r] @ planes[:, first : first + columns]`` to as
-    many entries of ``sums`` from ``place + offsets[number, r]`` on.
-
-    Parameters
-    ----------
-    block
-        Rows and columns of the step.
-
-    Returns
-    -------
-    Callable
-        For kernels alone. It takes `weights` ``(blocks, depth, rows)``, `planes` ``(depth, N)`` and `sums`,
-        1-D, all float32, and `offsets` ``(blocks, rows)`` intp, all with neighboring values next to each
-        other. Nothing is checked.
+    For each row `r` of the block it adds ``weights[index, :, r] @ channels[:, first : first + columns]`` to
+    ``sums[position + offsets[index, r] :]``. `weights` is ``(blocks, depth, rows)``, `channels`
+    ``(depth, N)``, `sums` 1-D, all float32, and `offsets` ``(blocks, rows)`` intp; all are C-contiguous.
+    Nothing is checked.
     """
     lanes, rows, vectors = block
-    number, bits = ir.FloatType(), ir.IntType(32)
-    vector = ir.VectorType(number, lanes)
+    float_type, int_type = ir.FloatType(), ir.IntType(32)
+    vector = ir.VectorType(float_type, lanes)
 
     @intrinsic
     def add_products(
-        _context: Any, weights: Any, index: Any, planes: Any, first: Any, sums: Any, offsets: Any, place: Any
+        _context: Any,
+        weights: Any,
+        index: Any,
+        channels: Any,
+        first: Any,
+        sums: Any,
+        offsets: Any,
+        position: Any,
     ) -> Any:
-        signature = types.void(weights, types.intp, planes, types.intp, sums, offsets, types.intp)
+        signature = types.void(weights, types.intp, channels, types.intp, sums, offsets, types.intp)
 
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            kinds = signature.args
             left, right, out, shifts = (
-                context.make_array(kinds[place])(context, builder, arguments[place]) for place in (0, 2, 4, 5)
+                context.make_array(signature.args[number])(context, builder, arguments[number])
+                for number in (0, 2, 4, 5)
             )
 
-            def whole(value: int) -> Any:
+            def constant(value: int) -> Any:
                 return context.get_constant(types.intp, value)
 
             def address(array: Any, offset: Any, kind: Any) -> Any:
@@ -85,62 +82,63 @@ def block_adder(block: Block) -> Callable[..., None]:
 
             def load(array: Any, offset: Any, kind: Any) -> Any:
                 value = builder.load(address(array, offset, kind))
-                value.align = 8 if kind is index_kind else 4
+                value.align = 8 if kind is index_type else 4
                 return value
 
-            def spread(value: Any) -> Any:
-                nothing = ir.Constant(vector, ir.Undefined)
-                single = builder.insert_element(nothing, value, ir.Constant(bits, 0))
-                return builder.shuffle_vector(
-                    single, nothing, ir.Constant(ir.VectorType(bits, lanes), [0] * lanes)
-                )
+            def broadcast(value: Any) -> Any:
+                undefined = ir.Constant(vector, ir.Undefined)
+                single = builder.insert_element(undefined, value, ir.Constant(int_type, 0))
+                zeros = ir.Constant(ir.VectorType(int_type, lanes), [0] * lanes)
+                return builder.shuffle_vector(single, undefined, zeros)
 
-            def columns(offset: Any) -> list[Any]:
-                return [builder.add(offset, whole(4 * lanes * part)) for part in range(vectors)]
+            def vector_offsets(offset: Any) -> list[Any]:
+                return [builder.add(offset, constant(4 * lanes * part)) for part in range(vectors)]
 
             multiply_add = cgutils.get_or_insert_function(
                 builder.module, ir.FunctionType(vector, [vector] * 3), f"llvm.fmuladd.v{lanes}f32"
             )
-            index_kind = context.get_value_type(types.intp)
+            index_type = context.get_value_type(types.intp)
             depth = cgutils.unpack_tuple(builder, left.shape)[1]
             block_bytes = cgutils.unpack_tuple(builder, left.strides)[0]
-            plane_bytes = cgutils.unpack_tuple(builder, right.strides)[0]
+            channel_bytes = cgutils.unpack_tuple(builder, right.strides)[0]
             start = builder.block
             weight_start = builder.mul(arguments[1], block_bytes)
-            plane_start = builder.mul(arguments[3], whole(4))
+            channel_start = builder.mul(arguments[3], constant(4))
             loop, done = builder.append_basic_block("depth"), builder.append_basic_block("sums")
             builder.branch(loop)
+            # The loop over the depth: its counters and sums are phi nodes, which stay in registers.
             builder.position_at_end(loop)
-            count, weight, plane = (builder.phi(depth.type) for _ in range(3))
+            count, weight, channel = (builder.phi(depth.type) for _ in range(3))
             totals = [[builder.phi(vector) for _ in range(vectors)] for _ in range(rows)]
-            values = [load(right, offset, vector) for offset in columns(plane)]
-            raised = []
+            values = [load(right, offset, vector) for offset in vector_offsets(channel)]
+            updated = []
             for row, line in enumerate(totals):
-                factor = spread(load(left, builder.add(weight, whole(4 * row)), number))
-                raised.append(
+                factor = broadcast(load(left, builder.add(weight, constant(4 * row)), float_type))
+                updated.append(
                     [builder.call(multiply_add, [factor, value, total]) for value, total in zip(values, line)]
                 )
-            steps = (count, whole(0), whole(1)), (weight, weight_start, whole(4 * rows)), (
-                plane, plane_start, plane_bytes
-            )  # fmt: skip
-            for counter, origin, step in steps:
+            for counter, origin, step in (
+                (count, constant(0), constant(1)),
+                (weight, weight_start, constant(4 * rows)),
+                (channel, channel_start, channel_bytes),
+            ):
                 counter.add_incoming(origin, start)
                 counter.add_incoming(builder.add(counter, step), loop)
-            for line, sums_of_line in zip(totals, raised):
-                for total, more in zip(line, sums_of_line):
+            for line, updated_line in zip(totals, updated):
+                for total, new_total in zip(line, updated_line):
                     total.add_incoming(ir.Constant(vector, [0.0] * lanes), start)
-                    total.add_incoming(more, loop)
-            going_on = builder.icmp_signed("<", builder.add(count, whole(1)), depth)
-            builder.cbranch(going_on, loop, done)
+                    total.add_incoming(new_total, loop)
+            unfinished = builder.icmp_signed("<", builder.add(count, constant(1)), depth)
+            builder.cbranch(unfinished, loop, done)
             builder.position_at_end(done)
-            size = context.get_abi_sizeof(index_kind)
-            of_block = builder.mul(arguments[1], whole(rows * size))
-            for row, line in enumerate(raised):
-                shift = load(shifts, builder.add(of_block, whole(row * size)), index_kind)
-                origin = builder.mul(builder.add(arguments[6], shift), whole(4))
-                for offset, more in zip(columns(origin), line):
+            index_bytes = context.get_abi_sizeof(index_type)
+            block_offset = builder.mul(arguments[1], constant(rows * index_bytes))
+            for row, line in enumerate(updated):
+                shift = load(shifts, builder.add(block_offset, constant(row * index_bytes)), index_type)
+                origin = builder.mul(builder.add(arguments[6], shift), constant(4))
+                for offset, total in zip(vector_offsets(origin), line):
                     known = load(out, offset, vector)
-                    stored = builder.store(builder.fadd(known, more), address(out, offset, vector))
+                    stored = builder.store(builder.fadd(known, total), address(out, offset, vector))
                     stored.align = 4
             return context.get_dummy_value()
 

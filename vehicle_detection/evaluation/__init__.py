@@ -1,24 +1,22 @@
-"""Labels, and the scores of detections and tracks against them."""
+"""Labelled frames, label files, scores of detections and tracks, and calibration of scores."""
 
 from vehicle_detection.evaluation.calibration import Platt, calibrate_scores, calibration_error
 from vehicle_detection.evaluation.detections import (
     DetectionScores,
+    best_f1,
     evaluate_detections,
-    match_detections,
     precision_recall_curve,
 )
-from vehicle_detection.evaluation.labels import (
-    NO_TRACK,
-    FrameBoxes,
-    FrameKey,
+from vehicle_detection.evaluation.frame_boxes import NO_TRACK, FrameBoxes, FrameKey
+from vehicle_detection.evaluation.labelled_frames import (
     Frames,
     LabelledFrames,
-    check_labels_of,
+    check_frame_boxes,
+    iterate_frames,
     keyed_frames,
     keys_of,
-    pairs_of,
 )
-from vehicle_detection.evaluation.matching import prepare_sides
+from vehicle_detection.evaluation.matching import match_detections, prepare_evaluation
 from vehicle_detection.evaluation.readers import read_labels
 from vehicle_detection.evaluation.tracks import TrackScores, evaluate_tracks
 
@@ -31,16 +29,17 @@ __all__ = [
     "LabelledFrames",
     "Platt",
     "TrackScores",
+    "best_f1",
     "calibrate_scores",
     "calibration_error",
-    "check_labels_of",
+    "check_frame_boxes",
     "evaluate_detections",
     "evaluate_tracks",
+    "iterate_frames",
     "keyed_frames",
     "keys_of",
     "match_detections",
-    "pairs_of",
     "precision_recall_curve",
-    "prepare_sides",
+    "prepare_evaluation",
     "read_labels",
 ]

@@ -1,4 +1,4 @@
-"""Scores that mean a probability: Platt's sigmoid."""
+"""Turn scores into probabilities with Platt's sigmoid, and measure their calibration error."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Platt:
         check_number(self.b, "b")
 
     def probability(self, scores: ArrayLike) -> NDArray[np.float64]:
-        """Probability of a vehicle for each decision value, float64 in [0, 1], of the same shape."""
+        """Probability of a vehicle for each score, float64 in [0, 1], of the same shape."""
         from scipy.special import expit
 
         values = np.asarray(scores)
@@ -44,34 +44,37 @@ class Platt:
         return np.asarray(expit(-(self.a * values.astype(np.float64) + self.b)))
 
     def score(self, probability: float) -> float:
-        """Return the decision value that has this probability, in (0, 1): a threshold for a search."""
-        share = check_number(probability, "probability", above=0)
-        if share >= 1 or self.a == 0:
+        """Return the score that has this probability, in (0, 1), for use as a threshold."""
+        value = check_number(probability, "probability", above=0)
+        if value >= 1 or self.a == 0:
             raise InvalidInputError(
-                f"probability must lie in (0, 1) and a must not be 0; got {share:g} and a={self.a:g}"
+                f"probability must lie in (0, 1) and a must not be 0; got {value:g} and a={self.a:g}"
             )
-        return float((np.log((1 - share) / share) - self.b) / self.a)
+        return float((np.log((1 - value) / value) - self.b) / self.a)
 
     def to_dict(self) -> dict[str, float]:
         """Return plain numbers, ready for the metadata of a model."""
         return asdict(self)
 
 
-def calibrate_scores(scores: ArrayLike, labels: ArrayLike) -> Platt:
-    """Fit the sigmoid that turns decision values into probabilities.
+def calibrate_scores(scores: ArrayLike, labels: ArrayLike, *, prior: bool = True) -> Platt:
+    """Fit the sigmoid that turns scores into probabilities.
 
     Parameters
     ----------
     scores
-        ``(N,)`` decision values of patches that the classifier was not trained on: those of its own
-        training patches are too good.
+        ``(N,)`` scores of samples that the model was not trained on; scores of its own training samples are
+        too good.
     labels
         ``(N,)`` truth, 0 or 1 or bool, both present.
+    prior
+        Smooth the labels with Platt's prior on both classes. False fits plain logistic regression, whose
+        slope may grow without a useful limit if the scores separate the classes.
 
     Returns
     -------
     Platt
-        Its `probability` is checked with `calibration_error`.
+        Its probabilities can be checked with `calibration_error`.
 
     Raises
     ------
@@ -80,8 +83,8 @@ def calibrate_scores(scores: ArrayLike, labels: ArrayLike) -> Platt:
 
     Notes
     -----
-    Platt, "Probabilistic outputs for support vector machines" (1999), with his prior on both classes; the
-    same sigmoid as that of scikit-learn's ``CalibratedClassifierCV``.
+    Platt, "Probabilistic outputs for support vector machines" (1999); with the prior the sigmoid equals that
+    of scikit-learn's ``CalibratedClassifierCV``.
 
     Examples
     --------
@@ -94,37 +97,46 @@ def calibrate_scores(scores: ArrayLike, labels: ArrayLike) -> Platt:
         raise InvalidInputError(f"scores must be a one-dimensional array of numbers; got {describe(values)}")
     if not np.isfinite(values).all():
         raise InvalidInputError("scores must be finite, got NaN or infinity; drop those rows")
-    if truth.shape != values.shape or not np.isin(truth, (0, 1)).all():
-        raise InvalidInputError(
-            f"labels must be 0 or 1 for each of the {len(values)} scores, got {describe(truth)}; "
-            "labels of -1 and 1 convert with labels > 0"
-        )
+    _check_truth(truth, values, "scores")
     if truth.min() == truth.max():
         raise InvalidInputError("labels must hold both classes: vehicles (1) and non-vehicles (0)")
-    return _fit(values.astype(np.float64), truth.astype(np.int64))
+    return _fit(values.astype(np.float64), truth.astype(np.int64), prior)
 
 
-def _fit(values: NDArray[np.float64], truth: NDArray[np.int64]) -> Platt:
-    """Fit by logistic regression, each sample split between both classes as Platt's prior has it."""
+def _check_truth(truth: NDArray[np.generic], values: NDArray[np.generic], name: str) -> None:
+    if truth.shape != values.shape or not np.isin(truth, (0, 1)).all():
+        raise InvalidInputError(
+            f"labels must be 0 or 1 for each of the {len(values)} {name}, got {describe(truth)}; "
+            "labels of -1 and 1 convert with labels > 0"
+        )
+
+
+def _fit(values: NDArray[np.float64], truth: NDArray[np.int64], prior: bool) -> Platt:
+    """Logistic regression; for the prior, each sample is split between both classes."""
     from sklearn.linear_model import LogisticRegression
 
-    vehicles = int(truth.sum())
-    others = len(truth) - vehicles
-    target = np.where(truth == 1, (vehicles + 1) / (vehicles + 2), 1 / (others + 2))
-    spread = float(values.std()) or 1.0
-    column = np.tile(values / spread, 2)[:, None]
-    classes = np.repeat([1, 0], len(values))
-    regression = LogisticRegression(C=np.inf, tol=1e-8, max_iter=1000)
-    regression.fit(column, classes, sample_weight=np.concatenate([target, 1 - target]))
-    return Platt(-float(regression.coef_[0, 0]) / spread, -float(regression.intercept_[0]))
+    scale = 1.0
+    if prior:
+        positives = int(truth.sum())
+        negatives = len(truth) - positives
+        target = np.where(truth == 1, (positives + 1) / (positives + 2), 1 / (negatives + 2))
+        scale = float(values.std()) or 1.0
+        regression = LogisticRegression(C=np.inf, tol=1e-8, max_iter=1000)
+        regression.fit(
+            np.tile(values / scale, 2)[:, None],
+            np.repeat([1, 0], len(values)),
+            sample_weight=np.concatenate([target, 1 - target]),
+        )
+    else:
+        regression = LogisticRegression(C=1e6).fit(values[:, None], truth)
+    return Platt(-float(regression.coef_[0, 0]) / scale, -float(regression.intercept_[0]))
 
 
 def calibration_error(probabilities: ArrayLike, labels: ArrayLike, *, bins: int = 15) -> float:
-    """Measure how far probabilities are from the share of vehicles among them: the ECE.
+    """Measure the expected calibration error (ECE): probabilities against the observed fraction of vehicles.
 
-    The expected calibration error is the sum over `bins` equal bins of ``|mean label - mean probability|``,
-    weighted by the bin's share of the samples (Naeini et al., "Obtaining well calibrated probabilities
-    using Bayesian binning", 2015).
+    The sum over `bins` equal bins of ``|mean label - mean probability|``, weighted by the bin's fraction of
+    the samples (Naeini et al., "Obtaining well calibrated probabilities using Bayesian binning", 2015).
 
     Parameters
     ----------
@@ -150,19 +162,15 @@ def calibration_error(probabilities: ArrayLike, labels: ArrayLike, *, bins: int 
     >>> round(calibration_error([0.9, 0.9, 0.1, 0.1], [1, 1, 0, 1]), 3)
     0.25
     """
-    shares, truth = np.asarray(probabilities), np.asarray(labels)
-    inside = shares.dtype.kind in "iuf" and bool(((shares >= 0) & (shares <= 1)).all())
-    if shares.ndim != 1 or not shares.size or not inside:
+    values, truth = np.asarray(probabilities), np.asarray(labels)
+    inside = values.dtype.kind in "iuf" and bool(((values >= 0) & (values <= 1)).all())
+    if values.ndim != 1 or not values.size or not inside:
         raise InvalidInputError(
-            f"probabilities must be a one-dimensional array of numbers from 0 to 1, got {describe(shares)}; "
-            "a decision value becomes one by the classifier's calibration"
+            f"probabilities must be a one-dimensional array of numbers from 0 to 1, got {describe(values)}; "
+            "convert scores with calibrate_scores(...).probability"
         )
-    if truth.shape != shares.shape or not np.isin(truth, (0, 1)).all():
-        raise InvalidInputError(
-            f"labels must be 0 or 1 for each of the {len(shares)} probabilities, got {describe(truth)}; "
-            "labels of -1 and 1 convert with labels > 0"
-        )
+    _check_truth(truth, values, "probabilities")
     count = check_integer(bins, "bins", low=1)
-    chosen = np.minimum((shares * count).astype(np.intp), count - 1)
-    gaps = np.bincount(chosen, weights=truth.astype(np.float64) - shares, minlength=count)
-    return float(np.abs(gaps).sum() / len(shares))
+    chosen = np.minimum((values * count).astype(np.intp), count - 1)
+    gaps = np.bincount(chosen, weights=truth.astype(np.float64) - values, minlength=count)
+    return float(np.abs(gaps).sum() / len(values))

@@ -1,54 +1,89 @@
-"""Detections and tracks against labelled frames: how many are found, how well they fit, who stays who.
+"""Score detections against labelled frames: precision, recall, F1, average precision.
 
-The boxes of `FrameBoxes` marked ``ignore`` are not scored, and a prediction on them is neither right nor wrong:
-one whose center lies in a region (``ignore`` with track -1), or that covers an ignored box at the IoU in
-use. Usable boxes are matched first, so an ignore region over a vehicle does not take its detection away.
+Labels marked ``ignore`` are not scored, and a prediction on them is ignored: it counts neither as right nor
+as wrong. That holds for a prediction whose center lies in a region (``ignore`` with track -1), or that
+overlaps an ignored box by at least the IoU in use. Other labels are matched first, so a region over a vehicle
+does not remove its detection.
 
-Where a box to ignore holds several vehicles, such as cars that touch in a mask of a class, none of them
-covers it. With ``ignored_as_regions`` a prediction is neutral, too, where half of it or more lies in one.
+If one ignored box covers several vehicles, such as touching cars in a class mask, no single prediction
+reaches that IoU. With ``ignored_as_regions`` a prediction is also ignored if half of it lies in an ignored
+box.
 
-A ratio with nothing to count is NaN: ``n/a`` in a summary, None in ``to_dict``.
+A ratio whose denominator is 0 is NaN: ``n/a`` in a summary, None in ``to_dict``.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check_number
-from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation.labels import FrameBoxes, FrameKey
-from vehicle_detection.evaluation.matching import (
-    Scores,
-    as_lines,
-    as_text,
-    find_ignored,
-    mean,
-    prepare_sides,
-    rates,
-    ratio,
-)
+from vehicle_detection.evaluation.frame_boxes import FrameBoxes, FrameKey
+from vehicle_detection.evaluation.matching import DetectionMatches, match_detections, prepare_evaluation
 
 SIZES = {"small": (0.0, 64.0), "medium": (64.0, 128.0), "large": (128.0, math.inf)}
 """Half-open ranges of box width in pixels."""
 
 
 @dataclass(frozen=True)
-class SizeScores:
-    """Detection scores of one range of widths; the label's width counts, for a false box its own.
+class Scores:
+    """Base class of detection scores and track scores."""
 
-    Attributes
-    ----------
-    tp, fp, fn
-        Vehicles found, false boxes, vehicles missed.
-    precision, recall, f1, mean_iou
-        As in `DetectionScores`.
-    """
+    def summary(self) -> str:
+        """Return the scores as a few aligned lines."""
+        raise NotImplementedError
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers for JSON; NaN becomes None."""
+        return {key: _nan_to_none(value) for key, value in dataclasses.asdict(self).items()}
+
+    def __str__(self) -> str:
+        return self.summary()
+
+
+def _nan_to_none(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _nan_to_none(entry) for key, entry in value.items()}
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def rates(tp: int, fp: int, fn: int) -> tuple[int, int, int, float, float, float]:
+    """Return the counts followed by precision, recall and F1."""
+    return tp, fp, fn, ratio(tp, tp + fp), ratio(tp, tp + fn), ratio(2 * tp, 2 * tp + fp + fn)
+
+
+def ratio(part: float, whole: float) -> float:
+    """Divide; NaN where `whole` is 0."""
+    return part / whole if whole else math.nan
+
+
+def mean(values: ArrayLike) -> float:
+    """Mean; NaN for no values."""
+    array = np.asarray(values, np.float64)
+    return float(array.mean()) if array.size else math.nan
+
+
+def format_number(value: float) -> str:
+    """Format a ratio or length for a summary."""
+    return "n/a" if math.isnan(value) else f"{value:.3f}"
+
+
+def format_summary(title: str, rows: dict[str, str]) -> str:
+    """Lay out a title and, below it, one aligned line for each name and its text."""
+    width = max(map(len, rows))
+    return "\n".join([title, *(f"  {name:<{width}}  {text}" for name, text in rows.items())])
+
+
+@dataclass(frozen=True)
+class SizeScores:
+    """Detection scores of one range of box widths: of the label, or of the prediction if it is false."""
 
     tp: int
     fp: int
@@ -61,26 +96,26 @@ class SizeScores:
 
 @dataclass(frozen=True)
 class DetectionScores(Scores):
-    """What `evaluate_detections` found.
+    """Result of `evaluate_detections`.
 
     Attributes
     ----------
     frames
         Number of evaluated frames.
     iou
-        Overlap from which a detection matches a vehicle.
+        Smallest IoU of a match.
     tp, fp, fn
-        Vehicles found, false detections, vehicles missed.
+        Numbers of vehicles found, false detections and vehicles missed.
     ignored
-        Detections that are neither right nor wrong.
+        Number of ignored detections, which count neither as right nor as wrong.
     precision, recall, f1
         ``tp / (tp + fp)``, ``tp / (tp + fn)`` and ``2 tp / (2 tp + fp + fn)``.
     average_precision
-        Area under the precision-recall curve, precision made monotonic (PASCAL VOC from 2010 on).
+        Area under the precision-recall curve with monotonic precision (PASCAL VOC since 2010).
     false_positives_per_frame
         ``fp / frames``.
     mean_iou
-        Mean overlap of the matched pairs.
+        Mean IoU of the matched pairs.
     by_size
         The same for ``"small"`` (under 64 px wide), ``"medium"`` (under 128 px) and ``"large"`` vehicles.
     """
@@ -100,23 +135,22 @@ class DetectionScores(Scores):
     by_size: dict[str, SizeScores]
 
     def summary(self) -> str:
-        """Say the scores in a few aligned lines."""
+        """Return the scores as a few aligned lines."""
         rows = {
-            "F1": as_text(self.f1),
-            "precision": as_text(self.precision),
-            "recall": as_text(self.recall),
-            "average precision": as_text(self.average_precision),
-            "mean IoU": as_text(self.mean_iou),
-            "false a frame": as_text(self.false_positives_per_frame),
+            "F1": format_number(self.f1),
+            "precision": format_number(self.precision),
+            "recall": format_number(self.recall),
+            "average precision": format_number(self.average_precision),
+            "mean IoU": format_number(self.mean_iou),
+            "false a frame": format_number(self.false_positives_per_frame),
             "boxes": f"{self.tp} found, {self.fn} missed, {self.fp} false, {self.ignored} ignored",
         }
         for name, (low, high) in SIZES.items():
             size = self.by_size[name]
-            reach = f"from {low:g} px" if high == math.inf else f"under {high:g} px"
-            rows[f"{name}, {reach}"] = (
-                f"F1 {as_text(size.f1)}, {size.tp} of {size.tp + size.fn}, {size.fp} false"
-            )
-        return as_lines(f"Detections in {self.frames} frames at IoU {self.iou:g}", rows)
+            limit = f"from {low:g} px" if high == math.inf else f"under {high:g} px"
+            found = f"F1 {format_number(size.f1)}, {size.tp} of {size.tp + size.fn}, {size.fp} false"
+            rows[f"{name}, {limit}"] = found
+        return format_summary(f"Detections in {self.frames} frames at IoU {self.iou:g}", rows)
 
 
 def evaluate_detections(
@@ -129,62 +163,60 @@ def evaluate_detections(
 ) -> DetectionScores:
     """Score detections against labels, each frame by itself.
 
-    In every frame the detections choose in order of their score, each the vehicle it overlaps most among
-    those still free, as in PASCAL VOC and COCO; equal scores choose in order of their best overlap.
+    In every frame the detections are matched in order of their score, each to the free label that it overlaps
+    most, as in PASCAL VOC and COCO; equal scores are ordered by their best overlap.
 
     Parameters
     ----------
     predictions
-        Detected boxes; their tracks do not matter. Without scores all count as equally sure. Rows marked
+        Detected boxes; their tracks are not used. Without scores, all scores count as equal. Rows marked
         ``ignore`` are left out.
     labels
         True boxes.
     iou
-        Overlap in (0, 1] from which a detection matches a vehicle, or covers an ignored box.
+        Smallest IoU, in (0, 1], at which a detection matches a label or is ignored with an ignored box.
     frames
         All evaluated frames, so that those without label and prediction count too. Labels in other frames
-        are left out. None takes all frames that `predictions` or `labels` know of.
+        are left out. None takes all frames of `predictions` and `labels`.
     ignored_as_regions
-        Whether a detection of which half or more lies in an ignored box is neutral as well: for labels whose
-        ignored boxes hold several vehicles each.
+        Also ignore a detection of which at least half lies in an ignored box: for labels whose ignored boxes
+        cover several vehicles each.
 
     Returns
     -------
     DetectionScores
-        Counts and ratios, in all and by size.
+        Counts and ratios, overall and by size.
 
     Raises
     ------
     InvalidInputError
-        If an argument is no `FrameBoxes`, `iou` is out of range, a prediction is in none of the `frames`, or
+        If an argument is not `FrameBoxes`, `iou` is out of range, a prediction is in none of the `frames`, or
         predictions and labels name their frames differently.
 
     Examples
     --------
-    >>> labels = Labels([0, 0], [1, 2], [[0, 0, 50, 40], [200, 0, 290, 60]])
-    >>> found = Labels([0, 0], None, [[1, 0, 51, 40], [400, 0, 450, 40]], scores=[2.0, 0.5])
+    >>> labels = FrameBoxes([0, 0], [1, 2], [[0, 0, 50, 40], [200, 0, 290, 60]])
+    >>> found = FrameBoxes([0, 0], None, [[1, 0, 51, 40], [400, 0, 450, 40]], scores=[2.0, 0.5])
     >>> scores = evaluate_detections(found, labels)
     >>> scores.precision, scores.recall, scores.average_precision
     (0.5, 0.5, 0.5)
     """
-    predictions, labels, keys = prepare_sides(predictions, labels, frames)
-    limit = check_number(iou, "iou", above=0, high=1)
-    found = match_detections(predictions, labels, keys, limit, ignored_as_regions=ignored_as_regions)
-    hit, false = found.partner >= 0, (found.partner < 0) & ~found.ignored
-    missed = np.setdiff1d(found.usable, found.partner)
+    predictions, labels, keys = prepare_evaluation(predictions, labels, frames)
+    min_iou = check_number(iou, "iou", above=0, high=1)
+    found = match_detections(predictions, labels, keys, min_iou, ignored_as_regions=ignored_as_regions)
+    hit, false, missed = found.match >= 0, (found.match < 0) & ~found.ignored, found.missed
 
-    true_widths = _widths(labels)
+    label_widths, widths = (side.boxes[:, 2] - side.boxes[:, 0] for side in (labels, predictions))
     by_size = {}
     for name, (low, high) in SIZES.items():
-        widths = true_widths[found.partner[hit]], _widths(predictions)[false], true_widths[missed]
-        tp, fp, fn = ((low <= width) & (width < high) for width in widths)
-        by_size[name] = SizeScores(
-            *rates(int(tp.sum()), int(fp.sum()), int(fn.sum())), mean(found.overlap[hit][tp])
-        )
+        sides = label_widths[found.match[hit]], widths[false], label_widths[missed]
+        tp, fp, fn = ((low <= width) & (width < high) for width in sides)
+        counts = int(tp.sum()), int(fp.sum()), int(fn.sum())
+        by_size[name] = SizeScores(*rates(*counts), mean(found.iou[hit][tp]))
     tp_all, fp_all, fn_all, precision, recall, f1 = rates(int(hit.sum()), int(false.sum()), len(missed))
     return DetectionScores(
         frames=len(keys),
-        iou=limit,
+        iou=min_iou,
         tp=tp_all,
         fp=fp_all,
         fn=fn_all,
@@ -194,7 +226,7 @@ def evaluate_detections(
         f1=f1,
         average_precision=_average_precision(*_curve(predictions, found)[:2]),
         false_positives_per_frame=ratio(fp_all, len(keys)),
-        mean_iou=mean(found.overlap[hit]),
+        mean_iou=mean(found.iou[hit]),
         by_size=by_size,
     )
 
@@ -210,16 +242,14 @@ def precision_recall_curve(
         Detected boxes with scores.
     labels
         True boxes.
-    iou
-        Overlap in (0, 1] from which a detection matches a vehicle.
-    ignored_as_regions
+    iou, ignored_as_regions
         As in `evaluate_detections`.
 
     Returns
     -------
     precision, recall, thresholds : numpy.ndarray
-        Three ``(K,)`` float64 arrays, one entry for each score that occurs, highest first: what the
-        detections with a score of at least ``thresholds[k]`` reach. Recall never falls along them; it is
+        Three ``(K,)`` float64 arrays with one entry for each distinct score, highest first: the values for
+        the detections with a score of at least ``thresholds[k]``. Recall never decreases along them; it is
         NaN where no vehicle is labelled.
 
     Raises
@@ -229,99 +259,43 @@ def precision_recall_curve(
 
     Examples
     --------
-    >>> labels = Labels([0, 0], [1, 2], [[0, 0, 50, 40], [200, 0, 290, 60]])
-    >>> found = Labels([0, 0], None, [[0, 0, 50, 40], [400, 0, 450, 40]], scores=[2.0, 0.5])
+    >>> labels = FrameBoxes([0, 0], [1, 2], [[0, 0, 50, 40], [200, 0, 290, 60]])
+    >>> found = FrameBoxes([0, 0], None, [[0, 0, 50, 40], [400, 0, 450, 40]], scores=[2.0, 0.5])
     >>> precision_recall_curve(found, labels)
     (array([1. , 0.5]), array([0.5, 0.5]), array([2. , 0.5]))
     """
-    predictions, labels, keys = prepare_sides(predictions, labels, None)
+    predictions, labels, keys = prepare_evaluation(predictions, labels, None)
     if len(predictions) and predictions.scores is None:
-        raise InvalidInputError("predictions need scores for a curve; pass Labels with scores=")
-    limit = check_number(iou, "iou", above=0, high=1)
-    found = match_detections(predictions, labels, keys, limit, ignored_as_regions=ignored_as_regions)
+        raise InvalidInputError("predictions need scores for a curve; pass FrameBoxes with scores=")
+    min_iou = check_number(iou, "iou", above=0, high=1)
+    found = match_detections(predictions, labels, keys, min_iou, ignored_as_regions=ignored_as_regions)
     return _curve(predictions, found)
 
 
-def _widths(labels: FrameBoxes) -> NDArray[np.float64]:
-    return labels.boxes[:, 2] - labels.boxes[:, 0]
-
-
-@dataclass(frozen=True)
-class Matching:
-    """The fate of every prediction.
-
-    Attributes
-    ----------
-    partner
-        ``(N,)`` row of the label that each prediction found, -1 for none.
-    overlap
-        ``(N,)`` IoU of the two.
-    ignored
-        ``(N,)`` whether the prediction is neither right nor wrong.
-    usable
-        Rows of the labels that are scored.
-    """
-
-    partner: NDArray[np.intp]
-    overlap: NDArray[np.float64]
-    ignored: NDArray[np.bool_]
-    usable: NDArray[np.intp]
-
-
-def match_detections(
-    predictions: FrameBoxes,
-    labels: FrameBoxes,
-    keys: list[FrameKey],
-    limit: float,
-    *,
-    ignored_as_regions: bool = False,
-) -> Matching:
-    """Match each frame greedily by score, then find what is neutral among the rest.
-
-    Parameters
-    ----------
-    predictions, labels
-        Found and true boxes.
-    keys
-        The frames to match in.
-    limit
-        Least IoU of a match.
-    ignored_as_regions
-        As in `evaluate_detections`.
-    """
-    count = len(predictions)
-    scores = np.zeros(count) if predictions.scores is None else predictions.scores
-    partner, overlap, ignored = np.full(count, -1, np.intp), np.zeros(count), np.zeros(count, np.bool_)
-    usable: list[int] = []
-    for key in keys:
-        here, rows = predictions.rows(key), labels.rows(key)
-        targets = rows[~labels.ignore[rows]]
-        usable += targets.tolist()
-        overlaps = iou_matrix(predictions.boxes[here], labels.boxes[targets])
-        best = overlaps.max(axis=1, initial=0)
-        for index in np.lexsort((-best, -scores[here])) if len(targets) else ():
-            target = int(np.argmax(overlaps[index]))
-            if overlaps[index, target] >= limit:
-                partner[here[index]], overlap[here[index]] = targets[target], overlaps[index, target]
-                overlaps[:, target] = -1
-        rest = here[partner[here] < 0]
-        ignored[rest] = find_ignored(
-            predictions.boxes[rest], labels, rows, limit, as_regions=ignored_as_regions
-        )
-    return Matching(partner, overlap, ignored, np.array(usable, np.intp))
+def best_f1(
+    precision: NDArray[np.float64], recall: NDArray[np.float64], thresholds: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Best F1 of a precision-recall curve, and the first threshold that reaches it; ``(0, NaN)`` if empty."""
+    if not len(thresholds):
+        return 0.0, math.nan
+    recall = np.nan_to_num(recall)  # NaN: no vehicle is labelled
+    f1 = 2 * precision * recall / np.maximum(precision + recall, 1e-9)
+    # The tolerance makes equal F1 from different counts tie in spite of rounding errors.
+    best = int(np.argmax(f1 >= f1.max() - 1e-12))
+    return float(f1.max()), float(thresholds[best])
 
 
 def _curve(
-    predictions: FrameBoxes, found: Matching
+    predictions: FrameBoxes, found: DetectionMatches
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Precision, recall and threshold for every distinct score, highest first.
 
-    A greedy match depends on higher scores alone, so the match at a threshold is a prefix of the whole.
+    A greedy match depends on higher scores only, so one matching serves all thresholds.
     """
-    counted = np.flatnonzero(~found.ignored)
-    scores = np.zeros(len(counted)) if predictions.scores is None else predictions.scores[counted]
+    scored = np.flatnonzero(~found.ignored)
+    scores = np.zeros(len(scored)) if predictions.scores is None else predictions.scores[scored]
     order = np.argsort(-scores, kind="stable")
-    hits = np.cumsum(found.partner[counted][order] >= 0)
+    hits = np.cumsum(found.match[scored][order] >= 0)
     last = np.flatnonzero(np.diff(scores[order], append=-np.inf))
     recall = hits[last] / len(found.usable) if len(found.usable) else np.full(len(last), np.nan)
     return hits[last] / (last + 1), recall, scores[order][last]

@@ -1,52 +1,33 @@
-"""What the scores of detections and of tracks share: their frames, what is neutral, ratios and summaries."""
+"""Match detections to labels frame by frame, and find the detections to be ignored."""
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from vehicle_detection._common import describe
 from vehicle_detection.boxes import box_areas, intersection_matrix, iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation.labels import NO_TRACK, FrameBoxes, FrameKey, check_keys, frame_order
+from vehicle_detection.evaluation.frame_boxes import NO_TRACK, FrameBoxes, FrameKey, check_keys, frame_order
 
-# Share of a box that lies in an ignored box which is taken as a region.
-_WITHIN = 0.5
-
-
-@dataclass(frozen=True)
-class Scores:
-    """What both kinds of scores can do."""
-
-    def summary(self) -> str:
-        """Say the scores in a few aligned lines."""
-        raise NotImplementedError
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers, ready for JSON; a ratio with nothing to count is None."""
-        return {key: _plain(value) for key, value in dataclasses.asdict(self).items()}
-
-    def __str__(self) -> str:
-        return self.summary()
+# With ignored_as_regions: a detection is ignored from this fraction of its area inside an ignored box on.
+_MIN_INSIDE = 0.5
 
 
-def prepare_sides(
+def prepare_evaluation(
     predictions: FrameBoxes, labels: FrameBoxes, frames: Sequence[FrameKey] | None
 ) -> tuple[FrameBoxes, FrameBoxes, list[FrameKey]]:
-    """Check both sides, drop predictions that are to be ignored, and list the frames in order."""
+    """Check both sides, drop the predictions marked ``ignore``, and list the frames in order."""
     for name, side in (("predictions", predictions), ("labels", labels)):
         if not isinstance(side, FrameBoxes):
             raise InvalidInputError(
-                f"{name} must be Labels, got {describe(side)}; read a file with read_labels or convert the "
-                "Detections of each frame with Labels.from_detections"
+                f"{name} must be FrameBoxes, got {describe(side)}; read a file with read_labels or convert "
+                "the Detections of each frame with FrameBoxes.from_detections"
             )
     predictions = predictions[~predictions.ignore]
     given = None if frames is None else check_keys(frames, "frames")
@@ -55,23 +36,24 @@ def prepare_sides(
     if len({type(key) for key in first.values()}) > 1:
         listed = ", ".join(f"{key!r} in {name}" for name, key in first.items())
         raise InvalidInputError(
-            f"frames must go by numbers or by names throughout, got {listed}; convert with Labels.renamed"
+            f"frame keys must be all numbers or all names, got {listed}; convert with FrameBoxes.renamed"
         )
     if given is not None:
-        return predictions, labels, _given_frames(predictions, given)
-    # Without a frame in common, names that differ by folder or suffix alone are a slip, not a result of 0.
+        return predictions, labels, _check_frames(predictions, given)
+    # If no frame matches and names differ only by folder or suffix, that is a mistake, not an F1 of 0.
     ours, theirs = set(predictions.frames), set(labels.frames)
     if not ours & theirs:
         stems = [{PurePosixPath(str(key)).stem for key in side} for side in (ours, theirs)]
         if stems[0] & stems[1]:
             raise InvalidInputError(
                 f"predictions and labels name their frames differently: {predictions.frames[0]!r} and "
-                f"{labels.frames[0]!r}; convert with Labels.renamed"
+                f"{labels.frames[0]!r}; convert with FrameBoxes.renamed"
             )
     return predictions, labels, sorted({*predictions.frame_keys, *labels.frame_keys}, key=frame_order)
 
 
-def _given_frames(predictions: FrameBoxes, frames: tuple[FrameKey, ...]) -> list[FrameKey]:
+def _check_frames(predictions: FrameBoxes, frames: tuple[FrameKey, ...]) -> list[FrameKey]:
+    """Frames in order: numbers sorted, names as given."""
     known = set(frames)
     if len(known) < len(frames):
         twice = next(key for key, count in Counter(frames).items() if count > 1)
@@ -89,54 +71,66 @@ def find_ignored(
     boxes: NDArray[np.float64],
     labels: FrameBoxes,
     rows: NDArray[np.intp],
-    limit: float,
+    min_iou: float,
     *,
     as_regions: bool = False,
 ) -> NDArray[np.bool_]:
-    """Whether each box lies with its center in a region, or covers an ignored box, of the label `rows`.
+    """Which boxes have their center in a region, or overlap an ignored box, among the label `rows`.
 
-    With `as_regions` also whether half of it or more lies in an ignored box, whatever that is.
+    With `as_regions` also those of which at least half lies in an ignored box.
     """
     ignored = rows[labels.ignore[rows]]
     regions = labels.boxes[ignored[labels.tracks[ignored] == NO_TRACK]]
     center = (boxes[:, :2] + boxes[:, 2:]) / 2
     inside = (regions[:, :2] <= center[:, None]) & (center[:, None] < regions[:, 2:])
-    covers = iou_matrix(boxes, labels.boxes[ignored]) >= limit
+    covers = iou_matrix(boxes, labels.boxes[ignored]) >= min_iou
     if as_regions:
         shared = intersection_matrix(boxes, labels.boxes[ignored])
-        covers |= shared >= np.maximum(_WITHIN * box_areas(boxes)[:, None], 1e-9)
+        covers |= shared >= np.maximum(_MIN_INSIDE * box_areas(boxes)[:, None], 1e-9)
     return np.asarray(inside.all(axis=2).any(axis=1) | covers.any(axis=1))
 
 
-def rates(tp: int, fp: int, fn: int) -> tuple[int, int, int, float, float, float]:
-    """Put precision, recall and F1 beside the counts."""
-    return tp, fp, fn, ratio(tp, tp + fp), ratio(tp, tp + fn), ratio(2 * tp, 2 * tp + fp + fn)
+@dataclass(frozen=True)
+class DetectionMatches:
+    """The result of matching N predictions to labels."""
+
+    match: NDArray[np.intp]  # (N,) row of the matched label, -1 for none
+    iou: NDArray[np.float64]  # (N,) IoU with it
+    ignored: NDArray[np.bool_]  # (N,) whether the prediction counts neither as right nor as wrong
+    usable: NDArray[np.intp]  # rows of the labels that are scored
+
+    @property
+    def missed(self) -> NDArray[np.intp]:
+        """Rows of the scored labels that no prediction matches."""
+        return np.setdiff1d(self.usable, self.match)
 
 
-def ratio(part: float, whole: float) -> float:
-    """Divide; NaN where there is nothing to count."""
-    return part / whole if whole else math.nan
-
-
-def mean(values: ArrayLike) -> float:
-    """Average; NaN for no values."""
-    array = np.asarray(values, np.float64)
-    return float(array.mean()) if array.size else math.nan
-
-
-def _plain(value: Any) -> Any:
-    """Turn NaN into None, at any depth: JSON knows no NaN."""
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
-    return None if isinstance(value, float) and math.isnan(value) else value
-
-
-def as_text(value: float) -> str:
-    """Write a ratio or length of a summary."""
-    return "n/a" if math.isnan(value) else f"{value:.3f}"
-
-
-def as_lines(title: str, rows: dict[str, str]) -> str:
-    """Lay out a summary: a title, and under it a line for each name with its text."""
-    width = max(map(len, rows))
-    return "\n".join([title, *(f"  {name:<{width}}  {text}" for name, text in rows.items())])
+def match_detections(
+    predictions: FrameBoxes,
+    labels: FrameBoxes,
+    keys: Sequence[FrameKey],
+    min_iou: float,
+    *,
+    ignored_as_regions: bool = False,
+) -> DetectionMatches:
+    """Match each frame of `keys` greedily by score, then find the unmatched predictions to be ignored."""
+    count = len(predictions)
+    scores = np.zeros(count) if predictions.scores is None else predictions.scores
+    match, iou, ignored = np.full(count, -1, np.intp), np.zeros(count), np.zeros(count, np.bool_)
+    usable: list[int] = []
+    for key in keys:
+        here, rows = predictions.rows(key), labels.rows(key)
+        targets = rows[~labels.ignore[rows]]
+        usable += targets.tolist()
+        overlaps = iou_matrix(predictions.boxes[here], labels.boxes[targets])
+        best = overlaps.max(axis=1, initial=0)
+        for index in np.lexsort((-best, -scores[here])) if len(targets) else ():
+            target = int(np.argmax(overlaps[index]))
+            if overlaps[index, target] >= min_iou:
+                match[here[index]], iou[here[index]] = targets[target], overlaps[index, target]
+                overlaps[:, target] = -1
+        rest = here[match[here] < 0]
+        ignored[rest] = find_ignored(
+            predictions.boxes[rest], labels, rows, min_iou, as_regions=ignored_as_regions
+        )
+    return DetectionMatches(match, iou, ignored, np.array(usable, np.intp))

@@ -1,4 +1,4 @@
-"""Label and prediction files of any layout; all are checked in one place and refused for the same faults."""
+"""Read label and prediction files: CSV, KITTI, MOTChallenge and COCO."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import numpy as np
 from vehicle_detection._common import check_choice
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import DatasetError
-from vehicle_detection.evaluation.labels import NO_TRACK, FrameBoxes, FrameKey, frame_order
+from vehicle_detection.evaluation.frame_boxes import NO_TRACK, FrameBoxes, FrameKey, frame_order
 
 LABEL_COLUMNS = ("frame", "track", "x1", "y1", "x2", "y2", "occluded", "truncated", "ignore")
 PREDICTION_COLUMNS = ("frame", "track_id", "x1", "y1", "x2", "y2", "score")
@@ -26,14 +26,14 @@ VEHICLE_CLASSES = ("car", "van", "truck", "bus", "vehicle")
 LOOKALIKE_CLASSES = ("tram", "train", "misc", "trailer", "caravan", "autorickshaw", "vehicle fallback")
 PERSON_CLASSES = ("pedestrian", "person_sitting", "cyclist")
 
-# What the project's own labels leave unscored: largely hidden, cut off, too small.
-HIDDEN, CUT_OFF, NARROW = 2, 0.7, 40.0
+# The project's labels do not score vehicles that are largely hidden, truncated by more, or narrower (px).
+_HIDDEN, _MAX_TRUNCATED, _MIN_WIDTH = 2, 0.7, 40.0
 
 
 class Row(NamedTuple):
-    """One box as a reader found it; `where` names its file and line."""
+    """One box as read from a file."""
 
-    where: str
+    where: str  # file and line, for error messages
     frame: FrameKey
     track: int
     box: tuple[float, float, float, float]
@@ -45,32 +45,32 @@ class Row(NamedTuple):
     speed_mps: float = math.nan
 
 
-Found = tuple[list[Row], list[FrameKey]]
+Rows = tuple[list[Row], list[FrameKey]]
+"""The rows of a file, and the frames that it lists, which may have no row."""
 
 
-def read_text(file: Path) -> str:
-    """Read a whole file."""
+def _read_text(file: Path) -> str:
     try:
         return file.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise DatasetError(f"{file} is no UTF-8 text; save it as UTF-8") from None
+        raise DatasetError(f"{file} is not UTF-8 text; save it as UTF-8") from None
     except OSError as error:
         raise DatasetError(f"{file} cannot be read: {error.strerror}") from error
 
 
-def split_words(line: str) -> list[str]:
-    """Split a line at commas and blanks."""
+def _split_words(line: str) -> list[str]:
+    """Split a line at commas and white space."""
     return re.split(r"\s*,\s*|\s+", line.strip())
 
 
 def _number(text: str, name: str, where: str, *, low: float = -math.inf, high: float = math.inf) -> float:
-    """One finite number in ``[low, high]``."""
+    """Parse a finite number in ``[low, high]``."""
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        hint = "; write decimals with a point" if re.fullmatch(r"\s*-?\d+,\d+\s*", text) else ""
+        hint = "; use a decimal point" if re.fullmatch(r"\s*-?\d+,\d+\s*", text) else ""
         raise DatasetError(f"{where}: {name} must be a finite number, got {text!r}{hint}")
     if not low <= value <= high:
         bound = f"at least {low:g}" if value < low else f"at most {high:g}"
@@ -78,23 +78,23 @@ def _number(text: str, name: str, where: str, *, low: float = -math.inf, high: f
     return value
 
 
-def _whole(text: str, name: str, where: str, *, low: int) -> int:
+def _integer(text: str, name: str, where: str, *, low: int) -> int:
     value = _number(text, name, where, low=low, high=2.0**53)
     if value != int(value):
         raise DatasetError(f"{where}: {name} must be a whole number, got {text!r}")
     return int(value)
 
 
-def _read_csv(source: Path, classes: Collection[str] | None) -> Found:
-    del classes  # The columns hold vehicles only.
-    text = read_text(source)
+def _read_csv(source: Path, classes: Collection[str] | None) -> Rows:
+    del classes  # these files hold vehicles only
+    text = _read_text(source)
     header = text.split("\n", 1)[0]
     separator = max(",;\t", key=header.count)
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
     try:
         lines = [(reader.line_num, line) for line in reader]
     except csv.Error as error:
-        raise DatasetError(f"{source} line {reader.line_num}: no CSV text ({error})") from None
+        raise DatasetError(f"{source} line {reader.line_num}: not CSV text ({error})") from None
     names = [" ".join(name.split()).lower() for name in lines[0][1]] if lines else []
     predicted = "track_id" in names or ("score" in names and "track" not in names)
     expected = PREDICTION_COLUMNS if predicted else LABEL_COLUMNS
@@ -113,17 +113,17 @@ def _read_csv(source: Path, classes: Collection[str] | None) -> Found:
         if not any(cell.strip() for cell in line):
             continue
         if len(line) != len(names):
-            raise DatasetError(f"{where}: {len(names)} columns are expected, found {len(line)}")
+            raise DatasetError(f"{where}: expected {len(names)} columns, found {len(line)}")
         records.append((where, dict(zip(names, (cell.strip() for cell in line)))))
-    # A number with leading zeros is a name; one with a sign or a decimal point is a number, checked below.
+    # A number with leading zeros is a file name; signs and decimal points are checked below.
     counted = all(re.fullmatch(r"-?(0|[1-9][0-9]*)(\.0*)?", record["frame"]) for _, record in records)
     return [_csv_row(where, record, predicted, counted) for where, record in records], []
 
 
 def _csv_row(where: str, record: dict[str, str], predicted: bool, counted: bool) -> Row:
     if not record["frame"]:
-        raise DatasetError(f"{where}: frame is empty; give its number from 0 or its file name")
-    frame: FrameKey = _whole(record["frame"], "frame", where, low=0) if counted else record["frame"]
+        raise DatasetError(f"{where}: frame is empty; enter its number from 0 or its file name")
+    frame: FrameKey = _integer(record["frame"], "frame", where, low=0) if counted else record["frame"]
     x1, y1, x2, y2 = (_number(record[name], name, where) for name in ("x1", "y1", "x2", "y2"))
     if predicted:
         track = record["track_id"]
@@ -135,7 +135,7 @@ def _csv_row(where: str, record: dict[str, str], predicted: bool, counted: bool)
         return Row(
             where,
             frame,
-            _whole(track, "track_id", where, low=NO_TRACK) if track else NO_TRACK,
+            _integer(track, "track_id", where, low=NO_TRACK) if track else NO_TRACK,
             (x1, y1, x2, y2),
             score=_number(record["score"], "score", where),
             distance_m=distance,
@@ -147,15 +147,15 @@ def _csv_row(where: str, record: dict[str, str], predicted: bool, counted: bool)
     return Row(
         where,
         frame,
-        _whole(record["track"], "track", where, low=NO_TRACK),
+        _integer(record["track"], "track", where, low=NO_TRACK),
         (x1, y1, x2, y2),
-        _whole(record["occluded"], "occluded", where, low=0),
+        _integer(record["occluded"], "occluded", where, low=0),
         _number(record["truncated"], "truncated", where, low=0, high=1),
         flag,
     )
 
 
-def _read_kitti(source: Path, classes: Collection[str] | None) -> Found:
+def _read_kitti(source: Path, classes: Collection[str] | None) -> Rows:
     files = (
         sorted(source.glob("*.txt"), key=lambda file: frame_order(file.name)) if source.is_dir() else [source]
     )
@@ -163,7 +163,7 @@ def _read_kitti(source: Path, classes: Collection[str] | None) -> Found:
         raise DatasetError(f"{source} holds no .txt file; name a KITTI label_2 folder or a label file")
     rows: list[Row] = []
     for file in files:
-        for number, line in enumerate(read_text(file).splitlines(), 1):
+        for number, line in enumerate(_read_text(file).splitlines(), 1):
             if line.strip():
                 row = _kitti_row(f"{file} line {number}", file.stem, len(rows), line.split(), classes)
                 rows += [row] if row else []
@@ -173,7 +173,7 @@ def _read_kitti(source: Path, classes: Collection[str] | None) -> Found:
 def _kitti_row(
     where: str, frame: str, number: int, words: list[str], classes: Collection[str] | None
 ) -> Row | None:
-    """One KITTI object; None for a person. KITTI's stills have no tracks: every box gets its own number."""
+    """One KITTI object; None for a person. KITTI images have no tracks, so every box gets its own number."""
     if len(words) not in (15, 16):
         raise DatasetError(f"{where}: a KITTI object has 15 values (16 with a score), found {len(words)}")
     name = words[0].lower()
@@ -186,31 +186,29 @@ def _kitti_row(
     wanted = name in (VEHICLE_CLASSES if classes is None else classes)
     if not wanted and name in PERSON_CLASSES:
         return None
-    # Results carry -1 for what a detector does not know; 3 is KITTI's "unknown".
+    # Results hold -1 for unknown values; an occlusion of 3 is KITTI's "unknown".
     truncated = min(max(_number(words[1], "truncated", where), 0.0), 1.0)
-    occluded = min(max(int(_number(words[2], "occluded", where)), 0), HIDDEN)
-    unfit = occluded >= HIDDEN or truncated > CUT_OFF or x2 - x1 < NARROW
-    ignore = not wanted or (unfit and score is None)
+    occluded = min(max(int(_number(words[2], "occluded", where)), 0), _HIDDEN)
+    unscored = occluded >= _HIDDEN or truncated > _MAX_TRUNCATED or x2 - x1 < _MIN_WIDTH
+    ignore = not wanted or (unscored and score is None)
     return Row(where, frame, number, (x1, y1, x2, y2), occluded, truncated, ignore, score)
 
 
-def _read_mot(source: Path, classes: Collection[str] | None) -> Found:
+def _read_mot(source: Path, classes: Collection[str] | None) -> Rows:
     rows: list[Row] = []
-    for number, line in enumerate(read_text(source).splitlines(), 1):
-        words, where = split_words(line.strip().rstrip(",")), f"{source} line {number}"
+    for number, line in enumerate(_read_text(source).splitlines(), 1):
+        words, where = _split_words(line.strip().rstrip(",")), f"{source} line {number}"
         if words == [""]:
             continue
         if len(words) < 6:
-            raise DatasetError(
-                f"{where}: frame, id, x, y, width, height are expected, found {len(words)} values"
-            )
-        frame = _whole(words[0], "frame (counted from 1)", where, low=1) - 1
-        track = _whole(words[1], "id", where, low=NO_TRACK)
+            raise DatasetError(f"{where}: expected frame, id, x, y, width, height, found {len(words)} values")
+        frame = _integer(words[0], "frame (counted from 1)", where, low=1) - 1
+        track = _integer(words[1], "id", where, low=NO_TRACK)
         x, y, width, height = (
             _number(word, name, where) for word, name in zip(words[2:6], ("x", "y", "width", "height"))
         )
         box = (x, y, x + width, y + height)
-        # Nine columns are ground truth: flag, class, visibility. Results have -1 for class, or ten columns.
+        # Ground truth has nine columns, the last ones flag, class, visibility. Results have class -1 or ten.
         if len(words) == 9 and words[7] != "-1":
             if classes is None or words[7] in classes:
                 rows.append(Row(where, frame, track, box, ignore=_number(words[6], "flag", where) == 0))
@@ -220,33 +218,33 @@ def _read_mot(source: Path, classes: Collection[str] | None) -> Found:
     return rows, []
 
 
-def _read_coco(source: Path, classes: Collection[str] | None) -> Found:
+def _read_coco(source: Path, classes: Collection[str] | None) -> Rows:
     try:
-        data = json.loads(read_text(source))
+        data = json.loads(_read_text(source))
     except json.JSONDecodeError as error:
-        raise DatasetError(f"{source} line {error.lineno}: no JSON text ({error.msg})") from None
+        raise DatasetError(f"{source} line {error.lineno}: not JSON text ({error.msg})") from None
     parts = data if isinstance(data, dict) else {}
     missing = [
         name for name in ("images", "annotations", "categories") if not isinstance(parts.get(name), list)
     ]
     if missing:
-        raise DatasetError(f"{source} is no COCO file: it lacks the lists {', '.join(missing)}")
+        raise DatasetError(f"{source} is not a COCO file: it lacks the lists {', '.join(missing)}")
     try:
         images = {image["id"]: image.get("file_name", image["id"]) for image in data["images"]}
         names = {entry["id"]: str(entry["name"]).lower() for entry in data["categories"]}
     except (KeyError, TypeError, AttributeError):
         raise DatasetError(
-            f"{source}: every image and category needs an id, and a category its name"
+            f"{source}: every image and category needs an id, and every category a name"
         ) from None
     if {*map(type, images.values())} not in (set(), {int}, {str}):
-        raise DatasetError(f"{source}: give every image its file_name, or none and an integer id")
+        raise DatasetError(f"{source}: give every image a file_name, or none of them and integer ids")
     if len(set(images.values())) < len(data["images"]):
-        raise DatasetError(f"{source}: two images share an id or a file_name; give each its own")
+        raise DatasetError(f"{source}: two images share an id or a file_name; make them unique")
     wanted = VEHICLE_CLASSES if classes is None else classes
     if data["annotations"] and not set(names.values()) & set(wanted):
         raise DatasetError(
             f"{source} has no category among {', '.join(wanted)}; found "
-            f"{', '.join(map(repr, names.values())) or 'none'}; name those that are vehicles with classes="
+            f"{', '.join(map(repr, names.values())) or 'none'}; name those of vehicles with classes="
         )
     rows: list[Row] = []
     for number, entry in enumerate(data["annotations"]):
@@ -256,7 +254,7 @@ def _read_coco(source: Path, classes: Collection[str] | None) -> Found:
             frame, name = images[entry["image_id"]], names[entry["category_id"]]
         except (KeyError, TypeError, ValueError) as error:
             raise DatasetError(
-                f"{where}: it needs bbox [x, y, width, height] and the image_id and category_id of an image "
+                f"{where}: expected bbox [x, y, width, height] and the image_id and category_id of an image "
                 f"and a category in the file ({error})"
             ) from None
         if name not in wanted and name not in LOOKALIKE_CLASSES:
@@ -268,7 +266,7 @@ def _read_coco(source: Path, classes: Collection[str] | None) -> Found:
             Row(
                 where,
                 frame,
-                NO_TRACK if crowd or track is None else _whole(str(track), "track_id", where, low=NO_TRACK),
+                NO_TRACK if crowd or track is None else _integer(str(track), "track_id", where, low=NO_TRACK),
                 (x, y, x + width, y + height),
                 ignore=crowd or bool(entry.get("ignore")) or name not in wanted,
                 score=None if score is None else _number(str(score), "score", where),
@@ -277,7 +275,7 @@ def _read_coco(source: Path, classes: Collection[str] | None) -> Found:
     return rows, list(images.values())
 
 
-READERS: dict[str, Callable[[Path, Collection[str] | None], Found]] = {
+_READERS: dict[str, Callable[[Path, Collection[str] | None], Rows]] = {
     "csv": _read_csv,
     "kitti": _read_kitti,
     "mot": _read_mot,
@@ -298,38 +296,39 @@ def read_labels(
     ----------
     path
         A CSV file (``frame,track,x1,y1,x2,y2,occluded,truncated,ignore`` or, for predictions,
-        ``frame,track_id,x1,y1,x2,y2,score[,distance_m,speed_mps]``; more columns may follow, the
+        ``frame,track_id,x1,y1,x2,y2,score[,distance_m,speed_mps]``; further columns are skipped, the
         separator is a comma, semicolon or tab), a KITTI ``label_2`` folder, a MOTChallenge text file or
         a COCO JSON file.
     format
-        ``"csv"``, ``"kitti"``, ``"mot"`` or ``"coco"``; None tells by suffix and content.
+        ``"csv"``, ``"kitti"``, ``"mot"`` or ``"coco"``; None chooses by suffix and content.
     classes
-        KITTI types, COCO category names or MOT class numbers that are vehicles, in any case. None takes
-        car, van, truck, bus and vehicle, and every row of a MOT file.
+        KITTI types, COCO category names or MOT class numbers that are vehicles, in upper or lower case.
+        None takes car, van, truck, bus and vehicle, and every row of a MOT file.
     shape
-        ``(height, width, ...)`` of the frames: boxes are clipped to it. None leaves them as they are.
+        ``(height, width, ...)`` of the frames, to which boxes are clipped. None does not clip them.
 
     Returns
     -------
-    Labels
-        Boxes in half-open pixels. CSV frames are int where all of them are whole numbers, else str.
-        KITTI frames are the files' names without ``.txt``, COCO frames the images' ``file_name``, and
-        MOT frames, 1-based in the file, are counted from 0.
+    FrameBoxes
+        Boxes in half-open pixels. CSV frames are int if all of them are whole numbers, else str. KITTI
+        frames are the files' names without ``.txt``, COCO frames the images' ``file_name``, and MOT frames,
+        which count from 1 in the file, count from 0.
 
     Raises
     ------
     DatasetError
-        If the file is missing, is of none of these layouts, or holds a faulty row; the message names the
-        line: no finite number, a box without area, a track twice in a frame, a box outside `shape`.
+        If the file is missing, has none of these formats, or holds an invalid row; the message names the
+        line: a value that is not a finite number, a box without area, a track twice in a frame, a box
+        outside `shape`.
     InvalidInputError
         If `format` or `shape` is none of the values above.
 
     Notes
     -----
-    KITTI's ``DontCare`` and COCO's crowds become regions to ignore; trams, trailers and the like become
-    boxes to ignore, as do KITTI's vehicles that are largely hidden, cut off by more than 0.7 or under
-    40 px wide: the rule of the project's own labels. Persons and all else are left out. A MOT file with
-    nine columns is ground truth, whose rows with flag 0 are ignored; in others column seven is the score.
+    KITTI's ``DontCare`` and COCO's crowds become regions; trams, trailers and the like become ignored boxes,
+    as do KITTI's vehicles that are largely hidden, truncated by more than 0.7 or narrower than 40 px, the
+    same rule as in the project's labels. Persons and all other classes are left out. A MOT file with nine
+    columns is ground truth, whose rows with flag 0 are ignored; in others column seven is the score.
 
     Examples
     --------
@@ -340,19 +339,21 @@ def read_labels(
     """
     source = Path(path)
     if format is not None:
-        check_choice(format, "format", tuple(READERS))
+        check_choice(format, "format", tuple(_READERS))
     if not source.exists():
         raise DatasetError(f"{source} does not exist; check the path")
     kind = format or _guess_format(source)
     if source.is_dir() and kind != "kitti":
-        raise DatasetError(f"{source} is a folder, and {kind} labels are one file; name the file in it")
+        raise DatasetError(
+            f"{source} is a folder, and {kind} labels are one file; pass the path of that file"
+        )
     chosen = None if classes is None else frozenset(str(name).lower() for name in classes)
-    rows, keys = READERS[kind](source, chosen)
+    rows, keys = _READERS[kind](source, chosen)
     return _assemble(rows, keys, shape)
 
 
 def _assemble(rows: list[Row], keys: list[FrameKey], shape: tuple[int, ...] | None) -> FrameBoxes:
-    """Check the rows of any format and make them columns."""
+    """Check the rows of any format, and return them as columns."""
     boxes = np.array([row.box for row in rows], np.float64).reshape(-1, 4)
     scored = [row.score is not None for row in rows]
     first: dict[tuple[FrameKey, int], str] = {}
@@ -360,7 +361,7 @@ def _assemble(rows: list[Row], keys: list[FrameKey], shape: tuple[int, ...] | No
         x1, y1, x2, y2 = row.box
         if not all(map(math.isfinite, row.box)):
             raise DatasetError(f"{row.where}: a box needs finite corners, got {list(row.box)}")
-        # A prediction cut at the border may have no area left; a label without area is a slip of the hand.
+        # A prediction clipped at the border may have no area; a label without area is a mistake.
         if x2 < x1 or y2 < y1 or (not has_score and (x2 == x1 or y2 == y1)):
             raise DatasetError(f"{row.where}: a box needs x1 < x2 and y1 < y2, got {list(row.box)}")
         if row.track != NO_TRACK:
@@ -395,14 +396,14 @@ def _assemble(rows: list[Row], keys: list[FrameKey], shape: tuple[int, ...] | No
 
 
 def _guess_format(source: Path) -> str:
-    """Tell a layout by its suffix, and where that says nothing by its first line."""
+    """Choose the format by the suffix or else by the first line."""
     if source.is_dir():
         return "kitti"
     by_suffix = {".json": "coco", ".csv": "csv", ".tsv": "csv"}.get(source.suffix.lower())
     if by_suffix:
         return by_suffix
-    start = read_text(source).lstrip()[:4096]
-    words = split_words(start.splitlines()[0]) if start else [""]
+    start = _read_text(source).lstrip()[:4096]
+    words = _split_words(start.splitlines()[0]) if start else [""]
     if start.startswith(("{", "[")):
         return "coco"
     if re.fullmatch(r"[0-9]+(\.0*)?", words[0]):

@@ -1,4 +1,4 @@
-"""Tracks against labelled vehicles: CLEAR MOT, identity and steadiness."""
+"""Score tracks against labelled vehicles: CLEAR MOT metrics, IDF1 and jitter."""
 
 from __future__ import annotations
 
@@ -13,51 +13,50 @@ from numpy.typing import NDArray
 from vehicle_detection._common import check_number
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation.labels import NO_TRACK, FrameBoxes, FrameKey
-from vehicle_detection.evaluation.matching import (
+from vehicle_detection.evaluation.detections import (
     Scores,
-    as_lines,
-    as_text,
-    find_ignored,
+    format_number,
+    format_summary,
     mean,
-    prepare_sides,
     rates,
     ratio,
 )
+from vehicle_detection.evaluation.frame_boxes import NO_TRACK, FrameBoxes, FrameKey
+from vehicle_detection.evaluation.matching import find_ignored, prepare_evaluation
 
 
 @dataclass(frozen=True)
 class TrackScores(Scores):
-    """What `evaluate_tracks` found.
+    """Result of `evaluate_tracks`.
 
     Attributes
     ----------
     frames
         Number of evaluated frames.
     iou
-        Overlap from which a tracked box matches a vehicle.
+        Smallest IoU of a match.
     vehicles, tracks
-        Number of labelled vehicles, and of predicted tracks with a box that counts.
+        Number of labelled vehicles, and of predicted tracks with a box that is not ignored.
     tp, fp, fn
-        Boxes on a vehicle, boxes on none, vehicles without a box, each summed over the frames.
+        Numbers of boxes on a vehicle, boxes on none, and vehicles without a box, summed over the frames.
     ignored
-        Boxes that are neither right nor wrong.
+        Number of ignored boxes, which count neither as right nor as wrong.
     precision, recall, f1
-        Of the tracked boxes, as in `DetectionScores`.
+        Ratios of the tracked boxes, as in `DetectionScores`.
     mean_iou
-        Mean overlap of the matched pairs.
+        Mean IoU of the matched pairs.
     jitter
-        Mean change of a matched box's four edge errors from one frame to the next, in pixels.
+        Mean change of the four edge errors of a matched box from one frame to the next, in pixels.
     mota
         ``1 - (fn + fp + id_switches) / (tp + fn)``; at most 1, and below 0 if errors outnumber vehicles.
     idf1
-        F1 of the boxes under the best one-to-one pairing of vehicles and tracks over the whole clip.
+        F1 of the boxes under the best one-to-one assignment of tracks to vehicles over the whole clip.
     id_switches
-        Times a vehicle is matched by another track than the last one that matched it.
+        Number of times a vehicle is matched by another track than the one that matched it last.
     fragmentations
-        Times a vehicle is lost and found again.
+        Number of times a vehicle is lost and found again.
     longest_false_positive_run
-        Most evaluated frames in a row in which one track is on no vehicle and not on ignored ground.
+        Largest number of consecutive evaluated frames in which one track is a false positive.
     """
 
     frames: int
@@ -80,49 +79,48 @@ class TrackScores(Scores):
     longest_false_positive_run: int
 
     def summary(self) -> str:
-        """Say the scores in a few aligned lines."""
+        """Return the scores as a few aligned lines."""
+        f1, precision, recall = map(format_number, (self.f1, self.precision, self.recall))
         rows = {
-            "MOTA": as_text(self.mota),
-            "IDF1": as_text(self.idf1),
-            "F1": f"{as_text(self.f1)} (precision {as_text(self.precision)}, recall {as_text(self.recall)})",
-            "mean IoU": as_text(self.mean_iou),
-            "jitter": f"{as_text(self.jitter)} px a frame",
+            "MOTA": format_number(self.mota),
+            "IDF1": format_number(self.idf1),
+            "F1": f"{f1} (precision {precision}, recall {recall})",
+            "mean IoU": format_number(self.mean_iou),
+            "jitter": f"{format_number(self.jitter)} px a frame",
             "identity switches": str(self.id_switches),
             "fragmentations": str(self.fragmentations),
             "longest false run": f"{self.longest_false_positive_run} frames",
             "boxes": f"{self.tp} found, {self.fn} missed, {self.fp} false, {self.ignored} ignored",
         }
-        title = (
-            f"{self.tracks} tracks of {self.vehicles} vehicles in {self.frames} frames at IoU {self.iou:g}"
-        )
-        return as_lines(title, rows)
+        counts = f"{self.tracks} tracks of {self.vehicles} vehicles in {self.frames} frames"
+        return format_summary(f"{counts} at IoU {self.iou:g}", rows)
 
 
 def evaluate_tracks(
     predictions: FrameBoxes, labels: FrameBoxes, *, iou: float = 0.5, frames: Sequence[FrameKey] | None = None
 ) -> TrackScores:
-    """Score tracks against labels: CLEAR MOT, identity and steadiness.
+    """Score tracks against labels: CLEAR MOT metrics, IDF1 and jitter.
 
-    A vehicle keeps the track that it was matched with last, as long as they overlap enough; the others are
-    paired for the greatest number of matches and, among those, the greatest overlap. The counts equal those
-    of the package motmetrics.
+    A vehicle keeps the track that matched it last as long as their IoU is large enough; the rest are assigned
+    for the largest number of matches and, among those, the largest total IoU. The counts equal those of the
+    package motmetrics.
 
     Parameters
     ----------
     predictions
         Tracked boxes, each with its track. Rows marked ``ignore`` are left out.
     labels
-        True boxes, each with its track unless it is to be ignored.
+        True boxes, each with its track unless it is marked ``ignore``.
     iou
-        Overlap in (0, 1] from which a tracked box matches a vehicle, or covers an ignored box.
+        Smallest IoU, in (0, 1], at which a tracked box matches a label or is ignored with an ignored box.
     frames
-        All evaluated frames, as in `evaluate_detections`; names stay in the order they are given in.
+        All evaluated frames, as in `evaluate_detections`; names keep the given order.
 
     Returns
     -------
     TrackScores
-        Counts and ratios. Frames follow each other where their numbers differ by the least difference
-        that occurs, which is 1 unless only every n-th frame is labelled; named frames in their order.
+        Counts and ratios. Frames are consecutive if their numbers differ by the smallest difference that
+        occurs, which is 1 unless only every n-th frame is labelled; named frames in their order.
 
     Raises
     ------
@@ -133,65 +131,61 @@ def evaluate_tracks(
     -----
     MOTA, switches and fragmentations: Bernardin and Stiefelhagen, "Evaluating multiple object tracking
     performance: the CLEAR MOT metrics", 2008. IDF1: Ristani et al., "Performance measures and a data set
-    for multi-target, multi-camera tracking", 2016. Ignored boxes are taken out before anything is counted.
+    for multi-target, multi-camera tracking", 2016. Ignored boxes are removed before anything is counted.
 
     Examples
     --------
-    >>> labels = Labels([0, 1, 2], [1, 1, 1], [[0, 0, 50, 40], [4, 0, 54, 40], [8, 0, 58, 40]])
-    >>> found = Labels([0, 1, 2], [7, 7, 8], [[0, 0, 50, 40], [5, 0, 55, 40], [9, 0, 59, 40]])
+    >>> labels = FrameBoxes([0, 1, 2], [1, 1, 1], [[0, 0, 50, 40], [4, 0, 54, 40], [8, 0, 58, 40]])
+    >>> found = FrameBoxes([0, 1, 2], [7, 7, 8], [[0, 0, 50, 40], [5, 0, 55, 40], [9, 0, 59, 40]])
     >>> scores = evaluate_tracks(found, labels)
     >>> scores.id_switches, round(scores.mota, 3), scores.jitter
     (1, 0.667, 0.25)
     """
-    predictions, labels, keys = prepare_sides(predictions, labels, frames)
-    limit = check_number(iou, "iou", above=0, high=1)
+    predictions, labels, keys = prepare_evaluation(predictions, labels, frames)
+    min_iou = check_number(iou, "iou", above=0, high=1)
     _check_tracks(predictions, "predictions", keys)
     _check_tracks(labels, "labels", keys)
-    followed = _follow(predictions, labels, keys, limit)
+    matched = _match_tracks(predictions, labels, keys, min_iou)
 
-    overlaps = [overlap for frame in followed for *_, overlap in frame.pairs]
-    histories = _histories(predictions, labels, followed)
-    false_rows = [row for frame in followed for row in frame.false]
-    fn = sum(len(frame.missed) for frame in followed)
+    overlaps = [overlap for frame in matched for *_, overlap in frame.pairs]
+    histories = _histories(predictions, labels, matched)
+    false_rows = [row for frame in matched for row in frame.false]
+    fn = sum(len(frame.missed) for frame in matched)
     tp, fp, fn, precision, recall, f1 = rates(len(overlaps), len(false_rows), fn)
     switches = sum(_count_switches(history) for history in histories.values())
-    counted = [*false_rows, *(row for frame in followed for _, row, _ in frame.pairs)]
+    counted = [*false_rows, *(row for frame in matched for _, row, _ in frame.pairs)]
     return TrackScores(
         frames=len(keys),
-        iou=limit,
+        iou=min_iou,
         vehicles=len(histories),
         tracks=len(np.unique(predictions.tracks[counted])),
         tp=tp,
         fp=fp,
         fn=fn,
-        ignored=sum(frame.ignored for frame in followed),
+        ignored=sum(frame.ignored for frame in matched),
         precision=precision,
         recall=recall,
         f1=f1,
         mean_iou=mean(overlaps),
-        jitter=_jitter(predictions, labels, followed),
+        jitter=_jitter(predictions, labels, matched),
         mota=1 - ratio(fn + fp + switches, tp + fn),
-        idf1=ratio(2 * _identity_hits(followed), 2 * tp + fp + fn),
+        idf1=ratio(2 * _identity_true_positives(matched), 2 * tp + fp + fn),
         id_switches=switches,
         fragmentations=sum(_count_fragmentations(history) for history in histories.values()),
-        longest_false_positive_run=_longest_false_run(predictions, followed),
+        longest_false_positive_run=_longest_false_run(predictions, matched),
     )
 
 
 @dataclass(frozen=True)
-class _Frame:
-    """What became of one frame's boxes: rows of `labels` and `predictions`.
+class _MatchedFrame:
+    """The matches of one frame, as row numbers of `labels` and `predictions`."""
 
-    `tick` counts evaluated frames, one more where frames are missing; `together` lists every vehicle and
-    track that overlap enough, matched or not.
-    """
-
-    tick: int
-    pairs: list[tuple[int, int, float]]
-    missed: list[int]
-    false: list[int]
+    position: int  # consecutive frames differ by 1, others by more
+    pairs: list[tuple[int, int, float]]  # label row, prediction row, IoU
+    missed: list[int]  # label rows
+    false: list[int]  # prediction rows
     ignored: int
-    together: list[tuple[int, int]]
+    overlapping: list[tuple[int, int]]  # vehicle and track of every pair that overlaps enough, matched or not
 
 
 # The tracks that matched a vehicle, frame by frame; None where it was missed.
@@ -204,15 +198,17 @@ def _check_tracks(side: FrameBoxes, name: str, keys: list[FrameKey]) -> None:
         if side.frames[row] in wanted:
             raise InvalidInputError(
                 f"{name} must have a track for every box, row {row} in frame {side.frames[row]!r} has none; "
-                "boxes without tracks are for evaluate_detections"
+                "score boxes without tracks with evaluate_detections"
             )
 
 
-def _follow(predictions: FrameBoxes, labels: FrameBoxes, keys: list[FrameKey], limit: float) -> list[_Frame]:
-    """Match the frames in order, each vehicle with its last track if it can."""
+def _match_tracks(
+    predictions: FrameBoxes, labels: FrameBoxes, keys: list[FrameKey], min_iou: float
+) -> list[_MatchedFrame]:
+    """Match the frames in order, each vehicle with its last track where possible."""
     track_of: dict[int, int] = {}
-    followed: list[_Frame] = []
-    for key, tick in zip(keys, _ticks(keys)):
+    matched: list[_MatchedFrame] = []
+    for key, position in zip(keys, _positions(keys)):
         here, rows = predictions.rows(key), labels.rows(key)
         targets = rows[~labels.ignore[rows]]
         overlap = iou_matrix(labels.boxes[targets], predictions.boxes[here])
@@ -221,56 +217,59 @@ def _follow(predictions: FrameBoxes, labels: FrameBoxes, keys: list[FrameKey], l
         kept: list[tuple[int, int]] = []
         for i, vehicle in enumerate(vehicles):
             j = tracks.index(track_of[vehicle]) if track_of.get(vehicle) in tracks else -1
-            # Two vehicles may have had the same track last: the first row takes it, as in motmetrics.
-            if j >= 0 and overlap[i, j] >= limit and all(j != taken for _, taken in kept):
+            # If two vehicles had the same track last, the first row takes it, as in motmetrics.
+            if j >= 0 and overlap[i, j] >= min_iou and all(j != taken for _, taken in kept):
                 kept.append((i, j))
-        pairs = kept + _pair_rest(overlap, kept, limit)
+        pairs = kept + _assign_rest(overlap, kept, min_iou)
         track_of.update((vehicles[i], tracks[j]) for i, j in pairs)
 
         rest = np.delete(here, [j for _, j in pairs])
-        ignored = find_ignored(predictions.boxes[rest], labels, rows, limit)
-        out = set(rest[ignored].tolist())
-        followed.append(
-            _Frame(
-                tick,
+        ignored = find_ignored(predictions.boxes[rest], labels, rows, min_iou)
+        dropped = set(rest[ignored].tolist())
+        close = np.argwhere(overlap >= min_iou)
+        matched.append(
+            _MatchedFrame(
+                position,
                 [(int(targets[i]), int(here[j]), float(overlap[i, j])) for i, j in pairs],
                 np.delete(targets, [i for i, _ in pairs]).tolist(),
                 rest[~ignored].tolist(),
-                len(out),
-                [(vehicles[i], tracks[j]) for i, j in np.argwhere(overlap >= limit) if here[j] not in out],
+                len(dropped),
+                [(vehicles[i], tracks[j]) for i, j in close if here[j] not in dropped],
             )
         )
-    return followed
+    return matched
 
 
-def _ticks(keys: list[FrameKey]) -> list[int]:
-    """Count frames so that those which follow each other differ by 1, and others by more."""
+def _positions(keys: list[FrameKey]) -> list[int]:
+    """Assign positions to frames: consecutive ones differ by 1, others by more."""
     numbers = [key for key in keys if isinstance(key, int)]
     if not numbers:
         return list(range(len(keys)))
     steps = [after - before for before, after in pairwise(numbers)]
-    least = min(steps, default=1)
-    return list(accumulate((1 if step == least else 2 for step in steps), initial=0))
+    min_step = min(steps, default=1)
+    return list(accumulate((1 if step == min_step else 2 for step in steps), initial=0))
 
 
-def _pair_rest(
-    overlap: NDArray[np.float64], kept: list[tuple[int, int]], limit: float
+def _assign_rest(
+    overlap: NDArray[np.float64], kept: list[tuple[int, int]], min_iou: float
 ) -> list[tuple[int, int]]:
-    """Pair what is left: as many as possible, then with the greatest overlap."""
+    """Assign the remaining rows: as many pairs as possible, then the largest total IoU."""
     from scipy.optimize import linear_sum_assignment
 
-    allowed = overlap >= limit
+    allowed = overlap >= min_iou
     for i, j in kept:
         allowed[i], allowed[:, j] = False, False
-    # One forbidden pair costs more than all allowed pairs together.
+    # A forbidden pair costs more than all allowed pairs together.
     chosen = linear_sum_assignment(np.where(allowed, 1 - overlap, 1.0 + min(overlap.shape)))
     return [(int(i), int(j)) for i, j in zip(*chosen) if allowed[i, j]]
 
 
-def _histories(predictions: FrameBoxes, labels: FrameBoxes, followed: list[_Frame]) -> dict[int, _History]:
-    """Each labelled vehicle's frames in order."""
+def _histories(
+    predictions: FrameBoxes, labels: FrameBoxes, matched: list[_MatchedFrame]
+) -> dict[int, _History]:
+    """Tracks that matched each labelled vehicle, in frame order."""
     histories: dict[int, _History] = defaultdict(list)
-    for frame in followed:
+    for frame in matched:
         for target, row, _ in frame.pairs:
             histories[int(labels.tracks[target])].append(int(predictions.tracks[row]))
         for target in frame.missed:
@@ -285,15 +284,15 @@ def _count_switches(history: _History) -> int:
 
 def _count_fragmentations(history: _History) -> int:
     found = [track is not None for track in history]
-    again = sum(not before and after for before, after in pairwise(found))
-    return again - (any(found) and not found[0])
+    regained = sum(not before and after for before, after in pairwise(found))
+    return regained - (any(found) and not found[0])
 
 
-def _identity_hits(followed: list[_Frame]) -> int:
-    """Boxes right under the best one-to-one pairing of vehicles and tracks."""
+def _identity_true_positives(matched: list[_MatchedFrame]) -> int:
+    """Count the right boxes under the best one-to-one assignment of tracks to vehicles (IDTP)."""
     from scipy.optimize import linear_sum_assignment
 
-    counts = Counter(pair for frame in followed for pair in frame.together)
+    counts = Counter(pair for frame in matched for pair in frame.overlapping)
     vehicles = {vehicle: index for index, vehicle in enumerate(sorted({v for v, _ in counts}))}
     tracks = {track: index for index, track in enumerate(sorted({t for _, t in counts}))}
     table = np.zeros((len(vehicles), len(tracks)))
@@ -302,29 +301,29 @@ def _identity_hits(followed: list[_Frame]) -> int:
     return int(table[linear_sum_assignment(table, maximize=True)].sum())
 
 
-def _jitter(predictions: FrameBoxes, labels: FrameBoxes, followed: list[_Frame]) -> float:
-    """Mean absolute change of the edge errors, over vehicles that are matched in two frames in a row.
+def _jitter(predictions: FrameBoxes, labels: FrameBoxes, matched: list[_MatchedFrame]) -> float:
+    """Mean absolute change of the edge errors, over vehicles that are matched in two consecutive frames.
 
-    It goes by vehicle: a jump that comes with another track's box is jitter as well.
+    Errors are followed by vehicle, so the jump to another track's box counts as jitter.
     """
     changes: list[NDArray[np.float64]] = []
     before: dict[int, tuple[int, NDArray[np.float64]]] = {}
-    for frame in followed:
+    for frame in matched:
         for target, row, _ in frame.pairs:
             vehicle, error = int(labels.tracks[target]), predictions.boxes[row] - labels.boxes[target]
-            tick, last = before.get(vehicle, (-2, error))
-            if tick == frame.tick - 1:
+            position, last = before.get(vehicle, (-2, error))
+            if position == frame.position - 1:
                 changes.append(np.abs(error - last))
-            before[vehicle] = frame.tick, error
+            before[vehicle] = frame.position, error
     return mean(changes)
 
 
-def _longest_false_run(predictions: FrameBoxes, followed: list[_Frame]) -> int:
+def _longest_false_run(predictions: FrameBoxes, matched: list[_MatchedFrame]) -> int:
     longest = 0
     runs: dict[int, tuple[int, int]] = {}
-    for frame in followed:
+    for frame in matched:
         for track in predictions.tracks[frame.false].tolist():
-            tick, length = runs.get(track, (-2, 0))
-            runs[track] = frame.tick, length + 1 if tick == frame.tick - 1 else 1
+            position, length = runs.get(track, (-2, 0))
+            runs[track] = frame.position, length + 1 if position == frame.position - 1 else 1
             longest = max(longest, runs[track][1])
     return longest

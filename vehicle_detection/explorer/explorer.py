@@ -313,10 +313,8 @@ class Explorer:
         bands = tuple(self.search.bands[band] for band in self.bands)
         return VehicleDetector(
             self._classifier,
-            regions=self.kind,
-            search=dataclasses.replace(self.search, bands=bands),
-            heat=self.heat,
-            fit=self.fit,
+            search_params=dataclasses.replace(self.search, bands=bands),
+            region_params=self.fit if self.kind == "fitted" else self.heat,
             camera=self._camera,
             **options,
         )
@@ -441,7 +439,7 @@ class Explorer:
         parts, numbers = [], []
         for number, band in enumerate(whole.bands):
             if band.place(image.shape, whole.horizon, whole.horizontal_padding) is not None:
-                found = self._searcher.find(image, dataclasses.replace(whole, bands=(band,)))
+                found = self._searcher.find_windows(image, dataclasses.replace(whole, bands=(band,)))
                 parts.append(found)
                 numbers.append(np.full(len(found), number))
         boxes = np.concatenate([part.boxes for part in parts])

@@ -354,7 +354,7 @@ def _batch_extractor(params: FeatureParams) -> Callable[[NDArray[np.uint8], NDAr
             hog = features[:, hist_stop:]
             if params.transform_sqrt:
                 gradients = sqrt_gradients(source)
-                _hog_kernels.patch_hog_of_angles(*gradients, bounds, channels, cell, block, coarse, hog)
+                _hog_kernels.patch_hog_from_angles(*gradients, bounds, channels, cell, block, coarse, hog)
             else:
                 flat = source.reshape(n, PATCH_SIZE, PATCH_SIZE * channels)
                 _hog_kernels.patch_hog(flat, channels, cell, block, coarse, cotangents, hog)

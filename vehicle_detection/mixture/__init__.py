@@ -2,39 +2,38 @@
 
 from vehicle_detection.mixture.boxes import BoxRegressor, mostly_inside, overlaps, vote_boxes
 from vehicle_detection.mixture.crops import (
-    COLORS,
-    CROP,
-    CROP_LENGTH,
-    EDGES,
-    box_planes,
-    crop_features,
-    crop_views,
+    CROP_CELLS,
+    N_COLOR_FEATURES,
+    N_EDGE_FEATURES,
+    N_REGRESSION_FEATURES,
+    crop_channels,
+    regression_features,
+    rescoring_features,
 )
-from vehicle_detection.mixture.denoise import without_noise
+from vehicle_detection.mixture.denoise import denoise
 from vehicle_detection.mixture.features import (
     COARSE,
     FINE,
-    PLANES,
+    N_CHANNELS,
     FeatureMap,
-    border_strip,
+    feature_maps,
     image_pyramid,
-    level_maps,
-    mirror_planes,
+    mirror_channels,
     pyramid_levels,
-    strip_boxes,
 )
-from vehicle_detection.mixture.model import MixtureSearch, TemplateMixture, load_model
+from vehicle_detection.mixture.model import TemplateMixture, load_model
 from vehicle_detection.mixture.rescoring import Projection, Rescorer
+from vehicle_detection.mixture.search import MixtureSearch
 from vehicle_detection.mixture.template import MixtureTemplate, smallest_box
 
 __all__ = [
     "COARSE",
-    "COLORS",
-    "CROP",
-    "CROP_LENGTH",
-    "EDGES",
+    "CROP_CELLS",
     "FINE",
-    "PLANES",
+    "N_CHANNELS",
+    "N_COLOR_FEATURES",
+    "N_EDGE_FEATURES",
+    "N_REGRESSION_FEATURES",
     "BoxRegressor",
     "FeatureMap",
     "MixtureSearch",
@@ -42,19 +41,17 @@ __all__ = [
     "Projection",
     "Rescorer",
     "TemplateMixture",
-    "border_strip",
-    "box_planes",
-    "crop_features",
-    "crop_views",
+    "crop_channels",
+    "denoise",
+    "feature_maps",
     "image_pyramid",
-    "level_maps",
     "load_model",
-    "mirror_planes",
+    "mirror_channels",
     "mostly_inside",
     "overlaps",
     "pyramid_levels",
+    "regression_features",
+    "rescoring_features",
     "smallest_box",
-    "strip_boxes",
     "vote_boxes",
-    "without_noise",
 ]

@@ -1,4 +1,4 @@
-"""Windows of several templates to boxes of vehicles: suppression, voting, and a linear correction."""
+"""Windows of several templates to boxes: voting, non-maximum suppression and box regression."""
 
 from __future__ import annotations
 
@@ -11,71 +11,70 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer, finite_array
 from vehicle_detection.boxes import box_areas, clip_boxes, intersection_matrix
-from vehicle_detection.mixture.crops import CROP_LENGTH, crop_features
+from vehicle_detection.mixture.crops import N_REGRESSION_FEATURES, regression_features
 
-WEAKEST = -1.0
-"""Least value of a template that makes a window a candidate."""
+MIN_MARGIN = -1.0
+"""Minimum margin of a window that takes part in the voting."""
 
-# Overlaps: of windows that vote for one box; above which the weaker of two vehicles goes, by IoU and by the
-# share of the smaller one that is covered.
-_VOTE, _IOU, _COVER = 0.5, 0.35, 0.75
-# IoU above which two boxes are the same.
-_SAME = 0.7
-# What a window's value exceeds this by counts in a vote.
-_VOTE_FROM = -1.1
-_MOST_VEHICLES = 60
-# Least share of a box inside the frame.
-_LEAST_INSIDE = 0.35
-# A correction moves an edge by this share of the box's side at most; a box is looked at again where it moved
-# one by more than the second.
-_MOST_SHIFT, _SETTLED = 0.3, 0.15
+# A window votes for a box at an IoU above the first; of two boxes on one vehicle, the weaker one is removed
+# at an IoU above the second or if more than the third of the smaller one is covered.
+_VOTE_IOU, _NMS_IOU, _NMS_COVER = 0.5, 0.35, 0.75
+# IoU above which two regressed boxes are duplicates.
+_DUPLICATE_IOU = 0.7
+# A window's vote is its margin above this one.
+_VOTE_MARGIN = -1.1
+_MAX_VEHICLES = 60
+_MIN_VISIBLE_FRACTION = 0.35
+# Largest shift of an edge per regression step, as a fraction of the box's side; a box is regressed again if
+# one of its edges moved by more than the second.
+_MAX_SHIFT, _SETTLED_SHIFT = 0.3, 0.15
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class ScoredWindows:
-    """Windows as columns: boxes, values of their templates, numbers of the templates."""
+    """Windows as columns: boxes ``(N, 4)``, SVM margins ``(N,)`` and template indices ``(N,)``."""
 
     boxes: Floats
-    scores: Floats
+    margins: Floats
     templates: NDArray[np.intp]
 
     def __len__(self) -> int:
         return len(self.boxes)
 
     def __getitem__(self, rows: NDArray[Any] | slice) -> ScoredWindows:
-        return ScoredWindows(self.boxes[rows], self.scores[rows], self.templates[rows])
+        return ScoredWindows(self.boxes[rows], self.margins[rows], self.templates[rows])
 
     @classmethod
     def empty(cls) -> ScoredWindows:
-        """No window."""
+        """No windows."""
         return cls(np.empty((0, 4)), np.empty(0), np.empty(0, np.intp))
 
     @classmethod
     def join(cls, parts: Sequence[ScoredWindows], shape: tuple[int, ...]) -> ScoredWindows:
-        """Put the windows of several searches together; those that are mostly outside the frame go."""
+        """Concatenate the windows of several searches, without those mostly outside the frame."""
         parts = [part for part in parts if len(part)] or [cls.empty()]
-        both = cls(
+        joined = cls(
             np.concatenate([part.boxes for part in parts]),
-            np.concatenate([part.scores for part in parts]),
+            np.concatenate([part.margins for part in parts]),
             np.concatenate([part.templates for part in parts]),
         )
-        return both[np.flatnonzero(mostly_inside(both.boxes, shape))]
+        return joined[np.flatnonzero(mostly_inside(joined.boxes, shape))]
 
-    def best(self, most: int) -> ScoredWindows:
-        """Take the best windows, from the best one down; of equals the first."""
-        return self[np.argsort(-self.scores, kind="stable")[:most]]
+    def best(self, count: int) -> ScoredWindows:
+        """Keep the `count` best windows, best first; equal margins keep their order."""
+        return self[np.argsort(-self.margins, kind="stable")[:count]]
 
 
 def mostly_inside(boxes: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Tell which boxes show enough of a vehicle inside a frame of ``(height, width, ...)``."""
+    """Select the boxes whose visible fraction inside a frame of ``(height, width, ...)`` is large enough."""
     inside = box_areas(clip_boxes(boxes, shape))
-    return np.asarray(inside > _LEAST_INSIDE * box_areas(boxes), np.bool_)
+    return np.asarray(inside > _MIN_VISIBLE_FRACTION * box_areas(boxes), np.bool_)
 
 
 def overlaps(box: Floats, others: Floats) -> tuple[Floats, Floats]:
-    """IoU of a box with others, and the share of the smaller of both that they share."""
+    """IoU of a box with others, and the covered fraction of the smaller of each pair."""
     shared = intersection_matrix(box[None], others)[0]
     area, areas = float(box_areas(box[None])[0]), box_areas(others)
     return shared / np.maximum(area + areas - shared, 1e-9), shared / np.maximum(
@@ -84,81 +83,65 @@ def overlaps(box: Floats, others: Floats) -> tuple[Floats, Floats]:
 
 
 def vote_boxes(
-    windows: ScoredWindows, *, least: float, most: int = _MOST_VEHICLES
+    windows: ScoredWindows, *, min_margin: float, max_boxes: int = _MAX_VEHICLES
 ) -> tuple[ScoredWindows, Floats]:
-    """Keep the best window of each group, at the place for which the windows around it vote.
+    """Keep the best window of each group, with the weighted mean box of the windows that overlap it.
 
-    Parameters
-    ----------
-    windows
-        From the best one down.
-    least
-        Least value of a window that is kept; weaker ones vote only.
-
-    Returns
-    -------
-    Candidates
-        At most `most` of them; they still overlap as vehicles behind one another do.
-    numpy.ndarray
-        Support of each: the sum of what the windows that vote for it exceed -1.1 by.
+    `windows` are sorted, best first; those below `min_margin` vote but are not kept. Also returns the vote
+    mass of each kept window: the sum of the voters' margins above `_VOTE_MARGIN`.
     """
-    left = np.flatnonzero(windows.scores >= least)
+    remaining = np.flatnonzero(windows.margins >= min_margin)
     boxes: list[Floats] = []
     kept: list[int] = []
     vote_mass: list[float] = []
-    strengths = np.maximum(windows.scores - _VOTE_FROM, 0)
+    strengths = np.maximum(windows.margins - _VOTE_MARGIN, 0)
     weights = strengths**2
-    # In columns, and with the areas known: this is done for every group of every frame.
+    # This loop runs for every group of every frame: columns are contiguous and areas computed once.
     columns, areas = np.ascontiguousarray(windows.boxes.T), box_areas(windows.boxes)
-    while len(left) and len(kept) < most:
-        best = int(left[0])
+    while len(remaining) and len(kept) < max_boxes:
+        best = int(remaining[0])
         low = np.maximum(columns[:2], columns[:2, best, None])
         width, height = np.maximum(np.minimum(columns[2:], columns[2:, best, None]) - low, 0)
         shared = width * height
         iou = shared / np.maximum(areas + areas[best] - shared, 1e-9)
-        voters = iou > _VOTE
+        voters = iou > _VOTE_IOU
         vote_mass.append(float(strengths @ voters))
         votes = weights * voters
         votes[best] = max(votes[best], 1e-9)
         boxes.append(votes @ windows.boxes / votes.sum())
         kept.append(best)
-        left = left[iou[left] <= _VOTE]
-        left = left[left != best]
+        remaining = remaining[iou[remaining] <= _VOTE_IOU]
+        remaining = remaining[remaining != best]
     rows = np.array(kept, np.intp)
-    groups = ScoredWindows(np.array(boxes).reshape(-1, 4), windows.scores[rows], windows.templates[rows])
+    groups = ScoredWindows(np.array(boxes).reshape(-1, 4), windows.margins[rows], windows.templates[rows])
     return groups, np.array(vote_mass)
 
 
-def nms(boxes: Floats, scores: Floats, *, iou: float = _IOU, cover: float = _COVER) -> NDArray[np.intp]:
-    """Rows of the boxes that stay when the weaker of two on one vehicle goes, from the best one down.
+def nms(
+    boxes: Floats, scores: Floats, *, iou: float = _NMS_IOU, cover: float = _NMS_COVER
+) -> NDArray[np.intp]:
+    """Rows of the boxes that greedy suppression keeps, best first.
 
-    Two boxes are on one vehicle whose IoU is above `iou`, or of which the smaller one is covered by more than
-    `cover`.
+    A box is removed by a better one at an IoU above `iou`, or if more than `cover` of the smaller one is
+    covered.
     """
-    left = np.argsort(-scores, kind="stable")
+    remaining = np.argsort(-scores, kind="stable")
     kept: list[int] = []
-    while len(left):
-        best, left = left[0], left[1:]
+    while len(remaining):
+        best, remaining = remaining[0], remaining[1:]
         kept.append(best)
-        overlap, covered = overlaps(boxes[best], boxes[left])
-        left = left[(overlap <= iou) & (covered <= cover)]
+        overlap, covered = overlaps(boxes[best], boxes[remaining])
+        remaining = remaining[(overlap <= iou) & (covered <= cover)]
     return np.array(kept, np.intp)
 
 
 @dataclass(frozen=True, eq=False)
 class BoxRegressor:
-    """A linear correction of boxes from what they show.
+    """A linear regression of the shifts of a box's edges from the features of its crop.
 
-    Attributes
-    ----------
-    weights
-        ``(length, 4)`` float32: shifts of the four edges, in sides of the box, for each feature of
-        `crop_features`.
-    bias
-        ``(4,)`` float32.
-    n_iterations
-        How often a box is corrected; from the second time on only those that the last correction moved much.
-        A box that is far too small or beside its vehicle shows too little of it at first.
+    `weights` ``(length, 4)`` and `bias` ``(4,)`` float32 give shifts as fractions of the box's sides, from
+    `regression_features`. The regression runs `n_iterations` times; from the second time on only for boxes
+    whose last shift was large, because the crop of a misplaced box shows too little of its vehicle.
     """
 
     weights: NDArray[np.float32]
@@ -167,34 +150,34 @@ class BoxRegressor:
 
     def __post_init__(self) -> None:
         check_integer(self.n_iterations, "n_iterations", low=1, high=10)
-        weights = finite_array(self.weights, "box_regressor.weights", (CROP_LENGTH, 4))
+        weights = finite_array(self.weights, "box_regressor.weights", (N_REGRESSION_FEATURES, 4))
         object.__setattr__(self, "weights", weights)
         object.__setattr__(self, "bias", finite_array(self.bias, "box_regressor.bias", (4,)))
 
     @classmethod
     def none(cls) -> BoxRegressor:
-        """Correct nothing."""
-        return cls(np.zeros((CROP_LENGTH, 4), np.float32), np.zeros(4, np.float32))
+        """Return a regressor that shifts nothing."""
+        return cls(np.zeros((N_REGRESSION_FEATURES, 4), np.float32), np.zeros(4, np.float32))
 
     def shifts(self, image: NDArray[np.uint8], boxes: Floats) -> Floats:
-        """Shifts of the edges of each box, in sides of the box, ``(N, 4)``."""
+        """Shifts of the edges of each box, ``(N, 4)``, as fractions of the box's sides."""
         if not len(boxes):
             return np.empty((0, 4))
-        shifts = crop_features(image, boxes) @ self.weights + self.bias
-        return np.clip(shifts.astype(np.float64), -_MOST_SHIFT, _MOST_SHIFT)
+        shifts = regression_features(image, boxes) @ self.weights + self.bias
+        return np.clip(shifts.astype(np.float64), -_MAX_SHIFT, _MAX_SHIFT)
 
     def apply(self, image: NDArray[np.uint8], windows: ScoredWindows) -> tuple[Floats, Floats]:
-        """Correct boxes, clip them to the image and drop those that nearly coincide with a better one."""
-        boxes, values = windows.boxes.copy(), windows.scores
+        """Correct boxes, clip them to the image, and remove near duplicates of better ones."""
+        boxes, margins = windows.boxes.copy(), windows.margins
         moving = np.ones(len(boxes), np.bool_)
         for _ in range(self.n_iterations):
-            # No box turns inside out: of a side, at least two fifths are left.
+            # Shifts of at most 0.3 from both sides leave at least two fifths of a side.
             sides = np.tile(boxes[moving, 2:] - boxes[moving, :2], 2)
             shifts = self.shifts(image, boxes[moving])
             boxes[moving] += shifts * sides
-            moving[moving] = np.abs(shifts).max(axis=1, initial=0) > _SETTLED
+            moving[moving] = np.abs(shifts).max(axis=1, initial=0) > _SETTLED_SHIFT
             inside = clip_boxes(boxes, image.shape)
-            rows = nms(inside, values, iou=_SAME, cover=np.inf)
+            rows = nms(inside, margins, iou=_DUPLICATE_IOU, cover=np.inf)
             rows = rows[box_areas(inside[rows]) > 0]
-            boxes, values, moving = boxes[rows], values[rows], moving[rows]
-        return np.asarray(clip_boxes(boxes, image.shape), np.float64), values
+            boxes, margins, moving = boxes[rows], margins[rows], moving[rows]
+        return np.asarray(clip_boxes(boxes, image.shape), np.float64), margins

@@ -10,30 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_number, describe, finite_array
-from vehicle_detection._kernels import product
+from vehicle_detection._kernels import matmul
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture.crops import COLORS, EDGES, crop_views
+from vehicle_detection.mixture.crops import N_COLOR_FEATURES, N_EDGE_FEATURES, rescoring_features
 
 Floats = NDArray[np.float64]
 
 RESCORE_MIN = -0.8
-"""What templates and the gains give a box that is worth a second opinion."""
+"""Minimum margin of a proposed box that is rescored."""
 
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """A linear projection onto a few axes: principal components, scaled.
+    """Scaled principal components; arrays are rounded to half precision, as in the model file."""
 
-    Attributes
-    ----------
-    mean
-        ``(length,)`` float32, taken off first.
-    axes
-        ``(count, length)`` float32. Both are rounded to half precision, as the model file holds them.
-    """
-
-    mean: NDArray[np.float32]
-    axes: NDArray[np.float32]
+    mean: NDArray[np.float32]  # (length,)
+    axes: NDArray[np.float32]  # (count, length)
     _columns: NDArray[np.float32] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -44,82 +36,64 @@ class Projection:
             object.__setattr__(self, name, array)
 
     def __call__(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Project rows of features, ``(N, length)`` to ``(N, count)``."""
-        return product(rows - self.mean, self._columns)
+        """Project features, ``(N, length)`` to ``(N, count)``."""
+        return matmul(rows - self.mean, self._columns)
 
 
 @dataclass(frozen=True, eq=False)
 class Rescorer:
-    """Tells by the edges and colors of a box, seen together, whether it shows a vehicle.
+    """An RBF SVM on the projected edge and color features of boxes.
 
-    Attributes
-    ----------
-    edges, colors
-        Projections of what `crop_views` gives.
-    vectors
-        ``(n, count)`` float32: support vectors, edges first.
-    weights
-        ``(n,)`` float32, with the sign of their class. These too are rounded to half precision.
-    bias
-        Added to the weighted sum of kernels.
-    gamma
-        Width of the kernel ``exp(-gamma * distance**2)``.
-    blend_weight
-        Share of this opinion in a vehicle's value; the templates have the rest.
-
-    Raises
-    ------
-    InvalidInputError
-        If arrays do not fit one another, or a number is out of range.
+    `vectors` and `weights` are rounded to half precision. The kernel is ``exp(-gamma * distance**2)``.
     """
 
-    edges: Projection
+    edges: Projection  # of the two kinds of `rescoring_features`
     colors: Projection
-    vectors: NDArray[np.float32]
-    weights: NDArray[np.float32]
+    vectors: NDArray[np.float32]  # (n, count): support vectors, projected edges first
+    weights: NDArray[np.float32]  # (n,): dual coefficients with the sign of the class
     bias: float
     gamma: float
-    blend_weight: float
+    blend_weight: float  # weight of the rescorer in the final margin; that of the templates is the rest to 1
     _columns: NDArray[np.float32] = field(init=False, repr=False)
     _squares: NDArray[np.float32] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        for projection, name, length in (self.edges, "edges", EDGES), (self.colors, "colors", COLORS):
+        lengths = (self.edges, "edges", N_EDGE_FEATURES), (self.colors, "colors", N_COLOR_FEATURES)
+        for projection, name, length in lengths:
             if len(projection.mean) != length:
                 raise InvalidInputError(
                     f"rescorer.{name} must take {length} values, got {len(projection.mean)}; train again"
                 )
         count = len(self.edges.axes) + len(self.colors.axes)
         vectors = _half_precision(self.vectors, "rescorer.vectors", (None, count))
-        object.__setattr__(self, "vectors", vectors)
-        object.__setattr__(
-            self, "weights", _half_precision(self.weights, "rescorer.weights", (len(vectors),))
-        )
+        weights = _half_precision(self.weights, "rescorer.weights", (len(vectors),))
         check_number(self.bias, "rescorer.bias")
         check_number(self.gamma, "rescorer.gamma", above=0, high=1e6)
         check_number(self.blend_weight, "rescorer.blend_weight", above=0, high=1)
+        object.__setattr__(self, "vectors", vectors)
+        object.__setattr__(self, "weights", weights)
         object.__setattr__(self, "_columns", np.ascontiguousarray(vectors.T))
         object.__setattr__(self, "_squares", (vectors**2).sum(axis=1))
 
-    def coordinates(self, edges: NDArray[np.float32], colors: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Where crops lie in the space of the kernel, ``(N, count)``."""
+    def project(self, edges: NDArray[np.float32], colors: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Project `rescoring_features` to the space of the support vectors, ``(N, count)``."""
         return np.hstack([self.edges(edges), self.colors(colors)])
 
     def decision_function(self, points: NDArray[np.float32]) -> Floats:
-        """Value of each point: about 1 and more for vehicles, -1 and less for others."""
-        distances = (points**2).sum(axis=1)[:, None] + self._squares - 2 * product(points, self._columns)
+        """SVM decision values of projected features: at least about 1 for vehicles, at most -1 for others."""
+        distances = (points**2).sum(axis=1)[:, None] + self._squares - 2 * matmul(points, self._columns)
         kernels = np.exp(-np.float32(self.gamma) * distances) * self.weights
         return np.asarray(kernels.sum(axis=1, dtype=np.float64) + self.bias)
 
-    def apply(self, image: NDArray[np.uint8], boxes: Floats, values: Floats) -> Floats:
-        """Give boxes of a frame a value in which both opinions have their share."""
+    def apply(self, image: NDArray[np.uint8], boxes: Floats, margins: Floats) -> Floats:
+        """Weighted mean of the margins that the templates gave and the decision values of the boxes."""
         if not len(boxes):
-            return values
-        found = self.decision_function(self.coordinates(*crop_views(image, boxes)))
-        return np.asarray((1 - self.blend_weight) * values + self.blend_weight * found, np.float64)
+            return margins
+        decisions = self.decision_function(self.project(*rescoring_features(image, boxes)))
+        return np.asarray((1 - self.blend_weight) * margins + self.blend_weight * decisions, np.float64)
 
     def tensors(self) -> dict[str, NDArray[Any]]:
-        """Arrays for a model file, by name, in half precision."""
+        """Arrays for the model file by name, in half precision."""
         arrays = {
             "edges.mean": self.edges.mean,
             "edges.axes": self.edges.axes,
@@ -131,27 +105,23 @@ class Rescorer:
         return {f"rescorer.{name}": array.astype(np.float16) for name, array in arrays.items()}
 
     def numbers(self) -> dict[str, float]:
-        """Numbers for a model file."""
+        """Numbers for the model file."""
         return {"bias": self.bias, "gamma": self.gamma, "blend_weight": self.blend_weight}
 
     @classmethod
     def build(cls, tensors: Mapping[str, NDArray[Any]], numbers: Mapping[str, float]) -> Rescorer:
-        """Put together again what `tensors` and `numbers` gave."""
-        projections = [
+        """Rebuild a rescorer from its `tensors` and `numbers`."""
+        edges, colors = (
             Projection(tensors[f"rescorer.{name}.mean"], tensors[f"rescorer.{name}.axes"])
             for name in ("edges", "colors")
-        ]
-        return cls(
-            projections[0],
-            projections[1],
-            tensors["rescorer.vectors"],
-            tensors["rescorer.weights"],
-            *(float(numbers[name]) for name in ("bias", "gamma", "blend_weight")),
         )
+        arrays = tensors["rescorer.vectors"], tensors["rescorer.weights"]
+        scalars = (float(numbers[name]) for name in ("bias", "gamma", "blend_weight"))
+        return cls(edges, colors, *arrays, *scalars)
 
 
 def _half_precision(values: object, name: str, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
-    """Return finite float32 numbers that half precision can hold, rounded to it."""
+    """Check finite numbers and round them to half precision, as float32."""
     array = finite_array(values, name, shape)
     with np.errstate(over="ignore"):
         rounded = array.astype(np.float16).astype(np.float32)

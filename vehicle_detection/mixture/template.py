@@ -1,4 +1,4 @@
-"""One template of a mixture: its weights over the cells of a map, the scores they give, and the boxes."""
+"""One template of a mixture: a linear SVM over the FHOG channels of a window."""
 
 from __future__ import annotations
 
@@ -9,46 +9,39 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Take, check_number, describe, finite_array, new_array
+from vehicle_detection._common import NEW_ARRAYS, Workspace, check_number, describe, finite_array
 from vehicle_detection._kernels import Filter
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture.features import PLANES, FeatureMap, border_strip, strip_boxes
+from vehicle_detection.mixture.features import N_CHANNELS, FeatureMap, mirror_channels
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class MixtureTemplate:
-    """One linear template over the cells of a feature map.
+    """A linear SVM over the cells of a window.
 
-    Attributes
-    ----------
-    weights
-        ``(rows, columns, 28)`` float32.
-    bias
-        Added to the weighted sum.
-    margin
-        Cells around the vehicle's box at the left and right, and above and below.
-    border
-        Whether it shows what is seen of a vehicle that the frame's right border cuts: it ends there, without
-        a margin, and is searched for at the border alone; at the left one it is mirrored.
+    A template with `border` is for vehicles that the frame's right border truncates: its windows end at that
+    border, without padding there. Its mirror image is used at the left border.
     """
 
-    weights: NDArray[np.float32]
+    weights: NDArray[np.float32]  # (rows, columns, 28)
     bias: float
-    margin: tuple[float, float]
+    padding: tuple[float, float]  # cells left and right of the vehicle's box, and above and below it
     border: bool = False
 
     def __post_init__(self) -> None:
-        weights = finite_array(self.weights, "weights", (None, None, PLANES))
+        weights = finite_array(self.weights, "weights", (None, None, N_CHANNELS))
         check_number(self.bias, "bias")
         rows, columns = weights.shape[:2]
-        margin: object = self.margin
-        if not isinstance(margin, tuple) or len(margin) != 2:
-            raise InvalidInputError(f"margin must be two numbers of cells, got {describe(margin)}")
-        for cells, side in zip(margin, (columns, rows)):
-            # Above half a side nothing would be left for the box.
-            if not check_number(cells, "margin", low=-1) < side / 2:
+        padding: object = self.padding
+        if not isinstance(padding, tuple) or len(padding) != 2:
+            raise InvalidInputError(f"padding must be two numbers of cells, got {describe(padding)}")
+        for cells, side in zip(padding, (columns, rows)):
+            if not check_number(cells, "padding", low=-1) < side / 2:
                 raise InvalidInputError(
-                    f"margin must leave cells for the box of {columns}x{rows} cells, got {describe(margin)}"
+                    f"padding must be less than half of the window's {columns}x{rows} cells, "
+                    f"got {describe(padding)}"
                 )
         border: object = self.border
         if not isinstance(border, bool):
@@ -59,20 +52,7 @@ class MixtureTemplate:
     def box_cells(self) -> tuple[float, float]:
         """Columns and rows of cells that the vehicle's box fills."""
         rows, columns = self.weights.shape[:2]
-        return columns - self.margin[0] * (1 if self.border else 2), rows - 2 * self.margin[1]
-
-    def scores(self, planes: NDArray[np.float32], take: Take = new_array) -> NDArray[np.float32]:
-        """Score of every window of a map, ``(rows, columns)`` float32; empty where none fits."""
-        rows, columns = self.weights.shape[:2]
-        shape = max(planes.shape[1] - rows + 1, 0), max(planes.shape[2] - columns + 1, 0)
-        scores = np.full(shape, self.bias, np.float32)
-        if scores.shape[1] == 1:
-            # Of a strip, the places of its windows are put side by side: they are worked on together.
-            line = np.ascontiguousarray(planes.transpose(0, 2, 1)).reshape(-1, 1, planes.shape[1])
-            self._strip_filter.add_to(line, scores.reshape(1, -1), take)
-        elif scores.size:
-            self._filter.add_to(planes, scores, take)
-        return scores
+        return columns - self.padding[0] * (1 if self.border else 2), rows - 2 * self.padding[1]
 
     @functools.cached_property
     def _filter(self) -> Filter:
@@ -82,27 +62,71 @@ class MixtureTemplate:
     def _strip_filter(self) -> Filter:
         return Filter(self.weights.transpose(0, 2, 1).reshape(1, len(self.weights), -1))
 
-    def boxes(
-        self, level: FeatureMap, rows: NDArray[np.intp], columns: NDArray[np.intp]
-    ) -> NDArray[np.float64]:
-        """Boxes, in pixels of the frame, of the windows that start at these cells of a map."""
+    def margins(
+        self, channels: NDArray[np.float32], workspace: Workspace = NEW_ARRAYS
+    ) -> NDArray[np.float32]:
+        """Margin of every window of FHOG channels, ``(rows, columns)``; empty if no window fits."""
+        rows, columns = self.weights.shape[:2]
+        shape = max(channels.shape[1] - rows + 1, 0), max(channels.shape[2] - columns + 1, 0)
+        margins = np.full(shape, self.bias, np.float32)
+        if margins.shape[1] == 1:
+            # A strip as wide as the template: place its windows side by side, which vectorizes better.
+            line = np.ascontiguousarray(channels.transpose(0, 2, 1)).reshape(-1, 1, channels.shape[1])
+            self._strip_filter.add_to(line, margins.reshape(1, -1), workspace)
+        elif margins.size:
+            self._filter.add_to(channels, margins, workspace)
+        return margins
+
+    def boxes(self, feature_map: FeatureMap, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Floats:
+        """Boxes, in pixels of the frame, of the windows that start at these cells; ``(N, 4)``."""
         width, height = self.box_cells
-        left = level.left + (columns + self.margin[0]) * level.step_x
-        top = level.top + (rows + self.margin[1]) * level.step_y
-        return np.stack([left, top, left + width * level.step_x, top + height * level.step_y], axis=1)
+        left = feature_map.left + (columns + self.padding[0]) * feature_map.step_x
+        top = feature_map.top + (rows + self.padding[1]) * feature_map.step_y
+        right, bottom = left + width * feature_map.step_x, top + height * feature_map.step_y
+        return np.stack([left, top, right, bottom], axis=1)
 
     def border_windows(
-        self, level: FeatureMap, end: float, *, left: bool, least: float, take: Take = new_array
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Boxes and scores, above the least, of the windows that end at a border at this pixel."""
-        strip = border_strip(level, self.weights.shape[1], end, left=left)
-        scores = self.scores(strip, take)[:, 0] if strip is not None else np.empty(0, np.float32)
-        hits = np.flatnonzero(scores > least)
-        boxes = strip_boxes(level, hits, end, left=left, cells=self.box_cells, above=self.margin[1])
-        return boxes, scores[hits].astype(np.float64)
+        self,
+        feature_map: FeatureMap,
+        border_x: float,
+        *,
+        left: bool,
+        min_margin: float,
+        workspace: Workspace = NEW_ARRAYS,
+    ) -> tuple[Floats, Floats]:
+        """Boxes and margins above `min_margin` of the windows at the left or right border of the frame."""
+        strip = self.border_strip(feature_map, border_x, left=left)
+        margins = self.margins(strip, workspace)[:, 0] if strip is not None else np.empty(0, np.float32)
+        rows = np.flatnonzero(margins > min_margin)
+        return self.border_boxes(feature_map, rows, border_x, left=left), margins[rows].astype(np.float64)
+
+    def border_strip(
+        self, feature_map: FeatureMap, border_x: float, *, left: bool
+    ) -> NDArray[np.float32] | None:
+        """FHOG channels ``(28, rows, columns of the template)`` that end at a border in column `border_x`.
+
+        They are mirrored at the left border. None if the map has too few columns.
+        """
+        columns = self.weights.shape[1]
+        first = round((border_x - feature_map.left) / feature_map.step_x) - (0 if left else columns)
+        if first < 0 or first + columns > feature_map.channels.shape[2]:
+            return None
+        strip = feature_map.channels[:, :, first : first + columns]
+        return mirror_channels(strip) if left else np.ascontiguousarray(strip)
+
+    def border_boxes(
+        self, feature_map: FeatureMap, rows: NDArray[np.intp], border_x: float, *, left: bool
+    ) -> Floats:
+        """Boxes, in pixels of the frame, of the windows of a `border_strip` that start in these rows."""
+        width = self.box_cells[0] * feature_map.step_x
+        top = feature_map.top + (rows + self.padding[1]) * feature_map.step_y
+        boxes = np.empty((len(rows), 4))
+        boxes[:, 0], boxes[:, 2] = (border_x, border_x + width) if left else (border_x - width, border_x)
+        boxes[:, 1], boxes[:, 3] = top, top + self.box_cells[1] * feature_map.step_y
+        return boxes
 
 
 def smallest_box(templates: Sequence[MixtureTemplate]) -> tuple[float, float]:
-    """Least columns and rows of a box, of whole vehicles where a template shows one."""
+    """Minimum columns and rows of the templates' boxes; border templates only if there are no others."""
     boxes = [each.box_cells for each in templates if not each.border] or [t.box_cells for t in templates]
     return min(columns for columns, _ in boxes), min(rows for _, rows in boxes)

@@ -20,10 +20,10 @@ from vehicle_detection.evaluation import (
     match_detections,
     precision_recall_curve,
 )
-from vehicle_detection.mixture import MixtureSearch, TemplateMixture, without_noise
+from vehicle_detection.mixture import TemplateMixture
 from vehicle_detection.mixture_training.negatives import check_sources
 from vehicle_detection.mixture_training.train import FrameDataset, train_mixture
-from vehicle_detection.params import MixtureParams, PyramidParams
+from vehicle_detection.params import MixtureParams
 
 Floats = NDArray[np.float64]
 
@@ -190,18 +190,17 @@ def cross_validate_mixture(
 def detect_in_source(
     mixture: TemplateMixture, source: FrameDataset, *, n_jobs: int | None = None
 ) -> list[FoldDetections]:
-    """Find vehicles in all frames of a source as a detector does that is told nothing, weak ones too."""
-    search = MixtureSearch(mixture, n_jobs=1)
-    sizes = PyramidParams()
+    """Detect vehicles in all frames of a source, including weak ones; scores are margins."""
+    with mixture.open_search(n_jobs=1) as search, ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
 
-    def boxes_of(pair: tuple[Any, NDArray[np.uint8]]) -> tuple[Any, Detections]:
-        key, image = pair[0], without_noise(pair[1])
-        found = search.candidates(image, sizes)
-        return key, Detections(*mixture.vehicles(image, found, least=_LOWEST))
+        def detect(pair: tuple[Any, NDArray[np.uint8]]) -> tuple[Any, Detections]:
+            # An uncalibrated mixture has slope 1 and offset 0, so its scores are margins.
+            found = search.find(pair[1], min_vehicle_score=_LOWEST).vehicles
+            assert found is not None
+            return pair[0], found
 
-    with ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
         return [
-            FoldDetections(source.name, part, FrameBoxes.from_detections(dict(pool.map(boxes_of, part))))
+            FoldDetections(source.name, part, FrameBoxes.from_detections(dict(pool.map(detect, part))))
             for part in source.sets
         ]
 
@@ -254,7 +253,7 @@ def _threshold(held: Sequence[FoldDetections]) -> float:
     for part in held:
         match = match_detections(part.found, part.truth, list(part.frames.keys), 0.5)
         found = part.scores[~match.ignored][:, None] >= _THRESHOLDS
-        right += found[match.partner[~match.ignored] >= 0].sum(axis=0)
+        right += found[match.match[~match.ignored] >= 0].sum(axis=0)
         shown += found.sum(axis=0)
         vehicles += int((~part.truth.ignore).sum())
     f1 = 2 * right / np.maximum(shown + vehicles, 1)
@@ -270,7 +269,7 @@ def _log_odds(held: Sequence[FoldDetections]) -> tuple[float, float]:
         match = match_detections(part.found, part.truth, list(part.frames.keys), 0.5)
         judged = ~match.ignored
         values += part.scores[judged].tolist()
-        right += (match.partner[judged] >= 0).tolist()
+        right += (match.match[judged] >= 0).tolist()
     if len(set(right)) < 2:
         return 1.0, 0.0
     fitted = LogisticRegression(C=1e6).fit(np.array(values)[:, None], right)

@@ -16,16 +16,14 @@ from vehicle_detection.evaluation import LabelledFrames
 from vehicle_detection.mixture import (
     FeatureMap,
     MixtureTemplate,
-    border_strip,
+    denoise,
+    feature_maps,
     image_pyramid,
-    level_maps,
-    mirror_planes,
+    mirror_channels,
     mostly_inside,
     overlaps,
     pyramid_levels,
     smallest_box,
-    strip_boxes,
-    without_noise,
 )
 from vehicle_detection.params import MixtureParams, entries
 
@@ -124,7 +122,7 @@ def frames_of(sources: Sequence[FrameDataset]) -> list[Frame]:
             for key, image in part:
                 labels = part.labels.frame(key)
                 boxes, ignored = labels.boxes[~labels.ignore], labels.boxes[labels.ignore]
-                found.append(Frame(without_noise(image), boxes, ignored, source.min_labelled_width))
+                found.append(Frame(denoise(image), boxes, ignored, source.min_labelled_width))
     return found
 
 
@@ -142,7 +140,7 @@ def with_mirrored(templates: Sequence[MixtureTemplate], facing: Sequence[bool]) 
     views = [View(template, index, False) for index, template in enumerate(templates)]
     for index, template in enumerate(templates):
         if facing[index]:
-            weights = mirror_planes(template.weights.transpose(2, 0, 1)).transpose(1, 2, 0)
+            weights = mirror_channels(template.weights.transpose(2, 0, 1)).transpose(1, 2, 0)
             views.append(View(replace(template, weights=weights), index, True))
     return views
 
@@ -198,7 +196,7 @@ def _windows_of(
         levels = [
             features
             for level in pyramid_levels(sizes)
-            for _, features in level_maps(images, level, (0, shape[0]))
+            for _, features in feature_maps(images, level, (0, shape[0]))
         ]
     mined: HardNegatives = []
     for number, view in enumerate(views):
@@ -207,7 +205,7 @@ def _windows_of(
             continue
         places, parts, values = [], [], []
         for size, level in enumerate(levels):
-            scores = view.template.scores(level.planes)
+            scores = view.template.margins(level.channels)
             rows, columns = np.divmod(choose(scores.ravel()), max(scores.shape[1], 1))
             parts.append(view.template.boxes(level, rows, columns))
             values.append(scores[rows, columns].astype(np.float64))
@@ -218,8 +216,8 @@ def _windows_of(
         for row in _apart(boxes, np.concatenate(values), allowed, params.per_frame):
             size, top, left = places[row]
             high, wide = view.template.weights.shape[:2]
-            block = levels[size].planes[:, top : top + high, left : left + wide]
-            block = mirror_planes(block) if view.mirrored else block
+            block = levels[size].channels[:, top : top + high, left : left + wide]
+            block = mirror_channels(block) if view.mirrored else block
             mined.append((view.index, (number, size, top, left), block.transpose(1, 2, 0).ravel()))
     return mined
 
@@ -234,7 +232,6 @@ def _windows_at_ends(
 ) -> HardNegatives:
     """Windows next to the borders of a frame, and where it might as well have ended."""
     template, (height, width) = view.template, frame.image.shape[:2]
-    columns = template.weights.shape[1]
     mined: HardNegatives = []
     for left, share in itertools.product((False, True), (1.0, *params.cuts)):
         end = round(width * (1 - share if left else share))
@@ -242,15 +239,13 @@ def _windows_at_ends(
             size: (level, strip)
             for size, level in enumerate(levels)
             if template.box_cells[0] * level.step_x > 0.999 * params.search.min_width
-            and (strip := border_strip(level, columns, end, left=left)) is not None
+            and (strip := template.border_strip(level, end, left=left)) is not None
         }
         places, parts, values = [], [np.empty((0, 4))], [np.empty(0)]
         for size, (level, strip) in strips.items():
-            scores = template.scores(strip).ravel()
+            scores = template.margins(strip).ravel()
             rows = choose(scores)
-            parts.append(
-                strip_boxes(level, rows, end, left=left, cells=template.box_cells, above=template.margin[1])
-            )
+            parts.append(template.border_boxes(level, rows, end, left=left))
             values.append(scores[rows].astype(np.float64))
             places += [(size, row) for row in rows.tolist()]
         boxes = np.concatenate(parts)

@@ -8,7 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import relight
-from vehicle_detection.mixture import COARSE, FINE, BoxRegressor, MixtureTemplate, box_planes, mirror_planes
+from vehicle_detection.mixture import (
+    COARSE,
+    FINE,
+    BoxRegressor,
+    MixtureTemplate,
+    crop_channels,
+    mirror_channels,
+)
 from vehicle_detection.mixture_training.negatives import Frame
 from vehicle_detection.params import MixtureParams
 
@@ -32,8 +39,8 @@ def window_features(image: Image, box: Floats, template: MixtureTemplate) -> NDA
     cell = FINE if np.sqrt(step_x * step_y) < COARSE else COARSE
     if template.border:
         # The window ends with the box: its margin is part of what is warped.
-        box, inside = box - [template.margin[0] * step_x, 0, 0, 0], (float(columns), inside[1])
-    return box_planes(image, box.tolist(), inside, (columns, rows), cell)
+        box, inside = box - [template.padding[0] * step_x, 0, 0, 0], (float(columns), inside[1])
+    return crop_channels(image, box.tolist(), inside, (columns, rows), cell)
 
 
 def whole_vehicles(
@@ -85,7 +92,9 @@ def vehicle_features(
         for index in _alike(box, templates, params.near):
             planes = window_features(image, box, templates[index])
             # At the border every vehicle comes from both sides already.
-            found[index] += _rows(planes) if templates[index].border else _rows(planes, mirror_planes(planes))
+            found[index] += (
+                _rows(planes) if templates[index].border else _rows(planes, mirror_channels(planes))
+            )
     return _stacked(found, templates)
 
 
@@ -126,7 +135,7 @@ def patch_features(
             planes = window_features(image, box, templates[index]).copy()
             unseen = _beyond(image, box, templates[index])
             planes[:, unseen] = means[index][:, unseen]
-            found[index] += _rows(planes, mirror_planes(planes))
+            found[index] += _rows(planes, mirror_channels(planes))
     return _stacked(found, templates)
 
 
@@ -143,7 +152,7 @@ def _beyond(image: Image, box: Floats, template: MixtureTemplate) -> NDArray[np.
     """Which cells of a template lie beyond the image by more than a part of a cell, ``(rows, columns)``."""
     outside = []
     for axis, (cells, margin, inside) in enumerate(
-        zip(template.weights.shape[1::-1], template.margin, template.box_cells)
+        zip(template.weights.shape[1::-1], template.padding, template.box_cells)
     ):
         step = (box[axis + 2] - box[axis]) / inside
         start = (box[axis] + (np.arange(cells) - margin) * step) / step

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.mixture import (
-    COLORS,
-    CROP,
-    EDGES,
-    PLANES,
+    CROP_CELLS,
+    N_CHANNELS,
+    N_COLOR_FEATURES,
+    N_EDGE_FEATURES,
     MixtureSearch,
     Projection,
     Rescorer,
-    crop_views,
-    mirror_planes,
+    mirror_channels,
+    rescoring_features,
 )
 from vehicle_detection.mixture_training.negatives import Frame, is_negative
 from vehicle_detection.mixture_training.positives import jitter_boxes
@@ -26,7 +26,7 @@ from vehicle_detection.params import MixtureParams, PyramidParams
 
 Floats = NDArray[np.float64]
 Rows = tuple[NDArray[np.float32], NDArray[np.float32]]
-"""Edges and colors of some crops, as `crop_views` gives them."""
+"""Edges and colors of some crops, as `rescoring_features` gives them."""
 
 # Principal components that are kept of edges and colors, and the weight of the colors' spread.
 _EDGE_AXES, _COLOUR_AXES, _COLOUR_WEIGHT = 200, 40, 0.5
@@ -76,7 +76,7 @@ def train_rescorer(
 
     def views(frame: Frame, seed: int) -> tuple[Rows, Rows]:
         right, wrong = _boxes(frame, search, params, np.random.default_rng(seed))
-        return crop_views(frame.image, right), crop_views(frame.image, wrong)
+        return rescoring_features(frame.image, right), rescoring_features(frame.image, wrong)
 
     found = list(pool.map(views, frames, seeds))
     vehicles, clutter = (_joined(rows) for rows in zip(*found))
@@ -103,8 +103,8 @@ def _boxes(
     frame: Frame, search: MixtureSearch, params: MixtureParams, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
     """Boxes of a frame that show a vehicle, and boxes that do not."""
-    windows = search.candidates(frame.image, PyramidParams())
-    found, _ = search.mixture.proposals(frame.image, windows, least=_LEAST)
+    windows = search.score_windows(frame.image, PyramidParams())
+    found, _ = search.model.propose_boxes(frame.image, windows, min_margin=_LEAST)
     wrong = found[is_negative(found, frame)]
     right = found[iou_matrix(found, frame.boxes).max(axis=1, initial=0) >= _RIGHT]
     wide = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.min_width]
@@ -118,8 +118,8 @@ def _boxes(
 
 
 def _joined(parts: Sequence[Rows]) -> Rows:
-    edges = np.concatenate([np.empty((0, EDGES), np.float32), *(each for each, _ in parts)])
-    colors = np.concatenate([np.empty((0, COLORS), np.float32), *(each for _, each in parts)])
+    edges = np.concatenate([np.empty((0, N_EDGE_FEATURES), np.float32), *(each for each, _ in parts)])
+    colors = np.concatenate([np.empty((0, N_COLOR_FEATURES), np.float32), *(each for _, each in parts)])
     return edges, colors
 
 
@@ -127,12 +127,16 @@ def _mirrored(rows: Rows) -> Rows:
     """Rows of the mirrored crops."""
     edges, colors = rows
     count = len(edges)
-    planes = edges.reshape(count, PLANES, CROP, CROP).transpose(1, 0, 2, 3)
-    align_mirrored = mirror_planes(planes.reshape(PLANES, count * CROP, CROP))
+    planes = edges.reshape(count, N_CHANNELS, CROP_CELLS, CROP_CELLS).transpose(1, 0, 2, 3)
+    align_mirrored = mirror_channels(planes.reshape(N_CHANNELS, count * CROP_CELLS, CROP_CELLS))
     align_mirrored = (
-        align_mirrored.reshape(PLANES, count, CROP, CROP).transpose(1, 0, 2, 3).reshape(count, EDGES)
+        align_mirrored.reshape(N_CHANNELS, count, CROP_CELLS, CROP_CELLS)
+        .transpose(1, 0, 2, 3)
+        .reshape(count, N_EDGE_FEATURES)
     )
-    return align_mirrored, colors.reshape(count, 3 * CROP, CROP)[:, :, ::-1].reshape(count, COLORS)
+    return align_mirrored, colors.reshape(count, 3 * CROP_CELLS, CROP_CELLS)[:, :, ::-1].reshape(
+        count, N_COLOR_FEATURES
+    )
 
 
 def _principal(rows: NDArray[np.float32], count: int, weight: float, seed: int) -> Projection:

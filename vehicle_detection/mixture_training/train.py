@@ -21,13 +21,13 @@ from vehicle_detection._common import (
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture import (
-    CROP_LENGTH,
-    PLANES,
+    N_CHANNELS,
+    N_REGRESSION_FEATURES,
     BoxRegressor,
     MixtureSearch,
     MixtureTemplate,
     TemplateMixture,
-    crop_features,
+    regression_features,
     vote_boxes,
 )
 from vehicle_detection.mixture_training.negatives import (
@@ -233,7 +233,7 @@ class _Rounds:
 def _blank(shape: tuple[float, float], margin: float, *, border: bool = False) -> MixtureTemplate:
     columns, rows = round(shape[0] + margin * (1 if border else 2)), round(shape[1] + 2 * margin)
     across = (columns - shape[0]) / (1 if border else 2)
-    weights = np.zeros((rows, columns, PLANES), np.float32)
+    weights = np.zeros((rows, columns, N_CHANNELS), np.float32)
     return MixtureTemplate(weights, 0.0, (across, (rows - shape[1]) / 2), border)
 
 
@@ -288,10 +288,10 @@ def _fit_box_regressor(
 
     def pairs(frame: Frame, seed: int) -> tuple[NDArray[np.float32], Floats]:
         if not len(frame.boxes):
-            return np.empty((0, CROP_LENGTH), np.float32), np.empty((0, 4))
+            return np.empty((0, N_REGRESSION_FEATURES), np.float32), np.empty((0, 4))
         found = np.empty((0, 4))
         if search is not None:
-            found = vote_boxes(search.candidates(frame.image, params.search), least=-1.0)[0].boxes
+            found = vote_boxes(search.score_windows(frame.image, params.search), min_margin=-1.0)[0].boxes
         overlap = iou_matrix(found, frame.boxes)
         near = overlap.max(axis=1) >= 0.4
         wide = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.min_width]
@@ -302,7 +302,9 @@ def _fit_box_regressor(
         mirrored = np.ascontiguousarray(frame.image[:, ::-1])
         width = frame.image.shape[1]
         flipped, back = mirror_boxes(boxes, width), mirror_boxes(shifts, 0)
-        features = np.concatenate([crop_features(frame.image, boxes), crop_features(mirrored, flipped)])
+        features = np.concatenate(
+            [regression_features(frame.image, boxes), regression_features(mirrored, flipped)]
+        )
         return features, np.concatenate([shifts, back])
 
     found = list(pool.map(pairs, frames, seeds))

@@ -1,35 +1,38 @@
-"""Where windows are searched: bands below the horizon, placed on frames of any size."""
+"""Search parameters: bands of windows below the horizon, and the pyramid of a mixture of templates."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from vehicle_detection._common import check_choice, check_integer, check_number, describe
 from vehicle_detection.errors import InvalidInputError
 
 REFERENCE_WIDTH = 1280
-"""Search windows are given in pixels of a frame whose longer side is this long."""
+"""Search windows are given in pixels of a frame whose longer side has this length."""
 
-# A window of fewer pixels, blown up to a patch, is a blur.
-_LEAST_WINDOW = 16
+# Minimum side of a window in pixels of the frame: smaller ones are too blurred when enlarged to a patch.
+_MIN_WINDOW = 16
+# Typical width of a vehicle in meters.
+_VEHICLE_WIDTH_M = 1.8
+# Tolerance of a horizon that the user states, as a fraction of the frame's height.
+_KNOWN_HORIZON_TOLERANCE = 0.06
 
 Pair = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class PixelBand:
-    """A search band placed on one frame: all integer pixels of that frame.
+    """A search band in integer pixels of one frame.
 
     Attributes
     ----------
     x1, y1, x2, y2
-        The band's half-open rectangle. It lies inside the frame, but for an overhang at the sides.
+        Half-open rectangle of the band. It may extend beyond the frame's left and right border.
     window
-        Width and height of its windows.
+        Width and height of the windows.
     step
         Horizontal and vertical step between windows.
     """
@@ -44,18 +47,18 @@ class PixelBand:
 
 @dataclass(frozen=True, kw_only=True)
 class SearchBand:
-    """Windows of one size over a strip of the road, in pixels of a 1280-wide reference frame.
+    """Windows of one size in a horizontal band, in pixels of a 1280-wide reference frame.
 
     Attributes
     ----------
     window
         Width and height of the windows.
     y
-        Top and bottom of the strip, counted from the horizon downwards (negative: above it).
+        Top and bottom of the band relative to the horizon, positive downwards.
     x
-        Left and right end as shares of the frame's width, 0-1.
+        Left and right end as fractions of the frame's width, 0-1.
     overlap
-        Horizontal and vertical share that neighboring windows have in common, in [0, 1).
+        Horizontal and vertical overlap of neighboring windows as fractions of their size, in [0, 1).
     """
 
     window: Pair
@@ -77,46 +80,49 @@ class SearchBand:
     def place(
         self, shape: tuple[int, ...], horizon: float, horizontal_padding: float = 0.0
     ) -> PixelBand | None:
-        """Place the band on a frame of `shape` (height, width); None where no window fits."""
+        """Place the band on a frame of `shape` (height, width); None if no window fits."""
         height, width = shape[:2]
         scale = max(height, width) / REFERENCE_WIDTH
         window_w, window_h = (round(side * scale) for side in self.window)
         y1, y2 = (min(max(round(horizon * height + side * scale), 0), height) for side in self.y)
         x1, x2 = round(self.x[0] * width), round(self.x[1] * width)
-        if min(window_w, window_h) < _LEAST_WINDOW or x2 - x1 < window_w or y2 - y1 < window_h:
+        if min(window_w, window_h) < _MIN_WINDOW or x2 - x1 < window_w or y2 - y1 < window_h:
             return None
-        beyond = round(horizontal_padding * window_w)
-        x1 -= beyond if x1 == 0 else 0
-        x2 += beyond if x2 == width else 0
-        step = (
-            max(1, int(window_w * (1 - self.overlap[0]) + 1e-9)),
-            max(1, int(window_h * (1 - self.overlap[1]) + 1e-9)),
+        padding = round(horizontal_padding * window_w)
+        x1 -= padding if x1 == 0 else 0
+        x2 += padding if x2 == width else 0
+        step_x, step_y = (
+            max(1, int(side * (1 - overlap) + 1e-9))
+            for side, overlap in zip((window_w, window_h), self.overlap)
         )
-        return PixelBand(x1, y1, x2, y2, (window_w, window_h), step)
+        return PixelBand(x1, y1, x2, y2, (window_w, window_h), (step_x, step_y))
 
 
 @dataclass(frozen=True, kw_only=True)
 class SearchParams:
-    """Where and at which sizes windows are searched.
+    """Positions and sizes of the windows that are searched.
 
     Attributes
     ----------
     bands
-        The strips, each with its window size.
+        Bands of windows, each with its window size.
     horizon
-        Height of the horizon as a share of the frame's height, 0 at the top.
+        Row of the horizon as a fraction of the frame's height, 0 at the top.
     min_score
-        Windows with a score above this count as hits.
+        Minimum score of a hit (exclusive).
     horizontal_padding
-        Share of a window that may lie beyond the frame's left and right edge, where the outermost column
-        is repeated: vehicles that are half in the picture are found.
+        Fraction of a window that may extend beyond the frame's left and right border, where the outermost
+        column is replicated, so that truncated vehicles are found.
 
     Examples
     --------
-    >>> search = SearchParams.preset("three-scales")
-    >>> search.place((720, 1280))[1]
+    >>> params = SearchParams.preset("three-scales")
+    >>> params.place((720, 1280))[1]
     PixelBand(x1=0, y1=400, x2=1280, y2=656, window=(64, 64), step=(8, 8))
     """
+
+    horizon_tolerance: ClassVar[float] = 0.1
+    """Maximum error of the horizon that the bands allow, as a fraction of the frame's height."""
 
     bands: tuple[SearchBand, ...]
     horizon: float = 0.58
@@ -135,18 +141,23 @@ class SearchParams:
         check_number(self.horizontal_padding, "horizontal_padding", low=0, high=0.9)
 
     @classmethod
-    def preset(cls, name: str = "default") -> SearchParams:
-        """Bands of the project (``"default"``) or of the course's first or third system.
+    def default(cls) -> SearchParams:
+        """Return the preset ``"default"``."""
+        return cls.preset()
 
-        ``"130-windows"`` is the window list of the first system, ``"three-scales"`` the dense search
-        of the third, both for 1280x720 frames.
+    @classmethod
+    def preset(cls, name: str = "default") -> SearchParams:
+        """Return the project's bands (``"default"``) or those of a system of the course, for 1280x720 frames.
+
+        ``"130-windows"`` is the window list of the first system, ``"three-scales"`` the dense search of the
+        third.
         """
-        presets = {"three-scales": _third_system, "130-windows": _first_system, "default": _default_search}
+        presets = {"three-scales": _three_scales, "130-windows": _window_list, "default": _default_bands}
         check_choice(name, "preset", presets)
         return cls(**presets[name]())
 
     def with_horizon(self, horizon: float | None) -> SearchParams:
-        """Return the same search with another horizon; None keeps it."""
+        """Return the same parameters with another horizon; None keeps it."""
         return self if horizon is None else dataclasses.replace(self, horizon=horizon)
 
     def place(self, shape: tuple[int, ...]) -> tuple[PixelBand, ...]:
@@ -155,18 +166,16 @@ class SearchParams:
         Raises
         ------
         InvalidInputError
-            If not one window fits into the frame.
+            If no window fits into the frame.
         """
-        placed = tuple(band for band in self._place_each(shape) if band)
-        if not placed:
+        placed = [band.place(shape, self.horizon, self.horizontal_padding) for band in self.bands]
+        fitting = tuple(band for band in placed if band is not None)
+        if not fitting:
             raise InvalidInputError(
-                f"image of {shape[1]}x{shape[0]} pixels holds no search window below the horizon at "
+                f"image of {shape[1]}x{shape[0]} pixels has no room for a search window below the horizon at "
                 f"{self.horizon:g} of its height; pass a larger image, another horizon or other bands"
             )
-        return placed
-
-    def _place_each(self, shape: tuple[int, ...]) -> Iterator[PixelBand | None]:
-        return (band.place(shape, self.horizon, self.horizontal_padding) for band in self.bands)
+        return fitting
 
 
 def _check_pair(value: object, name: str, *, low: float, high: float) -> None:
@@ -176,7 +185,7 @@ def _check_pair(value: object, name: str, *, low: float, high: float) -> None:
         check_number(number, f"{name}[{index}]", low=low, high=high)
 
 
-def _first_system() -> dict[str, Any]:
+def _window_list() -> dict[str, Any]:
     rows = (
         ((96.0, 96.0), (395, 530), (0.9, 0.5)),
         ((110.0, 145.0), (380, 590), (0.7, 0.6)),
@@ -190,17 +199,17 @@ def _first_system() -> dict[str, Any]:
     return {"bands": bands, "horizon": 400 / 720, "min_score": 0.0}
 
 
-def _third_system() -> dict[str, Any]:
+def _three_scales() -> dict[str, Any]:
     bands = tuple(SearchBand(window=(64 * s, 64 * s), y=(0.0, 256.0)) for s in (1.5, 1.0, 0.8))
     return {"bands": bands, "horizon": 400 / 720, "min_score": 0.0}
 
 
-def _default_search() -> dict[str, Any]:
-    """Windows from 64 px up in even steps of scale, wherever a vehicle on a flat road may stand.
+def _default_bands() -> dict[str, Any]:
+    """Windows from 64 pixels up, in steps of 1.25, wherever a vehicle on a flat road may be.
 
-    With the camera `c` meters above the road, the foot of a vehicle whose face fills 0.84 of a window of
-    side `s` is ``0.84 * s * c / 1.8`` below the horizon. For cameras from 0.9 to 2 m high that puts the
-    window between -0.35 and 0.95 `s`; the margin allows for hills and for a horizon that is not exact.
+    With the camera `c` meters above the road, the bottom of a vehicle whose face fills 0.84 of a window of
+    side `s` is ``0.84 * s * c / 1.8`` below the horizon. For cameras at 0.9 to 2 m the window is between
+    -0.35 `s` and 0.95 `s`; the margin allows for hills and an inexact horizon.
     """
     margin = 16.0
     sides = [64.0 * 1.25**step for step in range(8)]
@@ -210,31 +219,27 @@ def _default_search() -> dict[str, Any]:
     return {"bands": bands, "horizon": 0.58, "min_score": 0.0, "horizontal_padding": 0.5}
 
 
-# By how much of the frame's height a horizon that somebody states may be wrong.
-_KNOWN = 0.06
-
-
 @dataclass(frozen=True, kw_only=True)
 class PyramidParams:
-    """How the search with several templates walks through a frame, of whatever size.
+    """Sizes and positions of the windows of a mixture of templates, for frames of any size.
 
     Attributes
     ----------
     min_width
-        Width in pixels of the narrowest vehicle looked for.
+        Minimum width of a vehicle in pixels.
     max_height
-        Height of the highest one, as a share of the frame's height.
+        Maximum height of a vehicle as a fraction of the frame's height.
     per_octave
-        Sizes from one to twice of it.
+        Number of sizes per doubling.
     horizon
-        Height of the horizon as a share of the frame's height: a vehicle of each size is looked for where a
-        flat road would carry it. None: everywhere.
+        Row of the horizon as a fraction of the frame's height; vehicles of each size are searched where they
+        are possible on a flat road. None: everywhere.
     camera_height_m
-        Heights in meters, least and most, at which the camera may be where the horizon is known.
-    horizon_error
-        By how much of the frame's height the horizon may be wrong; the default holds for any dash-cam.
+        Minimum and maximum height of the camera above the road in meters, if the horizon is given.
+    horizon_tolerance
+        Maximum error of the horizon as a fraction of the frame's height; the default suits any dash-cam.
     min_score
-        Least score of a window that is told, in log-odds above the model's threshold.
+        Minimum score of the windows that a search returns, in log-odds above the model's threshold.
 
     Examples
     --------
@@ -247,7 +252,7 @@ class PyramidParams:
     per_octave: int = 5
     horizon: float | None = 0.5
     camera_height_m: tuple[float, float] = (0.9, 2.6)
-    horizon_error: float = 0.15
+    horizon_tolerance: float = 0.15
     min_score: float = 0.0
 
     def __post_init__(self) -> None:
@@ -259,38 +264,43 @@ class PyramidParams:
         heights: object = self.camera_height_m
         if not isinstance(heights, (tuple, list)) or len(heights) != 2:
             raise InvalidInputError(
-                f"camera_height_m must be the least and the most, such as (0.9, 2.6); got {describe(heights)}"
+                f"camera_height_m must be (minimum, maximum), such as (0.9, 2.6); got {describe(heights)}"
             )
         low, high = (check_number(each, "camera_height_m", above=0, high=1000) for each in heights)
         if low > high:
-            raise InvalidInputError(f"camera_height_m must be the least one first; got {describe(heights)}")
+            raise InvalidInputError(f"camera_height_m must be in ascending order; got {describe(heights)}")
         object.__setattr__(self, "camera_height_m", (low, high))
-        check_number(self.horizon_error, "horizon_error", low=0, high=1)
+        check_number(self.horizon_tolerance, "horizon_tolerance", low=0, high=1)
         check_number(self.min_score, "min_score")
 
+    @classmethod
+    def default(cls) -> PyramidParams:
+        """Return the default parameters."""
+        return cls()
+
     def with_horizon(self, horizon: float | None) -> PyramidParams:
-        """Return the same for a horizon that is known to 6% of the height; None changes nothing."""
+        """Return the same parameters with a known horizon and a lower tolerance; None changes nothing."""
         if horizon is None:
             return self
-        return dataclasses.replace(self, horizon=horizon, horizon_error=_KNOWN)
+        return dataclasses.replace(self, horizon=horizon, horizon_tolerance=_KNOWN_HORIZON_TOLERANCE)
 
     def sizes(self, columns: float, rows: float, shape: tuple[int, ...]) -> list[float]:
-        """Pixels a cell of each level, for boxes of `columns` by `rows` cells in a frame of `shape`."""
-        least = self.min_width / columns
-        most = max(self.max_height * shape[0] / rows, least)
-        count = math.floor(self.per_octave * math.log2(most / least)) + 1
-        return [least * 2 ** (step / self.per_octave) for step in range(count)]
+        """Cell sizes in pixels of the frame, for boxes of `columns` by `rows` cells in a frame of `shape`."""
+        smallest = self.min_width / columns
+        largest = max(self.max_height * shape[0] / rows, smallest)
+        count = math.floor(self.per_octave * math.log2(largest / smallest)) + 1
+        return [smallest * 2 ** (step / self.per_octave) for step in range(count)]
 
     def rows(self, width: float, height: float, shape: tuple[int, ...]) -> tuple[int, int]:
-        """First and last row of the frame that boxes of `width` by `height` pixels may reach.
+        """Half-open range of rows that boxes of `width` by `height` pixels can cover in a frame of `shape`.
 
-        A vehicle about 1.8 m wide that stands on a flat road has its foot below the horizon by its width in
-        pixels times the camera's height over its own width.
+        On a flat road, the bottom of a vehicle is below the horizon by its width in pixels times the ratio of
+        the camera's height and the vehicle's width.
         """
         if self.horizon is None:
             return 0, shape[0]
-        near, far = (share * width / 1.8 for share in self.camera_height_m)
-        slack = self.horizon_error * shape[0]
-        top = (self.horizon * shape[0]) + near - slack - height
-        bottom = (self.horizon * shape[0]) + far + slack
+        low, high = (camera_height * width / _VEHICLE_WIDTH_M for camera_height in self.camera_height_m)
+        slack = self.horizon_tolerance * shape[0]
+        top = (self.horizon * shape[0]) + low - slack - height
+        bottom = (self.horizon * shape[0]) + high + slack
         return max(0, math.floor(top)), min(shape[0], math.ceil(bottom))

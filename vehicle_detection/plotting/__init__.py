@@ -1,18 +1,18 @@
-"""Figures with matplotlib, of what the other rooms hand out; the drawing itself is done in ``_plot_*``.
+"""Figures with matplotlib.
 
-A function that draws one panel takes ``ax=None`` and returns the Axes; None makes a figure of pyplot's, which
-``plt.show()`` and a notebook's cell show. A function that draws several takes ``figure=None``, a Figure or
-SubFigure, and returns it; None makes a figure that pyplot does not keep: a notebook shows it as the value of
-its cell, and ``savefig`` writes it. Nothing else is kept from one call to the next.
+A function that draws one panel has the parameter ``ax=None`` and returns the Axes; None creates a pyplot
+figure, which ``plt.show()`` or a notebook displays. A function that draws several panels has the parameter
+``figure=None`` (a Figure or SubFigure) and returns the figure; None creates one that pyplot does not manage:
+a notebook displays it as the value of a cell, and ``savefig`` writes it. No state is kept between calls.
 
-The colors are Okabe and Ito's, which stay apart for color-blind eyes, and matplotlib's perceptually
-uniform maps.
+Colors are those of Okabe and Ito, which are safe for color-blind readers, and matplotlib's perceptually
+uniform colormaps.
 """
 
 from __future__ import annotations
 
 from vehicle_detection.plotting.features import plot_channels, plot_features, plot_hog
-from vehicle_detection.plotting.images import ImageFacts, describe_image, plot_methods, show_images
+from vehicle_detection.plotting.images import ImageDescription, describe_image, plot_methods, show_images
 from vehicle_detection.plotting.patches import plot_balance, plot_near_duplicates, plot_patches
 from vehicle_detection.plotting.quality import (
     plot_errors,
@@ -29,10 +29,10 @@ from vehicle_detection.plotting.search import (
     plot_windows,
 )
 from vehicle_detection.plotting.tracks import plot_stage_times, plot_tracks
-from vehicle_detection.plotting.training import plot_scores, plot_split_scores, plot_weights
+from vehicle_detection.plotting.training import plot_scores, plot_weights
 
 __all__ = [
-    "ImageFacts",
+    "ImageDescription",
     "describe_image",
     "plot_balance",
     "plot_bands",
@@ -50,7 +50,6 @@ __all__ = [
     "plot_precision_recall",
     "plot_scores",
     "plot_speedups",
-    "plot_split_scores",
     "plot_stage_times",
     "plot_tracks",
     "plot_tradeoff",

@@ -1,4 +1,4 @@
-"""Figures of the features: colors, HOG, and the vector before and after scaling."""
+"""Figures of the features: color channels, HOG, and the feature vector before and after scaling."""
 
 from __future__ import annotations
 
@@ -19,37 +19,46 @@ from vehicle_detection.plotting.style import (
     LINE_COLORS,
     OTHER,
     VEHICLE,
-    Sheet,
-    check_count,
-    check_sequence,
+    FigureLike,
+    Image,
+    add_image,
+    check_length,
+    check_list,
+    check_numbers,
     new_figure,
-    panels,
-    put_image,
+    split_titles,
+    subplot_grid,
 )
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.collections import LineCollection
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+# Thin lines for glyphs of more cells per row than this.
+_MANY_CELLS = 24
 
-# Cells in a row from which the lines are thin.
-_MANY = 24
+_CHANNEL_NAMES = {"YCrCb": ("Y", "Cr", "Cb"), "LAB": ("L", "a", "b")}
+_CHANNEL_PAIRS = ((0, 1), (0, 2), (1, 2))
+
+
+def channel_names(color_space: str) -> tuple[str, ...]:
+    """Names of a color space's channels."""
+    return _CHANNEL_NAMES.get(color_space, tuple(color_space))
+
+
+def hog_channel_names(params: FeatureParams) -> tuple[str, ...]:
+    """Names of the channels that HOG is computed on."""
+    if params.hog_channel == "GRAY":
+        return ("gray",)
+    names = channel_names(params.color_space)
+    return names if params.hog_channel == "ALL" else (names[int(params.hog_channel)],)
 
 
 def sum_blocks(blocks: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sum for each cell what the blocks that it belongs to hold of it.
+    """Sum the values of each cell over the blocks that contain it.
 
-    Parameters
-    ----------
-    blocks
-        ``(block rows, block columns, b, b, orient)``, as `hog_blocks` gives it, or weights laid out alike.
-
-    Returns
-    -------
-    sums, counts : numpy.ndarray
-        ``(rows, columns, orient)`` and ``(rows, columns, 1)`` float64: the number of blocks of each cell.
+    ``(block rows, block columns, b, b, orient)``, as `hog_blocks` returns, to ``(rows, columns, orient)``
+    sums and ``(rows, columns, 1)`` numbers of blocks.
     """
     down, across, side, _, orient = blocks.shape
     sums = np.zeros((down + side - 1, across + side - 1, orient))
@@ -61,74 +70,36 @@ def sum_blocks(blocks: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.fl
     return sums, counts
 
 
-def put_glyphs(
-    ax: Axes, cells: NDArray[Any], *, size: float = 1.0, peak: float | None = None, cmap: str = "gray"
+def add_glyphs(
+    ax: Axes, cells: NDArray[Any], *, size: float = 1.0, peak: float | None = None
 ) -> LineCollection:
-    """Draw a line for each cell and orientation, along the edge: the brighter, the more there is of it.
+    """Draw a line along the edge for each cell and orientation of ``(rows, columns, orient)`` > 0.
 
-    Parameters
-    ----------
-    ax
-        Where to draw; it becomes a square-celled picture with its origin at the top left.
-    cells
-        ``(rows, columns, orient)``; what is zero or less is not drawn.
-    size
-        Side of a cell in the coordinates of the axes.
-    peak
-        Value of the brightest line; None takes the greatest.
-    cmap
-        Colors from nothing to `peak`; its first one is the ground.
+    The brightness is the value, relative to `peak` (None: the maximum). A cell has the side `size` in data
+    coordinates.
     """
-    from matplotlib import colormaps
     from matplotlib.collections import LineCollection
 
     rows, columns, orient = cells.shape
     angles = np.pi * (np.arange(orient) + 0.5) / orient
     row, column, bin_ = np.nonzero(cells > 0)
     values = cells[row, column, bin_]
-    order = np.argsort(values, kind="stable")  # Strong ones lie on top.
+    order = np.argsort(values, kind="stable")  # strong lines on top
     row, column, bin_, values = row[order], column[order], bin_[order], values[order]
-    middle = np.stack([column + 0.5, row + 0.5], axis=1) * size
-    # An edge runs across its gradient; skimage.feature.hog draws the same.
-    along = np.stack([np.sin(angles), -np.cos(angles)], axis=1)[bin_] * (0.47 * size)
-    top = float(values.max()) if peak is None and len(values) else peak or 1.0
+    center = np.stack([column + 0.5, row + 0.5], axis=1) * size
+    # An edge is perpendicular to its gradient, as drawn by skimage.feature.hog.
+    offset = np.stack([np.sin(angles), -np.cos(angles)], axis=1)[bin_] * (0.47 * size)
     lines = LineCollection(
-        list(np.stack([middle - along, middle + along], axis=1)),
+        list(np.stack([center - offset, center + offset], axis=1)),
         array=values,
-        cmap=cmap,
-        linewidths=1.1 if columns <= _MANY else 0.5,
+        cmap="gray",
+        linewidths=1.1 if columns <= _MANY_CELLS else 0.5,
     )
-    lines.set_clim(0, top)
+    lines.set_clim(0, float(values.max()) if peak is None and len(values) else peak or 1.0)
     ax.add_collection(lines, autolim=False)
-    ax.set_facecolor(colormaps[cmap](0.0))
-    ax.set_xlim(0, columns * size)
-    ax.set_ylim(rows * size, 0)
-    ax.set_aspect("equal")
-    ax.set_xticks([])
-    ax.set_yticks([])
+    ax.set_facecolor("black")
+    ax.set(xlim=(0, columns * size), ylim=(rows * size, 0), aspect="equal", xticks=[], yticks=[])
     return lines
-
-
-Image = NDArray[np.uint8]
-
-_CHANNELS = {
-    "YCrCb": ("Y", "Cr", "Cb"),
-    "LAB": ("L", "a", "b"),
-}
-_PAIRS = ((0, 1), (0, 2), (1, 2))
-
-
-def channel_names(color_space: str) -> tuple[str, ...]:
-    """Names of a color space's channels."""
-    return _CHANNELS.get(color_space, tuple(color_space))
-
-
-def hog_channel_names(params: FeatureParams) -> tuple[str, ...]:
-    """Names of the channels that HOG sees."""
-    if params.hog_channel == "GRAY":
-        return ("gray",)
-    names = channel_names(params.color_space)
-    return names if params.hog_channel == "ALL" else (names[int(params.hog_channel)],)
 
 
 def plot_channels(
@@ -138,35 +109,36 @@ def plot_channels(
     labels: ArrayLike | None = None,
     points: int = 4000,
     random_state: int = 0,
-    figure: Sheet | None = None,
-) -> Sheet:
-    """Plot how the pixels of images lie in a color space: each channel by itself, and pairs of channels.
+    figure: FigureLike | None = None,
+) -> FigureLike:
+    """Plot the distribution of pixels in a color space: each channel, and pairs of channels.
 
     Parameters
     ----------
     images
-        One ``(H, W, 3)`` uint8 RGB image, several, or a set of patches.
+        One ``(H, W, 3)`` uint8 RGB image, several images, or a set of patches.
     color_space
         One of ``COLOR_SPACES``.
     labels
-        ``(N,)`` 1 for a vehicle, 0 for anything else: the classes are drawn apart. Those of a set are known.
+        ``(N,)`` 1 for a vehicle, 0 for anything else: one curve per class. None takes those of a set.
     points
-        Pixels of each class, drawn at random, in the lower panels; without classes each has its own color.
+        Number of randomly chosen pixels per class in the lower panels; without labels each point has the
+        color of its pixel.
     random_state
-        Seed of that draw.
+        Seed of that choice.
     figure
-        Where to draw; None makes a new figure.
+        Where to draw; None for a new figure.
 
     Returns
     -------
     matplotlib.figure.Figure or SubFigure
-        Three panels with the channels' distributions over all pixels, and under them three with pairs of
-        channels.
+        Three panels with the histograms of the channels over all pixels; below, three scatter plots of
+        pairs of channels.
 
     Raises
     ------
     InvalidInputError
-        If an image is malformed, the color space unknown, or the labels do not fit.
+        If an image is malformed, the color space unknown, or the number of labels wrong.
 
     Examples
     --------
@@ -175,58 +147,52 @@ def plot_channels(
     ['H', 'S', 'V', 'H', 'H', 'S']
     """
     check_choice(color_space, "color_space", COLOR_SPACES)
-    seed = check_integer(random_state, "random_state", low=0)
-    wanted = check_integer(points, "points", low=1, high=1_000_000)
-    groups = _pixels_of(images, labels)
+    rng = np.random.default_rng(check_integer(random_state, "random_state", low=0))
+    max_points = check_integer(points, "points", low=1, high=1_000_000)
+    groups = _pixels_by_class(images, labels)
     names = channel_names(color_space)
-    sheet = new_figure(figure, 11, 6)
-    upper, lower = panels(sheet, 2, 3)
-    rng = np.random.default_rng(seed)
-    spaces = [convert_color(pixels[None], color_space)[0] for _, _, pixels in groups]
-    for (label, color, pixels), values in zip(groups, spaces):
+    figure = new_figure(figure, 11, 6)
+    upper, lower = subplot_grid(figure, 2, 3)
+    converted = [convert_color(pixels[None], color_space)[0] for _, _, pixels in groups]
+    for (label, color, pixels), values in zip(groups, converted):
         for channel, panel in enumerate(upper):
-            shares = np.bincount(values[:, channel] // 2, minlength=128) / len(values)
-            panel.stairs(100 * shares, np.arange(0, 257, 2), color=color, label=label, linewidth=1.4)
-        chosen = rng.choice(len(values), min(wanted, len(values)), replace=False)
-        paint = pixels[chosen] / 255 if label is None else [color]
-        for panel, (first, second) in zip(lower, _PAIRS):
+            fractions = np.bincount(values[:, channel] // 2, minlength=128) / len(values)
+            panel.stairs(100 * fractions, np.arange(0, 257, 2), color=color, label=label, linewidth=1.4)
+        chosen = rng.choice(len(values), min(max_points, len(values)), replace=False)
+        point_colors = pixels[chosen] / 255 if label is None else [color]
+        for panel, (first, second) in zip(lower, _CHANNEL_PAIRS):
             x, y = values[chosen, first], values[chosen, second]
-            panel.scatter(x, y, s=3, c=paint, alpha=0.5, linewidths=0, label=label)
-    reach = [_reach([values[:, channel] for values in spaces]) for channel in range(3)]
-    for name, panel, ends in zip(names, upper, reach):
-        panel.set(xlabel=name, ylabel="share of the pixels (%)", xlim=ends)
-    for panel, (first, second) in zip(lower, _PAIRS):
-        panel.set(xlabel=names[first], ylabel=names[second], xlim=reach[first], ylim=reach[second])
+            panel.scatter(x, y, s=3, c=point_colors, alpha=0.5, linewidths=0, label=label)
+    limits = [_axis_limits([values[:, channel] for values in converted]) for channel in range(3)]
+    for name, panel, limit in zip(names, upper, limits):
+        panel.set(xlabel=name, ylabel="pixels (%)", xlim=limit)
+    for panel, (first, second) in zip(lower, _CHANNEL_PAIRS):
+        panel.set(xlabel=names[first], ylabel=names[second], xlim=limits[first], ylim=limits[second])
     if groups[0][0] is not None:
         upper[0].legend(fontsize=9)
-    sheet.suptitle(f"{color_space}, 8 bits a channel", fontsize=11)
-    return sheet
+    figure.suptitle(f"{color_space}, 8 bits per channel", fontsize=11)
+    return figure
 
 
-def _reach(channel: list[NDArray[np.uint8]]) -> tuple[float, float]:
-    """Find the ends of an axis on which all classes are seen, but for a thousandth of their pixels."""
+def _axis_limits(channel: list[NDArray[np.uint8]]) -> tuple[float, float]:
+    """Axis limits that contain all but 0.1% of each class's pixels at either end."""
     ends = np.concatenate([np.quantile(values, (0.001, 0.999)) for values in channel])
-    spare = max(2.0, 0.04 * float(np.ptp(ends)))
-    return max(0.0, float(ends.min()) - spare), min(256.0, float(ends.max()) + spare)
+    margin = max(2.0, 0.04 * float(np.ptp(ends)))
+    return max(0.0, float(ends.min()) - margin), min(256.0, float(ends.max()) + margin)
 
 
-def _pixels_of(images: object, labels: ArrayLike | None) -> list[tuple[str | None, Any, Image]]:
-    """Name, color and ``(N, 3)`` RGB pixels of each class; without classes, of all."""
+def _pixels_by_class(images: object, labels: ArrayLike | None) -> list[tuple[str | None, Any, Image]]:
+    """Name, color and ``(N, 3)`` RGB pixels of each class, or of all images without labels."""
     if isinstance(images, np.ndarray) and images.ndim == 3:
-        listed = [images]
+        images = [images]
     elif isinstance(images, PatchSet):
         labels = images.labels if labels is None else labels
-        listed = check_sequence(images.patches, "images", "images")
-    else:
-        listed = check_sequence(images, "images", "images")
+        images = images.patches
+    listed = check_list(images, "images", "images")
     flat = [check_image(image, f"images[{index}]").reshape(-1, 3) for index, image in enumerate(listed)]
-    if labels is None:
+    known = check_numbers(labels, "labels", len(flat), "images")
+    if known is None:
         return [(None, "0.35", np.concatenate(flat))]
-    known = np.asarray(labels)
-    if known.shape != (len(flat),) or known.dtype.kind not in "biuf":
-        raise InvalidInputError(
-            f"labels must be one number for each of {len(flat)} images; got {describe(known)}"
-        )
     groups = (("vehicle", VEHICLE, known > 0), ("other", OTHER, known <= 0))
     return [
         (name, color, np.concatenate([flat[row] for row in np.flatnonzero(mask)]))
@@ -241,37 +207,37 @@ def plot_hog(
     *,
     pix_per_cell: Sequence[int] = (8, 16),
     titles: Sequence[str] | None = None,
-    figure: Sheet | None = None,
-) -> Sheet:
-    """Draw the HOG of each channel at several cell sizes, image beside image.
+    figure: FigureLike | None = None,
+) -> FigureLike:
+    """Draw the HOG of each channel of images at several cell sizes.
 
-    What is drawn are the normalized histograms that the SVM sees: of each cell, the mean over the blocks it
-    belongs to. The lines run along the edges, across the gradients. Dalal and Triggs (CVPR 2005).
+    Each cell shows its block-normalized histogram, averaged over the blocks that contain the cell (Dalal and
+    Triggs, CVPR 2005). Lines are parallel to the edges, that is, perpendicular to the gradients.
 
     Parameters
     ----------
     images
-        One ``(H, W, 3)`` uint8 RGB image or several, such as a vehicle and a non-vehicle; a mapping gives the
-        titles.
+        One ``(H, W, 3)`` uint8 RGB image or several, such as a vehicle and a non-vehicle; the keys of a
+        mapping are the titles.
     params
-        Color space, channels, orientations and block; the default is ``FeatureParams()``.
+        Color space, channels, orientations and block; by default ``FeatureParams()``.
     pix_per_cell
-        Cell sizes, a row of panels each.
+        Cell sizes in pixels, one row of panels each.
     titles
-        One for each image.
+        One title per image.
     figure
-        Where to draw; None makes a new figure.
+        Where to draw; None for a new figure.
 
     Returns
     -------
     matplotlib.figure.Figure or SubFigure
-        A column for each image and channel: above the channel in gray, below its HOG, whose lines are the
-        panel's one collection.
+        One column per image and channel: the channel in gray, and below it its HOG as one line collection per
+        cell size.
 
     Raises
     ------
     InvalidInputError
-        If an image is malformed, or too small for a block.
+        If an image is malformed, or smaller than a block.
 
     Examples
     --------
@@ -280,31 +246,25 @@ def plot_hog(
     6
     """
     params = params or FeatureParams()
-    if isinstance(images, Mapping):
-        titles = list(images) if titles is None else titles
-        images = list(images.values())
-    elif isinstance(images, np.ndarray) and images.ndim == 3:
-        images = [images]
-    listed = check_sequence(images, "images", "images")
-    names = check_count(titles, "titles", len(listed), "images")
-    cells = [
+    single = isinstance(images, np.ndarray) and images.ndim == 3
+    listed, names = split_titles([images] if single else images, titles)
+    cell_sizes = [
         check_integer(cell, "pix_per_cell", low=2)
-        for cell in check_sequence(pix_per_cell, "pix_per_cell", "cell sizes")
+        for cell in check_list(pix_per_cell, "pix_per_cell", "cell sizes")
     ]
     columns = []
     for index, (image, name) in enumerate(zip(listed, names)):
         source = hog_source(check_image(image, f"images[{index}]"), params)
         for channel, letter in enumerate(hog_channel_names(params)):
             columns.append((source[..., channel], f"{name}: {letter}" if name else letter))
-    wide = min(2.2, 12.5 / len(columns)) if len(columns) > 1 else 6.0
-    aspect = columns[0][0].shape[0] / columns[0][0].shape[1]
-    sheet = new_figure(
-        figure, wide * len(columns), wide * aspect * (1 + len(cells)) + 0.4, layout="compressed"
-    )
-    grid = panels(sheet, 1 + len(cells), len(columns))
-    for place, (channel_image, title) in enumerate(columns):
-        put_image(grid[0, place], channel_image, title, vmin=0, vmax=255)
-        for panel, cell in zip(grid[1:, place], cells):
+    width = min(2.2, 12.5 / len(columns)) if len(columns) > 1 else 6.0
+    height = width * columns[0][0].shape[0] / columns[0][0].shape[1]
+    rows = 1 + len(cell_sizes)
+    figure = new_figure(figure, width * len(columns), height * rows + 0.4, layout="compressed")
+    grid = subplot_grid(figure, rows, len(columns))
+    for column, (channel_image, title) in zip(grid.T, columns):
+        add_image(column[0], channel_image, title, vmin=0, vmax=255)
+        for panel, cell in zip(column[1:], cell_sizes):
             blocks = hog_blocks(
                 channel_image,
                 params.orient,
@@ -313,12 +273,11 @@ def plot_hog(
                 transform_sqrt=params.transform_sqrt,
             )
             sums, counts = sum_blocks(blocks)
-            put_glyphs(panel, sums / counts, size=cell)
-            panel.set_xlim(0, channel_image.shape[1])
-            panel.set_ylim(channel_image.shape[0], 0)
-            if place == 0:
-                panel.set_ylabel(f"{cell} px cells", fontsize=9)
-    return sheet
+            add_glyphs(panel, sums / counts, size=cell)
+            panel.set(xlim=(0, channel_image.shape[1]), ylim=(channel_image.shape[0], 0))
+    for panel, cell in zip(grid[1:, 0], cell_sizes):
+        panel.set_ylabel(f"{cell} px cells", fontsize=9)
+    return figure
 
 
 def plot_features(
@@ -328,31 +287,32 @@ def plot_features(
     rows: Sequence[int] = (0,),
     names: Sequence[str] | None = None,
     template: int = 0,
-    figure: Sheet | None = None,
-) -> Sheet:
+    figure: FigureLike | None = None,
+) -> FigureLike:
     """Plot feature vectors before and after scaling, with their parts shaded.
 
-    Before scaling the counts of the histograms drown the HOG values; after it all parts have the same say.
+    Before scaling, histogram counts are much larger than HOG values; after scaling, all parts have the same
+    range.
 
     Parameters
     ----------
     patches
         ``(N, 64, 64, 3)`` uint8 RGB, or a set.
     model
-        A classifier, whose scaler is used; or parameters: then the scaler is fitted to all of `patches`.
+        A classifier, whose scaler is used; or parameters, with the scaler fitted to all of `patches`.
     rows
-        The patches to draw.
+        Row numbers of the patches to plot.
     names
-        A name for each of them.
+        One name per row.
     template
-        The classifier's template whose scaler is used.
+        Number of the classifier's template whose scaler is used.
     figure
-        Where to draw; None makes a new figure.
+        Where to draw; None for a new figure.
 
     Returns
     -------
     matplotlib.figure.Figure or SubFigure
-        Two panels, one line for each of `rows` in either: the vector as it is, and scaled.
+        Two panels with one line per row: the vector before and after scaling.
 
     Raises
     ------
@@ -366,38 +326,35 @@ def plot_features(
     >>> len(figure.axes[1].lines[0].get_ydata())
     2628
     """
-    given = patches.patches if isinstance(patches, PatchSet) else patches
-    images = check_patches(given, PATCH_SIZE)
+    images = check_patches(patches.patches if isinstance(patches, PatchSet) else patches, PATCH_SIZE)
     chosen = [
         check_integer(row, "rows", low=0, high=len(images) - 1)
-        for row in check_sequence(rows, "rows", "row numbers")
+        for row in check_list(rows, "rows", "row numbers")
     ]
-    texts = check_count(names, "names", len(chosen), "rows")
+    labels = check_length(names, "names", len(chosen), "rows")
     params, mean, scale = _scaler(images, model, template)
     raw = extract_features(images[chosen], params)
-    sheet = new_figure(figure, 11, 5.5)
-    above, below = panels(sheet, 2, 1, sharex=True)[:, 0]
+    figure = new_figure(figure, 11, 5.5)
+    above, below = subplot_grid(figure, 2, 1, sharex=True)[:, 0]
     for panel, values in ((above, raw), (below, (raw - mean) / scale)):
-        for line, text, color in zip(values, texts, LINE_COLORS * len(chosen)):
-            panel.plot(line, linewidth=0.6, color=color, label=text)
+        for line, label, color in zip(values, labels, LINE_COLORS * len(chosen)):
+            panel.plot(line, linewidth=0.6, color=color, label=label)
         _shade_parts(panel, params)
-    above.set_ylabel("value")
-    below.set_ylabel("value (standard deviations)")
-    below.set_xlabel("number of the feature")
+    above.set(ylabel="value", xlim=(0, params.length))
+    below.set(ylabel="value (standard deviations)", xlabel="feature")
     above.set_title("before scaling", loc="left", fontsize=10)
     below.set_title("after scaling", loc="left", fontsize=10)
-    above.set_xlim(0, params.length)
-    if any(text is not None for text in texts):
+    if any(label is not None for label in labels):
         legend = above.legend(loc="upper right", fontsize=9)
         for handle in legend.get_lines():
             handle.set_linewidth(2)
-    return sheet
+    return figure
 
 
 def _scaler(
     images: Image, model: object, template: int
 ) -> tuple[FeatureParams, NDArray[np.float64], NDArray[np.float64]]:
-    """Parameters, mean and scale."""
+    """Feature parameters, mean and scale."""
     if isinstance(model, VehicleClassifier):
         known = model.templates[check_integer(template, "template", low=0, high=len(model.templates) - 1)]
         return model.params, known.mean, known.scale
@@ -408,12 +365,12 @@ def _scaler(
         )
     features = extract_features(images, model).astype(np.float64)
     scale = features.std(axis=0)
-    scale[scale == 0] = 1  # As the scaler does: a constant feature stays at zero.
+    scale[scale == 0] = 1  # as StandardScaler does for constant features
     return model, features.mean(axis=0), scale
 
 
 def part_bounds(params: FeatureParams) -> dict[str, tuple[int, int]]:
-    """First and last feature, half-open, of each part of the vector."""
+    """Half-open range of feature numbers of each part of the vector."""
     lengths = {
         "spatial bins": params.spatial_length,
         "color histogram": params.hist_length,

@@ -1,4 +1,4 @@
-"""Figures of pictures as they are: a grid of images, and an image in words."""
+"""Figures of images: a grid of images, methods side by side, and a description of an array."""
 
 from __future__ import annotations
 
@@ -8,63 +8,61 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from vehicle_detection._common import check_image, check_integer, describe
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes
 from vehicle_detection.plotting.style import (
     SKY,
     TRUTH,
-    Sheet,
-    boxes_of,
-    check_count,
-    check_picture,
-    check_sequence,
+    Boxes,
+    FigureLike,
+    Image,
+    add_boxes,
+    add_image,
+    box_array,
+    check_displayable,
+    check_length,
+    filled_axes,
     new_figure,
-    panels,
-    put_boxes,
-    put_image,
+    split_titles,
 )
-
-Image = NDArray[np.uint8]
-Boxes = Detections | FrameBoxes | ArrayLike
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImageFacts:
-    """What an array holds, and whether the library takes it as an image.
+class ImageDescription:
+    """The contents of an array, and whether the library accepts it as an image.
 
     Attributes
     ----------
     shape, dtype
-        Those of the array.
-    low, high
-        Its least and greatest value.
-    means
-        Mean of each channel; one value for an array of other than three dimensions.
+        Shape and dtype of the array.
+    min, max
+        Minimum and maximum value.
+    mean
+        Mean of each channel; a single value unless the array has three dimensions.
     problem
-        Why the library refuses it as an image, and what to do; empty where it takes it.
+        Why the library rejects it as an image, and the remedy; empty if it is accepted.
     """
 
     shape: tuple[int, ...]
     dtype: str
-    low: float
-    high: float
-    means: tuple[float, ...]
+    min: float
+    max: float
+    mean: tuple[float, ...]
     problem: str
 
     def __str__(self) -> str:
-        means = ", ".join(f"{value:.4g}" for value in self.means)
-        text = f"{self.dtype} array of shape {self.shape}, values {self.low:g} to {self.high:g}, mean {means}"
+        mean = ", ".join(f"{value:.4g}" for value in self.mean)
+        text = f"{self.dtype} array of shape {self.shape}, values {self.min:g} to {self.max:g}, mean {mean}"
         return f"{text}\n{self.problem}" if self.problem else text
 
 
-def describe_image(image: NDArray[Any]) -> ImageFacts:
-    """Say what an array holds: shape, dtype, range and mean, and whether it is an image of this library.
+def describe_image(image: NDArray[Any]) -> ImageDescription:
+    """Describe an array: shape, dtype, range and mean, and whether the library accepts it as an image.
 
-    The classic trap is a PNG read as 0-1 floats and a JPEG as 0-255: here it shows.
+    Typical use: find out that a PNG was read as floats from 0 to 1 and a JPEG as integers from 0 to 255.
 
     Parameters
     ----------
@@ -73,13 +71,13 @@ def describe_image(image: NDArray[Any]) -> ImageFacts:
 
     Returns
     -------
-    ImageFacts
-        The same as attributes, and ``str`` of it in a line or two.
+    ImageDescription
+        ``print`` shows it in one or two lines.
 
     Raises
     ------
     InvalidInputError
-        If `image` is no array of numbers, or empty.
+        If `image` is not an array of numbers, or is empty.
 
     Examples
     --------
@@ -98,13 +96,13 @@ def describe_image(image: NDArray[Any]) -> ImageFacts:
         problem = ""
     except InvalidInputError as error:
         problem = str(error)
-    means = image.mean(axis=(0, 1), dtype=np.float64) if image.ndim == 3 else image.mean(dtype=np.float64)
-    return ImageFacts(
+    mean = image.mean(axis=(0, 1) if image.ndim == 3 else None, dtype=np.float64)
+    return ImageDescription(
         shape=image.shape,
         dtype=str(image.dtype),
-        low=float(image.min()),
-        high=float(image.max()),
-        means=tuple(np.atleast_1d(means).tolist()),
+        min=float(image.min()),
+        max=float(image.max()),
+        mean=tuple(np.atleast_1d(mean).tolist()),
         problem=problem,
     )
 
@@ -116,34 +114,34 @@ def show_images(
     boxes: Sequence[Boxes | None] | None = None,
     truth: Sequence[Boxes | None] | None = None,
     columns: int | None = None,
-    figure: Sheet | None = None,
-) -> Sheet:
+    figure: FigureLike | None = None,
+) -> FigureLike:
     """Show images in a row or a grid.
 
     Parameters
     ----------
     images
-        ``(H, W, 3)`` uint8 RGB, or ``(H, W)`` numbers, which are drawn in gray; a mapping gives the titles.
+        ``(H, W, 3)`` uint8 RGB, or ``(H, W)`` numbers, shown in gray; the keys of a mapping are the titles.
     titles
-        One for each image.
+        One title per image.
     boxes
-        Boxes to draw on each image, or None for none: `Detections`, `FrameBoxes` or ``(N, 4)``.
+        Boxes to draw on each image, or None: `Detections`, `FrameBoxes` or ``(N, 4)``.
     truth
-        Labelled boxes in the same way, drawn with dashes.
+        Labelled boxes in the same form, drawn with dashed lines.
     columns
-        Images in a row; None takes up to three.
+        Images per row; None for up to three.
     figure
-        Where to draw; None makes a new figure.
+        Where to draw; None for a new figure.
 
     Returns
     -------
     matplotlib.figure.Figure or SubFigure
-        A panel for each image.
+        One Axes per image.
 
     Raises
     ------
     InvalidInputError
-        If an image is malformed, or there is not one title or entry of `boxes` for each.
+        If an image is malformed, or the number of titles or boxes differs from the number of images.
 
     Examples
     --------
@@ -152,29 +150,23 @@ def show_images(
     >>> [panel.get_title() for panel in figure.axes]
     ['first', 'second']
     """
-    if isinstance(images, Mapping):
-        titles = list(images) if titles is None else titles
-        images = list(images.values())
-    listed = check_sequence(images, "images", "images")
-    shown = [check_picture(image, f"images[{index}]") for index, image in enumerate(listed)]
-    names = check_count(titles, "titles", len(shown), "images")
-    found = check_count(boxes, "boxes", len(shown), "images")
-    true = check_count(truth, "truth", len(shown), "images")
-    across = min(3, len(shown)) if columns is None else check_integer(columns, "columns", low=1, high=100)
-    down = math.ceil(len(shown) / across)
-    wide = max(2.0, min(12.5 / across, 6.5))
-    tall = wide * float(np.median([image.shape[0] / image.shape[1] for image in shown]))
-    sheet = new_figure(figure, across * wide, down * (tall + 0.3 * any(names)), layout="compressed")
-    grid = panels(sheet, down, across)
-    for panel in grid.flat[len(shown) :]:
-        panel.remove()
-    for index, (panel, image, name) in enumerate(zip(grid.flat, shown, names)):
-        put_image(panel, image, "" if name is None else str(name))
+    listed, names = split_titles(images, titles)
+    shown = [check_displayable(image, f"images[{index}]") for index, image in enumerate(listed)]
+    count = len(shown)
+    found = check_length(boxes, "boxes", count, "images")
+    true = check_length(truth, "truth", count, "images")
+    per_row = min(3, count) if columns is None else check_integer(columns, "columns", low=1, high=100)
+    rows = math.ceil(count / per_row)
+    width = max(2.0, min(12.5 / per_row, 6.5))
+    height = width * float(np.median([image.shape[0] / image.shape[1] for image in shown]))
+    figure = new_figure(figure, per_row * width, rows * (height + 0.3 * any(names)), layout="compressed")
+    for index, panel in enumerate(filled_axes(figure, rows, per_row, count)):
+        add_image(panel, shown[index], "" if names[index] is None else str(names[index]))
         if true[index] is not None:
-            put_boxes(panel, boxes_of(true[index], f"truth[{index}]"), TRUTH, linestyles="--")
+            add_boxes(panel, box_array(true[index], f"truth[{index}]"), TRUTH, linestyles="--")
         if found[index] is not None:
-            put_boxes(panel, boxes_of(found[index], f"boxes[{index}]"), SKY)
-    return sheet
+            add_boxes(panel, box_array(found[index], f"boxes[{index}]"), SKY)
+    return figure
 
 
 def plot_methods(
@@ -182,30 +174,30 @@ def plot_methods(
     methods: Mapping[str, Sequence[Detections]],
     *,
     truth: Sequence[Boxes | None] | None = None,
-    figure: Sheet | None = None,
-) -> Sheet:
-    """Show what several methods find in the same images: a row for each image, a column for each method.
+    figure: FigureLike | None = None,
+) -> FigureLike:
+    """Show the boxes that several methods find in the same images: one row per image, one column per method.
 
     Parameters
     ----------
     images
-        ``(H, W, 3)`` uint8 RGB; a mapping names the rows.
+        ``(H, W, 3)`` uint8 RGB; the keys of a mapping name the rows.
     methods
-        By the method's name, what it found in each image.
+        For each method, its detections in each image.
     truth
-        Labelled boxes of each image, drawn with dashes.
+        Labelled boxes of each image, drawn with dashed lines.
     figure
-        Where to draw; None makes a new figure.
+        Where to draw; None for a new figure.
 
     Returns
     -------
     matplotlib.figure.Figure or SubFigure
-        Panels row by row; the title of each tells how many vehicles were found.
+        One Axes per image and method, row by row; each title counts the boxes.
 
     Raises
     ------
     InvalidInputError
-        If an image is malformed, or a method does not have one result for each image.
+        If an image is malformed, or a method does not have one result per image.
 
     Examples
     --------
@@ -219,22 +211,20 @@ def plot_methods(
     if not isinstance(given, Mapping) or not given:
         raise InvalidInputError(
             f"methods must map names to a list of Detections, got {describe(given)}; "
-            'pass {"fitted": [detector.detect(image) for image in images]}'
+            'pass {"default": [detector.detect(image) for image in images]}'
         )
-    rows = list(images) if isinstance(images, Mapping) else None
-    listed = check_sequence(images.values() if isinstance(images, Mapping) else images, "images", "images")
-    pictures, titles, boxes, true = [], [], [], []
-    truths = check_count(truth, "truth", len(listed), "images")
-    each = {
-        name: check_count(found, f"methods[{name!r}]", len(listed), "images")
-        for name, found in methods.items()
-    }
-    for index, picture in enumerate(listed):
-        for name, found in each.items():
-            count = len(boxes_of(found[index], f"methods[{name!r}][{index}]"))
-            row = f"{rows[index]}, " if rows else ""
-            pictures.append(check_image(picture, f"images[{index}]"))
-            titles.append(f"{row}{name}: {count} box{'es' * (count != 1)}")
+    listed, rows = split_titles(images)
+    true = check_length(truth, "truth", len(listed), "images")
+    for name, found in methods.items():
+        check_length(found, f"methods[{name!r}]", len(listed), "images")
+    shown, titles, boxes = [], [], []
+    for index, (image, row) in enumerate(zip(listed, rows)):
+        check_image(image, f"images[{index}]")
+        for name, found in methods.items():
+            count = len(box_array(found[index], f"methods[{name!r}][{index}]"))
+            prefix = "" if row is None else f"{row}, "
+            shown.append(image)
+            titles.append(f"{prefix}{name}: {count} box{'es' * (count != 1)}")
             boxes.append(found[index])
-            true.append(truths[index])
-    return show_images(pictures, titles, boxes=boxes, truth=true, columns=len(each), figure=figure)
+    repeated = [each for each in true for _ in methods]
+    return show_images(shown, titles, boxes=boxes, truth=repeated, columns=len(methods), figure=figure)

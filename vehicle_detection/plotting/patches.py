@@ -1,4 +1,4 @@
-"""Figures of the training patches: what they show, how many there are, which are near duplicates."""
+"""Figures of training patches: a grid of patches, class balance, and near duplicates."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.plotting.style import (
     OTHER,
     VEHICLE,
-    check_count,
-    check_picture,
-    check_sequence,
+    Image,
+    add_tiles,
+    check_displayable,
+    check_length,
+    check_list,
+    check_numbers,
+    evenly_spaced,
+    hide_spines,
     new_axes,
-    put_tiles,
-    spread,
-    tile_axes,
 )
 
 if TYPE_CHECKING:
@@ -30,12 +32,8 @@ if TYPE_CHECKING:
 _REMEDY = "read one with load_training_patches, or build PatchSet(patches, labels, names)"
 
 
-def _class_color(label: object) -> Any:
-    return None if label is None else VEHICLE if label else OTHER
-
-
 def plot_patches(
-    patches: PatchSet | NDArray[np.uint8] | Sequence[NDArray[np.uint8]],
+    patches: PatchSet | NDArray[np.uint8] | Sequence[Image],
     *,
     count: int = 32,
     columns: int = 8,
@@ -44,34 +42,34 @@ def plot_patches(
     scores: ArrayLike | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Show patches on a grid, each with a caption, in an edge of its class's color.
+    """Show patches on a grid, each with a caption and an edge in the color of its class.
 
     Parameters
     ----------
     patches
         A set, or ``(H, W, 3)`` images.
     count
-        Where there are more, this many are taken at even distances.
+        Maximum number of patches; of more, this many are chosen at even distances.
     columns
-        Patches in a row.
+        Patches per row.
     labels
-        ``(N,)`` 1 for a vehicle, 0 for anything else; those of a set are known. None draws no edges.
+        ``(N,)`` 1 for a vehicle, 0 for anything else. None takes those of a set, or draws no edges.
     captions
-        A text for each patch; by default the source of a set's patches.
+        One caption per patch; by default the source of a set's patches.
     scores
-        ``(N,)`` numbers that go to the captions, such as decision values.
+        ``(N,)`` numbers to add to the captions, such as decision values.
     ax
-        Where to draw; None makes a new figure.
+        Where to draw; None for a new figure.
 
     Returns
     -------
     matplotlib.axes.Axes
-        With one picture and one text a patch.
+        Contains one image and one text per patch.
 
     Raises
     ------
     InvalidInputError
-        If a patch is malformed, or a column is not as long as the patches.
+        If a patch is malformed, or the number of labels, captions or scores is wrong.
 
     Examples
     --------
@@ -80,51 +78,37 @@ def plot_patches(
     >>> len(plot_patches(patches, labels=labels, count=8).images)
     8
     """
-    kinds: list[Any]
-    listed: Any
+    images: Any
     if isinstance(patches, PatchSet):
-        listed = patches.patches
-        kinds = patches.labels.tolist() if labels is None else _column(labels, "labels", len(patches))
-        texts = check_count(captions or patches.sources.tolist(), "captions", len(patches), "patches")
+        images = patches.patches
+        labels = patches.labels if labels is None else labels
+        captions = captions or patches.sources.tolist()
     else:
-        listed = check_sequence(patches, "patches", "images")
-        kinds = _column(labels, "labels", len(listed))
-        texts = check_count(captions, "captions", len(listed), "patches")
-    values = _column(scores, "scores", len(listed))
-    rows = spread(len(listed), check_integer(count, "count", low=1, high=1000)).tolist()
+        images = check_list(patches, "patches", "images")
+    classes = check_numbers(labels, "labels", len(images), "patches")
+    texts = check_length(captions, "captions", len(images), "patches")
+    values = check_numbers(scores, "scores", len(images), "patches")
+    rows = evenly_spaced(len(images), check_integer(count, "count", low=1, high=1000)).tolist()
     if not rows:
         raise InvalidInputError("patches must hold at least one patch; got none")
-    lines = [[texts[row] or "", "" if values[row] is None else f"score {values[row]:+.2f}"] for row in rows]
-    across = min(check_integer(columns, "columns", low=1, high=100), len(rows))
-    named = max(sum(map(bool, line)) for line in lines)
-    axes = tile_axes(ax, len(rows), across, inches=1.25, lines=named)
-    put_tiles(
-        axes,
-        [check_picture(listed[row], f"patches[{row}]") for row in rows],
-        ["\n".join(filter(None, line)) for line in lines],
-        [_class_color(kinds[row]) for row in rows],
-        across,
+    lines = [[texts[row]] if texts[row] else [] for row in rows]
+    if values is not None:
+        lines = [[*line, f"score {values[row]:+.2f}"] for line, row in zip(lines, rows)]
+    axes, _ = add_tiles(
+        ax,
+        [check_displayable(images[row], f"patches[{row}]") for row in rows],
+        ["\n".join(line) for line in lines],
+        columns=min(check_integer(columns, "columns", low=1, high=100), len(rows)),
         inches=1.25,
-        lines=named,
+        caption_lines=max(map(len, lines)),
+        colors=None if classes is None else [VEHICLE if classes[row] else OTHER for row in rows],
     )
-    if any(kinds[row] is not None for row in rows):
-        _class_legend(axes)
+    if classes is not None:
+        _add_class_legend(axes)
     return axes
 
 
-def _column(values: ArrayLike | None, name: str, count: int) -> list[Any]:
-    """Numbers, one for each patch; None for each if there are none."""
-    if values is None:
-        return [None] * count
-    array = np.asarray(values)
-    if array.shape != (count,) or array.dtype.kind not in "biuf":
-        raise InvalidInputError(
-            f"{name} must be one number for each of {count} patches; got {describe(array)}"
-        )
-    return list(array.tolist())
-
-
-def _class_legend(axes: Axes) -> None:
+def _add_class_legend(axes: Axes) -> None:
     from matplotlib.patches import Patch
 
     handles = [
@@ -135,24 +119,24 @@ def _class_legend(axes: Axes) -> None:
 
 
 def plot_balance(patch_set: PatchSet, *, ax: Axes | None = None) -> Axes:
-    """Plot how many patches come from each source, vehicles first, and the share of each class.
+    """Plot the number of patches of each source and class, and the percentage of each class.
 
     Parameters
     ----------
     patch_set
         The patches.
     ax
-        Where to draw; None makes a new figure.
+        Where to draw; None for a new figure.
 
     Returns
     -------
     matplotlib.axes.Axes
-        With one bar for each class and source, from top to bottom.
+        Contains one bar per class and source, vehicles first.
 
     Raises
     ------
     InvalidInputError
-        If `patch_set` is no `PatchSet`, or empty.
+        If `patch_set` is not a `PatchSet`, or is empty.
 
     Examples
     --------
@@ -161,33 +145,28 @@ def plot_balance(patch_set: PatchSet, *, ax: Axes | None = None) -> Axes:
     >>> [text.get_text() for text in axes.get_yticklabels()]
     ['KITTI', 'GTI']
     """
-    _check_set(patch_set)
-    counted = Counter(zip((~patch_set.labels).tolist(), patch_set.sources.tolist()))
-    keys = sorted(counted)
+    _check_patch_set(patch_set)
+    counts = Counter(zip((~patch_set.labels).tolist(), patch_set.sources.tolist()))
+    keys = sorted(counts)
     axes = new_axes(ax, 7, 1.2 + 0.35 * len(keys))
-    for other, name in ((False, "vehicles"), (True, "other")):
-        places = [place for place, key in enumerate(keys) if key[0] == other]
-        share = float((~patch_set.labels == other).mean())
-        total = sum(counted[keys[place]] for place in places)
-        if places:
-            bars = axes.barh(
-                places,
-                [counted[keys[place]] for place in places],
-                color=OTHER if other else VEHICLE,
-                label=f"{name}: {total:,} ({share:.1%})",
+    for other, name, color in ((False, "vehicles", VEHICLE), (True, "other", OTHER)):
+        rows = [row for row, key in enumerate(keys) if key[0] == other]
+        lengths = [counts[keys[row]] for row in rows]
+        if rows:
+            label = f"{name}: {sum(lengths):,} ({sum(lengths) / len(patch_set):.1%})"
+            axes.bar_label(
+                axes.barh(rows, lengths, color=color, label=label), fmt="{:,.0f}", padding=3, fontsize=9
             )
-            axes.bar_label(bars, fmt="{:,.0f}", padding=3, fontsize=9)
     axes.set_yticks(range(len(keys)), [source for _, source in keys])
-    axes.invert_yaxis()
     axes.set_xlabel("patches")
     axes.margins(x=0.14)
     axes.legend(loc="upper left", bbox_to_anchor=(0, 1.0), ncols=2, frameon=False, fontsize=9)
     axes.set_ylim(len(keys) - 0.4, -1.2)
-    axes.spines[["top", "right"]].set_visible(False)
+    hide_spines(axes)
     return axes
 
 
-def _check_set(patch_set: PatchSet) -> None:
+def _check_patch_set(patch_set: PatchSet) -> None:
     check_type(patch_set, "patch_set", PatchSet, _REMEDY)
     if not len(patch_set):
         raise InvalidInputError(f"patch_set must hold patches, got none; {_REMEDY}")
@@ -201,26 +180,27 @@ def plot_near_duplicates(
     count: int = 10,
     ax: Axes | None = None,
 ) -> Axes:
-    """Show pairs of patches that are near duplicates: each patch, and under it the one most like it.
+    """Show pairs of near duplicates: each patch, and below it the patch that is most similar.
 
     Parameters
     ----------
     patch_set
         The patches.
     pairs
-        ``(M, 2)`` row numbers, what `find_near_duplicates` returns.
+        ``(M, 2)`` row numbers, as `find_near_duplicates` returns.
     split
-        A split of the patches: only pairs that it tears apart are shown, the tested patch above.
+        A split of the patches: only pairs of a test patch (above) and a training patch are shown.
     count
-        Where there are more pairs, this many are taken at even distances.
+        Maximum number of pairs; of more, this many are chosen at even distances.
     ax
-        Where to draw; None makes a new figure.
+        Where to draw; None for a new figure.
 
     Returns
     -------
     matplotlib.axes.Axes
-        With two pictures and two texts a pair: the source, and the correlation of the two. The title tells
-        which share of the patches has a near duplicate, or which share of the tested ones one to train on.
+        Contains two images and two texts per pair: the source, and the correlation of the two patches. The
+        title states the percentage of patches that have a near duplicate, or of test patches that have
+        one in the training part.
 
     Raises
     ------
@@ -235,45 +215,38 @@ def plot_near_duplicates(
     >>> plot_near_duplicates(drawn, np.array([[1, 3], [3, 1]])).get_title()
     '2 of 4 patches have a near duplicate (50.0%)'
     """
-    _check_set(patch_set)
+    _check_patch_set(patch_set)
     rows = np.asarray(pairs)
-    if rows.ndim != 2 or rows.shape[1] != 2 or rows.dtype.kind not in "iu" or not _inside(rows, patch_set):
+    size = len(patch_set)
+    valid = rows.ndim == 2 and rows.shape[1] == 2 and rows.dtype.kind in "iu"
+    if not valid or rows.min(initial=0) < 0 or rows.max(initial=0) >= size:
         raise InvalidInputError(
-            f"pairs must be (M, 2) row numbers of the {len(patch_set)} patches, got {describe(rows)}; "
+            f"pairs must be (M, 2) row numbers of the {size} patches, got {describe(rows)}; "
             "pass what find_near_duplicates returns for this set"
         )
-    whole, title = len(patch_set), "patches have a near duplicate"
+    total, title = size, "patches have a near duplicate"
     if split is not None:
-        check_type(split, "split", Split, "make one with split_random or the like")
-        tested = np.zeros(len(patch_set), np.bool_)
-        tested[split.test[split.test < len(patch_set)]] = True
+        check_type(split, "split", Split, "make one with split_random or a similar function")
+        tested = np.zeros(size, np.bool_)
+        tested[split.test[split.test < size]] = True
         rows = rows[tested[rows[:, 0]] & ~tested[rows[:, 1]]]
-        whole, title = len(split.test), "tested patches have their nearest copy among the training patches"
+        total, title = len(split.test), "test patches have their nearest duplicate in the training part"
     if not len(rows):
         raise InvalidInputError("pairs must hold at least one pair to show; got none")
-    chosen = rows[spread(len(rows), check_integer(count, "count", low=1, high=200))]
-    per_line = min(len(chosen), 10)
+    chosen = rows[evenly_spaced(len(rows), check_integer(count, "count", low=1, high=200))]
+    columns = min(len(chosen), 10)
     images: list[NDArray[Any]] = []
     captions: list[str] = []
-    for start in range(0, len(chosen), per_line):
-        line = chosen[start : start + per_line]
-        for side in range(2):
-            images += [patch_set.patches[row] for row in line[:, side]]
-            texts = patch_set.sources[line[:, 0]] if side == 0 else _correlations(patch_set, line)
-            captions += [str(text) for text in texts]
-            blanks = (per_line - len(line)) if start else 0
-            images += [np.full((1, 1, 3), 255, np.uint8)] * blanks
-            captions += [""] * blanks
-    axes = tile_axes(ax, len(images), per_line, inches=1.2, lines=1)
-    put_tiles(axes, images, captions, [None] * len(images), per_line, inches=1.2, lines=1)
-    axes.set_title(f"{len(rows):,} of {whole:,} {title} ({len(rows) / whole:.1%})", fontsize=10)
+    for start in range(0, len(chosen), columns):
+        first, second = chosen[start : start + columns].T
+        correlations = (make_thumbnails(patch_set[first]) * make_thumbnails(patch_set[second])).sum(axis=1)
+        blank = columns - len(first)
+        for side, texts in (
+            (first, patch_set.sources[first].tolist()),
+            (second, [f"r = {value:.3f}" for value in correlations]),
+        ):
+            images += [*patch_set.patches[side], *[np.full((1, 1, 3), 255, np.uint8)] * blank]
+            captions += [*texts, *[""] * blank]
+    axes, _ = add_tiles(ax, images, captions, columns=columns, inches=1.2, caption_lines=1)
+    axes.set_title(f"{len(rows):,} of {total:,} {title} ({len(rows) / total:.1%})", fontsize=10)
     return axes
-
-
-def _inside(rows: NDArray[Any], patch_set: PatchSet) -> bool:
-    return not rows.size or (rows.min() >= 0 and bool(rows.max() < len(patch_set)))
-
-
-def _correlations(patch_set: PatchSet, pairs: NDArray[Any]) -> list[str]:
-    first, second = (make_thumbnails(patch_set[pairs[:, side]]) for side in range(2))
-    return [f"r = {value:.3f}" for value in (first * second).sum(axis=1)]

@@ -1,4 +1,4 @@
-"""Figures of quality on labelled frames: curves, bars, and the worst mistakes."""
+"""Figures of detection quality on labelled frames: curves, bars, the worst errors, parameter studies."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_choice, check_integer, check_number, check_type, describe
-from vehicle_detection.boxes import iou_matrix
+from vehicle_detection.boxes import box_areas, clip_boxes, iou_matrix
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import (
@@ -17,21 +17,26 @@ from vehicle_detection.evaluation import (
     FrameBoxes,
     FrameKey,
     LabelledFrames,
+    best_f1,
     match_detections,
-    prepare_sides,
+    prepare_evaluation,
 )
 from vehicle_detection.plotting.style import (
     LINE_COLORS,
     SKY,
     TRUTH,
     VERMILION,
-    line_looks,
+    Color,
+    Image,
+    add_boxes,
+    add_tiles,
+    hide_spines,
+    legend_above,
+    legend_lines,
+    line_styles,
     new_axes,
-    put_boxes,
-    put_tiles,
-    tile_axes,
 )
-from vehicle_detection.tuning import numeric_column, pareto_front
+from vehicle_detection.tuning import check_column, numeric_column, pareto_front
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,26 +51,26 @@ _METRIC_NAMES = {"f1": "F1", "average_precision": "average precision", "mean_iou
 def plot_precision_recall(
     curves: Mapping[str, Curve] | Curve, *, threshold: float | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Plot precision against recall for every threshold on the scores, over lines of equal F1.
+    """Plot precision against recall for all score thresholds, with lines of equal F1.
 
     Parameters
     ----------
     curves
-        What `precision_recall_curve` returns, or several by name.
+        A result of `precision_recall_curve`, or a mapping from names to several.
     threshold
-        The threshold in use, marked with a square; a dot marks the best F1.
+        Threshold to mark with a square; a dot marks the best F1.
     ax
-        Where to draw; None makes a new figure.
+        Where to draw; None for a new figure.
 
     Returns
     -------
     matplotlib.axes.Axes
-        The legend tells the best F1 of each curve and its threshold.
+        The legend states the best F1 of each curve and its threshold.
 
     Raises
     ------
     InvalidInputError
-        If a curve is no such triple, or empty, or of frames without a labelled vehicle.
+        If a curve is malformed or empty, or the frames contain no labelled vehicle.
 
     Examples
     --------
@@ -80,24 +85,21 @@ def plot_precision_recall(
     checked = {str(name): _check_curve(curve, str(name)) for name, curve in named.items()}
     limit = None if threshold is None else check_number(threshold, "threshold")
     axes = new_axes(ax, 6.5, 6)
-    _put_f1_lines(axes)
-    for (name, (precision, recall, thresholds)), (color, dash) in zip(checked.items(), line_looks()):
-        total = precision + recall
-        f1 = np.divide(2 * precision * recall, total, out=np.zeros_like(total), where=total > 0)
-        best = int(f1.argmax())
-        text = f"best F1 {f1[best]:.2f} at {thresholds[best]:.2f}"
+    _add_f1_lines(axes)
+    for (name, (precision, recall, thresholds)), (color, dash) in zip(checked.items(), line_styles()):
+        f1, best_threshold = best_f1(precision, recall, thresholds)
+        best = int(np.argmax(thresholds == best_threshold))
+        text = f"best F1 {f1:.2f} at {best_threshold:.2f}"
         label = f"{name}: {text}" if name else text
         axes.plot(recall, precision, color=color, linestyle=dash, linewidth=1.8, label=label, zorder=3)
         axes.plot(recall[best], precision[best], "o", color=color, zorder=4)
         used = np.flatnonzero(thresholds > limit) if limit is not None else np.empty(0, np.intp)
         if len(used):
             axes.plot(recall[used[-1]], precision[used[-1]], "s", color=color, mfc="white", zorder=4)
-    axes.set_xlim(0, 1.01)
-    axes.set_ylim(0, 1.01)
-    axes.set_aspect("equal")
-    axes.set_xlabel("recall (share of the vehicles found)")
-    axes.set_ylabel("precision (share of the boxes that are right)")
-    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize=8, frameon=False)
+    axes.set(xlim=(0, 1.01), ylim=(0, 1.01), aspect="equal")
+    axes.set_xlabel("recall (fraction of vehicles found)")
+    axes.set_ylabel("precision (fraction of boxes that are correct)")
+    legend_above(axes, fontsize=8)
     return axes
 
 
@@ -110,11 +112,11 @@ def _check_curve(curve: object, name: str) -> Curve:
         )
     precision, recall, thresholds = (np.asarray(part, np.float64) for part in curve)
     if precision.ndim != 1 or not precision.size or np.isnan(recall).any():
-        raise InvalidInputError(f"{text} must hold detections and labelled vehicles; got none to compare")
+        raise InvalidInputError(f"{text} must be computed from detections and labelled vehicles; got none")
     return precision, recall, thresholds
 
 
-def _put_f1_lines(axes: Axes) -> None:
+def _add_f1_lines(axes: Axes) -> None:
     for f1 in (0.2, 0.4, 0.6, 0.8, 0.9):
         recall = np.linspace(f1 / (2 - f1), 1, 100)
         axes.plot(recall, f1 * recall / (2 * recall - f1), color="0.85", linewidth=0.8, zorder=1)
@@ -127,31 +129,31 @@ def plot_f1(
     metric: str = "f1",
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot the quality on each source of frames as bars, of one detector or of several side by side.
+    """Plot a metric on each source of frames as bars, for one detector or several.
 
     Parameters
     ----------
     scores
-        What `evaluate_detections` returns by source; or by detector, and in it by source.
+        Results of `evaluate_detections` by source; or by detector, then by source.
     metric
         ``"f1"``, ``"precision"``, ``"recall"``, ``"average_precision"`` or ``"mean_iou"``.
     ax
-        Where to draw; None makes a new figure.
+        Where to draw; None for a new figure.
 
     Returns
     -------
     matplotlib.axes.Axes
-        A group of bars for each source; a value that is unknown has none.
+        Contains a group of bars per source; an unknown value has no bar.
 
     Raises
     ------
     InvalidInputError
-        If `scores` or `metric` is something else.
+        If `scores` or `metric` is invalid.
 
     Examples
     --------
     >>> from vehicle_detection import evaluate_detections
-    >>> labels = Labels([0], None, [[0, 0, 50, 40]])
+    >>> labels = FrameBoxes([0], None, [[0, 0, 50, 40]])
     >>> axes = plot_f1({"road": evaluate_detections(labels, labels)})
     >>> [text.get_text() for text in axes.texts]
     ['1.00']
@@ -162,25 +164,25 @@ def plot_f1(
         raise InvalidInputError(f"scores must map sources to DetectionScores, got {describe(given)}")
     nested = all(isinstance(value, Mapping) for value in given.values())
     detectors: dict[str, Any] = dict(given) if nested else {"": given}
-    sources = list(dict.fromkeys(source for each in detectors.values() for source in each))
-    for each in detectors.values():
-        for source, value in each.items():
+    for by_source in detectors.values():
+        for source, value in by_source.items():
             check_type(value, f"scores[{source!r}]", DetectionScores, "pass what evaluate_detections returns")
+    sources = list(dict.fromkeys(source for by_source in detectors.values() for source in by_source))
     if not sources:
         raise InvalidInputError("scores must hold at least one source; got none")
     axes = new_axes(ax, 2.5 + 1.3 * len(sources), 4)
-    wide = 0.8 / len(detectors)
-    for place, (name, each) in enumerate(detectors.items()):
-        values = np.array([getattr(each[s], metric) if s in each else np.nan for s in sources])
-        offsets = np.arange(len(sources)) + (place - (len(detectors) - 1) / 2) * wide
-        bars = axes.bar(offsets, values, wide * 0.94, color=LINE_COLORS[place % len(LINE_COLORS)], label=name)
+    width = 0.8 / len(detectors)
+    for number, (name, by_source) in enumerate(detectors.items()):
+        values = [getattr(by_source[source], metric) if source in by_source else np.nan for source in sources]
+        positions = np.arange(len(sources)) + (number - (len(detectors) - 1) / 2) * width
+        color = LINE_COLORS[number % len(LINE_COLORS)]
+        bars = axes.bar(positions, values, width * 0.94, color=color, label=name)
         axes.bar_label(bars, ["" if np.isnan(v) else f"{v:.2f}" for v in values], padding=2, fontsize=8)
     axes.set_xticks(range(len(sources)), [str(source) for source in sources])
-    axes.set_ylim(0, 1.1)
-    axes.set_ylabel(_METRIC_NAMES.get(metric, metric))
-    axes.spines[["top", "right"]].set_visible(False)
+    axes.set(ylim=(0, 1.1), ylabel=_METRIC_NAMES.get(metric, metric))
+    hide_spines(axes)
     if nested:
-        axes.legend(fontsize=9, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False)
+        legend_above(axes, 3)
     return axes
 
 
@@ -194,101 +196,103 @@ def plot_errors(
     columns: int = 6,
     ax: Axes | None = None,
 ) -> Axes:
-    """Show crops of the worst mistakes: the largest vehicles that are missed, or the surest false alarms.
+    """Show crops of the worst errors: the largest missed vehicles, or the false positives of highest score.
 
     Parameters
     ----------
     frames
         Frames with their true boxes.
     predictions
-        Detected boxes, with scores; `FrameBoxes.from_detections` makes them.
+        Predicted boxes with scores, such as those of `FrameBoxes.from_detections`.
     kind
-        ``"missed"``: labelled vehicles without a detection, the largest first, each with the overlap of the
-        nearest one. ``"false"``: detections that are no vehicle, the best score first.
+        ``"missed"``: labelled vehicles without a detection, largest first, with the largest IoU of any
+        detection. ``"false"``: detections without a labelled vehicle, highest score first.
     iou
-        Overlap from which a detection matches a vehicle, as in `evaluate_detections`.
+        Minimum IoU of a detection and its vehicle, as in `evaluate_detections`.
     count
-        How many are shown at most.
+        Maximum number of errors to show.
     columns
-        Crops in a row.
+        Crops per row.
     ax
-        Where to draw; None makes a new figure.
+        Where to draw; None for a new figure.
 
     Returns
     -------
     matplotlib.axes.Axes
-        One picture for each mistake, with the labelled box dashed and detections in full lines. The title
-        tells how many there are in all; without any, nothing else is drawn.
+        Contains one image per error, with dashed labelled boxes and solid detections. The title states the
+        total number of errors.
 
     Raises
     ------
     InvalidInputError
-        If an argument is malformed, or `evaluate_detections` refuses the two sides.
+        If an argument is malformed, or `evaluate_detections` rejects the boxes.
 
     Examples
     --------
-    >>> labels = Labels([0], None, [[10, 10, 60, 50]])
+    >>> labels = FrameBoxes([0], None, [[10, 10, 60, 50]])
     >>> frames = LabelledFrames("road", [np.zeros((90, 120, 3), np.uint8)], labels)
-    >>> plot_errors(frames, Labels([], None, [], scores=[])).get_title()
+    >>> plot_errors(frames, FrameBoxes([], None, [], scores=[])).get_title()
     '1 of 1 vehicles missed'
     """
     check_type(
         frames, "frames", LabelledFrames, "pair frames and labels with LabelledFrames(name, frames, labels)"
     )
     check_choice(kind, "kind", ("missed", "false"))
-    limit = check_number(iou, "iou", above=0, high=1)
-    most = check_integer(count, "count", low=1, high=1000)
-    predictions, labels, keys = prepare_sides(predictions, frames.labels, frames.keys)
-    found = match_detections(predictions, labels, keys, limit)
+    min_iou = check_number(iou, "iou", above=0, high=1)
+    max_count = check_integer(count, "count", low=1, high=1000)
+    predictions, labels, keys = prepare_evaluation(predictions, frames.labels, frames.keys)
+    matches = match_detections(predictions, labels, keys, min_iou)
     if kind == "missed":
-        side, rows = labels, np.setdiff1d(found.usable, found.partner)
-        title = f"{len(rows):,} of {len(found.usable):,} vehicles missed"
-        sizes = side.boxes[rows, 2:] - side.boxes[rows, :2]
-        order = np.argsort(-sizes.prod(axis=1), kind="stable")
+        side, rows = labels, np.setdiff1d(matches.usable, matches.match)
+        title = f"{len(rows):,} of {len(matches.usable):,} vehicles missed"
+        order = np.argsort(-box_areas(side.boxes[rows]), kind="stable")
     else:
-        side, rows = predictions, np.flatnonzero((found.partner < 0) & ~found.ignored)
-        title = f"{len(rows):,} of {len(predictions):,} detections are no vehicle"
+        side, rows = predictions, np.flatnonzero((matches.match < 0) & ~matches.ignored)
+        title = f"{len(rows):,} of {len(predictions):,} detections are false positives"
         order = np.arange(len(rows)) if side.scores is None else np.argsort(-side.scores[rows], kind="stable")
-    shown = rows[order[:most]]
-    across = min(check_integer(columns, "columns", low=1, high=100), max(len(shown), 1))
-    axes = tile_axes(ax, max(len(shown), 1), across, inches=1.9, lines=2)
+    shown = rows[order[:max_count]].tolist()
+    crops = [_crop(_read_frame(frames, side.frames[row]), side.boxes[row]) for row in shown]
+    axes, tiles = add_tiles(
+        ax,
+        [crop for crop, _ in crops],
+        [_caption(side, row, predictions, kind) for row in shown],
+        columns=min(check_integer(columns, "columns", low=1, high=100), max(len(shown), 1)),
+        inches=1.9,
+        caption_lines=2,
+    )
     axes.set_title(title, fontsize=10)
-    crops, captions, corners = [], [], []
-    for row in shown.tolist():
+    for row, crop, tile in zip(shown, crops, tiles):
         key = side.frames[row]
-        crop, corner = _crop(_image_of(frames, key), side.boxes[row])
-        crops.append(crop)
-        corners.append(corner)
-        captions.append(_caption(side, row, key, predictions, labels, kind))
-    places = put_tiles(axes, crops, captions, [None] * len(crops), across, inches=1.9, lines=2)
-    for row, corner, crop, place in zip(shown.tolist(), corners, crops, places):
-        key = side.frames[row]
-        here = labels.frame(key)
-        _put_cut(axes, here.boxes[~here.ignore], crop, corner, place, TRUTH, "--")
-        _put_cut(axes, predictions.frame(key).boxes, crop, corner, place, SKY, "-")
+        true = labels.frame(key)
+        _add_cropped_boxes(axes, true.boxes[~true.ignore], crop, tile, TRUTH, "--")
+        _add_cropped_boxes(axes, predictions.frame(key).boxes, crop, tile, SKY, "-")
         if kind == "false":
-            _put_cut(axes, side.boxes[[row]], crop, corner, place, VERMILION, "-")
-    if len(shown):
-        _errors_legend(axes, kind)
+            _add_cropped_boxes(axes, side.boxes[[row]], crop, tile, VERMILION, "-")
+    if shown:
+        entries: list[tuple[str, Any, Any]] = [("labelled", "0.6", "--"), ("detected", SKY, "-")]
+        entries += [("false positive", VERMILION, "-")] if kind == "false" else []
+        axes.legend(
+            handles=legend_lines(*entries),
+            loc="upper right",
+            bbox_to_anchor=(1, 0),
+            ncols=3,
+            fontsize=8,
+            frameon=False,
+        )
     return axes
 
 
-def _errors_legend(axes: Axes, kind: str) -> None:
-    from matplotlib.lines import Line2D
-
-    looks: list[Any] = [("labelled", "0.6", "--"), ("detected", SKY, "-")]
-    looks += [("false alarm", VERMILION, "-")] if kind == "false" else []
-    handles = [Line2D([], [], color=color, linestyle=dash, label=name) for name, color, dash in looks]
-    axes.legend(handles=handles, loc="upper right", bbox_to_anchor=(1, 0), ncols=3, fontsize=8, frameon=False)
+def _read_frame(frames: LabelledFrames, key: FrameKey) -> Image:
+    images = frames.frames
+    return images[images.names.index(str(key))] if isinstance(images, FrameSet) else images[key]
 
 
-def _image_of(frames: LabelledFrames, key: FrameKey) -> NDArray[np.uint8]:
-    held = frames.frames
-    return held[held.names.index(str(key))] if isinstance(held, FrameSet) else held[key]
+Crop = tuple[Image, tuple[int, int]]
+"""An image cut out of a frame, and the frame's pixel at its upper left corner."""
 
 
-def _crop(image: NDArray[np.uint8], box: NDArray[Any]) -> tuple[NDArray[np.uint8], tuple[int, int]]:
-    """Cut out a square around a box, with half of its size to spare, and where it begins."""
+def _crop(image: Image, box: NDArray[Any]) -> Crop:
+    """Cut out a square around the center of a box, 1.8 times its longer side."""
     height, width = image.shape[:2]
     x, y = (box[:2] + box[2:]) / 2
     half = max(24.0, 0.9 * float((box[2:] - box[:2]).max()))
@@ -297,44 +301,41 @@ def _crop(image: NDArray[np.uint8], box: NDArray[Any]) -> tuple[NDArray[np.uint8
     return image[y1 : max(y2, y1 + 1), x1 : max(x2, x1 + 1)], (x1, y1)
 
 
-def _caption(
-    side: FrameBoxes, row: int, key: FrameKey, predictions: FrameBoxes, labels: FrameBoxes, kind: str
-) -> str:
+def _caption(side: FrameBoxes, row: int, predictions: FrameBoxes, kind: str) -> str:
+    """Frame, size of the box, and its best IoU or its score."""
+    key = side.frames[row]
     name = str(key).rpartition(".")[0] or str(key) if isinstance(key, str) else f"frame {key}"
     width, height = (side.boxes[row, 2:] - side.boxes[row, :2]).round().astype(int)
+    text = f"{width}x{height} px"
     if kind == "missed":
         overlaps = iou_matrix(side.boxes[[row]], predictions.frame(key).boxes)
-        text = f"{width}x{height} px, IoU {overlaps.max(initial=0):.2f}"
-    else:
-        score = "" if side.scores is None else f"score {side.scores[row]:.2f}, "
-        text = f"{score}{width}x{height} px"
+        text += f", IoU {overlaps.max(initial=0):.2f}"
+    elif side.scores is not None:
+        text = f"score {side.scores[row]:.2f}, {text}"
     return f"{name if len(name) <= 24 else '...' + name[-21:]}\n{text}"
 
 
-def _put_cut(
+def _add_cropped_boxes(
     axes: Axes,
     boxes: NDArray[Any],
-    crop: NDArray[np.uint8],
-    corner: tuple[int, int],
-    place: tuple[float, float, float],
-    color: Any,
-    dash: str,
+    crop: Crop,
+    tile: tuple[float, float, float],
+    color: Color,
+    linestyle: str,
 ) -> None:
-    """Draw the boxes that a tile shows, as far as they lie in it."""
-    left, top, pixel = place
-    height, width = crop.shape[:2]
-    limits = np.array([width, height, width, height])
-    inside = (boxes - np.tile(corner, 2)).clip(0, limits)
-    inside = inside[(inside[:, 2:] - inside[:, :2] >= 2).all(axis=1)]
-    if len(inside):
-        placed = inside * pixel + np.array([left, top, left, top])
-        put_boxes(axes, placed, color, linewidths=1.3, linestyles=dash)
+    """Draw the parts of boxes that lie inside a crop onto its tile (left, top, pixel size)."""
+    (image, corner), (left, top, pixel) = crop, tile
+    clipped = clip_boxes(boxes - np.tile(corner, 2), image.shape)
+    clipped = clipped[(clipped[:, 2:] - clipped[:, :2] >= 2).all(axis=1)]
+    if len(clipped):
+        placed = clipped * pixel + np.array([left, top, left, top])
+        add_boxes(axes, placed, color, linewidths=1.3, linestyles=linestyle)
 
 
-# Greatest over least value from which a scale is logarithmic.
-_WIDE = 20
-# Letters that fit side by side under the x axis.
-_ROOM = 60
+# Ratio of the largest to the smallest value above which the x axis is logarithmic.
+_LOG_RATIO = 20
+# Number of characters of tick labels that fit under the x axis without rotation.
+_MAX_TICK_CHARACTERS = 60
 
 
 def plot_tradeoff(
@@ -345,26 +346,25 @@ def plot_tradeoff(
     label: str | None = "configuration",
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot what each configuration reaches against what it costs, and mark the best front.
+    """Plot the quality of each configuration against its cost, with the Pareto front.
 
     Parameters
     ----------
     table
-        Rows of `compare_configurations` or `search_parameters`; those without either value are left out.
+        Results of `compare_configurations` or `search_parameters`; rows without either value are left out.
     quality
-        Column of the y axis; more is better.
+        Column of the y axis; higher is better.
     cost
-        Column of the x axis; less is better.
+        Column of the x axis; lower is better.
     label
-        Column written beside the points of the front; None writes nothing.
+        Column of the text beside the points of the front; None for no text.
     ax
-        Where to draw; None makes a new figure.
+        Where to draw; None for a new figure.
 
     Returns
     -------
     matplotlib.axes.Axes
-        Its first collection holds all points; its first line is the front, cheapest first: no other point
-        is better in one of the two without being worse in the other.
+        The first collection holds all points, and the first line is the front (see `pareto_front`).
 
     Raises
     ------
@@ -381,14 +381,16 @@ def plot_tradeoff(
     front = pareto_front(table, quality, cost)
     if not len(front):
         raise InvalidInputError(f"table has no row with both {quality} and {cost}; measure them first")
+    if label is not None:
+        check_column(table, label)
     axes = new_axes(ax)
     x, y = numeric_column(table, cost), numeric_column(table, quality)
     shown = ~np.isnan(x) & ~np.isnan(y)
     axes.scatter(x[shown], y[shown], s=24, color="0.6", label="measured", zorder=2)
-    axes.plot(front[cost], front[quality], "o-", color="C0", label="best front", zorder=3)
+    axes.plot(front[cost], front[quality], "o-", color="C0", label="Pareto front", zorder=3)
     if label is not None:
-        for place in zip(front[cost], front[quality], front[label]):
-            axes.annotate(str(place[2]), place[:2], (4, 6), textcoords="offset points", fontsize=8)
+        for x, y, text in zip(front[cost], front[quality], front[label]):
+            axes.annotate(str(text), (x, y), (4, 6), textcoords="offset points", fontsize=8)
     axes.set_xlabel(cost.replace("_", " "))
     axes.set_ylabel(quality.replace("_", " "))
     axes.margins(0.12)
@@ -405,32 +407,32 @@ def plot_parameter(
     by: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot what a parameter does: the mean of a measurement for each of its values.
+    """Plot the mean of a measurement against a parameter.
 
     Parameters
     ----------
     table
-        Rows of `compare_configurations` or `search_parameters`; those without a measurement are left out.
+        Results of `compare_configurations` or `search_parameters`; rows without the measurement are left out.
     parameter
         Column of the x axis, such as ``"C"`` or ``"orient"``.
     quality
         Column of the y axis, a measurement.
     by
-        A column that parts the rows into lines, such as ``"split"``; None draws one.
+        Column that groups the rows into lines, such as ``"split"``; None for one line.
     ax
-        Where to draw; None makes a new figure.
+        Where to draw; None for a new figure.
 
     Returns
     -------
     matplotlib.axes.Axes
-        One line for each value of `by`. The bars at its points are the standard deviation over the rows
-        that agree in `parameter` and `by`. Numbers that span more than a factor of 20 are on a
-        logarithmic scale; what holds more than numbers, at even distances.
+        One line for each value of `by`. Error bars show the standard deviation over rows with the same
+        `parameter` and `by`. The x axis is logarithmic if its numbers span more than a factor of 20, and
+        evenly spaced if it holds text.
 
     Raises
     ------
     InvalidInputError
-        If a column does not exist, or no row was measured.
+        If a column does not exist, or no row has a measurement.
 
     Examples
     --------
@@ -439,24 +441,21 @@ def plot_parameter(
     >>> plot_parameter(table, "C").get_xscale()
     'log'
     """
-    measured = table[~np.isnan(numeric_column(table, quality))]
-    for name in [parameter] if by is None else [parameter, by]:
-        if name not in table.columns:
-            raise InvalidInputError(
-                f"table has no column {name!r}; its columns are {', '.join(table.columns)}"
-            )
-        measured = measured[measured[name].notna()]
+    columns = [parameter] if by is None else [parameter, by]
+    for name in columns:
+        check_column(table, name)
+    measured = table[~np.isnan(numeric_column(table, quality))].dropna(subset=columns)
     if measured.empty:
         raise InvalidInputError(f"table has no row with both {parameter} and {quality}; measure them first")
     axes = new_axes(ax)
     values = measured[parameter].unique().tolist()
     numeric = all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
-    listed = sorted(values) if numeric else values
-    place = {value: value if numeric else index for index, value in enumerate(listed)}
+    values = sorted(values) if numeric else values
+    x_of = {value: value if numeric else index for index, value in enumerate(values)}
     groups = [(None, measured)] if by is None else measured.groupby(by, sort=False)
-    for (name, rows), (color, dash) in zip(groups, line_looks()):
+    for (name, rows), (color, dash) in zip(groups, line_styles()):
         runs = rows.groupby(parameter, sort=False)[quality].agg(["mean", "std"])
-        runs.index = runs.index.map(place)
+        runs.index = runs.index.map(x_of)
         runs = runs.sort_index()
         axes.errorbar(
             runs.index,
@@ -470,13 +469,13 @@ def plot_parameter(
             label=None if by is None else str(name),
         )
     if not numeric:
-        texts = [str(value) for value in listed]
-        axes.set_xticks(range(len(listed)), texts)
-        if max(map(len, texts)) * len(texts) > _ROOM:
+        texts = [str(value) for value in values]
+        axes.set_xticks(range(len(values)), texts)
+        if max(map(len, texts)) * len(texts) > _MAX_TICK_CHARACTERS:
             axes.tick_params(axis="x", rotation=30)
             for label in axes.get_xticklabels():
                 label.set_horizontalalignment("right")
-    elif listed[0] > 0 and listed[-1] > _WIDE * listed[0]:
+    elif values[0] > 0 and values[-1] > _LOG_RATIO * values[0]:
         axes.set_xscale("log")
     axes.set_xlabel(parameter.replace("_", " "))
     axes.set_ylabel(quality.replace("_", " "))

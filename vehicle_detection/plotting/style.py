@@ -1,4 +1,4 @@
-"""What all figures share: where they are drawn, colors, pictures, boxes and grids of tiles."""
+"""Helpers shared by all figures: figures and axes, colors, images, boxes and grids of tiles."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import functools
 import io
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Union
 
 import numpy as np
@@ -22,69 +22,67 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure, SubFigure
+    from matplotlib.legend import Legend
+    from matplotlib.lines import Line2D
 
-Sheet: TypeAlias = Union["Figure", "SubFigure"]
-"""What figures of several panels are drawn on."""
+FigureLike: TypeAlias = Union["Figure", "SubFigure"]
+Image = NDArray[np.uint8]
+Boxes = Detections | FrameBoxes | ArrayLike
+Color = tuple[float, float, float]
 
-Paint = tuple[float, float, float]
+COLORS: tuple[Color, ...] = tuple((r / 255, g / 255, b / 255) for r, g, b in TRACK_COLORS)
+"""The track colors (Okabe and Ito), as RGB in [0, 1]."""
 
-COLORS: tuple[Paint, ...] = tuple((r / 255, g / 255, b / 255) for r, g, b in TRACK_COLORS)
-"""Okabe and Ito's colors as matplotlib takes them, in the order of the tracks'."""
-
-LINE_COLORS: tuple[Paint, ...] = tuple(COLORS[index] for index in (4, 5, 2, 6, 0, 1))
-"""The same for lines on white, on which yellow is not seen."""
+LINE_COLORS: tuple[Color, ...] = tuple(COLORS[index] for index in (4, 5, 2, 6, 0, 1))
+"""The same colors without yellow, which is hard to see on white."""
 
 ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = COLORS
 VEHICLE, OTHER = VERMILION, BLUE
-"""Colors of the two classes."""
-
 TRUTH = (1.0, 1.0, 1.0)
-"""Color of labelled boxes on a picture; their dashes have a dark edge."""
+LINESTYLES = ("-", "--", "-.", ":")
 
-DASHES = ("-", "--", "-.", ":")
+# Images whose longer side has at most this many pixels are shown without interpolation.
+_MAX_PIXELATED = 200
 
-_PIXELATED = 200
 
-
-def line_looks() -> Iterator[tuple[Paint, str]]:
-    """Colors and dashes of one line after the other: lines of one color differ in their dashes."""
-    looks = [(color, dash) for dash in DASHES for color in LINE_COLORS]
-    return itertools.cycle(looks)
+def line_styles() -> Iterator[tuple[Color, str]]:
+    """Colors and line styles for consecutive lines; each combination is used before one repeats."""
+    return itertools.cycle((color, style) for style in LINESTYLES for color in LINE_COLORS)
 
 
 @functools.cache
-def _sheet_class() -> type[Figure]:
+def _notebook_figure_class() -> type[Figure]:
     from matplotlib.figure import Figure
 
-    class ShownFigure(Figure):
-        """A figure that pyplot knows nothing of, and that a notebook shows all the same."""
+    class NotebookFigure(Figure):
+        """A figure that pyplot does not manage, but that a notebook displays as the value of a cell."""
 
         def _repr_png_(self) -> bytes:
-            picture = io.BytesIO()
-            self.savefig(picture, format="png", dpi=100, bbox_inches="tight")
-            return picture.getvalue()
+            png = io.BytesIO()
+            self.savefig(png, format="png", dpi=100, bbox_inches="tight")
+            return png.getvalue()
 
-    return ShownFigure
+    return NotebookFigure
 
 
 def new_figure(
-    figure: Sheet | None,
+    figure: FigureLike | None,
     width: float,
     height: float,
     *,
     layout: Literal["constrained", "compressed"] = "constrained",
-) -> Sheet:
-    """Return the given figure, or a new one of this size in inches that pyplot does not keep."""
+) -> FigureLike:
+    """Return `figure`, or a new one (size in inches) that pyplot does not manage."""
     if figure is None:
-        return _sheet_class()(figsize=(width, height), layout=layout)
+        return _notebook_figure_class()(figsize=(width, height), layout=layout)
     from matplotlib.figure import FigureBase
 
-    check_type(figure, "figure", FigureBase, "pass a Figure, a SubFigure, or None for a new one")
+    check_type(figure, "figure", FigureBase, "pass a Figure, a SubFigure, or None for a new figure")
     return figure
 
 
 def new_axes(ax: Axes | None, width: float = 7.0, height: float = 4.5) -> Axes:
-    """Return the given Axes, or those of a new figure of this size in inches."""
+    """Return `ax`, or the Axes of a new pyplot figure (size in inches)."""
     if ax is None:
         import matplotlib.pyplot as plt
 
@@ -92,48 +90,105 @@ def new_axes(ax: Axes | None, width: float = 7.0, height: float = 4.5) -> Axes:
         return axes
     from matplotlib.axes import Axes as AxesClass
 
-    check_type(ax, "ax", AxesClass, "pass one panel, or None for a new figure")
+    check_type(ax, "ax", AxesClass, "pass matplotlib Axes, or None for a new figure")
     return ax
 
 
-def panels(sheet: Sheet, rows: int, columns: int, **options: Any) -> NDArray[Any]:
-    """Make a grid of panels, ``(rows, columns)`` objects."""
-    return np.asarray(sheet.subplots(rows, columns, squeeze=False, **options))
+def subplot_grid(figure: FigureLike, rows: int, columns: int, **options: Any) -> NDArray[Any]:
+    """Create ``(rows, columns)`` Axes."""
+    return np.asarray(figure.subplots(rows, columns, squeeze=False, **options))
 
 
-def check_picture(image: object, name: str) -> NDArray[Any]:
-    """Return an RGB image, or any array of two dimensions."""
+def filled_axes(figure: FigureLike, rows: int, columns: int, count: int) -> list[Axes]:
+    """Create the first `count` Axes of a grid, row by row."""
+    grid = subplot_grid(figure, rows, columns)
+    for unused in grid.flat[count:]:
+        unused.remove()
+    return list(grid.flat[:count])
+
+
+def hide_spines(axes: Axes) -> None:
+    """Hide the upper and the right border of a chart."""
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def legend_above(axes: Axes, columns: int = 1, *, fontsize: int = 9) -> Legend:
+    """Place the legend centered above the Axes."""
+    return axes.legend(
+        loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=columns, fontsize=fontsize, frameon=False
+    )
+
+
+def legend_lines(*entries: tuple[str, Any, Any]) -> list[Line2D]:
+    """Legend handles from (label, color, line style)."""
+    from matplotlib.lines import Line2D
+
+    return [Line2D([], [], color=color, linestyle=style, label=label) for label, color, style in entries]
+
+
+def check_displayable(image: object, name: str) -> NDArray[Any]:
+    """Return an ``(H, W, 3)`` uint8 RGB image or a non-empty ``(H, W)`` array of numbers."""
     if isinstance(image, np.ndarray) and image.ndim == 2 and image.size and image.dtype.kind in "iufb":
         return image
     return check_image(image, name)
 
 
-def check_sequence(values: object, name: str, kind: str) -> list[Any]:
-    """Return a list of at least one; `kind` says of what."""
-    one = isinstance(values, np.ndarray) and values.ndim < 4
-    if one or isinstance(values, (str, bytes)) or not hasattr(values, "__iter__"):
+def check_list(values: object, name: str, kind: str) -> list[Any]:
+    """Return `values` as a list with at least one entry; `kind` names the entries in the message."""
+    single = isinstance(values, np.ndarray) and values.ndim < 4
+    if single or isinstance(values, (str, bytes)) or not hasattr(values, "__iter__"):
         raise InvalidInputError(
             f"{name} must be a list of {kind}, got {describe(values)}; wrap a single one in a list"
         )
     listed = list(values)
     if not listed:
-        raise InvalidInputError(f"{name} must hold at least one of {kind}; got none")
+        raise InvalidInputError(f"{name} must be a list of {kind}, at least one; got an empty list")
     return listed
 
 
-def check_count(values: Sequence[object] | None, name: str, count: int, of: str) -> list[Any]:
-    """Return one value for each of `count` things, None for each if there are none."""
+def check_length(values: Sequence[object] | None, name: str, count: int, entries: str) -> list[Any]:
+    """Return `values` as a list of `count` entries; None stands for `count` times None."""
     if values is None:
         return [None] * count
     if len(values) != count:
         raise InvalidInputError(
-            f"{name} must be one for each of the {count} {of}, got {len(values)}; pass as many"
+            f"{name} must have one value for each of the {count} {entries}, got {len(values)}"
         )
     return list(values)
 
 
-def boxes_of(boxes: Detections | FrameBoxes | ArrayLike, name: str = "boxes") -> NDArray[Any]:
-    """Boxes of detections, of labels that are not ignored, or as they are."""
+def check_numbers(values: ArrayLike | None, name: str, count: int, entries: str) -> NDArray[Any] | None:
+    """Return `values` as an array with one number for each of `count` entries; None stays None."""
+    if values is None:
+        return None
+    array = np.asarray(values)
+    if array.shape != (count,) or array.dtype.kind not in "biuf":
+        raise InvalidInputError(
+            f"{name} must be one number for each of {count} {entries}; got {describe(array)}"
+        )
+    return array
+
+
+def check_scores(scores: ArrayLike, name: str) -> NDArray[np.float64]:
+    """Return `scores` as ``(N,)`` finite float64, N >= 1."""
+    array = np.asarray(scores)
+    if array.ndim != 1 or not array.size or array.dtype.kind not in "iuf" or not np.isfinite(array).all():
+        raise InvalidInputError(
+            f"{name} must be a list of finite numbers, at least one; got {describe(array)}"
+        )
+    return array.astype(np.float64)
+
+
+def split_titles(images: object, titles: Sequence[str] | None = None) -> tuple[list[Any], list[Any]]:
+    """List of images, and a title or None for each: from `titles` or the keys of a mapping."""
+    if isinstance(images, Mapping):
+        titles, images = list(images) if titles is None else titles, images.values()
+    listed = check_list(images, "images", "images")
+    return listed, check_length(titles, "titles", len(listed), "images")
+
+
+def box_array(boxes: Boxes, name: str = "boxes") -> NDArray[Any]:
+    """Boxes as ``(N, 4)``; ignored boxes of `FrameBoxes` are left out."""
     if isinstance(boxes, Detections):
         return boxes.boxes
     if isinstance(boxes, FrameBoxes):
@@ -141,111 +196,86 @@ def boxes_of(boxes: Detections | FrameBoxes | ArrayLike, name: str = "boxes") ->
     return check_boxes(boxes, name)
 
 
-def put_image(ax: Axes, image: NDArray[Any], title: str = "", *, ticks: bool = False, **options: Any) -> None:
-    """Show a picture so that the half-open pixels of boxes are the panel's coordinates.
-
-    With `ticks` the axes count pixels, without them there are none.
-    """
+def add_image(ax: Axes, image: NDArray[Any], title: str = "", *, ticks: bool = False, **options: Any) -> None:
+    """Show an image with data coordinates equal to half-open pixel coordinates; `ticks` labels the axes."""
     height, width = image.shape[:2]
     if image.ndim == 2:
         options.setdefault("cmap", "gray")
-    if max(height, width) <= _PIXELATED:
+    if max(height, width) <= _MAX_PIXELATED:
         options.setdefault("interpolation", "nearest")
     ax.imshow(image, extent=(0, width, height, 0), **options)
     if title:
         ax.set_title(title, fontsize=9)
     if ticks:
-        ax.set_xlabel("x (px)")
-        ax.set_ylabel("y (px)")
+        ax.set(xlabel="x (px)", ylabel="y (px)")
     else:
-        ax.set_xticks([])
-        ax.set_yticks([])
+        ax.set(xticks=[], yticks=[])
 
 
-def outline(boxes: NDArray[Any]) -> NDArray[np.float64]:
-    """Corners of boxes as closed lines, ``(N, 5, 2)`` float64."""
-    corners = np.asarray(boxes, np.float64)[:, [0, 1, 2, 1, 2, 3, 0, 3, 0, 1]]
-    return corners.reshape(-1, 5, 2)
-
-
-def put_boxes(
+def add_boxes(
     ax: Axes, boxes: NDArray[Any], color: Any = None, *, halo: bool = True, **options: Any
 ) -> LineCollection:
-    """Draw boxes as one collection of lines, each with a thin dark edge so that any ground will do."""
+    """Draw ``(N, 4)`` boxes as one line collection; `halo` adds a dark edge for contrast."""
     from matplotlib.collections import LineCollection
     from matplotlib.patheffects import withStroke
 
     width = options.setdefault("linewidths", 1.6)
-    lines = LineCollection(list(outline(boxes)), colors=color, **options)
+    corners = np.asarray(boxes, np.float64)[:, [0, 1, 2, 1, 2, 3, 0, 3, 0, 1]].reshape(-1, 5, 2)
+    lines = LineCollection(list(corners), colors=color, **options)
     if halo:
         lines.set_path_effects([withStroke(linewidth=width + 1.2, foreground="black", alpha=0.5)])
     ax.add_collection(lines, autolim=False)
     return lines
 
 
-def spread(count: int, wanted: int) -> NDArray[np.intp]:
-    """Row numbers of `wanted` out of `count`, evenly spread; all where there are no more."""
-    if count <= wanted:
+def evenly_spaced(count: int, max_rows: int) -> NDArray[np.intp]:
+    """At most `max_rows` evenly spaced row numbers out of `count`."""
+    if count <= max_rows:
         return np.arange(count)
-    return np.linspace(0, count - 1, wanted).round().astype(np.intp)
+    return np.linspace(0, count - 1, max_rows).round().astype(np.intp)
 
 
-def tile_axes(ax: Axes | None, count: int, columns: int, *, inches: float, lines: int) -> Axes:
-    """Axes for tiles of this size, with so many lines of caption under each."""
-    rows = math.ceil(count / columns)
-    axes = new_axes(ax, max(3.5, columns * inches + 0.1), rows * (inches + 0.17 * lines) + 0.35)
-    axes.set_axis_off()
-    axes.set_aspect("equal")
-    pitch = _pitch(inches, lines)
-    axes.set_xlim(-0.02, columns + 0.02)
-    axes.set_ylim(rows * pitch, -0.02)
-    return axes
-
-
-def _pitch(inches: float, lines: int) -> float:
-    """Height of a tile with its caption, where its width is 1."""
-    return (inches + 0.17 * lines) / inches
-
-
-def put_tiles(
-    ax: Axes,
+def add_tiles(
+    ax: Axes | None,
     images: Sequence[NDArray[Any]],
     captions: Sequence[str],
-    colors: Sequence[Any],
-    columns: int,
     *,
+    columns: int,
     inches: float,
-    lines: int,
-) -> list[tuple[float, float, float]]:
-    """Draw pictures on a grid, captions under them, edges in `colors` (None: no edge).
+    caption_lines: int,
+    colors: Sequence[Any] | None = None,
+) -> tuple[Axes, list[tuple[float, float, float]]]:
+    """Draw images on a grid in one Axes, with captions below and an optional colored edge each.
 
-    Returns
-    -------
-    list of tuple
-        Left and top of each picture, and the size of its pixel, in the coordinates of the axes.
+    Returns the Axes, and for each image its left and top and the size of a pixel in data coordinates.
     """
+    rows = max(math.ceil(len(images) / columns), 1)
+    # Height of a tile with its caption; its width is 1.
+    pitch = (inches + 0.17 * caption_lines) / inches
+    axes = new_axes(ax, max(3.5, columns * inches + 0.1), rows * pitch * inches + 0.35)
+    axes.set_axis_off()
+    axes.set_aspect("equal")
     places = []
-    pitch = _pitch(inches, lines)
-    for index, (image, caption, color) in enumerate(zip(images, captions, colors)):
+    for index, (image, caption, color) in enumerate(zip(images, captions, colors or [None] * len(images))):
         height, width = image.shape[:2]
         pixel = 0.94 / max(height, width)
         left = index % columns + (1 - width * pixel) / 2
         top = index // columns * pitch + (1 - height * pixel) / 2
-        # Pictures of a grid are drawn on one panel: dozens of panels take seconds.
-        ax.imshow(
+        right, bottom = left + width * pixel, top + height * pixel
+        # All images share one Axes: creating dozens of Axes takes seconds.
+        axes.imshow(
             image,
-            extent=(left, left + width * pixel, top + height * pixel, top),
-            interpolation="nearest" if max(height, width) <= _PIXELATED else None,
+            extent=(left, right, bottom, top),
+            interpolation="nearest" if max(height, width) <= _MAX_PIXELATED else None,
             cmap="gray" if image.ndim == 2 else None,
         )
         if color is not None:
-            box = np.array([[left, top, left + width * pixel, top + height * pixel]])
-            put_boxes(ax, box, color, halo=False, linewidths=2.0)
+            add_boxes(axes, np.array([[left, top, right, bottom]]), color, halo=False, linewidths=2.0)
         if caption:
-            middle = index % columns + 0.5
-            ax.text(middle, index // columns * pitch + 1.0, caption, ha="center", va="top", fontsize=7)
+            center = index % columns + 0.5
+            axes.text(center, index // columns * pitch + 1.0, caption, ha="center", va="top", fontsize=7)
         places.append((left, top, pixel))
-    # imshow takes the limits of its own picture.
-    ax.set_xlim(-0.02, columns + 0.02)
-    ax.set_ylim(math.ceil(len(images) / columns) * pitch, -0.02)
-    return places
+    # imshow changes the limits to those of its image.
+    axes.set_xlim(-0.02, columns + 0.02)
+    axes.set_ylim(rows * pitch, -0.02)
+    return axes, places

@@ -17,7 +17,7 @@ import vehicle_detection
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.mixture import TemplateMixture
-from vehicle_detection.params import FeatureParams, PyramidParams, SearchParams
+from vehicle_detection.params import FeatureParams, HeatParams, PyramidParams, SearchParams
 from vehicle_detection.report.assets import SCRIPT, STYLE
 from vehicle_detection.report.charts import (
     COLORS,
@@ -48,11 +48,12 @@ def settings_part(detector: Any, shape: tuple[int, ...]) -> str:
     if camera is None and isinstance(search, (SearchParams, PyramidParams)):
         known = {} if search.horizon is None else {"horizon": search.horizon}
         camera, camera_title = Camera.for_frame(shape, **known), "Camera (assumed)"
-    heat = getattr(detector, "regions", None) == "heat"
+    regions = getattr(detector, "region_params", None)
+    heat = isinstance(regions, HeatParams)
     groups = {
         "Search": search,
-        "Regions (heat map)": getattr(detector, "heat_params", None) if heat else None,
-        "Regions (fitted boxes)": None if heat or on_pyramid else getattr(detector, "region_params", None),
+        "Regions (heat map)": regions if heat else None,
+        "Regions (fitted boxes)": None if heat or on_pyramid else regions,
         "Tracks": getattr(detector, "track_params", None),
         camera_title: camera,
     }
@@ -275,7 +276,7 @@ def page(
         tag("section", tag("h2", "Tracks"), _track_table(tracks, axis.fps)),
         tag("section", tag("h2", "Time spent"), _stages(report)),
         settings_part(detector, report.shape),
-        model_part(getattr(detector, "classifier", None)),
+        model_part(getattr(detector, "model", None)),
     ]
     version = f"Written by vehicle_detection {vehicle_detection.__version__}."
     end = [

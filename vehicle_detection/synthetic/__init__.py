@@ -1,17 +1,17 @@
-"""Road scenes, drives and patches with exact ground truth, rendered by the library."""
+"""Synthetic road scenes, drives and training patches with exact ground truth.
 
-from vehicle_detection.synthetic.drive import (
-    Drive,
-    SceneVehicle,
-    render_drive,
-    render_patches,
-    render_scene,
-    write_labels,
-)
+A pinhole camera looks along a flat, straight road; vehicles are painted bodies in true perspective. Boxes,
+distances and speeds are therefore known exactly, and the library can be tried and tested without photographs.
+"""
+
+from vehicle_detection.synthetic.drive import Drive, render_drive, write_labels
+from vehicle_detection.synthetic.patches import render_patches
 from vehicle_detection.synthetic.render import VehicleTruth
+from vehicle_detection.synthetic.scene import Scene, SceneVehicle, render_scene
 
 __all__ = [
     "Drive",
+    "Scene",
     "SceneVehicle",
     "VehicleTruth",
     "render_drive",

@@ -1,458 +1,290 @@
-"""The painting of a vehicle's surfaces: windows, lamps, plates, bumpers, wheels."""
+"""The details of a vehicle's surfaces: windows, lamps, plates, bumpers, wheels."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection.synthetic.camera_light import Floats
+from vehicle_detection.synthetic.raster import Color, Floats
 from vehicle_detection.synthetic.shapes import profile_at
+from vehicle_detection.synthetic.surface import Mask, Outline, SurfaceCanvas, round_corners
 
 if TYPE_CHECKING:
-    from vehicle_detection.synthetic.camera_light import Floats
-    from vehicle_detection.synthetic.vehicles import Car
-
-PIXELS_PER_METRE = 112
-
-Outline = NDArray[np.float64]
+    from vehicle_detection.synthetic.vehicles import VehicleBody
 
 
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """A painted surface: ``(H, W, 4)`` premultiplied RGBA, 0-255, and the meters of its upper left corner."""
+class BodyPainter:
+    """Paints the details of one end or flank of a vehicle on a canvas in the body color."""
 
-    rgba: Floats
-    left: float
-    top: float
-    depth: Floats | None = None
+    def __init__(self, body: VehicleBody, canvas: SurfaceCanvas, reflection: Floats) -> None:
+        self.body, self.canvas = body, canvas
+        self.reflection = reflection  # (H, W, 3) color of the surroundings in a mirror
+        self.dims, self.look, self.light = body.dimensions, body.appearance, body.light
 
+    def by_light(self, night: float, day: float) -> float:
+        """Choose a value for night or day."""
+        return night if self.light.dark else day
 
-@dataclass(frozen=True, eq=False)
-class Cover:
-    """How much a shape covers of each pixel, 0-1, in the part of the sheet where it lies."""
+    def band(self, low: float, high: float, ratio: float, inset: float = 0.0, *, soften: float = 0.0) -> Mask:
+        """Mask of a band across the body, `ratio` of its width less `inset` meters at each side."""
+        y = np.linspace(low, high, 12)
+        x = self.body.half_width(y) * ratio - inset
+        outline = np.concatenate([np.column_stack([x, y]), np.column_stack([-x, y])[::-1]])
+        return self.canvas.polygon(outline, soften=soften)
 
-    values: Floats
-    top: int
-    left: int
+    def box(
+        self, x: float, y: float, width: float, height: float, color: ArrayLike, opacity: float,
+        radius: float = 0.0,
+    ) -> None:  # fmt: skip
+        """Paint a box centered at ``(x, y)``."""
+        self.canvas.paint(self.canvas.box(x, y, width, height, radius=radius), color, opacity)
 
-    @property
-    def place(self) -> tuple[slice, slice]:
-        """Rows and columns of the part."""
-        height, width = self.values.shape
-        return slice(self.top, self.top + height), slice(self.left, self.left + width)
-
-    def _aligned(self, other: Cover) -> Floats:
-        """Give the other's values where this one lies, 0 outside it."""
-        sheet = np.zeros_like(self.values)
-        y1, x1 = max(self.top, other.top), max(self.left, other.left)
-        y2 = min(self.top + self.values.shape[0], other.top + other.values.shape[0])
-        x2 = min(self.left + self.values.shape[1], other.left + other.values.shape[1])
-        if y1 < y2 and x1 < x2:
-            inside = other.values[y1 - other.top : y2 - other.top, x1 - other.left : x2 - other.left]
-            sheet[y1 - self.top : y2 - self.top, x1 - self.left : x2 - self.left] = inside
-        return sheet
-
-    def within(self, other: Cover) -> Cover:
-        """Return the part that lies in another cover."""
-        return Cover(self.values * self._aligned(other), self.top, self.left)
-
-    def without(self, other: Cover) -> Cover:
-        """Return what another cover leaves of it."""
-        return Cover(np.maximum(self.values - self._aligned(other), 0), self.top, self.left)
-
-    def __mul__(self, gain: Floats) -> Cover:
-        """Thin it out by a gain for the whole sheet."""
-        return Cover(self.values * gain[self.place], self.top, self.left)
-
-
-class Easel:
-    """A sheet in meters, `left`..`right` by `low`..`top`, to paint polygons on."""
-
-    def __init__(self, left: float, right: float, low: float, top: float) -> None:
-        ppm = PIXELS_PER_METRE
-        self.left, self.top = left, top
-        self.size = (round((top - low) * ppm), round((right - left) * ppm))
-        self.x: Floats = (left + (np.arange(self.size[1], dtype=np.float32) + 0.5) / ppm)[None, :].astype(
-            np.float32
+    def window(self, low: float, high: float, ratio: float, inset: float, radius: float) -> Mask:
+        """Paint a window across the body."""
+        bottom, top = (float(self.body.half_width(y)) * ratio - inset for y in (low, high))
+        return self.glass(
+            round_corners([(-bottom, low), (bottom, low), (top, high), (-top, high)], radius), seats=True
         )
-        self.y: Floats = (top - (np.arange(self.size[0], dtype=np.float32) + 0.5) / ppm)[:, None].astype(
-            np.float32
+
+    def glass(self, outline: Outline, *, seats: bool) -> Mask:
+        """Paint a pane: a dark cabin behind it, the reflected sky on it, a dark seal around it."""
+        canvas, look = self.canvas, self.look
+        gain = self.by_light(0.3, 1.0)
+        low, high = float(outline[:, 1].min()), float(outline[:, 1].max())
+        rise = np.clip((canvas.y - low) / (high - low), 0, 1)
+        canvas.paint(canvas.polygon(outline, soften=0.012), (18, 18, 20), 0.75)
+        pane = canvas.polygon(outline)
+        cabin = np.array([34, 38, 42], np.float32) * (gain * look.glass_tint * self.light.ambient / 0.6)
+        canvas.paint(pane, cabin * (0.8 + 0.5 * rise)[..., None])
+        for side in (-1, 1) if seats else ():
+            seat = canvas.box(side * 0.36, low + 0.1, 0.26, 0.34, radius=0.1)
+            canvas.paint(seat & pane, np.array([22, 24, 26]) * gain, 0.55)
+        ripple = 0.75 + 0.25 * np.sin(canvas.x * 5.0 + look.seed % 7) * np.cos(canvas.y * 9.0 + look.seed % 5)
+        strength = (0.16 + 0.42 * look.glass_reflection) * (0.45 + 0.55 * rise) * ripple
+        color = canvas.color[pane.region]
+        color += (pane.values * strength[pane.region])[..., None] * (
+            self.reflection[pane.region] - 0.4 * color
         )
-        self.color: Floats = np.zeros((*self.size, 3), np.float32)
-        self.alpha: Floats = np.zeros(self.size, np.float32)
+        return pane
 
-    def mask(self, points: ArrayLike, *, soften: float = 0.0) -> Cover:
-        """Cover of a polygon of ``(x, y)`` points, its edge softened by some meters."""
-        corners = (np.asarray(points, np.float64) - (self.left, self.top)) * (1, -1) * PIXELS_PER_METRE - 0.5
-        margin = 2 + int(3 * soften * PIXELS_PER_METRE)
-        x1, y1 = np.maximum(np.floor(corners.min(0)).astype(int) - margin, 0).tolist()
-        x2, y2 = np.minimum(np.ceil(corners.max(0)).astype(int) + margin + 1, self.size[::-1]).tolist()
-        if x1 >= x2 or y1 >= y2:
-            return Cover(np.zeros((0, 0), np.float32), 0, 0)
-        sheet = np.zeros((y2 - y1, x2 - x1), np.uint8)
-        cv2.fillPoly(sheet, [np.rint((corners - (x1, y1)) * 16).astype(np.int32)], 255, cv2.LINE_AA, 4)
-        cover = sheet.astype(np.float32) / 255
-        if soften:
-            cover = cv2.GaussianBlur(cover, (0, 0), soften * PIXELS_PER_METRE)  # type: ignore[assignment]
-        return Cover(np.asarray(cover, np.float32), y1, x1)
+    def plate(self, y: float) -> None:
+        """Paint a license plate with its recess."""
+        light, look = self.light, self.look
+        gain = self.by_light(max(0.5, light.lamps * 0.7), min(1.1, light.ambient + 0.6 * light.sun))
+        self.box(0, y, 0.6, 0.185, self.body.color * 0.35, 0.55, radius=0.03)
+        self.box(0, y, 0.52, 0.115, np.array(look.plate_color) * gain, 1.0)
+        rng = np.random.default_rng(look.seed)
+        for x in np.linspace(-0.2, 0.2, 8):
+            if rng.random() < 0.85:
+                self.box(x, y, rng.uniform(0.02, 0.045), 0.066, (40, 42, 48), 0.8)
 
-    def box(self, x: float, y: float, width: float, height: float, *, round_by: float = 0.0) -> Cover:
-        """Cover of a box around ``(x, y)`` with rounded corners."""
-        w, h = width / 2, height / 2
-        corners = [(x - w, y - h), (x + w, y - h), (x + w, y + h), (x - w, y + h)]
-        return self.mask(rounded(corners, round_by))
+    def lamp(self, outline: Outline, color: Color) -> None:
+        """Paint a lamp: its glass, darker at the rim, and its light."""
+        canvas, lamps = self.canvas, self.light.lamps
+        mask = canvas.polygon(outline)
+        gain = self.by_light(0.45, self.light.ambient + 0.4 * self.light.sun)
+        canvas.paint(canvas.polygon(outline, soften=0.012), (26, 16, 16), 0.55)
+        canvas.paint(mask, np.array(color) * gain)
+        core = canvas.polygon(outline.mean(0) + (outline - outline.mean(0)) * 0.55, soften=0.02)
+        canvas.paint(core, np.minimum(np.array(color) * 1.25 + 38, 255) * max(gain, lamps), 0.55)
+        if lamps:
+            canvas.paint(mask, np.minimum(np.array(color) * 1.3 + 60, 255), 0.75 * lamps)
 
-    def paint(self, cover: Cover, color: ArrayLike, strength: float = 1.0) -> None:
-        """Lay a color, or a sheet of colors, over what is there."""
-        paint = np.asarray(color, np.float32)
-        if paint.ndim == 3:
-            paint = np.broadcast_to(paint, self.color.shape)[cover.place]
-        part = self.color[cover.place]
-        part += (cover.values * strength)[..., None] * (paint - part)
+    def paint_rear(self) -> None:
+        """Paint the rear of a car: bumper, tailgate or trunk lid, window, tail lamps, plate."""
+        canvas, dims, look, light = self.canvas, self.dims, self.look, self.light
+        sedan = dims.rear[-1][1] > 1.5
+        bumper_top = dims.clearance + 0.42
+        # The bumper has a crease at its top and a dark lower edge.
+        if look.plastic_bumper:
+            plastic = np.array([46, 47, 49]) * self.by_light(0.35, light.ambient / 0.6)
+            canvas.paint(self.band(dims.clearance, bumper_top - 0.04, 1.2), plastic, 0.9)
+        canvas.multiply(self.band(bumper_top - 0.012, bumper_top + 0.012, 0.99), 0.35)
+        canvas.multiply(self.band(bumper_top - 0.1, bumper_top - 0.075, 0.96), 1.22)
+        lower_edge = self.band(dims.clearance - 0.02, dims.clearance + 0.09, 0.82, soften=0.02)
+        canvas.paint(lower_edge, (24, 24, 26), 0.9)
+        for side in (-1, 1):
+            self.box(side * 0.62, dims.clearance + 0.16, 0.16, 0.035, (120, 20, 20), 0.8, radius=0.01)
+        if look.exhaust:
+            self.box(-0.5, dims.clearance + 0.02, 0.11, 0.05, (150, 150, 150), 0.7, radius=0.02)
+        # Gaps around the tailgate and a crease under the window.
+        low = dims.belt + (0.11 if sedan else 0.03)
+        high = dims.height - (0.075 if sedan else 0.11)
+        gate = self.band(bumper_top, dims.belt + (0.02 if sedan else 0.0), 0.8, 0.03)
+        canvas.multiply(gate - self.band(bumper_top + 0.012, dims.belt - 0.012, 0.8, 0.042), 0.5)
+        canvas.multiply(self.band(dims.belt - 0.2, dims.belt - 0.18, 0.8, 0.05), 0.78)
+        if sedan:
+            # The trunk lid reflects the sky.
+            lid = self.band(dims.belt + 0.025, dims.belt + 0.085, 0.93, 0.02, soften=0.01)
+            canvas.paint(lid, self.reflection, 0.3)
+            edge = self.band(dims.belt - 0.06, dims.belt - 0.005, 0.9, 0.02, soften=0.01)
+            canvas.multiply(edge, 1.12)
+        if not look.windowless:
+            self.window(low, high, 0.86 if sedan else 0.93, 0.0 if sedan else 0.035, 0.1)
+            if not sedan:
+                self.box(-0.12, low + 0.03, 0.42, 0.018, (14, 14, 14), 0.8)
+        if look.rear_doors:
+            middle, length = (dims.clearance + dims.height) / 2 + 0.1, dims.height - dims.clearance - 0.4
+            self.box(0, middle, 0.05, length, self.body.color * 0.6, 0.9)
+            canvas.multiply(canvas.box(0, middle, 0.014, length), 0.3)
+        roof = self.band(high + 0.035, dims.height - 0.015, 0.86, 0.04, soften=0.008)
+        canvas.paint(roof, self.reflection * 0.5 + self.body.color * 0.55 * self.by_light(0.3, 1), 0.35)
+        self.box(0, high + 0.02, 0.34, 0.022, (110, 20, 20), 0.8)
+        self._paint_tail_lamps(bumper_top, low)
+        metal = self.by_light(0.3, 0.9)
+        if look.chrome:
+            self.box(0, dims.belt - 0.15, 0.56, 0.028, np.array((196, 198, 200)) * metal, 0.8)
+        self.plate(dims.belt - 0.24 if look.plate_high else dims.clearance + 0.24)
+        self.box(0, dims.belt - 0.09, 0.07, 0.07, np.array((190, 192, 196)) * metal, 0.8, radius=0.035)
 
-    def dim(self, cover: Cover, gain: float) -> None:
-        """Multiply what is there by `gain` under a cover."""
-        self.color[cover.place] *= (1 + cover.values * (gain - 1))[..., None]
-
-    def show(self, cover: Cover) -> None:
-        """Make the sheet opaque under a cover."""
-        part = self.alpha[cover.place]
-        np.maximum(part, cover.values, out=part)
-
-    def surface(self, depth: Floats | None = None) -> Surface:
-        """Return what has been painted."""
-        color = np.clip(self.color, 0, 255) * self.alpha[..., None]
-        return Surface(np.dstack([color, self.alpha * 255]), self.left, self.top, depth)
-
-
-def rounded(corners: ArrayLike, radius: float) -> Outline:
-    """Replace each corner of a polygon by a curve that starts `radius` before it."""
-    points = np.asarray(corners, np.float64)
-    if radius <= 0:
-        return points
-    t = np.linspace(0, 1, 7)[:, None]
-    out = []
-    for before, corner, after in zip(np.roll(points, 1, 0), points, np.roll(points, -1, 0)):
-        start, end = (
-            corner + (other - corner) * min(0.5, radius / max(float(np.linalg.norm(other - corner)), 1e-9))
-            for other in (before, after)
-        )
-        out.append((1 - t) ** 2 * start + 2 * t * (1 - t) * corner + t**2 * end)
-    return np.concatenate(out)
-
-
-_PLATE = (0.52, 0.115)
-
-
-def _band(car: Car, low: float, high: float, share: float, inset: float) -> Outline:
-    """Outline of a band across the body from one height to another, `share` of its width less `inset`."""
-    y = np.linspace(low, high, 12)
-    x = car.half_width(y) * share - inset
-    return np.concatenate([np.column_stack([x, y]), np.column_stack([-x, y])[::-1]])
-
-
-def _window(car: Car, low: float, high: float, share: float, inset: float) -> list[tuple[float, float]]:
-    bottom, top = (float(car.half_width(y)) * share - inset for y in (low, high))
-    return [(-bottom, low), (bottom, low), (top, high), (-top, high)]
-
-
-def _paint_glass(car: Car, easel: Easel, outline: Outline, mirrored: Floats, *, seats: bool = True) -> Cover:
-    """Paint a pane: a dark cabin behind it, the sky mirrored in it, a dark seal around it."""
-    looks = car.looks
-    day = 0.3 if car.light.dark else 1.0
-    low, high = float(outline[:, 1].min()), float(outline[:, 1].max())
-    rise = np.clip((easel.y - low) / (high - low), 0, 1)
-    easel.paint(easel.mask(outline, soften=0.012), (18, 18, 20), 0.75)
-    pane = easel.mask(outline)
-    cabin = np.array([34, 38, 42], np.float32) * (day * looks.tint * car.light.ambient / 0.6)
-    easel.paint(pane, cabin * (0.8 + 0.5 * rise)[..., None])
-    for side in (-1, 1) if seats else ():
-        seat = easel.box(side * 0.36, low + 0.1, 0.26, 0.34, round_by=0.1)
-        easel.paint(seat.within(pane), np.array([22, 24, 26]) * day, 0.55)
-    ripple = 0.75 + 0.25 * np.sin(easel.x * 5.0 + looks.seed % 7) * np.cos(easel.y * 9.0 + looks.seed % 5)
-    strength = (pane * ((0.16 + 0.42 * looks.glare) * (0.45 + 0.55 * rise) * ripple)).values[..., None]
-    part = easel.color[pane.place]
-    part += strength * (mirrored[pane.place] - 0.4 * part)
-    return pane
-
-
-def _paint_plate(car: Car, easel: Easel, y: float) -> None:
-    day = (
-        max(0.5, car.light.lamps * 0.7)
-        if car.light.dark
-        else min(1.1, car.light.ambient + 0.6 * car.light.sun)
-    )
-    width, height = _PLATE
-    easel.paint(easel.box(0, y, width + 0.08, height + 0.07, round_by=0.03), car.paint * 0.35, 0.55)
-    easel.paint(easel.box(0, y, width, height), np.array(car.looks.plate) * day)
-    rng = np.random.default_rng(car.looks.seed)
-    for x in np.linspace(-0.2, 0.2, 8):
-        if rng.random() < 0.85:
-            easel.paint(easel.box(x, y, rng.uniform(0.02, 0.045), 0.066), (40, 42, 48), 0.8)
-
-
-def _lamp(car: Car, easel: Easel, outline: Outline, color: tuple[int, int, int], shine: float) -> None:
-    """Paint a lamp glass: its color, darker at the rim, lit from within by `shine`."""
-    cover = easel.mask(outline)
-    day = 0.45 if car.light.dark else car.light.ambient + 0.4 * car.light.sun
-    easel.paint(easel.mask(outline, soften=0.012), (26, 16, 16), 0.55)
-    easel.paint(cover, np.array(color) * day)
-    core = easel.mask(outline.mean(0) + (outline - outline.mean(0)) * 0.55, soften=0.02)
-    bright = np.minimum(np.array(color) * 1.25 + 38, 255)
-    easel.paint(core, bright * max(day, shine), 0.55)
-    if shine:
-        easel.paint(cover, np.minimum(np.array(color) * 1.3 + 60, 255), 0.75 * shine)
-
-
-def paint_rear(car: Car, easel: Easel, mirrored: Floats) -> None:
-    """Paint the rear of a car: tailgate or boot, window, tail lamps, plate, bumper."""
-    d, looks = car.design, car.looks
-    sedan = d.rear[-1][1] > 1.5
-    bumper_top = d.clearance + 0.42
-    # Bumper: a crease above, a dark lower edge, plastic on some.
-    if looks.plastic:
-        easel.paint(easel.mask(_band(car, d.clearance, bumper_top - 0.04, 1.2, 0.0)), _plastic(car), 0.9)
-    easel.dim(easel.mask(_band(car, bumper_top - 0.012, bumper_top + 0.012, 0.99, 0.0)), 0.35)
-    easel.dim(easel.mask(_band(car, bumper_top - 0.1, bumper_top - 0.075, 0.96, 0.0)), 1.22)
-    easel.paint(
-        easel.mask(_band(car, d.clearance - 0.02, d.clearance + 0.09, 0.82, 0.0), soften=0.02),
-        (24, 24, 26),
-        0.9,
-    )
-    for side in (-1, 1):
-        easel.paint(
-            easel.box(side * 0.62, d.clearance + 0.16, 0.16, 0.035, round_by=0.01), (120, 20, 20), 0.8
-        )
-    if looks.exhaust:
-        easel.paint(easel.box(-0.5, d.clearance + 0.02, 0.11, 0.05, round_by=0.02), (150, 150, 150), 0.7)
-    # Tailgate: shut lines, a crease under the window.
-    low = d.belt + (0.11 if sedan else 0.03)
-    high = d.height - (0.075 if sedan else 0.11)
-    gate = _band(car, bumper_top, d.belt - (0.0 if not sedan else -0.02), 0.8, 0.03)
-    inner = _band(car, bumper_top + 0.012, d.belt - 0.012, 0.8, 0.042)
-    easel.dim(easel.mask(gate).without(easel.mask(inner)), 0.5)
-    easel.dim(easel.mask(_band(car, d.belt - 0.2, d.belt - 0.18, 0.8, 0.05)), 0.78)
-    if sedan:
-        # Sky on the boot lid, shadow where the window meets it.
-        easel.paint(
-            easel.mask(_band(car, d.belt + 0.025, d.belt + 0.085, 0.93, 0.02), soften=0.01), mirrored, 0.3
-        )
-        easel.dim(easel.mask(_band(car, d.belt - 0.06, d.belt - 0.005, 0.9, 0.02), soften=0.01), 1.12)
-    if not looks.windowless:
-        share, inset = (0.86, 0.0) if sedan else (0.93, 0.035)
-        corners = _window(car, low, high, share, inset)
-        _paint_glass(car, easel, rounded(corners, 0.1), mirrored)
-        if not sedan:
-            easel.paint(easel.box(-0.12, low + 0.03, 0.42, 0.018), (14, 14, 14), 0.8)
-    if looks.doors:
-        easel.paint(
-            easel.box(0, (d.clearance + d.height) / 2 + 0.1, 0.05, d.height - d.clearance - 0.4),
-            car.paint * 0.6,
-            0.9,
-        )
-        easel.dim(easel.box(0, (d.clearance + d.height) / 2 + 0.1, 0.014, d.height - d.clearance - 0.4), 0.3)
-    roof = easel.mask(_band(car, high + 0.035, d.height - 0.015, 0.86, 0.04), soften=0.008)
-    easel.paint(roof, mirrored * 0.5 + car.paint * 0.55 * (0.3 if car.light.dark else 1), 0.35)
-    easel.paint(easel.box(0, high + 0.02, 0.34, 0.022), (110, 20, 20), 0.8)
-    _paint_tail_lamps(car, easel, bumper_top, low)
-    plate_y = d.belt - 0.24 if looks.plate_high else d.clearance + 0.24
-    if looks.chrome:
-        easel.paint(
-            easel.box(0, d.belt - 0.15, 0.56, 0.028),
-            np.array((196, 198, 200)) * (0.3 if car.light.dark else 0.9),
-            0.8,
-        )
-    _paint_plate(car, easel, plate_y)
-    easel.paint(
-        easel.box(0, d.belt - 0.09, 0.07, 0.07, round_by=0.035),
-        np.array((190, 192, 196)) * (0.3 if car.light.dark else 0.9),
-        0.8,
-    )
-
-
-def _plastic(car: Car) -> NDArray[np.float64]:
-    return np.array([46, 47, 49]) * (0.35 if car.light.dark else car.light.ambient / 0.6)
-
-
-def _paint_tail_lamps(car: Car, easel: Easel, bumper_top: float, window_low: float) -> None:
-    d, looks = car.design, car.looks
-    rng = np.random.default_rng(looks.seed + 1)
-    if looks.tall_lamps:
-        top = (
-            window_low + rng.uniform(-0.05, 0.3)
-            if d.height > 1.5 or rng.random() < 0.4
-            else window_low - 0.02
-        )
-        low = top - looks.lamp_height
-    else:
-        top = d.belt - 0.05
-        low = top - looks.lamp_height
-    low = max(low, bumper_top - 0.03)
-    lean = rng.uniform(0.0, 0.05)
-    shine = car.light.lamps
-    for side in (-1, 1):
-        outer_low, outer_top = (float(car.half_width(y)) * 0.985 for y in (low, top))
-        inner_low, inner_top = outer_low - looks.lamp_width - lean, outer_top - looks.lamp_width + lean
-        corners = [(outer_low, low), (outer_top, top), (inner_top, top), (inner_low, low)]
-        outline = rounded(np.array(corners) * (side, 1), 0.05)
-        _lamp(car, easel, outline, (136, 20, 24), shine)
-        middle = outline.mean(0)
-        if looks.tall_lamps:
-            lens = easel.box(
-                middle[0], low + 0.3 * looks.lamp_height, looks.lamp_width * 0.6, 0.055, round_by=0.02
-            )
+    def _paint_tail_lamps(self, bumper_top: float, window_low: float) -> None:
+        look, half_width = self.look, self.body.half_width
+        rng = np.random.default_rng(look.seed + 1)
+        if not look.tall_lamps:
+            top = self.dims.belt - 0.05
+        elif self.dims.height > 1.5 or rng.random() < 0.4:
+            top = window_low + rng.uniform(-0.05, 0.3)
         else:
-            lens = easel.box(
-                middle[0] - side * 0.3 * looks.lamp_width,
-                middle[1],
-                0.07,
-                looks.lamp_height * 0.5,
-                round_by=0.02,
-            )
-        easel.paint(lens, np.array((226, 206, 200)) * (0.4 if car.light.dark else 0.9), 0.65)
+            top = window_low - 0.02
+        low = max(top - look.lamp_height, bumper_top - 0.03)
+        lean = rng.uniform(0.0, 0.05)
+        outer_low, outer_top = (float(half_width(y)) * 0.985 for y in (low, top))
+        inner_low, inner_top = outer_low - look.lamp_width - lean, outer_top - look.lamp_width + lean
+        corners = np.array([(outer_low, low), (outer_top, top), (inner_top, top), (inner_low, low)])
+        reverse_light = np.array((226, 206, 200)) * self.by_light(0.4, 0.9)
+        for side in (-1, 1):
+            outline = round_corners(corners * (side, 1), 0.05)
+            self.lamp(outline, (136, 20, 24))
+            x, y = outline.mean(0)
+            if look.tall_lamps:
+                lens = (x, low + 0.3 * look.lamp_height, look.lamp_width * 0.6, 0.055)
+            else:
+                lens = (x - side * 0.3 * look.lamp_width, y, 0.07, look.lamp_height * 0.5)
+            self.box(*lens, reverse_light, 0.65, radius=0.02)
 
-
-def paint_front(car: Car, easel: Easel, mirrored: Floats) -> None:
-    """Paint the front of a car: windscreen, bonnet, headlamps, grille, bumper, plate."""
-    d, looks = car.design, car.looks
-    nose = float(
-        np.interp(0.22, profile_at(d.front, np.linspace(0.6, d.belt, 40)), np.linspace(0.6, d.belt, 40))
-    )
-    low = float(np.interp(1.05 if not d.box else 0.1, [z for _, z in d.front], [y for y, _ in d.front]))
-    low = min(max(low, d.belt), d.height - 0.5)
-    high = d.height - 0.1 if not d.box else 2.4
-    corners = _window(car, low, high, 0.92, 0.02)
-    pane = _paint_glass(car, easel, rounded(corners, 0.09), mirrored)
-    easel.paint(easel.box(0, high - 0.07, 0.2, 0.06, round_by=0.03).within(pane), (20, 22, 24), 0.9)
-    # The bonnet's shut line and the shadow along its front edge.
-    easel.dim(easel.mask(_band(car, nose - 0.01, nose + 0.008, 0.86, 0.05)), 0.5)
-    dark = np.array([22, 22, 24]) * (0.5 if car.light.dark else 1.0)
-    grille = easel.box(0, nose - 0.06 - looks.grille_tall / 2, 0.72, looks.grille_tall, round_by=0.04)
-    easel.paint(grille, dark, 0.92)
-    if looks.chrome:
-        easel.paint(easel.box(0, nose - 0.06 - looks.grille_tall / 2, 0.7, 0.02), (190, 192, 196), 0.7)
-    intake = easel.box(0, d.clearance + 0.13, 1.05, 0.13, round_by=0.05)
-    easel.paint(intake, dark, 0.9)
-    for side in (-1, 1):
-        easel.paint(easel.box(side * 0.66, d.clearance + 0.14, 0.17, 0.1, round_by=0.04), dark, 0.7)
-        top = nose - 0.02
-        outer = float(car.half_width(top)) * 0.97
-        corners = [(outer, top + 0.03), (outer - 0.4, top - 0.03), (outer - 0.36, top - 0.17)]
-        outline = rounded(np.array([*corners, (outer - 0.02, top - 0.13)]) * (side, 1), 0.05)
-        _lamp(car, easel, outline, (186, 190, 196), car.light.lamps)
-        if car.light.lamps > 0.3:
-            middle = outline.mean(0)
-            easel.paint(
-                easel.box(middle[0], middle[1], 0.2, 0.15, round_by=0.07), (255, 252, 236), car.light.lamps
-            )
-    easel.dim(easel.mask(_band(car, d.clearance + 0.4, d.clearance + 0.415, 0.98, 0.0)), 0.6)
-    _paint_plate(car, easel, d.clearance + 0.27)
-    easel.paint(
-        easel.mask(_band(car, d.clearance - 0.02, d.clearance + 0.05, 0.86, 0.0), soften=0.02), dark, 0.9
-    )
-
-
-def paint_box(car: Car, easel: Easel) -> None:
-    """Paint the rear of a box lorry: cargo doors, lamps and the bar low down."""
-    d, looks = car.design, car.looks
-    half = d.width / 2
-    gain = car.light.ambient + 0.4 * car.light.sun
-    day = 0.4 if car.light.dark else gain
-    doors = easel.mask(_band(car, 1.0, d.height, 1.0, 0.0))
-    shade = 1.03 - 0.1 * (easel.y - 1.0) / (d.height - 1.0)
-    easel.paint(doors, np.array(looks.cargo) * day * shade[..., None])
-    frame = doors.without(easel.mask(_band(car, 1.06, d.height - 0.07, 1.0, 0.07)))
-    easel.paint(frame, np.array([150, 150, 152]) * day, 0.8)
-    easel.dim(easel.box(0, (1 + d.height) / 2, 0.025, d.height - 1.1), 0.35)
-    for x in (-0.75, -0.3, 0.3, 0.75):
-        easel.dim(easel.box(x, (1 + d.height) / 2, 0.03, d.height - 1.15), 0.72)
-        easel.paint(easel.box(x, 1.6, 0.09, 0.06), np.array([90, 90, 92]) * day, 0.8)
-    low = easel.mask(_band(car, d.clearance, 1.0, 1.0, 0.0))
-    easel.paint(low, np.array([30, 30, 32]) * (0.5 if car.light.dark else 1))
-    easel.paint(easel.box(0, 0.55, d.width * 0.92, 0.12), np.array([120, 120, 120]) * day, 0.8)
-    for side in (-1, 1):
-        outline = rounded([(side * (half - 0.1), 0.78), (side * (half - 0.1), 0.94),
-                           (side * (half - 0.5), 0.94), (side * (half - 0.5), 0.78)], 0.03)  # fmt: skip
-        _lamp(car, easel, outline, (176, 24, 26), car.light.lamps)
-    _paint_plate(car, easel, 0.8)
-
-
-def paint_flank(car: Car, easel: Easel, mirrored: Floats) -> None:
-    """Paint the flank: outline, windows with pillars, wheels in their arches, doors, sill."""
-    d, looks = car.design, car.looks
-    y = np.linspace(d.clearance, d.height, 50)
-    near = profile_at(car.end, y) - 0.06
-    far = d.length - profile_at(car.far_end, y)
-    outline = np.concatenate([np.column_stack([near, y]), np.column_stack([far, y])[::-1]])
-    easel.show(easel.mask(outline))
-    dark = np.array([20, 20, 21]) * (0.5 if car.light.dark else 1.0)
-    hubs = (car.overhang, d.length - d.overhangs[1 if car.facing == "rear" else 0])
-    if d.box:
-        start, stop = (1.6, d.length) if car.facing == "front" else (0.0, d.length - 1.7)
-        cargo = easel.mask([(start, 1.0), (stop, 1.0), (stop, d.height), (start, d.height)])
-        gain = 0.4 if car.light.dark else car.light.ambient + 0.3 * car.light.sun
-        easel.paint(cargo, np.array(looks.cargo) * gain)
-        under = easel.mask([(0, 0), (d.length, 0), (d.length, 1.0), (0, 1.0)])
-        easel.paint(under, dark * 1.6, 0.85)
-    front, back = d.windows
-    if car.facing == "front":
-        front, back = d.length - back, d.length - front
-    low, high = d.belt + 0.02, d.height - 0.09
-    band_y = np.array([low, high])
-    edge = np.maximum(profile_at(car.end, band_y) + 0.1, front)
-    limit = np.minimum(d.length - profile_at(car.far_end, band_y) - 0.1, back)
-    pane = np.array([(edge[0], low), (limit[0], low), (limit[1], high), (edge[1], high)])
-    easel.dim(_paint_glass(car, easel, rounded(pane, 0.06), mirrored, seats=False), 0.85)
-    span = pane[1, 0] - pane[0, 0]
-    for share in (0.3, 0.62) if not d.box else ():
-        x = pane[0, 0] + span * share
-        easel.paint(
-            easel.box(x, (low + high) / 2, 0.07, high - low),
-            car.paint * (0.12 if car.light.dark else 0.4),
-            0.9,
+    def paint_front(self) -> None:
+        """Paint the front of a vehicle: windshield, hood, headlamps, grille, bumper, plate."""
+        canvas, dims, look, light = self.canvas, self.dims, self.look, self.light
+        heights = np.linspace(0.6, dims.belt, 40)
+        nose = float(np.interp(0.22, profile_at(dims.front, heights), heights))
+        low = float(
+            np.interp(0.1 if dims.is_box else 1.05, [z for _, z in dims.front], [y for y, _ in dims.front])
         )
-        easel.dim(easel.box(x, (d.clearance + low) / 2 + 0.06, 0.014, low - d.clearance - 0.12), 0.55)
-        easel.paint(easel.box(x + 0.2, d.belt - 0.11, 0.17, 0.03), car.paint * 0.7, 0.6)
-    easel.dim(
-        easel.mask(
-            [
-                (0.1, d.belt - 0.18),
-                (d.length - 0.2, d.belt - 0.2),
-                (d.length - 0.2, d.belt - 0.215),
-                (0.1, d.belt - 0.195),
-            ]
-        ),
-        0.75,
-    )
-    sill = easel.mask(
-        [
-            (0, d.clearance - 0.05),
-            (d.length, d.clearance - 0.05),
-            (d.length, d.clearance + 0.1),
-            (0, d.clearance + 0.1),
-        ]
-    )
-    easel.paint(sill, dark * 1.3, 0.75)
-    turn = np.linspace(0, 2 * np.pi, 40)
-    ring = np.column_stack([np.cos(turn), np.sin(turn)])
-    day = 0.35 if car.light.dark else car.light.ambient / 0.65
-    lamp = [(-0.02, d.belt - 0.28), (0.2, d.belt - 0.26), (0.16, d.belt - 0.1), (-0.02, d.belt - 0.08)]
-    if not d.box:
-        color = (160, 24, 26) if car.facing == "rear" else (190, 194, 198)
-        easel.paint(easel.mask(rounded(lamp, 0.03)), np.array(color) * max(day, car.light.lamps), 0.9)
-    for hub in hubs:
-        center = np.array([hub, d.wheel])
-        arch = easel.mask(center + ring * (d.wheel + 0.06))
-        easel.paint(arch, dark * 0.7)
-        tyre = easel.mask(center + ring * d.wheel)
-        easel.show(tyre)
-        easel.paint(tyre, dark * 1.4)
-        rim = easel.mask(center + ring * d.wheel * 0.64)
-        easel.paint(rim, np.full(3, looks.rims * 0.85 * day))
-        for angle in np.arange(5) * 2 * np.pi / 5 + looks.seed % 3:
-            spoke = center + np.array([np.cos(angle), np.sin(angle)]) * d.wheel * 0.42
-            easel.paint(easel.mask(spoke + ring * d.wheel * 0.13), dark, 0.85)
+        low = min(max(low, dims.belt), dims.height - 0.5)
+        high = 2.4 if dims.is_box else dims.height - 0.1
+        pane = self.window(low, high, 0.92, 0.02, 0.09)
+        mirror = canvas.box(0, high - 0.07, 0.2, 0.06, radius=0.03)
+        canvas.paint(mirror & pane, (20, 22, 24), 0.9)
+        # The gap at the front edge of the hood.
+        canvas.multiply(self.band(nose - 0.01, nose + 0.008, 0.86, 0.05), 0.5)
+        dark = np.array([22, 22, 24]) * self.by_light(0.5, 1.0)
+        grille_y = nose - 0.06 - look.grille_height / 2
+        self.box(0, grille_y, 0.72, look.grille_height, dark, 0.92, radius=0.04)
+        if look.chrome:
+            self.box(0, grille_y, 0.7, 0.02, (190, 192, 196), 0.7)
+        self.box(0, dims.clearance + 0.13, 1.05, 0.13, dark, 0.9, radius=0.05)
+        top = nose - 0.02
+        outer = float(self.body.half_width(top)) * 0.97
+        corners = np.array([(0, 0.03), (-0.4, -0.03), (-0.36, -0.17), (-0.02, -0.13)])
+        corners += (outer, top)
+        for side in (-1, 1):
+            self.box(side * 0.66, dims.clearance + 0.14, 0.17, 0.1, dark, 0.7, radius=0.04)
+            outline = round_corners(corners * (side, 1), 0.05)
+            self.lamp(outline, (186, 190, 196))
+            if light.lamps > 0.3:
+                x, y = outline.mean(0)
+                self.box(x, y, 0.2, 0.15, (255, 252, 236), light.lamps, radius=0.07)
+        canvas.multiply(self.band(dims.clearance + 0.4, dims.clearance + 0.415, 0.98), 0.6)
+        self.plate(dims.clearance + 0.27)
+        canvas.paint(self.band(dims.clearance - 0.02, dims.clearance + 0.05, 0.86, soften=0.02), dark, 0.9)
+
+    def paint_box_rear(self) -> None:
+        """Paint the rear of a box truck: cargo doors, lamps, underrun bar, plate."""
+        canvas, dims, light = self.canvas, self.dims, self.light
+        half, middle = dims.width / 2, (1 + dims.height) / 2
+        gain = self.by_light(0.4, light.ambient + 0.4 * light.sun)
+        doors = self.band(1.0, dims.height, 1.0)
+        shade = 1.03 - 0.1 * (canvas.y - 1.0) / (dims.height - 1.0)
+        canvas.paint(doors, np.array(self.look.cargo_color) * gain * shade[..., None])
+        frame = doors - self.band(1.06, dims.height - 0.07, 1.0, 0.07)
+        canvas.paint(frame, np.array([150, 150, 152]) * gain, 0.8)
+        canvas.multiply(canvas.box(0, middle, 0.025, dims.height - 1.1), 0.35)
+        for x in (-0.75, -0.3, 0.3, 0.75):
+            canvas.multiply(canvas.box(x, middle, 0.03, dims.height - 1.15), 0.72)
+            self.box(x, 1.6, 0.09, 0.06, np.array([90, 90, 92]) * gain, 0.8)
+        canvas.paint(self.band(dims.clearance, 1.0, 1.0), np.array([30, 30, 32]) * self.by_light(0.5, 1))
+        self.box(0, 0.55, dims.width * 0.92, 0.12, np.array([120, 120, 120]) * gain, 0.8)
+        for side in (-1, 1):
+            outer, inner = side * (half - 0.1), side * (half - 0.5)
+            outline = round_corners([(outer, 0.78), (outer, 0.94), (inner, 0.94), (inner, 0.78)], 0.03)
+            self.lamp(outline, (176, 24, 26))
+        self.plate(0.8)
+
+    def paint_flank(self) -> None:
+        """Paint a flank: outline, windows with pillars, wheels in their arches, doors, sill."""
+        canvas, dims, look, light, body = self.canvas, self.dims, self.look, self.light, self.body
+        y = np.linspace(dims.clearance, dims.height, 50)
+        near = np.column_stack([profile_at(body.end, y) - 0.06, y])
+        far = np.column_stack([dims.length - profile_at(body.far_end, y), y])
+        canvas.make_opaque(canvas.polygon(np.concatenate([near, far[::-1]])))
+        dark = np.array([20, 20, 21]) * self.by_light(0.5, 1.0)
+        if dims.is_box:
+            start, stop = (1.6, dims.length) if body.view == "front" else (0.0, dims.length - 1.7)
+            cargo = self._rectangle(start, stop, 1.0, dims.height)
+            gain = self.by_light(0.4, light.ambient + 0.3 * light.sun)
+            canvas.paint(cargo, np.array(look.cargo_color) * gain)
+            canvas.paint(self._rectangle(0, dims.length, 0, 1.0), dark * 1.6, 0.85)
+        low, high = dims.belt + 0.02, dims.height - 0.09
+        self._paint_side_windows(low, high)
+        crease = [(0.1, -0.18), (dims.length - 0.2, -0.2), (dims.length - 0.2, -0.215), (0.1, -0.195)]
+        canvas.multiply(canvas.polygon([(x, dims.belt + y) for x, y in crease]), 0.75)
+        sill = self._rectangle(0, dims.length, dims.clearance - 0.05, dims.clearance + 0.1)
+        canvas.paint(sill, dark * 1.3, 0.75)
+        gain = self.by_light(0.35, light.ambient / 0.65)
+        if not dims.is_box:
+            lamp = np.array([(-0.02, -0.28), (0.2, -0.26), (0.16, -0.1), (-0.02, -0.08)])
+            lamp[:, 1] += dims.belt
+            color = np.array((160, 24, 26) if body.view == "rear" else (190, 194, 198))
+            canvas.paint(canvas.polygon(round_corners(lamp, 0.03)), color * max(gain, light.lamps), 0.9)
+        self._paint_wheels(dark, gain)
+
+    def _rectangle(self, x1: float, x2: float, y1: float, y2: float) -> Mask:
+        return self.canvas.polygon([(x1, y1), (x2, y1), (x2, y2), (x1, y2)])
+
+    def _paint_side_windows(self, low: float, high: float) -> None:
+        """Paint windows, pillars, door gaps and door handles."""
+        canvas, dims, body = self.canvas, self.dims, self.body
+        first, last = dims.windows
+        if body.view == "front":
+            first, last = dims.length - last, dims.length - first
+        y = np.array([low, high])
+        near = np.maximum(profile_at(body.end, y) + 0.1, first)
+        far = np.minimum(dims.length - profile_at(body.far_end, y) - 0.1, last)
+        pane = np.array([(near[0], low), (far[0], low), (far[1], high), (near[1], high)])
+        canvas.multiply(self.glass(round_corners(pane, 0.06), seats=False), 0.85)
+        if dims.is_box:
+            return
+        for position in (0.3, 0.62):
+            x = near[0] + (far[0] - near[0]) * position
+            self.box(x, (low + high) / 2, 0.07, high - low, body.color * self.by_light(0.12, 0.4), 0.9)
+            gap = canvas.box(x, (dims.clearance + low) / 2 + 0.06, 0.014, low - dims.clearance - 0.12)
+            canvas.multiply(gap, 0.55)
+            self.box(x + 0.2, dims.belt - 0.11, 0.17, 0.03, body.color * 0.7, 0.6)
+
+    def _paint_wheels(self, dark: NDArray[np.float64], gain: float) -> None:
+        canvas, dims, body = self.canvas, self.dims, self.body
+        angles = np.linspace(0, 2 * np.pi, 40)
+        circle = np.column_stack([np.cos(angles), np.sin(angles)])
+        for hub in (body.overhang, dims.length - body.far_overhang):
+            center = np.array([hub, dims.wheel_radius])
+            canvas.paint(canvas.polygon(center + circle * (dims.wheel_radius + 0.06)), dark * 0.7)
+            tire = canvas.polygon(center + circle * dims.wheel_radius)
+            canvas.make_opaque(tire)
+            canvas.paint(tire, dark * 1.4)
+            rim = canvas.polygon(center + circle * dims.wheel_radius * 0.64)
+            canvas.paint(rim, np.full(3, self.look.rim_tone * 0.85 * gain))
+            for angle in np.arange(5) * 2 * np.pi / 5 + self.look.seed % 3:
+                spoke = center + np.array([np.cos(angle), np.sin(angle)]) * dims.wheel_radius * 0.42
+                canvas.paint(canvas.polygon(spoke + circle * dims.wheel_radius * 0.13), dark, 0.85)

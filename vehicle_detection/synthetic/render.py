@@ -1,271 +1,56 @@
-"""A moment of traffic becomes a picture: vehicles in order of distance, shadows, lamps, and their truth."""
+"""Drawing of vehicles into a scene: perspective, shadows, lamps, occlusion and ground truth."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection.synthetic.bodywork import PIXELS_PER_METRE, Surface
-from vehicle_detection.synthetic.camera_light import Floats, Light, Pinhole
-from vehicle_detection.synthetic.scenery import Canvas, Scenery
+from vehicle_detection.synthetic.camera_light import SceneConfig
+from vehicle_detection.synthetic.raster import Floats, Image, alpha_over
+from vehicle_detection.synthetic.scenery import Canvas, Scenery, draw_layer
 from vehicle_detection.synthetic.shapes import profile_at
-from vehicle_detection.synthetic.vehicles import Car
+from vehicle_detection.synthetic.surface import PIXELS_PER_METER
+from vehicle_detection.synthetic.vehicles import VehicleBody
 
 NEAR_PLANE = 1.0
-"""Metres ahead of the camera from which on anything is drawn."""
+"""Distance in meters from which on anything is drawn."""
 
-_ROUNDS = 4
 _INVERSE = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-
-
-@dataclass(frozen=True, eq=False)
-class Sprite:
-    """Pixels of a vehicle: ``(h, w, 4)`` premultiplied RGBA, 0-255, from column `left` and row `top` on."""
-
-    rgba: Floats
-    left: int
-    top: int
-
-
-class _Sheet:
-    """Samples of a sprite, `fine` of them along a pixel's side, and the rays of the camera through them."""
-
-    def __init__(self, camera: Pinhole, left: int, top: int, right: int, bottom: int, fine: int) -> None:
-        self.camera, self.left, self.top, self.fine = camera, left, top, fine
-        self.rgba: Floats = np.zeros(((bottom - top) * fine, (right - left) * fine, 4), np.float32)
-
-    def columns(self, x: NDArray[np.float64], z: NDArray[np.float64]) -> slice:
-        """Find the samples between the outermost of some points in meters, and a few more."""
-        seen = (self.camera.project(x, 0.0, z)[..., 0] - self.left) * self.fine
-        first, last = np.clip([seen.min() - 3, seen.max() + 4], 0, self.rgba.shape[1])
-        return slice(int(first), int(last))
-
-    def rays(self, columns: slice) -> tuple[Floats, Floats]:
-        """Slopes to the right ``(1, w)`` and upwards ``(h, 1)`` of the rays through some columns."""
-        x = self.left + (np.arange(columns.start, columns.stop) + 0.5) / self.fine
-        y = self.top + (np.arange(self.rgba.shape[0]) + 0.5) / self.fine
-        right = (x - self.camera.center_px) / self.camera.focal_px
-        up = (self.camera.horizon_px - y) / self.camera.focal_px
-        return right.astype(np.float32)[None, :], up.astype(np.float32)[:, None]
-
-    def lay(self, columns: slice, layer: Floats) -> None:
-        """Lay premultiplied pixels over some columns."""
-        part = self.rgba[:, columns]
-        part *= 1 - layer[..., 3:] * np.float32(1 / 255)
-        part += layer
-
-    def sprite(self) -> Sprite:
-        """Average the samples to pixels."""
-        if self.fine == 1:
-            return Sprite(self.rgba, self.left, self.top)
-        size = (self.rgba.shape[1] // self.fine, self.rgba.shape[0] // self.fine)
-        pixels = cv2.resize(self.rgba, size, interpolation=cv2.INTER_AREA)
-        return Sprite(np.asarray(pixels, np.float32), self.left, self.top)
-
-
-def full_box(car: Car, camera: Pinhole, lateral: float, distance: float) -> NDArray[np.float64]:
-    """Box of a whole vehicle in the picture, seen or not: its outline, projected.
-
-    Whatever is nearer than `NEAR_PLANE` is taken to be there.
-    """
-    d = car.design
-    y = np.linspace(d.clearance, d.height, 40)
-    half, near = car.half_width(y), profile_at(car.end, y)
-    middle = np.where(y < d.belt, d.length / 2, near)
-    far = d.length - profile_at(car.far_end, y)
-    foot = np.full_like(y, d.width / 2 - 0.03)
-    groups = [
-        (0.93 * half, y, near + 0.22 * d.corner),
-        (0.5 * half, y, near),
-        (half, y, near + 0.8 * d.corner),
-        (half, y, middle),
-        (half, y, far),
-        (foot, 0 * y, np.full_like(y, car.overhang)),
-    ]
-    x, up, behind = (np.concatenate([group[axis] for group in groups]) for axis in range(3))
-    ahead = np.maximum(distance - car.overhang + behind, NEAR_PLANE)
-    seen = np.concatenate([camera.project(lateral + side * x, up, ahead) for side in (-1, 1)])
-    return np.concatenate([seen.min(0), seen.max(0)])
-
-
-def draw_sprite(
-    car: Car, camera: Pinhole, lateral: float, distance: float, shape: tuple[int, int]
-) -> Sprite | None:
-    """Draw a vehicle whose nearer tyres stand `distance` meters ahead and its middle `lateral` meters right.
-
-    Returns None when no part of it can be in a picture of `shape`.
-    """
-    d = car.design
-    start = distance - car.overhang
-    if start + d.length < NEAR_PLANE + 0.5:
-        return None
-    x1, y1, x2, y2 = full_box(car, camera, lateral, distance).tolist()
-    left, top = max(int(x1) - 3, 0), max(int(y1) - 3, 0)
-    right, bottom = min(int(x2) + 4, shape[1]), min(int(y2) + 4, shape[0])
-    if right <= left or bottom <= top:
-        return None
-    sheet = _Sheet(camera, left, top, right, bottom, fine=2 if x2 - x1 < 240 else 1)
-    if distance > NEAR_PLANE:
-        _draw_under(sheet, car, lateral, distance)
-    for side in (-1, 1):
-        if side * lateral < -d.width / 2:
-            _draw_flank(sheet, car, side, lateral, start)
-    if start > NEAR_PLANE:
-        _draw_near(sheet, car, lateral, start)
-    return sheet.sprite()
-
-
-def _level(car: Car, name: str, wide: float, high: float) -> tuple[Surface, float, float]:
-    """Take a surface at about the size it is drawn at, with its pixels per metre across and upwards.
-
-    `wide` and `high` say how many of its pixels fall on one sample.
-    """
-    steps = [int(np.clip(np.log2(max(ratio, 1.0)) + 0.25, 0, 6)) for ratio in (wide, high)]
-    full: Surface = getattr(car, name)
-    key = (name, steps[0], steps[1])
-    if key not in car.levels:
-        height, width = full.rgba.shape[:2]
-        size = (max(1, width >> steps[0]), max(1, height >> steps[1]))
-        rgba = cv2.resize(full.rgba, size, interpolation=cv2.INTER_AREA) if any(steps) else full.rgba
-        car.levels[key] = Surface(np.asarray(rgba, np.float32), full.left, full.top, full.depth)
-    level = car.levels[key]
-    across = PIXELS_PER_METRE * level.rgba.shape[1] / full.rgba.shape[1]
-    upwards = PIXELS_PER_METRE * level.rgba.shape[0] / full.rgba.shape[0]
-    return level, across, upwards
-
-
-def _draw_under(sheet: _Sheet, car: Car, lateral: float, distance: float) -> None:
-    """Tyres and underside, in an upright plane across the road: a scaling."""
-    scale = sheet.camera.focal_px / distance * sheet.fine
-    level, across, upwards = _level(car, "under", PIXELS_PER_METRE / scale, PIXELS_PER_METRE / scale)
-    x, y = sheet.camera.project(lateral + level.left, level.top, distance).tolist()
-    a, b = across / scale, upwards / scale
-    shift = ((0.5 - (x - sheet.left) * sheet.fine) * a - 0.5, (0.5 - (y - sheet.top) * sheet.fine) * b - 0.5)
-    matrix = np.array([[a, 0, shift[0]], [0, b, shift[1]]])
-    size = (sheet.rgba.shape[1], sheet.rgba.shape[0])
-    layer = cv2.warpAffine(level.rgba, matrix, size, flags=_INVERSE)
-    sheet.lay(slice(0, size[0]), np.asarray(layer, np.float32))
-
-
-def _draw_flank(sheet: _Sheet, car: Car, side: int, lateral: float, start: float) -> None:
-    """Draw the flank towards the camera: an upright plane, and one that leans inwards above the belt."""
-    d, camera, fine = car.design, sheet.camera, sheet.fine
-    plane = lateral + side * d.width / 2
-    belt_half, roof_half = car.half_width([d.belt, d.height - 0.06]).tolist()
-    lean = 0.0 if d.box else (belt_half - roof_half) / (d.height - 0.06 - d.belt)
-    first, last = max(start - 0.1, NEAR_PLANE), start + d.length
-    inner = lateral + side * roof_half
-    columns = sheet.columns(np.array([plane, plane, inner, inner]), np.array([first, last] * 2))
-    size = (columns.stop - columns.start, sheet.rgba.shape[0])
-    if size[0] < 1:
-        return
-    scale = camera.focal_px / np.sqrt(first * last) * fine
-    shown = abs(camera.focal_px * plane * (1 / first - 1 / last)) * fine
-    level, across, upwards = _level(
-        car, "flank", PIXELS_PER_METRE * d.length / max(shown, 1.0), PIXELS_PER_METRE / scale
-    )
-    sample = np.array(
-        [
-            [1 / fine, 0, sheet.left + (columns.start + 0.5) / fine - camera.center_px],
-            [0, -1 / fine, camera.horizon_px - sheet.top - 0.5 / fine],
-            [0, 0, camera.focal_px],
-        ]
-    )
-
-    def warp(offset: float, tilt: float) -> Floats:
-        # The plane x = offset + tilt * y meets the ray (right * z, height + up * z, z) at
-        # z = (offset + tilt * height) / (right - tilt * up): a homography from pixels to the surface.
-        reach = offset + tilt * camera.height_m
-        weight = np.array([1.0, -tilt, 0.0])
-        depth = np.array([0.0, 0.0, reach]) - start * weight
-        height = camera.height_m * weight + np.array([0.0, reach, 0.0])
-        column = across * (depth - level.left * weight) - 0.5 * weight
-        row = upwards * (level.top * weight - height) - 0.5 * weight
-        matrix = np.stack([column, row, weight]) @ sample
-        # A ray along the plane never meets it: OpenCV gives NaN there.
-        return np.nan_to_num(
-            np.asarray(cv2.warpPerspective(level.rgba, matrix, size, flags=_INVERSE), np.float32)
-        )
-
-    layer = warp(plane, 0.0)
-    if lean:
-        # Above the belt line of the upright plane a pixel shows the leaning one.
-        right, up = sheet.rays(columns)
-        away = plane / np.where(np.abs(right) > 1e-4, right, 1e-4 * np.sign(plane))
-        above = (camera.height_m + up * away > d.belt)[..., None]
-        layer = np.where(above, warp(lateral + side * (belt_half + lean * d.belt), -side * lean), layer)
-    # A flank in the sun is brighter than one in the shade.
-    sun = car.light.sun * max(0.0, side * car.light.to_sun[0])
-    layer[..., :3] = np.minimum(layer[..., :3] * (0.86 + 0.5 * sun / car.light.ambient), layer[..., 3:])
-    sheet.lay(columns, layer)
-
-
-def _draw_near(sheet: _Sheet, car: Car, lateral: float, start: float) -> None:
-    """Draw the near end: each ray meets its curved surface where some rounds of substitution say.
-
-    A ray is at ``(right * z, height + up * z, z)``, the surface at ``z = start + depth(x, y)``: a point on
-    the ray gives a depth, the depth the next point.
-    """
-    d, camera = car.design, sheet.camera
-    scale = camera.focal_px / start * sheet.fine
-    level, across, upwards = _level(car, "near", PIXELS_PER_METRE / scale, PIXELS_PER_METRE / scale)
-    assert level.depth is not None
-    sides = lateral + np.array([-0.5, 0.5, -0.5, 0.5]) * d.width
-    columns = sheet.columns(sides, start + np.array([0.0, 0.0, 2.5, 2.5]))
-    if columns.stop <= columns.start:
-        return
-    right, up = sheet.rays(columns)
-    left, drop = np.float32(lateral + level.left), np.float32(level.top - camera.height_m)
-    ppm = np.float32(PIXELS_PER_METRE)
-    away = np.full((up.size, right.size), start, np.float32)
-    for _ in range(_ROUNDS):
-        x, y = (right * away - left) * ppm - 0.5, (drop - up * away) * ppm - 0.5
-        depth = cv2.remap(level.depth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        away = np.asarray(np.float32(start) + depth, np.float32)
-    x, y = (right * away - left) * np.float32(across) - 0.5, (drop - up * away) * np.float32(upwards) - 0.5
-    sheet.lay(columns, np.asarray(cv2.remap(level.rgba, x, y, cv2.INTER_LINEAR), np.float32))
-
-
-Image = NDArray[np.uint8]
-
-PARTLY_HIDDEN = 0.1
-LARGELY_HIDDEN = 0.5
-MOST_TRUNCATED = 0.7
-LEAST_WIDTH = 40
-_SOLID = 127.5
 
 
 @dataclass(frozen=True)
 class VehicleTruth:
-    """What is true of one vehicle in one picture.
+    """Ground truth of one vehicle in one image.
 
     Attributes
     ----------
     track
-        Its number, the same in every frame of a drive.
+        Number of the vehicle, the same in every frame of a drive.
     box
-        ``(x1, y1, x2, y2)``, half-open pixels, around the vehicle as it is drawn, inside the picture. Other
-        vehicles may hide a part of it; its shadow does not belong to it.
+        ``(x1, y1, x2, y2)``, half-open pixels, around the vehicle inside the image, without its shadow. It
+        includes the parts that other vehicles hide.
     full_box
-        The same with what lies outside the picture. It may lie below 0 and beyond the picture's size.
+        The same including the parts outside the image: it may be negative or exceed the size of the image.
     distance_m
-        Metres along the road from the camera to where the nearer tyres stand; below 0 beside and behind it.
-        The row where they stand is ``horizon + focal * camera height / distance_m``.
+        Distance in meters along the road from the camera to the nearer tires; negative beside and behind the
+        camera. The tires are in row ``horizon_px + focal_px * height_m / distance_m`` of the camera.
     speed_mps
-        How fast the distance grows, in meters per second.
-    hidden
-        Share in [0, 1] of the vehicle's pixels that nearer vehicles and the barrier cover.
+        Rate of change of the distance, in meters per second.
+    occluded_fraction
+        Fraction of the vehicle's pixels that nearer vehicles and the barrier cover, in [0, 1].
     occluded
-        0 visible, 1 partly hidden (10% or more), 2 largely (over 50%).
+        Level of occlusion: 0 visible, 1 partly occluded (10% or more), 2 largely occluded (over 50%).
     truncated
-        Share of `full_box` outside the picture, in [0, 1].
+        Fraction of `full_box` outside the image, in [0, 1].
     ignore
-        1 for what is not scored: largely hidden, truncated by more than 0.7, under 40 pixels wide, or
-        oncoming behind the barrier.
+        1 if the vehicle is not scored: largely occluded, truncated by more than 0.7, narrower than 40
+        pixels, or oncoming behind the barrier.
     """
 
     track: int
@@ -273,185 +58,366 @@ class VehicleTruth:
     full_box: tuple[float, float, float, float]
     distance_m: float
     speed_mps: float
-    hidden: float
+    occluded_fraction: float
     occluded: int
     truncated: float
     ignore: int
 
 
 @dataclass(frozen=True)
-class Placed:
-    """A vehicle at one moment."""
+class VehiclePose:
+    """A vehicle and its position at one moment."""
 
-    car: Car
+    body: VehicleBody
     track: int
-    lateral: float
-    distance: float
-    speed: float
+    lateral: float  # from the camera to its middle, to the right (m)
+    distance: float  # to its nearer tires (m)
+    speed: float = 0.0  # away from the camera (m/s)
     oncoming: bool = False
 
+    @property
+    def start(self) -> float:
+        """Distance to its near end (m)."""
+        return self.distance - self.body.overhang
 
-def stage(
-    placed: Sequence[Placed],
-    scenery: Scenery,
-    camera: Pinhole,
-    travel: float,
-    shape: tuple[int, int],
-    image: Image | None,
+
+@dataclass(frozen=True, eq=False)
+class Sprite:
+    """Image of a vehicle: ``(h, w, 4)`` premultiplied RGBA, 0-255, at column `left` and row `top`."""
+
+    rgba: Floats
+    left: int
+    top: int
+
+    @property
+    def region(self) -> tuple[slice, slice]:
+        """Rows and columns of the frame that it covers."""
+        height, width = self.rgba.shape[:2]
+        return slice(self.top, self.top + height), slice(self.left, self.left + width)
+
+    @cached_property
+    def solid(self) -> NDArray[np.bool_]:
+        """``(h, w)``: True where it is more opaque than transparent."""
+        return np.asarray(self.rgba[..., 3] > 127.5)
+
+    @property
+    def box(self) -> tuple[int, int, int, int]:
+        """Bounding box of its solid pixels."""
+        rows, columns = np.flatnonzero(self.solid.any(1)), np.flatnonzero(self.solid.any(0))
+        x1, x2 = self.left + int(columns[0]), self.left + int(columns[-1]) + 1
+        return x1, self.top + int(rows[0]), x2, self.top + int(rows[-1]) + 1
+
+
+def composite(
+    poses: Sequence[VehiclePose], scenery: Scenery, config: SceneConfig, travel: float, image: Image | None
 ) -> tuple[tuple[VehicleTruth, ...], NDArray[np.int32]]:
-    """Draw vehicles into `image`, in place and far ones first; without an image find the truth alone.
+    """Draw vehicles and the barrier into `image` in place, far ones first; None: only find the truth.
 
-    Returns
-    -------
-    tuple
-        The truth, by track, and the ``(H, W)`` map of the track that each pixel shows, 0 where none does.
+    Returns the truth by track, and the ``(H, W)`` map of the track that each pixel shows, 0 where none.
     """
-    seen = np.zeros(shape, np.int32)
-    sprites: list[tuple[Placed, Sprite, NDArray[np.bool_]]] = []
-    ordered = sorted(placed, key=lambda one: (not one.oncoming, -one.distance))
-    barrier_due = True
-    for one in ordered:
-        if barrier_due and not one.oncoming:
-            scenery.draw_barrier(Canvas(camera, image, seen), travel)
-            barrier_due = False
-        sprite = draw_sprite(one.car, camera, one.lateral, one.distance, shape)
-        if sprite is None:
-            continue
-        solid = sprite.rgba[..., 3] > _SOLID
-        if not solid.any():
-            continue
-        if image is not None:
-            _cast_shadow(image, camera, scenery.light, one)
-            _blend(image, sprite, one, camera, scenery.light)
-        height, width = solid.shape
-        seen[sprite.top : sprite.top + height, sprite.left : sprite.left + width][solid] = one.track
-        sprites.append((one, sprite, solid))
-    if barrier_due:
-        scenery.draw_barrier(Canvas(camera, image, seen), travel)
-    truth = (_judge(one, sprite, solid, seen, camera, shape) for one, sprite, solid in sprites)
-    return tuple(sorted(truth, key=lambda row: row.track)), seen
+    instance_map = np.zeros(config.shape, np.int32)
+    canvas = Canvas(config, image, instance_map)
+    drawn: list[tuple[VehiclePose, Sprite]] = []
+    # The barrier stands between the oncoming vehicles and the others.
+    for oncoming in (True, False):
+        group = [pose for pose in poses if pose.oncoming == oncoming]
+        for pose in sorted(group, key=lambda pose: -pose.distance):
+            sprite = draw_sprite(pose, config)
+            if sprite is None:
+                continue
+            if image is not None:
+                _draw_into(image, config, pose, sprite)
+            instance_map[sprite.region][sprite.solid] = pose.track
+            drawn.append((pose, sprite))
+        if oncoming:
+            scenery.draw_barrier(canvas, travel)
+    truth = (ground_truth(pose, sprite, instance_map, config) for pose, sprite in drawn)
+    return tuple(sorted(truth, key=lambda row: row.track)), instance_map
 
 
-def draw_one(image: Image, camera: Pinhole, light: Light, one: Placed) -> NDArray[np.int64] | None:
-    """Draw a single vehicle into `image`, in place, and return its box; None if it is outside."""
-    sprite = draw_sprite(one.car, camera, one.lateral, one.distance, image.shape[:2])
-    if sprite is None or not (solid := sprite.rgba[..., 3] > _SOLID).any():
+def draw_vehicle(image: Image, config: SceneConfig, pose: VehiclePose) -> NDArray[np.int64] | None:
+    """Draw a single vehicle into `image` in place and return its box; None if it is outside."""
+    sprite = draw_sprite(pose, config)
+    if sprite is None:
         return None
-    _cast_shadow(image, camera, light, one)
-    _blend(image, sprite, one, camera, light)
-    return np.array(_solid_box(sprite, solid), np.int64)
+    _draw_into(image, config, pose, sprite)
+    return np.array(sprite.box, np.int64)
 
 
-def _solid_box(sprite: Sprite, solid: NDArray[np.bool_]) -> tuple[int, int, int, int]:
-    rows, columns = np.flatnonzero(solid.any(1)), np.flatnonzero(solid.any(0))
-    return (
-        sprite.left + int(columns[0]),
-        sprite.top + int(rows[0]),
-        sprite.left + int(columns[-1]) + 1,
-        sprite.top + int(rows[-1]) + 1,
-    )
-
-
-def _judge(
-    one: Placed,
-    sprite: Sprite,
-    solid: NDArray[np.bool_],
-    seen: NDArray[np.int32],
-    camera: Pinhole,
-    shape: tuple[int, int],
+def ground_truth(
+    pose: VehiclePose, sprite: Sprite, instance_map: NDArray[np.int32], config: SceneConfig
 ) -> VehicleTruth:
-    """Find the truth of a vehicle from the pixels it covers and those that are left of it."""
-    box = _solid_box(sprite, solid)
-    # Inside the picture the silhouette is exact; where the border cuts it, the projected outline goes on.
-    outline = full_box(one.car, camera, one.lateral, one.distance)
-    limits = (0, 0, shape[1], shape[0])
-    whole = [float(b) if b != limit else float(o) for b, o, limit in zip(box, outline, limits)]
-    whole = [min(w, b) if side < 2 else max(w, b) for side, (w, b) in enumerate(zip(whole, box))]
-    area = (whole[2] - whole[0]) * (whole[3] - whole[1])
-    truncated = 1 - (box[2] - box[0]) * (box[3] - box[1]) / area
-    part = seen[sprite.top : sprite.top + solid.shape[0], sprite.left : sprite.left + solid.shape[1]]
-    hidden = 1 - np.count_nonzero(part[solid] == one.track) / np.count_nonzero(solid)
-    occluded = 2 if hidden > LARGELY_HIDDEN else 1 if hidden >= PARTLY_HIDDEN else 0
-    ignore = occluded == 2 or truncated > MOST_TRUNCATED or box[2] - box[0] < LEAST_WIDTH or one.oncoming
+    """Compute the truth of a vehicle from the pixels that it covers and those that remain visible."""
+    height, width = config.shape
+    # The silhouette gives the exact box; where the border cuts it, the projected outline extends it.
+    box = np.array(sprite.box, np.float64)
+    full = np.where(box == (0, 0, width, height), projected_box(pose, config), box)
+    full = np.concatenate([np.minimum(full[:2], box[:2]), np.maximum(full[2:], box[2:])])
+    x1, y1, x2, y2 = full.tolist()
+    truncated = 1 - float((box[2] - box[0]) * (box[3] - box[1])) / ((x2 - x1) * (y2 - y1))
+    visible = instance_map[sprite.region][sprite.solid] == pose.track
+    fraction = 1 - np.count_nonzero(visible) / visible.size
+    occluded = 2 if fraction > 0.5 else 1 if fraction >= 0.1 else 0
+    ignore = occluded == 2 or truncated > 0.7 or box[2] - box[0] < 40 or pose.oncoming
     return VehicleTruth(
-        one.track, box, (whole[0], whole[1], whole[2], whole[3]), one.distance, one.speed,
-        float(hidden), occluded, float(truncated), int(ignore),
+        pose.track, sprite.box, (x1, y1, x2, y2), pose.distance, pose.speed, fraction, occluded, truncated,
+        int(ignore),
     )  # fmt: skip
 
 
-def _cast_shadow(image: Image, camera: Pinhole, light: Light, one: Placed) -> None:
-    """Darken the road under a vehicle, and where it keeps the sun away."""
-    d = one.car.design
-    start = one.distance - one.car.overhang
-    first, last = max(start + 0.15, NEAR_PLANE), start + d.length - 0.1
+def projected_box(pose: VehiclePose, config: SceneConfig) -> NDArray[np.float64]:
+    """Bounding box of a vehicle's projected outline, inside the image or not.
+
+    Points nearer than `NEAR_PLANE` are moved there.
+    """
+    body, dims = pose.body, pose.body.dimensions
+    y = np.linspace(dims.clearance, dims.height, 40)
+    half, near = body.half_width(y), profile_at(body.end, y)
+    middle = np.where(y < dims.belt, dims.length / 2, near)
+    far = dims.length - profile_at(body.far_end, y)
+    tires = np.full_like(y, dims.width / 2 - 0.03)
+    outlines = [
+        (0.93 * half, y, near + 0.22 * dims.corner),
+        (0.5 * half, y, near),
+        (half, y, near + 0.8 * dims.corner),
+        (half, y, middle),
+        (half, y, far),
+        (tires, 0 * y, np.full_like(y, body.overhang)),
+    ]
+    x, up, behind = (np.concatenate(values) for values in zip(*outlines))
+    ahead = np.maximum(pose.start + behind, NEAR_PLANE)
+    points = np.concatenate([config.project(pose.lateral + side * x, up, ahead) for side in (-1, 1)])
+    return np.concatenate([points.min(0), points.max(0)])
+
+
+def draw_sprite(pose: VehiclePose, config: SceneConfig) -> Sprite | None:
+    """Draw a vehicle in perspective; None if no pixel of it is in the frame."""
+    dims = pose.body.dimensions
+    if pose.start + dims.length < NEAR_PLANE + 0.5:
+        return None
+    x1, y1, x2, y2 = projected_box(pose, config).tolist()
+    left, top = max(int(x1) - 3, 0), max(int(y1) - 3, 0)
+    right, bottom = min(int(x2) + 4, config.shape[1]), min(int(y2) + 4, config.shape[0])
+    if right <= left or bottom <= top:
+        return None
+    buffer = _SpriteBuffer(config, left, top, right, bottom, samples=2 if x2 - x1 < 240 else 1)
+    if pose.distance > NEAR_PLANE:
+        _draw_underside(buffer, pose)
+    for side in (-1, 1):
+        if side * pose.lateral < -dims.width / 2:
+            _draw_flank(buffer, pose, side)
+    if pose.start > NEAR_PLANE:
+        _draw_near_end(buffer, pose)
+    sprite = buffer.sprite()
+    return sprite if sprite.solid.any() else None
+
+
+class _SpriteBuffer:
+    """Supersampled image of a sprite, with `samples` samples along each side of a pixel."""
+
+    def __init__(
+        self, config: SceneConfig, left: int, top: int, right: int, bottom: int, *, samples: int
+    ) -> None:
+        self.config, self.left, self.top, self.samples = config, left, top, samples
+        self.rgba: Floats = np.zeros(((bottom - top) * samples, (right - left) * samples, 4), np.float32)
+
+    def columns(self, x: NDArray[np.float64], z: NDArray[np.float64]) -> slice:
+        """Columns of samples between the outermost of some points in meters, with a margin."""
+        columns = (self.config.project(x, 0.0, z)[..., 0] - self.left) * self.samples
+        first, last = np.clip([columns.min() - 3, columns.max() + 4], 0, self.rgba.shape[1])
+        return slice(int(first), int(last))
+
+    def rays(self, columns: slice) -> tuple[Floats, Floats]:
+        """Slopes to the right ``(1, w)`` and upwards ``(h, 1)`` of the camera rays through some columns."""
+        x = self.left + (np.arange(columns.start, columns.stop) + 0.5) / self.samples
+        y = self.top + (np.arange(self.rgba.shape[0]) + 0.5) / self.samples
+        camera = self.config.camera
+        right = (x - self.config.center_px) / camera.focal_px
+        up = (camera.horizon_px - y) / camera.focal_px
+        return right.astype(np.float32)[None, :], up.astype(np.float32)[:, None]
+
+    def composite(self, columns: slice, layer: NDArray[Any]) -> None:
+        """Composite premultiplied RGBA over some columns."""
+        rgba = np.asarray(layer, np.float32)
+        part = self.rgba[:, columns]
+        part[:] = alpha_over(part, rgba, rgba[..., 3:] * np.float32(1 / 255))
+
+    def sprite(self) -> Sprite:
+        """Average the samples of each pixel."""
+        rgba = self.rgba
+        if self.samples > 1:
+            size = (rgba.shape[1] // self.samples, rgba.shape[0] // self.samples)
+            rgba = np.asarray(cv2.resize(rgba, size, interpolation=cv2.INTER_AREA), np.float32)
+        return Sprite(rgba, self.left, self.top)
+
+
+def _draw_underside(buffer: _SpriteBuffer, pose: VehiclePose) -> None:
+    """Draw tires and underside: an upright plane across the road, so a scaling."""
+    config, surface, samples = buffer.config, pose.body.underside, buffer.samples
+    scale = config.camera.focal_px / pose.distance * samples
+    rgba, across, upwards = surface.mipmap(PIXELS_PER_METER / scale, PIXELS_PER_METER / scale)
+    x, y = config.project(pose.lateral + surface.left, surface.top, pose.distance).tolist()
+    sx, sy = across / scale, upwards / scale
+    shift_x = (0.5 - (x - buffer.left) * samples) * sx - 0.5
+    shift_y = (0.5 - (y - buffer.top) * samples) * sy - 0.5
+    height, width = buffer.rgba.shape[:2]
+    matrix = np.array([[sx, 0, shift_x], [0, sy, shift_y]])
+    buffer.composite(slice(0, width), cv2.warpAffine(rgba, matrix, (width, height), flags=_INVERSE))
+
+
+def _draw_flank(buffer: _SpriteBuffer, pose: VehiclePose, side: int) -> None:
+    """Draw the flank towards the camera: an upright plane, and one that leans inwards above the belt."""
+    config, samples, start = buffer.config, buffer.samples, pose.start
+    body, dims, light, camera = pose.body, pose.body.dimensions, config.light, config.camera
+    plane = pose.lateral + side * dims.width / 2
+    belt_half, roof_half = body.half_width([dims.belt, dims.height - 0.06]).tolist()
+    lean = 0.0 if dims.is_box else (belt_half - roof_half) / (dims.height - 0.06 - dims.belt)
+    first, last = max(start - 0.1, NEAR_PLANE), start + dims.length
+    inner = pose.lateral + side * roof_half
+    columns = buffer.columns(np.array([plane, plane, inner, inner]), np.array([first, last] * 2))
+    size = (columns.stop - columns.start, buffer.rgba.shape[0])
+    if size[0] < 1:
+        return
+    surface = body.flank
+    width = abs(camera.focal_px * plane * (1 / first - 1 / last)) * samples
+    scale = camera.focal_px / np.sqrt(first * last) * samples
+    rgba, across, upwards = surface.mipmap(
+        PIXELS_PER_METER * dims.length / max(width, 1.0), PIXELS_PER_METER / scale
+    )
+    sample_to_ray = np.array(
+        [
+            [1 / samples, 0, buffer.left + (columns.start + 0.5) / samples - config.center_px],
+            [0, -1 / samples, camera.horizon_px - buffer.top - 0.5 / samples],
+            [0, 0, camera.focal_px],
+        ]
+    )
+
+    def warp(offset: float, tilt: float) -> Floats:
+        # The plane x = offset + tilt * y meets the ray (right * z, height + up * z, z) at
+        # z = (offset + tilt * height) / (right - tilt * up): a homography from samples to the surface.
+        reach = offset + tilt * camera.height_m
+        weight = np.array([1.0, -tilt, 0.0])
+        depth = np.array([0.0, 0.0, reach]) - start * weight
+        height = camera.height_m * weight + np.array([0.0, reach, 0.0])
+        column = across * (depth - surface.left * weight) - 0.5 * weight
+        row = upwards * (surface.top * weight - height) - 0.5 * weight
+        matrix = np.stack([column, row, weight]) @ sample_to_ray
+        # OpenCV gives NaN for a ray parallel to the plane.
+        return np.nan_to_num(np.asarray(cv2.warpPerspective(rgba, matrix, size, flags=_INVERSE), np.float32))
+
+    layer = warp(plane, 0.0)
+    if lean:
+        # Where the upright plane would be seen above the belt, the leaning plane is seen.
+        right, up = buffer.rays(columns)
+        ahead = plane / np.where(np.abs(right) > 1e-4, right, 1e-4 * np.sign(plane))
+        above = (camera.height_m + up * ahead > dims.belt)[..., None]
+        layer = np.where(
+            above, warp(pose.lateral + side * (belt_half + lean * dims.belt), -side * lean), layer
+        )
+    sun = light.sun * max(0.0, side * light.to_sun[0])
+    layer[..., :3] = np.minimum(layer[..., :3] * (0.86 + 0.5 * sun / light.ambient), layer[..., 3:])
+    buffer.composite(columns, layer)
+
+
+def _draw_near_end(buffer: _SpriteBuffer, pose: VehiclePose) -> None:
+    """Draw the near end: the intersection of each ray with its curved surface, by fixed-point iteration.
+
+    A ray is at ``(right * z, height + up * z, z)``, the surface at ``z = start + depth(x, y)``: a point on
+    the ray gives a depth, the depth the next point.
+    """
+    config, surface, start = buffer.config, pose.body.near_end, pose.start
+    scale = config.camera.focal_px / start * buffer.samples
+    rgba, across, upwards = surface.mipmap(PIXELS_PER_METER / scale, PIXELS_PER_METER / scale)
+    assert surface.depth is not None
+    sides = pose.lateral + np.array([-0.5, 0.5, -0.5, 0.5]) * pose.body.dimensions.width
+    columns = buffer.columns(sides, start + np.array([0.0, 0.0, 2.5, 2.5]))
+    if columns.stop <= columns.start:
+        return
+    right, up = buffer.rays(columns)
+    left = np.float32(pose.lateral + surface.left)
+    top = np.float32(surface.top - config.camera.height_m)
+    ahead = np.full((up.size, right.size), start, np.float32)
+
+    def surface_pixels(x_scale: float, y_scale: float) -> tuple[Floats, Floats]:
+        x = (right * ahead - left) * np.float32(x_scale) - 0.5
+        return x, (top - up * ahead) * np.float32(y_scale) - 0.5
+
+    for _ in range(4):
+        x, y = surface_pixels(PIXELS_PER_METER, PIXELS_PER_METER)
+        depth = cv2.remap(surface.depth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        ahead = np.asarray(np.float32(start) + depth, np.float32)
+    buffer.composite(columns, cv2.remap(rgba, *surface_pixels(across, upwards), cv2.INTER_LINEAR))
+
+
+def _draw_into(image: Image, config: SceneConfig, pose: VehiclePose, sprite: Sprite) -> None:
+    """Draw a sprite with shadow and lamps into the image; lens blur and haze grow with the distance."""
+    _draw_shadow(image, config, pose)
+    light, distance = config.light, max(pose.distance, 0.0)
+    sigma = (0.2 + 0.004 * min(distance, 60.0)) * max(1.0, config.camera.focal_px / 1152)
+    rgba = np.asarray(cv2.GaussianBlur(sprite.rgba, (0, 0), sigma), np.float32)
+    draw_layer(image[sprite.region], rgba, light, distance, offset=0.5)
+    if light.lamps > 0.3 and pose.distance > 2.5:
+        _draw_glow(image, config, pose)
+
+
+def _draw_shadow(image: Image, config: SceneConfig, pose: VehiclePose) -> None:
+    """Darken the road under a vehicle and where it blocks the sun."""
+    dims, light = pose.body.dimensions, config.light
+    first, last = max(pose.start + 0.15, NEAR_PLANE), pose.start + dims.length - 0.1
     if last <= first + 0.2:
         return
-    half = d.width / 2 - 0.06
-    scale = camera.focal_px / max(one.distance, 2.0)
-    left, right, near, far = one.lateral - half, one.lateral + half, first, last
-    foot = [(left, near), (right, near), (right, far), (left, far)]
-    shadows = [(foot, 0.78, 0.07)]
+    half = dims.width / 2 - 0.06
+    left, right = pose.lateral - half, pose.lateral + half
+    footprint = [(left, first), (right, first), (right, last), (left, last)]
+    shadows = [(footprint, 0.78, 0.07)]
     if light.sun > 0.15:
         to_sun = light.to_sun
-        reach = min(d.height / max(to_sun[1], 0.2), 4.0)
-        shift = (-to_sun[0] * reach, -to_sun[2] * reach)
-        moved = [(x + shift[0], max(z + shift[1], NEAR_PLANE)) for x, z in foot]
-        shadows.insert(0, (foot + moved, 0.55 * light.sun / (light.sun + 0.35 * light.ambient), 0.1))
+        reach = min(dims.height / max(to_sun[1], 0.2), 4.0)
+        roof = [(x - to_sun[0] * reach, max(z - to_sun[2] * reach, NEAR_PLANE)) for x, z in footprint]
+        shadows.insert(0, (footprint + roof, 0.55 * light.sun / (light.sun + 0.35 * light.ambient), 0.1))
+    scale = config.camera.focal_px / max(pose.distance, 2.0)
     for points, strength, softness in shadows:
         x, z = (np.array(values) for values in zip(*points))
-        corners = camera.project(x, 0.0, z)
-        hull = cv2.convexHull(corners.astype(np.float32))[:, 0]
+        hull = cv2.convexHull(config.project(x, 0.0, z).astype(np.float32))[:, 0]
         sigma = max(softness * scale * 0.6, 0.6)
-        margin = int(3 * sigma) + 2
-        x1, y1 = np.maximum(np.floor(hull.min(0)).astype(int) - margin, 0)
-        x2, y2 = np.minimum(np.ceil(hull.max(0)).astype(int) + margin, image.shape[1::-1])
-        if x1 >= x2 or y1 >= y2:
+        region = _clipped_region(hull, int(3 * sigma) + 2, image)
+        if region is None:
             continue
-        mask = np.zeros((y2 - y1, x2 - x1), np.uint8)
-        cv2.fillConvexPoly(
-            mask, np.rint((hull - (x1 + 0.5, y1 + 0.5)) * 16).astype(np.int32), 255, cv2.LINE_AA, 4
-        )
+        part = image[region]
+        mask = np.zeros(part.shape[:2], np.uint8)
+        corners = (hull - (region[1].start + 0.5, region[0].start + 0.5)) * 16
+        cv2.fillConvexPoly(mask, np.rint(corners).astype(np.int32), 255, cv2.LINE_AA, 4)
         soft = cv2.GaussianBlur(mask, (0, 0), sigma, sigmaY=max(0.6, sigma * 0.4))
         gain = np.rint(255 - strength * soft).astype(np.uint8)
-        part = image[y1:y2, x1:x2]
         cv2.multiply(part, cv2.merge([gain] * 3), dst=part, scale=1 / 255)
 
 
-def _blend(image: Image, sprite: Sprite, one: Placed, camera: Pinhole, light: Light) -> None:
-    """Lay a sprite over the picture: lens blur and haze grow with the distance, lamps shine at night."""
-    away = max(one.distance, 0.0)
-    rgba = cv2.GaussianBlur(
-        sprite.rgba, (0, 0), (0.2 + 0.004 * min(away, 60.0)) * max(1.0, camera.focal_px / 1152)
-    )
-    clear = light.clarity(away)
-    alpha = rgba[..., 3:] / 255
-    color = rgba[..., :3] * (clear * light.reach(away)) + light.haze * (1 - clear) * alpha
-    height, width = sprite.rgba.shape[:2]
-    part = image[sprite.top : sprite.top + height, sprite.left : sprite.left + width]
-    part[:] = np.clip(part * (1 - alpha) + color + 0.5, 0, 255)
-    if light.lamps > 0.3 and one.distance > 2.5:
-        _shine(image, camera, light, one)
-
-
-def _shine(image: Image, camera: Pinhole, light: Light, one: Placed) -> None:
+def _draw_glow(image: Image, config: SceneConfig, pose: VehiclePose) -> None:
     """Add a glow around each lamp."""
-    d = one.car.design
-    front = one.car.facing == "front"
-    high = 0.86 if d.box else d.belt - 0.14 if not front else 0.68
-    color = np.array([255, 244, 220] if front else [230, 30, 24], np.float32)
-    scale = camera.focal_px / one.distance
-    radius = max((0.34 if front else 0.16) * scale, 1.2)
-    strength = (0.9 if front else 0.55) * light.lamps * (1.0 if light.dark else 0.35)
+    dims, light = pose.body.dimensions, config.light
+    scale = config.camera.focal_px / pose.distance
+    if pose.body.view == "front":
+        height, radius, strength, color = 0.68, 0.34, 0.9, (255, 244, 220)
+    else:
+        height, radius, strength, color = dims.belt - 0.14, 0.16, 0.55, (230, 30, 24)
+    if dims.is_box:
+        height = 0.86
+    radius = max(radius * scale, 1.2)
+    strength = strength * light.lamps * (1.0 if light.dark else 0.35)
     for side in (-1, 1):
-        middle = camera.project(
-            one.lateral + side * (d.width / 2 - 0.2), high, one.distance - 0.6 * one.car.overhang
-        )
-        reach = int(3 * radius) + 1
-        x1, y1 = np.maximum(np.floor(middle).astype(int) - reach, 0)
-        x2, y2 = np.minimum(np.ceil(middle).astype(int) + reach, image.shape[1::-1])
-        if x1 >= x2 or y1 >= y2:
+        x = pose.lateral + side * (dims.width / 2 - 0.2)
+        center = config.project(x, height, pose.distance - 0.6 * pose.body.overhang)
+        region = _clipped_region(center[None], int(3 * radius) + 1, image)
+        if region is None:
             continue
-        x, y = np.arange(x1, x2) + 0.5 - middle[0], np.arange(y1, y2) + 0.5 - middle[1]
-        glow = np.exp(-(x[None, :] ** 2 + y[:, None] ** 2) / (2 * radius**2))[..., None]
-        part = image[y1:y2, x1:x2]
-        part[:] = np.clip(part + strength * glow * color, 0, 255)
+        rows, columns = (np.arange(part.start, part.stop) + 0.5 for part in region)
+        squared = (columns[None, :] - center[0]) ** 2 + (rows[:, None] - center[1]) ** 2
+        glow = np.exp(-squared / (2 * radius**2))[..., None]
+        image[region] = np.clip(image[region] + strength * glow * np.array(color, np.float32), 0, 255)
+
+
+def _clipped_region(points: NDArray[Any], margin: int, image: Image) -> tuple[slice, slice] | None:
+    """Rows and columns of the image around ``(column, row)`` points; None if they are outside."""
+    x1, y1 = np.maximum(np.floor(points.min(0)).astype(int) - margin, 0).tolist()
+    x2, y2 = np.minimum(np.ceil(points.max(0)).astype(int) + margin, image.shape[1::-1]).tolist()
+    return (slice(y1, y2), slice(x1, x2)) if x1 < x2 and y1 < y2 else None

@@ -1,4 +1,4 @@
-"""A view of the road, checked, and what turns placed vehicles into scenes."""
+"""Single road scenes with ground truth, and the rendering that scenes and drives share."""
 
 from __future__ import annotations
 
@@ -12,135 +12,268 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_choice, check_integer, check_number, describe
+from vehicle_detection.camera import Camera
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.synthetic.camera_light import LIGHTS, Light, Pinhole, Sensor, make_light
-from vehicle_detection.synthetic.render import Image, Placed, VehicleTruth, stage
+from vehicle_detection.synthetic.camera_light import LIGHTS, SceneConfig, Sensor, make_light
+from vehicle_detection.synthetic.raster import Image
+from vehicle_detection.synthetic.render import VehiclePose, VehicleTruth, composite
 from vehicle_detection.synthetic.scenery import Road, Scenery
-from vehicle_detection.synthetic.shapes import PAINTS
-from vehicle_detection.synthetic.vehicles import Car
+from vehicle_detection.synthetic.shapes import (
+    COLOR_WEIGHTS,
+    COLORS,
+    KIND_WEIGHTS,
+    VEHICLE_SHAPES,
+    weighted_choice,
+)
+from vehicle_detection.synthetic.vehicles import VehicleBody
 
 RandomState = int | np.random.Generator | None
 
-_LEAST_SIDE = 64
-_MOST_SIDE = 4320
+
+@dataclass(frozen=True, kw_only=True)
+class SceneVehicle:
+    """A vehicle to place in a scene; `kind` and `color` are random if they are None.
+
+    Attributes
+    ----------
+    distance_m
+        Distance in meters along the road from the camera to the vehicle's nearer tires.
+    lateral_m
+        Lateral position of its middle in meters, positive to the right of the camera. A lane is 3.6 m wide.
+    kind
+        One of ``"hatchback"``, ``"estate"``, ``"sedan"``, ``"mpv"``, ``"suv"``, ``"van"``, ``"truck"``.
+    color
+        One of ``"white"``, ``"silver"``, ``"gray"``, ``"anthracite"``, ``"black"``, ``"navy"``, ``"blue"``,
+        ``"ice"``, ``"red"``, ``"wine"``, ``"green"``, ``"beige"``, ``"brown"``, ``"yellow"``.
+    view
+        The end that the camera sees: ``"rear"`` or ``"front"``.
+    speed_mps
+        Speed away from the camera in meters per second; it only appears in the ground truth.
+    """
+
+    distance_m: float
+    lateral_m: float = 0.0
+    kind: str | None = None
+    color: str | None = None
+    view: str = "rear"
+    speed_mps: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_number(self.distance_m, "distance_m", low=2.0, high=1000.0)
+        check_number(self.lateral_m, "lateral_m", low=-100.0, high=100.0)
+        if self.kind is not None:
+            check_choice(self.kind, "kind", VEHICLE_SHAPES)
+        if self.color is not None:
+            check_choice(self.color, "color", COLORS)
+        check_choice(self.view, "view", ("rear", "front"))
+        check_number(self.speed_mps, "speed_mps", low=-150.0, high=150.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A drawn picture and what is true of it.
+    """A rendered image and its ground truth.
 
     Attributes
     ----------
     image
         ``(H, W, 3)`` uint8 RGB.
     truth
-        One `VehicleTruth` for each vehicle with a pixel in the picture, hidden or not, by track.
+        One `VehicleTruth` for each vehicle with a pixel in the image, occluded or not, ordered by track.
     camera
-        The camera that took it: rows to distances and back.
-    seen
-        ``(H, W)`` int32: the track that each pixel shows, 0 where it shows none.
+        The camera: focal length, horizon and height are exact.
+    instance_map
+        ``(H, W)`` int32: the track of the vehicle that each pixel shows, 0 where there is none.
     """
 
     image: Image
     truth: tuple[VehicleTruth, ...]
-    camera: Pinhole
-    seen: NDArray[np.int32]
+    camera: Camera
+    instance_map: NDArray[np.int32]
 
     @property
     def boxes(self) -> NDArray[np.int64]:
-        """``(N, 4)`` boxes of the vehicles in `truth`, in its order."""
+        """``(N, 4)`` boxes of the vehicles in `truth`, in the same order."""
         return np.array([row.box for row in self.truth], np.int64).reshape(-1, 4)
 
 
-@dataclass(frozen=True)
-class View:
-    """What every frame of a scene or drive shares."""
-
-    shape: tuple[int, int]
-    camera: Pinhole
-    light: Light
-    rain: float
-    jpeg_quality: int | None
-    margin: int
-    seed: int
-
-
-def make_view(
-    shape: Any, horizon: float, camera_height: float, focal: float | None, light: str, rain: float,
+def make_config(
+    shape: Any, horizon: float, camera_height_m: float, focal_px: float | None, light: str, rain: float,
     jpeg_quality: int | None, rng: np.random.Generator, margin: int = 0,
-) -> View:  # fmt: skip
-    """Check the options that scenes and drives share."""
+) -> SceneConfig:  # fmt: skip
+    """Check the options that scenes and drives have in common."""
     if not isinstance(shape, tuple) or len(shape) != 2:
         raise InvalidInputError(f"shape must be (height, width) in pixels, got {describe(shape)}")
     height, width = (
-        check_integer(side, f"shape[{axis}]", low=_LEAST_SIDE, high=_MOST_SIDE)
-        for axis, side in enumerate(shape)
+        check_integer(side, f"shape[{axis}]", low=64, high=4320) for axis, side in enumerate(shape)
     )
-    level = check_number(horizon, "horizon", low=0.1, high=0.9)
-    above = check_number(camera_height, "camera_height", low=0.5, high=5.0)
-    length = (
-        0.9 * max(height, width)
-        if focal is None
-        else check_number(focal, "focal", low=0.2 * width, high=10.0 * width)
-    )
+    horizon_px = check_number(horizon, "horizon", low=0.1, high=0.9) * height
+    height_m = check_number(camera_height_m, "camera_height_m", low=0.5, high=5.0)
+    if focal_px is None:
+        focal_px = 0.9 * max(height, width)
+    else:
+        focal_px = check_number(focal_px, "focal_px", low=0.2 * width, high=10.0 * width)
     check_choice(light, "light", LIGHTS)
-    wet = check_number(rain, "rain", low=0.0, high=1.0)
+    rain = check_number(rain, "rain", low=0.0, high=1.0)
     if jpeg_quality is not None:
         jpeg_quality = check_integer(jpeg_quality, "jpeg_quality", low=1, high=100)
-    camera = Pinhole(focal_px=length, center_px=width / 2, horizon_px=level * height, height_m=above)
+    camera = Camera(
+        focal_px=focal_px, horizon_px=horizon_px, height_m=height_m, focal_std=0.0, height_std_m=0.0
+    )
     seed = int(rng.integers(2**62))
-    lit = make_light(light, wet, np.random.default_rng([seed, 4]))
-    return View((height, width), camera, lit, wet, jpeg_quality, margin, seed)
+    lighting = make_light(light, rain, np.random.default_rng([seed, 4]))
+    return SceneConfig((height, width), camera, lighting, rain, jpeg_quality, margin, seed)
 
 
 def make_generator(random_state: RandomState) -> np.random.Generator:
+    """Check `random_state` and turn it into a generator."""
     if random_state is None or isinstance(random_state, np.random.Generator):
         return np.random.default_rng(random_state)
     return np.random.default_rng(check_integer(random_state, "random_state", low=0))
 
 
-class Studio:
-    """A view with its scenery and sensor: turns placed vehicles into scenes."""
+class SceneRenderer:
+    """Renders vehicles in the scenery of one configuration."""
 
-    def __init__(self, view: View, road: Road) -> None:
-        self.view, self.road = view, road
+    def __init__(self, config: SceneConfig, road: Road) -> None:
+        self.config, self.road = config, road
 
     @cached_property
     def scenery(self) -> Scenery:
-        view = self.view
-        # Rows above and below the picture, for a camera that nods.
-        tall = (view.shape[0] + 2 * view.margin, view.shape[1])
-        camera = replace(view.camera, horizon_px=view.camera.horizon_px + view.margin)
-        return Scenery(tall, camera, view.light, self.road, view.seed)
+        """The scenery, with additional rows for a camera that pitches."""
+        height, width = self.config.shape
+        margin = self.config.margin
+        return Scenery(replace(self.config.pitched(margin), shape=(height + 2 * margin, width)), self.road)
 
     @cached_property
     def sensor(self) -> Sensor:
-        return Sensor(self.view.shape, self.view.light, self.view.rain, self.view.seed)
+        """The sensor of the camera."""
+        return Sensor(self.config)
 
-    def car(self, kind: str, paint: str, facing: str, seed: int) -> Car:
-        return Car(kind, PAINTS[paint], facing, self.view.light, seed)
-
-    def camera(self, nod: int) -> Pinhole:
-        return replace(self.view.camera, horizon_px=self.view.camera.horizon_px + nod)
-
-    def scene(self, placed: Sequence[Placed], travel: float, frame: int, nod: int = 0) -> Scene:
-        view = self.view
-        first = view.margin - nod
-        image = np.ascontiguousarray(self.scenery.render(travel)[first : first + view.shape[0]])
-        camera = self.camera(nod)
-        truth, seen = stage(placed, self.scenery, camera, travel, view.shape, image)
+    def scene(self, poses: Sequence[VehiclePose], travel: float, pitch_offset: int, frame: int) -> Scene:
+        """Render a scene `travel` meters into the drive, with the horizon `pitch_offset` rows lower."""
+        config = self.config.pitched(pitch_offset)
+        first = config.margin - pitch_offset
+        image = np.ascontiguousarray(self.scenery.render(travel)[first : first + config.shape[0]])
+        truth, instance_map = composite(poses, self.scenery, config, travel, image)
         image = self.sensor.expose(image, frame)
-        if view.jpeg_quality is not None:
-            image = _recompress(image, view.jpeg_quality)
-        return Scene(image, truth, camera, seen)
+        if config.jpeg_quality is not None:
+            image = _compress(image, config.jpeg_quality)
+        return Scene(image, truth, config.camera, instance_map)
 
-    def truth(self, placed: Sequence[Placed], travel: float, nod: int = 0) -> tuple[VehicleTruth, ...]:
-        return stage(placed, self.scenery, self.camera(nod), travel, self.view.shape, None)[0]
+    def truth(
+        self, poses: Sequence[VehiclePose], travel: float, pitch_offset: int
+    ) -> tuple[VehicleTruth, ...]:
+        """Ground truth of the same scene without the image."""
+        return composite(poses, self.scenery, self.config.pitched(pitch_offset), travel, None)[0]
 
 
-def _recompress(image: Image, quality: int) -> Image:
-    """Return the picture as it comes back from a JPEG file."""
-    data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])[
-        1
-    ]
+def _compress(image: Image, quality: int) -> Image:
+    """Compress an image as JPEG and decompress it."""
+    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR_RGB), np.uint8)
+
+
+def render_scene(
+    *,
+    shape: tuple[int, int] = (720, 1280),
+    vehicles: Sequence[SceneVehicle] | int | None = None,
+    lane: int | None = None,
+    horizon: float = 0.56,
+    camera_height_m: float = 1.3,
+    focal_px: float | None = None,
+    light: str = "day",
+    rain: float = 0.0,
+    jpeg_quality: int | None = None,
+    random_state: RandomState = 0,
+) -> Scene:
+    """Render one road scene.
+
+    Parameters
+    ----------
+    shape
+        ``(height, width)`` in pixels.
+    vehicles
+        The vehicles to draw, or how many to place at random in the lanes ahead; None places one to five.
+    lane
+        The lane that the camera drives in: 0 left, 1 middle, 2 right; None chooses one at random.
+    horizon
+        Row of the horizon as a fraction of the height.
+    camera_height_m
+        Height of the camera above the road in meters.
+    focal_px
+        Focal length in pixels; None means 0.9 times the longer side.
+    light
+        ``"day"``, ``"overcast"``, ``"dusk"`` or ``"night"``.
+    rain
+        0 (dry) to 1 (heavy): streaks, haze, less contrast, more noise.
+    jpeg_quality
+        Compress and decompress the image as JPEG of this quality; None skips it.
+    random_state
+        Seed or generator; the same seed and options give the same bytes.
+
+    Returns
+    -------
+    Scene
+        Image and ground truth. The `track` of a vehicle is its position in `vehicles`, from 1 on.
+
+    Raises
+    ------
+    InvalidInputError
+        If an option is out of range.
+
+    Examples
+    --------
+    >>> car = SceneVehicle(distance_m=20.0, kind="sedan", color="white")
+    >>> scene = render_scene(shape=(360, 640), vehicles=[car], random_state=1)
+    >>> scene.image.shape, scene.truth[0].track, scene.truth[0].distance_m
+    ((360, 640, 3), 1, 20.0)
+    >>> x1, y1, x2, y2 = scene.truth[0].box
+    >>> camera = scene.camera
+    >>> abs(camera.horizon_px + camera.focal_px * camera.height_m / 20.0 - y2) <= 1
+    True
+    """
+    rng = make_generator(random_state)
+    config = make_config(shape, horizon, camera_height_m, focal_px, light, rain, jpeg_quality, rng)
+    own = int(rng.integers(3))
+    road = Road(own=own if lane is None else check_integer(lane, "lane", low=0, high=2))
+    if vehicles is None:
+        vehicles = int(rng.integers(1, 6))
+    if isinstance(vehicles, (int, np.integer)):
+        vehicles = _random_vehicles(road, check_integer(vehicles, "vehicles", low=0, high=60), rng)
+    poses = []
+    for track, vehicle in enumerate(vehicles, start=1):
+        if not isinstance(vehicle, SceneVehicle):
+            raise InvalidInputError(
+                f"vehicles[{track - 1}] must be a SceneVehicle, got {describe(vehicle)}; "
+                "make one with SceneVehicle(distance_m=20)"
+            )
+        # A generator for each vehicle: adding or removing a vehicle does not change the appearance of others.
+        own_rng = np.random.default_rng([config.seed, 5, track])
+        kind, color = weighted_choice(KIND_WEIGHTS, own_rng), weighted_choice(COLOR_WEIGHTS, own_rng)
+        body = VehicleBody(
+            vehicle.kind or kind,
+            vehicle.color or color,
+            vehicle.view,
+            config.light,
+            int(own_rng.integers(2**31)),
+        )
+        lateral, distance = float(vehicle.lateral_m), float(vehicle.distance_m)
+        poses.append(VehiclePose(body, track, lateral, distance, float(vehicle.speed_mps)))
+    travel = float(np.random.default_rng([config.seed, 6]).uniform(0, 200))
+    return SceneRenderer(config, road).scene(poses, travel, pitch_offset=0, frame=0)
+
+
+def _random_vehicles(road: Road, count: int, rng: np.random.Generator) -> list[SceneVehicle]:
+    """Place vehicles without overlap in the lanes ahead."""
+    free_from = [
+        float(rng.uniform(12, 24)) if lane != road.own else float(rng.uniform(18, 32))
+        for lane in range(road.lanes)
+    ]
+    vehicles = []
+    for _ in range(count):
+        lane = int(rng.integers(road.lanes)) if rng.random() < 0.5 else int(np.argmin(free_from))
+        lateral = road.lane(lane) + float(rng.uniform(-0.3, 0.3))
+        vehicles.append(SceneVehicle(distance_m=free_from[lane], lateral_m=lateral))
+        free_from[lane] += float(rng.uniform(22, 40))
+    return vehicles

@@ -5,6 +5,7 @@ from vehicle_detection.tuning.grid import TrialConfig, expand_grid, parse_grid
 from vehicle_detection.tuning.mining import mine_negatives
 from vehicle_detection.tuning.results import (
     RowStore,
+    check_column,
     make_table,
     numeric_column,
     pareto_front,
@@ -19,6 +20,7 @@ __all__ = [
     "RowStore",
     "TrialConfig",
     "TrialOptions",
+    "check_column",
     "compare_configurations",
     "digest_of",
     "expand_grid",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 
 import cv2
@@ -12,9 +13,15 @@ from vehicle_detection._common import check_integer, check_number
 from vehicle_detection.boxes import Detections, intersection_matrix, non_max_suppression
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.datasets import PatchSet
-from vehicle_detection.evaluation import FrameBoxes, Frames, check_labels_of, keyed_frames, keys_of, pairs_of
+from vehicle_detection.evaluation import (
+    FrameBoxes,
+    Frames,
+    check_frame_boxes,
+    iterate_frames,
+    keyed_frames,
+    keys_of,
+)
 from vehicle_detection.params import PATCH_SIZE, SearchParams
-from vehicle_detection.search import BandSearch
 
 
 def mine_negatives(
@@ -79,7 +86,7 @@ def mine_negatives(
     0
     """
     images = keyed_frames(frames)
-    known = check_labels_of(keys_of(images), labels)
+    known = check_frame_boxes(keys_of(images), labels)
     overlap = check_number(max_overlap, "max_overlap", low=0, high=1)
     limit = None if max_per_frame is None else check_integer(max_per_frame, "max_per_frame", low=1)
     params = dataclasses.replace(
@@ -87,9 +94,9 @@ def mine_negatives(
     )
     patches: list[NDArray[np.uint8]] = []
     names: list[str] = []
-    with BandSearch(classifier, n_jobs=n_jobs) as search:
-        for key, image in pairs_of(images):
-            windows = _false_windows(search.find(image, params), known.boxes[known.rows(key)])
+    with contextlib.closing(classifier.open_search(n_jobs)) as search:
+        for key, image in iterate_frames(images):
+            windows = _false_windows(search.find(image, params).windows, known.boxes[known.rows(key)])
             kept = windows[non_max_suppression(windows.boxes, windows.scores, threshold=overlap)]
             for box in np.rint(kept.boxes[:limit]).astype(np.int64):
                 patches.append(_cut_patch(image, box))

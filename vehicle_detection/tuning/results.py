@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import atomic_write, check_target, describe
+from vehicle_detection._common import atomic_write, check_target, describe, write_parquet
 from vehicle_detection.errors import DatasetError, InvalidInputError
 
 if TYPE_CHECKING:
@@ -38,8 +38,8 @@ def make_table(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None 
     return table.astype(dict.fromkeys(empty, np.float64))
 
 
-def numeric_column(table: DataFrame, name: str) -> NDArray[np.float64]:
-    """Return a column as float64; NaN where the value is missing."""
+def check_column(table: DataFrame, name: str) -> None:
+    """Raise unless `table` is a pandas table with the column."""
     import pandas as pd
 
     if not isinstance(table, pd.DataFrame):
@@ -50,6 +50,11 @@ def numeric_column(table: DataFrame, name: str) -> NDArray[np.float64]:
     if name not in table.columns:
         listed = ", ".join(map(str, table.columns))
         raise InvalidInputError(f"table has no column {name!r}; its columns are {listed or 'none'}")
+
+
+def numeric_column(table: DataFrame, name: str) -> NDArray[np.float64]:
+    """Return a column as float64; NaN where the value is missing."""
+    check_column(table, name)
     try:
         return np.asarray(table[name].to_numpy(np.float64, na_value=np.nan), np.float64)
     except (TypeError, ValueError):
@@ -111,14 +116,7 @@ def _write_parquet(table: DataFrame, path: str | os.PathLike[str]) -> None:
     # A Parquet column has one type, but hog_channel is 0 or "ALL": write mixed columns as text.
     mixed = [name for name in table if table[name].dropna().map(type).nunique() > 1]
     table = table.assign(**{name: table[name].map(str, na_action="ignore") for name in mixed})
-    with atomic_write(path, "path") as part:
-        try:
-            table.to_parquet(part, index=False)
-        except ImportError:
-            raise InvalidInputError(
-                "writing a .parquet table needs pyarrow; pip install 'vehicle-detection[parquet]', "
-                "or write .csv"
-            ) from None
+    write_parquet(path, table.reset_index(drop=True))
 
 
 def read_results(path: str | os.PathLike[str]) -> DataFrame:

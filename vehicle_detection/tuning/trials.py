@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 import math
@@ -22,11 +23,11 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import (
     FrameBoxes,
     LabelledFrames,
+    best_f1,
     evaluate_detections,
     precision_recall_curve,
 )
 from vehicle_detection.params import FeatureParams, RegionParams, SearchParams
-from vehicle_detection.search import BandSearch
 from vehicle_detection.tuning.cache import FeatureCache, digest_of
 from vehicle_detection.tuning.grid import FEATURE_FIELDS, TRAINING_FIELDS, Candidate, TrialConfig
 from vehicle_detection.tuning.results import RowStore, make_table
@@ -154,7 +155,7 @@ class TrialEvaluator:
         row["accuracy"] = self.accuracy(classifier, split.test)
         if on_frames and (self.options.frame_sets or self.options.time_search):
             try:
-                BandSearch(classifier, n_jobs=1).close()
+                classifier.open_search(n_jobs=1).close()
             except InvalidInputError as error:
                 return {"status": "partial", "message": str(error), **row}
             if self.options.time_search:
@@ -198,15 +199,15 @@ class TrialEvaluator:
     def _score_set(self, classifier: VehicleClassifier, frames: LabelledFrames) -> dict[str, float]:
         with VehicleDetector(
             classifier,
-            search=self.options.search_params,
-            fit=self.options.region_params,
+            search_params=self.options.search_params,
+            region_params=self.options.region_params,
             horizon=frames.horizon,
         ) as detector:
             found = FrameBoxes.from_detections({key: detector.detect(image) for key, image in frames})
         scores = evaluate_detections(found, frames.labels, frames=frames.keys)
         return {
             "frame_f1": scores.f1,
-            "frame_best_f1": best_f1(found, frames.labels),
+            "frame_best_f1": best_f1(*precision_recall_curve(found, frames.labels))[0],
             "frame_average_precision": scores.average_precision,
             "frame_iou": scores.mean_iou,
         }
@@ -216,7 +217,7 @@ class TrialEvaluator:
         if classifier.params not in self._search_ms:
             frame = np.random.default_rng(0).integers(0, 256, (*_TIMED_SHAPE, 3), np.uint8)
             seconds = []
-            with BandSearch(classifier, n_jobs=1) as search:
+            with contextlib.closing(classifier.open_search(n_jobs=1)) as search:
                 # The first run compiles kernels and allocates buffers.
                 for _ in range(_TIMED_RUNS + 1):
                     start = time.perf_counter()
@@ -275,14 +276,6 @@ class TrialRunner:
         self._rows.append(row)
         self._bar.update()
         return row
-
-
-def best_f1(found: FrameBoxes, labels: FrameBoxes) -> float:
-    """F1 score at the best threshold on the detections' score; 0 without a labelled vehicle."""
-    precision, recall, _ = precision_recall_curve(found, labels)
-    total = precision + recall
-    curve = np.divide(2 * precision * recall, total, out=np.zeros_like(total), where=total > 0)
-    return float(curve.max(initial=0))
 
 
 def _digest_frames(frames: LabelledFrames) -> str:

@@ -1,9 +1,11 @@
 """Video in and out: ffmpeg, the threaded pipeline, and the annotated video."""
 
+from vehicle_detection.video.ffmpeg import VideoInfo
 from vehicle_detection.video.horizon import estimate_video_horizon
 from vehicle_detection.video.process import VideoReport, probe_video, process_video, read_frames
 
 __all__ = [
+    "VideoInfo",
     "VideoReport",
     "estimate_video_horizon",
     "probe_video",

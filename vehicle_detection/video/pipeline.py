@@ -48,8 +48,8 @@ class SupportsFrames(Protocol):
     def search(self, frame: Frame, /) -> Any:
         """Find windows in one frame; runs in any thread and ahead of the order."""
 
-    def follow(self, windows: Any, shape: tuple[int, ...], /, *, time: float | None) -> Any:
-        """Take one frame's windows, in frame order, and return the result."""
+    def track(self, found: Any, /, *, time: float | None) -> Any:
+        """Update the tracks with one frame's search result, in frame order, and return the frame's result."""
 
     def annotate(self, frame: Frame, result: Any, /) -> Frame:
         """Draw a result on a copy of its frame."""
@@ -208,7 +208,7 @@ class Line:
                 thread.start()
             for moment, frame, search in self._found:
                 windows, seconds = search.result()
-                result = self._detector.follow(windows, frame.shape, time=moment)
+                result = self._detector.track(windows, time=moment)
                 self._count(result, seconds)
                 if writer is not None:
                     self._drawn.put(self._draw(frame, result))

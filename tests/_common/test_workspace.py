@@ -1,0 +1,25 @@
+import numpy as np
+
+from vehicle_detection._common import NEW_ARRAYS, Workspace
+
+
+def test_arrays_of_one_name_share_the_memory_of_the_largest():
+    workspace = Workspace()
+    large = workspace.take((40, 60, 3), np.uint8, "band")
+    large[:] = 7
+    for side in range(10, 40):
+        small = workspace.take((side, side, 3), np.uint8, "band")
+        assert small.shape == (side, side, 3)
+        assert small.flags.c_contiguous
+        assert np.shares_memory(small, large)
+    assert not np.shares_memory(workspace.take((40, 60, 3), np.uint8, "strip"), large)
+    assert not np.shares_memory(workspace.take((40, 60, 3), np.float32, "band"), large)
+    assert workspace.take((80, 60, 3), np.uint8, "band").shape == (80, 60, 3)
+
+
+def test_new_arrays_share_nothing():
+    first = NEW_ARRAYS.take((4, 6), np.float32, "band")
+    second = NEW_ARRAYS.take((4, 6), np.float32, "band")
+    assert first.shape == second.shape == (4, 6)
+    assert first.dtype == np.float32
+    assert not np.shares_memory(first, second)

@@ -1,0 +1,133 @@
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import Platt, calibrate_scores, calibration_error
+
+
+def drawn_scores(a, b, count=4000, seed=0):
+    rng = np.random.default_rng(seed)
+    scores = rng.normal(0, 2, count)
+    return scores, rng.random(count) < 1 / (1 + np.exp(a * scores + b))
+
+
+@pytest.mark.parametrize(("a", "b"), [(-2.0, 0.5), (-0.1, -1.0), (1.0, 0.0)])
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_the_sigmoid_is_recovered(a, b, scale):
+    scores, truth = drawn_scores(a, b)
+    platt = calibrate_scores(scores * scale, truth)
+    assert platt.a * scale == pytest.approx(a, rel=0.15, abs=0.05)
+    assert platt.b == pytest.approx(b, rel=0.15, abs=0.1)
+    assert calibration_error(platt.probability(scores * scale), truth) < 0.025
+
+
+def test_the_sigmoid_equals_that_of_scikit_learn():
+    from sklearn.calibration import CalibratedClassifierCV
+    from sklearn.frozen import FrozenEstimator
+    from sklearn.svm import LinearSVC
+
+    scores, truth = drawn_scores(-1.5, 0.3, count=300)
+    svm = LinearSVC().fit(scores[:, None], truth)
+    theirs = CalibratedClassifierCV(FrozenEstimator(svm), method="sigmoid").fit(scores[:, None], truth)
+    values = svm.decision_function(scores[:, None])
+    ours = calibrate_scores(values, truth).probability(values)
+    np.testing.assert_allclose(ours, theirs.predict_proba(scores[:, None])[:, 1], atol=1e-3)
+
+
+def test_the_prior_bounds_probabilities_of_separable_scores():
+    platt = calibrate_scores([-1.0, -1.0, 1.0, 1.0], [0, 0, 1, 1])
+    # Platt's prior: two of two is 3/4.
+    assert platt.probability([-1.0, 1.0]) == pytest.approx([0.25, 0.75], abs=1e-4)
+    level = calibrate_scores([0.3, 0.3], [0, 1])
+    assert level.probability(0.3) == pytest.approx(0.5, abs=1e-6)
+
+
+def test_without_the_prior_the_sigmoid_is_plain_logistic_regression():
+    from sklearn.linear_model import LogisticRegression
+
+    scores, truth = drawn_scores(-1.5, 0.3, count=300)
+    plain = LogisticRegression(C=1e6).fit(scores[:, None], truth)
+    platt = calibrate_scores(scores, truth, prior=False)
+    assert (platt.a, platt.b) == (-plain.coef_[0, 0], -plain.intercept_[0])
+    assert platt.a == pytest.approx(calibrate_scores(scores, truth).a, rel=0.1)
+
+
+@given(
+    scores=st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=20),
+    a=st.floats(-100, -1e-3),
+    b=st.floats(-10, 10),
+)
+def test_probabilities_increase_with_the_score(scores, a, b):
+    platt = Platt(a, b)
+    probabilities = platt.probability(sorted(scores))
+    assert ((probabilities >= 0) & (probabilities <= 1)).all()
+    assert (np.diff(probabilities) >= 0).all()
+
+
+@given(probability=st.floats(0.001, 0.999), a=st.floats(-10, -0.1), b=st.floats(-5, 5))
+def test_score_is_the_inverse_of_probability(probability, a, b):
+    platt = Platt(a, b)
+    assert platt.probability(platt.score(probability)) == pytest.approx(probability)
+    assert Platt(**json.loads(json.dumps(platt.to_dict()))) == platt
+
+
+def test_invalid_arguments_of_calibrate_scores():
+    for scores, truth, message in (
+        ([], [], "scores must be a one-dimensional array of numbers"),
+        ([[1.0]], [1], "scores must be a one-dimensional array of numbers"),
+        ([math.inf, 0], [1, 0], "scores must be finite"),
+        ([0.5, 1.0], [1], "labels must be 0 or 1 for each of the 2 scores"),
+        ([0.5, 1.0], [1, -1], "labels of -1 and 1 convert with labels > 0"),
+        ([0.5, 1.0], [1, 1], "labels must hold both classes"),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            calibrate_scores(scores, truth)
+    with pytest.raises(InvalidInputError, match="a must be a number"):
+        Platt(math.nan, 0.0)
+    with pytest.raises(InvalidInputError, match="scores must be numbers without NaN"):
+        Platt(-1.0, 0.0).probability([math.nan])
+    for platt, probability in ((Platt(-1.0, 0.0), 1.0), (Platt(0.0, 0.0), 0.5)):
+        with pytest.raises(InvalidInputError, match=r"probability must lie in \(0, 1\) and a must not be 0"):
+            platt.score(probability)
+
+
+def test_calibration_error_by_hand():
+    # Bin 0 holds 0.1 and 0.3 (mean 0.2, half of them vehicles), bin 1 holds 0.6 and 1.0 (0.8, all vehicles).
+    assert calibration_error([0.1, 0.3, 0.6, 1.0], [0, 1, 1, 1], bins=2) == pytest.approx(0.25)
+    assert calibration_error([0.0, 1.0], [False, True]) == 0
+
+
+@given(
+    pairs=st.lists(st.tuples(st.floats(0, 1), st.booleans()), min_size=1, max_size=20),
+    bins=st.integers(1, 20),
+)
+@example(pairs=[(1.0, False)], bins=15)
+def test_calibration_error_lies_between_0_and_1(pairs, bins):
+    probabilities, labels = zip(*pairs)
+    error = calibration_error(probabilities, labels, bins=bins)
+    assert 0 <= error <= 1
+    # Finer bins cannot hide what the whole shows.
+    assert error >= abs(np.mean(probabilities) - np.mean(labels)) - 1e-9
+
+
+@pytest.mark.parametrize(
+    ("probabilities", "labels", "bins", "message"),
+    [
+        ([], [], 15, "probabilities must be a one-dimensional array"),
+        ([1.5], [1], 15, "probabilities must be .* from 0 to 1"),
+        ([math.nan], [1], 15, "probabilities must be"),
+        ([[0.5]], [1], 15, "probabilities must be a one-dimensional"),
+        (["a"], [1], 15, "probabilities must be"),
+        ([0.5], [1, 0], 15, "labels must be 0 or 1 for each of the 1 probabilities"),
+        ([0.5], [-1], 15, "labels of -1 and 1 convert with labels > 0"),
+        ([0.5], [1], 0, "bins must be an integer at least 1"),
+    ],
+)
+def test_invalid_arguments_of_calibration_error(probabilities, labels, bins, message):
+    with pytest.raises(InvalidInputError, match=message):
+        calibration_error(probabilities, labels, bins=bins)

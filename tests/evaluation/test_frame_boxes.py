@@ -1,0 +1,144 @@
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tests.evaluation.cases import CAR, boxes_of, moved
+from vehicle_detection.boxes import Detections
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import FrameBoxes, evaluate_tracks, read_labels
+from vehicle_detection.export import write_tracks
+
+
+def test_rows_of_a_frame_and_frames_without_boxes():
+    labels = boxes_of((2, 1, CAR), (0, 1, moved(5)), (2, 3, moved(300)), frame_keys=(0, 1, 2, 3))
+    assert len(labels) == 3
+    assert labels.frame_keys == (0, 1, 2, 3)
+    assert labels.rows(2).tolist() == [0, 2]
+    assert labels.frame(2).tracks.tolist() == [1, 3]
+    assert len(labels.frame(1)) == len(labels.frame(99)) == 0
+    assert labels[labels.tracks == 3].frame_keys == (0, 1, 2, 3)
+    assert repr(labels) == "FrameBoxes(3 boxes in 4 frames)"
+
+
+def test_frame_names_are_sorted_by_their_numbers():
+    assert boxes_of(*((name, -1, CAR) for name in ("f10.png", "f2.png", "a.png"))).frame_keys == (
+        "a.png",
+        "f2.png",
+        "f10.png",
+    )
+    assert all(type(key) is int for key in FrameBoxes(np.arange(2), None, [CAR, CAR]).frame_keys)
+    assert FrameBoxes(np.array(["b", "a"]), None, [CAR, CAR]).frame_keys == ("a", "b")
+
+
+def test_empty_frame_boxes_and_from_detections():
+    assert len(FrameBoxes([], [], [])) == 0
+    found = FrameBoxes.from_detections({"a": Detections([CAR], [0.5]), "b": Detections.empty()})
+    assert found.scores.tolist() == [0.5]
+    assert found.frame_keys == ("a", "b")
+    assert found.tracks.tolist() == [-1]
+    assert len(FrameBoxes.from_detections({})) == 0
+
+
+def test_columns_are_copies():
+    boxes = np.array([CAR])
+    labels = FrameBoxes([0], [1], boxes)
+    boxes[:] = 0
+    assert labels.boxes.tolist() == [list(CAR)]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"frames": [0]}, "frames must be one key for each of the 2 boxes, got 1 keys"),
+        ({"frames": [0, "a"]}, "frames must be all int or all str, got int, str"),
+        ({"frames": [0.0, 1.0]}, "frames must be all int or all str, got float"),
+        ({"frames": "ab"}, "frames must be a sequence of frame keys"),
+        ({"frames": 5}, "frames must be a sequence of frame keys"),
+        ({"boxes": [CAR, (5, 0, 4, 9)]}, "boxes must be .* x1 <= x2"),
+        ({"tracks": [1]}, "tracks must be one value for each of the 2 boxes"),
+        ({"tracks": [1.5, 2]}, "tracks must be one value .* dtype float64"),
+        ({"tracks": [1, -2]}, "tracks must be numbers from 0, or -1"),
+        ({"tracks": [1, 1]}, "frame 0 holds track 1 twice"),
+        ({"occluded": [-1, 0]}, "occluded must be 0"),
+        ({"truncated": [0, 1.5]}, "truncated must be a fraction from 0 to 1"),
+        ({"ignore": [0, 1]}, "ignore must be one value .* dtype int64"),
+        ({"scores": [1, math.nan]}, "scores must be finite"),
+        ({"distance_m": [1]}, "distance_m must be one value for each of the 2 boxes"),
+        ({"frame_keys": ["a"]}, "frame_keys must be all int or all str"),
+    ],
+)
+def test_invalid_columns(change, message):
+    columns = {"frames": [0, 0], "tracks": [1, 2], "boxes": [CAR, moved(200)]}
+    with pytest.raises(InvalidInputError, match=message):
+        FrameBoxes(**{**columns, **change})
+
+
+def track_of(number, box, *, score=0.5, distance_m=None, speed_mps=None, shown=True):
+    return SimpleNamespace(
+        id=number, box=np.array(box), score=score, distance_m=distance_m, speed_mps=speed_mps, shown=shown
+    )
+
+
+def result_of(index, *tracks):
+    return SimpleNamespace(index=index, tracks=tracks)
+
+
+def test_from_results_equals_the_csv_file_of_the_same_run(tmp_path):
+    rng = np.random.default_rng(0)
+    results = []
+    for index in (0, 1, 3):
+        corners = rng.uniform(0, 500, (3, 2))
+        boxes = np.hstack([corners, corners + rng.uniform(20, 90, (3, 2))])
+        speeds = [None, 1.2345, -3.0]
+        tracks = [
+            track_of(number, box, score=rng.normal(), distance_m=rng.uniform(5, 50), speed_mps=speeds[number])
+            for number, box in enumerate(boxes)
+        ]
+        results.append(result_of(index, *tracks, track_of(9, CAR, shown=False)))
+    write_tracks(results, tmp_path / "tracks.csv")
+    found, read = FrameBoxes.from_results(results), read_labels(tmp_path / "tracks.csv")
+    assert (found.frames, found.frame_keys) == (read.frames, read.frame_keys)
+    np.testing.assert_array_equal(found.tracks, read.tracks)
+    np.testing.assert_allclose(found.boxes, read.boxes, atol=0.00501)
+    np.testing.assert_allclose(found.scores, read.scores, atol=0.0000501)
+    np.testing.assert_allclose(found.distance_m, read.distance_m, atol=0.00501)
+    np.testing.assert_allclose(found.speed_mps, read.speed_mps, atol=0.00501)
+
+
+def test_from_results_keeps_frames_without_tracks():
+    found = FrameBoxes.from_results(iter([result_of(0, track_of(1, CAR)), result_of(1), result_of(2)]))
+    assert (found.frames, found.frame_keys) == ((0,), (0, 1, 2))
+    assert found.distance_m is found.speed_mps is None
+    labels = boxes_of((0, 1, CAR), (1, 1, CAR))
+    scores = evaluate_tracks(found, labels)
+    assert (scores.frames, scores.tp, scores.fn) == (3, 1, 1)
+    assert len(FrameBoxes.from_results([])) == 0
+
+
+@pytest.mark.parametrize("results", [5, "results", [CAR], [{"index": 0, "tracks": []}]])
+def test_from_results_rejects_other_objects(results):
+    with pytest.raises(InvalidInputError, match="results must be"):
+        FrameBoxes.from_results(results)
+
+
+def test_frame_boxes_are_shown_as_a_table():
+    found = boxes_of((2, 1, CAR, 0.5), (0, 3, moved(5), 1.5))
+    table = found.to_dataframe()
+    assert list(table) == [
+        "frame",
+        "track",
+        "x1",
+        "y1",
+        "x2",
+        "y2",
+        "occluded",
+        "truncated",
+        "ignore",
+        "scores",
+    ]
+    assert table["frame"].tolist() == [2, 0]
+    np.testing.assert_array_equal(table[["x1", "y1", "x2", "y2"]], found.boxes)
+    assert "<table" in found._repr_html_()
+    assert "FrameBoxes(2 boxes in 2 frames)" in found._repr_html_()

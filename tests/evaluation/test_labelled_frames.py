@@ -1,0 +1,50 @@
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
+from vehicle_detection.synthetic import render_drive
+
+LABELS = FrameBoxes([0, 1, 1], None, [[10, 10, 60, 50], [20, 10, 70, 50], [100, 0, 150, 40]], frame_keys=[2])
+IMAGES = [np.full((60, 160, 3), value, np.uint8) for value in (10, 20)]
+
+
+def test_labelled_frames_have_a_repr_and_iterate():
+    frames = LabelledFrames("road", IMAGES, LABELS)
+    assert repr(frames) == "LabelledFrames('road', 2 frames, 3 boxes)"
+    assert (len(frames), frames.keys) == (2, (0, 1))
+    assert [image[0, 0, 0] for _, image in frames] == [10, 20]
+    one = LabelledFrames("one", {1: IMAGES[1]}, LABELS)
+    assert set(one.labels.frames) == {1}
+
+
+def test_labelled_frames_of_a_video(tmp_path):
+    drive = render_drive(frames=7, shape=(96, 160))
+    path = tmp_path / "drive.mp4"
+    writer = imageio_ffmpeg.write_frames(str(path), (160, 96), fps=25, macro_block_size=1)
+    writer.send(None)
+    for scene in drive:
+        writer.send(scene.image.tobytes())
+    writer.close()
+    taken = LabelledFrames.from_video(path, LABELS, every=3, horizon=0.5)
+    assert (taken.name, taken.keys, taken.horizon) == ("drive", (0, 3, 6), 0.5)
+    assert set(taken.labels.frames) == {0}
+    with pytest.raises(InvalidInputError, match="every must be an integer at least 1"):
+        LabelledFrames.from_video(path, LABELS, every=0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("", IMAGES, LABELS), "name must be a non-empty string, got ''"),
+        (("a", [], LABELS), "frames must hold at least one image"),
+        (("a", IMAGES, LABELS, 1.5), "horizon must be a number, at least 0 and at most 1"),
+        (("a", IMAGES, LABELS.renamed(lambda key: key + 10)), "labels contain none of the frames"),
+        (("a", IMAGES, [[0, 0, 9, 9]]), "labels must be FrameBoxes, got .*; read a file with read_labels"),
+        (("a", "frames", LABELS), "frames must be a list of images"),
+    ],
+)
+def test_invalid_labelled_frames(arguments, message):
+    with pytest.raises(InvalidInputError, match=message):
+        LabelledFrames(*arguments)

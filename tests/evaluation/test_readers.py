@@ -1,0 +1,313 @@
+import contextlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vehicle_detection.errors import DatasetError, InvalidInputError
+from vehicle_detection.evaluation import FrameBoxes, evaluate_detections, evaluate_tracks, read_labels
+
+HEADER = "frame,track,x1,y1,x2,y2,occluded,truncated,ignore"
+
+
+CSV = f"{HEADER}\n0,-1,0,370,601.5,476,0,0,1\n0,-1,600,390,841,441,0,0,1\n2,1,5,6,70,80,1,0.25,0\n"
+
+
+def written(folder, text, name="labels.csv"):
+    path = folder / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def test_csv_of_labels(tmp_path):
+    labels = read_labels(written(tmp_path, CSV))
+    assert labels.frames == (0, 0, 2)
+    assert labels.tracks.tolist() == [-1, -1, 1]
+    assert labels.boxes[0].tolist() == [0, 370, 601.5, 476]
+    assert labels.occluded.tolist() == [0, 0, 1]
+    assert labels.truncated.tolist() == [0, 0, 0.25]
+    assert labels.ignore.tolist() == [True, True, False]
+    assert labels.scores is labels.distance_m is labels.speed_mps is None
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"\xef\xbb\xbf" + CSV.encode(),
+        CSV.replace("\n", "\r\n"),
+        CSV.replace(",", ";"),
+        CSV.replace(",", "\t"),
+        CSV.replace(",", " , ") + "\n\n",
+        CSV.replace("frame,track", "Frame,Track"),
+        CSV.replace("\n", ",x\n"),
+        CSV.replace("\n0,", "\n0.0,").replace("\n2,1,", "\n2.0,1.0,"),
+        CSV.replace(",1\n", ",True\n").replace(",0\n", ",False\n"),
+    ],
+    ids=["bom", "windows", "semicolons", "tabs", "spaces", "capitals", "extra", "floats", "words"],
+)
+@pytest.mark.parametrize("name", ["labels.csv", "labels.txt"])
+def test_csv_dialects_give_equal_labels(tmp_path, text, name):
+    plain, other = read_labels(written(tmp_path, CSV)), read_labels(written(tmp_path, text, name))
+    assert other.frames == plain.frames
+    for column in ("boxes", "tracks", "occluded", "truncated", "ignore"):
+        np.testing.assert_array_equal(getattr(other, column), getattr(plain, column))
+
+
+def test_csv_of_predictions(tmp_path):
+    header = "frame,track_id,x1,y1,x2,y2,score,distance_m,speed_mps\n"
+    text = header + "a.jpg,,1,2,3,4,0.5,,\nb.jpg,7,1,2,3,2,-1,30.5,\n"
+    found = read_labels(written(tmp_path, text))
+    assert found.frames == ("a.jpg", "b.jpg")
+    assert found.tracks.tolist() == [-1, 7]
+    assert found.scores.tolist() == [0.5, -1]
+    np.testing.assert_array_equal(found.distance_m, [np.nan, 30.5])
+    assert found.speed_mps is None
+    assert len(read_labels(written(tmp_path, header))) == 0
+
+
+def test_csv_frames_with_leading_zeros_are_names(tmp_path):
+    text = f"{HEADER}\n007,1,0,0,9,9,0,0,0\n"
+    assert read_labels(written(tmp_path, text)).frames == ("007",)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "lacks the columns frame, track, .* found an empty file"),
+        (
+            "frame,track,x1,y1,x2,y2\n",
+            "lacks the columns occluded, truncated, ignore; found frame, track, x1",
+        ),
+        ("frame,track_id,x1,y1,x2,y2\n", "lacks the columns score; found frame"),
+        ("frame,score,x1,y1,x2,y2\n", "lacks the columns track_id; found"),
+        ("0,1,2,3,4,5,0,0,0\n", "lacks the columns frame.* found 0, 1, 2"),
+        (HEADER + ",x1\n", "has the column x1 more than once"),
+        (f"{HEADER}\n0,1,0,0,9\n", "line 2: expected 9 columns, found 5"),
+        (f"{HEADER}\n\n0,1,0,0,nan,9,0,0,0\n", "line 3: x2 must be a finite number, got 'nan'"),
+        (f"{HEADER}\n0,1,0,0,1e999,9,0,0,0\n", "line 2: x2 must be a finite number"),
+        (f"{HEADER}\n0,1,0,0,,9,0,0,0\n", "line 2: x2 must be a finite number, got ''"),
+        (f"{HEADER}\n0,1,0,0,-9,9,0,0,0\n", r"line 2: a box needs x1 < x2 and y1 < y2, got \[0.0, 0.0, -9.0"),
+        (f"{HEADER}\n0,1,0,5,9,5,0,0,0\n", "line 2: a box needs x1 < x2 and y1 < y2"),
+        (
+            f"{HEADER}\n4,1,0,0,9,9,0,0,0\n4,1,1,0,9,9,0,0,0\n",
+            "line 3: track 1 comes twice in frame 4, first at .* line 2",
+        ),
+        (f"{HEADER}\n0,1,0,0,9,9,0,0,2\n", "line 2: ignore must be 0 or 1, got '2'"),
+        (f"{HEADER}\n0,1.5,0,0,9,9,0,0,0\n", "line 2: track must be a whole number, got '1.5'"),
+        (f"{HEADER}\n0,-2,0,0,9,9,0,0,0\n", "line 2: track must be at least -1"),
+        (f"{HEADER}\n0,1e99,0,0,9,9,0,0,0\n", "line 2: track must be at most"),
+        (f"{HEADER}\n-1,1,0,0,9,9,0,0,0\n", "line 2: frame must be at least 0"),
+        (f"{HEADER}\n,1,0,0,9,9,0,0,0\n", "line 2: frame is empty"),
+        (f"{HEADER}\n0,1,0,0,9,9,0,1.5,0\n", "line 2: truncated must be at most 1"),
+        (
+            f"{HEADER}\n0,1,0,0,9,9,0,0,0\n".replace(",", ";").replace(";9;9;", ";9,5;9;"),
+            "use a decimal point",
+        ),
+        (f'{HEADER}\n"0,1', "not CSV text"),
+        (HEADER.encode() + b"\n\xff\xfe", "is not UTF-8 text; save it as UTF-8"),
+    ],
+)
+def test_invalid_csv_files(tmp_path, text, message):
+    with pytest.raises(DatasetError, match=message):
+        read_labels(written(tmp_path, text))
+
+
+def test_boxes_are_clipped_to_the_shape(tmp_path):
+    path = written(tmp_path, f"{HEADER}\n0,1,-5,10,700,90,0,0,0\n")
+    assert read_labels(path, shape=(80, 640, 3)).boxes.tolist() == [[0, 10, 640, 80]]
+    assert read_labels(path).boxes.tolist() == [[-5, 10, 700, 90]]
+    with pytest.raises(DatasetError, match=r"line 2: box .* lies outside the 640x10 image; check that shape"):
+        read_labels(path, shape=(10, 640))
+    with pytest.raises(InvalidInputError, match="shape must be"):
+        read_labels(path, shape=(640,))
+    predicted = written(tmp_path, "frame,track_id,x1,y1,x2,y2,score\n0,,900,0,950,9,1\n")
+    assert read_labels(predicted, shape=(80, 640)).boxes.tolist() == [[640, 0, 640, 9]]
+
+
+KITTI = """Car 0.00 0 -1.57 599.41 156.40 649.25 189.25 2.85 2.63 12.34 0.47 1.49 69.44 -1.56
+Van 0.80 1 0 10 10 60 60 1 1 1 1 1 1 1
+Truck 0.00 3 0 100 10 160 60 1 1 1 1 1 1 1
+Car 0.00 0 0 200 10 220 20 1 1 1 1 1 1 1
+Tram 0.00 0 0 300 10 360 60 1 1 1 1 1 1 1
+Cyclist 0.00 0 0 400 10 460 60 1 1 1 1 1 1 1
+DontCare -1 -1 -10 503.89 169.71 590.61 190.13 -1 -1 -1 -1000 -1000 -1000 -10
+"""
+
+
+def test_kitti_folder(tmp_path):
+    written(tmp_path, KITTI, "000002.txt")
+    written(tmp_path, "", "000010.txt")
+    labels = read_labels(tmp_path)
+    assert labels.frame_keys == ("000002", "000010")
+    assert labels.boxes[0].tolist() == [599.41, 156.40, 649.25, 189.25]
+    assert labels.ignore.tolist() == [False, True, True, True, True, True]
+    assert (labels.tracks[:-1] >= 0).all()
+    assert labels.tracks[-1] == -1
+    assert len(read_labels(tmp_path / "000002.txt")) == 6
+    assert (~read_labels(tmp_path, classes=["Tram"]).ignore).sum() == 1
+    scored = written(tmp_path, "Car -1 -1 0 200 10 220 20 1 1 1 1 1 1 1 0.5\n", "000002.txt")
+    result = read_labels(scored)
+    assert (result.scores.tolist(), result.ignore.tolist()) == ([0.5], [False])
+
+
+def test_mot_file(tmp_path):
+    truth = read_labels(written(tmp_path, "1,3,10,20,30,40,1,1,1\n2,3,11,20,30,40,0,1,0.5\n", "gt.txt"))
+    assert truth.frames == (0, 1)
+    assert truth.boxes[0].tolist() == [10, 20, 40, 60]
+    assert truth.ignore.tolist() == [False, True]
+    assert truth.scores is None
+    found = read_labels(written(tmp_path, "1, 3, 10, 20, 30, 40, 0.75, -1, -1, -1,\r\n", "mot.txt"))
+    assert found.scores.tolist() == [0.75]
+    assert read_labels(written(tmp_path, "1 -1 10 20 30 40\n", "bare.txt")).tracks.tolist() == [-1]
+    by_class = written(tmp_path, "1,1,0,0,9,9,1,1,1\n1,2,0,0,9,9,1,3,1\n", "gt.txt")
+    assert read_labels(by_class, classes={3}).tracks.tolist() == [2]
+
+
+def coco(**changes):
+    data = {
+        "images": [{"id": 5, "file_name": "b.jpg"}, {"id": 6, "file_name": "a.jpg"}],
+        "categories": [{"id": 1, "name": "Car"}, {"id": 2, "name": "person"}, {"id": 3, "name": "train"}],
+        "annotations": [
+            {"image_id": 5, "category_id": 1, "bbox": [10, 20, 30, 40]},
+            {"image_id": 5, "category_id": 2, "bbox": [0, 0, 30, 40]},
+            {"image_id": 5, "category_id": 3, "bbox": [0, 0, 60, 40]},
+            {"image_id": 5, "category_id": 1, "bbox": [90, 0, 99, 40], "iscrowd": 1},
+        ],
+    }
+    return json.dumps({**data, **changes})
+
+
+def test_coco_file(tmp_path):
+    labels = read_labels(written(tmp_path, coco(), "instances.json"))
+    assert labels.frame_keys == ("a.jpg", "b.jpg")
+    assert labels.boxes.tolist() == [[10, 20, 40, 60], [0, 0, 60, 40], [90, 0, 189, 40]]
+    assert labels.ignore.tolist() == [False, True, True]
+    assert labels.tracks.tolist() == [0, 2, -1]
+    assert len(read_labels(written(tmp_path, coco(), "coco.txt"), classes=["person"])) == 2
+    entry = {"image_id": 5, "category_id": 1, "bbox": [1, 2, 3, 4], "track_id": 9, "score": 0.5}
+    found = read_labels(written(tmp_path, coco(annotations=[entry], images=[{"id": 5}]), "a.json"))
+    assert (found.frames, found.tracks.tolist(), found.scores.tolist()) == ((5,), [9], [0.5])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.json", "{", "line 1: not JSON text"),
+        ("a.json", "[]", "is not a COCO file: it lacks the lists images, annotations, categories"),
+        ("a.json", coco(images=[{"file_name": "x"}]), "every image and category needs an id"),
+        ("a.json", coco(images=[{"id": 5}, {"id": 6, "file_name": "a"}]), "give every image a file_name"),
+        ("a.json", coco(images=[{"id": 5}, {"id": 5}]), "two images share an id"),
+        ("a.json", coco(images=[]), "annotation 0: expected bbox .* image_id"),
+        (
+            "a.json",
+            coco(annotations=[{"image_id": 5, "category_id": 1, "bbox": [1, 2]}]),
+            "annotation 0: expected bbox",
+        ),
+        (
+            "a.json",
+            coco(annotations=[{"image_id": 5, "category_id": 1, "bbox": [1, 2, 0, 5]}]),
+            "annotation 0: a box needs x1 < x2",
+        ),
+        ("a.json", coco(categories=[{"id": 1, "name": "boat"}]), "no category among car, .* found 'boat'"),
+        ("a.txt", "Car 0 0 0 1 2 3", "lacks the columns"),
+        ("a.txt", KITTI.replace("69.44 ", ""), "lacks the columns"),
+        ("a.txt", KITTI + "Car 0 0", "line 8: a KITTI object has 15 values .* found 3"),
+        ("a.txt", "0,1,2,3,4,5\n", r"line 1: frame \(counted from 1\) must be at least 1"),
+        ("a.txt", "1,1,2,3\n", "line 1: expected frame, id, x, y, width, height, found 4"),
+        ("a.txt", "1,1,2,3,-4,5\n", "line 1: a box needs x1 < x2"),
+        ("a.txt", "1,1,1e308,3,1.7e308,5\n", "line 1: a box needs finite corners"),
+        ("a.txt", "1,1,2,3,4,5,0.5\n1,2,2,3,4,5\n", "line 2: some boxes have a score and some have none"),
+    ],
+)
+def test_invalid_files_of_other_formats(tmp_path, name, text, message):
+    with pytest.raises(DatasetError, match=message):
+        read_labels(written(tmp_path, text, name))
+
+
+def test_invalid_paths(tmp_path):
+    with pytest.raises(DatasetError, match="does not exist; check the path"):
+        read_labels(tmp_path / "none.csv")
+    with pytest.raises(DatasetError, match=r"holds no \.txt file"):
+        read_labels(tmp_path)
+    with pytest.raises(DatasetError, match="is a folder, and csv labels are one file"):
+        read_labels(tmp_path, format="csv")
+    with pytest.raises(
+        InvalidInputError, match="format must be one of 'csv', 'kitti', 'mot', 'coco'; got 'voc'"
+    ):
+        read_labels(written(tmp_path, CSV), format="voc")
+
+
+FIELDS = st.sampled_from(
+    ["0", "1", "2", "-1", "0.5", "nan", "1e999", "1e308", "", "a", "Car", '"', "\x00", "007"]
+)
+
+
+@given(
+    kind=st.sampled_from(["csv", "kitti", "mot"]),
+    lines=st.lists(st.lists(FIELDS, min_size=5, max_size=16), max_size=4),
+    headed=st.booleans(),
+)
+@settings(max_examples=200)
+def test_readers_raise_only_dataset_errors(tmp_path_factory, kind, lines, headed):
+    separator = {"csv": ",", "kitti": " ", "mot": ","}[kind]
+    text = (HEADER + "\n") * headed + "\n".join(
+        separator.join(line[:9] if headed else line) for line in lines
+    )
+    path = written(tmp_path_factory.mktemp("fuzz"), text)
+    try:
+        assert isinstance(read_labels(path, format=kind), FrameBoxes)
+    except DatasetError as error:
+        assert len(str(error).splitlines()) == 1  # noqa: PT017
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers(-2, 6) | st.floats() | st.sampled_from(["car", "a.jpg", "x"]),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.dictionaries(
+            st.sampled_from(
+                ["id", "file_name", "name", "bbox", "image_id", "category_id", "score", "track_id", "iscrowd"]
+            ),
+            inner,
+            max_size=5,
+        )
+    ),
+    max_leaves=12,
+)
+
+
+@given(changes=st.dictionaries(st.sampled_from(["images", "categories", "annotations"]), JSON, max_size=2))
+@settings(max_examples=200)
+def test_coco_reader_raises_only_dataset_errors(tmp_path_factory, changes):
+    path = written(tmp_path_factory.mktemp("fuzz"), coco(**changes), "a.json")
+    with contextlib.suppress(DatasetError):
+        assert isinstance(read_labels(path), FrameBoxes)
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("name", "frames", "usable", "shape"),
+    [
+        ("project_clip", 350, 380, (720, 1280)),
+        ("test_video", 38, 76, (720, 1280)),
+        ("test_images", 6, 9, (720, 1280)),
+        ("india", 165, 509, None),
+        ("camvid", 157, 148, (360, 480)),
+        ("indonesia", 79, 242, None),
+    ],
+)
+def test_real_labels(real_data: Path, name, frames, usable, shape):
+    path = real_data / "labels" / f"{name}.csv"
+    labels = read_labels(path, shape=shape)
+    assert len(labels.frame_keys) == frames
+    assert (~labels.ignore).sum() == usable
+    scores = evaluate_detections(labels, labels)
+    assert (scores.f1, scores.mean_iou, scores.tp) == (1, 1, usable)
+    if shape is not None:
+        np.testing.assert_array_equal(labels.boxes, read_labels(path).boxes)
+    if name in ("project_clip", "test_video"):
+        tracked = evaluate_tracks(labels, labels)
+        assert (tracked.mota, tracked.jitter, tracked.vehicles) == (1, 0, 2)

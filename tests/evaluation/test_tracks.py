@@ -1,0 +1,143 @@
+import math
+
+import motmetrics
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.evaluation.cases import CAR, boxes_of, moved, trials
+from vehicle_detection.boxes import iou_matrix
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import FrameBoxes, evaluate_tracks
+
+
+def clip(tracks, *, step=4.0, offset=(0.0,)):
+    """One vehicle a frame further right in every frame, followed by `tracks`; None where it is missed."""
+    labels = boxes_of(*((frame, 1, moved(step * frame)) for frame in range(len(tracks))))
+    rows = [
+        (frame, track, moved(step * frame + offset[frame % len(offset)]))
+        for frame, track in enumerate(tracks)
+        if track is not None
+    ]
+    return (boxes_of(*rows) if rows else FrameBoxes([], [], [])), labels
+
+
+@pytest.mark.parametrize(
+    ("tracks", "switches", "fragmentations", "mota", "idf1"),
+    [
+        ([5, 5, 5, 5], 0, 0, 1, 1),
+        ([5, 5, 6, 6], 1, 0, 3 / 4, 1 / 2),
+        ([5, 6, 5, 5], 2, 0, 2 / 4, 3 / 4),
+        ([5, None, 5, 5], 0, 1, 3 / 4, 6 / 7),
+        ([5, None, 6, None], 1, 1, 1 / 4, 2 / 6),
+        ([None, 5, 5, None], 0, 0, 2 / 4, 4 / 6),
+        ([None, None, None, None], 0, 0, 0, 0),
+    ],
+)
+def test_switches_and_fragmentations_by_hand(tracks, switches, fragmentations, mota, idf1):
+    scores = evaluate_tracks(*clip(tracks))
+    assert (scores.id_switches, scores.fragmentations) == (switches, fragmentations)
+    assert scores.mota == pytest.approx(mota)
+    assert scores.idf1 == pytest.approx(idf1)
+    assert scores.vehicles == 1
+    assert scores.tracks == len({*tracks} - {None})
+
+
+def test_a_vehicle_keeps_its_track_even_if_another_overlaps_more():
+    labels = boxes_of((0, 1, CAR), (1, 1, CAR))
+    found = boxes_of((0, 5, CAR), (1, 5, moved(20)), (1, 6, CAR))
+    scores = evaluate_tracks(found, labels)
+    assert (scores.id_switches, scores.fp, scores.tp) == (0, 1, 2)
+
+
+def test_vehicles_that_swap_tracks_count_two_switches():
+    labels = boxes_of(*((f, v, moved(300 * v)) for f in (0, 1) for v in (0, 1)))
+    found = boxes_of(*((f, v ^ f, moved(300 * v)) for f in (0, 1) for v in (0, 1)))
+    assert evaluate_tracks(found, labels).id_switches == 2
+
+
+def test_jitter_by_hand():
+    # Errors of 0, 2, 0: each step changes the left and right edge by 2, top and bottom not at all.
+    assert evaluate_tracks(*clip([5, 5, 5], offset=(0, 2, 0))).jitter == 1
+    assert evaluate_tracks(*clip([5, 5, 5], offset=(3,))).jitter == 0
+    # Another track on the same vehicle jumps all the same; a gap is no pair of frames.
+    assert evaluate_tracks(*clip([5, 6], offset=(0, 2))).jitter == 1
+    assert math.isnan(evaluate_tracks(*clip([5, None, 5], offset=(0, 0, 2))).jitter)
+
+
+def test_consecutive_frames_differ_by_the_smallest_step():
+    found, labels = clip([5, 5, 5, 5], offset=(0, 2))
+    every_tenth = [side.renamed(lambda key: key * 10) for side in (found, labels)]
+    assert evaluate_tracks(*every_tenth).jitter == 1
+    gap = [side.renamed(lambda key: key + 90 * (key > 1)) for side in (found, labels)]
+    assert evaluate_tracks(*gap).jitter == 1
+    assert evaluate_tracks(gap[0], gap[1][:0]).longest_false_positive_run == 2
+    names = [side.renamed(lambda key: f"{3 * key}.png") for side in (found, labels)]
+    assert evaluate_tracks(*names).jitter == 1
+    # Names given in another order follow each other in that order: errors of 0, 0, 2, 2.
+    assert evaluate_tracks(*names, frames=[f"{3 * key}.png" for key in (0, 2, 1, 3)]).jitter == pytest.approx(
+        1 / 3
+    )
+
+
+@pytest.mark.parametrize(
+    ("frames", "longest"), [([], 0), ([3], 1), ([0, 1, 2], 3), ([0, 1, 3, 4, 5, 7], 3), ([0, 2, 4], 1)]
+)
+def test_longest_false_positive_run_by_hand(frames, longest):
+    _, labels = clip([None] * 8)
+    false = boxes_of(*((f, 9, moved(700)) for f in frames)) if frames else FrameBoxes([], [], [])
+    assert evaluate_tracks(false, labels).longest_false_positive_run == longest
+
+
+def test_a_false_run_belongs_to_one_track_and_ends_in_an_ignored_region():
+    rows = [(f, 9, moved(700)) for f in range(6)]
+    labels = boxes_of(*((f, 1, CAR) for f in range(6)), (2, -1, (700, 0, 900, 90)), ignore=np.arange(7) == 6)
+    assert evaluate_tracks(boxes_of(*rows), labels).longest_false_positive_run == 3
+    taking_turns = boxes_of(*((f, 9 + f % 2, moved(700)) for f in range(6)))
+    assert evaluate_tracks(taking_turns, labels).longest_false_positive_run == 1
+
+
+def test_boxes_without_tracks_are_rejected():
+    labels, loose = boxes_of((0, 1, CAR)), boxes_of((0, -1, CAR))
+    with pytest.raises(
+        InvalidInputError, match="predictions must have a track for every box, row 0 in frame 0"
+    ):
+        evaluate_tracks(loose, labels)
+    with pytest.raises(InvalidInputError, match="labels must have a track"):
+        evaluate_tracks(labels, loose)
+
+
+@st.composite
+def crowds(draw):
+    """Vehicles that cross and hide each other, under tracks that go over from one to the other."""
+    length = draw(st.integers(2, 8))
+    sides = []
+    for spread in (80, 30):
+        rows = [
+            (frame, track, moved(draw(st.integers(0, spread))))
+            for frame in range(length)
+            for track in range(3)
+            if draw(st.integers(0, 5))
+        ]
+        sides.append(boxes_of(*rows, frame_keys=range(length)) if rows else FrameBoxes([], [], []))
+    return sides[1], sides[0]
+
+
+@given(trial=trials() | crowds())
+@settings(max_examples=60)
+def test_track_scores_equal_those_of_motmetrics(trial):
+    found, labels = trial
+    accumulator = motmetrics.MOTAccumulator(auto_id=True)
+    for key in labels.frame_keys:
+        truth, here = labels.frame(key), found.frame(key)
+        overlap = iou_matrix(truth.boxes, here.boxes)
+        distance = np.where(overlap >= 0.5, 1 - overlap, np.nan)
+        accumulator.update(truth.tracks, here.tracks, distance)
+    names = ("mota", "idf1", "num_switches", "num_fragmentations", "num_misses", "num_false_positives")
+    row = motmetrics.metrics.create().compute(accumulator, metrics=list(names), name="clip").iloc[0]
+    scores = evaluate_tracks(found, labels)
+    assert scores.mota == pytest.approx(row["mota"], nan_ok=True)
+    assert scores.idf1 == pytest.approx(row["idf1"], nan_ok=True)
+    assert (scores.id_switches, scores.fragmentations) == (row["num_switches"], row["num_fragmentations"])
+    assert (scores.fn, scores.fp) == (row["num_misses"], row["num_false_positives"])

@@ -1,0 +1,290 @@
+"""Labelled or predicted boxes of several frames, as columns: `FrameBoxes`."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vehicle_detection._common import check_boxes, describe
+from vehicle_detection.boxes import Detections
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.export import check_items, is_result, shown_tracks
+
+if TYPE_CHECKING:
+    import pandas
+
+FrameKey = int | str
+
+NO_TRACK = -1
+"""Track of a box without identity. A row with `ignore` and this track is a region, not a vehicle."""
+
+_ROW_COLUMNS = ("tracks", "boxes", "occluded", "truncated", "ignore", "scores", "distance_m", "speed_mps")
+
+
+def check_keys(values: object, name: str) -> tuple[FrameKey, ...]:
+    """Return frame keys as Python values that are all int or all str."""
+    if isinstance(values, (str, bytes)) or not isinstance(values, Iterable):
+        raise InvalidInputError(
+            f"{name} must be a sequence of frame keys (int or str), got {describe(values)}"
+        )
+    keys = tuple(key.item() if isinstance(key, np.generic) else key for key in values)
+    kinds = {type(key) for key in keys}
+    if kinds - {int} and kinds - {str}:
+        listed = ", ".join(sorted(kind.__name__ for kind in kinds))
+        raise InvalidInputError(f"{name} must be all int or all str, got {listed}; convert them to one type")
+    return keys
+
+
+def frame_order(key: FrameKey) -> tuple[tuple[int, str], ...]:
+    """Natural sort key: frame 2 comes before frame 10, also in file names."""
+    if isinstance(key, int):
+        return ((key, ""),)
+    parts = re.split(r"([0-9]+)", key)
+    return tuple((int(part), "") if index % 2 else (-1, part) for index, part in enumerate(parts))
+
+
+def _column(values: ArrayLike | None, name: str, rows: int, kinds: str, default: Any) -> NDArray[Any]:
+    """Check one value per row of one of the dtype `kinds`; returned with the dtype of `default`."""
+    dtype = np.asarray(default).dtype
+    column = np.full(rows, default) if values is None else np.asarray(values)
+    if column.size == 0:
+        column = column.reshape(-1).astype(dtype)
+    if column.shape != (rows,) or column.dtype.kind not in kinds:
+        raise InvalidInputError(
+            f"{name} must be one value for each of the {rows} boxes, got {describe(column)}"
+        )
+    return column.astype(dtype)
+
+
+def count_noun(number: int, noun: str, ending: str = "s") -> str:
+    """Format a number with its noun: ``1 box``, ``2 boxes``."""
+    return f"{number} {noun}{ending * (number != 1)}"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FrameBoxes:
+    """Labelled or predicted boxes of several frames, as columns that are checked on construction.
+
+    Attributes
+    ----------
+    frames
+        Frame key of each row: all int (counted from 0) or all str (the image's file name).
+    tracks
+        ``(N,)`` int64, the vehicle's number within the clip, -1 for none. None: no box has one.
+    boxes
+        ``(N, 4)`` float64 ``[x1, y1, x2, y2]``, half-open pixels.
+    occluded
+        ``(N,)`` int64, 0 visible (the default), 1 partly, 2 largely hidden.
+    truncated
+        ``(N,)`` float64, fraction of the vehicle outside the image, 0-1; default 0.
+    ignore
+        ``(N,)`` bool, rows that are not scored; with track -1 the row is a region. Default False.
+    scores
+        ``(N,)`` float64 score of a prediction, or None.
+    distance_m, speed_mps
+        ``(N,)`` float64, NaN where unknown, or None.
+    frame_keys
+        All frames in order, including those without a box. Frames of the rows are added automatically.
+
+    Raises
+    ------
+    InvalidInputError
+        If columns differ in length or hold invalid values, or a track occurs twice in a frame.
+
+    Examples
+    --------
+    >>> labels = FrameBoxes([0, 0, 2], [1, 2, 1], [[0, 0, 50, 40], [90, 0, 140, 40], [5, 0, 55, 40]])
+    >>> labels, labels.frame_keys, labels.frame(2).boxes
+    (FrameBoxes(3 boxes in 2 frames), (0, 2), array([[ 5.,  0., 55., 40.]]))
+    """
+
+    frames: Sequence[FrameKey]
+    tracks: NDArray[np.int64]
+    boxes: NDArray[np.float64]
+    _: KW_ONLY
+    occluded: NDArray[np.int64] = None  # type: ignore[assignment]
+    truncated: NDArray[np.float64] = None  # type: ignore[assignment]
+    ignore: NDArray[np.bool_] = None  # type: ignore[assignment]
+    scores: NDArray[np.float64] | None = None
+    distance_m: NDArray[np.float64] | None = None
+    speed_mps: NDArray[np.float64] | None = None
+    frame_keys: Sequence[FrameKey] = ()
+    _rows: dict[FrameKey, NDArray[np.intp]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        frames = check_keys(self.frames, "frames")
+        boxes = check_boxes(self.boxes).astype(np.float64)
+        count = len(boxes)
+        if len(frames) != count:
+            raise InvalidInputError(
+                f"frames must be one key for each of the {count} boxes, got {len(frames)} keys"
+            )
+        columns: dict[str, Any] = {
+            "frames": frames,
+            "boxes": boxes,
+            "tracks": _column(self.tracks, "tracks", count, "iu", np.int64(NO_TRACK)),
+            "occluded": _column(self.occluded, "occluded", count, "iub", np.int64(0)),
+            "truncated": _column(self.truncated, "truncated", count, "iufb", 0.0),
+            "ignore": _column(self.ignore, "ignore", count, "b", False),
+        }
+        for name in ("scores", "distance_m", "speed_mps"):
+            values = getattr(self, name)
+            columns[name] = None if values is None else _column(values, name, count, "iuf", 0.0)
+        if columns["scores"] is not None and not np.isfinite(columns["scores"]).all():
+            raise InvalidInputError("scores must be finite, got NaN or infinity; drop those rows")
+        if (columns["tracks"] < NO_TRACK).any():
+            lowest = columns["tracks"].min()
+            raise InvalidInputError(f"tracks must be numbers from 0, or -1 for none; got {lowest}")
+        if not (columns["occluded"] >= 0).all():
+            raise InvalidInputError(
+                "occluded must be 0 (visible), 1 (partly) or 2 (largely hidden); got a negative value"
+            )
+        if not ((columns["truncated"] >= 0) & (columns["truncated"] <= 1)).all():
+            raise InvalidInputError("truncated must be a fraction from 0 to 1; got a value outside")
+        seen: set[tuple[FrameKey, int]] = set()
+        for key, track in zip(frames, columns["tracks"].tolist()):
+            if track != NO_TRACK and (key, track) in seen:
+                raise InvalidInputError(
+                    f"frame {key!r} holds track {track} twice; give each vehicle its own number"
+                )
+            seen.add((key, track))
+        keys = check_keys((*check_keys(self.frame_keys, "frame_keys"), *frames), "frame_keys")
+        columns["frame_keys"] = tuple(sorted(set(keys), key=frame_order))
+        rows: dict[FrameKey, list[int]] = {}
+        for row, key in enumerate(frames):
+            rows.setdefault(key, []).append(row)
+        columns["_rows"] = {key: np.array(found, np.intp) for key, found in rows.items()}
+        for name, column in columns.items():
+            object.__setattr__(self, name, column)
+
+    @classmethod
+    def from_detections(cls, detections: Mapping[FrameKey, Detections]) -> FrameBoxes:
+        """Collect the detections of each frame; frames without any still count as frames.
+
+        Examples
+        --------
+        >>> FrameBoxes.from_detections({0: Detections([[0, 0, 50, 40]], [1.5]), 1: Detections.empty()})
+        FrameBoxes(1 box in 2 frames)
+        """
+        parts = [np.empty((0, 4)), *(found.boxes for found in detections.values())]
+        return cls(
+            [key for key, found in detections.items() for _ in range(len(found))],
+            None,  # type: ignore[arg-type]
+            np.concatenate(parts),
+            scores=np.concatenate([np.empty(0), *(found.scores for found in detections.values())]),
+            frame_keys=tuple(detections),
+        )
+
+    @classmethod
+    def from_results(cls, results: Iterable[Any]) -> FrameBoxes:
+        """Collect the tracks that a detector shows, without writing a file.
+
+        Parameters
+        ----------
+        results
+            One :class:`FrameResult` for each frame.
+
+        Returns
+        -------
+        FrameBoxes
+            Tracks with their scores, distances and speeds: what `read_labels` reads from the CSV file that
+            `write_tracks` writes, without its rounding. Frames without a track still count as frames.
+
+        Raises
+        ------
+        InvalidInputError
+            If an item is not a result.
+
+        Examples
+        --------
+        >>> from types import SimpleNamespace
+        >>> track = SimpleNamespace(id=1, box=(0, 0, 50, 40), score=1.5, distance_m=None, speed_mps=None)
+        >>> FrameBoxes.from_results([SimpleNamespace(index=0, tracks=[track])]).tracks
+        array([1])
+        """
+        keys: list[FrameKey] = []
+        frames: list[FrameKey] = []
+        tracks: list[Any] = []
+        for result in check_items(results):
+            if not is_result(result):
+                raise InvalidInputError(
+                    f"results must be FrameResult objects, got {describe(result)}; "
+                    "read a file with read_labels"
+                )
+            keys.append(int(result.index))
+            shown = shown_tracks(result)
+            frames += [int(result.index)] * len(shown)
+            tracks += shown
+        distance, speed = (
+            np.array([getattr(track, name) for track in tracks], np.float64)  # None becomes NaN
+            for name in ("distance_m", "speed_mps")
+        )
+        return cls(
+            frames,
+            np.array([track.id for track in tracks], np.int64),
+            np.array([track.box for track in tracks], np.float64).reshape(-1, 4),
+            scores=np.array([track.score for track in tracks], np.float64),
+            distance_m=None if np.isnan(distance).all() else distance,
+            speed_mps=None if np.isnan(speed).all() else speed,
+            frame_keys=keys,
+        )
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+    def __repr__(self) -> str:
+        boxes, frames = count_noun(len(self), "box", "es"), count_noun(len(self.frame_keys), "frame")
+        return f"FrameBoxes({boxes} in {frames})"
+
+    def _repr_html_(self) -> str:
+        return f"<p>{self!r}</p>{self.to_dataframe().to_html(max_rows=20)}"
+
+    def __getitem__(self, rows: slice | NDArray[Any] | list[int]) -> FrameBoxes:
+        """Select rows by a slice, a mask or a list of indices; `frame_keys` stay the same."""
+        return self._take(np.arange(len(self))[rows], self.frame_keys)
+
+    def rows(self, key: FrameKey) -> NDArray[np.intp]:
+        """Row numbers of a frame's boxes; empty for a frame without boxes."""
+        return self._rows.get(key, np.empty(0, np.intp))
+
+    def frame(self, key: FrameKey) -> FrameBoxes:
+        """Select the boxes of one frame; empty for a frame without boxes."""
+        return self._take(self.rows(key), (key,))
+
+    def renamed(self, rename: Callable[[Any], FrameKey]) -> FrameBoxes:
+        """Return a copy in which ``rename(key)`` replaces every frame key.
+
+        Examples
+        --------
+        >>> FrameBoxes(["000007"], None, [[0, 0, 50, 40]]).renamed(lambda key: key + ".png").frame_keys
+        ('000007.png',)
+        """
+        frames, keys = ([rename(key) for key in each] for each in (self.frames, self.frame_keys))
+        return dataclasses.replace(self, frames=frames, frame_keys=keys)
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return the boxes as a table, one row per box.
+
+        Examples
+        --------
+        >>> list(FrameBoxes([0], [1], [[0, 0, 50, 40]]).to_dataframe())
+        ['frame', 'track', 'x1', 'y1', 'x2', 'y2', 'occluded', 'truncated', 'ignore']
+        """
+        import pandas
+
+        columns = {"frame": self.frames, "track": self.tracks}
+        columns |= dict(zip(("x1", "y1", "x2", "y2"), self.boxes.T))
+        rest = {name: getattr(self, name) for name in _ROW_COLUMNS[2:]}
+        return pandas.DataFrame(columns | {name: each for name, each in rest.items() if each is not None})
+
+    def _take(self, rows: NDArray[np.intp], keys: Sequence[FrameKey]) -> FrameBoxes:
+        frames = [self.frames[row] for row in rows.tolist()]
+        columns = {name: getattr(self, name) for name in _ROW_COLUMNS}
+        taken = {name: column[rows] for name, column in columns.items() if column is not None}
+        return dataclasses.replace(self, frames=frames, frame_keys=keys, **taken)

@@ -1,0 +1,159 @@
+"""Images with their labels: `LabelledFrames`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection._common import check_image, check_integer, check_number, describe
+from vehicle_detection.datasets import FrameSet
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation.frame_boxes import FrameBoxes, FrameKey, count_noun
+
+Frames = Mapping[FrameKey, NDArray[np.uint8]] | FrameSet | Sequence[NDArray[np.uint8]]
+"""Images by key, a `FrameSet`, or a list of images that are numbered from 0."""
+
+
+def keyed_frames(frames: Frames, name: str = "frames") -> Mapping[FrameKey, NDArray[np.uint8]] | FrameSet:
+    """Return frames with keys; the images of a list are numbered from 0."""
+    given: object = frames
+    if isinstance(given, (FrameSet, Mapping)):
+        return given
+    if isinstance(given, (list, tuple)):
+        return dict(enumerate(given))
+    raise InvalidInputError(
+        f"{name} must be a list of images, a mapping from key to image, or the frames of load_frames; "
+        f"got {describe(given)}"
+    )
+
+
+def iterate_frames(
+    frames: Mapping[FrameKey, NDArray[np.uint8]] | FrameSet,
+) -> Iterator[tuple[FrameKey, NDArray[np.uint8]]]:
+    """Yield each key with its checked image."""
+    for key, image in frames.items() if isinstance(frames, Mapping) else frames:
+        yield key, check_image(image, f"frame {key!r}")
+
+
+def keys_of(frames: Mapping[FrameKey, NDArray[np.uint8]] | FrameSet) -> tuple[FrameKey, ...]:
+    """List the frames' keys."""
+    return tuple(frames) if isinstance(frames, Mapping) else frames.names
+
+
+def check_frame_boxes(keys: Sequence[FrameKey], labels: object, name: str = "labels") -> FrameBoxes:
+    """Return `labels` if they contain at least one of the frames `keys`."""
+    if not isinstance(labels, FrameBoxes):
+        raise InvalidInputError(
+            f"{name} must be FrameBoxes, got {describe(labels)}; read a file with read_labels"
+        )
+    if keys and not set(keys) & set(labels.frame_keys):
+        known = f"such as {labels.frame_keys[0]!r}" if labels.frame_keys else "but it is empty"
+        raise InvalidInputError(
+            f"{name} contain none of the frames, such as {keys[0]!r}, {known}; "
+            "convert the keys with FrameBoxes.renamed"
+        )
+    return labels
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LabelledFrames:
+    """A named set of frames with its labels.
+
+    Attributes
+    ----------
+    name
+        Name of the set in tables.
+    frames
+        Images by key (``{7: image}``), a list of images that are numbered from 0, or a `FrameSet`, which
+        reads each image when it is used: ``(H, W, 3)`` uint8 RGB.
+    labels
+        True boxes; those of other frames are dropped. A frame without any box counts as empty.
+    horizon
+        Row of the horizon as a fraction of the frame height; None keeps the default of the search.
+
+    Examples
+    --------
+    >>> labels = FrameBoxes([0], None, [[10, 10, 60, 50]])
+    >>> LabelledFrames("road", [np.zeros((90, 120, 3), np.uint8)], labels)
+    LabelledFrames('road', 1 frame, 1 box)
+    """
+
+    name: str
+    frames: Mapping[FrameKey, NDArray[np.uint8]] | FrameSet
+    labels: FrameBoxes
+    horizon: float | None = None
+
+    def __post_init__(self) -> None:
+        name: object = self.name
+        if not isinstance(name, str) or not name:
+            raise InvalidInputError(f"name must be a non-empty string, got {describe(name)}")
+        frames = keyed_frames(self.frames)
+        keys = keys_of(frames)
+        if not keys:
+            raise InvalidInputError("frames must hold at least one image, got none")
+        labels = check_frame_boxes(keys, self.labels)
+        if self.horizon is not None:
+            check_number(self.horizon, "horizon", low=0, high=1)
+        known = set(keys)
+        mask = np.array([key in known for key in labels.frames], np.bool_)
+        object.__setattr__(self, "frames", frames)
+        object.__setattr__(self, "labels", labels[mask])
+
+    def __repr__(self) -> str:
+        frames, boxes = count_noun(len(self), "frame"), count_noun(len(self.labels), "box", "es")
+        return f"LabelledFrames({self.name!r}, {frames}, {boxes})"
+
+    @property
+    def keys(self) -> tuple[FrameKey, ...]:
+        """Keys of the frames."""
+        return keys_of(self.frames)
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def __iter__(self) -> Iterator[tuple[FrameKey, NDArray[np.uint8]]]:
+        return iterate_frames(self.frames)
+
+    @classmethod
+    def from_video(
+        cls,
+        path: str | os.PathLike[str],
+        labels: FrameBoxes,
+        *,
+        every: int = 1,
+        name: str | None = None,
+        horizon: float | None = None,
+    ) -> LabelledFrames:
+        """Read every n-th frame of a video whose labels are keyed by frame number.
+
+        Parameters
+        ----------
+        path
+            A file that ffmpeg can read. The chosen frames are kept in memory.
+        labels
+            True boxes.
+        every
+            Step between the chosen frames; neighboring frames show nearly the same.
+        name
+            Name of the set; None takes the file name without its suffix.
+        horizon
+            As in the class.
+
+        Raises
+        ------
+        InvalidInputError, VideoError
+            If the file is missing or not a video, or the labels contain none of its frames.
+        """
+        from vehicle_detection.video import read_frames
+
+        step = check_integer(every, "every", low=1)
+        with read_frames(path) as reader:
+            chosen: dict[FrameKey, NDArray[np.uint8]] = {
+                index: frame for index, _, frame in reader if index % step == 0
+            }
+        return cls(name or Path(path).stem, chosen, labels, horizon)

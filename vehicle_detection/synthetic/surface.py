@@ -1,0 +1,145 @@
+"""Drawing on the surfaces of a vehicle body, in meters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vehicle_detection.synthetic.raster import Floats, blend
+
+PIXELS_PER_METER = 112
+
+Outline = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A painted surface: ``(H, W, 4)`` premultiplied RGBA, 0-255."""
+
+    rgba: Floats
+    left: float  # position of the upper left corner (m)
+    top: float
+    depth: Floats | None = None  # (H, W) distance behind the nearest point (m)
+    _mipmaps: dict[tuple[int, ...], Floats] = field(default_factory=dict, init=False)
+
+    def mipmap(self, x_ratio: float, y_ratio: float) -> tuple[Floats, float, float]:
+        """Return the surface at about the size it is drawn at, and its pixels per meter along x and y.
+
+        The ratios are the number of full-size pixels per drawn sample along each axis.
+        """
+        steps = [int(np.clip(np.log2(max(ratio, 1.0)) + 0.25, 0, 6)) for ratio in (x_ratio, y_ratio)]
+        height, width = self.rgba.shape[:2]
+        size = (max(1, width >> steps[0]), max(1, height >> steps[1]))
+        if size not in self._mipmaps:
+            rgba = cv2.resize(self.rgba, size, interpolation=cv2.INTER_AREA) if any(steps) else self.rgba
+            self._mipmaps[size] = np.asarray(rgba, np.float32)
+        return self._mipmaps[size], PIXELS_PER_METER * size[0] / width, PIXELS_PER_METER * size[1] / height
+
+
+@dataclass(frozen=True, eq=False)
+class Mask:
+    """Coverage of pixels by a shape, 0-1, in the part of a canvas where the shape lies."""
+
+    values: Floats
+    top: int
+    left: int
+
+    @property
+    def region(self) -> tuple[slice, slice]:
+        """Rows and columns of the part."""
+        height, width = self.values.shape
+        return slice(self.top, self.top + height), slice(self.left, self.left + width)
+
+    def _aligned(self, other: Mask) -> Floats:
+        """Values of another mask in this region, 0 where the other does not reach."""
+        values = np.zeros_like(self.values)
+        y1, x1 = max(self.top, other.top), max(self.left, other.left)
+        y2 = min(self.top + self.values.shape[0], other.top + other.values.shape[0])
+        x2 = min(self.left + self.values.shape[1], other.left + other.values.shape[1])
+        if y1 < y2 and x1 < x2:
+            inside = other.values[y1 - other.top : y2 - other.top, x1 - other.left : x2 - other.left]
+            values[y1 - self.top : y2 - self.top, x1 - self.left : x2 - self.left] = inside
+        return values
+
+    def __and__(self, other: Mask) -> Mask:
+        return Mask(self.values * self._aligned(other), self.top, self.left)
+
+    def __sub__(self, other: Mask) -> Mask:
+        return Mask(np.maximum(self.values - self._aligned(other), 0), self.top, self.left)
+
+
+class SurfaceCanvas:
+    """A canvas from `left` to `right` and `low` to `top` in meters, to paint polygons on."""
+
+    def __init__(self, left: float, right: float, low: float, top: float) -> None:
+        ppm = PIXELS_PER_METER
+        self.left, self.top = left, top
+        self.size = (round((top - low) * ppm), round((right - left) * ppm))
+        x = left + (np.arange(self.size[1], dtype=np.float32) + 0.5) / ppm
+        y = top - (np.arange(self.size[0], dtype=np.float32) + 0.5) / ppm
+        self.x: Floats = x[None, :].astype(np.float32)
+        self.y: Floats = y[:, None].astype(np.float32)
+        self.color: Floats = np.zeros((*self.size, 3), np.float32)
+        self.alpha: Floats = np.zeros(self.size, np.float32)
+
+    def polygon(self, points: ArrayLike, *, soften: float = 0.0) -> Mask:
+        """Mask of a polygon of ``(x, y)`` points, blurred by `soften` meters."""
+        corners = (np.asarray(points, np.float64) - (self.left, self.top)) * (1, -1) * PIXELS_PER_METER - 0.5
+        margin = 2 + int(3 * soften * PIXELS_PER_METER)
+        x1, y1 = np.maximum(np.floor(corners.min(0)).astype(int) - margin, 0).tolist()
+        x2, y2 = np.minimum(np.ceil(corners.max(0)).astype(int) + margin + 1, self.size[::-1]).tolist()
+        if x1 >= x2 or y1 >= y2:
+            return Mask(np.zeros((0, 0), np.float32), 0, 0)
+        filled = np.zeros((y2 - y1, x2 - x1), np.uint8)
+        cv2.fillPoly(filled, [np.rint((corners - (x1, y1)) * 16).astype(np.int32)], 255, cv2.LINE_AA, 4)
+        values = filled.astype(np.float32) / 255
+        if soften:
+            values = cv2.GaussianBlur(values, (0, 0), soften * PIXELS_PER_METER)  # type: ignore[assignment]
+        return Mask(np.asarray(values, np.float32), y1, x1)
+
+    def box(self, x: float, y: float, width: float, height: float, *, radius: float = 0.0) -> Mask:
+        """Mask of a box centered at ``(x, y)`` with rounded corners."""
+        w, h = width / 2, height / 2
+        return self.polygon(
+            round_corners([(x - w, y - h), (x + w, y - h), (x + w, y + h), (x - w, y + h)], radius)
+        )
+
+    def paint(self, mask: Mask, color: ArrayLike, opacity: float = 1.0) -> None:
+        """Composite a color, or an ``(H, W, 3)`` image of colors, under a mask."""
+        paint = np.asarray(color, np.float32)
+        if paint.ndim == 3:
+            paint = np.broadcast_to(paint, self.color.shape)[mask.region]
+        blend(self.color[mask.region], paint, (mask.values * opacity)[..., None])
+
+    def multiply(self, mask: Mask, gain: float) -> None:
+        """Multiply the color under a mask by `gain`."""
+        self.color[mask.region] *= (1 + mask.values * (gain - 1))[..., None]
+
+    def make_opaque(self, mask: Mask) -> None:
+        """Add a mask to the opaque part of the canvas."""
+        alpha = self.alpha[mask.region]
+        np.maximum(alpha, mask.values, out=alpha)
+
+    def surface(self, depth: Floats | None = None) -> Surface:
+        """Return what has been painted."""
+        color = np.clip(self.color, 0, 255) * self.alpha[..., None]
+        return Surface(np.dstack([color, self.alpha * 255]), self.left, self.top, depth)
+
+
+def round_corners(corners: ArrayLike, radius: float) -> Outline:
+    """Replace each corner of a polygon by a curve that starts `radius` before it."""
+    points = np.asarray(corners, np.float64)
+    if radius <= 0:
+        return points
+    t = np.linspace(0, 1, 7)[:, None]
+    curves = []
+    for before, corner, after in zip(np.roll(points, 1, 0), points, np.roll(points, -1, 0)):
+        start, end = (
+            corner + (other - corner) * min(0.5, radius / max(float(np.linalg.norm(other - corner)), 1e-9))
+            for other in (before, after)
+        )
+        curves.append((1 - t) ** 2 * start + 2 * t * (1 - t) * corner + t**2 * end)
+    return np.concatenate(curves)
