@@ -1,6 +1,8 @@
 """Helpers shared by the tests."""
 
 import functools
+import signal
+import subprocess
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +26,23 @@ from vehicle_detection.synthetic import render_scene
 
 ROOT = Path(__file__).parents[1]
 """Root of the repository."""
+
+
+def start_interruptible(*command, **options):
+    """Start a program that SIGINT interrupts, even if pytest is a background job, which ignores SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return subprocess.Popen(
+            [str(word) for word in command],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            **options,
+        )
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def random_template(params, seed=0, *, bias=0.0):
@@ -61,15 +80,15 @@ def random_mixture(**options):
 
 SMALL_MIXTURE = MixtureParams(
     shapes=((6, 5),),
-    facing=(False,),
+    mirrored=(False,),
     border_shapes=(),
     size_prior_weight=0.0,
     vote_weight=0.0,
     C=5e-3,
     border_C=5e-3,
-    vehicles=100.0,
-    rounds=(0.5, 1.0, 1.0),
-    per_frame=20,
+    positive_weight=100.0,
+    mining_schedule=(0.5, 1.0, 1.0),
+    max_per_frame=20,
     search=PyramidParams(min_width=28),
 )
 

@@ -279,9 +279,7 @@ def test_search_presets_fit_common_frame_sizes(shape, preset):
 @pytest.mark.parametrize("shape", [(40, 40), (10, 10), (1, 1), (15, 100)])
 @pytest.mark.parametrize("preset", ["default", "three-scales", "130-windows"])
 def test_a_tiny_frame_is_rejected(shape, preset):
-    message = (
-        f"^image of {shape[1]}x{shape[0]} pixels holds no search window .*; pass a larger image"
-    )
+    message = f"^image of {shape[1]}x{shape[0]} pixels holds no search window .*; pass a larger image"
     with pytest.raises(InvalidInputError, match=message):
         SearchParams.preset(preset).place(shape)
 
