@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks._frames import shown_boxes
 from benchmarks._material import Context
 from benchmarks._report import Row, at_least, at_most
 from vehicle_detection import (
@@ -20,6 +19,7 @@ from vehicle_detection import (
     read_labels,
     render_drive,
 )
+from vehicle_detection.evaluation import FrameBoxes
 from vehicle_detection.synthetic import Drive
 
 FRAMES = 200
@@ -58,7 +58,9 @@ def drive_rows(name: str, drive: Drive, detector: VehicleDetector, context: Cont
     results = [detector.process(scene.image, index / drive.fps) for index, scene in enumerate(drive)]
     labels = context.work / f"{name}.csv"
     drive.write_labels(labels)
-    scores = evaluate_tracks(shown_boxes(results), read_labels(labels), frames=range(len(results)))
+    scores = evaluate_tracks(
+        FrameBoxes.from_results(results), read_labels(labels), frames=range(len(results))
+    )
     errors = range_errors(drive, results)
     material, details = f"{FRAMES} rendered frames each", scores.to_dict()
     return [

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from benchmarks._material import CLIP, Context, clip, data_folder, drawn_drive
 from benchmarks._report import Row, Target, at_least, at_most
 from vehicle_detection import (
-    FrameResult,
     VehicleDetector,
     evaluate_detections,
     evaluate_tracks,
@@ -61,7 +57,9 @@ def _clip_rows(
     with VehicleDetector(model) as detector, read_frames(source) as frames:
         detector.reset(fps=float(frames.info.fps))
         results = [detector.process(frame, time) for _, time, frame in frames]
-    scores = evaluate_tracks(shown_boxes(results), read_labels(labels), frames=range(len(results)))
+    scores = evaluate_tracks(
+        FrameBoxes.from_results(results), read_labels(labels), frames=range(len(results))
+    )
     false_run, details = scores.longest_false_positive_run, scores.to_dict()
     return [
         Row(f"{name}: F1", scores.f1, target=at_least(min_f1), material=material, details=details),
@@ -70,14 +68,3 @@ def _clip_rows(
         Row(f"{name}: identity switches", scores.id_switches, target=Target("=", 0)),
         Row(f"{name}: longest false run", false_run, unit="frames", target=at_most(3)),
     ]
-
-
-def shown_boxes(results: Iterable[FrameResult]) -> FrameBoxes:
-    """Boxes of the tracks that are drawn, as predictions."""
-    rows = [(result.index, track) for result in results for track in result.shown]
-    return FrameBoxes(
-        [index for index, _ in rows],
-        np.array([track.id for _, track in rows], np.int64),
-        np.array([track.box for _, track in rows], np.float64).reshape(-1, 4),
-        scores=np.array([track.score for _, track in rows], np.float64),
-    )
