@@ -77,7 +77,7 @@ def scene_of(seed):
 
 
 def drawn(seeds, name="road"):
-    """Drawn scenes with the boxes of their vehicles; narrow or half hidden ones are to be ignored."""
+    """Rendered scenes with the boxes of their vehicles; narrow or largely occluded ones are ignored."""
     scenes = [scene_of(seed) for seed in seeds]
     keys, boxes, ignore = [], [], []
     for key, scene in enumerate(scenes):
