@@ -1,4 +1,4 @@
-"""Labelled frames: how many vehicles are found, how well the boxes fit, who stays who."""
+"""Detection and tracking on labelled frames: F1, IoU, jitter and identity switches."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ from vehicle_detection.evaluation import FrameBoxes, TrackScores
 
 
 def run(context: Context) -> list[Row]:
-    """Score stills by `detect` and clips by `process`; a drawn drive where the real frames are missing."""
+    """Score images by `detect` and clips by `process`; without the real data, a rendered drive."""
     folder = data_folder()
     if folder is None:
         source, material = clip(context.work)
         truth = context.work / "drive.csv"
         drawn_drive().write_labels(truth)
-        return _clip_rows("drive", source, truth, material=material, judged=False)
+        return _clip_rows("drive", source, truth, material=material, has_targets=False)
     labels, videos = folder / "labels", folder / "videos"
-    note = "IoU 0.5; both models were trained on pictures of this road, which flatters them"
+    note = "IoU 0.5; both models were trained on images of this road, which favors them"
     rows: list[Row] = []
     for model in ("default", "highway"):
-        rows += _still_rows(model, folder / "test_images", labels / "test_images.csv", note)
-        for clip_name, least in (("test_video", 1.0), (CLIP, 0.99)):
+        rows += _image_rows(model, folder / "test_images", labels / "test_images.csv", note)
+        for clip_name, min_f1 in (("test_video", 1.0), (CLIP, 0.99)):
             files = videos / f"{clip_name}.mp4", labels / f"{clip_name}.csv"
-            rows += _clip_rows(f"{model}: {clip_name}", *files, model=model, least=least)
+            rows += _clip_rows(f"{model}: {clip_name}", *files, model=model, min_f1=min_f1)
     return rows
 
 
-def _still_rows(model: str, folder: Path, labels: Path, material: str) -> list[Row]:
+def _image_rows(model: str, folder: Path, labels: Path, material: str) -> list[Row]:
     with VehicleDetector(load_model(model)) as detector:
         found = FrameBoxes.from_detections(
             {name: detector.detect(image) for name, image in load_frames(folder)}
@@ -49,13 +49,13 @@ def _still_rows(model: str, folder: Path, labels: Path, material: str) -> list[R
     scores = evaluate_detections(found, read_labels(labels))
     return [
         Row(
-            what=f"{model}: test_images: F1",
-            value=scores.f1,
+            f"{model}: test_images: F1",
+            scores.f1,
             target=at_least(1.0),
             material=material,
             details=scores.to_dict(),
         ),
-        Row(what=f"{model}: test_images: mean IoU", value=scores.mean_iou, target=at_least(0.80)),
+        Row(f"{model}: test_images: mean IoU", scores.mean_iou, target=at_least(0.80)),
     ]
 
 
@@ -65,24 +65,24 @@ def _clip_rows(
     labels: Path,
     *,
     model: str = "default",
-    least: float = 1.0,
+    min_f1: float = 1.0,
     material: str = "",
-    judged: bool = True,
+    has_targets: bool = True,
 ) -> list[Row]:
     scores = track_scores(source, labels, model)
     values: list[tuple[str, float, str, Target]] = [
-        ("F1", scores.f1, "", at_least(least)),
+        ("F1", scores.f1, "", at_least(min_f1)),
         ("mean IoU", scores.mean_iou, "", at_least(0.80)),
-        ("jitter", scores.jitter, "px a frame", at_most(1.5)),
+        ("jitter", scores.jitter, "px/frame", at_most(1.5)),
         ("identity switches", scores.id_switches, "", Target("=", 0)),
         ("longest false run", scores.longest_false_positive_run, "frames", at_most(3)),
     ]
     return [
         Row(
-            what=f"{name}: {what}",
-            value=value,
+            f"{name}: {what}",
+            value,
             unit=unit,
-            target=target if judged else None,
+            target=target if has_targets else None,
             material=material,
             details=scores.to_dict() if what == "F1" else {},
         )
@@ -91,7 +91,7 @@ def _clip_rows(
 
 
 def track_scores(source: Path, labels: Path, model: str = "default") -> TrackScores:
-    """Follow the vehicles of a clip and score what would be drawn."""
+    """Track the vehicles of a clip and score the tracks that are drawn."""
     with VehicleDetector(load_model(model)) as detector, read_frames(source) as frames:
         detector.reset(fps=float(frames.info.fps))
         results = [detector.process(frame, time) for _, time, frame in frames]

@@ -14,6 +14,13 @@ from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
 from vehicle_detection.images import write_image
+from vehicle_detection.mixture import (
+    N_CHANNELS,
+    N_REGRESSION_FEATURES,
+    BoxRegressor,
+    MixtureTemplate,
+    TemplateMixture,
+)
 from vehicle_detection.params import MixtureParams, PyramidParams
 from vehicle_detection.synthetic import render_scene
 
@@ -56,17 +63,32 @@ def random_classifier(params, seed=0, *, templates=1, bias=0.0):
     )
 
 
+def mixture_template(columns=9, rows=8, seed=0, bias=0.0, padding=(1.0, 1.0), *, border=False):
+    """A template of a mixture with random weights."""
+    weights = np.random.default_rng(seed).normal(0, 0.05, (rows, columns, N_CHANNELS))
+    return MixtureTemplate(weights, bias, padding, border)
+
+
+def random_mixture(**options):
+    """A mixture that was never trained; some of all windows score above 0."""
+    shapes = ((9, 8), (12, 8), (8, 10))
+    templates = tuple(mixture_template(*shape, seed, -0.2) for seed, shape in enumerate(shapes))
+    rng = np.random.default_rng(3)
+    weights = rng.normal(0, 1e-3, (N_REGRESSION_FEATURES, 4))
+    return TemplateMixture(templates, BoxRegressor(weights, rng.normal(0, 0.01, 4)), **options)
+
+
 SMALL_MIXTURE = MixtureParams(
     shapes=((6, 5),),
-    facing=(False,),
+    mirrored=(False,),
     border_shapes=(),
     size_prior_weight=0.0,
     vote_weight=0.0,
     C=5e-3,
     border_C=5e-3,
-    vehicles=100.0,
-    rounds=(0.5, 1.0, 1.0),
-    per_frame=20,
+    positive_weight=100.0,
+    mining_schedule=(0.5, 1.0, 1.0),
+    max_per_frame=20,
     search=PyramidParams(min_width=28),
 )
 

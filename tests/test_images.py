@@ -115,7 +115,9 @@ def test_a_truncated_file_is_refused(tmp_path, picture, suffix, fraction):
     data = encoded(suffix, bgr(picture))
     file = tmp_path / f"cut{suffix}"
     file.write_bytes(data[: int(len(data) * fraction)])
-    with pytest.raises(InvalidInputError, match=r"image file .*cut.* must be a complete image file .*decoded"):
+    with pytest.raises(
+        InvalidInputError, match=r"image file .*cut.* must be a complete image file .*decoded"
+    ):
         read_image(file)
 
 

@@ -70,7 +70,14 @@ from .search import SearchResult, find_cars
 from .synthetic import render_drive, render_patches, render_scene
 from .tracking import Track, Tracker
 from .training import train_and_evaluate
-from .tuning import compare_configurations, mine_negatives, read_results, search_parameters
+from .tuning import (
+    TrialOptions,
+    compare_configurations,
+    mine_negatives,
+    pareto_front,
+    read_results,
+    search_parameters,
+)
 from .video import VideoInfo, VideoReport, probe_video, process_video, read_frames
 from .windows import search_windows, slide_window
 
@@ -108,6 +115,7 @@ __all__ = [
     "TrackScores",
     "TrackWriter",
     "Tracker",
+    "TrialOptions",
     "VehicleClassifier",
     "VehicleDetectionError",
     "VehicleDetector",
@@ -148,6 +156,7 @@ __all__ = [
     "load_training_patches",
     "mine_negatives",
     "non_max_suppression",
+    "pareto_front",
     "plotting",
     "precision_recall_curve",
     "probe_video",

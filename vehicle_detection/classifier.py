@@ -1,9 +1,9 @@
-"""The linear SVM of patches: the classifier, its training and its model file."""
+"""The linear SVM classifier of 64x64 patches: prediction, training and model file."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -35,26 +35,19 @@ if TYPE_CHECKING:
     from vehicle_detection.search import FrameSearch
 
 KIND = "patches"
-"""Kind of the model files that hold a classifier of patches."""
+"""Value of ``kind`` in the model files of patch classifiers."""
 
-_CHUNK = 1024
+DEFAULT_C = 1e-4
 
+CLASSIFIER_REMEDY = "load_classifier, train_classifier or VehicleClassifier.from_pipeline make one"
+
+_CHUNK = 1024  # Rows converted to float64 at a time.
 _TENSORS = ("mean", "scale", "coef", "intercept")
 
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """One linear SVM over a window of 8x8 cells and the scaler it was trained behind.
-
-    Attributes
-    ----------
-    mean, scale
-        ``(length,)`` float64: the scaler subtracts and divides by them.
-    coef
-        ``(length,)`` float64 weights of the scaled features.
-    intercept
-        Added to the weighted sum.
-    """
+    """A linear SVM on scaled features: ``score = coef @ ((x - mean) / scale) + intercept``."""
 
     mean: NDArray[np.float64]
     scale: NDArray[np.float64]
@@ -66,7 +59,7 @@ class Template:
             column = np.array(getattr(self, name), np.float64)
             if column.ndim != 1 or column.shape != np.shape(self.mean):
                 raise InvalidInputError(
-                    f"{name} must be a vector as long as the features ({np.shape(self.mean)}); "
+                    f"{name} must be a vector of the features' length {np.shape(self.mean)}; "
                     f"got {describe(column)}"
                 )
             if not np.isfinite(column).all():
@@ -79,7 +72,7 @@ class Template:
             raise InvalidInputError(f"intercept must be finite; got {self.intercept}")
 
     def fold(self) -> tuple[NDArray[np.float64], float]:
-        """Scaler and SVM as one affine function ``score = weights . features + bias``."""
+        """Weights and bias of the equivalent affine function ``score = weights @ x + bias``."""
         weights = self.coef / self.scale
         return weights, float(self.intercept - weights @ self.mean)
 
@@ -91,11 +84,11 @@ class VehicleClassifier:
     Attributes
     ----------
     params
-        The features it is trained on.
+        Parameters of the features.
     templates
-        One or more `Template`; a patch's score is the best of them.
+        One or more linear SVMs; the score of a patch is their maximum.
     metadata
-        What the model file tells about itself: training, accuracy, data, versions. JSON values only.
+        JSON values kept in the model file: training options, metrics, data, versions.
 
     Examples
     --------
@@ -117,12 +110,12 @@ class VehicleClassifier:
         for template in self.templates:
             if template.coef.shape != (self.params.length,):
                 raise InvalidInputError(
-                    f"templates must have {self.params.length} weights, as the parameters say; "
+                    f"templates must have {self.params.length} weights, the length of the features; "
                     f"got {len(template.coef)}"
                 )
 
     def decision_function(self, X: ArrayLike) -> NDArray[np.float64]:
-        """Signed distance from the separating plane; positive is a vehicle.
+        """Score of each patch: its signed distance from the separating hyperplane, positive for a vehicle.
 
         Parameters
         ----------
@@ -143,27 +136,29 @@ class VehicleClassifier:
         folded = [template.fold() for template in self.templates]
         scores = np.empty((len(folded), len(features)))
         for start in range(0, len(features), _CHUNK):
-            # Float64 copies of a chunk, not of features that may fill half the memory.
+            # Convert in chunks: a float64 copy of all features may not fit into memory.
             rows = features[start : start + _CHUNK].astype(np.float64)
             for row, (weights, bias) in zip(scores, folded):
                 row[start : start + _CHUNK] = rows @ weights + bias
         return np.asarray(scores.max(axis=0), np.float64)
 
     def predict(self, X: ArrayLike) -> NDArray[np.int64]:
-        """1 for a vehicle and 0 for anything else, ``(N,)`` int64; arguments as `decision_function`."""
+        """Predict 1 for a vehicle and 0 otherwise, ``(N,)`` int64; `X` as in `decision_function`."""
         return (self.decision_function(X) > 0).astype(np.int64)
 
     def score(self, X: ArrayLike, y: ArrayLike) -> float:
-        """Share of right predictions for the labels `y`, 0-1."""
+        """Accuracy: fraction of correct predictions for the labels `y`."""
         labels = np.asarray(y)
         predicted = self.predict(X)
         if labels.shape != predicted.shape or not labels.size:
             raise InvalidInputError(
-                f"y must be one label for each of {len(predicted)} rows, at least one; got {describe(labels)}"
+                f"y must hold one label for each of {len(predicted)} rows (at least one); "
+                f"got {describe(labels)}"
             )
         return float(np.mean(predicted == labels))
 
     def _features_of(self, X: ArrayLike) -> NDArray[Any]:
+        """Check feature vectors, or extract those of patches: ``(N, length)``."""
         array = np.asarray(X)
         if array.ndim == 4:
             return extract_features(check_patches(array, PATCH_SIZE, "X"), self.params)
@@ -180,21 +175,21 @@ class VehicleClassifier:
     def from_pipeline(
         cls, pipeline: Pipeline, params: FeatureParams, *, metadata: Mapping[str, Any] | None = None
     ) -> VehicleClassifier:
-        """Take over a fitted scikit-learn pipeline that ends in ``StandardScaler`` and ``LinearSVC``.
+        """Convert a fitted scikit-learn pipeline that ends in ``StandardScaler`` and ``LinearSVC``.
 
         Parameters
         ----------
         pipeline
-            Fitted; a `PatchFeatures` step before the scaler is allowed.
+            A fitted pipeline; it may start with `PatchFeatures`.
         params
-            The features that the scaler was fitted on.
+            Parameters of the features that the scaler was fitted on.
         metadata
-            Facts to keep in the model file.
+            JSON values to keep in the model file.
 
         Raises
         ------
         InvalidInputError
-            If the last two steps are others, not fitted, or of another length.
+            If the last two steps are different, not fitted, or fitted on features of another length.
         """
         steps = [step for _, step in pipeline.steps]
         names = [type(step).__name__ for step in steps]
@@ -214,12 +209,12 @@ class VehicleClassifier:
         return cls(params, (template,), metadata or {})
 
     def to_pipeline(self) -> Pipeline:
-        """Return a fitted scikit-learn pipeline: `PatchFeatures`, ``StandardScaler``, ``LinearSVC``.
+        """Convert to a fitted scikit-learn pipeline: `PatchFeatures`, ``StandardScaler``, ``LinearSVC``.
 
         Raises
         ------
         InvalidInputError
-            If the model has several templates: a pipeline holds one.
+            If the model has several templates.
         """
         from sklearn.pipeline import Pipeline
         from sklearn.preprocessing import StandardScaler
@@ -228,7 +223,9 @@ class VehicleClassifier:
         from vehicle_detection.features import PatchFeatures
 
         if len(self.templates) > 1:
-            raise InvalidInputError(f"a pipeline holds one template; this model has {len(self.templates)}")
+            raise InvalidInputError(
+                f"only a model with one template converts; this has {len(self.templates)}"
+            )
         template = self.templates[0]
         scaler = StandardScaler()
         scaler.mean_, scaler.scale_ = template.mean.copy(), template.scale.copy()
@@ -273,12 +270,12 @@ class VehicleClassifier:
         return title, {name: str(value) for name, value in asdict(self.params).items()}
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the model as a safetensors file: tensors and JSON, nothing that runs when loaded.
+        """Write the model as a safetensors file (tensors and JSON, no pickle).
 
         Raises
         ------
         InvalidInputError
-            If the folder is missing or read-only, or the metadata holds more than JSON values.
+            If the folder is missing or read-only, or `metadata` holds other values than JSON.
         """
         tensors = {
             f"{index}.{name}": np.atleast_1d(np.asarray(getattr(template, name), np.float64))
@@ -286,9 +283,6 @@ class VehicleClassifier:
             for name in _TENSORS
         }
         write_model(path, KIND, asdict(self.params), tensors, self.metadata)
-
-
-DEFAULT_C = 1e-4
 
 
 def train_classifier(
@@ -304,41 +298,49 @@ def train_classifier(
     n_jobs: int | None = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> VehicleClassifier:
-    """Fit a scaler and a linear SVM on patches.
+    """Train a linear SVM behind a feature scaler on patches.
 
     Parameters
     ----------
     patches
-        ``(N, 64, 64, 3)`` uint8 RGB: the training part only; nothing else is seen.
+        ``(N, 64, 64, 3)`` uint8 RGB training patches.
     labels
-        ``(N,)``, 1 (or True) for a vehicle, 0 for anything else.
+        ``(N,)``, 1 (or True) for a vehicle, 0 otherwise.
     params
         Features; the default is ``FeatureParams()``.
     C
-        Inverse strength of the regularisation. Small values generalise better to other sequences.
+        Inverse regularization strength. Small values generalize better to other sequences.
     mirror
-        Add each patch mirrored left to right.
+        Add the mirror image of each patch.
     gamma
-        Give the mirrored patches another brightness: exponents between ``exp(-gamma)`` and ``exp(gamma)``.
+        Brightness jitter of the mirrored patches: gamma exponents between ``exp(-gamma)`` and
+        ``exp(gamma)``.
     degraded
-        Weight of two more copies of each patch, in [0, 1]: one coarse, as from further away, and one coarse,
-        pale and compressed, as of another camera. It helps most on other cameras; 0 leaves them out.
+        Weight, in [0, 1], of two further copies of each patch: a blurred one, and one that is blurred,
+        desaturated and compressed. They help on images of other cameras. 0 leaves them out.
     random_state
         Seed of the solver.
     n_jobs
         Threads of the feature extraction.
     metadata
-        Facts to keep in the model file.
+        JSON values to keep in the model file.
 
     Returns
     -------
     VehicleClassifier
-        With one template. The same input and seed give the same model.
+        A classifier with one template. The same input and seed give the same model.
 
     Raises
     ------
     InvalidInputError
-        If a patch is malformed, the labels do not fit or hold one class only.
+        If a patch is malformed, the labels do not match the patches, or a class is missing.
+
+    Examples
+    --------
+    >>> from vehicle_detection import render_patches
+    >>> patches, labels = render_patches(20)
+    >>> train_classifier(patches, labels, params=FeatureParams(hog_channel=0)).score(patches, labels)
+    1.0
     """
     params = params or FeatureParams()
     images = check_patches(patches, PATCH_SIZE)
@@ -370,24 +372,28 @@ def patch_features(
     degraded: float = 0.0,
     n_jobs: int | None = None,
 ) -> NDArray[np.float32]:
-    """Features of all patches and below them, as asked for, of all mirrored, coarse and degraded ones."""
-    makers: list[Callable[[], NDArray[np.uint8]]] = [lambda: images]
-    if mirror:
-        makers.append(lambda: mirror_patches(images, gamma=gamma))
-    if degraded:
-        makers.append(lambda: blur_patches(images, mirror=mirror))
-        makers.append(lambda: degrade_patches(images, mirror=mirror))
-    if len(makers) == 1:
-        return extract_features(images, params, n_jobs=n_jobs)
-    count = len(images)
-    features = np.empty((len(makers) * count, params.length), np.float32)
-    for copy, make in enumerate(makers):
-        features[copy * count : (copy + 1) * count] = extract_features(make(), params, n_jobs=n_jobs)
+    """Features of all patches, followed by those of their mirrored, blurred and degraded copies."""
+    count, n_copies = len(images), len(copy_weights(mirror, degraded))
+    features = np.empty((n_copies * count, params.length), np.float32)
+    for copy, variant in enumerate(_augmented_copies(images, mirror, gamma, degraded)):
+        features[copy * count : (copy + 1) * count] = extract_features(variant, params, n_jobs=n_jobs)
     return features
 
 
+def _augmented_copies(
+    images: NDArray[np.uint8], mirror: bool, gamma: float, degraded: float
+) -> Iterator[NDArray[np.uint8]]:
+    """Yield the patches and their copies one after the other, to save memory."""
+    yield images
+    if mirror:
+        yield mirror_patches(images, gamma=gamma)
+    if degraded:
+        yield blur_patches(images, mirror=mirror)
+        yield degrade_patches(images, mirror=mirror)
+
+
 def copy_weights(mirror: bool, degraded: float) -> tuple[float, ...]:
-    """Weights of the copies of each patch that are trained on, in the order of `patch_features`."""
+    """Training weight of each copy of the patches, in the order of `patch_features`."""
     return (1.0, *(1.0,) * mirror, *(degraded, degraded) * (degraded > 0))
 
 
@@ -400,36 +406,31 @@ def fit_features(
     mirror: bool,
     gamma: float = 0.0,
     degraded: float = 0.0,
+    positive_weight: float = 1.0,
     random_state: int,
     rows: NDArray[np.intp] | None = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> VehicleClassifier:
-    """Fit a scaler and a linear SVM on features that `patch_features` computed; the caller checks.
+    """Train on features that `patch_features` computed with the same options; arguments are not checked.
 
-    Parameters
-    ----------
-    features
-        ``(copies * N, params.length)`` float32; not changed, and not copied.
-    labels
-        ``(N,)`` zeros and ones of the patches, both present.
-    rows
-        Patches to train on, with all their copies; all if None.
-    params, C, mirror, gamma, degraded, random_state, metadata
-        As in `train_classifier`; `mirror` and `degraded` tell which copies the features are of.
+    `features` is ``(copies * N, length)`` float32 and is not copied; `labels` is ``(N,)`` 0 or 1 with both
+    classes. `rows` are the patches to train on, with all their copies; None takes all. A misclassified
+    vehicle costs `positive_weight` times a misclassified non-vehicle.
     """
     weights = copy_weights(mirror, degraded)
     count = len(labels)
     chosen = np.arange(count) if rows is None else rows
+    all_labels = np.tile(labels, len(weights))
     fitted = fit_svm(
         features,
-        np.tile(labels, len(weights)),
-        C * np.repeat(weights, count),
+        all_labels,
+        C * np.repeat(weights, count) * np.where(all_labels == 1, positive_weight, 1.0),
         rows=np.concatenate([chosen + copy * count for copy in range(len(weights))]),
         gains=params.gains,
         random_state=random_state,
     )
     vehicles = int(labels[chosen].sum())
-    facts = {
+    all_metadata = {
         "training": {
             "C": C,
             "mirror": mirror,
@@ -442,7 +443,7 @@ def fit_features(
         "versions": {"vehicle_detection": vehicle_detection.__version__, **_library_versions()},
         **(metadata or {}),
     }
-    return VehicleClassifier(params, (Template(*fitted),), facts)
+    return VehicleClassifier(params, (Template(*fitted),), all_metadata)
 
 
 def _library_versions() -> dict[str, str]:
@@ -452,11 +453,11 @@ def _library_versions() -> dict[str, str]:
 
 
 def check_labels(labels: ArrayLike, count: int) -> NDArray[np.int64]:
-    """Return `labels` as `count` zeros and ones with both classes present."""
+    """Return `labels` as `count` integers 0 or 1, both of which must occur."""
     array = np.asarray(labels)
     if array.shape != (count,) or array.dtype.kind not in "biuf":
         raise InvalidInputError(
-            f"labels must be one number for each of {count} patches; got {describe(array)}"
+            f"labels must hold one number for each of {count} patches; got {describe(array)}"
         )
     if not np.isin(array, (0, 1)).all():
         raise InvalidInputError(f"labels must be 0 or 1; got {np.unique(array)[:5].tolist()}")
@@ -466,31 +467,27 @@ def check_labels(labels: ArrayLike, count: int) -> NDArray[np.int64]:
 
 
 def check_gamma(gamma: object, mirror: bool) -> float:
-    """Return `gamma` if it is one that patches with or without mirrored ones can have."""
+    """Return `gamma` if it is in range, and 0 without mirrored patches."""
     number = check_number(gamma, "gamma", low=0, high=2)
     if number and not mirror:
         raise InvalidInputError(
-            f"gamma must be 0 without mirrored patches, whose brightness it changes; got {number:g}"
+            f"gamma must be 0 with mirror=False, as it changes the mirrored patches; got {number:g}"
         )
     return number
 
 
-CLASSIFIER_REMEDY = "load_classifier, train_classifier or VehicleClassifier.from_pipeline make one"
-
-
 def load_classifier(path: str | os.PathLike[str] | None = None) -> VehicleClassifier:
-    """Load a classifier of patches: a model file, or the one that the package ships, ``"highway"``.
+    """Load a patch classifier from a model file, or the shipped model ``"highway"``.
 
     Parameters
     ----------
     path
-        A ``.safetensors`` file written by `VehicleClassifier.save`; None loads the shipped one.
+        A ``.safetensors`` file written by `VehicleClassifier.save`; None loads ``"highway"``.
 
     Raises
     ------
     ModelFileError
-        If the file is missing, cut, edited, of another kind or version, holds NaN, or does not fit its own
-        parameters.
+        If the file is missing, damaged, edited, of another kind or version, or inconsistent.
 
     Examples
     --------
@@ -501,7 +498,7 @@ def load_classifier(path: str | os.PathLike[str] | None = None) -> VehicleClassi
 
 
 def build_classifier(model: ModelData) -> VehicleClassifier:
-    """Build a classifier from what a model file holds."""
+    """Build a classifier from the contents of a model file."""
     tensors = model.tensors
     try:
         count = len({key.split(".")[0] for key in tensors})

@@ -26,7 +26,9 @@ def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
         except cv2.error:
             image = None
     if image is None or _is_truncated(data):
-        raise InvalidInputError(f"{name} must be a complete image file (PNG, JPEG, ...); it cannot be decoded")
+        raise InvalidInputError(
+            f"{name} must be a complete image file (PNG, JPEG, ...); it cannot be decoded"
+        )
     return np.asarray(image, np.uint8)
 
 

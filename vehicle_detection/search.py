@@ -19,8 +19,9 @@ from __future__ import annotations
 
 import threading
 import time
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -91,18 +92,37 @@ class SearchResult:
         return cls(windows, vehicles, (height, width), thumbnail, time.perf_counter() - start)
 
 
-class FrameSearch(Protocol):
-    """Interface of what ``model.open_search()`` returns, for either kind of model."""
+class FrameSearch(ABC):
+    """What ``model.open_search()`` returns for either kind of model: threads and memory kept between frames.
 
+    Searches are thread-safe context managers.
+    """
+
+    def __init__(self, n_jobs: int | None) -> None:
+        self._team = ThreadTeam(n_jobs, name="search")
+        self._local = threading.local()
+
+    @abstractmethod
     def find(
         self, frame: NDArray[np.uint8], params: Any = None, *, min_vehicle_score: float = 0.0
     ) -> SearchResult:
-        """Search a frame; thread-safe."""
-        ...
+        """Search a frame."""
+
+    @property
+    def workspace(self) -> Workspace:
+        """Scratch arrays of the calling thread."""
+        workspace: Workspace = self._local.__dict__.setdefault("workspace", Workspace())
+        return workspace
 
     def close(self) -> None:
         """Stop the threads; they start again on the next search."""
-        ...
+        self._team.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 def find_cars(
@@ -148,24 +168,13 @@ def find_cars(
         return search.find_windows(image, SearchParams.preset() if params is None else params)
 
 
-class BandSearch:
-    """The fast search, with filters and workspace kept from frame to frame; thread-safe."""
+class BandSearch(FrameSearch):
+    """The fast search with one template or a few that share the features of a band."""
 
     def __init__(self, classifier: VehicleClassifier, *, n_jobs: int | None = None) -> None:
         check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
+        super().__init__(n_jobs)
         self._filters = _Filters(classifier)
-        self._team = ThreadTeam(n_jobs, name="search")
-        self._local = threading.local()
-
-    def __enter__(self) -> BandSearch:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End the threads."""
-        self._team.close()
 
     def find(
         self,
@@ -198,15 +207,16 @@ class BandSearch:
         Entry ``[i, j]`` is the window that starts at row `i` and column `j` of the resized band's cells. With
         several templates, it is the maximum of their scores.
         """
-        workspace = self._local.__dict__.setdefault("workspace", Workspace())
+        workspace = self.workspace
         return self._filters.score_map(resize_band(image, band, workspace), workspace)
 
 
-class ReferenceSearch:
+class ReferenceSearch(FrameSearch):
     """The reference search: the windows of the same bands by `search_windows`, one patch per window."""
 
     def __init__(self, classifier: VehicleClassifier, *, n_jobs: int | None = None) -> None:
         check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
+        super().__init__(n_jobs)
         self._classifier, self._n_jobs = classifier, n_jobs
 
     def find(
@@ -227,9 +237,6 @@ class ReferenceSearch:
             frame, windows, self._classifier, min_score=params.min_score, n_jobs=self._n_jobs
         )
         return SearchResult.of(frame, found, None, start=start)
-
-    def close(self) -> None:
-        """Nothing to release."""
 
 
 def resized_shape(band: PixelBand) -> tuple[int, int]:

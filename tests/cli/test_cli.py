@@ -412,7 +412,7 @@ def test_video_can_be_quiet_and_take_a_part(clip, tmp_path):
 
 def test_video_estimates_the_horizon(clip, tmp_path, monkeypatch):
     words = ["video", clip, "-o", tmp_path / "out.mp4", "--end", 0.12, "--horizon", "auto"]
-    found = HorizonEstimate(horizon=0.551, error=0.012, camera_height_m=1.3, boxes=40)
+    found = HorizonEstimate(horizon=0.551, horizon_std=0.012, camera_height_m=1.3, n_boxes=40)
     monkeypatch.setattr(video, "estimate_video_horizon", lambda *_, **__: found)
     assert "horizon 0.551 (standard error 0.012, 40 boxes)" in succeed(*words)
     monkeypatch.setattr(video, "estimate_video_horizon", lambda *_, **__: None)

@@ -1,6 +1,5 @@
-import json
-
 import numpy as np
+import pandas as pd
 import pytest
 
 from tests.plotting.helpers import drawn_boxes, gray_image, legend, new_axes, texts
@@ -16,7 +15,6 @@ from vehicle_detection.evaluation import (
 )
 from vehicle_detection.images import write_image
 from vehicle_detection.plotting.style import VERMILION
-from vehicle_detection.tuning import ResultTable
 
 
 def labelled():
@@ -96,7 +94,7 @@ def test_malformed_options_of_the_errors_are_rejected():
         plotting.plot_errors(frames, found, kind="wrong")
     with pytest.raises(InvalidInputError, match="frames must be a LabelledFrames, got"):
         plotting.plot_errors([gray_image()], found)
-    with pytest.raises(InvalidInputError, match="predictions must be Labels, got"):
+    with pytest.raises(InvalidInputError, match="predictions must be FrameBoxes, got"):
         plotting.plot_errors(frames, Detections.empty())
     with pytest.raises(InvalidInputError, match=r"predictions hold frame 'x.png', which is not among the 3"):
         plotting.plot_errors(frames, found.renamed(lambda name: name.replace("c", "x")))
@@ -163,19 +161,33 @@ def test_metrics_are_plotted_by_source_and_detector():
         plotting.plot_f1({"old": {}})
 
 
-def rows(**columns):
-    return ResultTable([dict(zip(columns, values)) for values in zip(*columns.values())])
-
-
-def test_the_tradeoff_marks_the_front():
-    table = rows(configuration=["a", "b", "c"], accuracy=[0.97, 0.96, 0.99], search_ms=[4, 5, 9])
-    axes = plotting.plot_tradeoff(table, ax=new_axes())
-    assert axes.lines[0].get_xydata().tolist() == [[4, 0.97], [9, 0.99]]
-    assert texts(axes.texts) == ["a", "c"]
+def test_the_tradeoff_marks_the_pareto_front():
+    table = pd.DataFrame(
+        {
+            "configuration": ["a", "b", "c", "d"],
+            "accuracy": [0.97, 0.96, 0.99, None],
+            "search_ms": [4, 5, 9, 1],
+        }
+    )
+    given = new_axes()
+    assert plotting.plot_tradeoff(table, ax=given) is given
+    assert given.lines[0].get_xydata().tolist() == [[4, 0.97], [9, 0.99]]
+    assert given.collections[0].get_offsets().tolist() == [[4, 0.97], [5, 0.96], [9, 0.99]]
+    assert texts(given.texts) == ["a", "c"]
+    assert (given.get_xlabel(), given.get_ylabel()) == ("search ms", "accuracy")
+    other = plotting.plot_tradeoff(table, label=None)
+    assert other.figure is not given.figure
+    assert not other.texts
+    with pytest.raises(InvalidInputError, match="table has no column 'frame_f1'"):
+        plotting.plot_tradeoff(table, quality="frame_f1")
+    with pytest.raises(InvalidInputError, match="table has no column 'name'"):
+        plotting.plot_tradeoff(table, label="name")
+    with pytest.raises(InvalidInputError, match="table has no row with both accuracy and search_ms"):
+        plotting.plot_tradeoff(table[3:])
 
 
 def test_what_a_parameter_does():
-    table = rows(C=[1e-4, 1e-4, 1.0, None], split=["x"] * 4, accuracy=[0.9, 1.0, 0.8, 0.1])
+    table = pd.DataFrame({"C": [1e-4, 1e-4, 1.0, None], "split": ["x"] * 4, "accuracy": [0.9, 1.0, 0.8, 0.1]})
     axes = plotting.plot_parameter(table, "C", by="split", ax=new_axes())
     line = axes.lines[0]
     np.testing.assert_allclose(line.get_xydata(), [[1e-4, 0.95], [1.0, 0.8]])
@@ -188,7 +200,9 @@ def test_what_a_parameter_does():
 
 
 def test_a_parameter_of_words_and_one_of_few_numbers():
-    table = rows(color_space=["LUV", "YCrCb", "LUV"], orient=[8, 9, 9], frame_f1=[0.5, 0.75, 0.7])
+    table = pd.DataFrame(
+        {"color_space": ["LUV", "YCrCb", "LUV"], "orient": [8, 9, 9], "frame_f1": [0.5, 0.75, 0.7]}
+    )
     words = plotting.plot_parameter(table, "color_space", quality="frame_f1", ax=new_axes())
     assert texts(words.get_xticklabels()) == ["LUV", "YCrCb"]
     np.testing.assert_allclose(words.lines[0].get_xydata(), [[0, 0.6], [1, 0.75]])
@@ -197,19 +211,19 @@ def test_a_parameter_of_words_and_one_of_few_numbers():
     assert (
         plotting.plot_parameter(table, "orient", quality="frame_f1", ax=new_axes()).get_xscale() == "linear"
     )
-    with pytest.raises(InvalidInputError, match="column 'gamma' is none of the table's"):
+    with pytest.raises(InvalidInputError, match="table has no column 'gamma'"):
         plotting.plot_parameter(table, "gamma", quality="frame_f1")
     with pytest.raises(InvalidInputError, match="table has no row with both C and accuracy"):
-        plotting.plot_parameter(rows(C=[1.0], accuracy=[None]), "C")
+        plotting.plot_parameter(pd.DataFrame({"C": [1.0], "accuracy": [None]}), "C")
 
 
-def test_tables_from_json_are_drawn_too():
-    table = ResultTable(json.loads('[{"C": 1, "accuracy": 0.5}, {"C": "ALL", "accuracy": 0.6}]'))
+def test_a_parameter_of_numbers_and_text():
+    table = pd.DataFrame({"C": [1, "ALL"], "accuracy": [0.5, 0.6]})
     assert texts(plotting.plot_parameter(table, "C", ax=new_axes()).get_xticklabels()) == ["1", "ALL"]
 
 
 def test_many_lines_stay_apart():
-    table = rows(C=[1.0] * 9, seed=list(range(9)), accuracy=[0.9] * 9)
+    table = pd.DataFrame({"C": 1.0, "seed": range(9), "accuracy": 0.9})
     axes = plotting.plot_parameter(table, "C", by="seed", ax=new_axes())
     looks = {(str(line[0].get_color()), line[0].get_linestyle()) for line in axes.containers}
     assert len(looks) == 9

@@ -36,7 +36,7 @@ def test_the_horizon_from_two_frames_per_second(clip):
     found = estimate_video_horizon(clip, detector)
     assert detector.frames == 6
     assert found.horizon == pytest.approx(0.55, abs=0.01)
-    assert estimate_video_horizon(clip, detector, start=1, end=2).boxes == 40
+    assert estimate_video_horizon(clip, detector, start=1, end=2).n_boxes == 40
 
 
 def test_no_more_frames_than_necessary(clip):

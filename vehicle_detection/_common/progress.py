@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+from types import SimpleNamespace
 from typing import Any
+
+_HIDDEN = SimpleNamespace(update=lambda n=1: None, set_description=lambda text: None)
 
 
 def progress_bar(
@@ -13,15 +17,12 @@ def progress_bar(
     desc: str | None = None,
     terminal_only: bool = False,
 ) -> Any:
-    """Open a tqdm bar on standard error, with ``update(n=1)``; a hidden one if `show` is False.
+    """Context manager of a tqdm bar on standard error with ``update(n=1)`` and ``set_description(text)``.
 
-    With `terminal_only` the bar stays hidden unless standard error is a terminal. Use it in a ``with`` block.
+    Nothing is shown if `show` is False or, with `terminal_only`, if standard error is not a terminal.
     """
     if not show:
-        from tqdm import tqdm
+        return contextlib.nullcontext(_HIDDEN)
+    from tqdm.auto import tqdm
 
-        return tqdm(disable=True)
-    from tqdm.auto import tqdm as notebook_or_terminal_tqdm
-
-    disable = None if terminal_only else False
-    return notebook_or_terminal_tqdm(total=total, unit=unit, desc=desc, disable=disable)
+    return tqdm(total=total, unit=unit, desc=desc, disable=None if terminal_only else False)

@@ -325,7 +325,9 @@ def _estimate_horizon(
             )
         return None
     if not quiet:
-        typer.echo(f"horizon {found.horizon:.3f} (standard error {found.error:.3f}, {found.boxes} boxes)")
+        typer.echo(
+            f"horizon {found.horizon:.3f} (standard error {found.horizon_std:.3f}, {found.n_boxes} boxes)"
+        )
     return found.horizon
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,8 +13,9 @@ from vehicle_detection.cli.output import check_distinct_paths, print_table, run_
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from vehicle_detection.evaluation import LabelledFrames
-    from vehicle_detection.tuning import ResultTable
 
 _FIGURES = (".png", ".svg", ".pdf")
 _SHOWN = 15
@@ -58,7 +60,14 @@ def tune(
     """Try all combinations of a grid, and show which are best."""
     from vehicle_detection._common import check_choice, check_target
     from vehicle_detection.datasets import load_training_patches
-    from vehicle_detection.tuning import compare_configurations, expand_grid, parse_grid, search_parameters
+    from vehicle_detection.tuning import (
+        TrialOptions,
+        compare_configurations,
+        expand_grid,
+        parse_grid,
+        search_parameters,
+        write_results,
+    )
 
     values = parse_grid(grid)
     check_choice(split, "--split", ("sequences", "groups", "random"))
@@ -72,20 +81,20 @@ def tune(
     labelled = _read_frames(frames, labels, horizon)
     whole = out.suffix.lower() == ".parquet"  # Parquet takes no single rows: they are kept beside it.
     options: dict[str, Any] = {"store": out.with_suffix(".jsonl") if whole else out}
-    options |= {"frames": labelled, "cache": cache, "progress": True}
+    options |= {"options": TrialOptions(frames=labelled, cache=cache), "progress": True}
 
-    def work() -> ResultTable:
+    def work() -> DataFrame:
         patches = load_training_patches(vehicles, non_vehicles, progress=sys.stderr.isatty())
         if halving:
             return search_parameters(
-                patches, values, split=split, finalists=finalists, random_state=seed, **options
+                patches, values, split=split, n_finalists=finalists, random_state=seed, **options
             )
         return compare_configurations(patches, expand_grid(values), splits=split, seeds=(seed,), **options)
 
     table = run_interruptible(work)
     if whole:
-        table.write(out)
-    final = table.where(stage="final" if halving else "compare")
+        write_results(table, out)
+    final = table[table["stage"] == ("final" if halving else "compare")]
     _show(final, table)
     if plot is not None:
         _draw(final, plot)
@@ -103,14 +112,16 @@ def _read_frames(frames: Path | None, labels: Path | None, horizon: float | None
     return LabelledFrames(frames.name or "frames", load_frames(frames), read_labels(labels), horizon)
 
 
-def _show(final: ResultTable, table: ResultTable) -> None:
-    """Print the best rows, those of the best front with a star, and what could not be tried."""
-    measured = [row for row in final.sort("accuracy") if row["accuracy"] is not None] if len(final) else []
-    front = {row["trial"] for row in final.front()}
+def _show(final: DataFrame, table: DataFrame) -> None:
+    """Print the best rows, those of the Pareto front with a star, and what could not be tried."""
+    from vehicle_detection.tuning import pareto_front
+
+    measured = final[final["accuracy"].notna()].sort_values("accuracy", ascending=False, kind="stable")
+    front = set(pareto_front(final)["trial"])
     heads = ["", "configuration", "C", "accuracy", "training", "search ms"]
-    scored = any(row["frame_f1"] is not None for row in measured)
+    scored = bool(measured["frame_f1"].notna().any())
     rows = []
-    for row in measured[:_SHOWN]:
+    for row in measured.head(_SHOWN).to_dict("records"):
         cells = ["*" * (row["trial"] in front), row["configuration"], f"{row['C']:g}"]
         cells += [_text(row[name], 4) for name in ("accuracy", "train_accuracy")]
         cells += [_text(row["search_ms"], 1)]
@@ -118,16 +129,15 @@ def _show(final: ResultTable, table: ResultTable) -> None:
     heads += ["frames F1", "at best"] if scored else []
     title = f"{len(measured)} measured; * nothing is both more accurate and faster"
     print_table(title, heads, rows)
-    faults = {row["configuration"]: f"{row['status']}: {row['message']}" for row in table if row["message"]}
-    for name, fault in faults.items():
-        typer.echo(f"{name} {fault}")
+    for row in table[table["message"].notna()].drop_duplicates("configuration").to_dict("records"):
+        typer.echo(f"{row['configuration']} {row['status']}: {row['message']}")
 
 
-def _text(value: float | None, digits: int) -> str:
-    return "" if value is None else f"{value:.{digits}f}"
+def _text(value: float, digits: int) -> str:
+    return "" if math.isnan(value) else f"{value:.{digits}f}"
 
 
-def _draw(table: ResultTable, path: Path) -> None:
+def _draw(table: DataFrame, path: Path) -> None:
     from matplotlib.figure import Figure
 
     from vehicle_detection._common import atomic_write

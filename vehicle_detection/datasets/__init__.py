@@ -1,16 +1,14 @@
-"""Training patches: read, downloaded, split without leakage, and searched for near duplicates."""
+"""Training patches and frames: reading, download, splits and near duplicates."""
 
 from vehicle_detection.datasets.archives import fetch_patches
+from vehicle_detection.datasets.frames import FrameSet, load_frames
 from vehicle_detection.datasets.near_duplicates import find_near_duplicates, make_thumbnails
-from vehicle_detection.datasets.patches import (
-    FrameSet,
-    PatchSet,
-    load_frames,
-    load_patches,
-    load_training_patches,
-)
+from vehicle_detection.datasets.patches import PatchSet, load_patches, load_training_patches
 from vehicle_detection.datasets.splits import (
+    SEEDED_SPLITS,
+    SPLIT_NAMES,
     Split,
+    make_split,
     split_groups,
     split_leakage,
     split_random,
@@ -19,6 +17,8 @@ from vehicle_detection.datasets.splits import (
 )
 
 __all__ = [
+    "SEEDED_SPLITS",
+    "SPLIT_NAMES",
     "FrameSet",
     "PatchSet",
     "Split",
@@ -27,6 +27,7 @@ __all__ = [
     "load_frames",
     "load_patches",
     "load_training_patches",
+    "make_split",
     "make_thumbnails",
     "split_groups",
     "split_leakage",

@@ -1,4 +1,4 @@
-"""Where patches come from: course archives fetched and verified, folders and zips listed and decoded."""
+"""Sources of patches: download and verify the course's archives, list and decode folders and zip files."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import atomic_write, check_integer, describe
+from vehicle_detection._common import atomic_write, check_integer, describe, progress_bar
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import decode_image
 
-_log = logging.getLogger(__name__)
+_LOGGER = logging.getLogger(__name__)
 
 COURSE_URL = "https://s3.amazonaws.com/udacity-sdc/Vehicle_Tracking/"
-"""Web folder of ``vehicles.zip`` and ``non-vehicles.zip``."""
+"""Base URL of ``vehicles.zip`` and ``non-vehicles.zip``."""
 
 ARCHIVES: dict[str, dict[str, int]] = {
     "vehicles.zip": {
@@ -40,17 +40,17 @@ ARCHIVES: dict[str, dict[str, int]] = {
     },
     "non-vehicles.zip": {"non-vehicles/Extras": 5068, "non-vehicles/GTI": 3900},
 }
-"""Patches in each folder of each archive. Copies differ in their bytes, so no hash of the file is pinned."""
+"""Number of patches in each folder. Mirrors repack the archives, so there is no hash of the whole file."""
 
 CLASS_FOLDERS = {"vehicles": True, "cars": True, "nonvehicles": False, "notcars": False}
-"""Folder names, without hyphens and underscores, that say what their patches show."""
+"""Labels by folder name, without hyphens and underscores."""
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 STALE_SECONDS = 3600.0
-"""A partial download untouched for so long belongs to a process that was killed."""
+"""Age from which a partial download counts as left behind by a killed process."""
 
-# What zipfile raises on a damaged archive, depending on which byte is wrong; RuntimeError if it is encrypted.
+# Errors of zipfile on a damaged archive; RuntimeError if it is encrypted.
 _ZIP_ERRORS = (
     zipfile.BadZipFile,
     zlib.error,
@@ -66,28 +66,28 @@ _ZIP_ERRORS = (
 def natural_key(name: str) -> tuple[list[object], str]:
     """Sort key that puts ``image2`` before ``image10``."""
     parts = re.split(r"([0-9]+)", name)
-    # Digits compare by length, then as text: numbers of any length, whatever their leading zeros.
+    # Compare numbers by their number of digits, then as text: leading zeros do not count.
     numbers = [(len(digits.lstrip("0")), digits.lstrip("0")) for digits in parts[1::2]]
     return [item for pair in zip(parts[::2], [*numbers, (0, "")]) for item in pair], name
 
 
 def parent_folder(name: str) -> str:
-    """Everything of a patch's name before the file's own."""
+    """Folder part of a patch's name."""
     return name.rpartition("/")[0]
 
 
-def is_litter(name: str) -> bool:
-    """Whether a member or file is no data: hidden, or left behind by macOS."""
+def is_hidden(name: str) -> bool:
+    """Whether a file is hidden or a macOS resource file."""
     return any(part == "__MACOSX" or part.startswith(".") for part in name.split("/"))
 
 
 def is_image(name: str) -> bool:
-    """Whether a file's name is one of a PNG or JPEG that counts."""
-    return name.lower().endswith(IMAGE_SUFFIXES) and not is_litter(name)
+    """Whether a file name is that of a PNG or JPEG that is not hidden."""
+    return name.lower().endswith(IMAGE_SUFFIXES) and not is_hidden(name)
 
 
 def open_archive(path: Path, shown: str | None = None) -> zipfile.ZipFile:
-    """Open a zip for reading; a DatasetError says what the file is, if not a whole zip."""
+    """Open a zip for reading, or raise a DatasetError that says what the file is instead."""
     shown = shown or str(path)
     try:
         return zipfile.ZipFile(path)
@@ -100,26 +100,26 @@ def open_archive(path: Path, shown: str | None = None) -> zipfile.ZipFile:
                 f"{shown} cannot be read: {unreadable.strerror}; check the path and its permissions"
             ) from unreadable
         if head.startswith(b"PK"):
-            reason = "is a zip that is cut short or damaged; fetch it again"
+            reason = "is a damaged or incomplete zip; download it again"
         elif head.startswith(b"<"):
-            reason = "is a web page, not a zip (a login or proxy page?); open the address in a browser"
+            reason = "is a web page, not a zip (perhaps a login page); open the address in a browser"
         else:
-            reason = "is not a zip; pass a folder of patches or a whole .zip file"
+            reason = "is not a zip; pass a folder of patches or a .zip file"
         raise DatasetError(f"{shown} {reason}") from error
 
 
 @dataclass(frozen=True)
 class Listing:
-    """The images of one folder or zip in natural order: their names, and what each is read by."""
+    """Images of a folder or zip file in natural order."""
 
     path: Path
     is_zip: bool
-    names: tuple[str, ...]
-    members: tuple[str, ...]
+    names: tuple[str, ...]  # Names of the patches.
+    members: tuple[str, ...]  # Members of the zip, or paths relative to the folder.
 
     @contextlib.contextmanager
     def reader(self) -> Iterator[Callable[[str], bytes]]:
-        """Yield a function from member to bytes; each thread opens its own."""
+        """Yield a function that reads a member's bytes. It is not thread-safe: open one per thread."""
         if self.is_zip:
             with open_archive(self.path) as archive:
                 yield archive.read
@@ -128,7 +128,7 @@ class Listing:
 
 
 def list_patches(source: str | os.PathLike[str], name: str) -> Listing:
-    """List the images under a folder or in a zip; `name` is the argument that `source` came in by."""
+    """List the images in a folder or zip; `name` is the argument's name in error messages."""
     if not isinstance(source, (str, os.PathLike)):
         raise InvalidInputError(f"{name} must be the path of a folder or zip, got {describe(source)}")
     path = Path(source)
@@ -138,51 +138,51 @@ def list_patches(source: str | os.PathLike[str], name: str) -> Listing:
     found = _list_zip(path) if is_zip else _list_folder(path)
     if not found:
         zips = [] if is_zip else sorted(file.name for file in path.glob("*.zip"))
-        remedy = f"pass a zip of it ({', '.join(zips)})" if zips else "use fetch_patches for the course's"
+        remedy = f"pass one of its zip files ({', '.join(zips)})" if zips else "use fetch_patches"
         raise DatasetError(f"{name} {path} holds no PNG or JPEG patches; {remedy}")
     names = tuple(sorted(found, key=natural_key))
     return Listing(path, is_zip, names, tuple(found[each] for each in names))
 
 
 def _list_folder(folder: Path) -> dict[str, str]:
-    """Names of all images under `folder`, from its own name downwards, to paths relative to it."""
+    """Map names of images, which start with the folder's name, to paths relative to the folder."""
 
     def stop(error: OSError) -> None:
         raise DatasetError(f"{error.filename} cannot be read: {error.strerror}; check its permissions")
 
-    own = Path(os.path.abspath(folder)).name
+    folder_name = Path(os.path.abspath(folder)).name
     found = {}
     for parent, _, files in os.walk(folder, onerror=stop):
         for file in files:
             member = (Path(parent) / file).relative_to(folder).as_posix()
             if is_image(member):
-                found[f"{own}/{member}"] = member
+                found[f"{folder_name}/{member}"] = member
     return found
 
 
 def _list_zip(path: Path) -> dict[str, str]:
-    """Names of all images in a zip, as they would be once it is unpacked, to its members."""
+    """Map names of images, as they are after unpacking, to members of the zip."""
     with open_archive(path) as archive:
         members = {member.replace("\\", "/").removeprefix("./"): member for member in archive.namelist()}
     found = {name: member for name, member in members.items() if is_image(name)}
-    # Without one folder at its top, a zip unpacks into a folder of its own name.
+    # Unless all members are in one folder, a zip is unpacked into a folder with its own name.
     single = len({name.partition("/")[0] for name in found}) == 1 and all("/" in name for name in found)
     return found if single else {f"{path.stem}/{name}": member for name, member in found.items()}
 
 
 def infer_labels(listing: Listing) -> NDArray[np.bool_]:
-    """Label patches by the innermost folder, or else the zip's name, that tells the class."""
+    """Label patches by the innermost folder name, or else the zip's name, that stands for a class."""
     known: dict[str, bool] = {}
     for folder in dict.fromkeys(map(parent_folder, listing.names)):
         parts = [listing.path.stem, *folder.split("/")] if listing.is_zip else folder.split("/")
         classes = [CLASS_FOLDERS.get(re.sub("[-_ ]", "", part.lower())) for part in parts]
-        told = [each for each in classes if each is not None]
-        if not told:
+        labels = [label for label in classes if label is not None]
+        if not labels:
             raise InvalidInputError(
-                f"label must be 1 or 0 for {listing.path}, as no folder in {folder!r} is named vehicles or "
-                "non-vehicles; pass label=1 for vehicles, 0 for others"
+                f"label must be 1 or 0 for {listing.path}, because no folder in {folder!r} is named vehicles "
+                "or non-vehicles; pass label=1 for vehicles, 0 for non-vehicles"
             )
-        known[folder] = told[-1]
+        known[folder] = labels[-1]
     return np.array([known[parent_folder(name)] for name in listing.names])
 
 
@@ -194,30 +194,24 @@ def decode_listings(
     jobs = check_integer(n_jobs, "n_jobs", low=1) if n_jobs is not None else min(os.cpu_count() or 1, 8)
     total = sum(len(listing.names) for listing in listings)
     patches = np.empty((total, size, size, 3), np.uint8)
-    with contextlib.ExitStack() as stack:
-        tick: Callable[[], object] = int
-        if progress:
-            from tqdm import tqdm
-
-            tick = stack.enter_context(tqdm(total=total, unit="patch")).update
-        # Threads suffice, as OpenCV releases the GIL; a span of rows each, as opening a zip takes time.
-        pool = stack.enter_context(ThreadPoolExecutor(jobs))
-        waiting, start = [], 0
+    # OpenCV releases the GIL, so threads suffice. Each decodes a range of rows, as opening a zip takes time.
+    with progress_bar(progress, total, unit="patch") as bar, ThreadPoolExecutor(jobs) as pool:
+        futures, start = [], 0
         for listing in listings:
             count = len(listing.names)
             out = patches[start : start + count]
             step = math.ceil(count / jobs)
             for first in range(0, count, step):
                 rows = range(first, min(first + step, count))
-                waiting.append(pool.submit(_decode_rows, listing, rows, out, tick))
+                futures.append(pool.submit(_decode_rows, listing, rows, out, bar.update))
             start += count
-        for done in waiting:
-            done.result()
+        for future in futures:
+            future.result()
     return patches
 
 
-def _decode_rows(listing: Listing, rows: range, out: NDArray[np.uint8], tick: Callable[[], object]) -> None:
-    """Decode the images of `rows` into the same rows of `out`."""
+def _decode_rows(listing: Listing, rows: range, out: NDArray[np.uint8], update: Callable[[], object]) -> None:
+    """Decode the images of `rows` into the same rows of `out`; call `update` after each."""
     side = out.shape[1]
     with listing.reader() as read:
         for row in rows:
@@ -227,7 +221,9 @@ def _decode_rows(listing: Listing, rows: range, out: NDArray[np.uint8], tick: Ca
             except InvalidInputError as error:
                 raise DatasetError(f"{error}; replace or remove it") from error
             except _ZIP_ERRORS as error:
-                raise DatasetError(f"{where} cannot be read ({error}); fetch or unpack it again") from error
+                raise DatasetError(
+                    f"{where} cannot be read ({error}); download or unpack it again"
+                ) from error
             if image.shape != out.shape[1:]:
                 height, width = image.shape[:2]
                 raise DatasetError(
@@ -235,71 +231,66 @@ def _decode_rows(listing: Listing, rows: range, out: NDArray[np.uint8], tick: Ca
                     f"resize it with cv2.resize(image, ({side}, {side}))"
                 )
             out[row] = image
-            tick()
+            update()
 
 
-def verify_archive(path: Path, folders: dict[str, int], *, shown: str) -> None:
-    """Raise DatasetError unless the zip holds the PNGs of `folders`, in number, undamaged, and nothing else.
-
-    Directories and macOS litter do not count.
-    """
-    other = "pass the url of a folder that holds the course's archives"
+def verify_archive(path: Path, counts: dict[str, int], *, shown: str) -> None:
+    """Raise a DatasetError unless the zip holds exactly the number of PNGs per folder, all undamaged."""
+    remedy = "pass the url of a folder with the course's archives"
     with open_archive(path, shown) as archive:
         found: Counter[str] = Counter()
         for name in sorted({member.replace("\\", "/") for member in archive.namelist()}):
-            # Nothing is unpacked here: this protects whoever unpacks the file later.
+            # The file is not unpacked here, but a user may unpack it later.
             if name.startswith("/") or name[1:2] == ":" or ".." in name.split("/"):
-                raise DatasetError(f"{shown} holds the unsafe member {name!r}; {other}")
-            if is_litter(name) or name.endswith("/"):
+                raise DatasetError(f"{shown} holds the unsafe member {name!r}; {remedy}")
+            if is_hidden(name) or name.endswith("/"):
                 continue
             folder = parent_folder(name)
-            if folder not in folders or not name.endswith(".png"):
-                raise DatasetError(f"{shown} holds {name!r}, which is no patch of the course; {other}")
+            if folder not in counts or not name.endswith(".png"):
+                raise DatasetError(f"{shown} holds {name!r}, which is not a patch of the course; {remedy}")
             found[folder] += 1
-        for folder, expected in folders.items():
+        for folder, expected in counts.items():
             if found[folder] != expected:
                 raise DatasetError(
-                    f"{shown} holds {found[folder]} patches in {folder}, expected {expected}; {other}"
+                    f"{shown} holds {found[folder]} patches in {folder}, expected {expected}; {remedy}"
                 )
         try:
             damaged = archive.testzip()
         except _ZIP_ERRORS as error:
-            raise DatasetError(f"{shown} is damaged ({error}); fetch it again") from error
+            raise DatasetError(f"{shown} is damaged ({error}); download it again") from error
         if damaged is not None:
-            raise DatasetError(f"{shown} is damaged at {damaged!r}; fetch it again")
+            raise DatasetError(f"{shown} is damaged at {damaged!r}; download it again")
 
 
 def fetch_patches(
-    to: str | os.PathLike[str] | None = None, *, url: str = COURSE_URL, progress: bool = True
+    folder: str | os.PathLike[str] | None = None, *, url: str = COURSE_URL, progress: bool = True
 ) -> tuple[Path, Path]:
-    """Download the course's training patches, once: ``vehicles.zip`` and ``non-vehicles.zip`` (110 MB).
+    """Download the course's training patches: ``vehicles.zip`` and ``non-vehicles.zip`` (110 MB).
 
     Each archive is verified by the names, number and checksums of its members (8,792 vehicles and 8,968
-    non-vehicles) and appears whole or not at all: whatever goes wrong, an earlier file stays as it was and
-    calling again starts over. An archive that is there and verifies is not downloaded again. The patches come
-    from the GTI vehicle image database and from KITTI (CC BY-NC-SA 3.0, non-commercial).
+    non-vehicles) and written atomically. An existing archive that verifies is not downloaded again. The
+    patches come from the GTI vehicle image database and KITTI (CC BY-NC-SA 3.0, non-commercial).
 
     Parameters
     ----------
-    to
-        Folder for the two files, created where missing; None is the user's cache folder.
+    folder
+        Folder for the two files, created if missing; None is the user's cache folder.
     url
-        Web folder (``http://`` or ``https://``) that holds the two files.
+        Base URL (``http://`` or ``https://``) of the two files.
     progress
         Show a progress bar on standard error.
 
     Returns
     -------
     tuple of pathlib.Path
-        The vehicles and the non-vehicles, as `load_training_patches` takes them.
+        Paths of the vehicles and the non-vehicles, the arguments of `load_training_patches`.
 
     Raises
     ------
     DatasetError
-        If the server cannot be reached or has no such file, the connection is cut, or what came is not the
-        archive.
+        If the server cannot be reached or lacks a file, the connection breaks, or a file is not the archive.
     InvalidInputError
-        If `url` is no web address, or `to` cannot be written to.
+        If `url` is not a web address, or `folder` is not writable.
 
     Examples
     --------
@@ -310,42 +301,42 @@ def fetch_patches(
     """
     if not url.startswith(("http://", "https://")):
         raise InvalidInputError(f"url must start with http:// or https://; got {url!r}")
-    if to is None:
+    if folder is None:
         import pooch
 
-        to = pooch.os_cache("vehicle_detection")
+        folder = pooch.os_cache("vehicle_detection")
     vehicles, non_vehicles = (
-        _fetch(Path(to) / name, f"{url.rstrip('/')}/{name}", folders, progress)
-        for name, folders in ARCHIVES.items()
+        _fetch(Path(folder) / name, f"{url.rstrip('/')}/{name}", counts, progress)
+        for name, counts in ARCHIVES.items()
     )
     return vehicles, non_vehicles
 
 
-def _fetch(target: Path, address: str, folders: dict[str, int], progress: bool) -> Path:
-    """Return `target` once it holds the verified archive, downloading it if need be."""
+def _fetch(target: Path, address: str, counts: dict[str, int], progress: bool) -> Path:
+    """Download the archive to `target` unless that is verified already; return `target`."""
     if target.is_file():
         try:
-            verify_archive(target, folders, shown=str(target))
+            verify_archive(target, counts, shown=str(target))
         except DatasetError as error:
-            _log.warning("downloading again, as the file in place does not verify: %s", error)
+            _LOGGER.warning("the existing file is not the archive, downloading it again: %s", error)
         else:
             return target
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InvalidInputError(
-            f"to must be a folder, {target.parent} cannot be made: {error.strerror}; choose another"
+            f"folder {target.parent} cannot be created: {error.strerror}; choose another"
         ) from error
     _remove_stale_parts(target)
-    with atomic_write(target, "to") as part:
-        _log.info("downloading %s", address)
+    with atomic_write(target, "folder") as part:
+        _LOGGER.info("downloading %s", address)
         _download(address, part, progress)
-        verify_archive(part, folders, shown=address)
+        verify_archive(part, counts, shown=address)
     return target
 
 
 def _remove_stale_parts(target: Path) -> None:
-    """Remove what killed downloads of `target` left behind; a running one keeps its part fresh."""
+    """Remove partial downloads of killed processes; a running download keeps its file's time recent."""
     for part in target.parent.glob(f".{target.stem}.*{target.suffix}"):
         with contextlib.suppress(OSError):
             if time.time() - part.stat().st_mtime > STALE_SECONDS:
@@ -353,26 +344,26 @@ def _remove_stale_parts(target: Path) -> None:
 
 
 def _download(address: str, part: Path, progress: bool) -> None:
-    """Download `address` into the file `part`; every failure is a DatasetError with its remedy."""
+    """Download `address` into the file `part`; every failure raises a DatasetError."""
     import pooch
     import requests
 
-    answers: list[requests.Response] = []
+    responses: list[requests.Response] = []
 
     def keep(response: requests.Response, **_: object) -> None:
-        answers.append(response)
+        responses.append(response)
 
-    # The downloader itself: pooch.retrieve would log the hash of a file that has none to compare.
+    # Not pooch.retrieve, which asks to pin the hash of the file.
     download = pooch.HTTPDownloader(progressbar=progress, chunk_size=1 << 16, hooks={"response": keep})
     try:
         download(address, str(part), None)
     except requests.HTTPError as error:
-        answer = error.response.status_code if error.response is not None else "an error"
+        status = error.response.status_code if error.response is not None else "an error"
         raise DatasetError(
-            f"{address} answers {answer}; pass the url of a folder that holds {' and '.join(ARCHIVES)}"
+            f"{address} returns {status}; pass the url of a folder with {' and '.join(ARCHIVES)}"
         ) from error
     except requests.exceptions.ChunkedEncodingError as error:
-        raise DatasetError(f"{address} was cut off on the way; call again to start over") from error
+        raise DatasetError(f"the download of {address} was cut off; call again to restart it") from error
     except (requests.ConnectionError, requests.Timeout) as error:
         raise DatasetError(
             f"{address} cannot be reached ({type(error).__name__}); check the network and call again, "
@@ -383,9 +374,9 @@ def _download(address: str, part: Path, progress: bool) -> None:
     except OSError as error:
         raise DatasetError(
             f"{address} cannot be stored in {part.parent}: {error.strerror}; free some space or choose "
-            "another folder with to="
+            "another folder"
         ) from error
     finally:
-        # Pooch leaves the connection open when it raises.
-        for response in answers:
+        # pooch leaves the connection open when it raises.
+        for response in responses:
             response.close()

@@ -1,4 +1,4 @@
-"""Near duplicates among patches: the frames of a drive show the same car again and again."""
+"""Near duplicates among patches: consecutive frames of a drive show the same car."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from vehicle_detection._common import check_number, check_patches
 from vehicle_detection.datasets.patches import PatchSet
 from vehicle_detection.params import PATCH_SIZE
 
-_CHUNK = 512  # Rows compared with all others at a time: the table of products stays small.
+_CHUNK = 512  # Rows compared with all others at a time, to limit the memory of the correlation matrix.
 
 
 def find_near_duplicates(
     patches: PatchSet | NDArray[np.uint8], *, threshold: float = 0.95
 ) -> NDArray[np.intp]:
-    """Find the patches that have a near duplicate among the others.
+    """Find the patches that have a near duplicate in the same set.
 
-    Patches are compared by the correlation of their 16x16 gray thumbnails, so that brightness and contrast
-    do not count; a patch of one plain color is a copy of nothing. Labels do not count either.
+    Patches are compared by the correlation of their 16x16 gray thumbnails, which ignores brightness and
+    contrast. A uniform patch has no near duplicate. Labels are ignored.
 
     Parameters
     ----------
     patches
-        A set, or ``(N, 64, 64, 3)`` uint8 RGB.
+        A `PatchSet`, or ``(N, 64, 64, 3)`` uint8 RGB.
     threshold
         Correlation, in (0, 1], from which two patches are near duplicates.
 
     Returns
     -------
     numpy.ndarray
-        ``(M, 2)`` row numbers: each patch that has a near duplicate, ascending, and the patch most like it.
+        ``(M, 2)`` row numbers: each patch that has a near duplicate, ascending, and the most similar patch.
 
     Raises
     ------
     InvalidInputError
-        If `patches` are of another kind, or `threshold` is out of range.
+        If `patches` has another shape or type, or `threshold` is out of range.
 
     Examples
     --------
@@ -54,7 +54,7 @@ def find_near_duplicates(
 
 
 def make_thumbnails(patches: PatchSet | NDArray[np.uint8]) -> NDArray[np.float32]:
-    """16x16 gray of each patch, without mean and of length one: products are correlations."""
+    """16x16 gray thumbnails with zero mean and unit length, ``(N, 256)``; products are correlations."""
     images = patches.patches if isinstance(patches, PatchSet) else check_patches(patches, PATCH_SIZE)
     vectors = np.empty((len(images), 16 * 16), np.float32)
     for row, image in enumerate(images):
@@ -62,14 +62,14 @@ def make_thumbnails(patches: PatchSet | NDArray[np.uint8]) -> NDArray[np.float32
         vectors[row] = cv2.resize(gray, (16, 16), interpolation=cv2.INTER_AREA).ravel()
     vectors -= vectors.mean(axis=1, keepdims=True)
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    # A plain patch has only rounding errors left to compare.
+    # Of a uniform patch only rounding errors remain: set them to 0.
     return np.asarray(np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0.01))
 
 
 def find_nearest(
     queries: NDArray[np.float32], pool: NDArray[np.float32], *, same: bool
 ) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-    """Row in `pool` most like each query, and their correlation; with `same`, other than itself."""
+    """Row of `pool` most similar to each query, and their correlation; `same` excludes the query itself."""
     nearest = np.zeros(len(queries), np.intp)
     correlation = np.full(len(queries), -np.inf, np.float32)
     for start in range(0, len(queries), _CHUNK):
@@ -83,17 +83,17 @@ def find_nearest(
     return nearest, correlation
 
 
-def group_copies(thumbnails: NDArray[np.float32], limit: float) -> NDArray[np.int32]:
-    """Return the number of each patch's group: near duplicates, and near duplicates of those, are in one."""
+def group_near_duplicates(thumbnails: NDArray[np.float32], limit: float) -> NDArray[np.int32]:
+    """Group number of each patch, ``(N,)``: connected components of the near-duplicate relation."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     count = len(thumbnails)
     groups = np.arange(count, dtype=np.int32)
     for start in range(0, count, _CHUNK):
-        alike = thumbnails[start : start + _CHUNK] @ thumbnails[start:].T >= limit
-        rows, others = groups[start + np.array(alike.nonzero())]
-        # The pairs of this chunk join the groups found so far: all pairs at once may not fit into memory.
+        similar = thumbnails[start : start + _CHUNK] @ thumbnails[start:].T >= limit
+        rows, others = groups[start + np.array(similar.nonzero())]
+        # Merge the groups chunk by chunk: all pairs at once may not fit into memory.
         edges = coo_array((np.ones(len(rows), np.bool_), (rows, others)), shape=(count, count))
         groups = connected_components(edges, directed=False)[1][groups]
     return groups

@@ -1,16 +1,14 @@
-"""The training patches and frames: read, split honestly, and searched for near duplicates."""
+"""Training patches with labels and names, read from folders and zip files."""
 
 from __future__ import annotations
 
 import hashlib
 import math
-import operator
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,42 +18,42 @@ from vehicle_detection._common import check_choice, check_patches, describe
 from vehicle_detection.datasets.archives import (
     decode_listings,
     infer_labels,
-    is_image,
     list_patches,
     natural_key,
     parent_folder,
 )
-from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.images import read_image
+from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import PATCH_SIZE
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PatchSet:
-    """Training patches with their labels and names as columns, checked on construction.
+    """Training patches with labels and names. A notebook displays the counts of each source as a table.
 
     Attributes
     ----------
     patches
-        ``(N, 64, 64, 3)`` uint8 RGB; another side than 64 is allowed, the features refuse it.
+        ``(N, 64, 64, 3)`` uint8 RGB; another side length is allowed, but features cannot be extracted then.
     labels
-        ``(N,)`` bool, True for a vehicle; given as booleans or as 0 and 1.
+        ``(N,)`` bool, True for a vehicle; may be given as 0 and 1.
     names
         N strings ``set/folder/file``, such as ``vehicles/GTI_Far/image0000.png``.
 
     Raises
     ------
     InvalidInputError
-        If the columns differ in length or are of another kind.
+        If the attributes differ in length or have a wrong type.
 
     Examples
     --------
     >>> names = ["vehicles/KITTI/1.png", "vehicles/KITTI/2.png", "non-vehicles/GTI/1.png"]
     >>> patches = PatchSet(np.zeros((3, 64, 64, 3), np.uint8), [1, 1, 0], names)
+    >>> patches
+    PatchSet(3 patches of 64x64 pixels: 2 vehicles, 1 non-vehicles)
     >>> patches.counts()
     {'GTI': 1, 'KITTI': 2}
-    >>> patches[patches.labels]
-    PatchSet(2 patches of 64x64 pixels, 2 of them vehicles)
+    >>> len(patches[patches.labels])
+    2
     """
 
     patches: NDArray[np.uint8]
@@ -80,10 +78,10 @@ class PatchSet:
 
     @classmethod
     def concatenate(cls, sets: Sequence[PatchSet]) -> PatchSet:
-        """Put the patches of several sets, all of one side, into one set, in the order given."""
+        """Join several sets of the same patch size, in the given order."""
         if not sets or len({each.patches.shape[1:] for each in sets}) > 1:
             shapes = [each.patches.shape[1:] for each in sets]
-            raise InvalidInputError(f"sets must be one or more sets of one patch size; got {shapes}")
+            raise InvalidInputError(f"sets must be one or more sets of the same patch size; got {shapes}")
         return cls(
             np.concatenate([each.patches for each in sets]),
             np.concatenate([each.labels for each in sets]),
@@ -94,23 +92,37 @@ class PatchSet:
         return len(self.patches)
 
     def __repr__(self) -> str:
-        side = self.patches.shape[1]
-        return f"PatchSet({len(self)} patches of {side}x{side} pixels, {self.labels.sum()} of them vehicles)"
+        side, vehicles = self.patches.shape[1], int(self.labels.sum())
+        text = f"{vehicles:,} vehicles, {len(self) - vehicles:,} non-vehicles"
+        return f"PatchSet({len(self):,} patches of {side}x{side} pixels: {text})"
+
+    def _repr_html_(self) -> str:
+        """Table of the number of patches by source and class."""
+        import pandas as pd
+
+        total, vehicles = self.counts(), Counter(self.sources[self.labels].tolist())
+        table = pd.DataFrame(
+            [(vehicles[source], count - vehicles[source], count) for source, count in total.items()],
+            index=list(total),
+            columns=["vehicles", "non-vehicles", "total"],
+        )
+        table.loc["total"] = table.sum()
+        return str(table.to_html(max_rows=60))
 
     def __getitem__(self, rows: slice | NDArray[Any] | Sequence[int]) -> PatchSet:
-        """Take patches by a slice, a mask or indices."""
-        chosen = np.arange(len(self))[rows]
-        if chosen.ndim != 1:
+        """Select patches by a slice, a mask or indices."""
+        selected = np.arange(len(self))[rows]
+        if selected.ndim != 1:
             raise InvalidInputError(
                 f"rows must be a slice, a mask or a list of indices, got {describe(rows)}; "
                 "a single patch is patch_set.patches[index]"
             )
-        names = tuple(self.names[row] for row in chosen)
+        names = tuple(self.names[row] for row in selected)
         return PatchSet(self.patches[rows], self.labels[rows], names)
 
     @cached_property
     def sources(self) -> NDArray[np.str_]:
-        """``(N,)`` name of the folder that each patch lies in, such as ``GTI_Far``."""
+        """``(N,)`` name of each patch's folder, such as ``GTI_Far``."""
         return np.array([parent_folder(name).rpartition("/")[2] for name in self.names], np.str_)
 
     def counts(self) -> dict[str, int]:
@@ -120,12 +132,12 @@ class PatchSet:
 
     @property
     def balance(self) -> float:
-        """Share of vehicles, 0-1; NaN for an empty set."""
+        """Fraction of vehicles; NaN for an empty set."""
         return float(self.labels.mean()) if len(self) else math.nan
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 over names, labels and pixels: the same in any order, and from a zip or a folder."""
+        """SHA-256 of names, labels and pixels; it does not depend on the order, nor on zip or folder."""
         rows = zip(self.names, self.labels.tolist(), self.patches)
         digests = sorted(
             f"{name}\0{label:d}\0{hashlib.sha256(patch.tobytes()).hexdigest()}" for name, label, patch in rows
@@ -134,14 +146,14 @@ class PatchSet:
 
 
 def check_labels(labels: ArrayLike, name: str) -> NDArray[np.bool_]:
-    """Return `labels` as one boolean a patch."""
+    """Return `labels` as a one-dimensional boolean array."""
     array = np.asarray(labels)
     if array.size == 0:
         array = np.empty(0, np.bool_)
     if array.ndim != 1 or array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():
         raise InvalidInputError(
             f"{name} must be one boolean (or 0 or 1) for each patch, got {describe(array)}; "
-            "labels of -1 and 1 convert with labels > 0"
+            "convert labels of -1 and 1 with labels > 0"
         )
     return array.astype(np.bool_)
 
@@ -154,32 +166,37 @@ def load_patches(
     n_jobs: int | None = None,
     progress: bool = False,
 ) -> PatchSet:
-    """Read all patches (PNG, JPEG) under a folder, or straight from a zip.
+    """Read all patches (PNG, JPEG) in a folder or zip file.
 
-    The order is natural (``image2`` before ``image10``) and the same for a zip, in whatever order it was
-    packed, and for the folder it unpacks to. Hidden files and what macOS leaves behind are skipped.
+    The order is natural (``image2`` before ``image10``) and the same for a zip and the folder it unpacks to.
+    Hidden files and macOS resource files are skipped.
 
     Parameters
     ----------
     source
-        A folder, searched with all folders in it, or a zip.
+        A folder, searched with its subfolders, or a zip file.
     label
-        1 if these are vehicles, 0 if not. None reads it off the folders: ``vehicles`` or ``cars``,
-        ``non-vehicles`` or ``notcars``; the innermost decides.
+        1 for vehicles, 0 for non-vehicles. None takes the label from the folder names ``vehicles``,
+        ``cars``, ``non-vehicles`` or ``notcars``; the innermost one decides.
     size
-        Side in pixels that every patch must have.
+        Side length in pixels that every patch must have.
     n_jobs
-        Threads that decode; None for one a core, 8 at most.
+        Number of decoding threads; None uses one per core, at most 8.
     progress
         Show a progress bar on standard error.
+
+    Returns
+    -------
+    PatchSet
+        The patches, with their labels and names.
 
     Raises
     ------
     DatasetError
-        If `source` is missing, is no folder or whole zip, or holds no patch, an unreadable one, or one of
-        another size.
+        If `source` is missing, is neither a folder nor a complete zip, or holds no patch, an unreadable
+        one, or one of another size.
     InvalidInputError
-        If an option is out of range, or `label` is None and no folder tells the class.
+        If an option is out of range, or `label` is None and no folder name gives the class.
 
     Examples
     --------
@@ -189,8 +206,8 @@ def load_patches(
     ...     for number in (10, 9):
     ...         write_image(f"{folder}/{number}.png", np.zeros((64, 64, 3), np.uint8))
     ...     patches = load_patches(folder, label=1)
-    >>> patches, [name.split("/")[1] for name in patches.names]
-    (PatchSet(2 patches of 64x64 pixels, 2 of them vehicles), ['9.png', '10.png'])
+    >>> len(patches), [name.split("/")[1] for name in patches.names]
+    (2, ['9.png', '10.png'])
     """
     check_choice(label, "label", (None, 0, 1))
     listing = list_patches(source, "source")
@@ -206,19 +223,24 @@ def load_training_patches(
     n_jobs: int | None = None,
     progress: bool = False,
 ) -> PatchSet:
-    """Read both classes into one set, vehicles first; takes what `fetch_patches` returns.
+    """Read both classes into one set, vehicles first; the arguments are what `fetch_patches` returns.
 
     Parameters
     ----------
     vehicles, non_vehicles
-        A folder or zip for each class, as in `load_patches`.
+        A folder or zip file for each class, as in `load_patches`.
     n_jobs, progress
         As in `load_patches`.
+
+    Returns
+    -------
+    PatchSet
+        The patches, with their labels and names.
 
     Raises
     ------
     DatasetError
-        As in `load_patches`; also if one of the two holds no patch.
+        As in `load_patches`, for either class.
 
     Examples
     --------
@@ -231,70 +253,3 @@ def load_training_patches(
     patches = decode_listings(listings, size=PATCH_SIZE, n_jobs=n_jobs, progress=progress)
     names = listings[0].names + listings[1].names
     return PatchSet(patches, np.arange(len(names)) < len(listings[0].names), names)
-
-
-@dataclass(frozen=True)
-class FrameSet:
-    """Frames of a folder, each read when it is asked for; iterating yields ``(name, image)``.
-
-    Attributes
-    ----------
-    folder
-        Where they lie.
-    names
-        Their file names, in natural order.
-    """
-
-    folder: Path
-    names: tuple[str, ...]
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def __repr__(self) -> str:
-        return f"FrameSet({len(self)} frames of {self.folder})"
-
-    def __getitem__(self, index: int) -> NDArray[np.uint8]:
-        """Read one frame: ``(H, W, 3)`` uint8 RGB."""
-        try:
-            return read_image(self.folder / self.names[operator.index(index)])
-        except InvalidInputError as error:
-            raise DatasetError(f"{error}; replace or remove it") from error
-
-    def __iter__(self) -> Iterator[tuple[str, NDArray[np.uint8]]]:
-        for index, name in enumerate(self.names):
-            yield name, self[index]
-
-
-def load_frames(folder: str | os.PathLike[str]) -> FrameSet:
-    """List the frames (PNG, JPEG) that lie in a folder; their boxes are read with `read_labels`.
-
-    Parameters
-    ----------
-    folder
-        The folder; folders in it are not searched.
-
-    Returns
-    -------
-    FrameSet
-        ``frames.names[i]`` is the file name that labels go by, ``frames[i]`` the image.
-
-    Raises
-    ------
-    DatasetError
-        If the folder is missing or holds no frame; on reading, if a frame is damaged.
-
-    Examples
-    --------
-    >>> load_frames("missing")
-    Traceback (most recent call last):
-    ...
-    vehicle_detection.errors.DatasetError: folder missing does not exist or is no folder; check the path
-    """
-    path = Path(folder)
-    if not path.is_dir():
-        raise DatasetError(f"folder {path} does not exist or is no folder; check the path")
-    names = [file.name for file in path.iterdir() if is_image(file.name) and file.is_file()]
-    if not names:
-        raise DatasetError(f"folder {path} holds no PNG or JPEG frames; name the folder they lie in")
-    return FrameSet(path, tuple(sorted(names, key=natural_key)))

@@ -1,4 +1,4 @@
-"""Patches to train on and patches to test on, and how far the two are alike."""
+"""Splits into training and test patches, and the leakage between them."""
 
 from __future__ import annotations
 
@@ -10,19 +10,31 @@ from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check_integer, check_number, describe
 from vehicle_detection.datasets.archives import natural_key, parent_folder
-from vehicle_detection.datasets.near_duplicates import find_nearest, group_copies, make_thumbnails
+from vehicle_detection.datasets.near_duplicates import find_nearest, group_near_duplicates, make_thumbnails
 from vehicle_detection.datasets.patches import PatchSet, check_labels
 from vehicle_detection.errors import InvalidInputError
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Split:
-    """Rows to train on and rows to test on; unpacks as ``train, test = split``.
+    """Row numbers of training and test patches; unpacks as ``train, test = split``.
 
     Attributes
     ----------
     train, test
-        ``(N,)`` and ``(M,)`` intp indices without a common one, neither empty.
+        ``(N,)`` and ``(M,)`` intp row numbers, without a common one, neither empty.
+
+    Raises
+    ------
+    InvalidInputError
+        If a part is empty or not a list of row numbers, or a row occurs twice.
+
+    Examples
+    --------
+    >>> split = Split([0, 1, 3], [2])
+    >>> split
+    Split(train: 3 rows, test: 1 rows)
+    >>> train, test = split
     """
 
     train: NDArray[np.intp]
@@ -36,38 +48,41 @@ class Split:
             object.__setattr__(self, name, rows.astype(np.intp, copy=False))
         rows = np.concatenate([self.train, self.test])
         if len(np.unique(rows)) != len(rows):
-            raise InvalidInputError("train and test must share no row and repeat none; drop the doubles")
+            raise InvalidInputError("train and test must not share or repeat rows; drop the duplicates")
 
     def __iter__(self) -> Iterator[NDArray[np.intp]]:
         return iter((self.train, self.test))
+
+    def __repr__(self) -> str:
+        return f"Split(train: {len(self.train):,} rows, test: {len(self.test):,} rows)"
 
 
 def split_random(
     patches_or_labels: PatchSet | ArrayLike, *, test_size: float = 0.2, random_state: int
 ) -> Split:
-    """Split at random, with the same share of vehicles on both sides.
+    """Split at random, with the same fraction of vehicles in both parts.
 
-    On frames of a drive this tests on near duplicates of what was trained on (see `split_leakage`): quote
-    `split_groups`, `split_sequences` or `split_sources` beside it.
+    On frames of a drive this tests on near duplicates of training patches (see `split_leakage`). Report
+    `split_groups`, `split_sequences` or `split_sources` as well.
 
     Parameters
     ----------
     patches_or_labels
         The set, or its ``(N,)`` labels.
     test_size
-        Share to test on, in (0, 1); rounded up to whole patches.
+        Fraction of test patches, in (0, 1); rounded up to whole patches.
     random_state
         Seed; the same seed gives the same split.
 
     Returns
     -------
     Split
-        Rows in ascending order; together they are all rows.
+        Ascending row numbers, which together are all rows.
 
     Raises
     ------
     InvalidInputError
-        If a class has too few patches for both sides, or an argument is out of range.
+        If a class has too few patches for both parts, or an argument is out of range.
 
     Examples
     --------
@@ -79,39 +94,39 @@ def split_random(
 
     given = patches_or_labels
     labels = given.labels if isinstance(given, PatchSet) else check_labels(given, "patches_or_labels")
-    share = _check_share(test_size)
+    fraction = _check_test_size(test_size)
     seed = check_integer(random_state, "random_state", low=0, high=2**32 - 1)
     try:
         train, test = train_test_split(
-            np.arange(len(labels)), test_size=share, random_state=seed, stratify=labels
+            np.arange(len(labels)), test_size=fraction, random_state=seed, stratify=labels
         )
     except ValueError as error:
         raise InvalidInputError(
-            f"patches_or_labels cannot be split at test_size={share:g}: {labels.sum()} vehicles and "
-            f"{(~labels).sum()} others are too few; pass more patches or another test_size"
+            f"patches_or_labels cannot be split with test_size={fraction:g}: {labels.sum()} vehicles and "
+            f"{(~labels).sum()} non-vehicles are too few; pass more patches or another test_size"
         ) from error
     return Split(np.sort(train), np.sort(test))
 
 
 def split_sequences(patch_set: PatchSet, *, test_size: float = 0.2) -> Split:
-    """Test on the end of each folder, by the number in the file name.
+    """Test on the end of each folder, in the order of the numbers in the file names.
 
-    Where a folder is numbered through its drives, as those of GTI are, the frames of one car stay on one
-    side. ``KITTI_extracted`` is not: its numbers are shuffled, and on the course's patches `split_leakage` is
-    0.21, against 0.22 for a random split, 0.02 for `split_sources` and 0 for `split_groups`.
+    If the numbers follow the drive, as in the GTI folders, the frames of one car stay in one part. Those of
+    ``KITTI_extracted`` are shuffled: on the course's patches `split_leakage` is 0.21, compared with 0.22 for
+    a random split, 0.02 for `split_sources` and 0 for `split_groups`.
 
     Parameters
     ----------
     patch_set
-        The patches; folders are told apart by their whole path.
+        The patches; a folder is identified by its whole path.
     test_size
-        Share of each folder to test on, in (0, 1), rounded. A folder of two or more patches gives at least
-        one to each side; a single patch is trained on.
+        Fraction of each folder to test on, in (0, 1), rounded. A folder of two or more patches gives at least
+        one to each part; a single patch goes to the training part.
 
     Returns
     -------
     Split
-        Rows in ascending order; together they are all rows.
+        Ascending row numbers, which together are all rows.
 
     Raises
     ------
@@ -124,14 +139,14 @@ def split_sequences(patch_set: PatchSet, *, test_size: float = 0.2) -> Split:
     >>> split_sequences(PatchSet(np.zeros((5, 64, 64, 3), np.uint8), [1] * 5, names)).test
     array([4])
     """
-    share = _check_share(test_size)
+    fraction = _check_test_size(test_size)
     folders: dict[str, list[int]] = {}
     for row, name in enumerate(patch_set.names):
         folders.setdefault(parent_folder(name), []).append(row)
     tested = np.zeros(len(patch_set), np.bool_)
     for rows in folders.values():
         rows.sort(key=lambda row: natural_key(patch_set.names[row]))
-        count = min(max(round(len(rows) * share), 1), len(rows) - 1)
+        count = min(max(round(len(rows) * fraction), 1), len(rows) - 1)
         tested[rows[len(rows) - count :]] = True
     if not tested.any():
         raise InvalidInputError("patch_set holds no folder of two or more patches; use split_random")
@@ -141,69 +156,68 @@ def split_sequences(patch_set: PatchSet, *, test_size: float = 0.2) -> Split:
 def split_groups(
     patch_set: PatchSet, *, test_size: float = 0.2, threshold: float = 0.9, random_state: int = 0
 ) -> Split:
-    """Split at random, with near duplicates on one side: `split_leakage` at `threshold` is 0.
+    """Split groups of near duplicates at random, so that `split_leakage` at `threshold` is 0.
 
-    Near duplicates, and near duplicates of those, form a group. In random order, each group is tested on as a whole
-    where it still fits into the share of its folders, and trained on where it does not; so a group of more
-    than that share is always trained on.
+    Near duplicates, and their near duplicates in turn, form a group. In random order, each group goes to the
+    test part if it still fits into `test_size` of its folders, else to the training part. A group larger than
+    that is therefore always in the training part.
 
-    Two crops of one car may differ too much to be near duplicates. Where a folder is numbered through its drives,
-    as those of GTI are, `split_sequences` keeps more of them together; this split does for
-    ``KITTI_extracted``, whose numbers are shuffled.
+    Two crops of one car may differ too much to be near duplicates. In folders whose numbers follow the drive,
+    such as those of GTI, `split_sequences` keeps more of them together; for ``KITTI_extracted``, whose
+    numbers are shuffled, this split does.
 
     Parameters
     ----------
     patch_set
-        The patches; folders are told apart by their whole path.
+        The patches; a folder is identified by its whole path.
     test_size
-        Share of each folder, and of each class in it, to test on, in (0, 1), rounded; large groups may leave
-        less.
+        Fraction of each folder, and of each class in it, to test on, in (0, 1), rounded. Large groups may
+        make the test part smaller.
     threshold
-        Correlation, in (0, 1], from which two patches are near duplicates, as in `find_near_duplicates`. Of the
-        course's vehicles, pairs at 0.9 show mostly one car; at 0.85 chance makes a quarter of all patches one
-        group.
+        Correlation, in (0, 1], from which two patches are near duplicates, as in `find_near_duplicates`. On
+        the course's vehicles, most pairs at 0.9 show the same car; at 0.85 a quarter of all patches fall into
+        one group by chance.
     random_state
         Seed; the same seed gives the same split.
 
     Returns
     -------
     Split
-        Rows in ascending order; together they are all rows.
+        Ascending row numbers, which together are all rows.
 
     Raises
     ------
     InvalidInputError
-        If an argument is out of range, or no group fits into the share to test on.
+        If an argument is out of range, or no group fits into the test part.
 
     Examples
     --------
     >>> patches = np.random.default_rng(0).integers(0, 256, (6, 64, 64, 3), np.uint8)
     >>> patches[1::2] = patches[::2]
     >>> patch_set = PatchSet(patches, [1] * 6, [f"vehicles/KITTI/{number}.png" for number in range(6)])
-    >>> split_groups(patch_set, test_size=0.4)
-    Split(train=array([0, 1, 2, 3]), test=array([4, 5]))
+    >>> split_groups(patch_set, test_size=0.4).test
+    array([4, 5])
     """
-    share = _check_share(test_size)
+    fraction = _check_test_size(test_size)
     limit = check_number(threshold, "threshold", above=0, high=1)
     seed = check_integer(random_state, "random_state", low=0, high=2**32 - 1)
     strata = [f"{label:d}{parent_folder(name)}" for label, name in zip(patch_set.labels, patch_set.names)]
     _, stratum, sizes = np.unique(strata, return_inverse=True, return_counts=True)
-    # As in split_sequences; clipping to [1, 0] gives 0.
-    room = np.clip(np.round(sizes * share).astype(np.intp), 1, sizes - 1)
-
-    # A little below the limit, so that no pair at the limit comes apart by a rounding error.
-    groups = group_copies(make_thumbnails(patch_set), limit * (1 - 1e-5))
+    # Test patches that each folder may still give, as in split_sequences; clipping to [1, 0] gives 0.
+    remaining = np.clip(np.round(sizes * fraction).astype(np.intp), 1, sizes - 1)
+    # Slightly below the threshold, so that rounding errors separate no pair at the threshold.
+    groups = group_near_duplicates(make_thumbnails(patch_set), limit * (1 - 1e-5))
     order = np.argsort(groups, kind="stable")
     members = np.split(order, np.flatnonzero(np.diff(groups[order])) + 1)
     tested = np.zeros(len(patch_set), np.bool_)
     for group in np.random.default_rng(seed).permutation(len(members)):
-        needed = np.bincount(stratum[members[group]], minlength=len(room))
-        if (needed <= room).all():
+        needed = np.bincount(stratum[members[group]], minlength=len(remaining))
+        if (needed <= remaining).all():
             tested[members[group]] = True
-            room -= needed
+            remaining -= needed
     if not tested.any():
         raise InvalidInputError(
-            f"patch_set holds no group of near duplicates that fits into test_size={share:g} of its folders; "
+            f"no group of near duplicates in patch_set fits into test_size={fraction:g} of its folders; "
             "raise test_size or threshold"
         )
     return Split(np.flatnonzero(~tested), np.flatnonzero(tested))
@@ -212,77 +226,101 @@ def split_groups(
 def split_sources(
     patch_set: PatchSet, *, train: Sequence[str] = ("GTI",), test: Sequence[str] = ("KITTI", "Extras")
 ) -> Split:
-    """Train on some sources and test on others: another camera, another country.
+    """Train on some sources and test on others, which are from another camera and country.
 
-    The default trains on the GTI vehicles and GTI non-vehicles and tests on the KITTI vehicles and the
-    Extras; the reverse is ``train=("KITTI", "Extras"), test=("GTI",)``.
+    The default trains on the vehicles and non-vehicles of GTI, and tests on the vehicles of KITTI and the
+    non-vehicles of Extras. The reverse is ``train=("KITTI", "Extras"), test=("GTI",)``.
 
     Parameters
     ----------
     patch_set
         The patches.
     train, test
-        How the sources of each side begin: ``"GTI"`` takes ``GTI``, ``GTI_Far`` and the others of GTI.
-        Sources of neither side are left out.
+        Prefixes of the sources of each part: ``"GTI"`` selects ``GTI``, ``GTI_Far`` and so on. Other sources
+        are left out.
 
     Returns
     -------
     Split
-        Rows in ascending order.
+        Ascending row numbers.
 
     Raises
     ------
     InvalidInputError
-        If a beginning matches no source, a source falls on both sides, or a side lacks one of the classes.
+        If a prefix matches no source, both parts match the same source, or a part lacks a class.
 
     Examples
     --------
     >>> names = ["v/GTI_Far/1.png", "n/GTI/1.png", "v/KITTI_extracted/1.png", "n/Extras/1.png"]
     >>> patches = PatchSet(np.zeros((4, 64, 64, 3), np.uint8), [1, 0, 1, 0], names)
-    >>> split_sources(patches)
-    Split(train=array([0, 1]), test=array([2, 3]))
+    >>> split_sources(patches).test
+    array([2, 3])
     """
     known = ", ".join(patch_set.counts()) or "none"
     masks = []
-    for side, starts in (("train", train), ("test", test)):
-        starts = (starts,) if isinstance(starts, str) else tuple(starts)
-        found = [np.char.startswith(patch_set.sources, start) for start in starts]
-        for start, mask in zip(starts, found):
-            if not start or not mask.any():
-                raise InvalidInputError(f"{side} must name sources of patch_set ({known}); got {start!r}")
-        chosen = np.logical_or.reduce(found) if found else np.zeros(len(patch_set), np.bool_)
-        if len(np.unique(patch_set.labels[chosen])) < 2:
+    for side, prefixes in (("train", train), ("test", test)):
+        prefixes = (prefixes,) if isinstance(prefixes, str) else tuple(prefixes)
+        mask = np.zeros(len(patch_set), np.bool_)
+        for prefix in prefixes:
+            matching = np.char.startswith(patch_set.sources, prefix)
+            if not prefix or not matching.any():
+                raise InvalidInputError(f"{side} must name sources of patch_set ({known}); got {prefix!r}")
+            mask |= matching
+        if len(np.unique(patch_set.labels[mask])) < 2:
             raise InvalidInputError(
-                f"{side} must name sources of vehicles and of non-vehicles, got {starts}; it has {known}"
+                f"{side} must name sources of vehicles and of non-vehicles, got {prefixes}; "
+                f"patch_set has {known}"
             )
-        masks.append(chosen)
+        masks.append(mask)
     if (masks[0] & masks[1]).any():
         shared = sorted(set(patch_set.sources[masks[0] & masks[1]].tolist()))
-        raise InvalidInputError(f"train and test must share no source, both take {shared}; narrow one down")
+        raise InvalidInputError(
+            f"train and test must not share sources, both match {shared}; use longer prefixes"
+        )
     return Split(np.flatnonzero(masks[0]), np.flatnonzero(masks[1]))
 
 
+SPLIT_NAMES = ("sequences", "groups", "gti_to_kitti", "kitti_to_gti", "random")
+"""Names of `make_split`."""
+
+SEEDED_SPLITS = ("groups", "random")
+"""Splits that depend on the seed."""
+
+
+def make_split(patch_set: PatchSet, name: str, *, test_size: float = 0.2, random_state: int = 0) -> Split:
+    """Make a split by its name."""
+    if name == "random":
+        return split_random(patch_set, test_size=test_size, random_state=random_state)
+    if name == "groups":
+        return split_groups(patch_set, test_size=test_size, random_state=random_state)
+    if name == "sequences":
+        return split_sequences(patch_set, test_size=test_size)
+    if name == "gti_to_kitti":
+        return split_sources(patch_set)
+    return split_sources(patch_set, train=("KITTI", "Extras"), test=("GTI",))
+
+
 def split_leakage(patch_set: PatchSet, split: Split, *, threshold: float = 0.95) -> float:
-    """Share of the test patches that have a near duplicate among the training patches.
+    """Fraction of test patches that have a near duplicate among the training patches.
 
     Parameters
     ----------
     patch_set
         The patches.
     split
-        A split of them.
+        A split of these patches.
     threshold
         As in `find_near_duplicates`.
 
     Returns
     -------
     float
-        In [0, 1]; 0 is a split whose test is news to the classifier.
+        In [0, 1].
 
     Raises
     ------
     InvalidInputError
-        If `split` names rows that `patch_set` has not, or `threshold` is out of range.
+        If `split` holds rows that `patch_set` does not have, or `threshold` is out of range.
 
     Examples
     --------
@@ -296,15 +334,16 @@ def split_leakage(patch_set: PatchSet, split: Split, *, threshold: float = 0.95)
     last = max(int(rows.max()) for rows in split)
     if last >= len(patch_set):
         raise InvalidInputError(
-            f"split names row {last} of a set of {len(patch_set)} patches; pass the set it was made from"
+            f"split holds row {last}, but patch_set has {len(patch_set)} patches; "
+            "pass the set it was made from"
         )
     thumbnails = make_thumbnails(patch_set)
     _, correlation = find_nearest(thumbnails[split.test], thumbnails[split.train], same=False)
     return float((correlation >= limit).mean())
 
 
-def _check_share(test_size: object) -> float:
-    share = check_number(test_size, "test_size", above=0)
-    if share >= 1:
-        raise InvalidInputError(f"test_size must be a share in (0, 1), got {share:g}; 0.2 is a fifth")
-    return share
+def _check_test_size(test_size: object) -> float:
+    fraction = check_number(test_size, "test_size", above=0)
+    if fraction >= 1:
+        raise InvalidInputError(f"test_size must be a fraction in (0, 1), got {fraction:g}; 0.2 is a fifth")
+    return fraction

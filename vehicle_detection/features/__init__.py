@@ -1,4 +1,4 @@
-"""Patches to feature vectors ``[spatial | histogram | HOG | coarse HOG]``."""
+"""Feature vectors ``[spatial | histogram | HOG | coarse HOG]`` of patches."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +32,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    # PatchFeatures imports scikit-learn, which takes a second: load it on first use.
+    # Loaded on first use: it imports scikit-learn, which takes a second.
     if name == "PatchFeatures":
         from vehicle_detection.features.transformer import PatchFeatures
 

@@ -1,4 +1,4 @@
-"""The channels that features are computed of: color spaces, and what HOG sees."""
+"""Color spaces, and the channels that HOG is computed on."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _CODES = {
 def convert_color(
     image: NDArray[np.uint8], color_space: str = "YCrCb", *, out: NDArray[np.uint8] | None = None
 ) -> NDArray[np.uint8]:
-    """Convert an RGB image to another color space, by OpenCV's 8-bit conventions.
+    """Convert an RGB image to another color space, with OpenCV's 8-bit ranges.
 
     Parameters
     ----------
@@ -30,9 +30,9 @@ def convert_color(
         ``(H, W, 3)`` uint8 RGB.
     color_space
         ``"RGB"``, ``"HSV"`` (hue 0-179), ``"LUV"``, ``"HLS"``, ``"YUV"``, ``"YCrCb"`` or ``"LAB"``; the
-        course's spelling ``"RGB2YCrCb"`` is understood too.
+        course's spelling ``"RGB2YCrCb"`` is accepted, too.
     out
-        Array of the image's shape to write into; a new one if None.
+        Output array of the image's shape; None allocates a new one.
 
     Returns
     -------
@@ -61,14 +61,14 @@ def convert_color(
 
 
 def hog_source(image: NDArray[np.uint8], params: FeatureParams) -> NDArray[np.uint8]:
-    """Channels that HOG sees: ``(H, W, hog_channels)`` uint8 of an ``(H, W, 3)`` RGB image."""
+    """Channels of an RGB image that HOG is computed on: ``(H, W, hog_channels)`` uint8."""
     if params.hog_channel == "GRAY":
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)[..., None]
     return pick_hog_channels(convert_color(image, params.color_space), params)
 
 
 def pick_hog_channels(converted: NDArray[np.uint8], params: FeatureParams) -> NDArray[np.uint8]:
-    """Channels that HOG sees, of an image that is already in the color space; not for ``"GRAY"``."""
+    """Select the channels of HOG from an image that is already converted; not for ``"GRAY"``."""
     if params.hog_channel == "ALL":
         return converted
     return np.ascontiguousarray(converted[..., int(params.hog_channel), None])

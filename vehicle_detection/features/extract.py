@@ -1,7 +1,7 @@
-"""A 64x64 patch, or a batch of them, to feature vectors ``[spatial | histogram | HOG | coarse HOG]``.
+"""Feature vectors ``[spatial | histogram | HOG | coarse HOG]`` of 64x64 patches.
 
-The functions the course knows are the readable reference: scikit-image's HOG, ``cv2.resize`` and
-``numpy.histogram``. `extract_features` computes the same numbers with kernels, many patches at once.
+The course's functions are the readable reference: scikit-image's HOG, ``cv2.resize`` and
+``numpy.histogram``. `extract_features` computes the same values with compiled kernels, in batches.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from vehicle_detection._common import (
     check_patches,
     check_type,
     describe,
+    progress_bar,
     resolve_jobs,
 )
 from vehicle_detection._kernels import bin_of_value, degree_bounds, orientation_cotangents, sqrt_gradients
@@ -32,48 +33,7 @@ from vehicle_detection.features.color import convert_color, hog_source, pick_hog
 from vehicle_detection.images import read_image
 from vehicle_detection.params import PATCH_SIZE, FeatureParams
 
-
-def batch_extractor(params: FeatureParams) -> Callable[[NDArray[np.uint8], NDArray[np.float32]], None]:
-    """Build the function that fills the features of a batch of patches."""
-    channels, cell, block = params.hog_channels, params.pix_per_cell, params.cell_per_block
-    coarse = params.coarse_blocks
-    cotangents = orientation_cotangents(params.orient)
-    bounds = degree_bounds(params.orient)
-    bins = bin_of_value(params.hist_bins)
-    size = params.spatial_size
-    spatial_stop = params.spatial_length
-    hist_stop = spatial_stop + params.hist_length
-
-    def extract(patches: NDArray[np.uint8], features: NDArray[np.float32]) -> None:
-        n = len(patches)
-        # Color conversion is pixel by pixel: the batch is converted as one tall image.
-        tall = np.ascontiguousarray(patches).reshape(n * PATCH_SIZE, PATCH_SIZE, 3)
-        converted = convert_color(tall, params.color_space).reshape(patches.shape)
-        if params.spatial_feat:
-            for index, patch in enumerate(converted):
-                small = cv2.resize(patch, (size, size))
-                features[index, :spatial_stop].reshape(3, size, size)[:] = small.transpose(2, 0, 1)
-        if params.hist_feat:
-            counts = features[:, spatial_stop:hist_stop]
-            _color_kernels.patch_histograms(converted, bins, params.hist_bins, counts)
-            if params.hist_sqrt:
-                np.sqrt(counts, out=counts)
-        if params.hog_feat:
-            gray = params.hog_channel == "GRAY"
-            source = hog_source(tall, params) if gray else pick_hog_channels(converted, params)
-            source = source.reshape(n, PATCH_SIZE, PATCH_SIZE, channels)
-            hog = features[:, hist_stop:]
-            if params.transform_sqrt:
-                gradients = sqrt_gradients(source)
-                _hog_kernels.patch_hog_from_angles(*gradients, bounds, channels, cell, block, coarse, hog)
-            else:
-                flat = source.reshape(n, PATCH_SIZE, PATCH_SIZE * channels)
-                _hog_kernels.patch_hog(flat, channels, cell, block, coarse, cotangents, hog)
-
-    return extract
-
-
-_CHUNK = 256
+_BATCH_SIZE = 256
 
 
 def hog_blocks(
@@ -84,29 +44,7 @@ def hog_blocks(
     *,
     transform_sqrt: bool = False,
 ) -> NDArray[np.float64]:
-    """HOG of one channel by scikit-image (L2-Hys), a vector for each block position.
-
-    Parameters
-    ----------
-    img
-        ``(H, W)`` uint8, one channel.
-    orient
-        Orientations over 0-180 degrees.
-    pix_per_cell, cell_per_block
-        Side of a cell in pixels and of a block in cells.
-    transform_sqrt
-        Take the square root of the values first.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(block rows, block columns, cell_per_block, cell_per_block, orient)`` float64 in [0, 1].
-
-    Raises
-    ------
-    InvalidInputError
-        If the image is not one uint8 channel or smaller than a block.
-    """
+    """HOG of one channel: ``(block rows, block columns, cell rows, cell columns, orient)`` float64."""
     from skimage.feature import hog
 
     _check_hog(img, orient, pix_per_cell, cell_per_block)
@@ -132,7 +70,8 @@ def _check_hog(img: NDArray[np.uint8], orient: int, pix_per_cell: int, cell_per_
     )
     if min(img.shape) < side:
         raise InvalidInputError(
-            f"img must be at least one block large ({side}x{side} pixels); got {img.shape[1]}x{img.shape[0]}"
+            f"img must have at least the size of a block ({side}x{side} pixels); "
+            f"got {img.shape[1]}x{img.shape[0]}"
         )
 
 
@@ -144,19 +83,32 @@ def get_hog_features(
     *,
     transform_sqrt: bool = False,
 ) -> NDArray[np.float64]:
-    """HOG of one channel as a vector; see `hog_blocks` for the parameters and `hog_image` for a picture.
+    """Histogram of oriented gradients (HOG) of one channel, by scikit-image with L2-Hys normalization.
 
     Dalal and Triggs, "Histograms of oriented gradients for human detection" (CVPR 2005).
+
+    Parameters
+    ----------
+    img
+        ``(H, W)`` uint8, one channel.
+    orient
+        Number of orientations over 0-180 degrees.
+    pix_per_cell
+        Side length of a cell in pixels.
+    cell_per_block
+        Side length of a block in cells.
+    transform_sqrt
+        Use the square root of the pixel values.
 
     Returns
     -------
     numpy.ndarray
-        1-D float64: block row, block column, cell row, cell column, orientation.
+        1-D float64 in [0, 1], in the order block row, block column, cell row, cell column, orientation.
 
     Raises
     ------
     InvalidInputError
-        If the image is not one uint8 channel or smaller than a block.
+        If the image is not one uint8 channel, or is smaller than a block.
 
     Examples
     --------
@@ -173,7 +125,12 @@ def hog_image(
     *,
     transform_sqrt: bool = False,
 ) -> NDArray[np.float64]:
-    """Draw the orientation histograms of one channel as little stars of edges.
+    """Visualize the orientation histogram of each cell as a star of lines.
+
+    Parameters
+    ----------
+    img, orient, pix_per_cell, transform_sqrt
+        As in `get_hog_features`.
 
     Returns
     -------
@@ -183,7 +140,12 @@ def hog_image(
     Raises
     ------
     InvalidInputError
-        If the image is not one uint8 channel or smaller than a cell.
+        If the image is not one uint8 channel, or is smaller than a cell.
+
+    Examples
+    --------
+    >>> hog_image(np.zeros((64, 64), np.uint8)).shape
+    (64, 64)
     """
     from skimage.feature import hog
 
@@ -200,14 +162,14 @@ def hog_image(
 
 
 def bin_spatial(img: NDArray[np.uint8], size: int | tuple[int, int] = (32, 32)) -> NDArray[np.uint8]:
-    """Color values of a shrunken image, channel by channel.
+    """Pixel values of a downscaled image, channel by channel.
 
     Parameters
     ----------
     img
         ``(H, W, 3)`` uint8 in any color space.
     size
-        Width and height to shrink to.
+        Width and height to scale to, or an integer for both.
 
     Returns
     -------
@@ -229,14 +191,14 @@ def bin_spatial(img: NDArray[np.uint8], size: int | tuple[int, int] = (32, 32)) 
 
 
 def color_hist(img: NDArray[np.uint8], nbins: int = 32) -> NDArray[np.int64]:
-    """Histogram of each channel over 0-255, one after the other.
+    """Concatenated histograms of the channels over 0-255.
 
     Parameters
     ----------
     img
         ``(H, W, 3)`` uint8 in any color space.
     nbins
-        Bins of each channel.
+        Number of bins of each channel.
 
     Returns
     -------
@@ -255,14 +217,14 @@ def color_hist(img: NDArray[np.uint8], nbins: int = 32) -> NDArray[np.int64]:
 
 
 def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None = None) -> NDArray[np.float64]:
-    """Feature vector of one 64x64 patch by the reference functions.
+    """Feature vector of one 64x64 patch, computed by the reference functions.
 
     Parameters
     ----------
     image
         ``(64, 64, 3)`` uint8 RGB.
     params
-        What to compute; the default is ``FeatureParams()``.
+        Features to compute; the default is ``FeatureParams()``.
 
     Returns
     -------
@@ -290,8 +252,7 @@ def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None =
         parts.append(np.sqrt(counts) if params.hist_sqrt else counts)
     if params.hog_feat:
         source = hog_source(image, params)
-        # The histogram of a cell is the sum of those of its quarters: the coarse HOG is that of larger cells.
-        sides = (params.pix_per_cell, 2 * params.pix_per_cell)
+        sides = [params.pix_per_cell, 2 * params.pix_per_cell][: 2 if params.coarse_hog else 1]
         parts += [
             get_hog_features(
                 source[..., channel],
@@ -300,7 +261,7 @@ def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None =
                 params.cell_per_block,
                 transform_sqrt=params.transform_sqrt,
             )
-            for side in sides[: 2 if params.coarse_hog else 1]
+            for side in sides
             for channel in range(params.hog_channels)
         ]
     return np.concatenate(parts).astype(np.float64)
@@ -313,19 +274,19 @@ def extract_features(
     n_jobs: int | None = None,
     progress: bool = False,
 ) -> NDArray[np.float32]:
-    """Feature vectors of many patches, by kernels that equal `single_img_features`.
+    """Feature vectors of many patches, equal to those of `single_img_features`.
 
     Parameters
     ----------
     source
         ``(N, 64, 64, 3)`` uint8 RGB, a list of such patches, or paths of image files.
     params
-        What to compute; the default is ``FeatureParams()``.
+        Features to compute; the default is ``FeatureParams()``.
     n_jobs
-        Threads; None takes the environment's ``VEHICLE_DETECTION_JOBS`` or all cores. The result is
-        the same for any number.
+        Number of threads; None uses the environment variable ``VEHICLE_DETECTION_JOBS`` or all cores. The
+        result does not depend on it.
     progress
-        Show a bar on standard error.
+        Show a progress bar on standard error.
 
     Returns
     -------
@@ -335,7 +296,7 @@ def extract_features(
     Raises
     ------
     InvalidInputError
-        If a patch is not 64x64 uint8 RGB, or a file is missing or unreadable.
+        If a patch is not uint8 RGB of 64x64 pixels, or a file is missing or unreadable.
 
     Examples
     --------
@@ -345,28 +306,64 @@ def extract_features(
     params = _check_params(params)
     patches = check_patches(_read_all(source), PATCH_SIZE, "source")
     features = np.empty((len(patches), params.length), np.float32)
-    extract = batch_extractor(params)
+    extract = _batch_extractor(params)
 
     def run(start: int) -> int:
-        stop = min(start + _CHUNK, len(patches))
+        stop = min(start + _BATCH_SIZE, len(patches))
         extract(patches[start:stop], features[start:stop])
         return stop - start
 
-    with ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
-        done = pool.map(run, range(0, len(patches), _CHUNK))
-        if progress:
-            from tqdm.auto import tqdm
-
-            with tqdm(total=len(patches), unit="patch", desc="features") as bar:
-                for count in done:
-                    bar.update(count)
-        else:
-            list(done)
+    with (
+        progress_bar(progress, len(patches), unit="patch", desc="features") as bar,
+        ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool,
+    ):
+        for count in pool.map(run, range(0, len(patches), _BATCH_SIZE)):
+            bar.update(count)
     return features
 
 
+def _batch_extractor(params: FeatureParams) -> Callable[[NDArray[np.uint8], NDArray[np.float32]], None]:
+    """Build the function ``extract(patches, features)`` that fills the features of a batch."""
+    channels, cell, block = params.hog_channels, params.pix_per_cell, params.cell_per_block
+    coarse = params.coarse_blocks
+    cotangents = orientation_cotangents(params.orient)
+    bounds = degree_bounds(params.orient)
+    bins = bin_of_value(params.hist_bins)
+    size = params.spatial_size
+    spatial_stop = params.spatial_length
+    hist_stop = spatial_stop + params.hist_length
+
+    def extract(patches: NDArray[np.uint8], features: NDArray[np.float32]) -> None:
+        n = len(patches)
+        # Convert the colors of the whole batch as one tall image.
+        tall = np.ascontiguousarray(patches).reshape(n * PATCH_SIZE, PATCH_SIZE, 3)
+        converted = convert_color(tall, params.color_space).reshape(patches.shape)
+        if params.spatial_feat:
+            for index, patch in enumerate(converted):
+                small = cv2.resize(patch, (size, size))
+                features[index, :spatial_stop].reshape(3, size, size)[:] = small.transpose(2, 0, 1)
+        if params.hist_feat:
+            counts = features[:, spatial_stop:hist_stop]
+            _color_kernels.patch_histograms(converted, bins, params.hist_bins, counts)
+            if params.hist_sqrt:
+                np.sqrt(counts, out=counts)
+        if params.hog_feat:
+            gray = params.hog_channel == "GRAY"
+            source = hog_source(tall, params) if gray else pick_hog_channels(converted, params)
+            source = source.reshape(n, PATCH_SIZE, PATCH_SIZE, channels)
+            hog = features[:, hist_stop:]
+            if params.transform_sqrt:
+                gradients = sqrt_gradients(source)
+                _hog_kernels.patch_hog_from_angles(*gradients, bounds, channels, cell, block, coarse, hog)
+            else:
+                flat = source.reshape(n, PATCH_SIZE, PATCH_SIZE * channels)
+                _hog_kernels.patch_hog(flat, channels, cell, block, coarse, cotangents, hog)
+
+    return extract
+
+
 def _read_all(source: Any) -> Any:
-    """Read the patches of a list of paths; hand anything else on."""
+    """Read the files of a list of paths; return patches unchanged."""
     if isinstance(source, (str, os.PathLike)) or not isinstance(source, Iterable):
         raise InvalidInputError(
             f"source must be patches or a list of paths, got {describe(source)}; "

@@ -15,9 +15,9 @@ from vehicle_detection.params import FeatureParams
 class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """Turn 64x64 patches into feature vectors, for ``Pipeline`` and ``GridSearchCV``.
 
-    The arguments are the fields of `FeatureParams`, checked when `fit` is called, and `n_jobs` of
-    `extract_features`. The transformer learns nothing: it works without `fit`. The gains say what
-    `train_classifier` does with the features; here they change nothing.
+    The parameters are the fields of `FeatureParams`, checked by `fit`, and `n_jobs` of `extract_features`.
+    The transformer has no state and works without `fit`. It ignores the gains, which only `train_classifier`
+    uses.
 
     Examples
     --------
@@ -66,18 +66,18 @@ class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         self.n_jobs = n_jobs
 
     def to_params(self) -> FeatureParams:
-        """Return the arguments as checked `FeatureParams`."""
+        """Return the parameters as checked `FeatureParams`."""
         arguments = self.get_params(deep=False)
         del arguments["n_jobs"]
         return FeatureParams(**arguments)
 
     def fit(self, X: Any, y: Any = None) -> PatchFeatures:
-        """Check the arguments; there is nothing to learn."""
+        """Check the parameters."""
         self.to_params()
         return self
 
     def transform(self, X: Any) -> NDArray[np.float32]:
-        """Feature vectors ``(N, length)`` float32 of patches, as `extract_features` takes them."""
+        """Extract feature vectors, ``(N, length)`` float32; `X` as in `extract_features`."""
         return extract_features(X, self.to_params(), n_jobs=self.n_jobs)
 
     def get_feature_names_out(self, input_features: Any = None) -> NDArray[np.object_]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import threading
 import time
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import (
-    ThreadTeam,
     Workspace,
     check_image,
     check_number,
@@ -30,29 +28,18 @@ from vehicle_detection.mixture.features import (
 from vehicle_detection.mixture.model import TemplateMixture
 from vehicle_detection.mixture.template import MixtureTemplate, smallest_box
 from vehicle_detection.params import PyramidParams
-from vehicle_detection.search import SearchResult
+from vehicle_detection.search import FrameSearch, SearchResult
 
 _MAX_WINDOWS = 2000
 
 
-class MixtureSearch:
-    """A search with threads and workspace kept from frame to frame; thread-safe."""
+class MixtureSearch(FrameSearch):
+    """The search of frames with a mixture of templates."""
 
     def __init__(self, model: TemplateMixture, *, n_jobs: int | None = None) -> None:
         check_type(model, "model", TemplateMixture, 'load_model("default") or train_mixture return one')
+        super().__init__(n_jobs)
         self.model = model
-        self._team = ThreadTeam(n_jobs, name="search")
-        self._local = threading.local()
-
-    def __enter__(self) -> MixtureSearch:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End the threads."""
-        self._team.close()
 
     def find(
         self,
@@ -144,7 +131,7 @@ class MixtureSearch:
         rows = min((top for top, _ in ranges), default=0), max((bottom for _, bottom in ranges), default=0)
         if min(rows[1] - rows[0], shape[1]) * level.scale < COARSE:
             return ScoredWindows.empty()
-        workspace = self._local.__dict__.setdefault("workspace", Workspace())
+        workspace = self.workspace
         found = [
             _score_template(index, template, feature_map, min_margin, shape[1], workspace)
             for size, feature_map in feature_maps(images, level, rows, workspace)

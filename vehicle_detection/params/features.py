@@ -1,4 +1,4 @@
-"""What a patch is turned into: the features, and the presets of the course systems and the models."""
+"""Parameters of the features of a patch, with presets."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vehicle_detection._common import check_choice, check_integer, check_number,
 from vehicle_detection.errors import InvalidInputError
 
 PATCH_SIZE = 64
-"""Width and height in pixels of a training patch and of a window once it is resized."""
+"""Side length in pixels of a training patch and of a resized window."""
 
 COLOR_SPACES = ("RGB", "HSV", "LUV", "HLS", "YUV", "YCrCb", "LAB")
 HOG_CHANNELS: tuple[int | str, ...] = (0, 1, 2, "ALL", "GRAY")
@@ -20,38 +20,43 @@ HOG_CHANNELS: tuple[int | str, ...] = (0, 1, 2, "ALL", "GRAY")
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureParams:
-    """What a 64x64 patch is turned into: ``[spatial | histogram | HOG]``, each channel by channel.
+    """Features of a 64x64 patch: ``[spatial | histogram | HOG]``, each channel by channel.
 
-    With `coarse_hog` a second, coarser HOG stands at the end: ``[spatial | histogram | HOG | coarse HOG]``.
+    `coarse_hog` appends a second, coarser HOG: ``[spatial | histogram | HOG | coarse HOG]``.
 
     Attributes
     ----------
     color_space
-        Space of the spatial bins, the histograms and HOG: one of ``COLOR_SPACES``.
+        Color space of all three parts: ``"RGB"``, ``"HSV"``, ``"LUV"``, ``"HLS"``, ``"YUV"``, ``"YCrCb"`` or
+        ``"LAB"``.
     spatial_feat, hist_feat, hog_feat
-        Switches for the three parts.
+        Which of the three parts to compute.
     spatial_size
-        Side of the grid of spatial bins; ``spatial_size**2 * 3`` values.
+        Side length of the grid of spatial bins, which gives ``spatial_size**2 * 3`` values.
     hist_bins
-        Bins of each channel's histogram over 0-255.
+        Number of bins of each channel's histogram over 0-255.
     hist_sqrt
-        Square roots of the histogram's counts: a full bin drowns the others less.
+        Use the square roots of the histogram's counts, so that a full bin dominates less.
     orient
-        HOG orientations over 0-180 degrees.
+        Number of HOG orientations over 0-180 degrees.
     pix_per_cell
-        Side of a HOG cell in pixels.
+        Side length of a HOG cell in pixels.
     cell_per_block
-        Side of a HOG block in cells.
+        Side length of a HOG block in cells.
     hog_channel
-        0, 1, 2, ``"ALL"``, or ``"GRAY"`` (HOG of the gray image, whatever `color_space`).
+        Channel of HOG: 0, 1, 2, ``"ALL"``, or ``"GRAY"`` for the gray image in any `color_space`.
     transform_sqrt
-        HOG of the square root of the pixel values.
+        Compute HOG on the square root of the pixel values.
     coarse_hog
-        HOG of cells twice as large, too, as ``2 * pix_per_cell`` would give it: each is four of the cells.
+        Append the HOG of cells of ``2 * pix_per_cell`` pixels.
     hist_gain, coarse_gain
-        What the scaled histogram and the scaled coarse HOG are multiplied by in training, so that the SVM's
-        regularisation holds the few of them back less than the many other values. They change the weights
-        alone, not the features and not the time of a search.
+        Factors of the scaled histogram and the scaled coarse HOG in training. A larger factor weakens the
+        regularization of these few features. The gains change the weights only, not the features.
+
+    Raises
+    ------
+    InvalidInputError
+        If a field is out of range, or no part is selected.
 
     Examples
     --------
@@ -105,7 +110,7 @@ class FeatureParams:
             if not isinstance(getattr(self, name), bool):
                 raise InvalidInputError(f"{name} must be True or False; got {describe(getattr(self, name))}")
         if not (self.spatial_feat or self.hist_feat or self.hog_feat):
-            raise InvalidInputError("spatial_feat, hist_feat and hog_feat are all False; switch one on")
+            raise InvalidInputError("spatial_feat, hist_feat and hog_feat are all False; set one to True")
         self._check_integer("spatial_size", 1, PATCH_SIZE)
         self._check_integer("hist_bins", 1, 256)
         self._check_integer("orient", 1, 180)
@@ -116,68 +121,67 @@ class FeatureParams:
             self._check_integer("hog_channel", 0, 2)
         if self.coarse_hog and self.cells // 2 < self.cell_per_block:
             raise InvalidInputError(
-                f"coarse_hog must be False where no block of {self.cell_per_block} cells of "
-                f"{2 * self.pix_per_cell} pixels fits into a patch; got True"
+                f"coarse_hog must be False, because a block of {self.cell_per_block} cells of "
+                f"{2 * self.pix_per_cell} pixels does not fit into a patch; got True"
             )
-
         for name in ("hist_gain", "coarse_gain"):
             gain = check_number(getattr(self, name), name, low=0.01, high=100)
             object.__setattr__(self, name, float(gain))
 
     def _check_integer(self, name: str, low: int, high: int) -> None:
-        # A plain int replaces one of numpy, which the JSON of a model file does not take.
+        # Convert numpy integers, which JSON does not support.
         object.__setattr__(self, name, check_integer(getattr(self, name), name, low=low, high=high))
 
     @classmethod
     def preset(cls, name: str) -> FeatureParams:
-        """Parameters of a course system or of the shipped model.
+        """Parameters by name.
 
-        ``"luv-2384"``, ``"ycrcb-6156"`` and ``"ycrcb-8460"`` are the three systems' of the course;
-        ``"lab-9432"`` is the shipped highway model's: roots of the histogram and a coarse HOG beside what
-        ``"lab-8460"`` has.
+        ``"luv-2384"``, ``"ycrcb-6156"`` and ``"ycrcb-8460"`` are the features of three course projects.
+        ``"lab-9432"`` is used by the shipped model ``"highway"``: ``"lab-8460"`` with `hist_sqrt` and
+        `coarse_hog`.
         """
         check_choice(name, "preset", cls.PRESETS)
         return cls(**cls.PRESETS[name])
 
     @property
     def hog_channels(self) -> int:
-        """Number of channels that HOG sees."""
+        """Number of channels of HOG."""
         return 3 if self.hog_channel == "ALL" else 1
 
     @property
     def cells(self) -> int:
-        """HOG cells along a side of the patch."""
+        """Number of HOG cells along a side of the patch."""
         return PATCH_SIZE // self.pix_per_cell
 
     @property
     def blocks(self) -> int:
-        """HOG block positions along a side of the patch."""
+        """Number of HOG block positions along a side of the patch."""
         return self.cells - self.cell_per_block + 1
 
     @property
     def coarse_blocks(self) -> int:
-        """Block positions of the coarse HOG along a side of the patch, 0 without it."""
+        """Number of block positions of the coarse HOG along a side of the patch; 0 without it."""
         return self.cells // 2 - self.cell_per_block + 1 if self.coarse_hog else 0
 
     @property
     def spatial_length(self) -> int:
-        """Values from spatial bins."""
+        """Number of spatial features."""
         return self.spatial_size**2 * 3 if self.spatial_feat else 0
 
     @property
     def hist_length(self) -> int:
-        """Values from color histograms."""
+        """Number of histogram features."""
         return self.hist_bins * 3 if self.hist_feat else 0
 
     @property
     def hog_length(self) -> int:
-        """Values from HOG, the coarse ones included."""
+        """Number of HOG features, including the coarse ones."""
         values = self.blocks**2 * self.cell_per_block**2 * self.orient * self.hog_channels
         return values + self.coarse_length if self.hog_feat else 0
 
     @property
     def coarse_length(self) -> int:
-        """Values from the coarse HOG, at the end of the vector."""
+        """Number of coarse HOG features, the last ones of the vector."""
         values = self.coarse_blocks**2 * self.cell_per_block**2 * self.orient * self.hog_channels
         return values if self.hog_feat else 0
 
@@ -188,7 +192,7 @@ class FeatureParams:
 
     @property
     def gains(self) -> NDArray[np.float64]:
-        """What each scaled value is multiplied by in training, ``(length,)`` float64."""
+        """Factor of each scaled feature in training, ``(length,)`` float64."""
         gains = np.ones(self.length)
         gains[self.spatial_length :][: self.hist_length] = self.hist_gain
         gains[self.length - self.coarse_length :] = self.coarse_gain

@@ -172,7 +172,7 @@ class SearchParams:
         fitting = tuple(band for band in placed if band is not None)
         if not fitting:
             raise InvalidInputError(
-                f"image of {shape[1]}x{shape[0]} pixels has no room for a search window below the horizon at "
+                f"image of {shape[1]}x{shape[0]} pixels holds no search window below the horizon at "
                 f"{self.horizon:g} of its height; pass a larger image, another horizon or other bands"
             )
         return fitting

@@ -36,10 +36,11 @@ from vehicle_detection.plotting.style import (
     line_styles,
     new_axes,
 )
-from vehicle_detection.tuning import ResultTable
+from vehicle_detection.tuning import check_column, numeric_column, pareto_front
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from pandas import DataFrame
 
 Curve = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
@@ -331,40 +332,39 @@ def _add_cropped_boxes(
         add_boxes(axes, placed, color, linewidths=1.3, linestyles=linestyle)
 
 
-# Greatest over least value from which a scale is logarithmic.
-_WIDE = 20
-# Letters that fit side by side under the x axis.
-_ROOM = 60
+# Ratio of the largest to the smallest value above which the x axis is logarithmic.
+_LOG_RATIO = 20
+# Number of characters of tick labels that fit under the x axis without rotation.
+_MAX_TICK_CHARACTERS = 60
 
 
 def plot_tradeoff(
-    table: ResultTable,
+    table: DataFrame,
     *,
     quality: str = "accuracy",
     cost: str = "search_ms",
     label: str | None = "configuration",
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot what each configuration reaches against what it costs, and mark the best front.
+    """Plot the quality of each configuration against its cost, with the Pareto front.
 
     Parameters
     ----------
     table
-        Rows of `compare_configurations` or `search_parameters`; those without either value are left out.
+        Results of `compare_configurations` or `search_parameters`; rows without either value are left out.
     quality
-        Column of the y axis; more is better.
+        Column of the y axis; higher is better.
     cost
-        Column of the x axis; less is better.
+        Column of the x axis; lower is better.
     label
-        Column written beside the points of the front; None writes nothing.
+        Column of the text beside the points of the front; None for no text.
     ax
         Where to draw; None for a new figure.
 
     Returns
     -------
     matplotlib.axes.Axes
-        Its first collection holds all points; its first line is the front, cheapest first: no other point
-        is better in one of the two without being worse in the other.
+        The first collection holds all points, and the first line is the front (see `pareto_front`).
 
     Raises
     ------
@@ -373,22 +373,24 @@ def plot_tradeoff(
 
     Examples
     --------
-    >>> table = ResultTable([{"accuracy": 0.98, "search_ms": 4.0}, {"accuracy": 0.99, "search_ms": 9.0}])
+    >>> import pandas as pd
+    >>> table = pd.DataFrame({"accuracy": [0.98, 0.99], "search_ms": [4.0, 9.0]})
     >>> plot_tradeoff(table, label=None).get_xlabel()
     'search ms'
     """
-    front = table.front(quality, cost)
+    front = pareto_front(table, quality, cost)
     if not len(front):
         raise InvalidInputError(f"table has no row with both {quality} and {cost}; measure them first")
+    if label is not None:
+        check_column(table, label)
     axes = new_axes(ax)
-    x, y = table.numbers(cost), table.numbers(quality)
+    x, y = numeric_column(table, cost), numeric_column(table, quality)
     shown = ~np.isnan(x) & ~np.isnan(y)
     axes.scatter(x[shown], y[shown], s=24, color="0.6", label="measured", zorder=2)
-    axes.plot(front.numbers(cost), front.numbers(quality), "o-", color="C0", label="best front", zorder=3)
+    axes.plot(front[cost], front[quality], "o-", color="C0", label="Pareto front", zorder=3)
     if label is not None:
-        for row in front:
-            place = (row[cost], row[quality])
-            axes.annotate(str(row.get(label)), place, (4, 6), textcoords="offset points", fontsize=8)
+        for x, y, text in zip(front[cost], front[quality], front[label]):
+            axes.annotate(str(text), (x, y), (4, 6), textcoords="offset points", fontsize=8)
     axes.set_xlabel(cost.replace("_", " "))
     axes.set_ylabel(quality.replace("_", " "))
     axes.margins(0.12)
@@ -398,65 +400,67 @@ def plot_tradeoff(
 
 
 def plot_parameter(
-    table: ResultTable,
+    table: DataFrame,
     parameter: str,
     *,
     quality: str = "accuracy",
     by: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot what a parameter does: the mean of a measurement for each of its values.
+    """Plot the mean of a measurement against a parameter.
 
     Parameters
     ----------
     table
-        Rows of `compare_configurations` or `search_parameters`; those without a measurement are left out.
+        Results of `compare_configurations` or `search_parameters`; rows without the measurement are left out.
     parameter
         Column of the x axis, such as ``"C"`` or ``"orient"``.
     quality
         Column of the y axis, a measurement.
     by
-        A column that parts the rows into lines, such as ``"split"``; None draws one.
+        Column that groups the rows into lines, such as ``"split"``; None for one line.
     ax
         Where to draw; None for a new figure.
 
     Returns
     -------
     matplotlib.axes.Axes
-        One line for each value of `by`. The bars at its points are the standard deviation over the rows
-        that agree in `parameter` and `by`. Numbers that span more than a factor of 20 are on a
-        logarithmic scale; what holds more than numbers, at even distances.
+        One line for each value of `by`. Error bars show the standard deviation over rows with the same
+        `parameter` and `by`. The x axis is logarithmic if its numbers span more than a factor of 20, and
+        evenly spaced if it holds text.
 
     Raises
     ------
     InvalidInputError
-        If a column does not exist, or no row was measured.
+        If a column does not exist, or no row has a measurement.
 
     Examples
     --------
-    >>> table = ResultTable([{"C": 1e-4, "accuracy": 0.99}, {"C": 1.0, "accuracy": 0.98}])
+    >>> import pandas as pd
+    >>> table = pd.DataFrame({"C": [1e-4, 1.0], "accuracy": [0.99, 0.98]})
     >>> plot_parameter(table, "C").get_xscale()
     'log'
     """
-    keys = [parameter] if by is None else [by, parameter]
-    means = table.summarize(keys, [quality])
-    means = ResultTable([row for row in means if row.get(parameter) is not None])
-    if not len(means):
+    columns = [parameter] if by is None else [parameter, by]
+    for name in columns:
+        check_column(table, name)
+    measured = table[~np.isnan(numeric_column(table, quality))].dropna(subset=columns)
+    if measured.empty:
         raise InvalidInputError(f"table has no row with both {parameter} and {quality}; measure them first")
     axes = new_axes(ax)
-    values = means.column(parameter)
+    values = measured[parameter].unique().tolist()
     numeric = all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
-    listed = sorted(set(values)) if numeric else list(dict.fromkeys(values))
-    place = {value: value if numeric else index for index, value in enumerate(listed)}
-    groups: dict[Any, list[Any]] = {}
-    for row in means:
-        groups.setdefault(None if by is None else row[by], []).append(row)
-    for (name, rows), (color, dash) in zip(groups.items(), line_styles()):
-        ordered = sorted(rows, key=lambda row: place[row[parameter]])
+    values = sorted(values) if numeric else values
+    x_of = {value: value if numeric else index for index, value in enumerate(values)}
+    groups = [(None, measured)] if by is None else measured.groupby(by, sort=False)
+    for (name, rows), (color, dash) in zip(groups, line_styles()):
+        runs = rows.groupby(parameter, sort=False)[quality].agg(["mean", "std"])
+        runs.index = runs.index.map(x_of)
+        runs = runs.sort_index()
         axes.errorbar(
-            [place[row[parameter]] for row in ordered],
-            [row[quality] for row in ordered],
-            yerr=[row[f"{quality}_std"] or np.nan for row in ordered],
+            runs.index,
+            runs["mean"],
+            yerr=runs["std"],
             fmt="o",
             linestyle=dash,
             color=color,
@@ -465,13 +469,13 @@ def plot_parameter(
             label=None if by is None else str(name),
         )
     if not numeric:
-        texts = [str(value) for value in listed]
-        axes.set_xticks(range(len(listed)), texts)
-        if max(map(len, texts)) * len(texts) > _ROOM:
+        texts = [str(value) for value in values]
+        axes.set_xticks(range(len(values)), texts)
+        if max(map(len, texts)) * len(texts) > _MAX_TICK_CHARACTERS:
             axes.tick_params(axis="x", rotation=30)
             for label in axes.get_xticklabels():
                 label.set_horizontalalignment("right")
-    elif listed[0] > 0 and listed[-1] > _WIDE * listed[0]:
+    elif values[0] > 0 and values[-1] > _LOG_RATIO * values[0]:
         axes.set_xscale("log")
     axes.set_xlabel(parameter.replace("_", " "))
     axes.set_ylabel(quality.replace("_", " "))

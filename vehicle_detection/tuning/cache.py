@@ -1,4 +1,4 @@
-"""Features that are computed once for each parameter set, kept in memory and, if wanted, in a folder."""
+"""Features of a set of patches, computed once per parameter set and kept in memory and on disk."""
 
 from __future__ import annotations
 
@@ -21,44 +21,29 @@ from vehicle_detection.params import PATCH_SIZE, FeatureParams
 
 _LOGGER = logging.getLogger(__name__)
 
-_PROBE = 8  # Rows that tell whether a file still holds what this release computes.
+_N_CHECKED = 8  # Rows computed again to check that a file holds the features of this release.
 
 
-def digest_of(*facts: Any) -> str:
-    """Short hash of JSON values and arrays: the same facts, the same hash, in every run."""
+def digest_of(*parts: Any) -> str:
+    """Short hash of JSON values and arrays, the same in every run."""
     digest = hashlib.sha256()
-    for fact in facts:
-        if isinstance(fact, np.ndarray):
-            digest.update(f"{fact.shape}{fact.dtype}".encode())
-            digest.update(np.ascontiguousarray(fact).tobytes())
+    for part in parts:
+        if isinstance(part, np.ndarray):
+            digest.update(f"{part.shape}{part.dtype}".encode())
+            digest.update(np.ascontiguousarray(part).tobytes())
         else:
-            digest.update(json.dumps(fact, sort_keys=True).encode())
+            digest.update(json.dumps(part, sort_keys=True).encode())
         digest.update(b"\n")
     return digest.hexdigest()[:16]
 
 
 class FeatureCache:
-    """Feature vectors of one set of patches, by parameters; the same call twice computes once.
+    """Feature vectors of one set of patches by parameters.
 
-    Parameters
-    ----------
-    patches
-        ``(N, 64, 64, 3)`` uint8 RGB.
-    folder
-        Where features are kept from run to run, a ``.npy`` file for each parameter set (N x length x 4
-        bytes); it is made if it does not exist. None keeps them in memory alone.
-    memory_mb
-        Megabytes to keep in memory; the features used longest ago go first. One set is always kept.
-    n_jobs
-        Threads of the extraction.
+    `patches` is ``(N, 64, 64, 3)`` uint8 RGB. `folder` keeps one ``.npy`` file per parameter set
+    (N x length x 4 bytes) between runs; None keeps features in memory only. Beyond `memory_mb` megabytes the
+    least recently used sets are dropped, but one set is always kept. `n_jobs` is the number of threads.
 
-    Raises
-    ------
-    InvalidInputError
-        If the patches are malformed, or `folder` is a file or cannot be written.
-
-    Examples
-    --------
     >>> cache = FeatureCache(np.zeros((3, 64, 64, 3), np.uint8))
     >>> cache.all(FeatureParams()) is cache.all(FeatureParams())
     True
@@ -73,39 +58,41 @@ class FeatureCache:
         n_jobs: int | None = None,
     ) -> None:
         self.patches = check_patches(patches, PATCH_SIZE)
-        self.folder = None if folder is None else _check_folder(folder)
-        self._most_bytes = check_number(memory_mb, "memory_mb", low=0) * 1e6
+        self.folder = None if folder is None else _make_folder(folder)
+        self._max_bytes = check_number(memory_mb, "memory_mb", low=0) * 1e6
         self._n_jobs = n_jobs
-        self._kept: OrderedDict[tuple[FeatureParams, bool], NDArray[np.float32]] = OrderedDict()
+        self._in_memory: OrderedDict[tuple[FeatureParams, bool], NDArray[np.float32]] = OrderedDict()
         self.digest = digest_of(self.patches)
-        """Hash of the patches, in their order."""
 
     def rows(
         self, params: FeatureParams, rows: NDArray[np.intp], *, mirrored: bool = False
     ) -> NDArray[np.float32]:
-        """Features of some patches as a new array ``(len(rows), length)`` float32; the caller may change it.
+        """Features of some patches as a new array ``(len(rows), length)`` float32.
 
-        A few rows of features that are not at hand are computed alone.
+        If the set is not cached, few rows are computed without the others.
         """
-        if not self._is_at_hand(params, mirrored) and len(rows) < len(self.patches) / 4:
+        if not self._is_cached(params, mirrored) and len(rows) < len(self.patches) / 4:
             return self._compute(params, mirrored, rows)
         return self.all(params, mirrored=mirrored)[rows]
 
     def all(self, params: FeatureParams, *, mirrored: bool = False) -> NDArray[np.float32]:
-        """Features of all patches, ``(N, length)`` float32, read-only; `mirrored`, of the patches flipped."""
+        """Features of all patches, or of the mirrored patches: ``(N, length)`` float32, read-only."""
         key = (params, mirrored)
-        features = self._kept.get(key)
+        features = self._in_memory.get(key)
         if features is None:
             features = self._load(params, mirrored)
             if features is None:
                 features = self._compute(params, mirrored, slice(None))
                 self._save(features, params, mirrored)
             features.setflags(write=False)
-            self._kept[key] = features
-        self._kept.move_to_end(key)
-        while len(self._kept) > 1 and sum(kept.nbytes for kept in self._kept.values()) > self._most_bytes:
-            self._kept.popitem(last=False)
+            self._in_memory[key] = features
+        self._in_memory.move_to_end(key)
+        while len(self._in_memory) > 1 and self._n_bytes() > self._max_bytes:
+            self._in_memory.popitem(last=False)
         return features
+
+    def _n_bytes(self) -> int:
+        return sum(features.nbytes for features in self._in_memory.values())
 
     def _compute(
         self, params: FeatureParams, mirrored: bool, rows: NDArray[np.intp] | slice
@@ -120,9 +107,9 @@ class FeatureCache:
             return None
         return self.folder / f"{digest_of(self.digest, dataclasses.asdict(params), mirrored)}.npy"
 
-    def _is_at_hand(self, params: FeatureParams, mirrored: bool) -> bool:
+    def _is_cached(self, params: FeatureParams, mirrored: bool) -> bool:
         path = self._path(params, mirrored)
-        return (params, mirrored) in self._kept or (path is not None and path.exists())
+        return (params, mirrored) in self._in_memory or (path is not None and path.exists())
 
     def _save(self, features: NDArray[np.float32], params: FeatureParams, mirrored: bool) -> None:
         path = self._path(params, mirrored)
@@ -131,30 +118,29 @@ class FeatureCache:
                 np.save(file, features, allow_pickle=False)
 
     def _load(self, params: FeatureParams, mirrored: bool) -> NDArray[np.float32] | None:
-        """Read features from their file; None if there is none, or not what would be computed now."""
+        """Read features from their file; None if it is missing, damaged or from another release."""
         path = self._path(params, mirrored)
         if path is None or not path.exists():
             return None
         try:
             features = np.asarray(np.load(path, allow_pickle=False))
         except (OSError, ValueError, EOFError):
-            _LOGGER.warning("cached features %s are damaged and are computed again", path)
+            _LOGGER.warning("cached features %s are damaged; computing them again", path)
             return None
-        # Another release may compute other features under the same parameters.
-        probe = self._compute(params, mirrored, slice(_PROBE))
-        fits = features.shape == (len(self.patches), params.length) and features.dtype == np.float32
-        if not fits or not np.array_equal(features[:_PROBE], probe):
-            _LOGGER.warning("cached features %s are not those of this release; computed again", path)
+        expected = self._compute(params, mirrored, slice(_N_CHECKED))
+        has_shape = features.shape == (len(self.patches), params.length) and features.dtype == np.float32
+        if not has_shape or not np.array_equal(features[:_N_CHECKED], expected):
+            _LOGGER.warning("cached features %s are from another release; computing them again", path)
             return None
         return features
 
 
-def _check_folder(folder: str | os.PathLike[str]) -> Path:
+def _make_folder(folder: str | os.PathLike[str]) -> Path:
     path = Path(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InvalidInputError(
-            f"cache must be a folder that can be made, got {path} ({error.strerror}); choose another"
+            f"cache must be a folder, {path} cannot be created ({error.strerror}); choose another"
         ) from error
     return path

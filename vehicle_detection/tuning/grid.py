@@ -1,4 +1,4 @@
-"""Configurations by name: read, spelled out of a grid, and checked one by one."""
+"""Configurations: read from presets and mappings, expanded from a grid, and checked one by one."""
 
 from __future__ import annotations
 
@@ -11,36 +11,61 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_detection._common import describe
+from vehicle_detection._common import check_number, describe
+from vehicle_detection.classifier import DEFAULT_C
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import FeatureParams
 from vehicle_detection.tuning.results import number_or_text
-from vehicle_detection.tuning.trials import FEATURE_FIELDS, TRAINING_FIELDS, Recipe
 
-Configuration = FeatureParams | Mapping[str, Any] | str
-"""Features, a mapping from fields of `FeatureParams`, C, mirror and vehicle_weight, or a preset's name."""
-
+FEATURE_FIELDS = tuple(field.name for field in dataclasses.fields(FeatureParams))
+TRAINING_FIELDS = ("C", "mirror", "positive_weight")
 _FIELDS = (*FEATURE_FIELDS, *TRAINING_FIELDS)
 
-_MOST_COMBINATIONS = 100_000
+_MAX_COMBINATIONS = 100_000
 
-_WORDS: dict[str, Any] = {"true": True, "yes": True, "false": False, "no": False}
+_BOOLEANS = {"true": True, "yes": True, "false": False, "no": False}
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialConfig:
+    """Features and training options of one classifier, checked."""
+
+    params: FeatureParams
+    C: float = DEFAULT_C
+    mirror: bool = True
+    positive_weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "C", check_number(self.C, "C", above=0, high=1e12))
+        weight = check_number(self.positive_weight, "positive_weight", above=0, high=1e6)
+        object.__setattr__(self, "positive_weight", weight)
+        if not isinstance(self.mirror, bool):
+            raise InvalidInputError(f"mirror must be True or False; got {self.mirror!r}")
+
+    def to_columns(self) -> dict[str, Any]:
+        """Return the columns of a result row that describe the configuration."""
+        training = {name: getattr(self, name) for name in TRAINING_FIELDS}
+        return {**dataclasses.asdict(self.params), "n_features": self.params.length, **training}
+
+
+Configuration = FeatureParams | Mapping[str, Any] | str
+"""`FeatureParams`, a preset's name, or a mapping of fields of `FeatureParams` and of training options."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A named configuration: its recipe, or why it is impossible."""
+    """A named configuration; `config` is None where it is impossible, and `error` then says why."""
 
     name: str
     options: Mapping[str, Any]
-    recipe: Recipe | None
-    fault: str | None = None
+    config: TrialConfig | None
+    error: str | None = None
 
 
 def read_configurations(
     configurations: Mapping[str, Configuration] | Sequence[Configuration], *, defaults: Mapping[str, Any]
 ) -> list[Candidate]:
-    """Check each configuration; `defaults` are the training options that it does not name."""
+    """Check each configuration; `defaults` holds the training options that it does not set."""
     given: object = configurations
     if isinstance(given, Mapping):
         pairs: list[tuple[str | None, Any]] = list(given.items())
@@ -50,34 +75,44 @@ def read_configurations(
         pairs = []
     if not pairs:
         raise InvalidInputError(
-            "configurations must be a mapping from names to FeatureParams, or a list of them, at least one; "
-            f"got {describe(given)}"
+            "configurations must be a mapping from names to FeatureParams or a list of them, with at least "
+            f"one entry; got {describe(given)}"
         )
     return [_read(name, each, defaults) for name, each in pairs]
 
 
+def _read(name: str | None, configuration: object, defaults: Mapping[str, Any]) -> Candidate:
+    if isinstance(configuration, FeatureParams):
+        options = dataclasses.asdict(configuration)
+    elif isinstance(configuration, str):
+        options = dataclasses.asdict(FeatureParams.preset(configuration))
+    elif isinstance(configuration, Mapping):
+        options = dict(configuration)
+        _check_names(options, "configuration")
+    else:
+        raise InvalidInputError(
+            "a configuration must be FeatureParams, a mapping of options or a preset's name; "
+            f"got {describe(configuration)}"
+        )
+    features = {key: value for key, value in options.items() if key in FEATURE_FIELDS}
+    training = {key: options.get(key, defaults[key]) for key in TRAINING_FIELDS}
+    try:
+        config = TrialConfig(params=FeatureParams(**features), **training)
+    except InvalidInputError as error:
+        return Candidate(name or _join_options(options), {**options, **training}, None, str(error))
+    return Candidate(name or describe_params(config.params), options, config)
+
+
 def expand_grid(grid: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
-    """List all combinations of a grid's values, the last name varying fastest.
+    """List all combinations of a grid's values; the last name varies fastest.
 
-    Parameters
-    ----------
-    grid
-        Lists of values by name: fields of `FeatureParams`, ``C``, ``mirror`` and ``vehicle_weight``.
-
-    Raises
-    ------
-    InvalidInputError
-        If a name is no option, or a list is none, is empty, or makes more than 100,000 combinations.
-
-    Examples
-    --------
     >>> expand_grid({"orient": [8, 9], "C": [1e-4]})
     [{'orient': 8, 'C': 0.0001}, {'orient': 9, 'C': 0.0001}]
     """
     given: object = grid
     if not isinstance(given, Mapping) or not given:
         raise InvalidInputError(
-            f"grid must map names of {', '.join(_FIELDS)} to lists of values; got {describe(given)}"
+            f"grid must map option names ({', '.join(_FIELDS)}) to lists of values; got {describe(given)}"
         )
     _check_names(grid, "grid")
     lists = {}
@@ -88,21 +123,14 @@ def expand_grid(grid: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
         if not lists[name]:
             raise InvalidInputError(f"grid[{name!r}] must hold at least one value; got none")
     count = math.prod(map(len, lists.values()))
-    if count > _MOST_COMBINATIONS:
-        raise InvalidInputError(f"grid must span at most {_MOST_COMBINATIONS} combinations; got {count}")
+    if count > _MAX_COMBINATIONS:
+        raise InvalidInputError(f"grid must have at most {_MAX_COMBINATIONS} combinations; got {count}")
     return [dict(zip(lists, values)) for values in itertools.product(*lists.values())]
 
 
 def parse_grid(text: str) -> dict[str, list[Any]]:
-    """Read a grid as it is typed: ``"orient=8,9 color_space=YCrCb,LAB"``.
+    """Parse a grid from the command line.
 
-    Raises
-    ------
-    InvalidInputError
-        If a part is no ``name=value,value``, or a name is none or comes twice.
-
-    Examples
-    --------
     >>> parse_grid("orient=8,9 hog_channel=ALL,0 C=1e-4")
     {'orient': [8, 9], 'hog_channel': ['ALL', 0], 'C': [0.0001]}
     """
@@ -111,11 +139,11 @@ def parse_grid(text: str) -> dict[str, list[Any]]:
         name, sign, values = part.partition("=")
         if not sign or not name or not all(values.split(",")):
             raise InvalidInputError(
-                f"grid must be like 'orient=8,9 color_space=YCrCb,LAB', values parted by commas without a "
-                f"space; got {part!r}"
+                "grid must look like 'orient=8,9 color_space=YCrCb,LAB', with commas and no spaces between "
+                f"values; got {part!r}"
             )
         if name in grid:
-            raise InvalidInputError(f"grid names {name} twice; put its values into one list")
+            raise InvalidInputError(f"grid names {name} twice; put all its values into one list")
         grid[name] = [_parse_value(value) for value in values.split(",")]
     if not grid:
         raise InvalidInputError("grid is empty; name at least one option, such as 'orient=8,9'")
@@ -124,51 +152,24 @@ def parse_grid(text: str) -> dict[str, list[Any]]:
 
 
 def _parse_value(text: str) -> Any:
-    if text.lower() in _WORDS:
-        return _WORDS[text.lower()]
-    return number_or_text(text)
+    return _BOOLEANS.get(text.lower(), number_or_text(text))
 
 
 def _check_names(options: Mapping[str, Any], name: str) -> None:
     unknown = [key for key in options if key not in _FIELDS]
     if unknown:
-        raise InvalidInputError(f"{name} knows no {unknown[0]!r}; the options are {', '.join(_FIELDS)}")
-
-
-def _read(name: str | None, configuration: object, defaults: Mapping[str, Any]) -> Candidate:
-    if isinstance(configuration, Recipe):
-        options: dict[str, Any] = {**dataclasses.asdict(configuration.params)}
-        options |= {field: getattr(configuration, field) for field in TRAINING_FIELDS}
-    elif isinstance(configuration, FeatureParams):
-        options = dataclasses.asdict(configuration)
-    elif isinstance(configuration, str):
-        options = dataclasses.asdict(FeatureParams.preset(configuration))
-    elif isinstance(configuration, Mapping):
-        options = dict(configuration)
-        _check_names(options, "a configuration")
-    else:
-        raise InvalidInputError(
-            "a configuration must be FeatureParams, a mapping of options or a preset's name; "
-            f"got {describe(configuration)}"
-        )
-    features = {key: value for key, value in options.items() if key in FEATURE_FIELDS}
-    training = {key: options.get(key, defaults[key]) for key in TRAINING_FIELDS}
-    try:
-        recipe = Recipe(params=FeatureParams(**features), **training)
-    except InvalidInputError as error:
-        return Candidate(name or _spell(options), {**options, **training}, None, str(error))
-    return Candidate(name or describe_params(recipe.params), options, recipe)
+        raise InvalidInputError(f"{name} has the unknown option {unknown[0]!r}; use {', '.join(_FIELDS)}")
 
 
 def describe_params(params: FeatureParams) -> str:
-    """Name features by their preset, else by what differs from the defaults."""
-    values = dataclasses.asdict(params)
+    """Name features by their preset, or else by the fields that differ from the defaults."""
     for preset in FeatureParams.PRESETS:
         if FeatureParams.preset(preset) == params:
             return preset
-    plain = dataclasses.asdict(FeatureParams())
-    return _spell({key: value for key, value in values.items() if value != plain[key]})
+    defaults = dataclasses.asdict(FeatureParams())
+    values = dataclasses.asdict(params)
+    return _join_options({key: value for key, value in values.items() if value != defaults[key]})
 
 
-def _spell(options: Mapping[str, Any]) -> str:
+def _join_options(options: Mapping[str, Any]) -> str:
     return " ".join(f"{key}={value}" for key, value in options.items() if key in FEATURE_FIELDS) or "default"

@@ -1,7 +1,8 @@
-"""Hard negatives: windows of labelled frames that a classifier takes for vehicles and that are none."""
+"""Hard negative mining: false positive windows of labelled frames become training patches."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 
 import cv2
@@ -21,7 +22,6 @@ from vehicle_detection.evaluation import (
     keys_of,
 )
 from vehicle_detection.params import PATCH_SIZE, SearchParams
-from vehicle_detection.search import BandSearch
 
 
 def mine_negatives(
@@ -29,92 +29,92 @@ def mine_negatives(
     labels: FrameBoxes,
     classifier: VehicleClassifier,
     *,
-    search: SearchParams | None = None,
+    search_params: SearchParams | None = None,
     min_score: float = 0.0,
     max_overlap: float = 0.5,
-    per_frame: int | None = None,
+    max_per_frame: int | None = None,
     source: str = "mined",
     n_jobs: int | None = None,
 ) -> PatchSet:
-    """Cut out the false windows of labelled frames, as patches to train on.
+    """Cut the false positive windows of labelled frames out as training patches.
 
-    A window is false if it touches no labelled box, whether that is scored or to be ignored. So every
-    vehicle in the frames must be labelled, at least coarsely. Do not mine frames that are scored
-    afterwards.
+    A window is a false positive if it touches no labelled box, whether that box is scored or ignored. Every
+    vehicle in the frames must therefore be labelled, at least coarsely. Do not evaluate on mined frames.
 
     Parameters
     ----------
     frames
-        Images by key, a list of images that go by their numbers, or the frames of `load_frames`.
+        Images by key, a list of images with their numbers as keys, or the frames of `load_frames`.
     labels
-        True boxes of these frames; a frame without any counts as empty.
+        True boxes of these frames; a frame without a box counts as empty.
     classifier
-        The model whose mistakes are wanted.
-    search
+        The model whose false positives are collected.
+    search_params
         Where and at which sizes to search; the default is ``SearchParams.preset("default")``.
     min_score
-        Windows that score above this are mistakes; below 0, near mistakes are taken, too.
+        Windows above this score are collected; a value below 0 includes near misses.
     max_overlap
-        Of false windows that overlap by more than this (IoU), the best scored one is taken; 1 takes all.
-    per_frame
-        At most so many of a frame, the best scored ones; None takes all.
+        Of windows that overlap by more than this IoU only the best is kept; 1 keeps all.
+    max_per_frame
+        Number of patches to keep per frame, those with the highest scores; None keeps all.
     source
-        Name of the patches' source.
+        Source folder in the names of the patches.
     n_jobs
         Threads of the search.
 
     Returns
     -------
     PatchSet
-        Non-vehicles, 64x64, frame by frame, best score first, each named
-        ``non-vehicles/<source>/<frame>_<x1>_<y1>_<side>.png``; join it to the training patches with
-        ``PatchSet.concatenate``. It is empty if the classifier makes no mistake.
+        Non-vehicles, 64x64 pixels, frame by frame, highest score first, with the names
+        ``non-vehicles/<source>/<frame>_<x1>_<y1>_<side>.png``; may be empty. Append them to the training
+        patches with ``PatchSet.concatenate``.
 
     Raises
     ------
     InvalidInputError
-        If an argument is malformed, or the labels know none of the frames.
+        If an argument is malformed, or `labels` holds none of the frames.
 
     Notes
     -----
-    Dalal and Triggs (CVPR 2005), section 4: the detector is trained again with its own false positives.
+    Dalal and Triggs (CVPR 2005), section 4: the detector is retrained with its own false positives.
 
     Examples
     --------
     >>> from vehicle_detection import load_classifier
     >>> road = np.full((360, 640, 3), 90, np.uint8)
-    >>> mine_negatives([road], Labels([], None, [], frame_keys=[0]), load_classifier())
-    PatchSet(0 patches of 64x64 pixels, 0 of them vehicles)
+    >>> len(mine_negatives([road], FrameBoxes([], None, [], frame_keys=[0]), load_classifier()))
+    0
     """
     images = keyed_frames(frames)
     known = check_frame_boxes(keys_of(images), labels)
-    least = check_number(min_score, "min_score")
     overlap = check_number(max_overlap, "max_overlap", low=0, high=1)
-    most = None if per_frame is None else check_integer(per_frame, "per_frame", low=1)
-    wanted = dataclasses.replace(search or SearchParams.preset(), min_score=least)
+    limit = None if max_per_frame is None else check_integer(max_per_frame, "max_per_frame", low=1)
+    params = dataclasses.replace(
+        search_params or SearchParams.preset(), min_score=check_number(min_score, "min_score")
+    )
     patches: list[NDArray[np.uint8]] = []
     names: list[str] = []
-    with BandSearch(classifier, n_jobs=n_jobs) as bands:
+    with contextlib.closing(classifier.open_search(n_jobs)) as search:
         for key, image in iterate_frames(images):
-            windows = _false_windows(bands.find_windows(image, wanted), known.boxes[known.rows(key)])
+            windows = _false_windows(search.find(image, params).windows, known.boxes[known.rows(key)])
             kept = windows[non_max_suppression(windows.boxes, windows.scores, threshold=overlap)]
-            for box in np.rint(kept.boxes[:most]).astype(np.int64):
-                patches.append(cut_patch(image, box))
-                left, top, right, _ = box.tolist()
+            for box in np.rint(kept.boxes[:limit]).astype(np.int64):
+                patches.append(_cut_patch(image, box))
+                x1, y1, x2, _ = box.tolist()
                 stem = str(key).replace("/", "_")
-                names.append(f"non-vehicles/{source}/{stem}_{left}_{top}_{right - left}.png")
+                names.append(f"non-vehicles/{source}/{stem}_{x1}_{y1}_{x2 - x1}.png")
     stacked = np.stack(patches) if patches else np.empty((0, PATCH_SIZE, PATCH_SIZE, 3), np.uint8)
     return PatchSet(stacked, np.zeros(len(stacked), np.bool_), tuple(names))
 
 
 def _false_windows(windows: Detections, boxes: NDArray[np.float64]) -> Detections:
-    """Drop the windows that touch a box."""
-    touched = intersection_matrix(windows.boxes.astype(np.float64), boxes) > 0
-    return windows[np.flatnonzero(~touched.any(axis=1))]
+    """Windows that touch none of the boxes."""
+    touching = intersection_matrix(windows.boxes.astype(np.float64), boxes) > 0
+    return windows[np.flatnonzero(~touching.any(axis=1))]
 
 
-def cut_patch(image: NDArray[np.uint8], box: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """Cut a box out and resize it to a patch; beyond the frame its outermost pixels go on."""
+def _cut_patch(image: NDArray[np.uint8], box: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Cut a box out and resize it to a patch; pixels outside the frame repeat its border."""
     height, width = image.shape[:2]
     rows = np.clip(np.arange(box[1], box[3]), 0, height - 1)
     columns = np.clip(np.arange(box[0], box[2]), 0, width - 1)

@@ -1,7 +1,7 @@
-"""The testing system: which parameters are best, by accuracy without leaks, on frames, and by their cost.
+"""Parameter search: compare configurations on several splits, or search a grid by successive halving.
 
-Every trial is one row of a table. With a store, a row is on the disk as soon as it is measured: a run that
-is killed goes on where it was, and a run with more configurations measures only the new ones.
+Every trial is one row of a table. With a store, each row is on disk as soon as it is measured, so an
+interrupted run continues where it stopped, and a run with more configurations measures only the new ones.
 """
 
 from __future__ import annotations
@@ -10,81 +10,325 @@ import math
 import os
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, ClassifierMixin
-from sklearn.experimental import enable_halving_search_cv  # noqa: F401 - switches the next two on
-from sklearn.model_selection import HalvingGridSearchCV, HalvingRandomSearchCV, PredefinedSplit
 
-from vehicle_detection._common import check_choice, check_integer, describe
+from vehicle_detection._common import check_choice, check_integer, describe, progress_bar
 from vehicle_detection.classifier import DEFAULT_C
-from vehicle_detection.datasets import (
-    PatchSet,
-    Split,
-    split_groups,
-    split_random,
-    split_sequences,
-    split_sources,
-)
+from vehicle_detection.datasets import SEEDED_SPLITS, SPLIT_NAMES, PatchSet, Split, make_split
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import LabelledFrames
-from vehicle_detection.params import RegionParams, SearchParams
-from vehicle_detection.tuning.cache import FeatureCache
 from vehicle_detection.tuning.grid import (
     Configuration,
+    TrialConfig,
     describe_params,
     expand_grid,
     read_configurations,
 )
-from vehicle_detection.tuning.results import ResultTable, RowStore
-from vehicle_detection.tuning.runner import Ledger
-from vehicle_detection.tuning.trials import COLUMNS, Bench, Recipe
+from vehicle_detection.tuning.results import RowStore
+from vehicle_detection.tuning.trials import COLUMNS, TrialEvaluator, TrialOptions, TrialRunner
 
-_FEWEST_PATCHES = 300  # With fewer, chance decides who stays.
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+_MIN_PATCHES = 300  # Of the first halving round: scores on fewer patches are too noisy to rank candidates.
 
 
-def make_folds(patch_set: PatchSet, split: str, folds: int, seed: int) -> NDArray[np.intp]:
-    """Fold of each patch, 0 to ``folds - 1``: each fold is what the split tests on, out of the rest.
+def compare_configurations(
+    patch_set: PatchSet,
+    configurations: Mapping[str, Configuration] | Sequence[Configuration],
+    *,
+    splits: str | Sequence[str] | Mapping[str, Split] = "sequences",
+    seeds: Sequence[int] = (0,),
+    C: float | Sequence[float] = DEFAULT_C,
+    mirror: bool = True,
+    positive_weight: float = 1.0,
+    options: TrialOptions | None = None,
+    store: str | os.PathLike[str] | None = None,
+    progress: bool = False,
+) -> DataFrame:
+    """Train and evaluate every configuration with every C on every split.
 
-    So ``"sequences"`` cuts each folder into runs of file numbers, and ``"groups"`` keeps near duplicates
-    together; groups too large for a fold come into the last one.
+    Parameters
+    ----------
+    patch_set
+        The patches.
+    configurations
+        `FeatureParams`, names of presets, or mappings of fields of `FeatureParams` and of ``C``,
+        ``mirror`` and ``positive_weight``; as a mapping from names or as a list.
+    splits
+        One or more of ``"sequences"``, ``"groups"``, ``"random"`` (near duplicates in both parts, like the
+        course's split), ``"gti_to_kitti"`` (train on GTI, test on KITTI and Extras) and ``"kitti_to_gti"``;
+        or a mapping from names to splits.
+    seeds
+        Seeds of the splits ``"random"`` and ``"groups"``, one row each; other splits use the first.
+    C, mirror, positive_weight
+        Training options of configurations that do not set them; several values of C are all tried. A
+        misclassified vehicle costs `positive_weight` times a misclassified non-vehicle.
+    options
+        What is measured besides the accuracy; the default is ``TrialOptions()``.
+    store
+        A ``.csv`` or ``.jsonl`` file to which each row is appended as soon as it is measured. Rows that it
+        already holds are not measured again; an incomplete last line is dropped.
+    progress
+        Show a progress bar on standard error.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row per trial. NaN marks a missing value. The columns are:
+
+        - ``status``: ``"ok"``; ``"partial"`` if the fast search does not support the features, so that
+          neither frames nor speed are measured; ``"failed"`` if the combination is impossible.
+          ``message`` gives the reason.
+        - ``stage`` (``"compare"``), ``configuration`` (its name), the fields of `FeatureParams`,
+          ``n_features``, ``C``, ``mirror``, ``positive_weight``, ``split`` and ``seed``.
+        - ``train_size`` and ``test_size``, in patches; ``train_accuracy`` and ``accuracy``, fractions.
+        - ``frame_f1`` (at the detector's thresholds), ``frame_best_f1`` (at the best score threshold),
+          ``frame_average_precision`` and ``frame_iou``: means over the sets of frames;
+          ``frame_f1_by_set``: text.
+        - ``search_ms`` of the fast search of one frame and ``fit_seconds`` of the training.
+        - ``trial``: a hash of patches, configuration, split, seed, and the frames' names and labels.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is malformed or names an unknown option.
+    DatasetError
+        If the store is damaged or from another release.
+
+    Examples
+    --------
+    >>> from vehicle_detection import render_patches
+    >>> patches, labels = render_patches(40)
+    >>> patch_set = PatchSet(patches, labels, [f"drawn/{number}.png" for number in range(40)])
+    >>> table = compare_configurations(
+    ...     patch_set,
+    ...     [{"orient": 4}, {"orient": 0}],
+    ...     splits="random",
+    ...     options=TrialOptions(time_search=False),
+    ... )
+    >>> table["status"].tolist()
+    ['ok', 'failed']
     """
-    fold_of = np.full(len(patch_set), folds - 1, np.intp)
+    values = [C] if isinstance(C, (int, float)) else list(C)
+    if not values:
+        raise InvalidInputError("C must be a number or several; got none")
+    checked_seeds = _check_seeds(seeds)
+    # A configuration that sets C itself is tried with that value only.
+    candidates = [
+        candidate
+        for number, value in enumerate(values)
+        for candidate in read_configurations(
+            configurations, defaults={"C": value, "mirror": mirror, "positive_weight": positive_weight}
+        )
+        if number == 0 or "C" not in candidate.options
+    ]
+    evaluator = TrialEvaluator(patch_set, options or TrialOptions())
+    trials = list(_make_splits(patch_set, splits, checked_seeds))
+    rows = RowStore(store, COLUMNS)
+    # Candidates with the same features follow each other, so that a small cache computes them once.
+    order = {name: place for place, name in enumerate(dict.fromkeys(each.name for each in candidates))}
+    candidates.sort(key=lambda candidate: order[candidate.name])
+    total = sum(1 if candidate.config is None else len(trials) for candidate in candidates)
+    with progress_bar(progress, total, unit="trial") as bar:
+        runner = TrialRunner(evaluator, rows, bar)
+        for candidate in candidates:
+            if candidate.config is None:
+                runner.add_failed(candidate, stage="compare")
+                continue
+            for name, seed, split in trials:
+                runner.run(
+                    candidate.config, split, seed, name=candidate.name, split_name=name, stage="compare"
+                )
+    return runner.table()
+
+
+def search_parameters(
+    patch_set: PatchSet,
+    grid: Mapping[str, Iterable[Any]],
+    *,
+    split: str = "sequences",
+    n_folds: int = 3,
+    n_candidates: int | None = None,
+    factor: int = 3,
+    n_finalists: int = 3,
+    random_state: int = 0,
+    options: TrialOptions | None = None,
+    store: str | os.PathLike[str] | None = None,
+    progress: bool = False,
+) -> DataFrame:
+    """Search a grid by successive halving, then measure the best candidates in full.
+
+    All candidates are ranked on few patches, by cross-validation on folds without near duplicates between
+    them; the best ``1 / factor`` of them continue with `factor` times the patches, and so on (scikit-learn's
+    ``HalvingGridSearchCV``; Jamieson and Talwalkar, "Non-stochastic best arm identification", 2016). The
+    finalists are then trained on the training part of the split and evaluated on its test part, on the
+    frames, and by the time of their search.
+
+    Parameters
+    ----------
+    patch_set
+        The patches.
+    grid
+        Lists of values by name: fields of `FeatureParams`, ``C``, ``mirror`` and ``positive_weight``; the
+        others keep their defaults. Impossible combinations are reported and skipped.
+    split
+        ``"sequences"``, ``"groups"`` or ``"random"``: how the folds and the finalists' split are made.
+    n_folds
+        Number of folds.
+    n_candidates
+        Number of combinations to draw at random (``HalvingRandomSearchCV``); None tries all.
+    factor
+        One of `factor` candidates survives a round, and the number of patches grows by `factor`.
+    n_finalists
+        Number of best candidates to measure in full.
+    random_state
+        Seed of the draw, the folds and the training. The same seed repeats the search, so that an
+        interrupted one continues from its store.
+    options, store, progress
+        As in `compare_configurations`.
+
+    Returns
+    -------
+    pandas.DataFrame
+        The columns of `compare_configurations`. The stages are ``"grid"`` (impossible combinations),
+        ``"halving"`` (one row per candidate, fold and number of patches) and ``"final"`` (the finalists,
+        best first in the last round). Choose from ``pareto_front(table[table["stage"] == "final"])``.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is malformed, or no combination of the grid is possible.
+    DatasetError
+        If the store is damaged or from another release.
+
+    Examples
+    --------
+    >>> from vehicle_detection import render_patches
+    >>> patches, labels = render_patches(60)
+    >>> patch_set = PatchSet(patches, labels, [f"drawn/{number}.png" for number in range(60)])
+    >>> table = search_parameters(
+    ...     patch_set,
+    ...     {"orient": [4], "C": [1e-5, 1e-3]},
+    ...     split="random",
+    ...     n_finalists=1,
+    ...     options=TrialOptions(time_search=False),
+    ... )
+    >>> table["stage"].value_counts().to_dict()
+    {'halving': 6, 'final': 1}
+    """
+    check_choice(split, "split", ("sequences", "groups", "random"))
+    check_integer(n_folds, "n_folds", low=2, high=100)
+    check_integer(factor, "factor", low=2, high=100)
+    check_integer(n_finalists, "n_finalists", low=0)
+    seed = check_integer(random_state, "random_state", low=0, high=2**32 - 1)
+    if n_candidates is not None:
+        check_integer(n_candidates, "n_candidates", low=1)
+    defaults = {"C": DEFAULT_C, "mirror": True, "positive_weight": 1.0}
+    candidates = read_configurations(expand_grid(grid), defaults=defaults)
+    names = {each.config: each.name for each in candidates if each.config is not None}
+    if not names:
+        raise InvalidInputError(f"grid holds no possible combination: {candidates[0].error}")
+    evaluator = TrialEvaluator(patch_set, options or TrialOptions())
+    rows = RowStore(store, COLUMNS)
+    fold_of = make_folds(patch_set, split, n_folds, seed)
+    with progress_bar(progress, unit="trial") as bar:
+        runner = TrialRunner(evaluator, rows, bar)
+        for candidate in candidates:
+            if candidate.config is None:
+                runner.add_failed(candidate, stage="grid")
+        ranked = _halve(
+            runner, list(names), fold_of, split=split, n_candidates=n_candidates, factor=factor, seed=seed
+        )
+        if n_finalists:
+            ((name, _, parts),) = _make_splits(patch_set, split, (seed,))
+            for config in ranked[:n_finalists]:
+                runner.run(config, parts, seed, name=names[config], split_name=name, stage="final")
+    return runner.table()
+
+
+def make_folds(patch_set: PatchSet, split: str, n_folds: int, seed: int) -> NDArray[np.intp]:
+    """Fold of each patch, from 0; each fold is the test part of a split of the remaining patches.
+
+    Thus ``"sequences"`` cuts each folder into runs of file numbers, and ``"groups"`` keeps near duplicates
+    together; groups that are too large for a fold go into the last one.
+    """
+    fold_of = np.full(len(patch_set), n_folds - 1, np.intp)
     rest = np.arange(len(patch_set))
     try:
-        for fold in range(folds - 1):
-            share = 1 / (folds - fold)
-            if split == "sequences":
-                parts = split_sequences(patch_set[rest], test_size=share)
-            elif split == "groups":
-                parts = split_groups(patch_set[rest], test_size=share, random_state=seed)
-            else:
-                parts = split_random(patch_set[rest], test_size=share, random_state=seed)
+        for fold in range(n_folds - 1):
+            size = 1 / (n_folds - fold)
+            parts = make_split(patch_set[rest], split, test_size=size, random_state=seed)
             fold_of[rest[parts.test]] = fold
             rest = rest[parts.train]
     except InvalidInputError as error:
-        raise InvalidInputError(f"patch_set is too small for folds={folds}: {error}") from error
-    for fold in range(folds):
+        raise InvalidInputError(f"patch_set is too small for n_folds={n_folds}: {error}") from error
+    for fold in range(n_folds):
         if any(len(np.unique(patch_set.labels[side])) < 2 for side in (fold_of == fold, fold_of != fold)):
             raise InvalidInputError(
-                f"patch_set lacks vehicles or others in or beside fold {fold + 1} of folds={folds}; "
-                "use fewer folds or another split"
+                f"fold {fold + 1} of n_folds={n_folds}, or the rest of patch_set, lacks vehicles or "
+                "non-vehicles; use fewer folds or another split"
             )
     return fold_of
 
 
-def _make_estimator(ledger: Ledger, fold_of: NDArray[np.intp], split: str, seed: int) -> Any:
-    """Build an estimator over row numbers that is a recipe, trained when it is scored.
+def _halve(
+    runner: TrialRunner,
+    configs: Sequence[TrialConfig],
+    fold_of: NDArray[np.intp],
+    *,
+    split: str,
+    n_candidates: int | None,
+    factor: int,
+    seed: int,
+) -> list[TrialConfig]:
+    """Drop the worse configurations round by round, on more and more patches; return them best first."""
+    from sklearn.experimental import enable_halving_search_cv  # noqa: F401 - enables the next import
+    from sklearn.model_selection import HalvingGridSearchCV, HalvingRandomSearchCV, PredefinedSplit
 
-    Only then both sides of the trial are known, and the ledger can tell whether it was run before.
+    # One parameter that holds whole configurations: impossible combinations are never candidates.
+    values: dict[str, Any] = {"config": list(configs)}
+    count = min(n_candidates or len(configs), len(configs))
+    n_rounds = int(math.log(count, factor) + 1e-9)
+    n_patches = len(fold_of)
+    options: dict[str, Any] = {
+        "estimator": _make_estimator(runner, fold_of, split, seed),
+        "factor": factor,
+        "min_resources": min(n_patches, max(n_patches // factor**n_rounds, _MIN_PATCHES)),
+        "cv": PredefinedSplit(fold_of),
+        "error_score": "raise",
+        "return_train_score": False,
+        "refit": False,
+        "random_state": seed,
+    }
+    if count < len(configs):
+        search = HalvingRandomSearchCV(param_distributions=values, n_candidates=count, **options)
+    else:
+        search = HalvingGridSearchCV(param_grid=values, **options)
+    with warnings.catch_warnings():
+        # A configuration that cannot be trained has no score; the message of its row gives the reason.
+        warnings.filterwarnings("ignore", message="One or more of the test scores are non-finite")
+        search.fit(np.arange(n_patches)[:, None], runner.evaluator.labels)
+    results = search.cv_results_
+    # Order by the last round reached, then by score; NaN comes last.
+    scores = np.nan_to_num(results["mean_test_score"], nan=-1.0)
+    order = np.lexsort((-scores, -results["iter"]))
+    ranked = [results["params"][index]["config"] for index in order if scores[index] >= 0]
+    return list(dict.fromkeys(ranked))
+
+
+def _make_estimator(runner: TrialRunner, fold_of: NDArray[np.intp], split: str, seed: int) -> Any:
+    """Build a scikit-learn estimator over row numbers that runs a trial when it is scored.
+
+    Only then are both sides of the trial known, so that the runner can look it up in the store.
     """
+    from sklearn.base import BaseEstimator, ClassifierMixin
 
     class Trial(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
-        def __init__(self, recipe: Recipe | None = None) -> None:
-            self.recipe = recipe
+        def __init__(self, config: TrialConfig | None = None) -> None:
+            self.config = config
 
         def fit(self, X: NDArray[np.intp], y: NDArray[np.int64]) -> Trial:
             self.classes_ = np.unique(y)
@@ -92,12 +336,12 @@ def _make_estimator(ledger: Ledger, fold_of: NDArray[np.intp], split: str, seed:
             return self
 
         def score(self, X: NDArray[np.intp], y: NDArray[np.int64]) -> float:
-            assert self.recipe is not None
-            row = ledger.run(
-                self.recipe,
+            assert self.config is not None
+            row = runner.run(
+                self.config,
                 Split(np.sort(self.rows_), np.sort(X[:, 0])),
                 seed,
-                name=describe_params(self.recipe.params),
+                name=describe_params(self.config.params),
                 split_name=f"{split}, fold {fold_of[X[0, 0]] + 1} of {fold_of.max() + 1}",
                 stage="halving",
                 on_frames=False,
@@ -107,277 +351,7 @@ def _make_estimator(ledger: Ledger, fold_of: NDArray[np.intp], split: str, seed:
     return Trial()
 
 
-def halve(
-    ledger: Ledger,
-    recipes: Sequence[Recipe],
-    fold_of: NDArray[np.intp],
-    *,
-    split: str,
-    candidates: int | None,
-    factor: int,
-    seed: int,
-) -> list[Recipe]:
-    """Drop the worse recipes round by round, on ever more patches; return them best first."""
-    # A recipe is one value, so that only the possible combinations of a grid are candidates.
-    values: dict[str, Any] = {"recipe": list(recipes)}
-    count = min(candidates or len(recipes), len(recipes))
-    rounds = int(math.log(count, factor) + 1e-9)
-    patches = len(fold_of)
-    options: dict[str, Any] = {
-        "estimator": _make_estimator(ledger, fold_of, split, seed),
-        "factor": factor,
-        "min_resources": min(patches, max(patches // factor**rounds, _FEWEST_PATCHES)),
-        "cv": PredefinedSplit(fold_of),
-        "error_score": "raise",
-        "return_train_score": False,
-        "refit": False,
-        "random_state": seed,
-    }
-    if count < len(recipes):
-        search = HalvingRandomSearchCV(param_distributions=values, n_candidates=count, **options)
-    else:
-        search = HalvingGridSearchCV(param_grid=values, **options)
-    with warnings.catch_warnings():
-        # A recipe that cannot be trained has no score; its row says why.
-        warnings.filterwarnings("ignore", message="One or more of the test scores are non-finite")
-        search.fit(np.arange(patches)[:, None], ledger.bench.labels)
-    results = search.cv_results_
-    # Who came further is better; within a round the score decides, and NaN comes last.
-    scores = np.nan_to_num(results["mean_test_score"], nan=-1.0)
-    order = np.lexsort((-scores, -results["iter"]))
-    ranked = [results["params"][index]["recipe"] for index in order if scores[index] >= 0]
-    return list(dict.fromkeys(ranked))
-
-
-SPLITS = ("sequences", "groups", "sources", "sources-reversed", "random")
-"""Splits by name; the last one leaks near duplicates, as the course's does."""
-
-_SEEDED = ("groups", "random")
-
-Store = str | os.PathLike[str]
-
-
-def compare_configurations(
-    patch_set: PatchSet,
-    configurations: Mapping[str, Configuration] | Sequence[Configuration],
-    *,
-    splits: str | Sequence[str] | Mapping[str, Split] = "sequences",
-    C: float | Sequence[float] = DEFAULT_C,
-    mirror: bool = True,
-    vehicle_weight: float = 1.0,
-    seeds: Sequence[int] = (0,),
-    frames: LabelledFrames | Sequence[LabelledFrames] | None = None,
-    search: SearchParams | None = None,
-    fit: RegionParams | None = None,
-    time_search: bool = True,
-    cache: FeatureCache | str | os.PathLike[str] | None = None,
-    store: Store | None = None,
-    n_jobs: int | None = None,
-    progress: bool = False,
-) -> ResultTable:
-    """Train and judge every configuration with every C on every split.
-
-    Parameters
-    ----------
-    patch_set
-        The patches.
-    configurations
-        `FeatureParams`, names of presets, or mappings from fields of `FeatureParams` and from ``C``,
-        ``mirror`` and ``vehicle_weight`` to values, as a mapping from names or as a list.
-    splits
-        One or more of `SPLITS`, or splits of one's own by name. ``"sources"`` trains on GTI and tests on
-        KITTI and the Extras, ``"sources-reversed"`` the other way round.
-    C, mirror, vehicle_weight
-        How to train what does not say it itself; several values of C are all tried. See
-        `train_classifier`; a wrong vehicle costs `vehicle_weight` times a wrong non-vehicle.
-    seeds
-        Seeds of the splits ``"random"`` and ``"groups"``, each a row; other splits take the first.
-    frames
-        Labelled frames that each classifier is scored on, one by one as stills.
-    search, fit
-        The detector's parameters on these frames; `search` is timed, too.
-    time_search
-        Measure the milliseconds that the fast search takes for a 1280x720 frame on one core.
-    cache
-        A folder that keeps features from run to run, or a `FeatureCache` of these patches to share.
-    store
-        A ``.csv`` or ``.jsonl`` file that each row is appended to as soon as it is measured. Rows that
-        it holds already are not measured again; half a line at its end is dropped.
-    n_jobs
-        Threads of the feature extraction.
-    progress
-        Show a bar on standard error.
-
-    Returns
-    -------
-    ResultTable
-        A row for each trial. ``status`` is ``"ok"``; ``"partial"`` where the fast search cannot take the
-        features, so that frames and cost are not measured; or ``"refused"``, where the combination is
-        impossible. ``message`` says why. ``accuracy`` and ``train_accuracy`` are shares of the patches,
-        ``frame_f1`` (at the detector's thresholds), ``frame_best_f1`` (at the best threshold on the
-        score), ``frame_average_precision`` and ``frame_iou`` means over the sets of frames,
-        ``search_ms`` milliseconds. A row depends on patches, recipe, split, seed, and on the names and labels
-        of the frames, not on their pictures.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed or names an option that does not exist.
-    DatasetError
-        If the store is damaged or of another release.
-
-    Examples
-    --------
-    >>> from vehicle_detection import render_patches
-    >>> patches, labels = render_patches(40)
-    >>> patch_set = PatchSet(patches, labels, [f"drawn/{number}.png" for number in range(40)])
-    >>> table = compare_configurations(
-    ...     patch_set, [{"orient": 4}, {"orient": 0}], splits="random", time_search=False
-    ... )
-    >>> table.column("status")
-    ['ok', 'refused']
-    """
-    values = [C] if isinstance(C, (int, float)) else list(C)
-    if not values:
-        raise InvalidInputError("C must be a number or several; got none")
-    chosen = _check_seeds(seeds)
-    # A configuration that names its C is tried with that one alone.
-    candidates = [
-        candidate
-        for number, value in enumerate(values)
-        for candidate in read_configurations(
-            configurations, defaults={"C": value, "mirror": mirror, "vehicle_weight": vehicle_weight}
-        )
-        if number == 0 or "C" not in candidate.options
-    ]
-    bench = _make_bench(
-        patch_set, cache, n_jobs, frames=frames, search=search, fit=fit, time_search=time_search
-    )
-    trials = list(_plan_splits(patch_set, splits, chosen))
-    rows = RowStore(store, COLUMNS)
-    # Same features one after the other: a cache that holds one set computes each once.
-    order = {name: place for place, name in enumerate(dict.fromkeys(each.name for each in candidates))}
-    candidates.sort(key=lambda candidate: order[candidate.name])
-    total = sum(1 if each.recipe is None else len(trials) for each in candidates)
-    with _bar(progress, total) as bar:
-        ledger = Ledger(bench, rows, bar)
-        for candidate in candidates:
-            if candidate.recipe is None:
-                ledger.refuse(candidate, stage="compare")
-                continue
-            for name, seed, split in trials:
-                ledger.run(
-                    candidate.recipe, split, seed, name=candidate.name, split_name=name, stage="compare"
-                )
-    return ledger.table()
-
-
-def search_parameters(
-    patch_set: PatchSet,
-    grid: Mapping[str, Iterable[Any]],
-    *,
-    split: str = "sequences",
-    folds: int = 3,
-    candidates: int | None = None,
-    factor: int = 3,
-    finalists: int = 3,
-    frames: LabelledFrames | Sequence[LabelledFrames] | None = None,
-    search: SearchParams | None = None,
-    fit: RegionParams | None = None,
-    time_search: bool = True,
-    cache: FeatureCache | str | os.PathLike[str] | None = None,
-    store: Store | None = None,
-    random_state: int = 0,
-    n_jobs: int | None = None,
-    progress: bool = False,
-) -> ResultTable:
-    """Search a grid by successive halving, then measure the best with all objectives.
-
-    All candidates are judged on few patches, by cross-validation on folds that do not leak; the best
-    ``1 / factor`` of them go on with `factor` times the patches, and so on (scikit-learn's
-    ``HalvingGridSearchCV``; Jamieson and Talwalkar, "Non-stochastic best arm identification", 2016). The
-    finalists are then trained on the training part of the split, and judged on its test part, on the
-    frames, and by the time of their search.
-
-    Parameters
-    ----------
-    patch_set
-        The patches.
-    grid
-        Lists of values by name: fields of `FeatureParams`, ``C``, ``mirror`` and ``vehicle_weight``. What it
-        does not name has its default. Impossible combinations are reported and skipped.
-    split
-        ``"sequences"``, ``"groups"`` or ``"random"``: what the folds keep together, and the finalists' split.
-    folds
-        Number of folds.
-    candidates
-        Number of combinations to draw at random (``HalvingRandomSearchCV``); None takes all.
-    factor
-        Share of candidates that a round drops, and growth of the patches.
-    finalists
-        How many of the best are measured in full.
-    frames, search, fit, time_search, cache, store, n_jobs, progress
-        As in `compare_configurations`.
-    random_state
-        Seed of drawing, folds and training; the same seed repeats the search, so that a killed one
-        goes on from its store.
-
-    Returns
-    -------
-    ResultTable
-        Impossible combinations (stage ``"grid"``), a row for each candidate, fold and number of patches
-        (stage ``"halving"``), and the finalists (stage ``"final"``), best first as the halving saw
-        them; ``table.where(stage="final").front()`` is what to choose from.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed, or no combination of the grid is possible.
-    DatasetError
-        If the store is damaged or of another release.
-
-    Examples
-    --------
-    >>> from vehicle_detection import render_patches
-    >>> patches, labels = render_patches(60)
-    >>> patch_set = PatchSet(patches, labels, [f"drawn/{number}.png" for number in range(60)])
-    >>> table = search_parameters(
-    ...     patch_set, {"orient": [4], "C": [1e-5, 1e-3]}, split="random", finalists=1, time_search=False
-    ... )
-    >>> len(table.where(stage="halving")), len(table.where(stage="final"))
-    (6, 1)
-    """
-    check_choice(split, "split", ("sequences", "groups", "random"))
-    check_integer(folds, "folds", low=2, high=100)
-    check_integer(factor, "factor", low=2, high=100)
-    check_integer(finalists, "finalists", low=0)
-    seed = check_integer(random_state, "random_state", low=0, high=2**32 - 1)
-    if candidates is not None:
-        check_integer(candidates, "candidates", low=1)
-    defaults = {"C": DEFAULT_C, "mirror": True, "vehicle_weight": 1.0}
-    listed = read_configurations(expand_grid(grid), defaults=defaults)
-    recipes = list(dict.fromkeys(each.recipe for each in listed if each.recipe is not None))
-    if not recipes:
-        raise InvalidInputError(f"grid holds no possible combination: {listed[0].fault}")
-    bench = _make_bench(
-        patch_set, cache, n_jobs, frames=frames, search=search, fit=fit, time_search=time_search
-    )
-    rows = RowStore(store, COLUMNS)
-    fold_of = make_folds(patch_set, split, folds, seed)
-    with _bar(progress, None) as bar:
-        ledger = Ledger(bench, rows, bar)
-        for candidate in listed:
-            if candidate.recipe is None:
-                ledger.refuse(candidate, stage="grid")
-        ranked = halve(ledger, recipes, fold_of, split=split, candidates=candidates, factor=factor, seed=seed)
-        names = {each.recipe: each.name for each in listed if each.recipe is not None}
-        for name, number, parts in _plan_splits(patch_set, split, (seed,)) if finalists else ():
-            for recipe in ranked[:finalists]:
-                ledger.run(recipe, parts, number, name=names[recipe], split_name=name, stage="final")
-    return ledger.table()
-
-
-def _plan_splits(
+def _make_splits(
     patch_set: PatchSet, splits: str | Sequence[str] | Mapping[str, Split], seeds: tuple[int, ...]
 ) -> Iterator[tuple[str, int, Split]]:
     """Name, seed and rows of each split."""
@@ -388,75 +362,25 @@ def _plan_splits(
             last = max(int(split.train.max()), int(split.test.max()))
             if last >= len(patch_set):
                 raise InvalidInputError(
-                    f"splits[{name!r}] names row {last} of a set of {len(patch_set)} patches; "
+                    f"splits[{name!r}] holds row {last}, but patch_set has {len(patch_set)} patches; "
                     "pass the set it was made from"
                 )
             yield str(name), seeds[0], split
         return
     names = (splits,) if isinstance(splits, str) else tuple(splits)
     if not names:
-        raise InvalidInputError(f"splits must name at least one of {', '.join(SPLITS)}")
+        raise InvalidInputError(f"splits must name at least one of {', '.join(SPLIT_NAMES)}")
     for name in names:
-        check_choice(name, "splits", SPLITS)
-        for seed in seeds if name in _SEEDED else seeds[:1]:
-            yield name, seed, _split(patch_set, name, seed)
-
-
-def _split(patch_set: PatchSet, name: str, seed: int) -> Split:
-    if name == "random":
-        return split_random(patch_set, random_state=seed)
-    if name == "groups":
-        return split_groups(patch_set, random_state=seed)
-    if name == "sequences":
-        return split_sequences(patch_set)
-    if name == "sources":
-        return split_sources(patch_set)
-    return split_sources(patch_set, train=("KITTI", "Extras"), test=("GTI",))
+        check_choice(name, "splits", SPLIT_NAMES)
+        for seed in seeds if name in SEEDED_SPLITS else seeds[:1]:
+            yield name, seed, make_split(patch_set, name, random_state=seed)
 
 
 def _check_seeds(seeds: Sequence[int]) -> tuple[int, ...]:
     given: object = seeds
     if isinstance(given, (str, bytes)) or not isinstance(given, Iterable):
         raise InvalidInputError(f"seeds must be a list of integers, such as range(5); got {describe(given)}")
-    chosen = tuple(check_integer(seed, "seeds", low=0, high=2**32 - 1) for seed in given)
-    if not chosen or len(set(chosen)) < len(chosen):
+    checked = tuple(check_integer(seed, "seeds", low=0, high=2**32 - 1) for seed in given)
+    if not checked or len(set(checked)) < len(checked):
         raise InvalidInputError(f"seeds must be different integers, at least one; got {describe(seeds)}")
-    return chosen
-
-
-def _make_bench(
-    patch_set: object,
-    cache: FeatureCache | str | os.PathLike[str] | None,
-    n_jobs: int | None,
-    *,
-    frames: LabelledFrames | Sequence[LabelledFrames] | None,
-    **options: Any,
-) -> Bench:
-    if not isinstance(patch_set, PatchSet) or not len(patch_set):
-        raise InvalidInputError(
-            f"patch_set must be a PatchSet with patches, got {describe(patch_set)}; "
-            "read one with load_training_patches"
-        )
-    if not isinstance(cache, FeatureCache):
-        cache = FeatureCache(patch_set.patches, folder=cache, n_jobs=n_jobs)
-    elif cache.patches is not patch_set.patches:
-        raise InvalidInputError("cache must be a FeatureCache of the patches of patch_set; make one of them")
-    sets = (frames,) if isinstance(frames, LabelledFrames) else tuple(frames or ())
-    for each in sets:
-        if not isinstance(each, LabelledFrames):
-            raise InvalidInputError(f"frames must be LabelledFrames, one or more; got {describe(each)}")
-    if len({each.name for each in sets}) < len(sets):
-        raise InvalidInputError("frames must have different names; pass name=")
-    return Bench(patch_set, cache, frames=sets, **options)
-
-
-@contextmanager
-def _bar(progress: bool, total: int | None) -> Iterator[Any]:
-    """Yield a bar that counts rows, or None."""
-    if not progress:
-        yield None
-        return
-    from tqdm.auto import tqdm
-
-    with tqdm(total=total, unit="row", desc="trials") as bar:
-        yield bar
+    return checked

@@ -1,22 +1,22 @@
-"""One configuration at a time: trained on a part, judged on the rest, on frames, and by its cost."""
+"""Trials: a configuration is trained, then measured on other patches, on frames and by its search time."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from vehicle_detection._common import check_number
-from vehicle_detection._kernels import fit_svm
-from vehicle_detection.classifier import DEFAULT_C, Template, VehicleClassifier, check_labels
+from vehicle_detection._common import describe
+from vehicle_detection.classifier import VehicleClassifier, check_labels, fit_features
 from vehicle_detection.datasets import PatchSet, Split
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
@@ -28,167 +28,181 @@ from vehicle_detection.evaluation import (
     precision_recall_curve,
 )
 from vehicle_detection.params import FeatureParams, RegionParams, SearchParams
-from vehicle_detection.search import BandSearch
 from vehicle_detection.tuning.cache import FeatureCache, digest_of
+from vehicle_detection.tuning.grid import FEATURE_FIELDS, TRAINING_FIELDS, Candidate, TrialConfig
+from vehicle_detection.tuning.results import RowStore, make_table
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 _LOGGER = logging.getLogger(__name__)
 
-
-FEATURE_FIELDS = tuple(field.name for field in dataclasses.fields(FeatureParams))
-
-TRAINING_FIELDS = ("C", "mirror", "vehicle_weight")
-
-FRAME_COLUMNS = ("frame_f1", "frame_best_f1", "frame_average_precision", "frame_iou", "frame_f1_each")
+_FRAME_METRICS = ("frame_f1", "frame_best_f1", "frame_average_precision", "frame_iou")
 
 COLUMNS = (
-    "status", "message", "stage", "configuration", *FEATURE_FIELDS, "features", *TRAINING_FIELDS, "split",
-    "seed", "train_size", "test_size", "train_accuracy", "accuracy", *FRAME_COLUMNS, "search_ms",
-    "fit_seconds", "trial",
+    "status", "message", "stage", "configuration", *FEATURE_FIELDS, "n_features", *TRAINING_FIELDS, "split",
+    "seed", "train_size", "test_size", "train_accuracy", "accuracy", *_FRAME_METRICS, "frame_f1_by_set",
+    "search_ms", "fit_seconds", "trial",
 )  # fmt: skip
-"""Columns of a measured row."""
+"""Columns of a row; `compare_configurations` documents them."""
 
 _TIMED_SHAPE = (720, 1280)
 _TIMED_RUNS = 15
 
 
-@dataclass(frozen=True, kw_only=True)
-class Recipe:
-    """Everything that makes a classifier out of patches.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrialOptions:
+    """What each trial measures besides the accuracy on patches, and its resources.
 
     Attributes
     ----------
-    params
-        The features.
-    C
-        Inverse strength of the regularisation.
-    mirror
-        Train on each patch mirrored left to right, too.
-    vehicle_weight
-        What a wrong vehicle costs in training, where a wrong non-vehicle costs 1.
+    frames
+        One or more sets of labelled frames, with different names. Each classifier is evaluated on them,
+        frame by frame and without tracking.
+    search_params, region_params
+        Parameters of the detector on these frames. The search is also timed with `search_params`.
+    time_search
+        Measure the time of the fast search of a 1280x720 frame on one core.
+    cache
+        Folder that keeps features between runs, or a `FeatureCache` of the same patches.
+    n_jobs
+        Threads of the feature extraction.
+
+    Raises
+    ------
+    InvalidInputError
+        If `frames` holds anything else than labelled frames, or two sets of the same name.
+
+    Examples
+    --------
+    >>> TrialOptions(time_search=False).frame_sets
+    ()
     """
 
-    params: FeatureParams
-    C: float = DEFAULT_C
-    mirror: bool = True
-    vehicle_weight: float = 1.0
+    frames: LabelledFrames | Sequence[LabelledFrames] | None = None
+    search_params: SearchParams = dataclasses.field(default_factory=SearchParams.preset)
+    region_params: RegionParams = dataclasses.field(default_factory=RegionParams)
+    time_search: bool = True
+    cache: FeatureCache | str | os.PathLike[str] | None = None
+    n_jobs: int | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "C", check_number(self.C, "C", above=0, high=1e12))
-        weight = check_number(self.vehicle_weight, "vehicle_weight", above=0, high=1e6)
-        object.__setattr__(self, "vehicle_weight", weight)
-        if not isinstance(self.mirror, bool):
-            raise InvalidInputError(f"mirror must be True or False; got {self.mirror!r}")
+        for each in self.frame_sets:
+            if not isinstance(each, LabelledFrames):
+                raise InvalidInputError(f"frames must be LabelledFrames, one or more; got {describe(each)}")
+        if len({each.name for each in self.frame_sets}) < len(self.frame_sets):
+            raise InvalidInputError("frames must have different names; pass name=")
 
-    def to_cells(self) -> dict[str, Any]:
-        """Return the columns that describe the recipe."""
-        training = {name: getattr(self, name) for name in TRAINING_FIELDS}
-        return {**dataclasses.asdict(self.params), "features": self.params.length, **training}
+    @property
+    def frame_sets(self) -> tuple[LabelledFrames, ...]:
+        """The sets of `frames` as a tuple."""
+        return (self.frames,) if isinstance(self.frames, LabelledFrames) else tuple(self.frames or ())
 
 
-class Bench:
-    """The patches, and if wanted the frames, that recipes are tried on.
+class TrialEvaluator:
+    """Trains and evaluates configurations on one set of patches."""
 
-    Parameters
-    ----------
-    patch_set
-        The patches.
-    cache
-        Features of these patches.
-    frames
-        Sets of frames that each classifier is scored on; may be none.
-    search, fit
-        Parameters of the detector on these frames, and of the timed search.
-    time_search
-        Measure the fast search on one core.
-    """
-
-    def __init__(
-        self,
-        patch_set: PatchSet,
-        cache: FeatureCache,
-        *,
-        frames: Sequence[LabelledFrames] = (),
-        search: SearchParams | None = None,
-        fit: RegionParams | None = None,
-        time_search: bool = True,
-    ) -> None:
+    def __init__(self, patch_set: PatchSet, options: TrialOptions) -> None:
+        given: object = patch_set
+        if not isinstance(given, PatchSet) or not len(given):
+            raise InvalidInputError(
+                f"patch_set must be a PatchSet with patches, got {describe(patch_set)}; "
+                "read one with load_training_patches"
+            )
+        cache = options.cache
+        if not isinstance(cache, FeatureCache):
+            cache = FeatureCache(patch_set.patches, folder=cache, n_jobs=options.n_jobs)
+        elif cache.patches is not patch_set.patches:
+            raise InvalidInputError(
+                "cache must be a FeatureCache of the patches of patch_set; make one from patch_set.patches"
+            )
         self.labels = patch_set.labels.astype(np.int64)
         self.cache = cache
-        self.frames = tuple(frames)
-        self.search = search or SearchParams.preset()
-        self.region_params = fit or RegionParams()
-        self.time_search = time_search
-        self._milliseconds: dict[FeatureParams, float] = {}
-        self._material = digest_of(cache.digest, self.labels)
-        used: dict[str, Any] = {"search": dataclasses.asdict(self.search)} if time_search or frames else {}
-        if frames:
-            used["fit"] = dataclasses.asdict(self.region_params)
-            used["frames"] = [_digest_frames(each) for each in self.frames]
-        self._measured = digest_of(used, time_search)
+        self.options = options
+        self._search_ms: dict[FeatureParams, float] = {}
+        self._patches_digest = digest_of(cache.digest, self.labels)
+        used: dict[str, Any] = {}
+        if options.time_search or options.frame_sets:
+            used["search"] = dataclasses.asdict(options.search_params)
+        if options.frame_sets:
+            used["fit"] = dataclasses.asdict(options.region_params)
+            used["frames"] = [_digest_frames(each) for each in options.frame_sets]
+        self._options_digest = digest_of(used, options.time_search)
 
-    def trial(self, recipe: Recipe, split: Split, seed: int, *, on_frames: bool = True) -> str:
-        """Name a trial by all that its result depends on."""
+    def trial_id(self, config: TrialConfig, split: Split, seed: int, *, on_frames: bool = True) -> str:
+        """Hash of everything that the result depends on."""
         return digest_of(
-            self._material,
-            recipe.to_cells(),
+            self._patches_digest,
+            config.to_columns(),
             split.train,
             split.test,
             seed,
-            self._measured if on_frames else None,
+            self._options_digest if on_frames else None,
         )
 
-    def measure(self, recipe: Recipe, split: Split, seed: int, *, on_frames: bool = True) -> dict[str, Any]:
-        """Train and judge; the columns from ``"status"`` on that a measurement fills.
-
-        What cannot be measured at all has the status ``"refused"``, and what cannot be searched by the fast
-        search ``"partial"``: its accuracy is measured, its frames and its cost are not.
-        """
-        cells: dict[str, Any] = {"train_size": len(split.train), "test_size": len(split.test)}
-        began = time.perf_counter()
+    def evaluate(
+        self, config: TrialConfig, split: Split, seed: int, *, on_frames: bool = True
+    ) -> dict[str, Any]:
+        """Train and measure; the columns that a measurement fills."""
+        row: dict[str, Any] = {"train_size": len(split.train), "test_size": len(split.test)}
+        start = time.perf_counter()
         try:
-            classifier = self.train(recipe, split.train, seed)
+            classifier = self.train(config, split.train, seed)
         except InvalidInputError as error:
-            return {"status": "refused", "message": str(error), **cells}
-        cells["fit_seconds"] = round(time.perf_counter() - began, 3)
-        cells["train_accuracy"] = self.accuracy(classifier, split.train)
-        cells["accuracy"] = self.accuracy(classifier, split.test)
-        if on_frames and (self.frames or self.time_search):
+            return {"status": "failed", "message": str(error), **row}
+        row["fit_seconds"] = round(time.perf_counter() - start, 3)
+        row["train_accuracy"] = self.accuracy(classifier, split.train)
+        row["accuracy"] = self.accuracy(classifier, split.test)
+        if on_frames and (self.options.frame_sets or self.options.time_search):
             try:
-                BandSearch(classifier, n_jobs=1).close()
+                classifier.open_search(n_jobs=1).close()
             except InvalidInputError as error:
-                return {"status": "partial", "message": str(error), **cells}
-            if self.time_search:
-                cells["search_ms"] = self._time(classifier)
-            if self.frames:
-                cells |= self.score_frames(classifier)
-        return {"status": "ok", "message": None, **cells}
+                return {"status": "partial", "message": str(error), **row}
+            if self.options.time_search:
+                row["search_ms"] = self._time_search(classifier)
+            if self.options.frame_sets:
+                row |= self._score_frames(classifier)
+        return {"status": "ok", "message": None, **row}
 
-    def train(self, recipe: Recipe, rows: NDArray[np.intp], seed: int) -> VehicleClassifier:
-        """Train on some of the patches; equals `train_classifier` on them."""
-        targets = check_labels(self.labels[rows], len(rows))
-        copies = (False, True) if recipe.mirror else (False,)
-        _check_memory(recipe.params.length, len(self.labels), len(rows), len(copies))
-        parts = [self.cache.rows(recipe.params, rows, mirrored=copy) for copy in copies]
+    def train(self, config: TrialConfig, rows: NDArray[np.intp], seed: int) -> VehicleClassifier:
+        """Train on some of the patches; equal to `train_classifier` on them."""
+        labels = check_labels(self.labels[rows], len(rows))
+        copies = (False, True) if config.mirror else (False,)
+        _check_memory(config.params.length, len(self.labels), len(rows), len(copies))
+        parts = [self.cache.rows(config.params, rows, mirrored=copy) for copy in copies]
         features = np.concatenate(parts) if len(parts) > 1 else parts[0]
-        del parts  # They fill as much memory again.
-        return fit_features(features, np.tile(targets, len(copies)), recipe, seed)
+        del parts  # As large as the joined features.
+        return fit_features(
+            features,
+            labels,
+            params=config.params,
+            C=config.C,
+            mirror=config.mirror,
+            positive_weight=config.positive_weight,
+            random_state=seed,
+        )
 
     def accuracy(self, classifier: VehicleClassifier, rows: NDArray[np.intp]) -> float:
-        """Share of right answers on some of the patches, 0-1."""
+        """Fraction of correct predictions on some of the patches."""
         return classifier.score(self.cache.rows(classifier.params, rows), self.labels[rows])
 
-    def score_frames(self, classifier: VehicleClassifier) -> dict[str, Any]:
-        """Score detections on every set of frames; the mean over the sets, each counts the same."""
-        scores = [self._score_set(classifier, frames) for frames in self.frames]
-        cells: dict[str, Any] = {
-            name: _mean([score[name] for score in scores]) for name in FRAME_COLUMNS if name in scores[0]
-        }
-        each = (f"{frames.name} {score['frame_f1']:.4f}" for frames, score in zip(self.frames, scores))
-        return {**cells, "frame_f1_each": "; ".join(each)}
+    def _score_frames(self, classifier: VehicleClassifier) -> dict[str, Any]:
+        """Mean of each metric over the sets of frames, and the F1 score of each set as text."""
+        scores = [self._score_set(classifier, each) for each in self.options.frame_sets]
+        row: dict[str, Any] = {}
+        for name in _FRAME_METRICS:
+            values = [score[name] for score in scores if not math.isnan(score[name])]
+            row[name] = float(np.mean(values)) if values else None
+        by_set = [f"{s.name} {score['frame_f1']:.4f}" for s, score in zip(self.options.frame_sets, scores)]
+        return {**row, "frame_f1_by_set": "; ".join(by_set)}
 
     def _score_set(self, classifier: VehicleClassifier, frames: LabelledFrames) -> dict[str, float]:
-        options: dict[str, Any] = {"search_params": self.search, "region_params": self.region_params}
-        with VehicleDetector(classifier, horizon=frames.horizon, **options) as detector:
+        with VehicleDetector(
+            classifier,
+            search_params=self.options.search_params,
+            region_params=self.options.region_params,
+            horizon=frames.horizon,
+        ) as detector:
             found = FrameBoxes.from_detections({key: detector.detect(image) for key, image in frames})
         scores = evaluate_detections(found, frames.labels, frames=frames.keys)
         return {
@@ -198,54 +212,89 @@ class Bench:
             "frame_iou": scores.mean_iou,
         }
 
-    def _time(self, classifier: VehicleClassifier) -> float:
-        """Milliseconds of the fast search of a 1280x720 frame on one core: the fastest of a few runs."""
-        if classifier.params not in self._milliseconds:
+    def _time_search(self, classifier: VehicleClassifier) -> float:
+        """Milliseconds of the fast search of a 1280x720 frame on one core: the fastest of several runs."""
+        if classifier.params not in self._search_ms:
             frame = np.random.default_rng(0).integers(0, 256, (*_TIMED_SHAPE, 3), np.uint8)
-            with BandSearch(classifier, n_jobs=1) as bands:
-                bands.find(frame, self.search)  # The first frame compiles kernels and lays out buffers.
-                seconds = []
-                for _ in range(_TIMED_RUNS):
-                    began = time.perf_counter()
-                    bands.find(frame, self.search)
-                    seconds.append(time.perf_counter() - began)
-            self._milliseconds[classifier.params] = round(min(seconds) * 1000, 3)
-        return self._milliseconds[classifier.params]
+            seconds = []
+            with contextlib.closing(classifier.open_search(n_jobs=1)) as search:
+                # The first run compiles kernels and allocates buffers.
+                for _ in range(_TIMED_RUNS + 1):
+                    start = time.perf_counter()
+                    search.find(frame, self.options.search_params)
+                    seconds.append(time.perf_counter() - start)
+            self._search_ms[classifier.params] = round(min(seconds[1:]) * 1000, 3)
+        return self._search_ms[classifier.params]
 
 
-def fit_features(
-    features: NDArray[np.float32], targets: NDArray[np.int64], recipe: Recipe, seed: int
-) -> VehicleClassifier:
-    """Fit a scaler and a linear SVM on feature vectors, as `train_classifier` does."""
-    costs = recipe.C * np.where(targets == 1, recipe.vehicle_weight, 1.0)
-    fitted = fit_svm(features, targets, costs, gains=recipe.params.gains, random_state=seed)
-    return VehicleClassifier(recipe.params, (Template(*fitted),))
+class TrialRunner:
+    """Runs trials that the store does not hold yet, and stores each new row at once."""
+
+    def __init__(self, evaluator: TrialEvaluator, store: RowStore, bar: Any) -> None:
+        self.evaluator = evaluator
+        self._store = store
+        self._bar = bar
+        self._rows: list[Mapping[str, Any]] = []
+
+    def table(self) -> DataFrame:
+        """Rows so far, in the order in which they were requested."""
+        return make_table(self._rows, COLUMNS)
+
+    def run(
+        self,
+        config: TrialConfig,
+        split: Split,
+        seed: int,
+        *,
+        name: str,
+        split_name: str,
+        stage: str,
+        on_frames: bool = True,
+    ) -> Mapping[str, Any]:
+        """Return the row of a trial, from the store or measured now."""
+        trial = self.evaluator.trial_id(config, split, seed, on_frames=on_frames)
+        labels = {"stage": stage, "configuration": name, "split": split_name, "seed": seed, "trial": trial}
+        if trial in self._store:
+            return self._append({**self._store[trial], **labels})
+        measured = self.evaluator.evaluate(config, split, seed, on_frames=on_frames)
+        row = self._append({**measured, **config.to_columns(), **labels})
+        self._store.add(row)
+        _LOGGER.info("%s, C=%g, %s: %s", name, config.C, split_name, row["accuracy"] or row["message"])
+        return row
+
+    def add_failed(self, candidate: Candidate, *, stage: str) -> None:
+        """Record an impossible combination."""
+        trial = digest_of(dict(candidate.options), candidate.error)
+        labels = {"stage": stage, "configuration": candidate.name, "trial": trial}
+        row = self._append({**candidate.options, **labels, "status": "failed", "message": candidate.error})
+        if trial not in self._store:
+            self._store.add(row)
+            _LOGGER.warning("%s failed: %s", candidate.name, candidate.error)
+
+    def _append(self, cells: Mapping[str, Any]) -> dict[str, Any]:
+        row = {name: cells.get(name) for name in COLUMNS}
+        self._rows.append(row)
+        self._bar.update()
+        return row
 
 
 def _digest_frames(frames: LabelledFrames) -> str:
-    """Name a set by its frames' keys and labels; the pictures themselves take too long to read."""
+    """Hash of a set's name, frame keys and labels; hashing the images would take too long."""
     labels = frames.labels
-    facts = [list(map(str, frames.keys)), list(map(str, labels.frames)), frames.horizon]
-    return digest_of(frames.name, facts, labels.boxes, labels.ignore, labels.tracks)
+    keys = [list(map(str, frames.keys)), list(map(str, labels.frames)), frames.horizon]
+    return digest_of(frames.name, keys, labels.boxes, labels.ignore, labels.tracks)
 
 
-def _mean(values: ArrayLike) -> float | None:
-    """Mean of what was measured; None for nothing."""
-    array = np.asarray(values, np.float64)
-    array = array[~np.isnan(array)]
-    return float(array.mean()) if array.size else None
-
-
-def _check_memory(length: int, patches: int, rows: int, copies: int) -> None:
-    """Refuse features that do not fit into this machine, instead of being ended by it."""
-    # Features in float32 and the rows among them to train on, which are held twice while they are joined.
-    needed = length * copies * (4 * patches + (4 + 4) * rows)
+def _check_memory(length: int, n_patches: int, n_rows: int, n_copies: int) -> None:
+    """Raise if the features do not fit into memory, before the system kills the process."""
+    # float32 features of all patches, and twice those of the training rows while they are joined.
+    needed = length * n_copies * (4 * n_patches + (4 + 4) * n_rows)
     try:
-        present = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):  # Not told by this system.
+        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):  # Not available on this system.
         return
-    if needed > present:
+    if needed > memory:
         raise InvalidInputError(
-            f"{length} features of {rows} patches need about {math.ceil(needed / 1e9)} GB to train on, this "
-            f"machine has {present / 1e9:.0f}; choose coarser features or fewer patches"
+            f"training on {length} features of {n_rows} patches needs about {math.ceil(needed / 1e9)} GB, "
+            f"but this machine has {memory / 1e9:.0f} GB; choose coarser features or fewer patches"
         )

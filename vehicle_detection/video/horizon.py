@@ -47,5 +47,7 @@ def estimate_video_horizon(
         found = estimate_horizon(np.concatenate(boxes), shape)
     except InvalidInputError:  # too few boxes, or all of one width
         return None
-    plausible = found.error <= _MAX_STD and _MIN_CAMERA_HEIGHT <= found.camera_height_m <= _MAX_CAMERA_HEIGHT
+    plausible = (
+        found.horizon_std <= _MAX_STD and _MIN_CAMERA_HEIGHT <= found.camera_height_m <= _MAX_CAMERA_HEIGHT
+    )
     return found if plausible and 0 <= found.horizon <= 1 else None

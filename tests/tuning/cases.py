@@ -1,0 +1,31 @@
+"""Small features and searches for the tests of tuning."""
+
+from vehicle_detection.params import SearchBand, SearchParams
+from vehicle_detection.tuning import TrialOptions
+from vehicle_detection.tuning.trials import TrialEvaluator
+
+SMALL = {"spatial_size": 8, "hist_bins": 8, "orient": 4, "pix_per_cell": 16, "hog_channel": 0}
+SMALL_GRID = {name: [value] for name, value in SMALL.items()}
+UNTIMED = TrialOptions(time_search=False)
+SEARCH = SearchParams(
+    bands=(SearchBand(window=(128, 128), y=(-64, 192)), SearchBand(window=(256, 256), y=(-128, 300)))
+)
+
+
+def count_trials(monkeypatch, stop_after=None):
+    """List the configurations that are evaluated, and interrupt the run after some."""
+    configs = []
+    evaluate = TrialEvaluator.evaluate
+
+    def counted(self, config, *arguments, **options):
+        if stop_after is not None and len(configs) == stop_after:
+            raise KeyboardInterrupt
+        configs.append(config)
+        return evaluate(self, config, *arguments, **options)
+
+    monkeypatch.setattr(TrialEvaluator, "evaluate", counted)
+    return configs
+
+
+def without_times(table):
+    return table.drop(columns=["fit_seconds", "search_ms"])

@@ -1,0 +1,73 @@
+import logging
+
+import numpy as np
+import pytest
+
+from tests.tuning.cases import SMALL
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.features import extract_features
+from vehicle_detection.params import FeatureParams
+from vehicle_detection.tuning import FeatureCache, cache
+
+PARAMS = FeatureParams(**SMALL)
+
+
+def test_cached_features_equal_extracted_features(patch_set, monkeypatch):
+    features = FeatureCache(patch_set.patches)
+    rows = np.array([5, 3, 117])
+    expected = extract_features(patch_set.patches, PARAMS)
+    np.testing.assert_array_equal(features.rows(PARAMS, rows), expected[rows])
+    np.testing.assert_array_equal(features.all(PARAMS), expected)
+    mirrored = extract_features(np.ascontiguousarray(patch_set.patches[:, :, ::-1]), PARAMS)
+    np.testing.assert_array_equal(features.all(PARAMS, mirrored=True), mirrored)
+    monkeypatch.setattr(cache, "extract_features", None)
+    features.rows(PARAMS, rows)[:] = -1  # A copy.
+    np.testing.assert_array_equal(features.all(PARAMS), expected)
+    with pytest.raises(ValueError, match="read-only"):
+        features.all(PARAMS)[0] = 0
+
+
+def test_the_least_recently_used_features_are_dropped(patch_set):
+    one, two = PARAMS, FeatureParams(**{**SMALL, "orient": 5})
+    size = 120 * one.length * 4 / 1e6
+    features = FeatureCache(patch_set.patches, memory_mb=size * 2.5)
+    for params, mirrored in ((one, False), (two, False), (one, False), (one, True)):
+        features.all(params, mirrored=mirrored)
+    assert list(features._in_memory) == [(one, False), (one, True)]
+    assert len(FeatureCache(patch_set.patches, memory_mb=0).all(one)) == 120
+
+
+def test_features_stay_on_disk(patch_set, tmp_path, monkeypatch, caplog):
+    folder = tmp_path / "new" / "features"
+    expected = FeatureCache(patch_set.patches, folder=folder).all(PARAMS)
+    (file,) = folder.iterdir()
+    computed = []
+
+    def counted(patches, *arguments, **options):
+        computed.append(len(patches))
+        return extract_features(patches, *arguments, **options)
+
+    monkeypatch.setattr(cache, "extract_features", counted)
+    np.testing.assert_array_equal(FeatureCache(patch_set.patches, folder=folder).all(PARAMS), expected)
+    assert max(computed) < 10  # Only the rows that are checked.
+    FeatureCache(patch_set.patches[:50], folder=folder).all(PARAMS)
+    assert max(computed) == 50
+    data = file.read_bytes()
+    for damaged, message in (
+        (data[: len(data) // 2], "are damaged"),
+        (b"", "are damaged"),
+        (data[:200] + bytes(len(data) - 200), "are from another release"),
+    ):
+        caplog.clear()
+        file.write_bytes(damaged)
+        with caplog.at_level(logging.WARNING):
+            found = FeatureCache(patch_set.patches, folder=folder).all(PARAMS)
+        np.testing.assert_array_equal(found, expected)
+        assert message in caplog.text
+        assert file.read_bytes() == data
+
+
+def test_a_cache_folder_that_cannot_be_created(patch_set, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InvalidInputError, match=r"cache must be a folder, .*file cannot be created"):
+        FeatureCache(patch_set.patches, folder=tmp_path / "file")

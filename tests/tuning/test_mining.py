@@ -1,0 +1,140 @@
+import math
+
+import numpy as np
+import pytest
+
+from tests.tuning.cases import SEARCH, SMALL
+from vehicle_detection.classifier import train_classifier
+from vehicle_detection.datasets import PatchSet, load_frames
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import FrameBoxes, read_labels
+from vehicle_detection.images import write_image
+from vehicle_detection.params import FeatureParams, SearchBand, SearchParams
+from vehicle_detection.search import find_cars
+from vehicle_detection.tuning import mine_negatives
+
+
+def boxes_of(mined):
+    """Frame and box of each mined patch, from its name."""
+    parts = [name.removesuffix(".png").rsplit("/", 1)[1].rsplit("_", 3) for name in mined.names]
+    corners = np.array([[int(x1), int(y1), int(side)] for _, x1, y1, side in parts]).reshape(-1, 3)
+    boxes = np.concatenate([corners[:, :2], corners[:, :2] + corners[:, 2:]], axis=1)
+    return [frame for frame, *_ in parts], boxes
+
+
+def test_mined_windows_touch_no_label(scenes, labels, random_svm):
+    images = {number: scene.image for number, scene in enumerate(scenes)}
+    mined = mine_negatives(images, labels, random_svm, search_params=SEARCH, max_overlap=1.0)
+    assert len(mined) > 10
+    assert not mined.labels.any()
+    assert set(mined.sources) == {"mined"}
+    numbers, boxes = boxes_of(mined)
+    for number, (left, top, right, bottom) in zip(numbers, boxes):
+        for x1, y1, x2, y2 in labels.boxes[labels.rows(int(number))]:
+            assert left >= x2 - 1 or right <= x1 + 1 or top >= y2 - 1 or bottom <= y1 + 1
+    # Without labels, windows on vehicles are false positives as well.
+    nothing = FrameBoxes([], None, [], frame_keys=(0, 1))
+    unlabelled = mine_negatives(images, nothing, random_svm, search_params=SEARCH, max_overlap=1.0)
+    assert len(unlabelled) > len(mined)
+    assert len(unlabelled) == sum(len(find_cars(image, random_svm, SEARCH)) for image in images.values())
+
+
+def test_a_mined_patch_is_the_window_that_was_searched(random_svm):
+    # In a frame of this width, windows of 64 pixels are not resized: the patch is a crop of the frame.
+    image = np.random.default_rng(3).integers(0, 256, (200, 1280, 3), np.uint8)
+    search = SearchParams(bands=(SearchBand(window=(64, 64), y=(0, 100)),), horizon=0.25)
+    nothing = FrameBoxes([], None, [], frame_keys=[0])
+    mined = mine_negatives([image], nothing, random_svm, search_params=search)
+    assert len(mined) > 5
+    _, boxes = boxes_of(mined)
+    for patch, (left, top, right, bottom) in zip(mined.patches, boxes):
+        np.testing.assert_array_equal(patch, image[top:bottom, left:right])
+    windows = find_cars(image, random_svm, search)
+    scores = {tuple(box): score for box, score in zip(windows.boxes.astype(int).tolist(), windows.scores)}
+    mined_scores = [scores[tuple(box)] for box in boxes.tolist()]
+    assert mined_scores == sorted(mined_scores, reverse=True)
+
+
+def test_a_window_outside_the_frame_repeats_its_border(random_svm):
+    image = np.random.default_rng(4).integers(0, 256, (200, 1280, 3), np.uint8)
+    search = SearchParams(
+        bands=(SearchBand(window=(64, 64), y=(0, 100)),), horizon=0.25, horizontal_padding=0.5
+    )
+    mined = mine_negatives(
+        [image],
+        FrameBoxes([], None, [], frame_keys=[0]),
+        random_svm,
+        search_params=search,
+        min_score=-1e6,
+        max_overlap=1,
+    )
+    _, boxes = boxes_of(mined)
+    row = int(boxes[:, 0].argmin())
+    left, top = boxes[row, :2]
+    assert left == -32
+    np.testing.assert_array_equal(mined.patches[row][:, :32], image[top : top + 64, :1].repeat(32, axis=1))
+    np.testing.assert_array_equal(mined.patches[row][:, 32:], image[top : top + 64, :32])
+
+
+def test_options_limit_the_number_of_windows(frames, labels, random_svm):
+    def count(**options):
+        return len(mine_negatives(frames.frames, labels, random_svm, search_params=SEARCH, **options))
+
+    assert count(max_overlap=0.0) < count() < count(max_overlap=1.0)
+    assert count(min_score=1.0) < count() < count(min_score=-1.0)
+    assert count(max_per_frame=2) == 4
+    assert count(min_score=1e5) == 0
+    everything = FrameBoxes([0, 1], None, [[0, 0, 640, 360]] * 2, ignore=np.array([True, True]))
+    assert len(mine_negatives(frames.frames, everything, random_svm, search_params=SEARCH)) == 0
+
+
+def test_training_with_mined_patches_removes_false_positives(patch_set, frames, labels):
+    params = FeatureParams(**SMALL)
+    few = patch_set[::3]
+    before = train_classifier(few.patches, few.labels, params=params, C=0.1)
+    mined = mine_negatives(frames.frames, labels, before, search_params=SEARCH, min_score=-0.5)
+    more = PatchSet.concatenate([few, mined])
+    after = train_classifier(more.patches, more.labels, params=params, C=0.1)
+    counts = [(each.decision_function(mined.patches) > -0.5).sum() for each in (before, after)]
+    assert counts[1] < counts[0] / 2
+    assert after.score(few.patches, few.labels) > 0.9
+
+
+def test_frames_of_a_folder_are_mined_by_name(tmp_path, scenes, random_svm):
+    write_image(tmp_path / "road one.png", scenes[0].image)
+    boxes = FrameBoxes(["road one.png"], None, [[0, 0, 5, 5]])
+    mined = mine_negatives(load_frames(tmp_path), boxes, random_svm, search_params=SEARCH, source="road")
+    assert mined.names[0].startswith("non-vehicles/road/road one.png_")
+    assert set(mined.sources) == {"road"}
+
+
+def test_invalid_arguments(frames, labels, random_svm):
+    images = [image for _, image in frames]
+    for arguments, message in (
+        ((images, labels.renamed(str), random_svm), "none of the frames, such as 0"),
+        ((images, FrameBoxes([], None, []), random_svm), "none of the frames, such as 0"),
+        ((images, [[0, 0, 5, 5]], random_svm), "labels must be .*, got"),
+        ((7, labels, random_svm), "frames must be a list of images, a mapping .*; got 7"),
+        (([images[0].astype(float)], labels, random_svm), r"frame 0 must be an \(H, W, 3\) uint8 RGB array"),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            mine_negatives(*arguments)
+    for options, message in (
+        ({"max_overlap": 1.5}, "max_overlap must be a number, at least 0 and at most 1"),
+        ({"max_per_frame": 0}, "max_per_frame must be an integer at least 1"),
+        ({"min_score": math.nan}, "min_score must be a number"),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            mine_negatives(images, labels, random_svm, **options)
+
+
+@pytest.mark.realdata
+def test_real_frames_are_mined_outside_their_labels(real_data, random_svm):
+    labels = read_labels(real_data / "labels" / "test_images.csv")
+    frames = load_frames(real_data / "test_images")
+    mined = mine_negatives(frames, labels, random_svm, max_per_frame=30, min_score=0.5)
+    assert 0 < len(mined) <= 180
+    for frame, box in zip(*boxes_of(mined)):
+        boxes = labels.boxes[labels.rows(frame)]
+        inside = np.minimum(boxes[:, 2:], box[2:]) - np.maximum(boxes[:, :2], box[:2])
+        assert not (inside > 1).all(axis=1).any()

@@ -1,0 +1,157 @@
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vehicle_detection.errors import DatasetError, InvalidInputError
+from vehicle_detection.tuning import (
+    RowStore,
+    make_table,
+    numeric_column,
+    pareto_front,
+    read_results,
+    write_results,
+)
+from vehicle_detection.tuning.trials import COLUMNS
+
+
+def example_row(number):
+    return {
+        **dict.fromkeys(COLUMNS),
+        "status": "ok",
+        "message": 'a "quoted", text; ä',
+        "configuration": "007",
+        "hog_channel": ["ALL", 0][number % 2],
+        "mirror": True,
+        "C": 1e-4 / (number + 1),
+        "accuracy": 1 / (number + 3),
+        "seed": number,
+        "trial": f"{number:04d}e{number}",
+    }
+
+
+def example_table(count):
+    return make_table([example_row(number) for number in range(count)], COLUMNS)
+
+
+# The store
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".jsonl"])
+@settings(max_examples=40)
+@given(cut=st.integers(0, 10**6), count=st.integers(0, 5))
+def test_a_file_cut_anywhere_keeps_its_complete_lines(tmp_path_factory, suffix, cut, count):
+    path = tmp_path_factory.mktemp("cut") / f"rows{suffix}"
+    store = RowStore(path, COLUMNS)
+    for number in range(count):
+        store.add(example_row(number))
+    data = path.read_bytes() if count else b""
+    path.write_bytes(data[: cut % (len(data) + 1)])
+    n_complete = path.read_bytes().count(b"\n") - (suffix == ".csv")
+    again = RowStore(path, COLUMNS)
+    kept = [number for number in range(count) if f"{number:04d}e{number}" in again]
+    assert kept == list(range(max(n_complete, 0)))
+    for number in range(len(kept), count + 1):
+        again.add(example_row(number))
+    pd.testing.assert_frame_equal(read_results(path), example_table(count + 1))
+
+
+def test_numpy_values_and_nan_are_converted(tmp_path):
+    row = {**example_row(0), "accuracy": np.float64(0.5), "frame_f1": math.nan, "message": "two\nlines"}
+    for suffix in (".csv", ".jsonl"):
+        RowStore(tmp_path / f"rows{suffix}", COLUMNS).add(row)
+        (read,) = read_results(tmp_path / f"rows{suffix}").to_dict("records")
+        assert (read["accuracy"], read["message"]) == (0.5, "two lines")
+        assert math.isnan(read["frame_f1"])
+
+
+def test_damaged_and_foreign_stores(tmp_path):
+    path = tmp_path / "rows.csv"
+    path.write_text("frame,track\n1,2\n")
+    with pytest.raises(DatasetError, match="has other columns than this release writes; choose another"):
+        RowStore(path, COLUMNS)
+    RowStore(tmp_path / "other.csv", COLUMNS).add(example_row(0))
+    text = (tmp_path / "other.csv").read_text()
+    path.write_text(text + "ok,1\n")
+    with pytest.raises(DatasetError, match=r"rows.csv is damaged in line 3; delete that line"):
+        RowStore(path, COLUMNS)
+    lines = tmp_path / "rows.jsonl"
+    lines.write_text("[1]\n")
+    with pytest.raises(DatasetError, match=r"rows.jsonl is damaged in line 1"):
+        RowStore(lines, COLUMNS)
+    lines.write_bytes(b"\xff\xfe\n")
+    with pytest.raises(DatasetError, match="is not UTF-8"):
+        read_results(lines)
+    with pytest.raises(DatasetError, match=r"results file .*missing.csv does not exist"):
+        read_results(tmp_path / "missing.csv")
+    with pytest.raises(InvalidInputError, match=r"path must end in .csv or .jsonl; got 'rows.txt'"):
+        read_results(tmp_path / "rows.txt")
+
+
+# Tables
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".jsonl"])
+@pytest.mark.parametrize("count", [0, 4])
+def test_a_table_reads_as_it_was_written(tmp_path, suffix, count):
+    path = tmp_path / f"table{suffix}"
+    write_results(example_table(count), path)
+    read = read_results(path)
+    assert path.read_text(encoding="utf-8").count("\n") == count + (suffix == ".csv")
+    if count:
+        pd.testing.assert_frame_equal(read, example_table(count))
+    else:
+        assert len(read) == 0
+
+
+def test_a_table_as_parquet(tmp_path):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    table = example_table(4)
+    write_results(table, tmp_path / "table.parquet")
+    read = parquet.read_table(tmp_path / "table.parquet").to_pylist()
+    assert list(read[0]) == list(COLUMNS)
+    assert [row["accuracy"] for row in read] == table["accuracy"].tolist()
+    assert [row["hog_channel"] for row in read] == ["ALL", "0", "ALL", "0"]
+    assert [row["trial"] for row in read] == table["trial"].tolist()
+    assert [row["frame_f1"] for row in read] == [None] * 4
+    with pytest.raises(InvalidInputError, match=r"path must end in .csv or .jsonl or .parquet; got 'a.xls'"):
+        write_results(table, tmp_path / "a.xls")
+
+
+def test_missing_values_of_a_table():
+    table = make_table([{"name": "a", "ms": 3, "x": None}, {"name": "b", "ms": None, "x": None}])
+    assert table.columns.tolist() == ["name", "ms", "x"]
+    assert (table["ms"].dtype, table["x"].dtype) == (np.float64, np.float64)
+    np.testing.assert_array_equal(numeric_column(table, "ms"), [3, np.nan])
+    with pytest.raises(InvalidInputError, match="table has no column 'sec'; its columns are name, ms, x"):
+        numeric_column(table, "sec")
+    with pytest.raises(InvalidInputError, match="column 'name' must hold numbers only"):
+        numeric_column(table, "name")
+    with pytest.raises(InvalidInputError, match="table must be a pandas DataFrame, got"):
+        numeric_column([{"ms": 3}], "ms")
+
+
+points = st.lists(st.tuples(st.none() | st.integers(0, 5), st.none() | st.integers(0, 5)), max_size=12).map(
+    lambda pairs: make_table(
+        [{"accuracy": quality, "search_ms": cost} for quality, cost in pairs], ["accuracy", "search_ms"]
+    )
+)
+
+
+@given(table=points)
+def test_no_row_beats_the_pareto_front(table):
+    measured = list(table.dropna().itertuples(index=False, name=None))
+    front = list(pareto_front(table).itertuples(index=False, name=None))
+    assert sorted(front) == front
+    for quality, cost in measured:
+        beaten = any((q >= quality and c < cost) or (q > quality and c <= cost) for q, c in measured)
+        assert ((quality, cost) in front) == (not beaten)
+    assert len(set(front)) == len(front)
+
+
+def test_the_pareto_front_keeps_the_index():
+    table = pd.DataFrame({"f1": [0.5, 0.7, 0.6], "ms": [9, 3, 1]}, index=["a", "b", "c"])
+    assert pareto_front(table, "f1", "ms").index.tolist() == ["c", "b"]

@@ -1,0 +1,370 @@
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.tuning.cases import SEARCH, SMALL, SMALL_GRID, UNTIMED, count_trials, without_times
+from vehicle_detection.datasets import PatchSet, Split
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.tuning import (
+    TrialOptions,
+    compare_configurations,
+    expand_grid,
+    pareto_front,
+    read_results,
+    search_parameters,
+)
+from vehicle_detection.tuning.search import make_folds
+from vehicle_detection.tuning.trials import COLUMNS, TrialEvaluator
+
+
+def compare(patch_set, configurations, **options):
+    return compare_configurations(
+        patch_set, configurations, **{"mirror": False, "options": UNTIMED, **options}
+    )
+
+
+# compare_configurations
+
+
+def test_every_configuration_is_tried_with_every_c_split_and_seed(patch_set):
+    table = compare(
+        patch_set,
+        {"four": SMALL, "six": {**SMALL, "orient": 6}},
+        splits=("sequences", "random"),
+        C=(1e-3, 1.0),
+        seeds=range(3),
+    )
+    assert tuple(table.columns) == COLUMNS
+    assert set(table["status"]) == {"ok"}
+    # One row for the sequences, which do not depend on the seed, and three for the random split.
+    tried = table[["configuration", "C", "split", "seed"]]
+    assert list(tried.itertuples(index=False, name=None)) == [
+        (name, C, split, seed)
+        for name in ("four", "six")
+        for C in (1e-3, 1.0)
+        for split, seed in (("sequences", 0), ("random", 0), ("random", 1), ("random", 2))
+    ]
+    assert table["orient"].tolist() == [4] * 8 + [6] * 8
+    assert table["search_ms"].isna().all()
+    assert table["accuracy"].between(0.7, 1).all()
+    assert table["trial"].nunique() == 16
+
+
+def test_own_splits_and_presets_by_name(patch_set):
+    split = Split(np.arange(0, 120, 2), np.arange(1, 120, 2))
+    table = compare(patch_set, ["luv-2384"], splits={"mine": split})
+    assert table.loc[0, ["split", "n_features", "configuration"]].tolist() == ["mine", 2384, "luv-2384"]
+
+
+def test_a_configuration_overrides_the_training_options(patch_set):
+    configurations = [{**SMALL, "C": 0.5, "positive_weight": 3.0, "mirror": True}, SMALL]
+    table = compare(patch_set, configurations, C=[0.1, 0.2])
+    assert table["C"].tolist() == [0.5, 0.1, 0.2]
+    assert table["positive_weight"].tolist() == [3.0, 1.0, 1.0]
+    assert table["mirror"].tolist() == [True, False, False]
+    assert table["train_size"].nunique() == 1
+
+
+def test_impossible_combinations_are_reported_and_skipped(patch_set, caplog):
+    configurations = {"fine": SMALL, "none": {**SMALL, "orient": 0}, "odd": {**SMALL, "pix_per_cell": 10}}
+    table = compare_configurations(
+        patch_set, configurations, splits=("sequences", "random"), options=TrialOptions(search_params=SEARCH)
+    )
+    assert table["configuration"].tolist() == ["fine", "fine", "none", "odd", "odd"]
+    assert table["status"].tolist() == ["ok", "ok", "failed", "partial", "partial"]
+    assert table["message"].isna().tolist() == [True, True, False, False, False]
+    assert "orient must be an integer from 1 to 180; got 0" in table["message"][2]
+    assert table["orient"][2] == 0
+    assert np.isnan(table["accuracy"][2])
+    # The fast search does not support cells that do not divide the window.
+    assert "pix_per_cell=10 leaves a rest" in table["message"][3]
+    assert table["accuracy"][3] > 0.7
+    assert table["search_ms"].notna().tolist() == [True, True, False, False, False]
+    assert "none failed: orient must be" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"configurations": []}, "configurations must be a mapping .* at least one entry; got"),
+        ({"configurations": [3]}, "a configuration must be FeatureParams, a mapping .*; got 3"),
+        ({"configurations": ["vgg"]}, "preset must be one of"),
+        (
+            {"configurations": [{"orientt": 9}]},
+            "configuration has the unknown option 'orientt'; use color_space",
+        ),
+        ({"splits": "half"}, "splits must be one of 'sequences', 'groups'"),
+        ({"splits": ()}, "splits must name at least one of sequences"),
+        ({"splits": {}}, "splits must map names to Split; got"),
+        ({"splits": {"mine": Split([0], [120])}}, r"splits\['mine'\] holds row 120, but patch_set has 120"),
+        ({"C": ()}, "C must be a number or several; got none"),
+        ({"seeds": ()}, "seeds must be different integers, at least one"),
+        ({"seeds": (1, 1)}, "seeds must be different integers"),
+        ({"seeds": "12"}, "seeds must be a list of integers"),
+        ({"seeds": (0.5,)}, "seeds must be an integer from 0"),
+        ({"store": "rows.txt"}, "store must end in .csv or .jsonl; got 'rows.txt'"),
+        ({"store": "missing/rows.csv"}, "store needs an existing folder"),
+    ],
+)
+def test_invalid_arguments_of_compare_configurations(patch_set, options, message):
+    arguments = {"configurations": [SMALL], **options}
+    with pytest.raises(InvalidInputError, match=message):
+        compare(patch_set, arguments.pop("configurations"), **arguments)
+
+
+def test_a_bad_c_is_a_failed_row(patch_set):
+    table = compare(patch_set, [SMALL], C=[-1.0, 1.0])
+    assert table["status"].tolist() == ["failed", "ok"]
+    assert "C must be a number, greater than 0" in table["message"][0]
+
+
+def test_a_split_that_the_patches_do_not_allow(patch_set):
+    names = [f"a/{number}.png" for number in range(120)]
+    with pytest.raises(InvalidInputError, match="'GTI'"):
+        compare(PatchSet(patch_set.patches, patch_set.labels, names), [SMALL], splits="gti_to_kitti")
+
+
+def test_a_progress_bar_counts_the_rows(patch_set, capsys):
+    compare(patch_set, [SMALL, {"orient": 0}], progress=True)
+    assert "2/2" in capsys.readouterr().err
+
+
+# The store
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".jsonl"])
+def test_a_second_run_measures_only_what_is_new(patch_set, tmp_path, monkeypatch, suffix):
+    store = tmp_path / f"rows{suffix}"
+    options = {"splits": "random", "seeds": (0, 1), "store": store}
+    first = compare(patch_set, {"a": SMALL, "bad": {"orient": 0}}, **options)
+    tried = count_trials(monkeypatch)
+    again = compare(patch_set, {"a": SMALL, "bad": {"orient": 0}}, **options)
+    assert not tried
+    pd.testing.assert_frame_equal(again, first)
+    pd.testing.assert_frame_equal(read_results(store), first)
+    # The name of a configuration is not part of the trial.
+    more = compare(patch_set, {"b": SMALL, "c": {**SMALL, "hist_bins": 4}}, **options)
+    assert [config.params.hist_bins for config in tried] == [4, 4]
+    assert more["configuration"].tolist() == ["b", "b", "c", "c"]
+    assert len(read_results(store)) == 5
+
+
+def test_rows_of_other_patches_splits_and_frames_are_not_used(patch_set, frames, tmp_path, monkeypatch):
+    store = tmp_path / "rows.csv"
+    tried = count_trials(monkeypatch)
+    compare(patch_set, [SMALL], store=store)
+    changed = PatchSet(patch_set.patches[:, ::-1].copy(), patch_set.labels, patch_set.names)
+    on_frames = TrialOptions(frames=frames, time_search=False)
+    searched = TrialOptions(frames=frames, search_params=SEARCH, time_search=False)
+    for number, (patches, options) in enumerate(
+        [
+            (changed, {}),
+            (patch_set, {"splits": {"mine": Split([0, 119], [1, 118])}}),
+            (patch_set, {"options": on_frames}),
+            (patch_set, {"options": searched}),
+            (patch_set, {"options": TrialOptions()}),
+            (patch_set, {"mirror": True}),
+        ],
+        start=2,
+    ):
+        compare(patches, [SMALL], store=store, **options)
+        assert len(tried) == number
+    compare(patch_set, [SMALL], store=store)
+    assert len(tried) == 7
+
+
+def test_an_interrupted_run_continues_from_its_store(patch_set, tmp_path, monkeypatch):
+    store = tmp_path / "rows.jsonl"
+    grid = expand_grid({**SMALL_GRID, "orient": [4, 5, 6], "C": [0.1, 1.0]})
+    complete = compare(patch_set, grid)
+    with monkeypatch.context() as patched:
+        count_trials(patched, stop_after=4)
+        with pytest.raises(KeyboardInterrupt):
+            compare(patch_set, grid, store=store)
+    assert len(read_results(store)) == 4
+    with store.open("a") as file:
+        file.write('{"status": "ok", "accur')
+    tried = count_trials(monkeypatch)
+    resumed = compare(patch_set, grid, store=store)
+    assert len(tried) == 2
+    pd.testing.assert_frame_equal(without_times(resumed), without_times(complete))
+    pd.testing.assert_frame_equal(read_results(store), resumed)
+
+
+def test_a_killed_process_loses_nothing(tmp_path):
+    store = tmp_path / "rows.csv"
+    code = f"""
+import numpy as np
+from vehicle_detection.datasets import PatchSet
+from vehicle_detection.tuning import TrialOptions, compare_configurations
+patches = np.random.default_rng(0).integers(0, 256, (40, 64, 64, 3), np.uint8)
+names = [f"{{row % 2}}/{{row}}.png" for row in range(40)]
+patch_set = PatchSet(patches, np.arange(40) % 2 == 0, names)
+grid = [{{**{SMALL!r}, "hist_bins": bins}} for bins in range(1, 250)]
+untimed = TrialOptions(time_search=False)
+compare_configurations(patch_set, grid, splits="random", store={str(store)!r}, options=untimed)
+"""
+    process = subprocess.Popen([sys.executable, "-c", code])
+    try:
+        deadline = time.monotonic() + 60
+        while not (store.exists() and store.read_bytes().count(b"\n") > 3):
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+    finally:
+        process.kill()
+        process.wait()
+    assert process.returncode == -signal.SIGKILL
+    table = read_results(store)
+    assert len(table) >= 3
+    assert table["hist_bins"].tolist() == list(range(1, len(table) + 1))
+    assert set(table["status"]) == {"ok"}
+
+
+# search_parameters
+
+
+def test_halving_keeps_the_better_and_measures_the_best_in_full(patch_set, frames):
+    grid = {**SMALL_GRID, "orient": [0, 4, 6], "C": [1e-9, 1e-3, 1.0]}
+    options = TrialOptions(frames=frames, search_params=SEARCH)
+    table = search_parameters(patch_set, grid, n_finalists=2, n_folds=2, options=options)
+    assert table["stage"].unique().tolist() == ["grid", "halving", "final"]
+    assert table[table["stage"] == "grid"]["status"].tolist() == ["failed"] * 3
+    halving = table[table["stage"] == "halving"]
+    # 120 patches are too few for more than one round: 6 configurations on 2 folds.
+    assert len(halving) == 12
+    assert set(halving["split"]) == {"sequences, fold 1 of 2", "sequences, fold 2 of 2"}
+    assert halving["search_ms"].isna().all()
+    means = halving.groupby(["orient", "C"], sort=False)["accuracy"].mean()
+    final = table[table["stage"] == "final"]
+    assert len(final) == 2
+    assert tuple(final[["orient", "C"]].iloc[0]) == means.idxmax()
+    assert final["split"].tolist() == ["sequences"] * 2
+    assert (final["search_ms"] > 0).all()
+    assert final["frame_f1"].notna().all()
+    assert len(pareto_front(final)) >= 1
+
+
+def larger(patch_set, times):
+    """The patches several times, each copy a little brighter."""
+    copies = [
+        PatchSet(
+            (patch_set.patches // 2 + 10 * number).astype(np.uint8),
+            patch_set.labels,
+            [name.replace("/", f"/{number}_", 1) for name in patch_set.names],
+        )
+        for number in range(times)
+    ]
+    return PatchSet.concatenate(copies)
+
+
+def test_later_rounds_use_fewer_configurations_and_more_patches(patch_set):
+    many = larger(patch_set, 8)
+    grid = {**SMALL_GRID, "C": [1e-9, 1e-5, 1e-3, 1.0]}
+    table = search_parameters(
+        many, grid, split="random", n_folds=2, factor=2, n_finalists=0, random_state=1, options=UNTIMED
+    )
+    rounds = table.groupby(table["train_size"] + table["test_size"])["C"].unique()
+    assert [len(values) for values in rounds] == [4, 2]
+    assert rounds.index[1] == pytest.approx(2 * rounds.index[0], rel=0.01)
+    assert 1e-9 not in rounds.iloc[1]
+
+
+def test_candidates_are_drawn_at_random(patch_set):
+    grid = {**SMALL_GRID, "C": [10.0**power for power in range(-8, 2)]}
+    options = {"split": "random", "n_candidates": 3, "n_finalists": 1, "options": UNTIMED, "n_folds": 2}
+    drawn = []
+    for seed in (0, 0, 1):
+        table = search_parameters(patch_set, grid, random_state=seed, **options)
+        drawn.append(set(table[table["stage"] == "halving"]["C"]))
+    assert len(drawn[0]) == 3
+    assert drawn[0] == drawn[1] != drawn[2]
+
+
+def test_an_interrupted_search_continues_from_its_store(patch_set, tmp_path, monkeypatch):
+    many = larger(patch_set, 8)
+    grid = {**SMALL_GRID, "C": [1e-5, 1e-4, 1e-3], "orient": [3, 4, 5]}
+    options = {"split": "groups", "n_folds": 2, "n_finalists": 2, "options": UNTIMED}
+    store = tmp_path / "rows.csv"
+    with monkeypatch.context() as patched:
+        count_trials(patched, stop_after=13)
+        with pytest.raises(KeyboardInterrupt):
+            search_parameters(many, grid, store=store, **options)
+    assert len(read_results(store)) == 13
+    tried = count_trials(monkeypatch)
+    resumed = search_parameters(many, grid, store=store, **options)
+    n_resumed = len(tried)
+    fresh = search_parameters(many, grid, **options)
+    assert len(tried) - n_resumed == n_resumed + 13
+    pd.testing.assert_frame_equal(without_times(fresh), without_times(resumed))
+
+
+def test_a_configuration_that_cannot_be_trained_is_dropped(patch_set, monkeypatch):
+    train = TrialEvaluator.train
+
+    def train_others(self, config, *arguments):
+        if config.params.orient == 6:
+            raise InvalidInputError("too large")
+        return train(self, config, *arguments)
+
+    monkeypatch.setattr(TrialEvaluator, "train", train_others)
+    grid = {**SMALL_GRID, "orient": [6, 4]}
+    table = search_parameters(patch_set, grid, split="random", n_folds=2, options=UNTIMED)
+    halving = table[table["stage"] == "halving"]
+    assert halving[halving["orient"] == 6]["status"].tolist() == ["failed"] * 2
+    assert table[table["stage"] == "final"]["orient"].tolist() == [4]
+
+
+@pytest.mark.parametrize("split", ["sequences", "groups", "random"])
+def test_folds_cover_all_patches_without_leakage(patch_set, split):
+    copies = PatchSet(
+        np.concatenate([patch_set.patches, patch_set.patches // 2 + 20]),
+        np.tile(patch_set.labels, 2),
+        (*patch_set.names, *(name.replace(".png", "0.png") for name in patch_set.names)),
+    )
+    fold_of = make_folds(copies, split, 3, seed=0)
+    assert set(fold_of) == {0, 1, 2}
+    assert np.bincount(fold_of).min() > 240 / 3 * 0.6
+    if split == "groups":
+        np.testing.assert_array_equal(fold_of[:120], fold_of[120:])
+    if split == "sequences":
+        for source in set(copies.sources):
+            rows = np.flatnonzero(copies.sources == source)
+            numbers = [int(copies.names[row].rpartition("/")[2].removesuffix(".png")) for row in rows]
+            assert (np.diff(fold_of[rows][np.argsort(numbers)]) <= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"grid": {}}, r"grid must map option names \(color_space, .*\) to lists of values; got"),
+        ({"grid": {"size": [1]}}, "grid has the unknown option 'size'; use"),
+        ({"grid": {"orient": 8}}, r"grid\['orient'\] must be a list of values; got 8"),
+        ({"grid": {"color_space": "LAB"}}, r"grid\['color_space'\] must be a list of values"),
+        ({"grid": {"orient": []}}, r"grid\['orient'\] must hold at least one value"),
+        ({"grid": {"orient": [0, 500]}}, "grid holds no possible combination: orient must be"),
+        ({"grid": {"orient": range(1, 181), "hist_bins": range(1, 257), "C": range(1, 9)}}, "at most 100000"),
+        ({"split": "gti_to_kitti"}, "split must be one of 'sequences', 'groups', 'random'"),
+        ({"n_folds": 1}, "n_folds must be an integer from 2 to 100"),
+        ({"n_folds": 90, "split": "random"}, "patch_set is too small for n_folds=90"),
+        ({"factor": 1}, "factor must be an integer from 2"),
+        ({"n_finalists": -1}, "n_finalists must be an integer at least 0"),
+        ({"n_candidates": 0}, "n_candidates must be an integer at least 1"),
+        ({"random_state": -1}, "random_state must be an integer from 0"),
+    ],
+)
+def test_invalid_arguments_of_search_parameters(patch_set, options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        search_parameters(patch_set, **{"grid": {"orient": [4]}, "options": UNTIMED, **options})
+
+
+def test_a_fold_with_one_class_is_rejected(patch_set):
+    names = [f"all/{row}.png" for row in range(120)]
+    sorted_by_class = PatchSet(patch_set.patches, patch_set.labels, names)
+    with pytest.raises(InvalidInputError, match=r"fold 1 of n_folds=2, or the rest .* lacks vehicles or"):
+        search_parameters(sorted_by_class, {"orient": [4]}, n_folds=2)

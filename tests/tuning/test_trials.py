@@ -1,0 +1,100 @@
+import numpy as np
+import pytest
+
+from tests.tuning.cases import SEARCH, SMALL, UNTIMED
+from vehicle_detection.classifier import train_classifier
+from vehicle_detection.datasets import PatchSet, Split, make_split, split_sequences
+from vehicle_detection.detector import VehicleDetector
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, evaluate_detections
+from vehicle_detection.params import FeatureParams
+from vehicle_detection.tuning import (
+    FeatureCache,
+    TrialConfig,
+    TrialOptions,
+    compare_configurations,
+    trials,
+)
+from vehicle_detection.tuning.trials import TrialEvaluator
+
+PARAMS = FeatureParams(**SMALL)
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+@pytest.mark.parametrize("split", ["sequences", "gti_to_kitti", "kitti_to_gti", "random"])
+def test_a_trial_equals_training_on_that_part(patch_set, mirror, split):
+    parts = make_split(patch_set, split, random_state=3)
+    table = compare_configurations(
+        patch_set, [SMALL], splits=split, C=0.01, mirror=mirror, seeds=[3], options=UNTIMED
+    )
+    (row,) = table.to_dict("records")
+    train, test = patch_set[parts.train], patch_set[parts.test]
+    classifier = train_classifier(
+        train.patches, train.labels, params=PARAMS, C=0.01, mirror=mirror, random_state=3
+    )
+    config = TrialConfig(params=PARAMS, C=0.01, mirror=mirror)
+    tried = TrialEvaluator(patch_set, UNTIMED).train(config, parts.train, 3)
+    for name in ("mean", "scale", "coef", "intercept"):
+        expected, found = (getattr(each.templates[0], name) for each in (classifier, tried))
+        np.testing.assert_array_equal(found, expected)
+    assert row["accuracy"] == classifier.score(test.patches, test.labels)
+    assert row["train_accuracy"] == classifier.score(train.patches, train.labels)
+    assert (row["train_size"], row["test_size"]) == (len(train), len(test))
+    assert row["mirror"] is mirror
+
+
+def test_a_weight_on_vehicles_finds_more_of_them(patch_set):
+    noise = np.random.default_rng(0).integers(0, 2, len(patch_set)).astype(bool)
+    noisy = PatchSet(patch_set.patches, patch_set.labels ^ noise, patch_set.names)
+    evaluator = TrialEvaluator(noisy, UNTIMED)
+    found = []
+    for weight in (0.05, 1.0, 20.0):
+        config = TrialConfig(params=PARAMS, C=1e-4, mirror=False, positive_weight=weight)
+        classifier = evaluator.train(config, np.arange(len(noisy)), 0)
+        found.append(classifier.predict(noisy.patches).sum())
+    assert found[0] < found[1] < found[2]
+
+
+def test_features_that_exceed_the_memory_fail(patch_set, monkeypatch):
+    monkeypatch.setattr(trials.os, "sysconf", lambda name: 100)
+    table = compare_configurations(patch_set, [SMALL], mirror=False, options=UNTIMED)
+    assert table["status"].tolist() == ["failed"]
+    message = table["message"][0]
+    assert "features of 96 patches needs about 1 GB, but this machine has 0 GB" in message
+
+
+def test_training_on_one_class_fails(patch_set):
+    split = Split(np.flatnonzero(patch_set.labels), np.flatnonzero(~patch_set.labels))
+    table = compare_configurations(patch_set, [SMALL], splits={"vehicles": split}, options=UNTIMED)
+    assert table["status"].tolist() == ["failed"]
+    assert "labels must hold both classes" in table["message"][0]
+
+
+def test_frames_are_scored_like_the_detector(patch_set, frames, labels):
+    other = LabelledFrames("again", {1: frames.frames[1]}, labels, horizon=0.5)
+    options = TrialOptions(frames=[frames, other], search_params=SEARCH)
+    (row,) = compare_configurations(patch_set, [SMALL], C=0.1, options=options).to_dict("records")
+    train = patch_set[split_sequences(patch_set).train]
+    classifier = train_classifier(train.patches, train.labels, params=PARAMS, C=0.1)
+    scores = []
+    for each in (frames, other):
+        with VehicleDetector(classifier, search_params=SEARCH, horizon=each.horizon) as detector:
+            found = FrameBoxes.from_detections({key: detector.detect(image) for key, image in each})
+        scores.append(evaluate_detections(found, each.labels, frames=each.keys))
+    assert row["frame_f1"] == pytest.approx(np.nanmean([score.f1 for score in scores]))
+    assert row["frame_average_precision"] == pytest.approx(np.mean([s.average_precision for s in scores]))
+    assert row["frame_f1"] <= row["frame_best_f1"] + 1e-12
+    assert row["frame_f1_by_set"].split()[::2] == ["drawn", "again"]
+    assert row["search_ms"] > 0
+
+
+def test_invalid_options(patch_set, frames):
+    with pytest.raises(InvalidInputError, match="frames must be LabelledFrames, one or more; got 3"):
+        TrialOptions(frames=[3])
+    with pytest.raises(InvalidInputError, match="frames must have different names"):
+        TrialOptions(frames=[frames, frames])
+    with pytest.raises(InvalidInputError, match="patch_set must be a PatchSet with patches, got an array"):
+        compare_configurations(patch_set.patches, [SMALL])
+    other = FeatureCache(np.zeros((1, 64, 64, 3), np.uint8))
+    with pytest.raises(InvalidInputError, match="cache must be a FeatureCache of the patches"):
+        compare_configurations(patch_set, [SMALL], options=TrialOptions(cache=other))
