@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 import vehicle_detection
 from tests.helpers import SMALL_MIXTURE, drawn, start_interruptible, write_frame_set
-from vehicle_detection import classifier, datasets, detector, training, video
+from vehicle_detection import classifier, datasets, detector, mixture_training, training, video
 from vehicle_detection._common import files as _files
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import HorizonEstimate
@@ -30,8 +30,6 @@ from vehicle_detection.cli.output import output_folder, run_interruptible
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.mixture import load_model
-from vehicle_detection.mixture_training import cross_validation as mixture_report
-from vehicle_detection.mixture_training import drawn_frames as _drawn_frames
 from vehicle_detection.synthetic import render_drive, render_patches
 from vehicle_detection.video import probe_video, read_frames
 
@@ -289,7 +287,7 @@ def bad_images(material, tmp):
         r"cut_road.png must be a complete image file": [material / "cut_road.png"],
         r"nothing.png must be a complete image file": [tmp / "nothing.png"],
         r"floats.tiff must be a complete image file": [floats],
-        r"image of 12x12 pixels holds no search window": [tiny, "--model", "highway"],
+        r"image of 12x12 pixels has no room for a search window": [tiny, "--model", "highway"],
         r"--horizon must be a number, at least 0 and at most 1; got 2": [road, "--horizon", 2],
         r"--horizon must be a number, .* got nan": [road, "--horizon", "nan"],
         r"--output \S+ is the folder of road.png, which would be overwritten": [road, "-o", material],
@@ -442,7 +440,7 @@ def bad_videos(material, tmp):
         r"text.mp4 is not a video that ffmpeg can read": [material / "text.mp4", "-o", target],
         r"cut_clip.mp4 is not a video .*its index is missing": [material / "cut_clip.mp4", "-o", target],
         r"none.mp4 (has no|is not a video)": [tmp / "none.mp4", "-o", target],
-        r"image of 32x32 pixels holds no search window": [tiny, "-o", target, "--model", "highway"],
+        r"image of 32x32 pixels has no room for a search window": [tiny, "-o", target, "--model", "highway"],
         r"--output \S+clip.mp4 is also SOURCE": [clip, "-o", clip],
         r"--output needs an existing folder, \S+none is not one": [clip, "-o", tmp / "none" / "out.mp4"],
         r"--output must end in .mp4, .* got 'out.gif'": [clip, "-o", tmp / "out.gif"],
@@ -731,8 +729,8 @@ def test_models_by_name(picture):
 @pytest.fixture
 def small_training(monkeypatch):
     """Train with the few windows that a handful of drawn frames has."""
-    validate = functools.partial(mixture_report.cross_validate_mixture, params=SMALL_MIXTURE)
-    monkeypatch.setattr(mixture_report, "cross_validate_mixture", validate)
+    validate = functools.partial(mixture_training.cross_validate_mixture, params=SMALL_MIXTURE)
+    monkeypatch.setattr(mixture_training, "cross_validate_mixture", validate)
 
 
 @pytest.fixture(scope="module")
@@ -789,8 +787,8 @@ def test_train_frames(drawn_roads, small_training, tmp_path):
 
 
 def test_train_frames_adds_drawn_frames(drawn_roads, small_training, tmp_path, monkeypatch):
-    few = functools.partial(_drawn_frames.drawn_source, drives=1, frames=1)
-    monkeypatch.setattr(_drawn_frames, "drawn_source", few)
+    few = functools.partial(mixture_training.drawn_source, drives=1, frames=1)
+    monkeypatch.setattr(mixture_training, "drawn_source", few)
     card = tmp_path / "m.md"
     succeed("train-frames", drawn_roads, "-o", tmp_path / "m.safetensors", "--card", card)
     data = load_model(tmp_path / "m.safetensors").metadata["data"]
@@ -799,7 +797,7 @@ def test_train_frames_adds_drawn_frames(drawn_roads, small_training, tmp_path, m
 
 
 def test_train_frames_refuses_bad_input_before_it_trains(drawn_roads, tmp_path, monkeypatch):
-    monkeypatch.setattr(mixture_report, "train_mixture", None)
+    monkeypatch.setattr("vehicle_detection.mixture_training.cross_validation.train_mixture", None)
     one = tmp_path / "one"
     write_frame_set(one, "town", drawn(range(2)))
     model = tmp_path / "m.safetensors"
