@@ -93,7 +93,11 @@ def train(
         words += [word for name in compare or () for word in ("--compare", name)]
         words += ["-o", output.name, "--card", card.name]
         text = model_card(
-            classifier, judged, others=others, command=shlex.join(["vehicle-detection", "train", *words])
+            classifier,
+            judged,
+            name=output.stem,
+            others=others,
+            command=shlex.join(["vehicle-detection", "train", *words]),
         )
         with atomic_write(card) as part:
             part.write_text(text, encoding="utf-8")
