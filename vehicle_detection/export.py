@@ -13,7 +13,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, Literal, NamedTuple, TypeAlias, cast
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
@@ -71,14 +71,13 @@ def shown_tracks(result: Any) -> list[Any]:
 
 def _rows_of(item: Any, number: int) -> list[Row]:
     """Rows of a frame's result, one per shown track; a row stays one row."""
-    if not is_result(item):
-        return [_check_row(item, number)]
-    return [
-        _check_row(
-            (item.index, track.id, *track.box, track.score, track.distance_m, track.speed_mps), number + place
-        )
-        for place, track in enumerate(shown_tracks(item))
-    ]
+    rows = [item]
+    if is_result(item):
+        rows = [
+            (item.index, track.id, *track.box, track.score, track.distance_m, track.speed_mps)
+            for track in shown_tracks(item)
+        ]
+    return [_check_row(row, number + place) for place, row in enumerate(rows)]
 
 
 def _check_row(item: Any, number: int, *, stills: bool = False) -> Row:
@@ -138,8 +137,7 @@ def _check_value(value: Any, number: int, name: str, stills: bool) -> Any:
     return int(value)
 
 
-Format: TypeAlias = Literal["csv", "jsonl", "parquet", "mot", "coco"]
-FORMATS: dict[str, Format] = {
+FORMATS = {
     ".csv": "csv",
     ".jsonl": "jsonl",
     ".ndjson": "jsonl",
@@ -154,7 +152,7 @@ def write_tracks(
     results: Iterable[Any],
     path: str | os.PathLike[str],
     *,
-    format: Format | None = None,  # noqa: A002 - the name that pandas and Pillow use
+    format: str | None = None,  # noqa: A002 - the name that pandas and Pillow use
     shape: tuple[int, ...] | None = None,
 ) -> int:
     """Write the tracks of a video to a file; the file appears only when it is complete.
@@ -217,7 +215,7 @@ def write_boxes(
     boxes: Iterable[Any],
     path: str | os.PathLike[str],
     *,
-    format: Format | None = None,  # noqa: A002
+    format: str | None = None,  # noqa: A002
 ) -> int:
     """Write the boxes found in images to a file; the file appears only when it is complete.
 
@@ -298,12 +296,7 @@ class TrackWriter:
 "distance_m": null, "speed_mps": null}
     """
 
-    def __init__(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        format: Format | None = None,  # noqa: A002
-    ) -> None:
+    def __init__(self, path: str | os.PathLike[str], *, format: str | None = None) -> None:  # noqa: A002
         self._kind = _check_format(path, format, ("csv", "jsonl", "mot"))
         self._path = path
         self._stack = contextlib.ExitStack()
@@ -334,7 +327,7 @@ class TrackWriter:
         self._stack.__exit__(*error)
 
 
-def _check_format(path: object, name: str | None, allowed: Iterable[Format]) -> Format:
+def _check_format(path: object, name: str | None, allowed: Iterable[str]) -> str:
     """Choose the format by its name or the suffix, and check the target before any work is done."""
     if not isinstance(path, (str, os.PathLike)):
         raise InvalidInputError(
@@ -350,10 +343,10 @@ def _check_format(path: object, name: str | None, allowed: Iterable[Format]) -> 
         )
     check_choice(kind, "format", choices)
     check_target(path, "path")
-    return cast("Format", kind)
+    return str(kind)
 
 
-def _row_writer(file: IO[str], kind: Format, columns: Sequence[str]) -> Callable[[Row], object]:
+def _row_writer(file: IO[str], kind: str, columns: Sequence[str]) -> Callable[[Row], object]:
     """Write the header, and return the function that writes one row as text."""
     if kind == "csv":
         table = csv.writer(file, lineterminator="\n")
@@ -380,7 +373,7 @@ def _write_rows(
     rows: Sequence[Row],
     frames: Sequence[int | str],
     path: str | os.PathLike[str],
-    kind: Format,
+    kind: str,
     columns: Sequence[str],
     shape: tuple[int, ...] | None = None,
 ) -> int:

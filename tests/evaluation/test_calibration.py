@@ -1,4 +1,3 @@
-import json
 import math
 
 import numpy as np
@@ -73,7 +72,6 @@ def test_probabilities_increase_with_the_score(scores, a, b):
 def test_score_is_the_inverse_of_probability(probability, a, b):
     platt = Platt(a, b)
     assert platt.probability(platt.score(probability)) == pytest.approx(probability)
-    assert Platt(**json.loads(json.dumps(platt.to_dict()))) == platt
 
 
 def test_invalid_arguments_of_calibrate_scores():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,14 +13,7 @@ from vehicle_detection.errors import InvalidInputError
 
 @dataclass(frozen=True)
 class Platt:
-    """The sigmoid ``1 / (1 + exp(a * score + b))``; `a` is negative where higher scores are vehicles.
-
-    Examples
-    --------
-    >>> platt = Platt(a=-2.0, b=0.0)
-    >>> platt.probability([-1.0, 0.0, 1.0]).round(2).tolist(), round(platt.score(0.88), 1)
-    ([0.12, 0.5, 0.88], 1.0)
-    """
+    """The sigmoid ``1 / (1 + exp(a * score + b))``; `a` is negative where higher scores are vehicles."""
 
     a: float
     b: float
@@ -46,10 +39,6 @@ class Platt:
                 f"probability must lie in (0, 1) and a must not be 0; got {value:g} and a={self.a:g}"
             )
         return float((np.log((1 - value) / value) - self.b) / self.a)
-
-    def to_dict(self) -> dict[str, float]:
-        """Return plain numbers, ready for the metadata of a model."""
-        return asdict(self)
 
 
 def calibrate_scores(scores: ArrayLike, labels: ArrayLike, *, prior: bool = True) -> Platt:

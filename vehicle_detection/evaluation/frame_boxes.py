@@ -166,13 +166,7 @@ class FrameBoxes:
 
     @classmethod
     def from_detections(cls, detections: Mapping[FrameKey, Detections]) -> FrameBoxes:
-        """Collect the detections of each frame; frames without any still count as frames.
-
-        Examples
-        --------
-        >>> FrameBoxes.from_detections({0: Detections([[0, 0, 50, 40]], [1.5]), 1: Detections.empty()})
-        FrameBoxes(1 box in 2 frames)
-        """
+        """Collect the detections of each frame; frames without any still count as frames."""
         parts = [Detections.empty(), *detections.values()]
         return cls(
             [key for key, found in detections.items() for _ in range(len(found))],
@@ -188,13 +182,6 @@ class FrameBoxes:
 
         They are what `read_labels` reads from the CSV file that `write_tracks` writes, without its rounding.
         Frames without a track still count as frames.
-
-        Examples
-        --------
-        >>> from types import SimpleNamespace
-        >>> track = SimpleNamespace(id=1, box=(0, 0, 50, 40), score=1.5, distance_m=None, speed_mps=None)
-        >>> FrameBoxes.from_results([SimpleNamespace(index=0, tracks=[track])]).tracks
-        array([1])
         """
         keys: list[FrameKey] = []
         rows: list[tuple[FrameKey, Any]] = []  # frame and track
@@ -243,24 +230,12 @@ class FrameBoxes:
         return self._take(self.rows(key), (key,))
 
     def renamed(self, rename: Callable[[Any], FrameKey]) -> FrameBoxes:
-        """Return a copy in which ``rename(key)`` replaces every frame key.
-
-        Examples
-        --------
-        >>> FrameBoxes(["000007"], None, [[0, 0, 50, 40]]).renamed(lambda key: key + ".png").frame_keys
-        ('000007.png',)
-        """
+        """Return a copy in which ``rename(key)`` replaces every frame key."""
         frames, keys = ([rename(key) for key in each] for each in (self.frames, self.frame_keys))
         return dataclasses.replace(self, frames=frames, frame_keys=keys)
 
     def to_dataframe(self) -> pandas.DataFrame:
-        """Return the boxes as a table, one row per box.
-
-        Examples
-        --------
-        >>> list(FrameBoxes([0], [1], [[0, 0, 50, 40]]).to_dataframe())
-        ['frame', 'track', 'x1', 'y1', 'x2', 'y2', 'occluded', 'truncated', 'ignore']
-        """
+        """Return the boxes as a table, one row per box."""
         import pandas
 
         columns = {"frame": self.frames, "track": self.tracks}

@@ -214,10 +214,9 @@ def _read_coco(source: Path, classes: Collection[str] | None) -> Rows:
         data = json.loads(_read_text(source))
     except json.JSONDecodeError as error:
         raise DatasetError(f"{source} line {error.lineno}: not JSON text ({error.msg})") from None
-    lists = (
-        {name for name, part in data.items() if isinstance(part, list)} if isinstance(data, dict) else set()
-    )
-    missing = [name for name in ("images", "annotations", "categories") if name not in lists]
+    parts = data if isinstance(data, dict) else {}
+    needed = ("images", "annotations", "categories")
+    missing = [name for name in needed if not isinstance(parts.get(name), list)]
     if missing:
         raise DatasetError(f"{source} is not a COCO file: it lacks the lists {', '.join(missing)}")
     try:

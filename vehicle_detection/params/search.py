@@ -157,15 +157,14 @@ def _check_pair(value: object, name: str, *, low: float, high: float) -> None:
 
 
 def _window_list() -> SearchParams:
-    rows = (
-        ((96.0, 96.0), (395, 530), (0.9, 0.5)),
-        ((110.0, 145.0), (380, 590), (0.7, 0.6)),
-        ((155.0, 165.0), (370, 590), (0.6, 0.5)),
-        ((170.0, 200.0), (400, 700), (0.6, 0.5)),
-    )
     bands = tuple(
-        SearchBand(window=window, y=(top - 400.0, bottom - 400.0), x=(650 / 1280, 1.0), overlap=overlap)
-        for window, (top, bottom), overlap in rows
+        SearchBand(window=window, y=y, x=(650 / 1280, 1.0), overlap=overlap)
+        for window, y, overlap in (
+            ((96.0, 96.0), (-5.0, 130.0), (0.9, 0.5)),
+            ((110.0, 145.0), (-20.0, 190.0), (0.7, 0.6)),
+            ((155.0, 165.0), (-30.0, 190.0), (0.6, 0.5)),
+            ((170.0, 200.0), (0.0, 300.0), (0.6, 0.5)),
+        )
     )
     return SearchParams(bands=bands, horizon=400 / 720)
 

@@ -62,10 +62,6 @@ class TrackParams:
     --------
     >>> TrackParams(max_coast=0.5).show_coast
     0.3
-    >>> TrackParams(confirm_hits=0)
-    Traceback (most recent call last):
-    ...
-    vehicle_detection.errors.InvalidInputError: confirm_hits must be an integer from 1 to 10000; got 0
     """
 
     smoother: Literal["kalman", "history", "nearest"] = "kalman"

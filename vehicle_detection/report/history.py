@@ -127,7 +127,7 @@ class TrackLog:
 def _rows(tracks: object) -> Iterator[tuple[int, list[float]]]:
     """Id and values of `COLUMNS` of each shown track."""
     seen = set()
-    for track in tracks if isinstance(tracks, Iterable) else [tracks]:
+    for track in [tracks] if isinstance(tracks, str) or not isinstance(tracks, Iterable) else tracks:
         if not hasattr(track, "id"):
             raise InvalidInputError(
                 f"tracks must be Track objects, got {describe(track)}; pass result.tracks"
@@ -153,7 +153,7 @@ def _number(value: Any, name: str) -> float:
 
 
 def bin_means(frames: NDArray[np.int64], values: Floats, width: int) -> tuple[NDArray[np.int64], Floats]:
-    """Indices of the bins of `width` frames with known values, and the means of the known values."""
+    """Return the bins of `width` frames with known values, and the means of these values."""
     known = np.isfinite(values)
     bins, inverse, counts = np.unique(frames[known] // width, return_inverse=True, return_counts=True)
     return bins, np.bincount(inverse, values[known], len(bins)) / counts

@@ -36,6 +36,11 @@ class HorizonFilter:
 
     def __init__(self, camera: Camera) -> None:
         self.prior_camera = self.camera = camera
+        # Bottom edge below the horizon per width; standard deviation of its mean, and of one vehicle.
+        self._slope = camera.height_m / camera.vehicle_width_m
+        self._mean_slope_std = self._slope * camera.height_std_m / camera.height_m
+        vehicle_std = self._slope * camera.vehicle_width_std_m / camera.vehicle_width_m
+        self._slope_std = math.hypot(self._mean_slope_std, vehicle_std)
         self._ids = np.empty(0, np.int64)
         # Weighted sums of 1, width, width², bottom and width * bottom for each vehicle.
         self._sums = np.empty((0, 5))
@@ -49,15 +54,14 @@ class HorizonFilter:
         # The width of the near face alone.
         face_scale = camera.focal_px * camera.vehicle_width_m
         width = sides[:, 0] * face_scale / camera.width_times_distance(lateral_offsets(boxes, frame))
-        slope = camera.height_m / camera.vehicle_width_m
         edge_std = np.hypot(camera.bottom_std_px * scale, camera.box_std * sides)
         variance = (
             np.square(edge_std[:, 1])
-            + 2 * np.square(slope * edge_std[:, 0])
+            + 2 * np.square(self._slope * edge_std[:, 0])
             + np.square(camera.pitch_std_px * scale)
         )
-        residual = boxes[:, 3] - (camera.horizon_px + slope * width)
-        expected = variance + camera.horizon_std_px**2 + np.square(self._slope_std()[1] * width)
+        residual = boxes[:, 3] - (camera.horizon_px + self._slope * width)
+        expected = variance + camera.horizon_std_px**2 + np.square(self._slope_std * width)
         fits = np.square(residual) < _OUTLIER**2 * expected
         # If most vehicles do not fit the estimate, the estimate is wrong: forget it faster.
         misfit = 1 - float(fits.mean())
@@ -79,33 +83,21 @@ class HorizonFilter:
         kept = self._sums[:, 0] > _MIN_WEIGHT * self._sums[:, 0].max(initial=0.0)
         self._ids, self._sums = self._ids[kept], self._sums[kept]
 
-    def _slope_std(self) -> tuple[float, float]:
-        """Return the standard deviations of the mean slope, and of the slope of one vehicle."""
-        camera = self.prior_camera
-        slope = camera.height_m / camera.vehicle_width_m
-        mean_std = slope * camera.height_std_m / camera.height_m
-        vehicle_std = slope * camera.vehicle_width_std_m / camera.vehicle_width_m
-        return mean_std, math.hypot(mean_std, vehicle_std)
-
     def _solve(self) -> None:
         """Solve for horizon and mean slope, and update `camera`."""
-        camera = self.prior_camera
-        slope = camera.height_m / camera.vehicle_width_m
-        mean_std, total_std = self._slope_std()
-        vehicle_variance = max(total_std**2 - mean_std**2, 1e-12)
+        camera, mean_std = self.prior_camera, self._mean_slope_std
+        vehicle_variance = max(self._slope_std**2 - mean_std**2, 1e-12)
         n, x, xx, y, xy = self._sums.T
         # Information of each line about (horizon, mean slope), with its own part of the slope integrated out.
         factor = 1 / (xx + 1 / vehicle_variance)
+        crossed = (x - x * xx * factor).sum()
         information = np.array(
-            [
-                [(n - x * x * factor).sum(), (x - x * xx * factor).sum()],
-                [(x - x * xx * factor).sum(), (xx - xx * xx * factor).sum()],
-            ]
+            [[(n - x * x * factor).sum(), crossed], [crossed, (xx - xx * xx * factor).sum()]]
         )
         vector = np.array([(y - x * xy * factor).sum(), (xy - xx * xy * factor).sum()])
         prior = np.array([1 / camera.horizon_std_px**2, 1 / max(mean_std, 1e-6) ** 2])
         information[[0, 1], [0, 1]] += prior
-        vector += prior * (camera.horizon_px, slope)
+        vector += prior * (camera.horizon_px, self._slope)
         cov = np.linalg.inv(information)
         horizon = float((cov @ vector)[0])
         std = max(math.sqrt(max(float(cov[0, 0]), 0.0)), _MIN_STD_PX * camera.pixel_scale)

@@ -2,8 +2,7 @@
 
 The state of a box is ``[cx, cy, w, h]`` and its velocity in pixels per second. It is predicted at constant
 velocity and corrected by the measured edges (Bar-Shalom, Li and Kirubarajan, *Estimation with Applications
-to Tracking and Navigation*, chapter 6; for boxes: Bewley et al., *Simple Online and Realtime Tracking*, ICIP
-2016). Edges are measured, not centers, because the frame's border may truncate one edge alone.
+to Tracking and Navigation*, chapter 6), because the frame's border may truncate one edge alone.
 
 The state of a distance is ``[distance in m, speed in m/s, log(width / camera.vehicle_width_m)]``. The width
 is part of the state: a truck seems near by its width until its bottom edge has corrected it, and from then
@@ -36,9 +35,6 @@ UNKNOWN = 1e9
 # Box edges from ``[cx, cy, w, h]``, and the inverse.
 _TO_EDGES = np.array([[1, 0, -0.5, 0], [0, 1, 0, -0.5], [1, 0, 0.5, 0], [0, 1, 0, 0.5]], np.float64)
 _FROM_EDGES = np.linalg.inv(_TO_EDGES)
-# Blocks of the transition matrix and of the process noise.
-_IDENTITY, _POSITION_BY_VELOCITY = np.eye(8), np.eye(8, k=4)
-_POSITIONS, _VELOCITIES = np.diag([1.0] * 4 + [0.0] * 4), np.diag([0.0] * 4 + [1.0] * 4)
 _DIAGONAL = np.arange(4)
 _MIN_SIZE = 4.0
 # Standard deviation of a new box's velocity ``[cx, cy, w, h]``, in box sizes per second.
@@ -71,8 +67,7 @@ class KalmanStates(NamedTuple):
     @classmethod
     def empty(cls) -> KalmanStates:
         """States of no tracks."""
-        shapes = (0, 8), (0, 8, 8), (0, 4), (0, 3), (0, 3, 3)
-        return cls(*(np.empty(shape) for shape in shapes))
+        return cls(*(np.empty((0, *shape)) for shape in ((8,), (8, 8), (4,), (3,), (3, 3))))
 
     def boxes(self) -> Floats:
         """``(N, 4)`` boxes, including parts outside the frame."""
@@ -87,10 +82,9 @@ class KalmanStates(NamedTuple):
 
     def put(self, rows: Sequence[int], other: KalmanStates) -> KalmanStates:
         """Return a copy with these rows replaced by those of `other`."""
-        index = np.array(rows, np.intp)
         columns = [column.copy() for column in self]
         for column, new in zip(columns, other):
-            column[index] = new
+            column[list(rows)] = new
         return KalmanStates(*columns)
 
     def join(self, other: KalmanStates) -> KalmanStates:
@@ -148,7 +142,10 @@ class KalmanSmoother:
         position, size = self._params.process_noise_position, self._params.process_noise_size
         noise = mean[:, [2, 3, 2, 3]] * np.array([position, position, size, size])
         mean, cov = predict(mean, cov, dt, np.square(noise))
-        return states._replace(mean=mean, cov=limit_covariance(mean, cov))
+        # Limit the standard errors of coasting tracks.
+        std = np.sqrt(np.maximum(cov[:, np.arange(8), np.arange(8)], 1e-12))
+        scale = np.minimum(mean[:, [2, 3] * 4] * _MAX_STD / std, 1.0)
+        return states._replace(mean=mean, cov=cov * scale[:, :, None] * scale[:, None, :])
 
     def correct(
         self, states: KalmanStates, tracks: Sequence[TrackState], measured: Measurements, dt: float
@@ -187,16 +184,12 @@ def initiate(boxes: Floats, edge_std: Floats) -> tuple[Floats, Floats]:
 
 
 def predict(mean: Floats, cov: Floats, dt: float, noise_density: Floats) -> tuple[Floats, Floats]:
-    """Predict states by `dt` seconds at constant velocity.
-
-    `noise_density` ``(N, 4)`` is the variance that each velocity gains per second (white acceleration).
-    """
-    transition = _IDENTITY + dt * _POSITION_BY_VELOCITY
+    """Predict states by `dt` seconds; a velocity gains the variance `noise_density` ``(N, 4)`` per second."""
+    transition = np.kron([[1, dt], [0, 1]], np.eye(4))
+    noise = np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(4))
     predicted = mean @ transition.T
     predicted[:, 2:4] = np.maximum(predicted[:, 2:4], _MIN_SIZE)
-    cross = _POSITION_BY_VELOCITY + _POSITION_BY_VELOCITY.T
-    noise = (dt**3 / 3) * _POSITIONS + (dt**2 / 2) * cross + dt * _VELOCITIES
-    cov = transition @ cov @ transition.T + noise * noise_density[:, [0, 1, 2, 3, 0, 1, 2, 3], None]
+    cov = transition @ cov @ transition.T + noise * np.tile(noise_density, 2)[:, :, None]
     return predicted, cov
 
 
@@ -211,11 +204,9 @@ def update(
 ) -> tuple[Floats, Floats, Floats]:
     """Correct states by measured edges; returns means, covariances and innovation means.
 
-    The weight of an outlier is reduced (Huber, *Robust Statistics*, chapter 7), so that one wrong box does
-    not distort the track. If an edge deviates persistently to one side, the track is wrong: the variance of
-    that edge's position is increased instead. `variance` ``(N, 4)`` is `UNKNOWN` for edges that are not
-    visible. `reject_outliers` ``(N,)`` ignores outliers. `decay` is the weight of the past in
-    `innovation_mean`.
+    The weight of an outlier is reduced (Huber, *Robust Statistics*, chapter 7), or set to 0 with
+    `reject_outliers`, so that one wrong box does not distort the track. If an edge deviates persistently to
+    one side, the track is wrong: the variance of that edge's position is increased instead.
     """
     cross = cov[:, :, :4] @ _TO_EDGES.T  # cov @ H.T, because H is zero for the velocities
     innovation_cov = _TO_EDGES @ cross[:, :4]
@@ -239,14 +230,6 @@ def update(
     corrected[:, 2:4] = np.maximum(corrected[:, 2:4], _MIN_SIZE)
     cov = cov - gain @ cross.transpose(0, 2, 1)
     return corrected, (cov + cov.transpose(0, 2, 1)) / 2, innovation_mean
-
-
-def limit_covariance(mean: Floats, cov: Floats) -> Floats:
-    """Covariances scaled so that no standard error exceeds its limit, which coasting tracks would reach."""
-    limit = mean[:, [2, 3] * 4] * _MAX_STD
-    std = np.sqrt(np.maximum(cov[:, np.arange(8), np.arange(8)], 1e-12))
-    scale = np.minimum(limit / std, 1.0)
-    return np.asarray(cov * scale[:, :, None] * scale[:, None, :])
 
 
 def coasted_distance(mean: Floats, seconds: Floats) -> Floats:
