@@ -363,15 +363,17 @@ def model_card(
     classifier: VehicleClassifier,
     report: TrainingReport,
     *,
+    name: str = "",
     others: Sequence[TrainingReport] = (),
     command: str | None = None,
 ) -> str:
     """Write the Markdown model card: data, license, accuracy on each split, limitations.
 
-    `classifier` and `report` are the results of `train_and_evaluate`, `others` reports of other features on
-    the same patches, and `command` is the command that trains the model.
+    `classifier` and `report` are the results of `train_and_evaluate`, `name` is the model's name, `others`
+    are reports of other features on the same patches, and `command` is the command that trains the model.
     """
     parts = [
+        f"# Model card: {name}" if name else "# Model card",
         *_card_model(classifier, report, command),
         *_card_data(report),
         *_card_accuracy(report, others),
@@ -399,16 +401,15 @@ def _card_model(classifier: VehicleClassifier, report: TrainingReport, command: 
     lengths = f"{params.spatial_length} spatial bins, {params.hist_length} histogram, {params.hog_length} HOG"
     versions = ", ".join(f"{name} {text}" for name, text in classifier.metadata["versions"].items())
     copies = "with mirrored patches" if report.mirror else "without mirrored patches"
-    copies += f", brightness jitter (gamma {report.gamma:g})" if report.gamma else ""
-    copies += f", degraded copies of weight {report.degraded:g}" if report.degraded else ""
+    copies += f" of varied brightness (gamma {report.gamma:g})" if report.gamma else ""
+    copies += f" and degraded copies (weight {report.degraded:g})" if report.degraded else ""
     items = [
         f"Features: {report.features}, in {params.color_space}, {params.length} values ({lengths})",
         f"Training: C = {report.C:g}, {copies}, seed {report.random_state}",
         f"Versions: {versions}",
     ]
     text = [
-        "# Model card",
-        "A linear SVM that classifies 64x64 RGB patches as vehicle or non-vehicle, for window search.",
+        "A linear SVM that classifies 64x64 RGB patches as vehicle or non-vehicle, for searching images.",
         "\n".join(markdown_text(item, "- ") for item in items),
     ]
     if command:
@@ -473,7 +474,7 @@ def _card_accuracy(report: TrainingReport, others: Sequence[TrainingReport]) -> 
 
 
 SCORE_COLUMNS = (
-    "tested on", "trained", "tested", "accuracy", "missed vehicles", "false vehicles", "near duplicates",
+    "tested on", "trained", "tested", "accuracy", "false negatives", "false positives", "near duplicates",
 )  # fmt: skip
 """Column titles of `score_rows`."""
 

@@ -112,7 +112,8 @@ def train(
         command = shlex.join(["vehicle-detection", "train", *words])
         with atomic_write(card) as part:
             part.write_text(
-                model_card(classifier, evaluated, others=others, command=command), encoding="utf-8"
+                model_card(classifier, evaluated, name=output.stem, others=others, command=command),
+                encoding="utf-8",
             )
     typer.echo(f"wrote {', '.join(map(str, targets.values()))}")
 

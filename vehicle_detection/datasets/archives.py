@@ -328,7 +328,7 @@ def _fetch(target: Path, address: str, counts: dict[str, int], progress: bool) -
             f"folder {target.parent} cannot be created: {error.strerror}; choose another"
         ) from error
     _remove_stale_parts(target)
-    with atomic_write(target, "folder") as part:
+    with atomic_write(target) as part:
         _LOGGER.info("downloading %s", address)
         _download(address, part, progress)
         verify_archive(part, counts, shown=address)
@@ -363,7 +363,7 @@ def _download(address: str, part: Path, progress: bool) -> None:
             f"{address} returns {status}; pass the url of a folder with {' and '.join(ARCHIVES)}"
         ) from error
     except requests.exceptions.ChunkedEncodingError as error:
-        raise DatasetError(f"the download of {address} was cut off; call again to restart it") from error
+        raise DatasetError(f"{address} was cut off during the download; call again to restart it") from error
     except (requests.ConnectionError, requests.Timeout) as error:
         raise DatasetError(
             f"{address} cannot be reached ({type(error).__name__}); check the network and call again, "
