@@ -7,8 +7,7 @@ from typer.testing import CliRunner
 from vehicle_detection.cli.app import app
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.synthetic import render_patches, render_scene, write_labels
-from vehicle_detection.tuning import read_results
-from vehicle_detection.tuning import trials
+from vehicle_detection.tuning import read_results, trials
 
 SMALL = "spatial_size=8 hist_bins=8 pix_per_cell=16 hog_channel=0 mirror=no"
 
@@ -119,13 +118,13 @@ def test_tune_refuses_bad_input(patches, material, tmp_path):
     assert "--grid has the unknown option 'color'" in refuse(*patches, *table, "--grid", "color=LAB")
     assert "--grid must look like 'orient=8,9" in refuse(*patches, *table, "--grid", "orient")
     assert "--split must be one of 'sequences'" in refuse(*patches, *table, *grid, "--split", "half")
-    assert "--output must end in .csv or .jsonl or .parquet" in refuse(
+    assert "--output must end in .csv, .jsonl, .parquet" in refuse(
         *patches, *grid, "-o", tmp_path / "table.xls"
     )
     assert "--output needs an existing folder" in refuse(
         *patches, *grid, "-o", tmp_path / "none" / "table.csv"
     )
-    assert "--plot must end in .png or" in refuse(*patches, *grid, *table, "--plot", tmp_path / "plot.jpg")
+    assert "--plot must end in .png, .svg" in refuse(*patches, *grid, *table, "--plot", tmp_path / "plot.jpg")
     assert "--plot needs an existing folder" in refuse(
         *patches, *grid, *table, "--plot", tmp_path / "none" / "p.png"
     )

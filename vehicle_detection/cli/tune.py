@@ -21,7 +21,7 @@ _TABLES, _FIGURES = (".csv", ".jsonl", ".parquet"), (".png", ".svg", ".pdf")
 _MAX_ROWS = 15
 
 
-@option_names(random_state="--seed", n_finalists="--finalists")
+@option_names(random_state="--seed", seeds="--seed", n_finalists="--finalists", store="--output")
 def tune(
     vehicles: Annotated[Path, typer.Option(metavar="PATH", help="Folder or zip of patches of vehicles.")],
     non_vehicles: Annotated[Path, typer.Option(metavar="PATH", help="Folder or zip of other patches.")],
@@ -83,7 +83,7 @@ def tune(
         if path is not None:
             targets[name] = check_target(path, name)
             if path.suffix.lower() not in suffixes:
-                raise InvalidInputError(f"{name} must end in {' or '.join(suffixes)}; got {path.name!r}")
+                raise InvalidInputError(f"{name} must end in {', '.join(suffixes)}; got {path.name!r}")
     check_distinct_paths(targets, {"--vehicles": vehicles, "--non-vehicles": non_vehicles})
     labelled = _read_frames(frames, labels, horizon)
     # Rows cannot be appended to Parquet, so they are stored in a .jsonl file beside it.
