@@ -471,7 +471,7 @@ def check_gamma(gamma: object, mirror: bool) -> float:
     number = check_number(gamma, "gamma", low=0, high=2)
     if number and not mirror:
         raise InvalidInputError(
-            f"gamma must be 0 with mirror=False, as it changes the mirrored patches; got {number:g}"
+            f"gamma must be 0 without mirrored patches, whose brightness it changes; got {number:g}"
         )
     return number
 
