@@ -1,4 +1,4 @@
-"""``python -m benchmarks [NAME...]``: measure, print the table, write the JSON."""
+"""``python -m benchmarks [NAME...]``: run benchmarks, print the table and write the JSON file."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ OUTPUT = Path(__file__).with_name("results.json")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the benchmarks that the arguments name, all of them by default."""
+    """Run the named benchmarks, all of them by default."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHMARKS))
-    parser.add_argument("--long", action="store_true", help="memory: a run of 3,000 frames too")
-    parser.add_argument("--plots", type=Path, metavar="DIR", help="scaling: draw scaling.png in this folder")
+    parser.add_argument("--long", action="store_true", help="memory: also a run of 3,000 frames")
+    parser.add_argument("--plots", type=Path, metavar="DIR", help="scaling: write scaling.png to this folder")
     parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FILE", help="the JSON file to write")
     options = parser.parse_args(arguments)
     unknown = sorted(set(options.names) - set(BENCHMARKS))
     if unknown:
         parser.error(f"no benchmark {unknown[0]!r}; choose from {', '.join(BENCHMARKS)}")
 
-    # A file or a pipe has no width: the longest rows fit in this one.
+    # Files and pipes have no width; this one fits the longest rows.
     console = Console(width=None if sys.stdout.isatty() else 112)
     if not is_real():
-        console.print(f"{DATA_VARIABLE} names no data: drawn pictures instead, and no verdict on quality")
+        console.print(f"{DATA_VARIABLE} is not set: using rendered images, without verdicts on quality")
     results = {}
     with tempfile.TemporaryDirectory(prefix="benchmarks") as work:
         context = Context(Path(work), plots=options.plots, long=options.long)

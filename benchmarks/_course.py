@@ -1,12 +1,12 @@
-"""The yardstick: the search of the course, written plainly and by itself.
+"""The course's search as the reference of the speed comparison, independent of the library.
 
-For each scale: HOG of the whole band once by scikit-image; then, window by window, the blocks of the
-window are cut out of it, its spatial bins and histograms are made, and scaler and classifier are called.
-Features are those of the course's third system: YCrCb, 32x32 spatial bins, 32 histogram bins, HOG of all
-channels with 9 orientations, 8 pixels a cell and 2 cells a block: 8460 values.
+For each scale, scikit-image computes the HOG of the whole band once. Then, for each window, its HOG blocks
+are cropped, its spatial bins and histograms computed, and scaler and classifier called. The features are
+those of the course's third system: YCrCb, 32x32 spatial bins, 32 histogram bins, HOG of all channels with 9
+orientations, 8 pixels per cell and 2 cells per block; 8460 values.
 
-One line differs from the course's: the band is resized before its colors are converted, not after, so that
-rounding gives the same pixels on both sides. It costs the same.
+Unlike in the course, the band is resized before its colors are converted, so that rounding gives the same
+pixels in both searches. The cost is the same.
 """
 
 from __future__ import annotations
@@ -30,13 +30,10 @@ BLOCKS = WINDOW // CELL - BLOCK + 1
 
 @dataclass(frozen=True)
 class CourseSearch:
-    """All windows of a frame, band by band and row by row, and how long their HOG took.
+    """All windows of a frame, ordered by band and row, and the seconds that their HOG took."""
 
-    `boxes` is ``(N, 4)`` in pixels of the frame, `scores` ``(N,)``.
-    """
-
-    boxes: NDArray[np.float64]
-    scores: NDArray[np.float64]
+    boxes: NDArray[np.float64]  # (N, 4) in pixels of the frame
+    scores: NDArray[np.float64]  # (N,)
     hog_seconds: float
 
 

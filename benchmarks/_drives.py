@@ -1,4 +1,4 @@
-"""Drawn drives with exact truth: who is followed through what, how far away and how fast."""
+"""Tracking on rendered drives with exact ground truth: tracks, distances and speeds."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks._frames import shown_boxes
 from benchmarks._material import Context
-from benchmarks._report import Row, Target, at_least, at_most
+from benchmarks._report import Row, at_least, at_most
 from vehicle_detection import (
     FrameResult,
     VehicleDetector,
@@ -20,6 +19,7 @@ from vehicle_detection import (
     read_labels,
     render_drive,
 )
+from vehicle_detection.evaluation import FrameBoxes
 from vehicle_detection.synthetic import Drive
 
 FRAMES = 200
@@ -38,11 +38,11 @@ CASES: dict[str, dict[str, Any]] = {
 
 SEED = 7
 NEAR_M, FAR_M = 10.0, 60.0
-"""Distances, in meters, between which distance and speed are judged."""
+"""Range of distances in meters in which distance and speed are evaluated."""
 
 
 def run(context: Context) -> list[Row]:
-    """Follow the vehicles of every drive with the settings shipped as default."""
+    """Track the vehicles of every drive with the default settings."""
     rows: list[Row] = []
     with VehicleDetector() as detector:
         for name, options in CASES.items():
@@ -58,37 +58,29 @@ def drive_rows(name: str, drive: Drive, detector: VehicleDetector, context: Cont
     results = [detector.process(scene.image, index / drive.fps) for index, scene in enumerate(drive)]
     labels = context.work / f"{name}.csv"
     drive.write_labels(labels)
-    scores = evaluate_tracks(shown_boxes(results), read_labels(labels), frames=range(len(results)))
+    scores = evaluate_tracks(
+        FrameBoxes.from_results(results), read_labels(labels), frames=range(len(results))
+    )
     errors = range_errors(drive, results)
-    values: list[tuple[str, float, str, Target]] = [
-        ("MOTA", scores.mota, "", at_least(0.95)),
-        ("IDF1", scores.idf1, "", at_least(0.95)),
-        ("median error of the distance", errors.distance, "%", at_most(15)),
-        ("median error of the speed", errors.speed, "m/s", at_most(1.5)),
-    ]
+    material, details = f"{FRAMES} rendered frames each", scores.to_dict()
     return [
-        Row(
-            what=f"{name}: {what}",
-            value=value,
-            unit=unit,
-            target=target,
-            material=f"{FRAMES} frames each, drawn by the project",
-            details=scores.to_dict() if what == "MOTA" else {},
-        )
-        for what, value, unit, target in values
+        Row(f"{name}: MOTA", scores.mota, target=at_least(0.95), material=material, details=details),
+        Row(f"{name}: IDF1", scores.idf1, target=at_least(0.95)),
+        Row(f"{name}: median error of the distance", errors.distance, unit="%", target=at_most(15)),
+        Row(f"{name}: median error of the speed", errors.speed, unit="m/s", target=at_most(1.5)),
     ]
 
 
 @dataclass(frozen=True)
 class RangeErrors:
-    """Median errors of what is told about vehicles 10 to 60 m away: percent, and meters a second."""
+    """Median errors for vehicles 10 to 60 m away: distance in percent, speed in m/s."""
 
     distance: float
     speed: float
 
 
 def range_errors(drive: Drive, results: list[FrameResult]) -> RangeErrors:
-    """Compare the distances and speeds that are told with the true ones."""
+    """Compare estimated and true distances and speeds."""
     pairs = np.array(list(_ranges(drive, results))).reshape(-1, 4)
     distance = np.abs(pairs[:, 0] - pairs[:, 1]) / pairs[:, 1] * 100
     speed = np.abs(pairs[:, 2] - pairs[:, 3])
@@ -101,7 +93,7 @@ def _median(values: NDArray[np.float64]) -> float:
 
 
 def _ranges(drive: Drive, results: list[FrameResult]) -> Iterator[tuple[float, float, float, float]]:
-    """Distance told and true, speed told and true, of each pair of a shown track and a vehicle."""
+    """Estimated and true distance, estimated and true speed of each match of a track and a vehicle."""
     for truth, result in zip(drive.truth, results):
         near = [row for row in truth if not row.ignore and NEAR_M <= row.distance_m <= FAR_M]
         if not near or not result.shown:
@@ -110,6 +102,6 @@ def _ranges(drive: Drive, results: list[FrameResult]) -> Iterator[tuple[float, f
         for track, shared in zip(result.shown, overlap):
             row = near[int(shared.argmax())]
             if shared.max() >= 0.5:
-                told = (track.distance_m, track.speed_mps)
-                distance, speed = (np.nan if value is None else value for value in told)
+                estimates = (track.distance_m, track.speed_mps)
+                distance, speed = (np.nan if value is None else value for value in estimates)
                 yield distance, row.distance_m, speed, row.speed_mps

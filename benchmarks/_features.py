@@ -1,4 +1,4 @@
-"""Features of the course's patches on one core, against scikit-image."""
+"""Feature extraction of the course's patches on one core, compared with scikit-image."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TOLERANCE = 1e-4
 def run(context: Context) -> list[Row]:
     """Extract the features of all patches, and of a sample by the reference functions."""
     found, material = patches()
-    # Drawn patches are repeated to the same number: what they show does not change the time.
+    # Rendered patches are repeated to the same number; their content does not change the time.
     images = np.resize(found.patches, (COUNT, *found.patches.shape[1:]))
     params = FeatureParams.preset("ycrcb-6156")
     sample = images[:: COUNT // SAMPLE][:SAMPLE]
@@ -32,17 +32,17 @@ def run(context: Context) -> list[Row]:
     slow = seconds_of(by_reference) * COUNT / SAMPLE
     return [
         Row(
-            what=f"features of {COUNT:,} patches, {params.length} long, one core",
-            value=seconds,
+            f"features of {COUNT:,} patches, {params.length} long, one core",
+            seconds,
             unit="s",
             target=at_most(6),
             material=material,
         ),
-        Row(what=f"scikit-image, extrapolated from {SAMPLE} patches", value=slow, unit="s"),
-        Row(what="faster than scikit-image", value=slow / seconds, unit="x"),
+        Row(f"scikit-image, extrapolated from {SAMPLE} patches", slow, unit="s"),
+        Row("faster than scikit-image", slow / seconds, unit="x"),
         Row(
-            what="largest difference of a feature, share of its size or of 1",
-            value=float((np.abs(fast - reference) / np.maximum(1, np.abs(reference))).max()),
+            "maximum difference of a feature, relative to its size or 1",
+            float((np.abs(fast - reference) / np.maximum(1, np.abs(reference))).max()),
             target=at_most(TOLERANCE),
         ),
     ]

@@ -1,6 +1,6 @@
-"""What is measured on: the real data where it is at hand, else what the project draws.
+"""The data of the benchmarks: real data if available, else rendered.
 
-Every function also says in a few words what it took, and `is_real` whether targets apply.
+Functions also return a short description of the data.
 """
 
 from __future__ import annotations
@@ -34,20 +34,17 @@ DATA_VARIABLE = "VEHICLE_DETECTION_DATA"
 
 CLIP = "project_clip"
 SEARCHED_FRAME = 300
-"""Frame of the clip that is searched: two cars, on a road with shadows."""
+"""Frame of the clip that is searched: two cars on a road with shadows."""
 
 DRAWN_FRAMES = 60
 
-_EVERY = 6
-"""The search's classifier is trained on every sixth patch: its speed does not depend on its weights."""
+_STRIDE = 6
+"""The searched classifier is trained on every sixth patch; its speed does not depend on the weights."""
 
 
 @dataclass(frozen=True)
 class Context:
-    """Where a benchmark may write, and what was asked for on the command line.
-
-    `work` is a folder that is deleted after the run, `plots` one for pictures, None for none.
-    """
+    """Options of a run: a temporary folder, a folder for plots, and whether to do the long memory run."""
 
     work: Path
     plots: Path | None = None
@@ -55,28 +52,28 @@ class Context:
 
 
 def data_folder() -> Path | None:
-    """Folder of the real data, None where it is not at hand."""
+    """Folder of the real data; None without it."""
     folder = os.environ.get(DATA_VARIABLE)
     return Path(folder) if folder and Path(folder).is_dir() else None
 
 
 def is_real() -> bool:
-    """Whether the real data is measured."""
+    """Whether the real data is used."""
     return data_folder() is not None
 
 
 def if_real(target: Target) -> Target | None:
-    """Return a target that only means something on the real data; None without it."""
+    """Return a target that applies to the real data only; None without it."""
     return target if is_real() else None
 
 
 def drawn_drive() -> Drive:
-    """Return the drive that stands in for the project clip."""
+    """Return the rendered drive that replaces the project clip."""
     return render_drive(frames=DRAWN_FRAMES, random_state=1)
 
 
 def clip(work: Path) -> tuple[Path, str]:
-    """Video of 1280x720: the project clip, or the drawn drive."""
+    """Video of 1280x720: the project clip, or the rendered drive."""
     folder = data_folder()
     if folder is not None:
         return folder / "videos" / f"{CLIP}.mp4", CLIP
@@ -86,8 +83,8 @@ def clip(work: Path) -> tuple[Path, str]:
     return target, "synthetic drive"
 
 
-def looped(source: Path, frames: int, work: Path) -> Path:
-    """Video of exactly `frames` frames that repeats `source`, without encoding it again."""
+def repeated_clip(source: Path, frames: int, work: Path) -> Path:
+    """Repeat a video to exactly `frames` frames, without encoding it again."""
     target = work / f"{source.stem}_{frames}.mp4"
     if not target.exists():
         options = ["-stream_loop", "-1", "-i", str(source), "-an", "-c:v", "copy", "-frames:v", str(frames)]
@@ -128,7 +125,7 @@ def searched_frame() -> tuple[NDArray[np.uint8], str]:
 
 
 def patches(*, synthetic: int = 600) -> tuple[PatchSet, str]:
-    """Return the course's 17,760 patches, or `synthetic` drawn ones."""
+    """Return the course's 17,760 patches, or `synthetic` rendered ones."""
     folder = data_folder()
     if folder is not None:
         found = load_training_patches(folder / "vehicles.zip", folder / "non-vehicles.zip")
@@ -139,14 +136,14 @@ def patches(*, synthetic: int = 600) -> tuple[PatchSet, str]:
 
 
 def classifier_for_search(name: str = "ycrcb-8460") -> tuple[VehicleClassifier, str]:
-    """Classifier with the features of a course system, trained once and kept among the temporary files."""
+    """Classifier with the features of a system of the course, cached in the temporary folder."""
     kind = "real" if is_real() else "synthetic"
     folder = Path(tempfile.gettempdir()) / "vehicle-detection-benchmarks"
     folder.mkdir(exist_ok=True)
     file = folder / f"{name}-{kind}-{FORMAT_VERSION}.safetensors"
     if not file.exists():
         found, _ = patches()
-        part = found[::_EVERY] if is_real() else found
+        part = found[::_STRIDE] if is_real() else found
         train_classifier(part.patches, part.labels, params=FeatureParams.preset(name)).save(file)
-    share = f"every {_EVERY}th real patch" if is_real() else "synthetic patches"
-    return load_classifier(file), f"{name} model trained on {share}"
+    source = f"every {_STRIDE}th real patch" if is_real() else "synthetic patches"
+    return load_classifier(file), f"{name} model trained on {source}"

@@ -1,7 +1,7 @@
-"""What has to be measured in a process of its own; started by the benchmarks, prints one line of JSON.
+"""Measurements in a process of their own, which print one line of JSON.
 
-``python -m benchmarks._probe startup FRAME.npy [--kernels]`` and ``... memory VIDEO TARGET``. Nothing but the
-standard library is imported before the clock runs.
+``python -m benchmarks._probe startup FRAME.npy [--kernels]`` and ``... memory VIDEO TARGET``. Only the
+standard library is imported before the measurement starts.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def run_probe(*arguments: str, **environment: str) -> dict[str, Any]:
-    """Run this module in a fresh interpreter and return what it printed."""
+    """Run this module in a new interpreter and return its result."""
     command = [sys.executable, "-m", "benchmarks._probe", *arguments]
     done = subprocess.run(
         command, cwd=ROOT, env={**os.environ, **environment}, capture_output=True, text=True, check=False
     )
     if done.returncode:
-        raise RuntimeError(f"the measuring process failed:\n{done.stderr}")
+        raise RuntimeError(f"the measurement failed:\n{done.stderr}")
     found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found
 
@@ -53,42 +53,42 @@ def startup(frame: str, *, kernels: bool = False) -> dict[str, Any]:
 
 
 def _compile_seconds(record: Any) -> dict[str, float]:
-    """Seconds that each kernel takes to compile, with what is compiled for it on the way."""
+    """Seconds to compile each kernel, including the functions that it calls."""
     seconds: dict[str, float] = {}
-    begun: list[float] = []
+    starts: list[float] = []
     for moment, occurrence in record.buffer:
         if occurrence.is_start:
-            begun.append(moment)
+            starts.append(moment)
             continue
-        began = begun.pop()
-        if not begun:
+        began = starts.pop()
+        if not starts:
             name = occurrence.data["dispatcher"].py_func.__name__
             seconds[name] = seconds.get(name, 0.0) + moment - began
     return seconds
 
 
 def memory(source: str, target: str) -> dict[str, Any]:
-    """Process a whole video and tell the most memory that this process, without ffmpeg's, ever had."""
+    """Process a whole video; report this process's memory (without ffmpeg) and the time of each frame."""
     import vehicle_detection
 
-    moments: list[float] = []
-    held: list[int] = []
+    times: list[float] = []
+    sampled: list[int] = []
 
     def note(result: Any) -> None:
-        moments.append(time.perf_counter())
-        if len(moments) % 100 == 0:
-            held.append(current_memory())
+        times.append(time.perf_counter())
+        if len(times) % 100 == 0:
+            sampled.append(current_memory())
 
     with vehicle_detection.VehicleDetector() as detector:
         vehicle_detection.process_video(source, target, detector, progress=False, on_result=note)
-    return {"frames": len(moments), "peak": peak_memory(), "held": held, "moments": moments}
+    return {"frames": len(times), "peak": peak_memory(), "memory": sampled, "times": times}
 
 
 def peak_memory() -> int:
-    """Most bytes this process has had in memory.
+    """Peak resident memory of this process in bytes.
 
-    ``getrusage`` would do, but on Linux its maximum survives ``exec``: a child of a large parent, before its
-    first own byte, has the parent's peak. ``VmHWM`` starts anew.
+    On Linux the maximum of ``getrusage`` survives ``exec`` and may be that of the parent process; ``VmHWM``
+    is reset.
     """
     status = Path("/proc/self/status")
     if status.exists():
@@ -102,7 +102,7 @@ def peak_memory() -> int:
 
 
 def current_memory() -> int:
-    """Bytes this process has in memory now; 0 where the system does not tell."""
+    """Resident memory of this process in bytes; 0 if the system does not report it."""
     status = Path("/proc/self/statm")
     if not status.exists():
         return 0
@@ -110,7 +110,7 @@ def current_memory() -> int:
 
 
 def main(arguments: list[str]) -> None:
-    """Run the probe that the arguments name."""
+    """Run the named measurement."""
     kind, *rest = arguments
     found = startup(rest[0], kernels="--kernels" in rest) if kind == "startup" else memory(*rest)
     print(json.dumps(found))

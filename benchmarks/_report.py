@@ -1,4 +1,4 @@
-"""Rows of measurements beside their targets: a table on the terminal and a JSON file."""
+"""Measurements and their targets, as a table on the terminal and a JSON file."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import os
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -29,12 +29,12 @@ LIBRARIES = (
 )
 
 ABOUT = 1.1
-"""An "about" target is met by at most this many times its value."""
+"""Factor of its value up to which an "about" target is met."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """What a row has to reach: ``"<="`` and ``">="`` a value, ``"="`` it, or ``"about"`` it or less."""
+    """The required value of a row: a bound, an exact value, or ``"about"`` a value or less."""
 
     sense: Literal["<=", ">=", "=", "about"]
     value: float
@@ -50,21 +50,22 @@ class Target:
 
 
 def at_most(value: float) -> Target:
-    """Target of a row whose value should be small."""
+    """Target with an upper bound."""
     return Target("<=", value)
 
 
 def at_least(value: float) -> Target:
-    """Target of a row whose value should be large."""
+    """Target with a lower bound."""
     return Target(">=", value)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Row:
-    """One measurement. A row without a target informs; `material` says what it was measured on."""
+    """One measurement; rows without a target are for information. `material` names the data."""
 
     what: str
     value: float
+    _: KW_ONLY
     unit: str = ""
     target: Target | None = None
     material: str = ""
@@ -72,7 +73,7 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """``"met"``, ``"missed"``, or nothing to judge."""
+        """``"met"``, ``"missed"``, or empty without a target."""
         if self.target is None:
             return ""
         return "met" if self.target.is_met(self.value) else "missed"
@@ -96,7 +97,7 @@ Results = Mapping[str, Sequence[Row]]
 
 
 def machine_facts() -> dict[str, Any]:
-    """What a speed depends on, without anything that names the machine."""
+    """Describe what the speed depends on, without identifying the machine."""
     return {
         "cores": available_cores(),
         "processor": _processor(),
@@ -115,11 +116,11 @@ def _processor() -> str:
 
 
 def format_value(value: float, unit: str = "") -> str:
-    """Format a number to three digits or so, with its unit."""
+    """Format a number with about three digits and its unit."""
     if value == int(value) and abs(value) < 1e6:
         text = f"{int(value):,}"
     elif not unit and 0.5 <= abs(value) <= 1:
-        text = f"{value:.4f}".rstrip("0")  # A share of 1: its last digits are what counts.
+        text = f"{value:.4f}".rstrip("0")  # The last digits of fractions near 1 matter.
     else:
         text = f"{value:.3g}" if abs(value) < 100 else f"{value:,.0f}"
     return f"{text} {unit}".rstrip()
@@ -134,7 +135,7 @@ def format_target(row: Row) -> str:
 
 
 def print_table(results: Results, console: Console | None = None) -> None:
-    """Print all rows, a section for each benchmark."""
+    """Print all rows, one section per benchmark."""
     table = Table(title="vehicle_detection benchmarks", title_justify="left")
     table.add_column("what", overflow="fold")
     table.add_column("measured", justify="right", no_wrap=True)
@@ -153,7 +154,7 @@ def print_table(results: Results, console: Console | None = None) -> None:
 
 
 def write_json(results: Results, path: Path) -> None:
-    """Write rows and machine facts; rows of other benchmarks stay if the same machine measured them."""
+    """Write rows and machine facts; keep other benchmarks' rows if they are from the same machine."""
     facts = machine_facts()
     kept: dict[str, Any] = {}
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):

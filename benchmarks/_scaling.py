@@ -1,4 +1,4 @@
-"""What the search costs as frames, windows and cores change, and where one frame's time goes."""
+"""Cost of the search by frame size, number of windows and cores, and by stage."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ SCALES = (1.5, 1.0, 0.8, 0.7, 0.6, 0.5)
 CALLS = 20
 
 Points = Mapping[int, float]
-"""Milliseconds of a search by what it depends on."""
+"""Milliseconds of a search by the number of windows or cores."""
 
 
 def run(context: Context) -> list[Row]:
-    """Measure, and draw what was measured if a folder for plots was given."""
+    """Measure, and plot if a folder for plots is given."""
     frame, source = searched_frame()
     classifier, model = classifier_for_search()
     default = load_classifier()
@@ -52,23 +52,17 @@ def run(context: Context) -> list[Row]:
     return [
         *(
             Row(
-                what=f"default search of a {width}x{height} frame ({count:,} windows), all cores",
-                value=cost,
+                f"default search of a {width}x{height} frame ({count:,} windows), all cores",
+                cost,
                 unit="ms",
                 material=f"{source}; windows, cores and stages: {model}",
             )
             for (width, height), (cost, count) in sizes.items()
         ),
+        *(Row(f"search of {count:,} windows, one core", cost, unit="ms") for count, cost in windows.items()),
+        *(Row(f"three scales, {n} core{'s' * (n > 1)}", cost, unit="ms") for n, cost in cores.items()),
         *(
-            Row(what=f"search of {count:,} windows, one core", value=cost, unit="ms")
-            for count, cost in windows.items()
-        ),
-        *(
-            Row(what=f"three scales, {n} core{'s' * (n > 1)}", value=cost, unit="ms")
-            for n, cost in cores.items()
-        ),
-        *(
-            Row(what=f"three scales, one core: {name}", value=seconds * 1e3, unit="ms")
+            Row(f"three scales, one core: {name}", seconds * 1e3, unit="ms")
             for name, seconds in stages.items()
         ),
     ]
@@ -88,13 +82,13 @@ def _default_cost(frame: NDArray[np.uint8], classifier: VehicleClassifier) -> tu
 
 
 def count_windows(frame: NDArray[np.uint8], classifier: VehicleClassifier, params: SearchParams) -> int:
-    """Count the windows of a search: all of them are hits if any score will do."""
+    """Count the windows of a search."""
     with BandSearch(classifier, n_jobs=1) as bands:
         return len(bands.find_windows(frame, dataclasses.replace(params, min_score=-1e6)))
 
 
 def _cost_of_windows(frame: NDArray[np.uint8], classifier: VehicleClassifier) -> dict[int, float]:
-    """Milliseconds of searches with more and more scales, by their number of windows."""
+    """Milliseconds of searches with an increasing number of scales, by number of windows."""
     costs = {}
     for number in range(1, len(SCALES) + 1):
         bands = tuple(SearchBand(window=(64 * s, 64 * s), y=(0.0, 256.0)) for s in SCALES[:number])
@@ -103,8 +97,8 @@ def _cost_of_windows(frame: NDArray[np.uint8], classifier: VehicleClassifier) ->
     return costs
 
 
-class _Clock:
-    """Adds up the seconds of wrapped functions; a call inside another one counts for the outer."""
+class _Stopwatch:
+    """Sums the seconds of wrapped functions; nested calls count for the outer function."""
 
     def __init__(self) -> None:
         self.seconds: defaultdict[str, float] = defaultdict(float)
@@ -127,16 +121,18 @@ class _Clock:
         return timed
 
 
-class _Watched:
-    """A module some of whose functions are timed; with no names given, all of them."""
+class _TimedModule:
+    """A module with timed functions: those with a stage in `names`, or all of them."""
 
-    def __init__(self, module: Any, clock: _Clock, names: Mapping[str, str], *, everything: bool) -> None:
-        self._module, self._clock, self._names, self._everything = module, clock, names, everything
+    def __init__(
+        self, module: Any, stopwatch: _Stopwatch, names: Mapping[str, str], *, everything: bool
+    ) -> None:
+        self._module, self._stopwatch, self._names, self._everything = module, stopwatch, names, everything
 
     def __getattr__(self, name: str) -> Any:
         value = getattr(self._module, name)
         if name in self._names or (self._everything and callable(value)):
-            return self._clock.wrap(self._names.get(name, name), value)
+            return self._stopwatch.wrap(self._names.get(name, name), value)
         return value
 
 
@@ -152,20 +148,20 @@ _FUNCTIONS = {"resize_band": "resize", "convert_color": "color", "_hits": "hits"
 
 
 @contextlib.contextmanager
-def _watch(clock: _Clock) -> Iterator[None]:
-    """Time the steps of the search from outside, for the duration of a block."""
+def _timed_stages(stopwatch: _Stopwatch) -> Iterator[None]:
+    """Replace the stages of the search by timed ones for the duration of a block."""
     with contextlib.ExitStack() as stack:
 
         def put(name: str, value: Any) -> None:
             stack.enter_context(mock.patch.object(search, name, value))
 
-        put("_hog_kernels", _Watched(_hog_kernels, clock, _KERNELS, everything=True))
-        put("_color_kernels", _Watched(_color_kernels, clock, _KERNELS, everything=True))
+        put("_hog_kernels", _TimedModule(_hog_kernels, stopwatch, _KERNELS, everything=True))
+        put("_color_kernels", _TimedModule(_color_kernels, stopwatch, _KERNELS, everything=True))
         for name, functions in _MODULES.items():
-            put(name, _Watched(getattr(search, name), clock, functions, everything=False))
+            put(name, _TimedModule(getattr(search, name), stopwatch, functions, everything=False))
         for name, stage in _FUNCTIONS.items():
-            put(name, clock.wrap(stage, getattr(search, name)))
-        timed = clock.wrap("correlation", Filter.add_to)
+            put(name, stopwatch.wrap(stage, getattr(search, name)))
+        timed = stopwatch.wrap("correlation", Filter.add_to)
         stack.enter_context(mock.patch.object(Filter, "add_to", timed))
         yield
 
@@ -173,16 +169,16 @@ def _watch(clock: _Clock) -> Iterator[None]:
 def stage_seconds(
     frame: NDArray[np.uint8], classifier: VehicleClassifier, params: SearchParams, *, calls: int = CALLS
 ) -> dict[str, float]:
-    """Median seconds of each step of a search on one core; ``rest`` is what no step accounts for."""
+    """Median seconds of each stage of a search on one core, and of the ``rest``."""
     runs: list[dict[str, float]] = []
     with BandSearch(classifier, n_jobs=1) as bands:
         for _ in range(3):
             bands.find_windows(frame, params)
         for _ in range(calls):
-            clock = _Clock()
-            with _watch(clock):
+            stopwatch = _Stopwatch()
+            with _timed_stages(stopwatch):
                 whole = seconds_of(lambda: bands.find_windows(frame, params))
-            runs.append({**clock.seconds, "rest": whole - sum(clock.seconds.values())})
+            runs.append({**stopwatch.seconds, "rest": whole - sum(stopwatch.seconds.values())})
     return {name: median_of(one[name] for one in runs) for name in runs[0]}
 
 
@@ -193,7 +189,7 @@ def _plot(
     cores: Points,
     stages: Mapping[str, float],
 ) -> None:
-    """Draw the four curves as ``scaling.png``."""
+    """Plot cost by frame size, windows, cores and stage as ``scaling.png``."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 7.5), layout="constrained")
@@ -201,11 +197,11 @@ def _plot(
     pixels = [width * height / 1e6 for width, height in sizes]
     by_size.plot(pixels, [cost for cost, _ in sizes.values()], "o-")
     by_size.set_xticks(pixels, [f"{width}x{height}" for width, height in sizes], rotation=20)
-    by_size.set(title="default search, all cores; its windows grow with the frame", xlabel="frame")
+    by_size.set(title="default search, all cores; windows scale with the frame", xlabel="frame")
     by_windows.plot([count / 1000 for count in windows], list(windows.values()), "o-")
-    by_windows.set(title="1280x720 at more and more scales, one core", xlabel="thousand windows")
+    by_windows.set(title="1280x720 with an increasing number of scales, one core", xlabel="thousand windows")
     by_cores.plot(list(cores), list(cores.values()), "o-", label="measured")
-    by_cores.plot(list(cores), [cores[1] / n for n in cores], "--", color="gray", label="shared evenly")
+    by_cores.plot(list(cores), [cores[1] / n for n in cores], "--", color="gray", label="ideal")
     by_cores.set(title="three scales, 11,580 windows of 1280x720", xlabel="cores", xticks=list(cores))
     by_cores.legend()
     bars = by_stage.barh(list(stages), [seconds * 1e3 for seconds in stages.values()])
@@ -214,7 +210,7 @@ def _plot(
     by_stage.set(title="one frame by stage: three scales, one core", xlabel="ms")
     by_stage.margins(x=0.12)
     for axes in (by_size, by_windows, by_cores):
-        axes.set_ylabel("ms a frame")
+        axes.set_ylabel("ms/frame")
         axes.set_ylim(0, 1.08 * axes.get_ylim()[1])
         axes.grid(alpha=0.3)
     folder.mkdir(parents=True, exist_ok=True)

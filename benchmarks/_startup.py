@@ -1,4 +1,4 @@
-"""Time to import the package and to the first frame, each in a fresh interpreter."""
+"""Time to import the package and to detect on the first frame, each in a new interpreter."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WARM, COLD = 5, 3
 
 
 def run(context: Context) -> list[Row]:
-    """Measure with an empty kernel cache, then with the cache that those runs left."""
+    """Measure with an empty kernel cache and with a filled one."""
     image, material = searched_frame()
     frame = context.work / "frame.npy"
     np.save(frame, image)
@@ -30,25 +30,25 @@ def run(context: Context) -> list[Row]:
     kernels = _kernel_seconds(frame, context.work / "kernels for the profile")
     return [
         Row(
-            what="import vehicle_detection",
-            value=median_of(start["import"] for start in warm),
+            "import vehicle_detection",
+            median_of(start["import"] for start in warm),
             unit="s",
             target=at_most(0.5),
             material=f"medians of {WARM} warm and {COLD} cold starts, {material}",
         ),
         Row(
-            what="first frame after the import, kernels in the cache",
-            value=median_of(start["first_frame"] for start in warm),
+            "first frame after the import, kernels in the cache",
+            median_of(start["first_frame"] for start in warm),
             unit="s",
             target=at_most(2.0),
         ),
         Row(
-            what="first frame after the import, no kernel in the cache",
-            value=median_of(start["first_frame"] for start in cold),
+            "first frame after the import, no kernel in the cache",
+            median_of(start["first_frame"] for start in cold),
             unit="s",
             target=at_most(6.0),
         ),
-        *(Row(what=f"compile {name}", value=seconds, unit="s") for name, seconds in kernels.items()),
+        *(Row(f"compile {name}", seconds, unit="s") for name, seconds in kernels.items()),
     ]
 
 
@@ -57,6 +57,6 @@ def _start(frame: Path, cache: Path, *options: str) -> dict[str, Any]:
 
 
 def _kernel_seconds(frame: Path, cache: Path) -> dict[str, float]:
-    """Compilation time of each kernel of the first frame, the longest first."""
+    """Compilation time of each kernel of the first frame, longest first."""
     seconds: dict[str, float] = _start(frame, cache, "--kernels")["kernels"]
     return dict(sorted(seconds.items(), key=lambda pair: -pair[1]))

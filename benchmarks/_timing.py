@@ -1,4 +1,4 @@
-"""Time on the clock, and medians."""
+"""Wall-clock time and medians."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 
 
 def seconds_of(function: Callable[[], object]) -> float:
-    """Seconds that one call takes."""
+    """Seconds of one call."""
     began = time.perf_counter()
     function()
     return time.perf_counter() - began
@@ -20,6 +20,6 @@ def median_of(values: Iterable[float]) -> float:
 
 
 def median_seconds(function: Callable[[], object], repetitions: int) -> float:
-    """Median of the seconds of several calls, after one that does not count."""
+    """Median seconds of several calls after a warm-up call."""
     function()
     return median_of(seconds_of(function) for _ in range(repetitions))

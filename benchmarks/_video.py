@@ -1,4 +1,4 @@
-"""A whole video against the same rewrite by moviepy with a function that does nothing."""
+"""Whole-video processing compared with rewriting the video by moviepy with an identity function."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from pathlib import Path
 from benchmarks._material import Context, clip
 from benchmarks._report import Row, at_least, at_most
 from benchmarks._timing import median_of, seconds_of
-from vehicle_detection import VehicleDetector, VideoReport, load_model, process_video
+from vehicle_detection import VehicleDetector, VideoReport, process_video
 
 ROUNDS = 3
 
 
 def run(context: Context) -> list[Row]:
-    """Process the clip with either model and rewrite it by moviepy, in turn."""
+    """Alternately process the clip with each model and rewrite it by moviepy."""
     source, material = clip(context.work)
     target = context.work / "out.mp4"
     reports: dict[str, list[VideoReport]] = {"highway": [], "default": []}
     moviepy_seconds = []
     with contextlib.ExitStack() as stack:
-        detectors = {name: stack.enter_context(VehicleDetector(load_model(name))) for name in reports}
+        detectors = {name: stack.enter_context(VehicleDetector(name)) for name in reports}
         for detector in detectors.values():
             process_video(source, target, detector, end=0.4, progress=False)
         rewrite(source, target, end=0.4)
@@ -29,32 +29,30 @@ def run(context: Context) -> list[Row]:
             for name, detector in detectors.items():
                 report = process_video(source, target, detector, preset="veryfast", progress=False)
                 reports[name].append(report)
-    theirs = median_of(moviepy_seconds)
+    moviepy_median = median_of(moviepy_seconds)
     frames = reports["highway"][0].frames
     rows = [
         Row(
-            what="moviepy with an identity function",
-            value=theirs,
+            "moviepy with an identity function",
+            moviepy_median,
             unit="s",
             material=f"{material}, {frames} frames, veryfast",
         )
     ]
-    for name, least in (("highway", 30), ("default", 25)):
+    for name, min_speed in (("highway", 30), ("default", 25)):
         ours = median_of(report.seconds for report in reports[name])
         middle = sorted(reports[name], key=lambda report: report.seconds)[ROUNDS // 2]
         rows += [
-            Row(what=f"{name}: process_video", value=ours, unit="s"),
+            Row(f"{name}: process_video", ours, unit="s"),
             Row(
-                what=f"{name}: time of moviepy's rewrite",
-                value=ours / theirs,
+                f"{name}: time relative to moviepy's rewrite",
+                ours / moviepy_median,
                 unit="x",
                 target=at_most(1.3) if name == "highway" else None,
             ),
-            Row(what=f"{name}: speed", value=frames / ours, unit="frames/s", target=at_least(least)),
+            Row(f"{name}: speed", frames / ours, unit="frames/s", target=at_least(min_speed)),
             *(
-                Row(
-                    what=f"{name}: work of the stage {stage}", value=seconds / frames * 1e3, unit="ms a frame"
-                )
+                Row(f"{name}: stage {stage}", seconds / frames * 1e3, unit="ms/frame")
                 for stage, seconds in middle.stages.items()
             ),
         ]
@@ -62,7 +60,7 @@ def run(context: Context) -> list[Row]:
 
 
 def rewrite(source: Path, target: Path, *, end: float | None = None) -> None:
-    """Decode, hand every frame through and encode, as users of moviepy do."""
+    """Decode and encode every frame unchanged, as users of moviepy do."""
     from moviepy import VideoFileClip
 
     with VideoFileClip(str(source)) as movie:

@@ -1,6 +1,8 @@
 """Helpers shared by the tests."""
 
 import functools
+import signal
+import subprocess
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,11 +14,35 @@ from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
 from vehicle_detection.images import write_image
+from vehicle_detection.mixture import (
+    N_CHANNELS,
+    N_REGRESSION_FEATURES,
+    BoxRegressor,
+    MixtureTemplate,
+    TemplateMixture,
+)
 from vehicle_detection.params import MixtureParams, PyramidParams
 from vehicle_detection.synthetic import render_scene
 
 ROOT = Path(__file__).parents[1]
 """Root of the repository."""
+
+
+def start_interruptible(*command, **options):
+    """Start a program that SIGINT interrupts, even if pytest is a background job, which ignores SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return subprocess.Popen(
+            [str(word) for word in command],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            **options,
+        )
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def random_template(params, seed=0, *, bias=0.0):
@@ -37,17 +63,32 @@ def random_classifier(params, seed=0, *, templates=1, bias=0.0):
     )
 
 
+def mixture_template(columns=9, rows=8, seed=0, bias=0.0, padding=(1.0, 1.0), *, border=False):
+    """A template of a mixture with random weights."""
+    weights = np.random.default_rng(seed).normal(0, 0.05, (rows, columns, N_CHANNELS))
+    return MixtureTemplate(weights, bias, padding, border)
+
+
+def random_mixture(**options):
+    """A mixture that was never trained; some of all windows score above 0."""
+    shapes = ((9, 8), (12, 8), (8, 10))
+    templates = tuple(mixture_template(*shape, seed, -0.2) for seed, shape in enumerate(shapes))
+    rng = np.random.default_rng(3)
+    weights = rng.normal(0, 1e-3, (N_REGRESSION_FEATURES, 4))
+    return TemplateMixture(templates, BoxRegressor(weights, rng.normal(0, 0.01, 4)), **options)
+
+
 SMALL_MIXTURE = MixtureParams(
     shapes=((6, 5),),
-    facing=(False,),
+    mirrored=(False,),
     border_shapes=(),
     size_prior_weight=0.0,
     vote_weight=0.0,
     C=5e-3,
     border_C=5e-3,
-    vehicles=100.0,
-    rounds=(0.5, 1.0, 1.0),
-    per_frame=20,
+    positive_weight=100.0,
+    mining_schedule=(0.5, 1.0, 1.0),
+    max_per_frame=20,
     search=PyramidParams(min_width=28),
 )
 
@@ -58,7 +99,7 @@ def scene_of(seed):
 
 
 def drawn(seeds, name="road"):
-    """Drawn scenes with the boxes of their vehicles; narrow or half hidden ones are to be ignored."""
+    """Rendered scenes with the boxes of their vehicles; narrow or largely occluded ones are ignored."""
     scenes = [scene_of(seed) for seed in seeds]
     keys, boxes, ignore = [], [], []
     for key, scene in enumerate(scenes):

@@ -1,4 +1,4 @@
-"""The cheap part of the benchmarks, on small drawn material."""
+"""The fast parts of the benchmarks, on small rendered images."""
 
 import json
 
@@ -39,42 +39,42 @@ def classifier():
     return VehicleClassifier(params, (Template(mean, scale, rng.normal(0, 0.01, params.length), 0.0),))
 
 
-def course(frame, classifier):
+def course_search(frame, classifier):
     scaler, svc = (step for _, step in classifier.to_pipeline().steps[-2:])
     return search_course(frame, SEARCH.place(frame.shape), scaler, svc)
 
 
-def test_yardstick_and_search_agree(frame, classifier):
-    theirs = course(frame, classifier)
-    assert 0 < (theirs.scores > 0).sum() < len(theirs.scores)
+def test_course_and_search_agree(frame, classifier):
+    course = course_search(frame, classifier)
+    assert 0 < (course.scores > 0).sum() < len(course.scores)
     with BandSearch(classifier, n_jobs=1) as ours:
-        agreement = check_agreement(frame, ours, SEARCH, theirs)
-    assert agreement.windows == len(theirs.boxes) > 200
+        agreement = check_agreement(frame, ours, SEARCH, course)
+    assert agreement.windows == len(course.boxes) > 200
     assert agreement.difference < 1e-4
     assert agreement.shared > 0
     assert agreement.disputed == 0
 
 
-def test_agreement_notices_a_wrong_hit_and_a_wrong_box(frame, classifier):
-    theirs = course(frame, classifier)
-    best = int(theirs.scores.argmax())
+def test_the_comparison_detects_wrong_hits_and_boxes(frame, classifier):
+    course = course_search(frame, classifier)
+    best = int(course.scores.argmax())
     with BandSearch(classifier, n_jobs=1) as ours:
-        theirs.scores[best] -= 2 * theirs.scores[best]
-        assert check_agreement(frame, ours, SEARCH, theirs).disputed == 1
-        theirs.boxes[best] += 1
+        course.scores[best] -= 2 * course.scores[best]
+        assert check_agreement(frame, ours, SEARCH, course).disputed == 1
+        course.boxes[best] += 1
         with pytest.raises(AssertionError, match="windows are not the course's"):
-            check_agreement(frame, ours, SEARCH, theirs)
+            check_agreement(frame, ours, SEARCH, course)
 
 
 def test_search_rows(frame, classifier):
-    rows = {row.what: row for row in compare_searches(frame, classifier, SEARCH, "drawn", rounds=1, calls=2)}
+    rows = {row.what: row for row in compare_searches(frame, classifier, SEARCH, "scene", rounds=1, calls=2)}
     assert rows["windows searched"].value > 200
     assert rows["faster than course method, two cores"].value > 1
     assert rows["faster than HOG alone, two cores"].target == at_least(90)
-    assert rows["largest difference of a score"].verdict == "met"
+    assert rows["maximum difference of a score"].verdict == "met"
 
 
-def test_stages_are_measured_and_the_search_is_put_back(frame, classifier):
+def test_stages_are_measured_and_the_search_is_restored(frame, classifier):
     from vehicle_detection import search
 
     before = dict(vars(search))
@@ -104,16 +104,16 @@ def test_stages_are_measured_and_the_search_is_put_back(frame, classifier):
     ],
 )
 def test_verdicts(target, met, missed):
-    assert Row(what="a", value=met, target=target).verdict == "met"
-    assert Row(what="a", value=missed, target=target).verdict == "missed"
-    assert Row(what="a", value=missed).verdict == ""
+    assert Row("a", met, target=target).verdict == "met"
+    assert Row("a", missed, target=target).verdict == "missed"
+    assert Row("a", missed).verdict == ""
 
 
 def test_report_writes_json_and_keeps_other_benchmarks(tmp_path):
     file = tmp_path / "results.json"
-    row = Row(what="time", value=1.25, unit="s", target=at_most(1), material="drawn", details={"n": 3})
+    row = Row("time", 1.25, unit="s", target=at_most(1), material="drawn", details={"n": 3})
     _report.write_json({"first": [row]}, file)
-    _report.write_json({"second": [Row(what="count", value=4)]}, file)
+    _report.write_json({"second": [Row("count", 4)]}, file)
     found = json.loads(file.read_text(encoding="utf-8"))
     assert found["benchmarks"]["first"] == [
         {
@@ -133,23 +133,23 @@ def test_report_writes_json_and_keeps_other_benchmarks(tmp_path):
     assert set(found["machine"]) == {"cores", "processor", "system", "python", "jobs_variable", "libraries"}
 
 
-def test_report_starts_anew_on_another_machine_or_a_damaged_file(tmp_path, monkeypatch):
+def test_results_of_another_machine_or_a_damaged_file_are_replaced(tmp_path, monkeypatch):
     file = tmp_path / "results.json"
-    _report.write_json({"first": [Row(what="count", value=4)]}, file)
+    _report.write_json({"first": [Row("count", 4)]}, file)
     monkeypatch.setattr(_report, "machine_facts", lambda: {"cores": 128})
-    _report.write_json({"second": [Row(what="count", value=4)]}, file)
+    _report.write_json({"second": [Row("count", 4)]}, file)
     assert list(json.loads(file.read_text(encoding="utf-8"))["benchmarks"]) == ["second"]
     file.write_text("{", encoding="utf-8")
-    _report.write_json({"third": [Row(what="count", value=4)]}, file)
+    _report.write_json({"third": [Row("count", 4)]}, file)
     assert list(json.loads(file.read_text(encoding="utf-8"))["benchmarks"]) == ["third"]
 
 
 def test_table_shows_measured_target_and_verdict():
     console = Console(width=120)
     rows = [
-        Row(what="memory", value=12.34, unit="MB", target=at_most(20), material="drawn"),
-        Row(what="windows", value=11580),
-        Row(what="F1", value=0.98765, target=at_least(1)),
+        Row("memory", 12.34, unit="MB", target=at_most(20), material="drawn"),
+        Row("windows", 11580),
+        Row("F1", 0.98765, target=at_least(1)),
     ]
     with console.capture() as capture:
         _report.print_table({"things": rows}, console)

@@ -8,9 +8,12 @@ from vehicle_detection.boxes import (
     Detections,
     box_areas,
     clip_boxes,
+    greedy_nms,
     intersection_matrix,
     iou_matrix,
+    iter_nms,
     non_max_suppression,
+    overlap_matrices,
 )
 from vehicle_detection.errors import InvalidInputError
 
@@ -19,8 +22,8 @@ def corners_to_boxes(array):
     return np.concatenate([np.minimum(array[:, :2], array[:, 2:]), np.maximum(array[:, :2], array[:, 2:])], 1)
 
 
-def boxes_of(elements, dtype, most=8):
-    shapes = st.tuples(st.integers(0, most), st.just(4))
+def boxes_of(elements, dtype, max_count=8):
+    shapes = st.tuples(st.integers(0, max_count), st.just(4))
     return shapes.flatmap(lambda shape: hnp.arrays(dtype, shape, elements=elements)).map(corners_to_boxes)
 
 
@@ -32,7 +35,7 @@ any_boxes = st.one_of(integer_boxes, float_boxes)
 @st.composite
 def detections(draw):
     boxes = draw(any_boxes)
-    # Few different scores make ties likely.
+    # Few distinct scores make ties likely.
     scores = draw(hnp.arrays(np.float64, len(boxes), elements=st.integers(-3, 3).map(float)))
     return Detections(boxes, scores)
 
@@ -54,7 +57,7 @@ def test_areas_and_overlaps_count_pixels(first, second):
 
 
 @given(any_boxes, any_boxes)
-def test_iou_is_symmetric_and_a_share(first, second):
+def test_iou_is_symmetric_and_between_0_and_1(first, second):
     overlap = iou_matrix(first, second)
     assert overlap.shape == (len(first), len(second))
     assert overlap.dtype == np.float64
@@ -63,23 +66,23 @@ def test_iou_is_symmetric_and_a_share(first, second):
 
 
 @given(any_boxes)
-def test_a_box_covers_itself_unless_it_has_no_area(boxes):
+def test_iou_of_a_box_with_itself_is_1_unless_it_has_no_area(boxes):
     own = np.diag(iou_matrix(boxes, boxes))
     np.testing.assert_array_equal(own, (box_areas(boxes) > 0).astype(float))
 
 
-def test_iou_of_small_integer_types_does_not_wrap():
+def test_iou_of_small_integer_types_does_not_overflow():
     boxes = np.array([[0, 0, 200, 200], [100, 100, 250, 250]], np.uint8)
     np.testing.assert_array_equal(iou_matrix(boxes, boxes), iou_matrix(boxes.astype(int), boxes.astype(int)))
 
 
-def test_iou_names_the_argument():
+def test_iou_error_names_the_argument():
     with pytest.raises(InvalidInputError, match="second must be an"):
         iou_matrix([[0, 0, 1, 1]], [0, 0, 1, 1])
 
 
 @given(any_boxes, st.tuples(st.integers(1, 40), st.integers(1, 40)))
-def test_clipped_boxes_lie_in_the_image(boxes, shape):
+def test_clipped_boxes_lie_inside_the_image(boxes, shape):
     before = boxes.copy()
     clipped = clip_boxes(boxes, shape)
     height, width = shape
@@ -94,41 +97,69 @@ def test_clipped_boxes_lie_in_the_image(boxes, shape):
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.uint32, np.float32])
-def test_clipping_keeps_the_type(dtype):
+def test_clipping_keeps_the_dtype(dtype):
     clipped = clip_boxes(np.array([[0, 0, 200, 100]], dtype), (720, 1280))
     assert clipped.dtype == dtype
     assert clipped.tolist() == [[0, 0, 200, 100]]
 
 
 @pytest.mark.parametrize("shape", [(10,), (0, 10), (10, 0), ()])
-def test_clipping_wants_the_shape_of_an_image(shape):
+def test_clipping_rejects_invalid_shapes(shape):
     with pytest.raises(InvalidInputError, match=r"shape must be \(height, width, ...\) of an image, got"):
         clip_boxes([[0, 0, 1, 1]], shape)
 
 
-def suppressed_one_by_one(boxes, scores, threshold):
+def nms_by_definition(boxes, scores, max_iou, max_coverage=np.inf):
     kept = []
     for row in sorted(range(len(boxes)), key=lambda row: -scores[row]):
-        if all(iou_matrix(boxes[[row]], boxes[[other]])[0, 0] <= threshold for other in kept):
+        overlaps = [overlap_matrices(boxes[[row]], boxes[[other]]) for other in kept]
+        if all(iou <= max_iou and coverage <= max_coverage for iou, coverage in overlaps):
             kept.append(row)
     return kept
 
 
 @given(detections(), st.floats(0, 1))
-def test_suppression_equals_its_definition(found, threshold):
+def test_nms_equals_its_definition(found, threshold):
     kept = non_max_suppression(found.boxes, found.scores, threshold=threshold)
-    assert kept.tolist() == suppressed_one_by_one(found.boxes, found.scores, threshold)
+    assert kept.tolist() == nms_by_definition(found.boxes, found.scores, threshold)
+
+
+@given(detections(), st.floats(0, 1), st.floats(0, 1))
+def test_nms_by_iou_and_coverage_equals_its_definition(found, max_iou, max_coverage):
+    kept = greedy_nms(found.boxes, found.scores, max_iou=max_iou, max_coverage=max_coverage)
+    assert kept.tolist() == nms_by_definition(found.boxes, found.scores, max_iou, max_coverage)
+
+
+@given(float_boxes, st.floats(0, 1), st.randoms(use_true_random=False))
+def test_iterative_nms_considers_the_listed_rows_and_yields_the_iou_with_all_boxes(boxes, max_iou, random):
+    order = [row for row in range(len(boxes)) if random.random() < 0.7]
+    random.shuffle(order)
+    kept = list(iter_nms(boxes, np.array(order, np.intp), max_iou=max_iou))
+    scores = -np.arange(len(order))
+    expected = [order[index] for index in nms_by_definition(boxes[order], scores, max_iou)]
+    assert [row for row, _ in kept] == expected
+    for row, iou in kept:
+        np.testing.assert_array_equal(iou, iou_matrix(boxes[[row]], boxes)[0])
+
+
+@given(float_boxes, float_boxes)
+def test_coverage_is_the_covered_fraction_of_the_smaller_box(first, second):
+    iou, coverage = overlap_matrices(first, second)
+    np.testing.assert_array_equal(iou, iou_matrix(first, second))
+    smaller = np.minimum(box_areas(first)[:, None], box_areas(second)[None])
+    np.testing.assert_allclose(coverage * smaller, intersection_matrix(first, second), rtol=1e-12)
+    assert ((coverage >= iou - 1e-12) & (coverage <= 1)).all()
 
 
 @given(detections(), st.floats(0, 1))
-def test_suppression_is_idempotent(found, threshold):
+def test_nms_is_idempotent(found, threshold):
     once = found[non_max_suppression(found.boxes, found.scores, threshold=threshold)]
     twice = non_max_suppression(once.boxes, once.scores, threshold=threshold)
     assert twice.tolist() == list(range(len(once)))
 
 
 @given(detections(), st.floats(0, 1))
-def test_what_is_kept_does_not_overlap_and_what_is_not_does(found, threshold):
+def test_kept_boxes_do_not_overlap_and_dropped_boxes_overlap_a_better_one(found, threshold):
     kept = non_max_suppression(found.boxes, found.scores, threshold=threshold)
     overlap = iou_matrix(found.boxes, found.boxes)
     among = overlap[np.ix_(kept, kept)]
@@ -140,7 +171,7 @@ def test_what_is_kept_does_not_overlap_and_what_is_not_does(found, threshold):
         assert (overlap[row, better] > threshold).any()
 
 
-def test_suppression_of_nothing():
+def test_nms_of_no_boxes():
     assert non_max_suppression([], []).shape == (0,)
 
 
@@ -154,13 +185,13 @@ def test_suppression_of_nothing():
         (([[0, 0, 1, 1]], ["a"]), "scores must be one number"),
     ],
 )
-def test_suppression_refuses(arguments, message):
+def test_nms_rejects_invalid_boxes_and_scores(arguments, message):
     with pytest.raises(InvalidInputError, match=message):
         non_max_suppression(*arguments)
 
 
 @pytest.mark.parametrize("threshold", [-0.1, 1.1, np.nan, None])
-def test_suppression_refuses_a_threshold(threshold):
+def test_nms_rejects_invalid_thresholds(threshold):
     with pytest.raises(InvalidInputError, match="threshold must be a number, at least 0 and at most 1"):
         non_max_suppression([[0, 0, 1, 1]], [1], threshold=threshold)
 
@@ -174,11 +205,24 @@ def test_detections_are_columns():
     assert found[found.scores < 2].boxes.tolist() == [[0, 0, 10, 10]]
     assert found[[1, 0]].scores.tolist() == [2, 1]
     assert len(found[[]]) == 0
-    with pytest.raises(InvalidInputError, match="wrap a single box"):
-        found[0]
 
 
-def test_no_detections():
+def test_an_index_takes_one_detection():
+    found = Detections([[0, 0, 10, 10], [5, 5, 9, 9]], [1, 2])
+    for index in (1, -1, np.int64(1)):
+        assert (found[index].boxes.tolist(), found[index].scores.tolist()) == ([[5, 5, 9, 9]], [2.0])
+    with pytest.raises(IndexError):
+        found[2]
+
+
+def test_representation_of_detections():
+    found = Detections([[0, 0, 10, 10], [5, 5, 9, 9]], [1, -0.25])
+    assert repr(found) == "Detections(2 boxes, scores -0.25 to 1.00)"
+    assert repr(found[0]) == "Detections(1 box, scores 1.00 to 1.00)"
+    assert repr(Detections.empty()) == "Detections(0 boxes)"
+
+
+def test_empty_detections():
     for found in (Detections.empty(), Detections([], []), Detections(np.empty((0, 4)), np.empty((0, 1)))):
         assert len(found) == 0
         assert found.boxes.shape == (0, 4)
@@ -196,6 +240,6 @@ def test_no_detections():
         ([[1, 0, 0, 1]], [1], "boxes must be .* x1 <= x2"),
     ],
 )
-def test_detections_refuse(boxes, scores, message):
+def test_detections_reject_invalid_columns(boxes, scores, message):
     with pytest.raises(InvalidInputError, match=message):
         Detections(boxes, scores)

@@ -42,19 +42,19 @@ def added_one_by_one(heat, boxes, weights):
 
 
 @given(heats, windows(st.one_of(st.integers(-6, 24), st.floats(-30, 60, width=32))))
-def test_heat_is_added_where_windows_are(heat, found):
+def test_heat_is_added_inside_windows(heat, found):
     before, boxes = heat.copy(), found.boxes.copy()
     counted = add_heat(heat, found.boxes)
-    weighed = add_heat(heat, found.boxes, scores=found.scores)
+    weighted = add_heat(heat, found.boxes, scores=found.scores)
     np.testing.assert_array_equal(counted, added_one_by_one(heat, found.boxes, np.ones(len(found))))
-    np.testing.assert_allclose(weighed, added_one_by_one(heat, found.boxes, found.scores), atol=1e-4)
-    assert counted.dtype == weighed.dtype == np.float32
+    np.testing.assert_allclose(weighted, added_one_by_one(heat, found.boxes, found.scores), atol=1e-4)
+    assert counted.dtype == weighted.dtype == np.float32
     assert not np.shares_memory(counted, heat)
     np.testing.assert_array_equal(heat, before)
     np.testing.assert_array_equal(found.boxes, boxes)
 
 
-def test_no_dust_is_left_where_no_window_is():
+def test_rounding_errors_outside_windows_are_removed():
     boxes = [[0, 0, 5, 5], [3, 3, 9, 9], [1, 1, 4, 8]]
     heat = add_heat(np.zeros(SHAPE), boxes, scores=[0.1, 0.2, 0.7])
     covered = added_one_by_one(np.zeros(SHAPE), np.array(boxes), np.ones(3)) > 0
@@ -62,14 +62,14 @@ def test_no_dust_is_left_where_no_window_is():
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int64, np.float32, np.float64])
-def test_a_map_of_any_number_type(dtype):
+def test_maps_of_all_number_types_are_accepted(dtype):
     heat = add_heat(np.ones(SHAPE, dtype), [[0, 0, 1, 1]])
     assert heat.dtype == np.float32
     assert heat[0, 0] == 2
     assert heat.sum() == np.prod(SHAPE) + 1
 
 
-def test_windows_far_outside():
+def test_windows_far_outside_the_map():
     far = [[1e19, 1e19, 2e19, 2e19], [-50, -50, -40, -40], [-1e19, -1e19, 1e19, 1e19]]
     np.testing.assert_array_equal(add_heat(np.zeros(SHAPE), far), np.ones(SHAPE))
     np.testing.assert_array_equal(add_heat(np.zeros(SHAPE), []), np.zeros(SHAPE))
@@ -85,19 +85,19 @@ def test_windows_far_outside():
         ((np.zeros((3, 3)), [[2, 0, 1, 1]]), "boxes must be .* x1 <= x2"),
     ],
 )
-def test_add_heat_refuses(arguments, message):
+def test_add_heat_rejects_invalid_maps_and_boxes(arguments, message):
     with pytest.raises(InvalidInputError, match=message):
         add_heat(*arguments)
 
 
 @pytest.mark.parametrize("scores", [[1.0], [1.0, np.nan], [[1.0, 2.0]], "ab"])
-def test_add_heat_refuses_scores_that_do_not_fit(scores):
+def test_add_heat_rejects_invalid_scores(scores):
     with pytest.raises(InvalidInputError, match="scores must be"):
         add_heat(np.zeros((3, 3)), [[0, 0, 1, 1]] * 2, scores=scores)
 
 
 @given(heats, st.floats(0, 6))
-def test_threshold_is_exclusive_and_leaves_the_argument(heat, threshold):
+def test_threshold_is_exclusive_and_does_not_modify_its_argument(heat, threshold):
     before = heat.copy()
     hot = apply_threshold(heat, threshold)
     np.testing.assert_array_equal(hot, np.where(heat > np.float32(threshold), heat, 0))
@@ -106,7 +106,7 @@ def test_threshold_is_exclusive_and_leaves_the_argument(heat, threshold):
     np.testing.assert_array_equal(apply_threshold(hot, threshold), hot)
 
 
-def test_threshold_refuses():
+def test_threshold_rejects_invalid_arguments():
     with pytest.raises(InvalidInputError, match="threshold must be a number"):
         apply_threshold(np.zeros((3, 3)), np.nan)
     with pytest.raises(InvalidInputError, match="heatmap must be an"):
@@ -114,7 +114,7 @@ def test_threshold_refuses():
 
 
 @given(heats, st.integers(0, 4))
-def test_regions_are_those_of_scipy(heat, threshold):
+def test_regions_equal_those_of_scipy(heat, threshold):
     before = heat.copy()
     found = label_boxes(heat, threshold=threshold)
     labels, count = ndimage.label(heat > threshold, EIGHT)
@@ -140,7 +140,7 @@ def part_around_the_peak(heat, labels, index, peak_fraction):
 
 
 @given(heats, st.integers(0, 2), st.floats(0.05, 0.99))
-def test_a_share_of_the_peak_shrinks_the_box_around_it(heat, threshold, peak_fraction):
+def test_peak_fraction_shrinks_the_box_around_the_peak(heat, threshold, peak_fraction):
     whole = label_boxes(heat, threshold=threshold)
     core = label_boxes(heat, threshold=threshold, peak_fraction=peak_fraction)
     np.testing.assert_array_equal(core.scores, whole.scores)
@@ -154,13 +154,13 @@ def test_a_share_of_the_peak_shrinks_the_box_around_it(heat, threshold, peak_fra
     assert (smaller.boxes[:, 2:] <= core.boxes[:, 2:]).all()
 
 
-def test_regions_that_touch_at_a_corner_are_one():
+def test_regions_that_touch_at_a_corner_are_joined():
     heat = np.zeros((4, 4))
     heat[1, 1] = heat[2, 2] = 1
     assert label_boxes(heat).boxes.tolist() == [[1, 1, 3, 3]]
 
 
-def test_no_heat_has_no_regions():
+def test_a_map_without_heat_has_no_regions():
     found = label_boxes(np.zeros(SHAPE), peak_fraction=0.5)
     assert found.boxes.shape == (0, 4)
     assert len(label_boxes(np.ones(SHAPE), threshold=1.0)) == 0
@@ -175,7 +175,7 @@ def test_no_heat_has_no_regions():
         ({"peak_fraction": -0.1}, "peak_fraction must be a number"),
     ],
 )
-def test_label_boxes_refuses(options, message):
+def test_label_boxes_rejects_invalid_arguments(options, message):
     with pytest.raises(InvalidInputError, match=message):
         label_boxes(np.ones((3, 3)), **options)
     with pytest.raises(InvalidInputError, match="heatmap must be an"):
@@ -183,7 +183,7 @@ def test_label_boxes_refuses(options, message):
 
 
 @given(windows(st.integers(-6, 24)))
-def test_bounding_boxes_is_the_three_in_one(found):
+def test_bounding_boxes_combines_the_three_steps(found):
     counted = HeatParams(weighting="count", threshold=1, peak_fraction=0)
     expected = label_boxes(apply_threshold(add_heat(np.zeros(SHAPE), found.boxes), 1))
     result = bounding_boxes((*SHAPE, 3), found, params=counted)
@@ -191,7 +191,7 @@ def test_bounding_boxes_is_the_three_in_one(found):
     np.testing.assert_array_equal(result.scores, expected.scores)
 
 
-def test_windows_weigh_what_they_score():
+def test_windows_are_weighted_by_their_scores():
     found = Detections([[0, 0, 5, 5], [10, 0, 15, 5], [5, 8, 9, 12]], [3.0, 1.0, -2.0])
     heat = frame_heat((*SHAPE, 3), found, HeatParams())
     assert (heat[0, 0], heat[0, 10], heat[9, 6]) == (3, 1, 0)
@@ -210,14 +210,14 @@ def test_history_is_the_mean_of_the_last_frames(maps, frames):
     for index, heat in enumerate(maps):
         given_map = heat.copy()
         mean = history.add(given_map)
-        given_map[:] = 99  # what is remembered is a copy
+        given_map[:] = 99  # the history holds a copy
         last = maps[max(0, index + 1 - frames) : index + 1]
         np.testing.assert_allclose(mean, np.mean(last, axis=0), rtol=1e-6)
         assert mean.dtype == np.float32
         mean[:] = 99
 
 
-def test_history_starts_anew_with_another_size_and_when_cleared():
+def test_history_restarts_with_another_size_and_when_cleared():
     history = HeatHistory(3)
     history.add(np.full((2, 2), 8.0))
     assert history.add(np.full((3, 2), 1.0)).tolist() == np.ones((3, 2)).tolist()
@@ -225,7 +225,7 @@ def test_history_starts_anew_with_another_size_and_when_cleared():
     assert history.add(np.full((3, 2), 5.0)).max() == 5
 
 
-def test_history_refuses():
+def test_history_rejects_invalid_arguments():
     for frames in (0, 1.5, None):
         with pytest.raises(InvalidInputError, match="frames must be an integer at least 1"):
             HeatHistory(frames)

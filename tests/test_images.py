@@ -34,7 +34,7 @@ def bgr(image):
 
 
 @pytest.mark.parametrize("suffix", LOSSLESS)
-def test_lossless_formats_come_back_as_they_went(tmp_path, picture, suffix):
+def test_lossless_formats_keep_every_value(tmp_path, picture, suffix):
     write_image(tmp_path / f"a{suffix}", picture)
     image = read_image(tmp_path / f"a{suffix}")
     np.testing.assert_array_equal(image, picture)
@@ -44,7 +44,7 @@ def test_lossless_formats_come_back_as_they_went(tmp_path, picture, suffix):
 
 
 @pytest.mark.parametrize("suffix", LOSSY)
-def test_lossy_formats_come_back_nearly(tmp_path, picture, suffix):
+def test_lossy_formats_keep_the_image_approximately(tmp_path, picture, suffix):
     write_image(str(tmp_path / f"a{suffix.upper()}"), picture)
     image = read_image(str(tmp_path / f"a{suffix.upper()}"))
     assert image.shape == picture.shape
@@ -89,7 +89,7 @@ def test_sixteen_bits_are_scaled_to_eight(suffix, channels):
     assert (image.min(), image.max()) == (0, 255)
 
 
-def test_a_palette_is_looked_up(picture):
+def test_a_palette_becomes_rgb(picture):
     buffer = io.BytesIO()
     indexed = Image.fromarray(picture).quantize(16)
     indexed.save(buffer, "PNG")
@@ -103,40 +103,42 @@ def test_exif_rotation_is_applied(picture, orientation, turns):
     exif[0x0112] = orientation
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, "JPEG", quality=95, exif=exif)
-    image = decode_image(buffer.getvalue(), "turned")
+    image = decode_image(buffer.getvalue(), "rotated")
     upright = np.rot90(picture, turns)
     assert image.shape == upright.shape
     assert np.abs(image.astype(int) - upright).mean() < 3
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".webp"])
-@pytest.mark.parametrize("share", [0.02, 0.3, 0.7, 0.99])
-def test_a_cut_file_is_refused(tmp_path, picture, suffix, share):
+@pytest.mark.parametrize("fraction", [0.02, 0.3, 0.7, 0.99])
+def test_a_truncated_file_is_refused(tmp_path, picture, suffix, fraction):
     data = encoded(suffix, bgr(picture))
     file = tmp_path / f"cut{suffix}"
-    file.write_bytes(data[: int(len(data) * share)])
-    with pytest.raises(InvalidInputError, match=r"image file .*cut.* must be a whole image file .*decoded"):
+    file.write_bytes(data[: int(len(data) * fraction)])
+    with pytest.raises(
+        InvalidInputError, match=r"image file .*cut.* must be a complete image file .*decoded"
+    ):
         read_image(file)
 
 
 def test_a_jpeg_without_its_last_byte_is_refused(picture):
-    with pytest.raises(InvalidInputError, match="whole image file"):
+    with pytest.raises(InvalidInputError, match="complete image file"):
         decode_image(encoded(".jpg", bgr(picture))[:-1], "cut.jpg")
 
 
-def test_a_cut_jpeg_with_a_whole_thumbnail_is_refused(picture):
+def test_a_truncated_jpeg_with_a_complete_thumbnail_is_refused(picture):
     thumbnail = encoded(".jpg", bgr(picture[::4, ::4]))
     whole = encoded(".jpg", bgr(picture))
     # The thumbnail, with its own end marker, lies in a segment of the header.
     segment = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
     with_thumbnail = whole[:2] + segment + whole[2:]
     assert decode_image(with_thumbnail, "a.jpg").shape == picture.shape
-    with pytest.raises(InvalidInputError, match="whole image file"):
+    with pytest.raises(InvalidInputError, match="complete image file"):
         decode_image(with_thumbnail[: -len(whole) // 3], "a.jpg")
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_bytes_after_the_image_do_no_harm(picture, suffix):
+def test_bytes_after_the_image_are_ignored(picture, suffix):
     # Phones append previews and maker's notes.
     data = encoded(suffix, bgr(picture))
     np.testing.assert_array_equal(decode_image(data + bytes(10_000), "a"), decode_image(data, "a"))
@@ -149,7 +151,7 @@ def test_a_damaged_png_is_refused(picture):
         decode_image(bytes(data), "damaged.png")
 
 
-def test_an_image_of_absurd_size_is_refused(picture):
+def test_an_image_of_excessive_size_is_refused(picture):
     # A header that asks for gigapixels: OpenCV raises instead of returning nothing.
     data = bytearray(encoded(".png", bgr(picture)))
     data[16:24] = (2**30).to_bytes(4, "big") * 2
@@ -159,17 +161,17 @@ def test_an_image_of_absurd_size_is_refused(picture):
 
 
 @pytest.mark.parametrize("content", [b"", b"not an image", b"\x89PNG\r\n\x1a\n", b"\xff\xd8", bytes(1000)])
-def test_what_is_no_image_is_refused(tmp_path, content):
+def test_a_file_without_an_image_is_refused(tmp_path, content):
     file = tmp_path / "a.png"
     file.write_bytes(content)
-    with pytest.raises(InvalidInputError, match=r"a.png must be a whole image file"):
+    with pytest.raises(InvalidInputError, match=r"a.png must be a complete image file"):
         read_image(file)
 
 
 def test_missing_file_and_folder(tmp_path):
     with pytest.raises(InvalidInputError, match=r"image file .*nothing.png does not exist; check the path"):
         read_image(tmp_path / "nothing.png")
-    with pytest.raises(InvalidInputError, match=r"image file .* is a folder; name a file in it"):
+    with pytest.raises(InvalidInputError, match=r"image file .* is a folder; choose a file in it"):
         read_image(tmp_path)
 
 

@@ -12,24 +12,25 @@ from vehicle_detection.regions import WindowGroups, find_vehicles, fit_boxes, gr
 
 SHAPE = (720, 1280)
 CAMERA = Camera.for_frame(SHAPE)
-# Behaviour is tested here; the numbers may be tuned.
+DEFAULT = RegionParams()
+# Fixed parameters for tests of behavior, because the defaults may be tuned.
 PLAIN = RegionParams(
     min_peak=0.5,
     min_evidence=0.5,
-    overlap=0.4,
-    reach=0.6,
+    min_iou=0.4,
+    suppression_radius=0.6,
     face_width=0.8,
     face_height=0.75,
     face_offset_y=0.05,
     flank_length_m=4.0,
     flank_shift=0.25,
-    covered=0.5,
-    flank_peak=0.5,
+    max_coverage=0.5,
+    flank_peak_ratio=0.5,
 )
 
 
 def around(center, side, *, step=8, spread=2, peak=2.0):
-    """Windows as the search leaves them around a vehicle: the nearer to it, the better."""
+    """Windows around a vehicle, as a search finds them: the score decreases with the distance."""
     offsets = np.arange(-spread, spread + 1) * step
     shifts = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
     corners = np.array(center) + shifts - side / 2
@@ -38,7 +39,7 @@ def around(center, side, *, step=8, spread=2, peak=2.0):
     return Detections(boxes, scores)
 
 
-def together(*parts):
+def concatenated(*parts):
     return Detections(np.concatenate([p.boxes for p in parts]), np.concatenate([p.scores for p in parts]))
 
 
@@ -69,8 +70,8 @@ def test_windows_around_a_vehicle_are_one_group_at_its_place():
     assert groups.peaks.tolist() == [2.0]
 
 
-def test_the_mean_is_finer_than_the_step():
-    # The vehicle stands between two positions of the search.
+def test_the_mean_is_more_precise_than_the_step():
+    # The vehicle lies between two positions of the search.
     windows = around((640.0, 420.0), 96)
     middle = np.array([642.5, 420.0])
     centers = (windows.boxes[:, :2] + windows.boxes[:, 2:]) / 2
@@ -80,66 +81,66 @@ def test_the_mean_is_finer_than_the_step():
     assert (box[1] + box[3]) / 2 == pytest.approx(420)
 
 
-def test_windows_of_other_sizes_join_at_the_mean_of_the_logarithms():
+def test_the_size_of_a_group_is_the_mean_of_logarithmic_sizes():
     small, large = window(640, 80), window(640, 100)
-    groups = group_windows(Detections([small, large], [1.0, 1.0]), dataclasses.replace(PLAIN, power=0))
+    groups = group_windows(Detections([small, large], [1.0, 1.0]), dataclasses.replace(PLAIN, score_power=0))
     side = groups.boxes[0, 2] - groups.boxes[0, 0]
     assert 80 < side < 100
-    # A group holds no size that none of its windows has.
+    # Windows of one size give that size.
     same = group_windows(Detections([small, small], [1.0, 0.5]), PLAIN)
     np.testing.assert_allclose(same.boxes[0], small)
 
 
 def test_windows_that_overlap_too_little_do_not_join():
-    # Half a window aside: an overlap of a third. It is within reach, and so founds no group either.
+    # Shifted by half a window, the IoU is a third. They are within the radius, so they start no group either.
     found = Detections([window(640), window(690), window(690)], [2.0, 1.9, 1.9])
     groups = group_windows(found, PLAIN)
     np.testing.assert_allclose(groups.boxes, [window(640)])
     assert groups.evidence.tolist() == [2.0]
-    near = dataclasses.replace(PLAIN, reach=0.3)
-    assert len(group_windows(found, near)) == 2
+    narrow = dataclasses.replace(PLAIN, suppression_radius=0.3)
+    assert len(group_windows(found, narrow)) == 2
 
 
-def test_two_vehicles_are_two_groups_the_better_one_first():
-    found = together(around((400.0, 430.0), 90, peak=1.5), around((700.0, 430.0), 120, peak=2.5))
+def test_two_vehicles_are_two_groups_best_first():
+    found = concatenated(around((400.0, 430.0), 90, peak=1.5), around((700.0, 430.0), 120, peak=2.5))
     groups = group_windows(found, PLAIN)
     assert len(groups) == 2
     assert (groups.boxes[:, 0] < 500).tolist() == [False, True]
     assert groups.peaks.tolist() == [2.5, 1.5]
 
 
-def test_weak_and_lonely_windows_found_no_group():
+def test_low_scores_and_single_windows_form_no_group():
     strict = dataclasses.replace(PLAIN, min_peak=1.0, min_evidence=2.0)
     assert len(group_windows(Detections([window(300), window(302)], [0.9, 0.9]), strict)) == 0
     assert len(group_windows(Detections([window(300)], [1.5]), strict)) == 0
     assert len(group_windows(Detections([window(300), window(302)], [1.5, 0.9]), strict)) == 1
 
 
-def test_windows_at_or_below_zero_count_for_nothing():
+def test_windows_at_or_below_zero_are_ignored():
     good = around((640.0, 420.0), 96)
     bad = Detections(good.boxes + 20, -np.abs(good.scores))
-    with_bad = group_windows(together(bad, good), PLAIN)
+    with_bad = group_windows(concatenated(bad, good), PLAIN)
     alone = group_windows(good, PLAIN)
     np.testing.assert_array_equal(with_bad.boxes, alone.boxes)
     np.testing.assert_array_equal(with_bad.evidence, alone.evidence)
 
 
-def test_windows_without_area_count_for_nothing():
+def test_windows_without_area_are_ignored():
     flat = Detections([[10, 10, 10, 50], [10, 10, 50, 10], [5, 5, 5, 5]], [3.0, 3.0, 3.0])
     assert len(group_windows(flat, PLAIN)) == 0
-    assert len(group_windows(together(flat, around((640.0, 420.0), 96)), PLAIN)) == 1
+    assert len(group_windows(concatenated(flat, around((640.0, 420.0), 96)), PLAIN)) == 1
 
 
-def test_nothing_groups_to_nothing():
-    groups = group_windows(Detections.empty())
+def test_no_windows_give_no_groups():
+    groups = group_windows(Detections.empty(), DEFAULT)
     assert groups.boxes.shape == (0, 4)
     assert len(groups) == len(groups.peaks) == len(groups.evidence) == 0
-    assert len(fit_boxes(groups, CAMERA, SHAPE)) == 0
+    assert len(fit_boxes(groups, CAMERA, SHAPE, DEFAULT)) == 0
     assert len(find_vehicles(Detections.empty(), CAMERA, SHAPE)) == 0
 
 
 @given(any_windows())
-def test_groups_keep_what_the_parameters_promise(found):
+def test_groups_satisfy_the_thresholds(found):
     before = found.boxes.copy(), found.scores.copy()
     groups = group_windows(found, PLAIN)
     assert (groups.peaks >= PLAIN.min_peak).all()
@@ -155,10 +156,10 @@ def test_groups_keep_what_the_parameters_promise(found):
 
 
 @given(any_windows(), st.floats(0.5, 4), st.floats(-500, 500))
-def test_groups_move_and_grow_with_their_windows(found, factor, shift):
+def test_groups_translate_and_scale_with_their_windows(found, factor, shift):
     groups = group_windows(found, PLAIN)
     moved = group_windows(Detections(found.boxes * factor + shift, found.scores), PLAIN)
-    # Rounding may turn an overlap that lies on the bound: leave those out.
+    # Rounding may change the result for an IoU at the threshold.
     if len(moved) == len(groups):
         np.testing.assert_allclose(moved.boxes, groups.boxes * factor + shift, rtol=1e-6, atol=1e-3)
     else:
@@ -166,28 +167,28 @@ def test_groups_move_and_grow_with_their_windows(found, factor, shift):
 
 
 @given(any_windows(), st.floats(1e-3, 1e3))
-def test_the_mean_does_not_depend_on_the_unit_of_the_scores(found, unit):
+def test_the_mean_is_invariant_to_a_scaling_of_the_scores(found, factor):
     loose = dataclasses.replace(PLAIN, min_peak=0.0, min_evidence=0.0)
     groups = group_windows(found, loose)
-    scaled = group_windows(Detections(found.boxes, found.scores * unit), loose)
+    scaled = group_windows(Detections(found.boxes, found.scores * factor), loose)
     np.testing.assert_allclose(scaled.boxes, groups.boxes, rtol=1e-6, atol=1e-6)
 
 
-def test_huge_and_tiny_scores_do_not_overflow():
-    for unit in (1e-300, 1e300):
-        scores = around((640.0, 420.0), 96).scores / 25 * unit
-        steep = dataclasses.replace(PLAIN, min_peak=0.0, min_evidence=0.0, power=20.0)
+def test_very_large_and_small_scores_do_not_overflow():
+    for factor in (1e-300, 1e300):
+        scores = around((640.0, 420.0), 96).scores / 25 * factor
+        steep = dataclasses.replace(PLAIN, min_peak=0.0, min_evidence=0.0, score_power=20.0)
         groups = group_windows(Detections(around((640.0, 420.0), 96).boxes, scores), steep)
         np.testing.assert_allclose(groups.boxes[0], [592, 372, 688, 468], atol=1e-6)
 
 
-def test_a_vehicle_ahead_is_its_face():
+def test_the_box_of_a_vehicle_straight_ahead_is_its_face():
     found = fit_boxes(groups_of([window(640, 100, 450)]), CAMERA, SHAPE, PLAIN)
     np.testing.assert_allclose(found.boxes, [[600, 417.5, 680, 492.5]])
     assert found.scores.tolist() == [2.0]
 
 
-def test_a_vehicle_aside_shows_its_flank_towards_the_middle():
+def test_the_box_of_a_vehicle_in_another_lane_includes_its_side():
     sides = [640, 760, 900, 1050]
     found = [fit_boxes(groups_of([window(x)]), CAMERA, SHAPE, PLAIN).boxes[0] for x in sides]
     widths = [box[2] - box[0] for box in found]
@@ -195,32 +196,32 @@ def test_a_vehicle_aside_shows_its_flank_towards_the_middle():
     assert widths[0] == pytest.approx(80)
     assert widths[-1] > 90
     for x, box in zip(sides[1:], found[1:]):
-        # The middle of the whole vehicle is nearer to the vanishing point than that of its face.
+        # The center of the whole vehicle is nearer to the vanishing point than that of its face.
         assert (box[0] + box[2]) / 2 < x
         assert box[0] < x - 40
     heights = {round(box[3] - box[1], 6) for box in found}
     assert heights == {75}
 
 
-def test_a_nearer_vehicle_shows_more_of_its_flank():
-    shares = []
+def test_a_nearer_vehicle_shows_more_of_its_side():
+    widths = []
     for side in (60, 120, 240):
-        # The same place beside the camera: the nearer, the farther out in the picture.
+        # The same lateral position: the nearer, the farther from the middle of the image.
         x = 640 + 1.5 * side
         box = fit_boxes(groups_of([window(x, side)]), CAMERA, SHAPE, PLAIN).boxes[0]
-        shares.append((box[2] - box[0]) / side)
-    assert shares == sorted(shares)
-    assert shares[0] < shares[-1]
+        widths.append((box[2] - box[0]) / side)
+    assert widths == sorted(widths)
+    assert widths[0] < widths[-1]
 
 
-def test_without_a_flank_every_vehicle_is_its_face():
+def test_without_a_side_every_box_is_a_face():
     flat = dataclasses.replace(PLAIN, flank_length_m=0.0)
     box = fit_boxes(groups_of([window(1000)]), CAMERA, SHAPE, flat).boxes[0]
     np.testing.assert_allclose(box[[0, 2]], [960, 1040])
 
 
 @given(any_windows())
-def test_left_and_right_are_alike(found):
+def test_results_are_symmetric_to_left_and_right(found):
     groups = group_windows(found, PLAIN)
     mirrored = groups.boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1) + (1280, 0, 1280, 0)
     boxes = fit_boxes(groups, CAMERA, SHAPE, PLAIN)
@@ -232,7 +233,7 @@ def test_left_and_right_are_alike(found):
 @given(
     any_windows(), st.sampled_from([PLAIN, RegionParams(), dataclasses.replace(PLAIN, face_offset_y=-0.5)])
 )
-def test_a_box_never_leaves_the_frame(found, params):
+def test_boxes_lie_inside_the_frame(found, params):
     boxes = find_vehicles(found, CAMERA, SHAPE, params)
     height, width = SHAPE
     assert ((boxes.boxes >= 0) & (boxes.boxes <= (width, height, width, height))).all()
@@ -240,52 +241,52 @@ def test_a_box_never_leaves_the_frame(found, params):
     assert (boxes.scores >= params.min_peak).all()
 
 
-def test_half_a_vehicle_at_the_edge_is_cut_at_the_edge():
-    for x, edge, place in ((0, 0, 0), (1280, 1280, 2)):
+def test_boxes_are_clipped_at_the_border():
+    for x, border, edge in ((0, 0, 0), (1280, 1280, 2)):
         (box,) = fit_boxes(groups_of([window(x, 120)]), CAMERA, SHAPE, PLAIN).boxes
-        assert box[place] == edge
+        assert box[edge] == border
         assert box[2] - box[0] >= 40
 
 
-def test_a_face_outside_the_frame_is_no_vehicle():
+def test_faces_outside_the_frame_are_dropped():
     outside = groups_of([window(-80), window(1400), window(640, 100, -70), window(640, 100, 800)])
     assert len(fit_boxes(outside, CAMERA, SHAPE, PLAIN)) == 0
 
 
-def test_of_two_on_each_other_the_better_one_stays():
+def test_of_two_overlapping_faces_the_better_one_is_kept():
     near = groups_of([window(640), window(650)], [2.0, 1.5])
     assert fit_boxes(near, CAMERA, SHAPE, PLAIN).scores.tolist() == [2.0]
-    turned = groups_of([window(650), window(640)], [1.5, 2.0])
-    assert fit_boxes(turned, CAMERA, SHAPE, PLAIN).scores.tolist() == [2.0]
+    reversed_order = groups_of([window(650), window(640)], [1.5, 2.0])
+    assert fit_boxes(reversed_order, CAMERA, SHAPE, PLAIN).scores.tolist() == [2.0]
 
 
-def test_of_two_equals_on_each_other_one_stays():
+def test_of_overlapping_faces_with_equal_scores_one_is_kept():
     equal = groups_of([window(640), window(650)], [2.0, 2.0])
     assert len(fit_boxes(equal, CAMERA, SHAPE, PLAIN)) == 1
     same = groups_of([window(640)] * 3, [2.0] * 3)
     assert len(fit_boxes(same, CAMERA, SHAPE, PLAIN)) == 1
 
 
-def test_vehicles_side_by_side_both_stay():
+def test_vehicles_side_by_side_are_kept():
     apart = groups_of([window(540), window(640), window(740)], [2.0, 1.0, 1.5])
     assert len(fit_boxes(apart, CAMERA, SHAPE, PLAIN)) == 3
 
 
-def test_what_lies_on_a_flank_goes():
-    # A near vehicle far to the right: its flank reaches a third of a window towards the middle.
+def test_a_face_on_the_side_of_another_vehicle_is_dropped():
+    # A near vehicle far to the right: its side extends a third of a window towards the middle.
     vehicle = window(1000, 240)
     (box,) = fit_boxes(groups_of([vehicle]), CAMERA, SHAPE, PLAIN).boxes
     flank = window(box[0] + 18, 40)
     face = [1000 - 96, 0, 1000 + 96, 0]
     assert iou_matrix([flank], [[face[0], 354, face[2], 546]])[0, 0] < 0.2
-    # Even a better one goes, as long as the vehicle is not much weaker.
+    # Even a better one is dropped, unless the vehicle's score is much lower.
     for peaks, left in (([2.0, 1.0], [2.0]), ([1.5, 2.0], [1.5]), ([0.9, 2.0], [2.0, 0.9])):
         found = fit_boxes(groups_of([vehicle, flank], peaks), CAMERA, SHAPE, PLAIN)
         assert sorted(found.scores, reverse=True) == left
 
 
-def test_find_vehicles_is_both_steps():
-    found = together(around((400.0, 430.0), 90, peak=1.5), around((900.0, 430.0), 120, peak=2.5))
+def test_find_vehicles_groups_and_fits():
+    found = concatenated(around((400.0, 430.0), 90, peak=1.5), around((900.0, 430.0), 120, peak=2.5))
     both = find_vehicles(found, CAMERA, SHAPE, PLAIN)
     steps = fit_boxes(group_windows(found, PLAIN), CAMERA, SHAPE, PLAIN)
     np.testing.assert_array_equal(both.boxes, steps.boxes)
@@ -295,25 +296,25 @@ def test_find_vehicles_is_both_steps():
 
 
 class TestDefaults:
-    """What the shipped parameters do: each test fails where its parameter is undone."""
+    """Effects of the default parameters: each test fails if its parameter is disabled."""
 
-    def test_a_lonely_window_is_no_vehicle_and_two_that_agree_are(self):
-        assert len(group_windows(Detections([window(300)], [1.7]))) == 0
-        assert len(group_windows(Detections([window(300), window(304)], [0.9, 0.9]))) == 1
+    def test_two_windows_form_a_group_and_a_single_one_does_not(self):
+        assert len(group_windows(Detections([window(300)], [1.7]), DEFAULT)) == 0
+        assert len(group_windows(Detections([window(300), window(304)], [0.9, 0.9]), DEFAULT)) == 1
 
-    def test_many_weak_windows_are_no_vehicle(self):
-        assert len(group_windows(around((400.0, 430.0), 100, peak=0.65))) == 0
+    def test_many_low_scores_form_no_group(self):
+        assert len(group_windows(around((400.0, 430.0), 100, peak=0.65), DEFAULT)) == 0
 
-    def test_windows_of_other_sizes_on_a_vehicle_found_no_second_group(self):
+    def test_windows_of_other_sizes_on_a_vehicle_form_no_second_group(self):
         small = around((420.0, 440.0), 64, step=6, peak=1.4)
         large = around((400.0, 430.0), 128, peak=2.5)
-        assert len(group_windows(together(large, small))) == 1
+        assert len(group_windows(concatenated(large, small), DEFAULT)) == 1
 
-    def test_neighbors_whose_windows_overlap_stay_two(self):
-        found = together(around((400.0, 430.0), 100, spread=1), around((480.0, 430.0), 100, spread=1))
-        assert len(group_windows(found)) == 2
+    def test_neighbors_with_overlapping_windows_form_two_groups(self):
+        found = concatenated(around((400.0, 430.0), 100, spread=1), around((480.0, 430.0), 100, spread=1))
+        assert len(group_windows(found, DEFAULT)) == 2
 
-    def test_a_window_on_the_flank_of_a_better_one_is_no_vehicle(self):
+    def test_a_window_on_the_side_of_a_better_one_is_dropped(self):
         whole, flank = [1000.0, 380, 1160, 540], [960.0, 400, 1050, 490]
-        boxes = fit_boxes(groups_of([whole, flank], [3.0, 1.5]), CAMERA, SHAPE)
+        boxes = fit_boxes(groups_of([whole, flank], [3.0, 1.5]), CAMERA, SHAPE, DEFAULT)
         assert boxes.scores.tolist() == [3.0]

@@ -22,7 +22,7 @@ SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=6, pix_per_cell=16, ho
 
 
 def textured(height, width, seed=0):
-    """Blobs, hard edges and grain, dark and light: the gradients of every kind of road."""
+    """An image of random boxes, smooth variation and noise."""
     rng = np.random.default_rng(seed)
     image = np.full((height, width, 3), 110, float)
     for _ in range(40):
@@ -63,8 +63,8 @@ def band_of(window, *, x=(0, 330), y=(20, 220), step=(8, 8)):
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("window", [(96, 96), (64, 64), (51, 51)])
-def test_the_presets_equal_the_reference_at_the_courses_scales(preset, window):
-    # Smaller windows make larger bands: fewer rows keep the reference quick.
+def test_presets_equal_the_reference(preset, window):
+    # A band of two window heights keeps the reference fast.
     band = band_of(window, x=(10, 250), y=(30, 30 + 2 * window[1]))
     assert_equals_the_reference(IMAGE, band, random_classifier(FeatureParams.preset(preset)))
 
@@ -127,7 +127,7 @@ def test_the_presets_equal_the_reference_at_the_courses_scales(preset, window):
     ],
     ids=str,
 )
-def test_other_parameters_equal_the_reference(changes):
+def test_other_features_equal_the_reference(changes):
     classifier = random_classifier(dataclasses.replace(FeatureParams(), **changes))
     assert_equals_the_reference(IMAGE, band_of((80, 80), x=(5, 213), y=(40, 152)), classifier)
 
@@ -141,20 +141,20 @@ def test_windows_that_are_not_square(window, preset):
 
 @pytest.mark.parametrize("height", range(64, 74))
 def test_bands_of_any_height(height):
-    # What is left below the last whole cell still gives the cell above it its gradients.
+    # Rows below the last whole cell still affect the gradients of the cell above them.
     band = band_of((64, 64), x=(3, 3 + height + 17), y=(11, 11 + height))
     assert_equals_the_reference(IMAGE, band, random_classifier(FeatureParams(hog_channel=0)))
 
 
 def test_a_wide_band():
-    # Wider than the tiles that the kernel works in.
+    # Wider than the tiles of the HOG kernel.
     image = textured(80, 1300, 4)
     band = PixelBand(0, 0, 1300, 70, (64, 64), (8, 8))
     assert_equals_the_reference(image, band, random_classifier(FeatureParams.preset("ycrcb-6156")))
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_an_overhang_repeats_the_outermost_column(preset):
+def test_columns_beyond_the_frame_are_replicated(preset):
     classifier = random_classifier(FeatureParams.preset(preset))
     band = PixelBand(-32, 50, 330 + 32, 130, (64, 64), (8, 8))
     assert_equals_the_reference(IMAGE, band, classifier)
@@ -181,7 +181,7 @@ def test_any_band_equals_the_reference(window, corner, more, seed):
 
 
 @pytest.mark.parametrize("preset", ["ycrcb-6156", "luv-2384", "lab-9432"])
-def test_two_templates_give_the_better_score(preset):
+def test_two_templates_give_the_maximum_score(preset):
     params = FeatureParams.preset(preset)
     both = random_classifier(params, 3, templates=2, bias=0.3)
     band = band_of((80, 80), x=(0, 250), y=(30, 140))
@@ -209,25 +209,28 @@ def test_flat_and_extreme_images():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"pix_per_cell": 7}, "find_cars needs whole HOG cells in a 64 pixel window; pix_per_cell=7 leaves"),
-        ({"pix_per_cell": 24}, "pix_per_cell=24 leaves a rest; use search_windows, the reference search"),
-        ({"spatial_size": 20}, "find_cars needs whole spatial bins in a cell of 8 pixels; spatial_size=20"),
-        ({"spatial_size": 4}, "spatial_size=4 has none; use search_windows, the reference search"),
+        ({"pix_per_cell": 7}, "find_cars needs whole HOG cells in a window of 64 pixels, got pix_per_cell=7"),
+        ({"pix_per_cell": 24}, "pix_per_cell=24; use search_windows, the reference search"),
+        (
+            {"spatial_size": 20},
+            "find_cars needs whole spatial bins in a cell of 8 pixels, got spatial_size=20",
+        ),
+        ({"spatial_size": 4}, "spatial_size=4; use search_windows, the reference search"),
         ({"spatial_size": 24}, "spatial_size=24"),
-        ({"spatial_size": 8, "pix_per_cell": 4}, "spatial bins in a cell of 4 pixels; spatial_size=8"),
+        ({"spatial_size": 8, "pix_per_cell": 4}, "spatial bins in a cell of 4 pixels, got spatial_size=8"),
     ],
 )
-def test_parameters_that_windows_cannot_share_are_refused(changes, message):
+def test_features_that_windows_cannot_share_are_rejected(changes, message):
     classifier = random_classifier(dataclasses.replace(FeatureParams(), **changes))
-    search = SearchParams.preset("three-scales")
+    params = SearchParams.preset("three-scales")
     with pytest.raises(InvalidInputError, match=message):
-        find_cars(np.zeros((720, 1280, 3), np.uint8), classifier, search)
-    # The search that the message names takes them.
+        find_cars(np.zeros((720, 1280, 3), np.uint8), classifier, params)
+    # The reference search accepts them.
     assert len(search_windows(IMAGE, [[0, 0, 64, 64]], classifier, min_score=None)) == 1
 
 
-def small_search(**changes):
-    """Three bands for a frame of 330x220, with windows of 64, 42 and 96 pixels."""
+def small_params(**changes):
+    """Parameters with three bands for a frame of 330x220 and windows of 64, 42 and 96 pixels."""
     bands = tuple(
         SearchBand(window=(side * 1280 / 330,) * 2, y=(-400, 400), overlap=(0.8, 0.8))
         for side in (64, 42, 96)
@@ -239,7 +242,7 @@ def small_search(**changes):
 @pytest.mark.parametrize("templates", [1, 2])
 def test_threads_do_not_change_the_result(params, templates):
     classifier = random_classifier(params, 2, templates=templates)
-    search = small_search(horizontal_padding=0.3)
+    search = small_params(horizontal_padding=0.3)
     one = find_cars(IMAGE, classifier, search, n_jobs=1)
     assert len(one) > 10
     for n_jobs in (2, 3):
@@ -248,9 +251,9 @@ def test_threads_do_not_change_the_result(params, templates):
         np.testing.assert_array_equal(found.scores, one.scores)
 
 
-def test_a_search_is_used_again_and_again():
+def test_a_search_can_be_reused():
     classifier = random_classifier(SMALL)
-    search = small_search()
+    search = small_params()
     images = [textured(220, 330, seed) for seed in range(3)] + [textured(110, 165, 9)]
     fresh = [find_cars(image, classifier, search, n_jobs=1) for image in images]
     with BandSearch(classifier, n_jobs=2) as bands:
@@ -259,11 +262,11 @@ def test_a_search_is_used_again_and_again():
             np.testing.assert_array_equal(found.boxes, expected.boxes)
             np.testing.assert_array_equal(found.scores, expected.scores)
         bands.close()
-        # A closed search starts its threads again.
+        # A closed search restarts its threads.
         assert len(bands.find_windows(images[0], search)) == len(fresh[0])
 
 
-def test_a_score_map_is_the_callers_own():
+def test_a_score_map_is_not_overwritten_by_the_next_search():
     band = band_of((64, 64))
     with BandSearch(random_classifier(SMALL), n_jobs=1) as search:
         first = search.score_map(IMAGE, band)
@@ -272,18 +275,18 @@ def test_a_score_map_is_the_callers_own():
         np.testing.assert_array_equal(first, kept)
 
 
-def test_many_threads_share_one_search(monkeypatch):
+def test_many_threads_can_use_one_search(monkeypatch):
     opened = []
 
-    class SlowToOpen(ThreadPoolExecutor):
+    class SlowExecutor(ThreadPoolExecutor):
         def __init__(self, *arguments, **options):
             opened.append(self)
             time.sleep(0.02)
             super().__init__(*arguments, **options)
 
-    monkeypatch.setattr("vehicle_detection._common.threads.ThreadPoolExecutor", SlowToOpen)
+    monkeypatch.setattr("vehicle_detection._common.threads.ThreadPoolExecutor", SlowExecutor)
     classifier = random_classifier(SMALL)
-    search = small_search()
+    search = small_params()
     images = [textured(220, 330, seed) for seed in range(8)]
     fresh = [find_cars(image, classifier, search, n_jobs=1) for image in images]
     with BandSearch(classifier, n_jobs=2) as bands, ThreadPoolExecutor(8) as callers:
@@ -300,13 +303,13 @@ def test_many_threads_share_one_search(monkeypatch):
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("search")]
 
 
-def test_searching_changes_nothing():
+def test_find_cars_does_not_modify_the_image():
     before = IMAGE.copy()
-    find_cars(IMAGE, random_classifier(SMALL), small_search(horizontal_padding=0.5))
+    find_cars(IMAGE, random_classifier(SMALL), small_params(horizontal_padding=0.5))
     np.testing.assert_array_equal(IMAGE, before)
 
 
-def test_boxes_map_back_to_the_frame():
+def test_boxes_are_in_pixels_of_the_frame():
     classifier = random_classifier(SMALL)
     search = SearchParams(
         bands=(SearchBand(window=(128, 96), y=(-100, 284), overlap=(0.5, 0.75)),), min_score=-1e6
@@ -314,7 +317,7 @@ def test_boxes_map_back_to_the_frame():
     frame = textured(720, 1280, 2)
     (band,) = search.place(frame.shape)
     found = find_cars(frame, classifier, search, n_jobs=1)
-    # 1280 / 128 and 384 / 96 are whole: so are the windows, and a cell is a quarter of each side.
+    # 1280 / 128 and 384 / 96 are integers, so windows have exact sizes and steps are whole cells.
     np.testing.assert_array_equal(
         found.boxes[:, 2:] - found.boxes[:, :2], np.full((len(found), 2), (128, 96))
     )
@@ -324,7 +327,7 @@ def test_boxes_map_back_to_the_frame():
         for x in range(0, 1280 - 128 + 1, 64)
     ]
     np.testing.assert_array_equal(found.boxes, expected)
-    # The pixels inside a box are those that were scored.
+    # Each score is that of the pixels inside its box.
     alone = search_windows(
         resize_band(frame, PixelBand(0, band.y1, 1280, band.y2, (128, 96), (1, 1))),
         [[32, 16, 96, 80]],
@@ -343,7 +346,7 @@ def test_boxes_map_back_to_the_frame():
     st.floats(0, 0.5),
 )
 @settings(max_examples=30)
-def test_windows_lie_in_the_band_and_keep_their_size(shape, window, overlap, horizontal_padding):
+def test_windows_are_inside_the_band_and_have_its_window_size(shape, window, overlap, horizontal_padding):
     band = SearchBand(window=window, y=(-300, 300), overlap=overlap)
     search = SearchParams(bands=(band,), horizon=0.5, min_score=-1e6, horizontal_padding=horizontal_padding)
     try:
@@ -357,11 +360,11 @@ def test_windows_lie_in_the_band_and_keep_their_size(shape, window, overlap, hor
     assert (found.boxes[:, :2] >= (placed.x1 - slack, placed.y1 - slack)).all()
     assert (found.boxes[:, 2:] <= (placed.x2 + slack, placed.y2 + slack)).all()
     assert found.boxes[0, :2].tolist() == [placed.x1, placed.y1]
-    # The band is resized to whole pixels: a window is off by the share of half a pixel.
+    # The band is resized to whole pixels, which changes the window size by up to half a pixel of the band.
     height, width = resized_shape(placed)
     off = np.abs(found.boxes[:, 2:] - found.boxes[:, :2] - placed.window) / placed.window
     assert (off <= (0.51 / width, 0.51 / height)).all() or min(height, width) == 64
-    # Steps are whole cells, the nearest to the step asked for and at least one.
+    # Steps are rounded to whole cells, at least one.
     for axis in (0, 1):
         starts = np.unique(found.boxes[:, axis])
         if len(starts) > 1:
@@ -383,26 +386,26 @@ def test_a_step_is_rounded_to_whole_cells(overlap, cells):
     assert np.unique(np.diff(found.boxes[:, 0])).tolist() == [8.0 * cells]
 
 
-def test_the_third_systems_search_has_11580_windows():
+def test_the_three_scales_have_11580_windows():
     search = dataclasses.replace(SearchParams.preset("three-scales"), min_score=-1e6)
     classifier = random_classifier(FeatureParams(hog_feat=False, hist_feat=False, spatial_size=8))
     found = find_cars(np.zeros((720, 1280, 3), np.uint8), classifier, search)
     assert len(found) == 11_580
-    # Band by band, row by row.
+    # The order is by band and row.
     sizes = (found.boxes[:, 2] - found.boxes[:, 0]).round()
     assert [int((sizes == side).sum()) for side in (96, 64, 51)] == [1386, 3825, 6369]
     first = found.boxes[:1386]
     assert (np.lexsort((first[:, 0], first[:, 1])) == np.arange(1386)).all()
 
 
-def test_windows_above_the_least_score_are_found():
+def test_windows_above_the_minimum_score_are_found():
     classifier = random_classifier(SMALL)
-    every = find_cars(IMAGE, classifier, small_search(min_score=-1e6))
-    least = float(np.quantile(every.scores, 0.9))
-    some = find_cars(IMAGE, classifier, small_search(min_score=least))
-    np.testing.assert_array_equal(some.boxes, every.boxes[every.scores > least])
-    np.testing.assert_array_equal(some.scores, every.scores[every.scores > least])
-    assert len(find_cars(IMAGE, classifier, small_search(min_score=1e6))) == 0
+    every = find_cars(IMAGE, classifier, small_params(min_score=-1e6))
+    min_score = float(np.quantile(every.scores, 0.9))
+    some = find_cars(IMAGE, classifier, small_params(min_score=min_score))
+    np.testing.assert_array_equal(some.boxes, every.boxes[every.scores > min_score])
+    np.testing.assert_array_equal(some.scores, every.scores[every.scores > min_score])
+    assert len(find_cars(IMAGE, classifier, small_params(min_score=1e6))) == 0
 
 
 def test_the_default_search_is_the_preset():
@@ -432,31 +435,31 @@ def test_the_default_search_runs_on_the_usual_frames(shape):
         ("road.png", "image must be an .*read_image"),
     ],
 )
-def test_find_cars_refuses(image, message):
+def test_find_cars_rejects_invalid_images(image, message):
     with pytest.raises(InvalidInputError, match=message):
         find_cars(image, random_classifier(SMALL))
 
 
-def test_find_cars_refuses_what_is_no_classifier_and_no_search():
+def test_find_cars_rejects_other_classifiers_and_parameters():
     for other in ("model.safetensors", None, SMALL, random_classifier(SMALL).to_pipeline()):
         with pytest.raises(InvalidInputError, match=r"classifier must be a VehicleClassifier, .* make one"):
-            find_cars(IMAGE, other, small_search())
+            find_cars(IMAGE, other, small_params())
     for other in ("default", [SearchBand(window=(64, 64), y=(0, 100))], 1.5):
-        with pytest.raises(InvalidInputError, match=r"search must be a SearchParams, got .*; pass Search"):
+        with pytest.raises(InvalidInputError, match=r"params must be a SearchParams, got .*; pass Search"):
             find_cars(IMAGE, random_classifier(SMALL), other)
 
 
-def test_find_cars_refuses_a_number_of_threads():
+def test_find_cars_rejects_an_invalid_number_of_threads():
     with pytest.raises(InvalidInputError, match="n_jobs must be an integer from 1"):
-        find_cars(IMAGE, random_classifier(SMALL), small_search(), n_jobs=0)
+        find_cars(IMAGE, random_classifier(SMALL), small_params(), n_jobs=0)
 
 
-def test_a_strided_frame_gives_the_same():
+def test_a_strided_frame_gives_the_same_result():
     classifier = random_classifier(FeatureParams())
     turned = np.ascontiguousarray(IMAGE[:, ::-1])[:, ::-1]
     swapped = np.ascontiguousarray(IMAGE.transpose(1, 0, 2)).transpose(1, 0, 2)
-    expected = find_cars(IMAGE, classifier, small_search())
+    expected = find_cars(IMAGE, classifier, small_params())
     for view in (turned, swapped):
         assert not view.flags.c_contiguous
-        found = find_cars(view, classifier, small_search())
+        found = find_cars(view, classifier, small_params())
         np.testing.assert_array_equal(found.scores, expected.scores)

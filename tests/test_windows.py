@@ -22,10 +22,10 @@ def image_of(height, width, seed=0):
 IMAGE = image_of(120, 200)
 
 
-def windows_one_by_one(region, window, overlap):
-    """All windows of a grid that fit into a region, by their definition."""
+def expected_windows(region, window, overlap):
+    """All windows of a grid that fit into a region."""
     x1, y1, x2, y2 = region
-    steps = [max(1, int(side * (1 - share) + 1e-9)) for side, share in zip(window, overlap)]
+    steps = [max(1, int(side * (1 - part) + 1e-9)) for side, part in zip(window, overlap)]
     return [
         [x, y, x + window[0], y + window[1]]
         for y in range(y1, y2 + 1, steps[1])
@@ -42,7 +42,7 @@ def ranges(draw, size):
 
 
 @given(ranges(90), ranges(60), st.tuples(*[st.integers(1, 70)] * 2), st.tuples(*[st.floats(0, 0.99)] * 2))
-def test_every_window_that_fits_is_there(x_range, y_range, window, overlap):
+def test_every_window_that_fits_is_listed(x_range, y_range, window, overlap):
     image = np.zeros((60, 90, 3), np.uint8)
     found = slide_window(
         image, x_start_stop=x_range, y_start_stop=y_range, xy_window=window, xy_overlap=overlap
@@ -50,17 +50,17 @@ def test_every_window_that_fits_is_there(x_range, y_range, window, overlap):
     region = [x_range[0] or 0, y_range[0] or 0, x_range[1] or 90, y_range[1] or 60]
     assert found.dtype == np.int64
     assert found.shape == (len(found), 4)
-    assert found.tolist() == windows_one_by_one(region, window, overlap)
+    assert found.tolist() == expected_windows(region, window, overlap)
     assert (found[:, :2] >= region[:2]).all()
     assert (found[:, 2:] <= region[2:]).all()
     assert ((found[:, 2:] - found[:, :2]) == window).all()
 
 
-def test_the_arguments_are_left_as_they_were():
+def test_the_arguments_are_not_modified():
     x, y, window, overlap = [None, 100], [20, None], [32, 16], [0.5, 0.75]
     before = IMAGE.copy()
     slide_window(IMAGE, x_start_stop=x, y_start_stop=y, xy_window=window, xy_overlap=overlap)
-    # The course's version put the numbers into the caller's list.
+    # The course's version replaces None in the caller's list.
     assert (x, y, window, overlap) == ([None, 100], [20, None], [32, 16], [0.5, 0.75])
     np.testing.assert_array_equal(IMAGE, before)
 
@@ -71,7 +71,7 @@ def test_the_exact_fit():
     assert slide_window(image_of(63, 64)).shape == (0, 4)
 
 
-def test_a_step_is_not_lost_to_rounding():
+def test_steps_do_not_lose_a_pixel_to_rounding():
     # 110 * (1 - 0.7) is 33.000000000000004, 64 * (1 - 0.9) is 6.399999999999999, 50 * (1 - 0.9) is 4.99...
     for side, overlap, step in [(110, 0.7, 33), (64, 0.9, 6), (50, 0.9, 5), (8, 0.99, 1), (64, 0.875, 8)]:
         found = slide_window(
@@ -101,13 +101,13 @@ def test_a_step_is_not_lost_to_rounding():
         ({"image": IMAGE[..., 0]}, "image must be an"),
     ],
 )
-def test_slide_window_refuses(arguments, message):
+def test_slide_window_rejects_invalid_arguments(arguments, message):
     arguments = {"image": IMAGE, **arguments}
     with pytest.raises(InvalidInputError, match=message):
         slide_window(arguments.pop("image"), **arguments)
 
 
-def test_a_placed_band_lists_its_windows():
+def test_windows_of_a_placed_band():
     band = PixelBand(-10, 5, 50, 45, (20, 30), (15, 7))
     assert band_windows(band).tolist() == [
         [x, y, x + 20, y + 30] for y in (5, 12) for x in (-10, 5, 20) if x + 20 <= 50
@@ -131,7 +131,7 @@ def test_the_window_list_of_the_first_system():
     assert sum(map(len, lists)) == 114
 
 
-def test_scores_are_those_of_the_cut_out_patches():
+def test_scores_are_those_of_the_cropped_patches():
     windows = slide_window(IMAGE, xy_window=(50, 40), xy_overlap=(0.5, 0.5))
     found = search_windows(IMAGE, windows, CLASSIFIER, min_score=None)
     patches = [cv2.resize(IMAGE[y1:y2, x1:x2], (64, 64)) for x1, y1, x2, y2 in windows]
@@ -139,12 +139,12 @@ def test_scores_are_those_of_the_cut_out_patches():
     np.testing.assert_array_equal(found.scores, CLASSIFIER.decision_function(np.stack(patches)))
 
 
-def test_windows_above_the_least_score_are_returned():
+def test_windows_above_the_minimum_score_are_returned():
     windows = slide_window(IMAGE, xy_window=(40, 40))
     every = search_windows(IMAGE, windows, CLASSIFIER, min_score=None)
-    least = float(np.median(every.scores))
-    some = search_windows(IMAGE, windows, CLASSIFIER, min_score=least)
-    np.testing.assert_array_equal(some.boxes, windows[every.scores > least])
+    min_score = float(np.median(every.scores))
+    some = search_windows(IMAGE, windows, CLASSIFIER, min_score=min_score)
+    np.testing.assert_array_equal(some.boxes, windows[every.scores > min_score])
     default = search_windows(IMAGE, windows, CLASSIFIER)
     np.testing.assert_array_equal(default.boxes, windows[every.scores > 0])
 
@@ -160,20 +160,20 @@ def test_threads_and_order_do_not_change_scores():
     one = search_windows(IMAGE, windows, CLASSIFIER, min_score=None, n_jobs=1)
     two = search_windows(IMAGE, windows, CLASSIFIER, min_score=None, n_jobs=2)
     np.testing.assert_array_equal(one.scores, two.scores)
-    turned = search_windows(IMAGE, windows[::-1], CLASSIFIER, min_score=None)
-    np.testing.assert_allclose(turned.scores[::-1], one.scores, rtol=1e-9, atol=1e-9)
+    backwards = search_windows(IMAGE, windows[::-1], CLASSIFIER, min_score=None)
+    np.testing.assert_allclose(backwards.scores[::-1], one.scores, rtol=1e-9, atol=1e-9)
 
 
-def test_whole_numbers_in_a_float_array_are_pixels():
+def test_windows_may_be_integers_in_a_float_array():
     whole = search_windows(IMAGE, [[0.0, 0.0, 64.0, 64.0]], CLASSIFIER, min_score=None)
     assert whole.boxes.tolist() == [[0, 0, 64, 64]]
 
 
-def test_the_borders_differ_only_where_the_gradients_do():
+def test_both_borders_differ_only_in_the_gradients():
     params = FeatureParams(pix_per_cell=8, hog_channel="ALL", spatial_size=16)
     classifier = random_classifier(params)
     image = image_of(64, 64, 5)
-    # In an image that is one window, the window's border is the image's.
+    # The image is one window, so both borders coincide.
     window = [[0, 0, 64, 64]]
     own = search_windows(image, window, classifier, min_score=None)
     shared = search_windows(image, window, classifier, border="image", min_score=None)
@@ -188,7 +188,7 @@ def test_the_borders_differ_only_where_the_gradients_do():
     assert np.abs(own.scores - shared.scores).max() > 1e-4
 
 
-def test_without_hog_the_borders_give_the_same():
+def test_without_hog_both_borders_give_the_same_scores():
     classifier = random_classifier(FeatureParams(hog_feat=False))
     windows = slide_window(IMAGE, xy_overlap=(0.875, 0.875))
     own = search_windows(IMAGE, windows, classifier, min_score=None)
@@ -202,18 +202,18 @@ def test_without_hog_the_borders_give_the_same():
         ([[0, 0, 64, 64], [150, 0, 214, 64]], r"inside the 200x120 image; got \[150, 0, 214, 64\] in row 1"),
         ([[-1, 0, 63, 64]], "in row 0; use slide_window, or clip_boxes"),
         ([[0, 80, 64, 144]], "inside the 200x120 image"),
-        ([[10, 10, 10, 20]], "windows must be filled boxes"),
+        ([[10, 10, 10, 20]], "windows must be non-empty boxes"),
         ([[0, 0, 64.5, 64]], "windows must be whole pixels; got .* in row 0; round them first"),
         ([0, 0, 64, 64], "windows must be an"),
         ([[0, 0, np.nan, 64]], "windows must be finite"),
     ],
 )
-def test_search_windows_refuses(windows, message):
+def test_search_windows_rejects_invalid_windows(windows, message):
     with pytest.raises(InvalidInputError, match=message):
         search_windows(IMAGE, windows, CLASSIFIER)
 
 
-def test_search_windows_refuses_other_arguments():
+def test_search_windows_rejects_other_invalid_arguments():
     window = [[0, 0, 64, 64]]
     with pytest.raises(InvalidInputError, match="border must be one of 'window', 'image'; got 'none'"):
         search_windows(IMAGE, window, CLASSIFIER, border="none")
@@ -228,7 +228,7 @@ def test_search_windows_refuses_other_arguments():
             search_windows(IMAGE, off_grid, CLASSIFIER, border="image")
 
 
-def test_searching_changes_nothing():
+def test_search_windows_does_not_modify_its_arguments():
     windows = slide_window(IMAGE)
     image, boxes = IMAGE.copy(), windows.copy()
     search_windows(image, boxes, CLASSIFIER)
@@ -237,7 +237,7 @@ def test_searching_changes_nothing():
     np.testing.assert_array_equal(boxes, windows)
 
 
-def test_the_patches_of_windows_have_the_features_of_patches():
+def test_windows_have_the_features_of_patches():
     image = image_of(64, 128, 9)
     found = search_windows(image, [[64, 0, 128, 64]], CLASSIFIER, min_score=None)
     features = extract_features([image[:, 64:]], SMALL)

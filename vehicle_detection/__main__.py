@@ -1,4 +1,4 @@
-"""``python -m vehicle_detection``: the command line."""
+"""``python -m vehicle_detection`` runs the command line."""
 
 from vehicle_detection.cli import main
 

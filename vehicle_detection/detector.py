@@ -250,7 +250,7 @@ class VehicleDetector:
         self._tracker.set_camera(self._camera_of(found.shape))
         if self._is_cut(found):
             self._heat_history.clear()
-            self._tracker.cut()
+            self._tracker.end_tracks()
         self._thumbnail = found.thumbnail
         if self._heat_params is not None:
             heat = self._heat_history.add(frame_heat(found.shape, found.windows, self._heat_params))

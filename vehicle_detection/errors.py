@@ -1,18 +1,18 @@
-"""The exceptions of the library, each a :class:`VehicleDetectionError`."""
+"""The exceptions of the library."""
 
 from __future__ import annotations
 
 
 class VehicleDetectionError(Exception):
-    """Base of every error that the library raises on purpose."""
+    """Base class of the errors that the library raises for invalid input and files."""
 
 
 class InvalidInputError(VehicleDetectionError, ValueError):
-    """An argument is not what the function takes; the message says what it was and what to do."""
+    """An argument is invalid; the message states the expectation, the value and the remedy."""
 
 
 class ModelFileError(VehicleDetectionError):
-    """A model file is missing, damaged, of another version, or does not fit its own parameters."""
+    """A model file is missing, damaged, of another version, or inconsistent with its parameters."""
 
 
 class DatasetError(VehicleDetectionError):

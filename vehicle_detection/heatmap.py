@@ -1,4 +1,4 @@
-"""Windows to a heat map, and the heat map to labelled regions: the course's way from hits to vehicles."""
+"""Heat map of windows and its labelled regions: how the course turns windows into vehicles."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ def _check_heat(heatmap: object) -> NDArray[Any]:
 def add_heat(
     heatmap: NDArray[Any], boxes: ArrayLike, *, scores: ArrayLike | None = None
 ) -> NDArray[np.float32]:
-    """Add each window to the heat of the pixels it covers.
+    """Add each window's heat to the pixels that it covers.
 
-    A rectangle is added as four corner differences and the map is summed up once, so that the cost does
-    not grow with the windows' area.
+    A window is added as four corner differences, and one cumulative sum over the map follows, so the cost
+    does not depend on the area of the windows.
 
     Parameters
     ----------
     heatmap
         ``(H, W)``; not changed.
     boxes
-        ``(N, 4)`` windows; fractions of a pixel are rounded, parts outside the map are cut off.
+        ``(N, 4)`` windows, rounded to whole pixels and clipped to the map.
     scores
-        ``(N,)`` heat that each window adds; None adds 1 each, as in the course.
+        ``(N,)`` heat that each window adds; by default 1 each, as in the course.
 
     Returns
     -------
@@ -49,7 +49,7 @@ def add_heat(
     Raises
     ------
     InvalidInputError
-        If the map is not two-dimensional, or boxes and scores do not fit each other.
+        If the map is not two-dimensional, or boxes and scores differ in number.
 
     Examples
     --------
@@ -65,19 +65,31 @@ def add_heat(
     corners = np.zeros((height + 1, width + 1))
     for rows, columns, sign in ((y1, x1, 1), (y1, x2, -1), (y2, x1, -1), (y2, x2, 1)):
         np.add.at(corners, (rows, columns), sign * weights)
-    # Only the part that windows touch is summed up.
+    # Only the part of the map that windows touch is summed.
     result = heat.astype(np.float32)
     if len(windows):
         top, bottom, left, right = y1.min(), y2.max(), x1.min(), x2.max()
         part = corners[top:bottom, left:right].cumsum(axis=0).cumsum(axis=1)
-        # Sums of floats leave dust where the heat is zero.
+        # Set rounding errors of the sums to zero.
         part[np.abs(part) < 1e-9 * max(1.0, np.abs(weights).sum())] = 0
         result[top:bottom, left:right] += part.astype(np.float32)
     return result
 
 
 def apply_threshold(heatmap: NDArray[Any], threshold: float) -> NDArray[np.float32]:
-    """Return the map with heat at or below the threshold set to zero; the argument is not changed.
+    """Set heat at or below the threshold to zero.
+
+    Parameters
+    ----------
+    heatmap
+        ``(H, W)``; not changed.
+    threshold
+        Highest heat that is removed.
+
+    Returns
+    -------
+    numpy.ndarray
+        A new ``(H, W)`` float32 map.
 
     Examples
     --------
@@ -91,7 +103,7 @@ def apply_threshold(heatmap: NDArray[Any], threshold: float) -> NDArray[np.float
 
 
 def label_boxes(heatmap: NDArray[Any], *, threshold: float = 0.0, peak_fraction: float = 0.0) -> Detections:
-    """Find the connected regions of a heat map and their boxes.
+    """Find the connected regions of a heat map and their bounding boxes.
 
     Parameters
     ----------
@@ -100,14 +112,14 @@ def label_boxes(heatmap: NDArray[Any], *, threshold: float = 0.0, peak_fraction:
     threshold
         Heat at or below this belongs to no region.
     peak_fraction
-        0 gives the box of the whole region, as the course does. In (0, 1), the box of the part around the
-        region's peak that reaches this share of the peak's heat: windows spill over the vehicle, and the
-        spill is cooler.
+        0 gives the box of the whole region, as in the course. Otherwise the box of the part around the
+        region's peak that has at least this fraction of the peak's heat, in [0, 1): windows extend beyond
+        the vehicle, where the heat is lower.
 
     Returns
     -------
     Detections
-        ``(N, 4)`` int64 boxes and the heat of their peaks, from top to bottom.
+        ``(N, 4)`` int64 boxes and the heat of their peaks, ordered from top to bottom.
 
     Raises
     ------
@@ -117,55 +129,47 @@ def label_boxes(heatmap: NDArray[Any], *, threshold: float = 0.0, peak_fraction:
     Examples
     --------
     >>> heat = np.array([[0, 0, 0, 0, 0], [0, 1, 4, 3, 0], [0, 0, 0, 0, 0]])
-    >>> label_boxes(heat).boxes.tolist(), label_boxes(heat, share=0.5).boxes.tolist()
+    >>> label_boxes(heat).boxes.tolist(), label_boxes(heat, peak_fraction=0.5).boxes.tolist()
     ([[1, 1, 4, 2]], [[2, 1, 4, 2]])
     """
     heat = _check_heat(heatmap)
     check_number(peak_fraction, "peak_fraction", low=0, high=0.99)
+    labels, stats = _connected_components(heat > check_number(threshold, "threshold", low=0))
     boxes, peaks = [], []
-    for left, top, region, member in _components(heat > check_number(threshold, "threshold", low=0)):
-        part = np.where(member, heat[region], 0)
+    # From top to bottom, because OpenCV labels components by blocks of two rows and columns.
+    for label in (1 + np.lexsort((stats[1:, 0], stats[1:, 1]))).tolist():
+        x, y, width, height, _ = stats[label].tolist()
+        region = slice(y, y + height), slice(x, x + width)
+        part = np.where(labels[region] == label, heat[region], 0)
         peak = float(part.max())
-        x1, y1, x2, y2 = left, top, left + part.shape[1], top + part.shape[0]
         if peak_fraction > 0:
-            row, column = np.unravel_index(int(part.argmax()), part.shape)
-            for x, y, inner, around in _components(part >= peak_fraction * peak):
-                rows, columns = inner
-                if rows.start <= row < rows.stop and columns.start <= column < columns.stop:
-                    if not around[row - rows.start, column - columns.start]:
-                        continue
-                    x1, y1 = left + x, top + y
-                    x2, y2 = x1 + around.shape[1], y1 + around.shape[0]
-        boxes.append((x1, y1, x2, y2))
+            inner_labels, inner_stats = _connected_components(part >= peak_fraction * peak)
+            left, top, width, height, _ = inner_stats[inner_labels.flat[part.argmax()]].tolist()
+            x, y = x + left, y + top
+        boxes.append((x, y, x + width, y + height))
         peaks.append(peak)
     return Detections(np.array(boxes, np.int64).reshape(-1, 4), np.array(peaks))
 
 
-def _components(mask: NDArray[np.bool_]) -> list[tuple[int, int, tuple[slice, slice], NDArray[np.bool_]]]:
-    """Left, top, slices and own mask of each 8-connected component, from top to bottom."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-    found = []
-    for index in range(1, count):
-        x, y, width, height = (int(value) for value in stats[index, :4])
-        region = (slice(y, y + height), slice(x, x + width))
-        found.append((x, y, region, labels[region] == index))
-    # OpenCV counts by blocks of two rows and columns.
-    return sorted(found, key=lambda component: component[1::-1])
+def _connected_components(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Label image of the 8-connected components, and ``[x, y, width, height, area]`` by label."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    return labels, stats  # type: ignore[return-value]
 
 
 def bounding_boxes(
     shape: tuple[int, ...], windows: Detections, *, params: HeatParams | None = None
 ) -> Detections:
-    """Heat, threshold and labels in one: the boxes that a frame's positive windows make.
+    """Find the boxes of a frame's positive windows: heat map, threshold and labels in one call.
 
     Parameters
     ----------
     shape
         ``(height, width, ...)`` of the frame.
     windows
-        Positive windows and scores.
+        Positive windows with scores.
     params
-        Weighting, threshold and share of the peak; the default is ``HeatParams()``.
+        Weighting, threshold and fraction of the peak; by default ``HeatParams()``.
 
     Returns
     -------
@@ -175,7 +179,7 @@ def bounding_boxes(
     Examples
     --------
     >>> windows = Detections([[0, 0, 8, 8], [4, 0, 12, 8]], [2.0, 1.5])
-    >>> bounding_boxes((20, 20), windows, params=HeatParams(threshold=1.0, share=0.0)).boxes.tolist()
+    >>> bounding_boxes((20, 20), windows, params=HeatParams(threshold=1.0, peak_fraction=0)).boxes.tolist()
     [[0, 0, 12, 8]]
     """
     params = params or HeatParams()
@@ -185,18 +189,18 @@ def bounding_boxes(
 
 
 def frame_heat(shape: tuple[int, ...], windows: Detections, params: HeatParams) -> NDArray[np.float32]:
-    """Heat of one frame's windows, ``(H, W)`` float32, by the weighting of `params`."""
+    """Heat of one frame's windows, ``(H, W)`` float32, weighted as `params` say."""
     scores = windows.scores.clip(0) if params.weighting == "score" else None
     return add_heat(np.zeros(shape[:2], np.float32), windows.boxes, scores=scores)
 
 
 class HeatHistory:
-    """Mean heat over the last frames, which steadies regions and drowns hits that do not last.
+    """Mean heat over the last frames, which smooths regions and suppresses short false positives.
 
     Parameters
     ----------
     frames
-        How many frames are remembered.
+        Number of frames in the mean.
 
     Examples
     --------
@@ -210,9 +214,9 @@ class HeatHistory:
         self._maps: deque[NDArray[np.float32]] = deque(maxlen=check_integer(frames, "frames", low=1))
 
     def add(self, heatmap: NDArray[Any]) -> NDArray[np.float32]:
-        """Remember a frame's heat and return the mean over the remembered ones, ``(H, W)`` float32.
+        """Add a frame's heat and return the mean over the last frames, ``(H, W)`` float32.
 
-        A map of another size starts the history anew.
+        A map of another size clears the history first.
         """
         heat = _check_heat(heatmap).astype(np.float32)
         if self._maps and self._maps[-1].shape != heat.shape:
@@ -221,5 +225,5 @@ class HeatHistory:
         return np.asarray(np.mean(self._maps, axis=0), np.float32)
 
     def clear(self) -> None:
-        """Forget all frames."""
+        """Remove all frames."""
         self._maps.clear()

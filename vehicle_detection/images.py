@@ -1,4 +1,4 @@
-"""Image files in and out: the border where every image becomes ``(H, W, 3)`` uint8 RGB."""
+"""Reading and writing image files: every image becomes ``(H, W, 3)`` uint8 RGB."""
 
 from __future__ import annotations
 
@@ -14,22 +14,10 @@ from vehicle_detection.errors import InvalidInputError
 
 
 def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
-    """Decode the bytes of a PNG, JPEG or other image to ``(H, W, 3)`` uint8 RGB.
+    """Decode an image file's bytes to ``(H, W, 3)`` uint8 RGB; `name` is the file's name for errors.
 
-    Gray images are spread to three channels, alpha is dropped, 16-bit values are scaled to 0-255 and
-    the EXIF rotation is applied, so that every format gives the same 0-255 values.
-
-    Parameters
-    ----------
-    data
-        The whole file's bytes.
-    name
-        The file's name, for the error message.
-
-    Raises
-    ------
-    InvalidInputError
-        If the bytes are no image, or one that is cut short.
+    Gray becomes three equal channels, alpha is dropped, 16-bit values are scaled to 0-255, and the EXIF
+    rotation is applied.
     """
     image = None
     if data:
@@ -37,15 +25,17 @@ def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
         except cv2.error:
             image = None
-    if image is None or _is_cut(data):
-        raise InvalidInputError(f"{name} must be a whole image file (PNG, JPEG, ...); it cannot be decoded")
+    if image is None or _is_truncated(data):
+        raise InvalidInputError(
+            f"{name} must be a complete image file (PNG, JPEG, ...); it cannot be decoded"
+        )
     return np.asarray(image, np.uint8)
 
 
-def _is_cut(data: bytes) -> bool:
-    """Whether a JPEG or PNG lacks its end: OpenCV fills the missing part with gray and says nothing."""
+def _is_truncated(data: bytes) -> bool:
+    """Whether a JPEG or PNG lacks its end; OpenCV fills the missing part with gray without an error."""
     if data.startswith(b"\xff\xd8"):
-        # The end marker comes after the last scan; one before it belongs to a thumbnail in the header.
+        # The end marker must follow the last scan; an earlier one belongs to a thumbnail in the header.
         return data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
     return data.startswith(b"\x89PNG") and b"IEND" not in data
 
@@ -66,7 +56,7 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
     Raises
     ------
     InvalidInputError
-        If the file is missing, is a folder, or cannot be decoded as a whole.
+        If the file is missing, is a folder, or cannot be decoded completely.
 
     Examples
     --------
@@ -77,7 +67,7 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
     """
     file = Path(path)
     if file.is_dir():
-        raise InvalidInputError(f"image file {file} is a folder; name a file in it")
+        raise InvalidInputError(f"image file {file} is a folder; choose a file in it")
     try:
         data = file.read_bytes()
     except FileNotFoundError:
@@ -90,7 +80,7 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
 def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
     """Write an ``(H, W, 3)`` uint8 RGB image; the suffix (``.png``, ``.jpg``, ...) sets the format.
 
-    The file appears whole or not at all.
+    The file is written atomically: after an error, an existing file is unchanged.
 
     Raises
     ------

@@ -1,3 +1,5 @@
+from unittest import mock
+
 import numba
 import numpy as np
 import pytest
@@ -5,76 +7,104 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vehicle_detection._common import Workspace
-from vehicle_detection._kernels import Filter
+from vehicle_detection._kernels import Filter, correlation
 from vehicle_detection._kernels.vector import Block, block_adder, host_block
 
+KERNELS = {"blocks": correlation._correlate_blocks, "plain": correlation._correlate_plain}
 
-def reference(weights, planes, spread=1):
+
+def reference(weights, channels, dilation=1):
     """Sum the products window by window, in double precision."""
     rows, columns, _ = weights.shape
-    height = planes.shape[1] - (rows - 1) * spread
-    width = planes.shape[2] - (columns - 1) * spread
+    height = channels.shape[1] - (rows - 1) * dilation
+    width = channels.shape[2] - (columns - 1) * dilation
     scores = np.zeros((height, width))
     for i, j in np.ndindex(rows, columns):
-        part = planes[:, i * spread : i * spread + height, j * spread : j * spread + width]
+        top, left = i * dilation, j * dilation
+        part = channels[:, top : top + height, left : left + width]
         scores += np.tensordot(weights[i, j].astype(np.float64), part, axes=1)
     return scores
 
 
-def drawn(rows, columns, depth, height, width, seed=0):
+def random_inputs(rows, columns, depth, height, width, seed=0):
     rng = np.random.default_rng(seed)
     weights = rng.normal(size=(rows, columns, depth))
     return weights, rng.normal(size=(depth, height, width)).astype(np.float32)
 
 
-@settings(deadline=None, max_examples=60)
+@pytest.mark.parametrize("kernel", KERNELS)
+@settings(max_examples=60)
 @given(
     rows=st.integers(1, 10),
     columns=st.integers(1, 10),
     depth=st.integers(1, 30),
-    spread=st.integers(1, 2),
+    dilation=st.integers(1, 2),
     more=st.tuples(st.integers(0, 5), st.integers(0, 120)),
     seed=st.integers(0, 99),
 )
-def test_scores_equal_the_sums_of_products(rows, columns, depth, spread, more, seed):
-    height, width = (rows - 1) * spread + 1 + more[0], (columns - 1) * spread + 1 + more[1]
-    weights, planes = drawn(rows, columns, depth, height, width, seed)
-    expected = reference(weights, planes, spread)
+def test_scores_equal_the_sums_of_products(kernel, rows, columns, depth, dilation, more, seed):
+    height, width = (rows - 1) * dilation + 1 + more[0], (columns - 1) * dilation + 1 + more[1]
+    weights, channels = random_inputs(rows, columns, depth, height, width, seed)
+    expected = reference(weights, channels, dilation)
     scores = np.zeros(expected.shape, np.float32)
-    Filter(weights, spread=spread).add_to(planes, scores)
+    with mock.patch.object(correlation, "_kernel", lambda: KERNELS[kernel]):
+        Filter(weights, dilation=dilation).add_to(channels, scores)
     np.testing.assert_allclose(scores, expected, rtol=1e-4, atol=1e-4)
 
 
-def test_scores_are_added_to_what_is_there():
-    weights, planes = drawn(2, 3, 4, 6, 70)
+def test_a_block_kernel_that_does_not_compile_is_replaced(caplog):
+    weights, channels = random_inputs(3, 2, 4, 6, 70)
+    scores = np.zeros((4, 69), np.float32)
+    broken = mock.Mock()
+    broken.compile.side_effect = numba.core.errors.LoweringError("no such intrinsic")
+    correlation._kernel.cache_clear()
+    try:
+        with mock.patch.object(correlation, "_correlate_blocks", broken):
+            Filter(weights).add_to(channels, scores)
+            Filter(weights).add_to(channels, scores)
+    finally:
+        correlation._kernel.cache_clear()
+    np.testing.assert_allclose(scores, 2 * reference(weights, channels), rtol=1e-4, atol=1e-4)
+    broken.assert_not_called()
+    assert [record.getMessage() for record in caplog.records] == [
+        "correlation uses plain, slower loops: no such intrinsic"
+    ]
+
+
+def test_the_block_kernel_is_used_here():
+    assert correlation._kernel() is correlation._correlate_blocks
+
+
+def test_products_are_added_to_the_scores():
+    weights, channels = random_inputs(2, 3, 4, 6, 70)
     scores = np.full((5, 68), 7, np.float32)
-    Filter(weights).add_to(planes, scores)
-    np.testing.assert_allclose(scores, reference(weights, planes) + 7, rtol=1e-4, atol=1e-4)
+    Filter(weights).add_to(channels, scores)
+    np.testing.assert_allclose(scores, reference(weights, channels) + 7, rtol=1e-4, atol=1e-4)
 
 
-def test_fewer_windows_than_fit_are_the_first_ones():
-    weights, planes = drawn(3, 3, 5, 9, 50)
+def test_a_smaller_output_takes_the_first_windows():
+    weights, channels = random_inputs(3, 3, 5, 9, 50)
     scores = np.zeros((4, 20), np.float32)
-    Filter(weights).add_to(planes, scores)
-    np.testing.assert_allclose(scores, reference(weights, planes)[:4, :20], rtol=1e-4, atol=1e-4)
+    Filter(weights).add_to(channels, scores)
+    np.testing.assert_allclose(scores, reference(weights, channels)[:4, :20], rtol=1e-4, atol=1e-4)
 
 
-def test_memory_that_was_used_before_does_not_show():
-    weights, planes = drawn(4, 4, 6, 12, 60)
+def test_reused_memory_does_not_change_the_scores():
+    weights, channels = random_inputs(4, 4, 6, 12, 60)
     workspace = Workspace()
     first, second = np.zeros((2, 9, 57), np.float32)
-    Filter(weights).add_to(planes, first, workspace)
-    Filter(-weights).add_to(100 * planes, np.zeros((9, 57), np.float32), workspace)
-    Filter(weights).add_to(planes, second, workspace)
+    Filter(weights).add_to(channels, first, workspace)
+    Filter(-weights).add_to(100 * channels, np.zeros((9, 57), np.float32), workspace)
+    Filter(weights).add_to(channels, second, workspace)
     np.testing.assert_array_equal(first, second)
 
 
-def test_values_behind_the_last_cell_do_not_show():
-    weights, planes = drawn(2, 2, 3, 4, 5)
-    room = np.full((3 * 4 * 5 + 200,), np.nan, np.float32)
-    room[: planes.size] = planes.ravel()
+def test_values_beyond_the_last_cell_are_not_used():
+    weights, channels = random_inputs(2, 2, 3, 4, 5)
+    memory = np.full((3 * 4 * 5 + 200,), np.nan, np.float32)
+    memory[: channels.size] = channels.ravel()
     scores = np.zeros((3, 4), np.float32)
-    Filter(weights).add_to(room[: planes.size].reshape(planes.shape), scores)
+    Filter(weights).add_to(memory[: channels.size].reshape(channels.shape), scores)
     assert np.isfinite(scores).all()
 
 
@@ -83,19 +113,19 @@ def test_blocks_of_every_processor_add_the_same_products(block):
     add_products = block_adder(block)
 
     @numba.njit
-    def run(weights, planes, sums, offsets):
-        add_products(weights, 1, planes, 2, sums, offsets, 5)
+    def run(weights, channels, sums, offsets):
+        add_products(weights, 1, channels, 2, sums, offsets, 5)
 
     rng = np.random.default_rng(4)
     weights = rng.normal(size=(2, 7, block.rows)).astype(np.float32)
-    planes = rng.normal(size=(7, block.columns + 6)).astype(np.float32)
+    channels = rng.normal(size=(7, block.columns + 6)).astype(np.float32)
     offsets = np.arange(2 * block.rows).reshape(2, -1) * (block.columns + 1)
     sums = rng.normal(size=5 + 2 * block.rows * (block.columns + 1)).astype(np.float32)
     expected = sums.astype(np.float64)
     for row in range(block.rows):
-        place = 5 + offsets[1, row]
-        expected[place : place + block.columns] += weights[1, :, row] @ planes[:, 2 : 2 + block.columns]
-    run(weights, planes, sums, offsets)
+        start = 5 + offsets[1, row]
+        expected[start : start + block.columns] += weights[1, :, row] @ channels[:, 2 : 2 + block.columns]
+    run(weights, channels, sums, offsets)
     np.testing.assert_allclose(sums, expected, rtol=1e-5, atol=1e-5)
 
 

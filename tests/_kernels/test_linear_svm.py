@@ -8,8 +8,8 @@ from sklearn.svm import LinearSVC
 from vehicle_detection._kernels import fit_svm
 
 
-def material(count=120, length=30, seed=0):
-    """Two clouds that overlap, on columns of very different mean and spread; the last one is constant."""
+def overlapping_clouds(count=120, length=30, seed=0):
+    """Two overlapping classes; columns have very different means and scales, and the last one is constant."""
     rng = np.random.default_rng(seed)
     labels = np.arange(count) % 2
     features = rng.normal(0, 1, (count, length)) + 0.4 * labels[:, None]
@@ -22,10 +22,10 @@ def scores_of(fitted, features):
     return (features - fitted.mean) / fitted.scale @ fitted.coef + fitted.intercept
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 1000), st.sampled_from([1e-3, 0.01, 0.1]))
-def test_the_optimum_is_that_of_scikit_learn(seed, C):
-    features, labels = material(seed=seed)
+def test_the_optimum_equals_that_of_scikit_learn(seed, C):
+    features, labels = overlapping_clouds(seed=seed)
     weights = np.where(np.arange(len(labels)) % 3, 1.0, 0.2)
     gains = np.linspace(0.5, 2, features.shape[1])
     scaler = StandardScaler().fit(features.astype(np.float64))
@@ -34,12 +34,12 @@ def test_the_optimum_is_that_of_scikit_learn(seed, C):
     fitted = fit_svm(features, labels, C * weights, gains=gains)
     np.testing.assert_allclose(fitted.mean, scaler.mean_, rtol=1e-6)
     np.testing.assert_allclose(fitted.scale, scaler.scale_ / gains, rtol=1e-4)
-    # The tolerance of the solver, not that of float32.
+    # This is the tolerance of the solver; float32 is more accurate.
     np.testing.assert_allclose(scores_of(fitted, features), svm.decision_function(scaled), atol=5e-3)
 
 
-def test_rows_are_as_if_there_were_no_others():
-    features, labels = material()
+def test_other_rows_have_no_effect():
+    features, labels = overlapping_clouds()
     rows = np.flatnonzero(np.arange(len(labels)) % 5)
     costs = np.full(len(labels), 0.01)
     before = features.copy()
@@ -50,8 +50,8 @@ def test_rows_are_as_if_there_were_no_others():
     np.testing.assert_array_equal(features, before)
 
 
-def test_the_seed_decides_on_nothing_but_the_last_digits():
-    features, labels = material()
+def test_the_seed_changes_only_the_last_digits():
+    features, labels = overlapping_clouds()
     costs = np.full(len(labels), 0.01)
     first, again, other = (fit_svm(features, labels, costs, random_state=seed) for seed in (0, 0, 1))
     np.testing.assert_array_equal(first.coef, again.coef)

@@ -27,12 +27,12 @@ ALL = [FeatureParams(), BAND, SEARCH, HeatParams(), RegionParams(), TrackParams(
 FRAMES = [(720, 1280), (540, 960), (375, 1242), (360, 480), (1280, 720), (2160, 3840), (1080, 1920)]
 
 
-def of(params):
+def class_name(params):
     return type(params).__name__
 
 
-@pytest.mark.parametrize("params", ALL, ids=of)
-def test_parameters_are_frozen_values(params):
+@pytest.mark.parametrize("params", ALL, ids=class_name)
+def test_parameters_are_frozen_and_hashable(params):
     name = dataclasses.fields(params)[0].name
     with pytest.raises(dataclasses.FrozenInstanceError, match=name):
         setattr(params, name, 1)
@@ -40,8 +40,8 @@ def test_parameters_are_frozen_values(params):
     assert hash(dataclasses.replace(params)) == hash(params)
 
 
-@pytest.mark.parametrize("params", ALL, ids=of)
-def test_arguments_go_by_name(params):
+@pytest.mark.parametrize("params", ALL, ids=class_name)
+def test_parameters_are_keyword_only(params):
     first = getattr(params, dataclasses.fields(params)[0].name)
     with pytest.raises(TypeError, match="positional"):
         type(params)(first)
@@ -65,26 +65,26 @@ def test_every_field_is_checked_and_named(params, field, value):
         ("lab-9432", 9432, (3072, 96, 5292 + 972)),
     ],
 )
-def test_the_presets_have_the_known_lengths(name, length, parts):
+def test_feature_presets_have_the_known_lengths(name, length, parts):
     params = FeatureParams.preset(name)
     assert params.length == length
     assert (params.spatial_length, params.hist_length, params.hog_length) == parts
 
 
-def test_the_presets_are_those_of_the_course():
+def test_feature_presets_are_those_of_the_course():
     luv = FeatureParams.preset("luv-2384")
     assert (luv.color_space, luv.orient, luv.hog_channel, luv.transform_sqrt) == ("LUV", 8, 0, True)
     assert FeatureParams.preset("ycrcb-6156") == FeatureParams()
     assert FeatureParams.preset("ycrcb-8460") == FeatureParams(spatial_size=32)
 
 
-def test_features_that_are_off_have_no_length():
+def test_disabled_features_have_no_length():
     params = FeatureParams(spatial_feat=False, hist_feat=False)
     assert params.length == params.hog_length == 5292
     assert FeatureParams(hog_feat=False).length == 768 + 96
 
 
-def test_the_coarse_hog_is_the_end_of_hog():
+def test_coarse_hog_is_the_last_part_of_hog():
     params = FeatureParams(coarse_hog=True)
     assert (params.coarse_blocks, params.coarse_length) == (3, 3 * 3 * 4 * 9 * 3)
     assert params.hog_length == 5292 + params.coarse_length
@@ -94,7 +94,7 @@ def test_the_coarse_hog_is_the_end_of_hog():
     assert (FeatureParams().coarse_blocks, FeatureParams().coarse_length) == (0, 0)
 
 
-def test_gains_lie_on_their_parts():
+def test_gains_apply_to_their_parts():
     params = FeatureParams(coarse_hog=True, hist_gain=3, coarse_gain=2)
     expected = np.repeat([1.0, 3.0, 1.0, 2.0], [768, 96, 5292, 972])
     np.testing.assert_array_equal(params.gains, expected)
@@ -126,13 +126,13 @@ def test_gains_lie_on_their_parts():
         ({"coarse_gain": 101}, "coarse_gain must be a number, at least 0.01 and at most 100; got 101"),
     ],
 )
-def test_feature_params_refuse(arguments, message):
+def test_invalid_feature_params_are_rejected(arguments, message):
     with pytest.raises(InvalidInputError, match=message):
         FeatureParams(**arguments)
 
 
-def test_numbers_of_numpy_become_plain():
-    # A grid of parameters from numpy.arange has to fit into the JSON of a model file.
+def test_numpy_numbers_become_python_numbers():
+    # Parameters from numpy.arange must be JSON serializable for the model file.
     params = FeatureParams(
         orient=np.int64(9),
         hog_channel=np.int64(0),
@@ -146,7 +146,7 @@ def test_numbers_of_numpy_become_plain():
 
 @pytest.mark.parametrize("cls", [FeatureParams, SearchParams])
 @pytest.mark.parametrize("name", ["nothing", None, ["default"]])
-def test_an_unknown_preset_is_refused(cls, name):
+def test_an_unknown_preset_is_rejected(cls, name):
     with pytest.raises(InvalidInputError, match="preset must be one of '"):
         cls.preset(name)
 
@@ -163,19 +163,19 @@ def test_an_unknown_preset_is_refused(cls, name):
         ({"overlap": (0.5, math.nan)}, r"overlap\[1\] must be a number"),
     ],
 )
-def test_search_band_refuses(arguments, message):
+def test_invalid_bands_are_rejected(arguments, message):
     with pytest.raises(InvalidInputError, match=message):
         dataclasses.replace(BAND, **arguments)
 
 
-def test_search_params_refuse_and_normalize_bands():
+def test_search_params_check_and_normalize_bands():
     for bands in ((), [], (BAND, "band"), 5, BAND):
         with pytest.raises(InvalidInputError, match="bands must be a tuple of SearchBand"):
             SearchParams(bands=bands)
     assert SearchParams(bands=[BAND], horizon=0.5) == SEARCH
 
 
-def test_what_is_drawn_is_a_track():
+def test_show_coast_is_at_most_max_coast():
     with pytest.raises(InvalidInputError, match=r"show_coast must be at most max_coast, .*got 2 and 1"):
         TrackParams(show_coast=2, max_coast=1)
 
@@ -187,11 +187,11 @@ def test_with_horizon():
         SEARCH.with_horizon(1.2)
 
 
-def test_a_band_is_placed_by_the_horizon():
-    search = SearchParams(bands=(SearchBand(window=(96, 48), y=(-20, 200), overlap=(0.5, 0.75)),))
-    (band,) = search.with_horizon(0.5).place((720, 1280, 3))
+def test_a_band_is_relative_to_the_horizon():
+    params = SearchParams(bands=(SearchBand(window=(96, 48), y=(-20, 200), overlap=(0.5, 0.75)),))
+    (band,) = params.with_horizon(0.5).place((720, 1280, 3))
     assert band == PixelBand(0, 340, 1280, 560, (96, 48), (48, 12))
-    (lower,) = search.with_horizon(0.6).place((720, 1280, 3))
+    (lower,) = params.with_horizon(0.6).place((720, 1280, 3))
     assert (lower.y1, lower.y2) == (412, 632)
 
 
@@ -203,30 +203,30 @@ def test_a_band_scales_with_the_frame():
     )
 
 
-def test_a_step_is_not_lost_to_rounding():
+def test_steps_do_not_lose_a_pixel_to_rounding():
     # 50 * (1 - 0.9) is 4.999999999999999.
     band = SearchBand(window=(50, 50), y=(0, 100), overlap=(0.9, 0.9))
     assert SearchParams(bands=(band,)).place((720, 1280))[0].step == (5, 5)
 
 
-def test_an_upright_frame_scales_by_its_longer_side():
+def test_a_portrait_frame_scales_by_its_longer_side():
     (band,) = SEARCH.place((1280, 720))
     assert band == PixelBand(0, 640, 720, 896, (64, 64), (8, 8))
 
 
-def test_a_band_ends_at_the_frame():
+def test_a_band_is_clipped_to_the_frame():
     (band,) = SearchParams(bands=(SearchBand(window=(64, 64), y=(-4000, 4000)),)).place((720, 1280))
     assert (band.y1, band.y2) == (0, 720)
 
 
-def test_bands_that_hold_no_window_are_left_out():
+def test_bands_without_room_for_a_window_are_omitted():
     low = SearchBand(window=(64, 64), y=(330, 400))
     assert len(SearchParams(bands=(low, BAND), horizon=0.5).place((720, 1280))) == 1
     narrow = SearchBand(window=(64, 64), y=(0, 256), x=(0.5, 0.52))
     assert len(SearchParams(bands=(narrow, BAND), horizon=0.5).place((720, 1280))) == 1
 
 
-def test_the_overhang_is_at_the_frames_edges_only():
+def test_padding_is_added_at_the_frames_borders_only():
     left = SearchBand(window=(64, 64), y=(0, 256), x=(0, 0.5))
     right = SearchBand(window=(64, 64), y=(0, 256), x=(0.5, 1))
     bands = SearchParams(bands=(BAND, left, right), horizontal_padding=0.25).place((720, 1280))
@@ -234,30 +234,30 @@ def test_the_overhang_is_at_the_frames_edges_only():
 
 
 sizes = st.floats(16, 400)
-shares = st.floats(0, 0.95)
+overlaps = st.floats(0, 0.95)
 
 
 @given(
     st.tuples(st.integers(40, 1200), st.integers(40, 2000)),
     st.tuples(sizes, sizes),
     st.tuples(st.floats(-300, 0), st.floats(1, 500)),
-    st.tuples(shares, shares),
+    st.tuples(overlaps, overlaps),
     st.floats(0, 1),
     st.floats(0, 0.9),
 )
-def test_a_placed_band_lies_in_the_frame_and_holds_windows(
+def test_a_placed_band_is_inside_the_frame_and_has_windows(
     shape, window, y, overlap, horizon, horizontal_padding
 ):
     bands = (SearchBand(window=window, y=y, overlap=overlap),)
-    search = SearchParams(bands=bands, horizon=horizon, horizontal_padding=horizontal_padding)
+    params = SearchParams(bands=bands, horizon=horizon, horizontal_padding=horizontal_padding)
     try:
-        (band,) = search.place(shape)
+        (band,) = params.place(shape)
     except InvalidInputError:
         return
     height, width = shape
     assert 0 <= band.y1 < band.y2 <= height
-    beyond = round(horizontal_padding * band.window[0])
-    assert -beyond <= band.x1 < band.x2 <= width + beyond
+    padding = round(horizontal_padding * band.window[0])
+    assert -padding <= band.x1 < band.x2 <= width + padding
     assert all(1 <= step <= side for step, side in zip(band.step, band.window))
     windows = band_windows(band)
     assert len(windows) >= 1
@@ -267,7 +267,7 @@ def test_a_placed_band_lies_in_the_frame_and_holds_windows(
 
 @pytest.mark.parametrize("preset", ["default", "three-scales"])
 @pytest.mark.parametrize("shape", FRAMES)
-def test_the_presets_fit_the_usual_frames(shape, preset):
+def test_search_presets_fit_common_frame_sizes(shape, preset):
     bands = SearchParams.preset(preset).place(shape)
     assert all(0 <= band.y1 < band.y2 <= shape[0] for band in bands)
     # The road below the horizon is searched, across the whole width.
@@ -278,19 +278,19 @@ def test_the_presets_fit_the_usual_frames(shape, preset):
 
 @pytest.mark.parametrize("shape", [(40, 40), (10, 10), (1, 1), (15, 100)])
 @pytest.mark.parametrize("preset", ["default", "three-scales", "130-windows"])
-def test_a_tiny_frame_is_refused(shape, preset):
+def test_a_tiny_frame_is_rejected(shape, preset):
     message = f"^image of {shape[1]}x{shape[0]} pixels holds no search window .*; pass a larger image"
     with pytest.raises(InvalidInputError, match=message):
         SearchParams.preset(preset).place(shape)
 
 
-def test_a_window_is_never_blown_up_out_of_a_few_pixels():
+def test_windows_have_a_minimum_size():
     for shape in [(90, 160), (120, 160), (180, 320)]:
         for band in SearchParams.preset().place(shape):
             assert min(band.window) >= PATCH_SIZE / 4
 
 
-def test_the_first_systems_windows():
+def test_the_window_list_of_the_first_system():
     bands = SearchParams.preset("130-windows").place((720, 1280))
     placed = [(band.window, band.x1, band.x2, band.y1, band.y2) for band in bands]
     assert placed == [
@@ -299,25 +299,22 @@ def test_the_first_systems_windows():
         ((155, 165), 650, 1280, 370, 590),
         ((170, 200), 650, 1280, 400, 700),
     ]
-    # The course speaks of about 130; its own slide_window lists these 114.
+    # The course names about 130 windows; its slide_window lists these 114.
     assert [len(band_windows(band)) for band in bands] == [60, 32, 8, 14]
 
 
-def test_the_third_systems_windows_at_a_step_of_one_cell():
+def test_the_bands_of_the_third_system():
     bands = SearchParams.preset("three-scales").place((720, 1280))
     assert [band.window for band in bands] == [(96, 96), (64, 64), (51, 51)]
     assert {(band.x1, band.y1, band.x2, band.y2) for band in bands} == {(0, 400, 1280, 656)}
 
 
-# --- the pyramid of a mixture ---
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"camera_height_m": 1.2}, r"camera_height_m must be the least and the most, such as .*; got 1.2"),
-        ({"camera_height_m": (1.0, 1.2, 1.4)}, "camera_height_m must be the least and the most"),
-        ({"camera_height_m": (2.0, 1.0)}, r"camera_height_m must be the least one first; got \(2.0, 1.0\)"),
+        ({"camera_height_m": 1.2}, r"camera_height_m must be \(minimum, maximum\), such as .*; got 1.2"),
+        ({"camera_height_m": (1.0, 1.2, 1.4)}, r"camera_height_m must be \(minimum, maximum\)"),
+        ({"camera_height_m": (2.0, 1.0)}, r"camera_height_m must be in ascending order; got \(2.0, 1.0\)"),
         ({"camera_height_m": (0.0, 1.0)}, "camera_height_m must be a number, greater than 0"),
         ({"camera_height_m": (1.0, "x")}, "camera_height_m must be a number"),
         ({"min_width": 8}, "min_width must be a number, at least 16"),
@@ -328,21 +325,23 @@ def test_the_third_systems_windows_at_a_step_of_one_cell():
         ({"min_score": None}, "min_score must be a number"),
     ],
 )
-def test_pyramids_that_make_no_sense(options, message):
+def test_invalid_pyramid_params_are_rejected(options, message):
     with pytest.raises(InvalidInputError, match=message):
         PyramidParams(**options)
 
 
 @given(
-    least=st.floats(16, 200),
+    min_width=st.floats(16, 200),
     per_octave=st.integers(1, 12),
     cells=st.tuples(st.floats(2, 16), st.floats(2, 16)),
     height=st.integers(1, 3000),
 )
-def test_sizes_of_a_pyramid_rise_from_the_least_width_to_the_most_height(least, per_octave, cells, height):
-    params = PyramidParams(min_width=least, per_octave=per_octave)
+def test_cell_sizes_increase_from_the_minimum_width_to_the_maximum_height(
+    min_width, per_octave, cells, height
+):
+    params = PyramidParams(min_width=min_width, per_octave=per_octave)
     sizes = params.sizes(*cells, (height, 100))
-    assert sizes[0] == least / cells[0]
+    assert sizes[0] == min_width / cells[0]
     assert all(after / before == pytest.approx(2 ** (1 / per_octave)) for before, after in pairwise(sizes))
     assert len(sizes) == 1 or sizes[-1] * cells[1] <= params.max_height * height * (1 + 1e-9)
 
@@ -353,6 +352,6 @@ def test_rows_of_a_flat_road():
     assert everywhere.with_horizon(None) is everywhere
     known = PyramidParams(horizon=0.5, camera_height_m=[1.0, 2.0], horizon_tolerance=0.05)
     assert known.camera_height_m == (1.0, 2.0)
-    # 90 px are 1.8 m: the foot of a vehicle is 50 to 100 px below the horizon, which may be 36 px wrong.
+    # 90 px are 1.8 m: the bottom of a vehicle is 50 to 100 px below the horizon, with a tolerance of 36 px.
     assert known.rows(90, 80, (720, 1280)) == (360 + 50 - 36 - 80, 360 + 100 + 36)
     assert everywhere.with_horizon(0.4).horizon == 0.4

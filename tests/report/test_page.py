@@ -1,345 +1,308 @@
-"""The report in a real browser: chromium without a screen, driven by chromedriver over HTTP."""
+"""The content of the page."""
 
-import contextlib
-import itertools
+import base64
+import hashlib
+import html
 import json
-import os
+import math
 import re
-import shutil
-import signal
-import subprocess
 import sys
-import time
-import urllib.error
-import urllib.request
-from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
-from vehicle_detection.cli.demo import draw_clip
-from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.drawing import draw_tracks
-from vehicle_detection.report import ReportWriter
-from vehicle_detection.synthetic import render_drive
-from vehicle_detection.tracking import Track
-from vehicle_detection.video import process_video
-
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="process groups and file names of POSIX")
-
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-OPTIONS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-dev-shm-usage",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
+from tests.report.helpers import (
+    FPS,
+    FRAMES,
+    StrictParser,
+    script_data,
+    track,
+    video_report,
+    write_report,
 )
-SCREEN = {"width": 1280, "height": 900, "deviceScaleFactor": 1, "mobile": False}
-PHONE = {"width": 390, "height": 844, "deviceScaleFactor": 2, "mobile": True}
-ELEMENT = "element-6066-11e4-a52e-4f735466cecf"  # the key that the protocol gives to elements
-FRAMES, FPS = 50, 25
-SOURCE, TARGET = 'a <b>&amp; "c" #1.mp4', "50% <i> 'd' #2?.mp4"
-VIDEO = "document.querySelector('video')"
+from vehicle_detection.camera import Camera
+from vehicle_detection.classifier import load_classifier
+from vehicle_detection.detector import VehicleDetector
+from vehicle_detection.drawing import TRACK_COLORS
+from vehicle_detection.mixture import load_model
+from vehicle_detection.params import HeatParams, TrackParams
+from vehicle_detection.report import ReportWriter, page
 
-
-class Browser:
-    """A session of chromedriver: as much of https://www.w3.org/TR/webdriver as is needed here."""
-
-    def __init__(self, chromium, driver, folder):
-        self._session = ""
-        log = folder / "driver.log"
-        with log.open("w") as file:
-            self._driver = subprocess.Popen(
-                [driver, "--port=0"], stdout=file, stderr=file, start_new_session=True
-            )
-        try:
-            end = time.monotonic() + 30
-            while not (found := re.search(r"successfully on port (\d+)", log.read_text())):
-                assert self._driver.poll() is None, log.read_text()
-                assert time.monotonic() < end, log.read_text()
-                time.sleep(0.02)
-            self._address = f"http://127.0.0.1:{found[1]}/session"
-            profile = folder / "profile"
-            wanted = {
-                "goog:chromeOptions": {"binary": chromium, "args": [*OPTIONS, f"--user-data-dir={profile}"]},
-                "goog:loggingPrefs": {"browser": "ALL", "performance": "ALL"},
-            }
-            session = self.send("POST", "", {"capabilities": {"alwaysMatch": wanted}})
-            self._session = f"/{session['sessionId']}"
-        except BaseException:
-            self.close()
-            raise
-
-    def send(self, method, path, body=None):
-        data = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(self._address + self._session + path, data, method=method)
-        request.add_header("Content-Type", "application/json")
-        opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-        try:
-            with opener.open(request, timeout=60) as answer:
-                return json.load(answer)["value"]
-        except urllib.error.HTTPError as error:
-            with error:
-                raise AssertionError(error.read().decode()) from None
-
-    def run(self, expression, *words):
-        """Return the value of an expression of JavaScript."""
-        return self.send("POST", "/execute/sync", {"script": f"return {expression}", "args": words})
-
-    def until(self, expression, *, seconds=30):
-        """Wait until an expression is true."""
-        end = time.monotonic() + seconds
-        while not self.run(expression):
-            assert time.monotonic() < end, f"still not true: {expression}"
-            time.sleep(0.02)
-
-    def command(self, name, **words):
-        """Send a command of the DevTools protocol."""
-        return self.send("POST", "/goog/cdp/execute", {"cmd": name, "params": words})
-
-    def log(self, kind):
-        """Return the log since it was read last."""
-        return self.send("POST", "/se/log", {"type": kind})
-
-    def open(self, path, *, size=SCREEN, scheme="light"):
-        """Open a file in a window of a size, with an empty log, and wait for its video."""
-        self.command("Emulation.setDeviceMetricsOverride", **size)
-        scheme = {"name": "prefers-color-scheme", "value": scheme}
-        self.command("Emulation.setEmulatedMedia", features=[scheme])
-        self.send("POST", "/url", {"url": "about:blank"})
-        self.log("browser"), self.log("performance")
-        self.send("POST", "/url", {"url": path.as_uri()})
-        self.until(f"{VIDEO} !== null && {VIDEO}.readyState >= 2")
-
-    def requests(self):
-        """Return the addresses that the page has asked for."""
-        events = (json.loads(entry["message"])["message"] for entry in self.log("performance"))
-        return {
-            event["params"]["request"]["url"]
-            for event in events
-            if event["method"] == "Network.requestWillBeSent"
-        }
-
-    def element(self, selector):
-        return self.send("POST", "/element", {"using": "css selector", "value": selector})[ELEMENT]
-
-    def click(self, selector):
-        self.send("POST", f"/element/{self.element(selector)}/click", {})
-
-    def type(self, selector, text):
-        self.send("POST", f"/element/{self.element(selector)}/value", {"text": text})
-
-    def point(self, selector, share, *, press=False):
-        """Move the mouse to a share of an element's width; press its button there."""
-        self.run("document.querySelector(arguments[0]).scrollIntoView({block: 'center'})", selector)
-        width = self.run("document.querySelector(arguments[0]).getBoundingClientRect().width", selector)
-        origin = {ELEMENT: self.element(selector)}
-        moves = [{"type": "pointerMove", "origin": origin, "x": round((share - 0.5) * width), "y": 0}]
-        if press:
-            moves += [{"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0}]
-        mouse = {"type": "pointer", "id": "mouse", "actions": moves}
-        self.send("POST", "/actions", {"actions": [mouse]})
-
-    def close(self):
-        try:
-            if self._session:
-                self.send("DELETE", "")
-        finally:
-            # The driver's own group: a browser that it has started goes with it.
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self._driver.pid, signal.SIGKILL)
-            self._driver.wait()
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    chromium = next(filter(None, map(shutil.which, BROWSERS)), None)
-    driver = shutil.which("chromedriver")
-    if chromium is None or driver is None:
-        pytest.skip("no chromium and chromedriver here: apt-get install chromium chromium-driver")
-    browser = Browser(chromium, driver, tmp_path_factory.mktemp("browser"))
-    yield browser
-    browser.close()
-
-
-class Script:
-    """Stands in for the detector: one vehicle in all frames, another in those from 20 to 39."""
-
-    def reset(self, *, fps):
-        self.index = -1
-
-    def search(self, frame):
-        return None
-
-    def track(self, found, *, time):
-        self.index += 1
-        box = np.array([100.0 + self.index, 120, 180 + self.index, 180])
-        first = Track(
-            id=1,
-            box=box,
-            score=1.5,
-            state="confirmed",
-            shown=True,
-            age=1.0,
-            misses=0,
-            time_since_update=0.0,
-            velocity=(25.0, 0.0),
-            distance_m=20 + self.index / 10,
-            distance_std_m=2.0,
-            speed_mps=2.5,
-            speed_std_mps=0.5,
-        )
-        second = replace(first, id=2, box=box + 150, distance_m=None, speed_mps=-1.0)
-        tracks = (first, second) if 20 <= self.index < 40 else (first,)
-        return SimpleNamespace(index=self.index, time=time, tracks=tracks, seconds={"search": 0.01})
-
-    def annotate(self, frame, result):
-        return draw_tracks(frame, result.tracks)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """Return a folder with the page twice: the video in it, and beside it."""
-    folder = tmp_path_factory.mktemp("a #1 folder & 100%")
-    (folder / "pages").mkdir()
-    drive = render_drive(frames=FRAMES, fps=FPS, shape=(270, 480), scenario="empty")
-    draw_clip(drive, folder / SOURCE, folder / "labels.csv")
-    with VehicleDetector(n_jobs=1) as detector:
-        about = {"video": folder / TARGET, "source": folder / SOURCE, "detector": detector}
-        writers = [
-            ReportWriter(folder / "embedded.html", **about),
-            ReportWriter(folder / "pages" / "linked.html", **about, embed_limit=1000),
-        ]
-        report = process_video(
-            folder / SOURCE,
-            folder / TARGET,
-            Script(),
-            progress=False,
-            on_result=lambda result: [write(result) for write in writers],
-        )
-        for write in writers:
-            write.finish(report)
-    return folder
+UNSAFE_NAME = "\"><img src=x onerror=alert(1)>&amp;'</title><script>.mp4"
 
 
 @pytest.fixture
-def embedded(folder):
-    return folder / "embedded.html"
+def video(tmp_path_factory):
+    path = tmp_path_factory.mktemp("video") / "found.mp4"
+    path.write_bytes(bytes(range(256)) * 7)
+    return path
 
 
-def frame_shown(browser):
-    browser.until(f"!{VIDEO}.seeking")
-    return int(browser.run(f"{VIDEO}.currentTime") * FPS)
+class TestPage:
+    def test_is_complete_and_self_contained(self, tmp_path, video):
+        with VehicleDetector(n_jobs=1) as detector:
+            text = write_report(tmp_path, FRAMES, video=video, source="drive.mp4", detector=detector)
+        parsed = StrictParser(text)
+        assert text.startswith("<!DOCTYPE html>\n")
+        assert parsed.all("html") == [{"lang": "en"}]
+        assert parsed.texts["head/title"] == "Vehicles in drive.mp4"
+        (source,) = parsed.all("source")
+        kind, data = source["src"].split(",")
+        assert kind == "data:video/mp4;base64"
+        assert base64.b64decode(data, validate=True) == video.read_bytes()
+        addresses = [
+            value for _, each in parsed.elements for name, value in each.items() if name in ("src", "href")
+        ]
+        assert all(address.startswith("data:") for address in addresses)
+        assert not re.search(r"https?:|url\(|@import|//[a-z]", text.replace(data, "").replace("// ", ""))
+        identifiers = [each["id"] for _, each in parsed.elements if "id" in each]
+        assert len(set(identifiers)) == len(identifiers)
+
+    def test_its_policy_allows_its_own_script_and_style_only(self, tmp_path):
+        text = write_report(tmp_path, FRAMES)
+        (policy,) = [each["content"] for each in StrictParser(text).all("meta") if "http-equiv" in each]
+        rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
+        assert rules["default-src"] == "'none'"
+        for element, rule in (("script", "script-src"), ("style", "style-src")):
+            (code,) = re.findall(f"<{element}>(.*?)</{element}>", text, re.DOTALL)
+            digest = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
+            assert rules[rule] == f"'sha256-{digest}'"
+        # The policy forbids inline styles and event handlers.
+        assert not re.search(r'<[^>]* (style|on\w+)="', text)
+
+    def test_file_names_stay_text(self, tmp_path):
+        (tmp_path / "in").mkdir()
+        name = UNSAFE_NAME.replace("/", "_")
+        video = tmp_path / "in" / (name if sys.platform != "win32" else "found.mp4")
+        video.write_bytes(b"video")
+        text = write_report(tmp_path, FRAMES, source=f"/roads/{name}", video=video, embed_limit=3)
+        parsed = StrictParser(text)
+        assert parsed.all("img") == []
+        assert len(parsed.all("script")) == 2
+        assert parsed.texts["head/title"] == f"Vehicles in {name}"
+        assert parsed.texts["h1/bdi"] == name
+        assert parsed.texts["a/bdi"] == video.name
+
+    @settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @given(st.text(st.characters(codec="utf-8", exclude_characters="/\\\0\r\n"), min_size=1))
+    def test_any_source_name_is_escaped(self, tmp_path, name):
+        text = write_report(tmp_path, FRAMES[:1], source=f"{name}.mp4")
+        title = re.search(r"<title>(.*?)</title>", text, re.DOTALL)[1]
+        assert not set(title) & set("<>\"'")
+        assert html.unescape(title) == f"Vehicles in {name}.mp4"
+
+    def test_bytes_of_a_file_name_that_are_not_utf8_are_replaced(self, tmp_path):
+        name = b"road \xff.mp4".decode("utf-8", "surrogateescape")
+        assert "Vehicles in road ?.mp4" in write_report(tmp_path, FRAMES, source=name)
+
+    def test_a_run_without_a_video(self, tmp_path):
+        text = write_report(tmp_path, FRAMES)
+        parsed = StrictParser(text)
+        assert parsed.all("video") == []
+        assert "No video was written." in text
+        assert "go to that time in the video" not in text
+        assert parsed.texts["head/title"] == "Vehicles"
+
+    @pytest.mark.parametrize("tracks", [[], [track(1, shown=False)], [track(0, shown=False)] * 2])
+    def test_a_road_without_vehicles(self, tmp_path, tracks):
+        text = write_report(tmp_path, [tracks] * 10)
+        StrictParser(text)
+        assert text.count("No vehicle was shown.") == 2
+        assert json.loads(script_data(text))["tracks"] == []
+
+    def test_vehicles_without_distance_and_speed(self, tmp_path):
+        text = write_report(tmp_path, [[SimpleNamespace(id=7, shown=True)]] * 5)
+        StrictParser(text)
+        assert "No distance is known." in text
+        assert "No relative speed is known." in text
+        assert json.loads(script_data(text))["tracks"][0]["distance"] == [None] * 5
+
+    def test_counts_are_those_of_the_run(self, tmp_path):
+        text = write_report(tmp_path, FRAMES)
+        counts = dict(re.findall(r"<dt>([^<]*)</dt><dd>([^<]*)</dd>", text))
+        assert counts["Vehicles"] == "2"
+        assert counts["Frames"] == "50"
+        assert counts["Length"] == "0:02.0"
+        assert counts["Most at once"] == "2"
+        assert counts["Longest track"] == "#1, 2.0 s"
+        assert counts["Nearest"] == "21 m, #1"
+        rows = re.findall(r"<tr>(<th scope=\"row\">.*?)</tr>", text, re.DOTALL)
+        cells = [re.findall(r"<t[hd].*?>(.*?)</t[hd]>", row) for row in rows]
+        assert [re.sub("<.*?>", "", cell) for cell in cells[1]] == [
+            "#2", "0:00.4", "0:00.8", "10", "\N{EN DASH}", "\N{EN DASH}", "1.00",
+        ]  # fmt: skip
+        assert "decode" in text
+        assert "20.00" in text  # milliseconds per frame
+        assert "75.0%" in text
+
+    def test_tells_where_a_part_of_the_source_starts(self, tmp_path):
+        report = ReportWriter(tmp_path / "report.html")
+        for index in range(5):
+            report(SimpleNamespace(index=index, time=75.5 + index / FPS, tracks=[track(1)]))
+        report.finish(video_report(5))
+        assert "Times count from 1:15.5 of the source." in (tmp_path / "report.html").read_text()
+        assert "Times count" not in write_report(tmp_path, FRAMES)
+
+    def test_the_script_gets_the_values_of_the_charts(self, tmp_path):
+        frames = [
+            [track(3, distance=10 + index, speed=-1.25)] if index not in (4, 5) else [] for index in range(9)
+        ]
+        data = json.loads(script_data(write_report(tmp_path, frames)))
+        assert data["fps"] == FPS
+        assert data["frames"] == 9
+        assert data["step"] == 1
+        assert data["tracks"] == [
+            {
+                "id": 3,
+                "color": 2,
+                "spans": [[0, 4], [6, 9]],
+                "first": 0,
+                "distance": [10.0, 11.0, 12.0, 13.0, None, None, 16.0, 17.0, 18.0],
+                "speed": [-1.2, -1.2, -1.2, -1.2, None, None, -1.2, -1.2, -1.2],
+            }
+        ]
+
+    def test_speeds_with_large_standard_errors_are_hidden(self, tmp_path):
+        frames = [[track(1, speed=9.0, speed_std=3.5 - index)] for index in range(3)]
+        data = json.loads(script_data(write_report(tmp_path, frames)))
+        assert data["tracks"][0]["speed"] == [None, 9.0, 9.0]
+
+    @pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan, 1e300, 10**400, np.float32(math.inf)])
+    def test_infinite_and_absurd_numbers_are_unknown(self, tmp_path, value):
+        extreme = track(1, distance=value, distance_std=value, speed=value, score=value)
+        text = write_report(tmp_path, [[extreme]] * 3)
+        StrictParser(text)
+        assert "No distance is known." in text
+        body = text.split("<main>")[1].split("<script>")[0]
+        assert not re.search(r"\b(nan|NaN|inf|Infinity|None)\b", body)
+
+    def test_the_same_run_gives_the_same_page(self, tmp_path, video):
+        assert write_report(tmp_path, FRAMES, video=video) == write_report(tmp_path, FRAMES, video=video)
+
+    def test_the_page_of_an_hour_of_video_is_small(self, tmp_path):
+        frames = 90_000
+        report = ReportWriter(tmp_path / "report.html")
+        for index in range(frames):
+            report.write(index, None, [track(1 + index // 900, distance=10 + index % 900 / 10)])
+        report.finish(video_report(frames))
+        text = (tmp_path / "report.html").read_text()
+        assert len(text) < 300_000
+        StrictParser(text)
+        assert "Most shown at once in each 15 seconds" in text
+        data = json.loads(script_data(text))
+        assert len(data["tracks"]) == 100
+        assert max(len(each["distance"]) for each in data["tracks"]) <= 9
+
+    def test_many_tracks_share_rows(self, tmp_path):
+        text = write_report(tmp_path, [[track(1 + index // 10)] for index in range(300)])
+        StrictParser(text)
+        bars = re.findall(r'<g class="bar c\d".*?</g>', text)
+        assert len(bars) == 30
+        assert len({y for bar in bars for y in re.findall(r' y="([\d.]+)"', bar)}) <= 2
+        assert all("show in the video" in bar for bar in bars)
 
 
-@pytest.mark.parametrize("name", ["embedded.html", "pages/linked.html"])
-def test_the_video_plays_and_nothing_else_is_loaded(browser, folder, name):
-    browser.open(folder / name)
-    assert browser.run(f"[{VIDEO}.videoWidth, {VIDEO}.videoHeight]") == [480, 270]
-    assert browser.run(f"{VIDEO}.duration") == pytest.approx(FRAMES / FPS, abs=0.05)
-    browser.run(f"{VIDEO}.muted = true, {VIDEO}.play()")
-    browser.until(f"{VIDEO}.currentTime > 0.3")
-    browser.until(f"{VIDEO}.ended")
-    # The marks have come along.
-    browser.until("document.querySelector('.now').getAttribute('x1') === '99%'")
-    assert browser.log("browser") == []
-    schemes = {address.split(":")[0] for address in browser.requests()}
-    assert "file" in schemes
-    assert schemes <= {"file", "data", "blob"}
-    assert browser.run(f"{VIDEO}.currentSrc").startswith("file:" if "linked" in name else "blob:")
+class TestSettingsAndModel:
+    def test_of_a_classifier_of_patches(self, tmp_path):
+        camera = Camera.for_frame((720, 1280), height_m=1.75)
+        options = {"camera": camera, "track_params": TrackParams(confirm_score=0.625)}
+        with VehicleDetector("highway", n_jobs=1, **options) as detector:
+            text = write_report(tmp_path, FRAMES, detector=detector)
+        assert "<dt>confirm score</dt><dd>0.625</dd>" in text
+        assert "<dt>height m</dt><dd>1.75</dd>" in text
+        assert "<summary>Camera</summary>" in text
+        assert "<summary>Regions (fitted boxes)</summary>" in text
+        assert "64\xa0\xd7\xa064" in text
+        model = load_classifier()
+        assert model.metadata["data"]["fingerprint"] in text
+        assert f"{model.metadata['metrics']['splits']['random']['accuracy']:.4f}" in text
+        assert f"<p>{model.summary()[0]}</p>" in text
+        assert f"<dt>color space</dt><dd>{model.params.color_space}</dd>" in text
+        assert "CC BY-NC-SA 3.0" in text
 
+    def test_of_a_mixture(self, tmp_path):
+        with VehicleDetector(n_jobs=1, horizon=0.5) as detector:
+            text = write_report(tmp_path, FRAMES, detector=detector)
+        assert "<dt>horizon</dt><dd>0.5</dd>" in text
+        assert "<summary>Camera (assumed)</summary>" in text
+        assert "Regions" not in text
+        title, facts = load_model().summary()
+        assert f"<p>{title}</p>" in text
+        assert all(html.escape(fact) in text for fact in facts.values() if "'" not in fact)
+        for name, scores in load_model().metadata["metrics"]["left_out"].items():
+            assert name in text
+            assert f"{scores['f1']:.6g}" in text
+        assert "inherits the terms of the data" in text
 
-@pytest.mark.parametrize("name", ["embedded.html", "pages/linked.html"])
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_the_page_fits_a_telephone(browser, folder, name, scheme):
-    browser.open(folder / name, size=PHONE, scheme=scheme)
-    browser.run("document.querySelectorAll('details').forEach(each => each.open = true)")
-    assert browser.run("innerWidth") == PHONE["width"]
-    assert browser.run("document.documentElement.scrollWidth") <= PHONE["width"]
-    assert browser.run("document.querySelectorAll('details').length") > 5
-    # Texts of charts keep their size.
-    sizes = browser.run(
-        "[...document.querySelectorAll('svg text')].map(t => t.getBoundingClientRect().height)"
+    def test_of_the_heat_map_of_the_course(self, tmp_path):
+        with VehicleDetector(n_jobs=1, region_params=HeatParams(), horizon=0.5) as detector:
+            text = write_report(tmp_path, FRAMES, detector=detector)
+        assert "<summary>Regions (heat map)</summary>" in text
+        assert "<dt>threshold</dt><dd>2</dd>" in text
+        assert "fitted boxes" not in text
+        assert "<summary>Camera (assumed)</summary>" in text
+        assert "<dt>horizon px</dt><dd>360</dd>" in text
+
+    @pytest.mark.parametrize(
+        "metadata",
+        [
+            {},
+            {"note": "<i>mine</i>", "data": {"sources": {"own": 3}}, "metrics": 0.5},
+            {"data": "own", "metrics": {"splits": {"other": {"accuracy": 1.0}}, "left_out": {"a": "good"}}},
+            {"metrics": {"splits": {"random": "good", "sequences": {"accuracy": "high"}}, "left_out": 3}},
+        ],
     )
-    assert min(sizes) >= 10
+    @pytest.mark.parametrize("load", [load_classifier, load_model])
+    def test_metadata_may_hold_anything(self, tmp_path, load, metadata):
+        shipped = load()
+        if isinstance(shipped, type(load_classifier())):
+            model = type(shipped)(shipped.params, shipped.templates, metadata)
+        else:
+            model = shipped.with_metadata(metadata)
+        text = write_report(tmp_path, FRAMES, detector=SimpleNamespace(model=model))
+        StrictParser(text)
+        assert "License: the model inherits the terms of the data it was trained on." in text
+        assert "<i>" not in text
+
+    @pytest.mark.parametrize("model", [None, SimpleNamespace(summary=print)])
+    def test_a_detector_of_another_library_has_neither(self, tmp_path, model):
+        text = write_report(tmp_path, FRAMES, detector=SimpleNamespace(model=model))
+        assert "Settings" not in text
+        assert "Model" not in text
 
 
-def test_it_has_a_light_and_a_dark_scheme(browser, embedded):
-    grounds = []
-    for scheme in ("light", "dark"):
-        browser.open(embedded, scheme=scheme)
-        grounds.append(browser.run("getComputedStyle(document.body).backgroundColor"))
-    assert grounds == ["rgb(255, 255, 255)", "rgb(16, 20, 24)"]
+def color_schemes():
+    """Custom properties of the light and the dark color scheme."""
+    css = (Path(page.__file__).parent / "report.css").read_text(encoding="utf-8")
+    light, dark = re.findall(r":root \{(.*?)\}", css, re.DOTALL)
+    return [dict(re.findall(r"--(\w+): (#\w+);", scheme)) for scheme in (light, dark)]
 
 
-def test_bars_and_charts_lead_into_the_video(browser, embedded):
-    browser.open(embedded)
-    browser.click(".bar[data-track='2']")
-    assert frame_shown(browser) == 20
-    browser.type(".bar[data-track='1']", "\ue007")  # the enter key
-    assert frame_shown(browser) == 0
-    browser.click("td:nth-child(2) button[data-frame='20']")
-    assert frame_shown(browser) == 20
-    browser.point("figure:nth-of-type(3) .plot", 0.5, press=True)
-    assert frame_shown(browser) == pytest.approx(25, abs=1)
-    assert browser.log("browser") == []
+def luminance(color):
+    parts = [int(color[start : start + 2], 16) / 255 for start in (1, 3, 5)]
+    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
 
-def test_pointing_at_a_chart_tells_what_is_known(browser, embedded):
-    browser.open(embedded)
-    assert browser.run("document.querySelector('.told').textContent") == "0:00.0#1 20 m +2.5 m/s"
-    browser.point("figure:nth-of-type(4) .plot", 0.609)
-    told = browser.run("document.querySelector('.told').textContent")
-    assert told == "0:01.2#1 23 m +2.5 m/s#2 \u22121.0 m/s"
-    assert browser.run("document.querySelectorAll('.mark.on').length") == 4
-    assert browser.run("document.querySelector('.mark').getAttribute('x1')") == "61%"
-    assert browser.run(f"{VIDEO}.currentTime") == 0
-    browser.point("h1", 0.5)
-    assert browser.run("document.querySelectorAll('.mark.on').length") == 0
-    assert browser.run("document.querySelector('.told').textContent") == "0:00.0#1 20 m +2.5 m/s"
-    # While a bar is pointed at, the other tracks step back.
-    browser.point(".bar[data-track='2']", 0.5)
-    assert browser.run("[...document.querySelectorAll('.faded')].every(part => part.dataset.track === '1')")
-    assert browser.run("document.querySelectorAll('.faded').length") == 3
+def contrast(one, other):
+    light, dark = sorted((luminance(one), luminance(other)), reverse=True)
+    return (light + 0.05) / (dark + 0.05)
 
 
-def test_names_of_files_are_text(browser, folder):
-    browser.open(folder / "pages" / "linked.html")
-    assert browser.run("document.title") == f"Vehicles in {SOURCE}"
-    assert browser.run("document.querySelector('h1').textContent") == f"Vehicles in {SOURCE}"
-    assert browser.run("document.querySelector('h1').querySelectorAll(':scope > bdi, bdi *').length") == 1
-    assert browser.run("document.querySelector('.film a').textContent") == TARGET
+@pytest.mark.parametrize("scheme", color_schemes(), ids=["light", "dark"])
+class TestColors:
+    def test_contrast_with_the_background(self, scheme):
+        # Level AA of the Web Content Accessibility Guidelines 2.2: 4.5 for text, 3 for graphics.
+        for background in ("background", "panel"):
+            for color in ("text", "muted", "link"):
+                assert contrast(scheme[color], scheme[background]) >= 4.5, (color, background)
+        for number in range(len(TRACK_COLORS)):
+            assert contrast(scheme[f"c{number}"], scheme["background"]) >= 3.0, number
 
-
-def test_everything_to_use_has_a_name(browser, embedded):
-    browser.open(embedded)
-    nodes = browser.command("Accessibility.getFullAXTree")["nodes"]
-    named = {"heading", "image", "button", "region", "Video", "group", "link"}
-    found = [node for node in nodes if not node["ignored"] and node["role"]["value"] in named]
-    inside = ("details", "summary")
-    nameless = [
-        node["role"]["value"]
-        for node in found
-        if not node.get("name", {}).get("value") and node["role"]["value"] not in inside
-    ]
-    assert {node["role"]["value"] for node in found} >= {"heading", "image", "button", "region", "Video"}
-    assert set(nameless) <= {"group"}, nameless  # a <details> is a group without a name of its own
-    heads = browser.run("[...document.querySelectorAll('h1, h2, h3')].map(head => +head.tagName[1])")
-    assert heads[0] == 1
-    assert all(after <= before + 1 for before, after in itertools.pairwise(heads))
-
-
-def test_without_its_script_the_page_still_shows_the_video(browser, embedded):
-    browser.command("Emulation.setScriptExecutionDisabled", value=True)
-    try:
-        browser.open(embedded)
-        assert browser.run(f"{VIDEO}.currentSrc").startswith("data:video/mp4;base64,")
-        assert browser.run(f"{VIDEO}.videoWidth") == 480
-    finally:
-        browser.command("Emulation.setScriptExecutionDisabled", value=False)
+    def test_there_are_as_many_track_colors_as_in_the_video(self, scheme):
+        names = [name for name in scheme if re.fullmatch(r"c\d", name)]
+        assert names == [f"c{number}" for number in range(len(TRACK_COLORS))]

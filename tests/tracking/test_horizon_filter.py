@@ -8,31 +8,31 @@ from vehicle_detection.tracking.horizon_filter import HorizonFilter
 
 FRAME = (720, 1280)
 TRUE = Camera.for_frame(FRAME, horizon=0.56)
-DOUBT = 43.0
-GUESS = Camera.for_frame(FRAME, horizon=0.5, horizon_std_px=DOUBT)
+INITIAL_STD = 43.0
+GUESS = Camera.for_frame(FRAME, horizon=0.5, horizon_std_px=INITIAL_STD)
 
 
 def on_road(distance, *, x=0.0, width=1.8, height=1.5, length=4.0):
-    """Box of a vehicle `distance` meters ahead and `x` meters to the right, with the flank that it shows."""
+    """Box of a vehicle `distance` meters ahead and `x` meters to the right, with its visible side."""
     near, far = TRUE.focal_px / distance, TRUE.focal_px / (distance + length)
-    foot = TRUE.horizon_px + near * TRUE.height_m
+    bottom = TRUE.horizon_px + near * TRUE.height_m
     left, right = near * (x - width / 2), near * (x + width / 2)
     if x > width / 2:
         left = far * (x - width / 2)
     if x < -width / 2:
         right = far * (x + width / 2)
-    return [640 + left, foot - near * height, 640 + right, foot]
+    return [640 + left, bottom - near * height, 640 + right, bottom]
 
 
-def learn(scenes, *, camera=GUESS, noise=0.0, fps=25.0, seed=0):
-    """Feed the boxes of each frame; the number of a vehicle is its place in the list."""
+def estimated(scenes, *, camera=GUESS, noise=0.0, fps=25.0, seed=0):
+    """Camera after the boxes of all frames; the id of a vehicle is its index in the list."""
     rng = np.random.default_rng(seed)
-    known = HorizonFilter(camera)
+    horizon = HorizonFilter(camera)
     for boxes in scenes:
         array = np.array(boxes, float).reshape(-1, 4)
         array = array + rng.normal(0, noise, array.shape)
-        known.take(np.arange(len(array)) + 1, array, FRAME, 1 / fps)
-    return known.camera
+        horizon.update(np.arange(len(array)) + 1, array, FRAME, 1 / fps)
+    return horizon.camera
 
 
 def error(camera):
@@ -40,61 +40,61 @@ def error(camera):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_several_vehicles_tell_the_horizon(seed):
+def test_several_vehicles_determine_the_horizon(seed):
     cars = [on_road(15), on_road(30, x=3.6), on_road(50, x=-3.6), on_road(40)]
-    camera = learn([cars] * 125, noise=2.0, seed=seed)
+    camera = estimated([cars] * 125, noise=2.0, seed=seed)
     assert error(camera) < 8
     assert camera.horizon_std_px < 12
     assert error(GUESS) > 40
 
 
-def test_one_vehicle_that_stays_tells_less_than_one_that_comes_nearer():
-    stays = learn([[on_road(30)]] * 100)
-    comes = learn([[on_road(50 - 0.4 * step)] for step in range(100)])
-    assert comes.horizon_std_px < 0.7 * stays.horizon_std_px < 0.7 * DOUBT
-    assert error(comes) < 5
+def test_an_approaching_vehicle_contributes_more_than_one_at_constant_distance():
+    constant = estimated([[on_road(30)]] * 100)
+    approaching = estimated([[on_road(50 - 0.4 * step)] for step in range(100)])
+    assert approaching.horizon_std_px < 0.7 * constant.horizon_std_px < 0.7 * INITIAL_STD
+    assert error(approaching) < 5
 
 
-def test_vehicles_of_other_widths_that_move_tell_the_horizon_too():
+def test_moving_vehicles_of_other_widths_determine_the_horizon():
     cars = [
         [on_road(50 - 0.35 * step, width=1.6), on_road(20 + 0.3 * step, width=2.1)] for step in range(100)
     ]
-    assert error(learn(cars)) < 5
+    assert error(estimated(cars)) < 5
 
 
-def test_the_flank_of_a_vehicle_aside_is_not_taken_for_width():
+def test_the_side_of_a_vehicle_in_another_lane_does_not_count_as_width():
     cars = [[on_road(12 + 0.2 * step, x=3.6), on_road(30 - 0.1 * step, x=-3.6)] for step in range(100)]
-    assert error(learn(cars)) < 5
+    assert error(estimated(cars)) < 5
 
 
-def test_boxes_that_stand_nowhere_on_the_road_are_left_out():
+def test_boxes_that_are_not_on_the_road_are_ignored():
     cars = [on_road(15), on_road(30), on_road(50)]
-    plain = learn([cars] * 100)
+    plain = estimated([cars] * 100)
     sign = [600.0, 20.0, 660.0, 80.0]
-    assert learn([[*cars, sign]] * 100).horizon_px == pytest.approx(plain.horizon_px, abs=1.5)
+    assert estimated([[*cars, sign]] * 100).horizon_px == pytest.approx(plain.horizon_px, abs=1.5)
 
 
-def test_a_horizon_without_doubt_stays():
+def test_a_fixed_horizon_is_kept():
     known = Camera.for_frame(FRAME, horizon=0.5)
-    assert learn([[on_road(15), on_road(40)]] * 50, camera=known) is known
+    assert estimated([[on_road(15), on_road(40)]] * 50, camera=known) is known
 
 
-def test_what_is_learned_does_not_depend_on_the_frame_rate():
+def test_the_estimate_does_not_depend_on_the_frame_rate():
     cars = [on_road(15), on_road(40, x=3.6)]
-    slow, fast = (learn([cars] * int(4 * fps), fps=fps) for fps in (10.0, 50.0))
+    slow, fast = (estimated([cars] * int(4 * fps), fps=fps) for fps in (10.0, 50.0))
     assert slow.horizon_px == pytest.approx(fast.horizon_px, abs=2)
     assert slow.horizon_std_px == pytest.approx(fast.horizon_std_px, rel=0.15)
 
 
-def test_what_was_learned_gives_way_to_vehicles_that_do_not_fit():
-    known = HorizonFilter(GUESS)
+def test_the_estimate_adapts_to_vehicles_that_do_not_fit():
+    horizon = HorizonFilter(GUESS)
     ids = np.array([1, 2, 3])
     for shift, seconds in ((-40.0, 20), (0.0, 20)):
         boxes = np.array([on_road(25), on_road(40), on_road(60)]) + np.array([0, shift, 0, shift])
         for _ in range(5 * seconds):
-            known.take(ids, boxes, FRAME, 0.2)
+            horizon.update(ids, boxes, FRAME, 0.2)
         ids = ids + 3
-    assert error(known.camera) < 12
+    assert error(horizon.camera) < 12
 
 
 @given(
@@ -107,18 +107,18 @@ def test_what_was_learned_gives_way_to_vehicles_that_do_not_fit():
     st.integers(1, 30),
     st.randoms(use_true_random=False),
 )
-def test_whatever_is_seen_the_doubt_never_grows_and_the_order_does_not_matter(cars, frames, random):
+def test_the_error_never_grows_and_the_order_of_boxes_does_not_matter(cars, frames, random):
     boxes = np.array(cars, float).reshape(-1, 4)
     boxes = boxes[~truncated_edges(boxes, FRAME).any(axis=1)]
     order = list(range(len(boxes)))
     random.shuffle(order)
     one, other = HorizonFilter(GUESS), HorizonFilter(GUESS)
-    doubt = DOUBT
+    std = INITIAL_STD
     for _ in range(frames):
-        one.take(np.arange(len(boxes)), boxes, FRAME, 0.04)
-        other.take(np.array(order, np.int64), boxes[order], FRAME, 0.04)
+        one.update(np.arange(len(boxes)), boxes, FRAME, 0.04)
+        other.update(np.array(order, np.int64), boxes[order], FRAME, 0.04)
         assert np.isfinite(one.camera.horizon_px)
-        assert 0 < one.camera.horizon_std_px <= DOUBT
-        assert one.camera.horizon_std_px <= doubt * (1 + 1e-9) or len(boxes)
-        doubt = one.camera.horizon_std_px
+        assert 0 < one.camera.horizon_std_px <= INITIAL_STD
+        assert one.camera.horizon_std_px <= std * (1 + 1e-9) or len(boxes)
+        std = one.camera.horizon_std_px
     assert other.camera.horizon_px == pytest.approx(one.camera.horizon_px, abs=1e-6)

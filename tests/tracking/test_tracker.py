@@ -12,7 +12,6 @@ from vehicle_detection.evaluation import FrameBoxes, evaluate_tracks
 from vehicle_detection.params import TrackParams
 from vehicle_detection.synthetic import render_drive
 from vehicle_detection.tracking import Track, Tracker
-from vehicle_detection.tracking import kalman_filter as _kalman
 
 SHAPE = (720, 1280, 3)
 LIMITS = np.array([1280.0, 720.0, 1280.0, 720.0])
@@ -29,8 +28,9 @@ def on_road(distance, *, x=0.0, width=1.8, height=1.5):
     if distance < 1:
         return None
     pixel = CAMERA.focal_px / distance
-    foot, center = CAMERA.horizon_px + pixel * CAMERA.height_m, 640 + pixel * x
-    return np.array([center - pixel * width / 2, foot - pixel * height, center + pixel * width / 2, foot])
+    bottom, center = CAMERA.horizon_px + pixel * CAMERA.height_m, 640 + pixel * x
+    half = pixel * width / 2
+    return np.array([center - half, bottom - pixel * height, center + half, bottom])
 
 
 def play(
@@ -41,15 +41,15 @@ def play(
     noise=0.05,
     seed=0,
     params=None,
-    time_since_update=None,
+    undetected=None,
     extra=None,
     score=1.0,
     camera=None,
 ):
-    """Track a drive: `scene` gives each vehicle's box at a time, `time_since_update` who is not detected then.
+    """Track a scene: `scene` maps names to boxes as functions of time; `undetected` suppresses detections.
 
-    Detections are the visible parts, with noise on each edge that is no frame border; vehicles that show less
-    than a third are not detected. Yields time, visible boxes by name, and tracks.
+    Detections are the visible parts, with noise on each edge inside the frame; vehicles of which less than a
+    third is visible are not detected. Returns time, visible boxes by name, and tracks of each frame.
     """
     rng = np.random.default_rng(seed)
     tracker, steps = Tracker(params, fps=fps, camera=camera), []
@@ -60,11 +60,11 @@ def play(
             if box is None:
                 continue
             inside = np.clip(box, 0, LIMITS)
-            share = np.prod(inside[2:] - inside[:2]) / np.prod(box[2:] - box[:2])
-            if share <= 0:
+            visible = np.prod(inside[2:] - inside[:2]) / np.prod(box[2:] - box[:2])
+            if visible <= 0:
                 continue
             truth[name] = inside
-            if share < 1 / 3 or (time_since_update and time_since_update(name, time)):
+            if visible < 1 / 3 or (undetected and undetected(name, time)):
                 continue
             size = np.tile(inside[2:] - inside[:2], 2)
             noisy = inside + rng.normal(0, noise, 4) * size * (inside == box)
@@ -99,7 +99,7 @@ def shown_ids(steps):
 
 
 def jitter(steps, name):
-    """Mean change of the four edge errors from one frame to the next, in pixels."""
+    """Mean change of the edge errors from frame to frame in pixels."""
     errors = [
         next(t.box for t in tracks if t.shown) - truth[name]
         for _, truth, tracks in steps
@@ -108,29 +108,29 @@ def jitter(steps, name):
     return float(np.abs(np.diff(errors, axis=0)).mean())
 
 
-class TestFollowing:
-    def test_a_vehicle_at_constant_speed_is_followed_without_lag(self):
+class TestSmoothing:
+    def test_a_vehicle_at_constant_speed_is_tracked_without_lag(self):
         steps = play({"car": lambda t: np.array(CAR) + np.array([120.0, 0, 120.0, 0]) * t}, 4, noise=0.0)
         last = steps[-1]
         np.testing.assert_allclose(last[2][0].box, last[1]["car"], atol=0.5)
         assert last[2][0].velocity == pytest.approx((120, 0), abs=3)
 
     @pytest.mark.parametrize("seed", range(4))
-    def test_boxes_are_steady(self, seed):
-        """The raw boxes jump by 5.5 px a frame; tracked ones stay below the target of 1.5."""
+    def test_boxes_are_smooth(self, seed):
+        """Detections change by 5.5 px per frame; the target for tracks is at most 1.5."""
         steps = play({"car": lambda t: on_road(20 + t, x=2.0)}, 8, seed=seed)
         assert jitter(steps, "car") < 1.5
         overlaps = [overlap for time, overlap, _ in matched(steps, "car") if time > 0.5]
         assert np.mean(overlaps) > 0.9
 
-    def test_one_wrong_box_does_not_throw_the_track(self):
+    def test_one_wrong_box_hardly_moves_the_track(self):
         tracker = Tracker()
         for _ in range(30):
             tracker.update(found(CAR), SHAPE)
         (track,) = tracker.update(found([560.0, 340.0, 760.0, 520.0]), SHAPE)
         assert np.abs(track.box - CAR).max() < 12
 
-    def test_a_vehicle_that_changes_lanes_after_a_long_straight_is_followed(self):
+    def test_a_lane_change_after_a_long_straight_is_tracked(self):
         steps = play({"car": lambda t: on_road(15, x=3.6 / (1 + np.exp(-4 * (t - 6))))}, 9, noise=0.02)
         errors = [
             np.abs(tracks[0].box[[0, 2]] - truth["car"][[0, 2]]).max()
@@ -140,7 +140,7 @@ class TestFollowing:
         assert max(errors) < 25
 
     @pytest.mark.parametrize("fps", [10.0, 25.0, 60.0])
-    def test_a_track_that_is_wrong_comes_round_soon(self, fps):
+    def test_a_wrong_track_adapts_within_a_second(self, fps):
         tracker, larger = Tracker(fps=fps), [570.0, 380.0, 720.0, 520.0]
         for _ in range(int(2 * fps)):
             tracker.update(found(CAR), SHAPE)
@@ -148,7 +148,7 @@ class TestFollowing:
             (track,) = tracker.update(found(larger), SHAPE)
         assert iou_matrix([larger], [track.box])[0, 0] > 0.85
 
-    def test_a_box_that_flickers_between_two_sizes_leaves_the_track_steady(self):
+    def test_a_box_that_alternates_between_two_sizes_keeps_the_track_smooth(self):
         tracker, boxes = Tracker(), []
         for index in range(100):
             part = [600.0, 400.0, 700.0, 450.0]
@@ -157,20 +157,20 @@ class TestFollowing:
         assert np.abs(np.diff(boxes, axis=0)).max() < 6
 
     @pytest.mark.parametrize("speed", [8.0, 18.0, 25.0])
-    def test_oncoming_vehicles_are_followed_as_they_grow(self, speed):
+    def test_oncoming_vehicles_are_tracked_as_they_grow(self, speed):
         steps = play({"car": lambda t: on_road(60 - speed * t, x=-3.0)}, 48 / speed)
         assert ids(steps, "car") == {1}
         overlaps = [overlap for time, overlap, _ in matched(steps, "car") if time > 0.5]
         assert np.mean(overlaps) > 0.75
 
     @pytest.mark.parametrize("smoother", ["history", "nearest"])
-    def test_the_simple_smoothers_follow_a_slow_vehicle_too(self, smoother):
+    def test_the_simple_smoothers_track_a_slow_vehicle(self, smoother):
         params = TrackParams(smoother=smoother)
         steps = play({"car": lambda t: on_road(20 + t, x=2.0)}, 6, params=params)
         assert ids(steps, "car") == {1}
         assert np.mean([overlap for time, overlap, _ in matched(steps, "car") if time > 0.5]) > 0.85
 
-    def test_the_kalman_smoother_follows_a_fast_one_better(self):
+    def test_the_kalman_smoother_tracks_a_fast_vehicle_better(self):
         scene = {"car": lambda t: np.array([100.0, 400, 200, 490]) + np.array([220.0, 0, 220.0, 0]) * t}
         best = {}
         for smoother in ("kalman", "history", "nearest"):
@@ -180,7 +180,7 @@ class TestFollowing:
         assert best["kalman"] > best["history"] + 0.05
 
 
-class TestLife:
+class TestLifeCycle:
     @pytest.mark.parametrize("frames", [1, 2, 3])
     def test_false_positives_of_up_to_three_frames_are_never_shown(self, frames):
         tracker, shown = Tracker(), []
@@ -201,11 +201,11 @@ class TestLife:
             tracks = tracker.update(found(CAR, score=1.5), SHAPE)
             assert [track.id for track in tracks if track.shown] == ids_so_far
             assert not any(track.shown for track in tracker.update(Detections.empty(), SHAPE))
-            tracker.cut()
-        (weak,) = tracker.update(found(CAR, score=1.0), SHAPE)
-        assert not weak.shown
+            tracker.end_tracks()
+        (track,) = tracker.update(found(CAR, score=1.0), SHAPE)
+        assert not track.shown
 
-    def test_a_weak_vehicle_is_shown_later_and_a_very_weak_one_never(self):
+    def test_a_lower_score_delays_confirmation_and_a_very_low_one_prevents_it(self):
         first = {}
         for score in (1.5, 0.3, 0.15):
             tracker = Tracker()
@@ -215,7 +215,7 @@ class TestLife:
         assert first[1.5] < first[0.3] < 12
         assert first[0.15] is None
 
-    def test_scores_below_the_birth_score_start_no_track_but_keep_one(self):
+    def test_scores_below_the_high_threshold_continue_tracks_but_start_none(self):
         tracker = Tracker(TrackParams(high_threshold=0.5))
         assert tracker.update(found(CAR, score=0.4), SHAPE) == ()
         for _ in range(10):
@@ -224,7 +224,7 @@ class TestLife:
         assert (track.state, track.misses) == ("confirmed", 0)
 
     @pytest.mark.parametrize(("score", "misses"), [(-0.4, 0), (-1.4, 0), (-1.6, 5)])
-    def test_a_believed_vehicle_is_kept_by_weak_detections(self, score, misses):
+    def test_a_confirmed_track_is_continued_by_low_score_detections(self, score, misses):
         tracker = Tracker()
         for _ in range(10):
             tracker.update(found(CAR, score=3.0), SHAPE)
@@ -232,13 +232,13 @@ class TestLife:
             (track,) = tracker.update(found(CAR, score=score), SHAPE)
         assert track.misses == misses
 
-    def test_weak_detections_alone_are_no_vehicle(self):
+    def test_low_score_detections_alone_are_never_shown(self):
         for score in (-0.4, -1.0):
             tracker = Tracker()
             for _ in range(100):
                 assert not any(track.shown for track in tracker.update(found(CAR, score=score), SHAPE))
 
-    def test_a_vehicle_that_wavers_about_the_least_score_is_followed_without_a_gap(self):
+    def test_a_score_that_alternates_around_the_threshold_gives_a_track_without_gaps(self):
         tracker, shown = Tracker(), []
         for frame in range(100):
             tracks = tracker.update(found(CAR, score=0.9 if frame % 3 else -0.7), SHAPE)
@@ -246,7 +246,7 @@ class TestLife:
         assert shown.index([1]) < 25
         assert all(ids == [1] for ids in shown[25:])
 
-    def test_a_weak_detection_takes_no_vehicle_from_a_clear_one(self):
+    def test_a_low_score_detection_does_not_replace_a_high_score_one(self):
         tracker, moved = Tracker(), [612.0, 400.0, 712.0, 490.0]
         for _ in range(10):
             tracker.update(found(CAR, score=3.0), SHAPE)
@@ -254,19 +254,19 @@ class TestLife:
         assert track.score > 2
         assert track.box[0] > CAR[0] + 2
 
-    def test_a_weak_detection_must_be_nearer_than_a_clear_one(self):
+    def test_the_maximum_distance_is_smaller_for_low_score_detections(self):
         width = CAR[2] - CAR[0]
-        for share, clear, weak in ((0.2, 0, 0), (0.5, 0, 1)):
-            beside = np.array(CAR) + np.array([share * width, 0, share * width, 0])
-            for score, misses in ((3.0, clear), (-1.0, weak)):
+        for shift, high, low in ((0.2, 0, 0), (0.5, 0, 1)):
+            beside = np.array(CAR) + np.array([shift * width, 0, shift * width, 0])
+            for score, misses in ((3.0, high), (-1.0, low)):
                 tracker = Tracker()
                 for _ in range(10):
                     tracker.update(found(CAR, score=3.0), SHAPE)
                 tracks = tracker.update(found(beside, score=score), SHAPE)
                 assert tracks[0].misses == misses
 
-    def test_a_vehicle_that_stops_growing_does_not_run_away(self):
-        """As one that comes in from the left, fast at first: its box shall not shoot beyond it later on."""
+    def test_a_vehicle_that_stops_growing_is_not_overshot(self):
+        """A vehicle that enters from the left, fast at first: its box must not move beyond it later."""
         rng = np.random.default_rng(0)
         tracker = Tracker()
         for frame in range(120):
@@ -289,7 +289,7 @@ class TestLife:
         assert states[9] == ("confirmed", 1, 0)
         assert states[11] == ("coasting", 1, 2)
 
-    def test_a_lost_vehicle_is_shown_for_a_while_then_hidden_then_ended(self):
+    def test_a_vehicle_without_detections_is_shown_briefly_and_ends_later(self):
         tracker = Tracker()
         for _ in range(50):
             tracker.update(found(CAR), SHAPE)
@@ -300,23 +300,23 @@ class TestLife:
         assert alive == 25  # 1 s
 
     @pytest.mark.parametrize(
-        ("params", "least"), [({"confirm_hits": 6}, 6), ({"confirm_seconds": 0.4}, 11)], ids=["hits", "time"]
+        ("params", "frames"), [({"confirm_hits": 6}, 6), ({"confirm_seconds": 0.4}, 11)], ids=["hits", "time"]
     )
-    def test_hits_and_time_each_hold_a_track_back(self, params, least):
+    def test_number_of_hits_and_time_each_delay_confirmation(self, params, frames):
         tracker = Tracker(TrackParams(**params))
         tracker.update(Detections.empty(), SHAPE)
         shown = [any(t.shown for t in tracker.update(found(CAR, score=9.0), SHAPE)) for _ in range(20)]
-        assert shown.index(True) + 1 == least
+        assert shown.index(True) + 1 == frames
 
     @pytest.mark.parametrize("fps", [10.0, 60.0])
-    def test_neither_few_boxes_nor_a_short_time_are_enough(self, fps):
-        """At 10 frames a second three boxes take 0.2 s, at 60 four boxes take 0.05 s: not shown yet."""
+    def test_confirmation_requires_hits_and_time_at_any_frame_rate(self, fps):
+        """At 10 fps three detections take 0.2 s; at 60 fps four take 0.05 s: neither is confirmed yet."""
         tracker = Tracker(fps=fps)
         tracker.update(Detections.empty(), SHAPE)
         shown = [any(t.shown for t in tracker.update(found(CAR, score=9.0), SHAPE)) for _ in range(12)]
         assert shown.index(True) + 1 == (4 if fps == 10 else 9)
 
-    def test_a_vehicle_seen_for_a_moment_is_shown_for_a_moment_only(self):
+    def test_a_briefly_detected_vehicle_coasts_only_briefly(self):
         tracker = Tracker()
         for _ in range(5):
             tracker.update(found(CAR), SHAPE)
@@ -334,7 +334,7 @@ class TestLife:
         assert 0.5 < growth < 2.5
 
     def test_a_coasting_vehicle_slows_down(self):
-        """Speeds in the image do not last: undamped it would be 72 px on."""
+        """The velocity decays: without the decay the box would move by 72 px."""
         tracker = Tracker()
         for index in range(50):
             (last,) = tracker.update(found(np.add(CAR, [3 * index, 0, 3 * index, 0])), SHAPE)
@@ -350,13 +350,13 @@ class TestLife:
             shown |= {track.id for track in tracks if track.shown}
         assert shown == {1}
 
-    def test_a_second_box_that_comes_later_makes_no_second_track(self):
+    def test_a_later_second_box_on_a_vehicle_makes_no_second_track(self):
         steps = play(
             {"car": lambda t: on_road(15)}, 4, extra=lambda t: [np.array([600, 420, 670, 500.0])] * (t > 1)
         )
         assert shown_ids(steps) == {1}
 
-    def test_a_box_of_the_same_size_that_is_shifted_by_a_third_makes_no_second_track(self):
+    def test_a_box_shifted_by_a_third_makes_no_second_track(self):
         shifted = [635.0, 400.0, 735.0, 490.0]  # IoU 0.48, and neither covers 0.7 of the other
         tracker, shown = Tracker(), set()
         for index in range(50):
@@ -364,7 +364,7 @@ class TestLife:
             shown |= {track.id for track in tracks if track.shown}
         assert shown == {1}
 
-    def test_ids_are_consecutive_whatever_else_was_tried(self):
+    def test_ids_are_consecutive_despite_false_positives(self):
         rng = np.random.default_rng(3)
         tracker, seen = Tracker(), []
         for index in range(200):
@@ -377,21 +377,21 @@ class TestLife:
         assert len(seen) <= 3
 
 
-class TestMeetings:
+class TestOcclusion:
     @pytest.mark.parametrize("seed", range(4))
     def test_identity_survives_a_second_behind_another_vehicle(self, seed):
         scene = {"near": lambda t: on_road(12, x=-3 + 1.5 * t), "far": lambda t: on_road(25, x=1 - 0.5 * t)}
-        steps = play(scene, 5, seed=seed, time_since_update=lambda name, t: name == "far" and 1.5 <= t < 2.5)
+        steps = play(scene, 5, seed=seed, undetected=lambda name, t: name == "far" and 1.5 <= t < 2.5)
         assert ids(steps, "near") != ids(steps, "far")
         assert len(ids(steps, "near")) == len(ids(steps, "far")) == 1
         assert shown_ids(steps) == {1, 2}
 
     def test_a_hidden_vehicle_is_shown_throughout(self):
         scene = {"near": lambda t: on_road(10), "far": lambda t: on_road(20, x=3 - min(t, 4) * 0.8)}
-        steps = play(scene, 5, time_since_update=lambda name, t: name == "far" and 2 <= t < 3)
+        steps = play(scene, 5, undetected=lambda name, t: name == "far" and 2 <= t < 3)
         assert all(track for time, _, track in matched(steps, "far") if 0.5 < time < 3)
 
-    def test_a_hidden_vehicle_is_drawn_for_a_second_and_remembered_for_two(self):
+    def test_a_hidden_vehicle_is_shown_for_one_second_and_kept_for_two(self):
         tracker, near, far = Tracker(), [300.0, 380, 800, 600], [745.0, 420, 835, 465]
         for _ in range(60):
             tracker.update(found(near, far), SHAPE)
@@ -401,16 +401,16 @@ class TestMeetings:
 
     @pytest.mark.parametrize("seed", range(4))
     def test_crossing_vehicles_keep_their_identity(self, seed):
-        def hides(name, t):
+        def is_hidden(name, t):
             return name == "far" and abs((-4 + 3 * t) / 12 - (2 - 1.5 * t) / 22) * CAMERA.focal_px < 70
 
         scene = {"near": lambda t: on_road(12, x=-4 + 3 * t), "far": lambda t: on_road(22, x=2 - 1.5 * t)}
-        steps = play(scene, 2.6, seed=seed, time_since_update=hides)
+        steps = play(scene, 2.6, seed=seed, undetected=is_hidden)
         assert len(ids(steps, "near")) == len(ids(steps, "far")) == 1
         assert shown_ids(steps) == {1, 2}
 
     @pytest.mark.parametrize("seed", range(4))
-    def test_two_vehicles_in_one_region_stay_two(self, seed):
+    def test_two_vehicles_in_one_merged_box_stay_two(self, seed):
         def left(t):
             return on_road(15, x=-1.2)
 
@@ -423,24 +423,24 @@ class TestMeetings:
             return [together] if 1.5 <= t < 3 else []
 
         scene = {"left": left, "right": right}
-        steps = play(scene, 5, seed=seed, time_since_update=lambda name, t: 1.5 <= t < 3, extra=region)
+        steps = play(scene, 5, seed=seed, undetected=lambda name, t: 1.5 <= t < 3, extra=region)
         for name in scene:
             assert len(ids(steps, name)) == 1
             assert all(overlap > 0.6 for time, overlap, _ in matched(steps, name) if time > 0.3)
         assert shown_ids(steps) == {1, 2}
 
-    def test_a_vehicle_that_would_have_moved_far_is_no_longer_drawn_behind_another(self):
-        """Where it is by now is a guess, for which nothing is seen."""
+    def test_a_hidden_vehicle_that_must_have_moved_far_is_not_shown(self):
+        """Its position is only a guess."""
         tracker, near = Tracker(), [300.0, 380, 800, 600]
         for index in range(40):
             far = [900.0 - 8 * index, 420, 960 - 8 * index, 465]
             tracker.update(found(near, far), SHAPE)
         shown = [sum(t.shown for t in tracker.update(found(near), SHAPE)) for _ in range(30)]
-        # At 200 px a second a box of 60 px has moved by half of itself after 0.15 s.
+        # At 200 px per second, a box of 60 px moves by half of its width in 0.15 s.
         assert shown[:3] == [2, 2, 2]
         assert set(shown[4:]) == {1}
 
-    def test_a_vehicle_seen_for_a_moment_is_not_drawn_for_long_behind_another(self):
+    def test_a_briefly_detected_vehicle_is_shown_only_briefly_behind_another(self):
         tracker, near = Tracker(), [300.0, 380, 800, 600]
         for index in range(40):
             tracks = tracker.update(found(near, *[[745.0, 420, 835, 465]] * (index >= 34)), SHAPE)
@@ -486,7 +486,7 @@ class TestTime:
             "near": lambda t: on_road(12, x=-3 + 1.5 * t),
             "far": lambda t: on_road(25, x=1 - 0.5 * t) if t < 4 else None,
         }
-        steps = play(scene, 5.5, fps=fps, time_since_update=lambda name, t: name == "far" and 1.5 <= t < 2.5)
+        steps = play(scene, 5.5, fps=fps, undetected=lambda name, t: name == "far" and 1.5 <= t < 2.5)
         assert shown_ids(steps) == {1, 2}
         for name in scene:
             assert len(ids(steps, name)) == 1
@@ -499,7 +499,7 @@ class TestTime:
         assert hidden - 4 == pytest.approx(0.3, abs=0.11)
         assert ended - 4 == pytest.approx(1.0, abs=0.11)
 
-    def test_speed_in_the_image_is_a_second_not_a_frame(self):
+    def test_velocity_is_in_pixels_per_second(self):
         speeds = []
         for fps in (10.0, 25.0, 60.0):
             scene = {"car": lambda t: np.array(CAR) + np.array([60.0, 0, 60.0, 0]) * t}
@@ -521,27 +521,27 @@ class TestTime:
         assert tracker.update(Detections.empty(), SHAPE, time=9 / 25) is before
         assert tracker.update(found(CAR), SHAPE, time=10 / 25)[0].misses == 0
 
-    def test_pictures_that_come_twice_do_not_disturb(self):
-        """Film at 24 frames a second in a video of 30: each fifth picture is a copy."""
+    def test_duplicated_frames_do_not_disturb_the_tracks(self):
+        """Film at 24 fps in a video of 30 fps: every fifth frame is a duplicate."""
         tracker, seen = Tracker(fps=30), []
         for index in range(90):
-            picture = index - index // 5
-            seen.append(tracker.update(found(on_road(20 + 0.1 * picture)), SHAPE)[0])
+            film_frame = index - index // 5
+            seen.append(tracker.update(found(on_road(20 + 0.1 * film_frame)), SHAPE)[0])
         assert {track.id for track in seen[10:]} == {1}
         assert all(track.shown for track in seen[10:])
         assert np.abs(np.diff([track.box for track in seen[20:]], axis=0)).mean() < 1.0
 
-    def test_after_a_cut_nothing_is_dragged_along(self):
+    def test_a_scene_cut_resets_tracks_and_horizon(self):
         tracker = Tracker()
         for index in range(50):
             tracker.update(found(on_road(15 + 0.1 * index), on_road(40, x=3.6)), SHAPE)
-        learned = tracker.camera.horizon_std_px
-        tracker.cut()
+        estimated_std = tracker.camera.horizon_std_px
+        tracker.end_tracks()
         assert tracker.update(Detections.empty(), SHAPE) == ()
-        assert tracker.camera.horizon_std_px > 2 * learned
+        assert tracker.camera.horizon_std_px > 2 * estimated_std
 
     @pytest.mark.parametrize("times", [[0.0, 0.04, 0.0], [0.0, 0.04, 2.0]], ids=["back", "gap"])
-    def test_a_jump_in_time_ends_all_tracks_and_ids_go_on(self, times):
+    def test_a_jump_in_time_ends_all_tracks_and_ids_continue(self, times):
         tracker = Tracker(TrackParams(confirm_hits=1, confirm_seconds=0.0, confirm_score=0.1))
         seen = [[t.id for t in tracker.update(found(CAR, score=2.0), SHAPE, time=time)] for time in times]
         assert seen == [[1], [1], [2]]
@@ -553,16 +553,16 @@ class TestTime:
         (track,) = tracker.update(found(CAR), (1080, 1920, 3))
         assert (track.id, track.age) == (0, 0.0)
 
-    def test_cut_ends_all_tracks_and_ids_go_on(self):
+    def test_end_tracks_ends_all_tracks_and_ids_continue(self):
         tracker = Tracker()
         for _ in range(10):
             tracker.update(found(CAR), SHAPE)
-        tracker.cut()
+        tracker.end_tracks()
         for _ in range(10):
             tracks = tracker.update(found(CAR), SHAPE)
         assert [track.id for track in tracks] == [2]
 
-    def test_reset_starts_afresh(self):
+    def test_reset_restores_the_initial_state(self):
         tracker = Tracker()
         runs = []
         for _ in range(2):
@@ -591,11 +591,11 @@ class TestDistance:
             speeds.append(abs(track.speed_mps - speed) / track.speed_std_mps)
             assert track.distance_std_m < 0.25 * truth
             assert track.speed_std_mps < 3
-        # The scene's camera and vehicle are the assumed ones, so that only the boxes' noise is left.
+        # Camera and vehicle are the assumed ones, so only the noise of the boxes contributes.
         assert np.mean(np.array(distances) < 2) > 0.9
         assert np.mean(np.array(speeds) < 2) > 0.9
 
-    def test_a_truck_is_not_taken_for_a_near_car_forever(self):
+    def test_the_distance_of_a_truck_is_corrected_over_time(self):
         scene = {"truck": lambda t: on_road(20.0, width=2.5, height=3.5)}
         steps = play(scene, 6, noise=0.03, camera=CAMERA)
         (track,) = steps[-1][2]
@@ -623,8 +623,8 @@ class TestDistance:
         assert frames[-1].distance_m is None
 
     @pytest.mark.parametrize("seed", range(3))
-    def test_the_horizon_of_an_unknown_camera_is_learned(self, seed):
-        """The guess is 43 px off; with it, what is 30 m ahead would be 50 m or 22 m ahead."""
+    def test_the_horizon_of_an_unknown_camera_is_estimated(self, seed):
+        """The initial guess is wrong by 43 px, which changes a distance of 30 m to 50 m or 22 m."""
         scene = {"near": lambda t: on_road(14 + 2 * t), "far": lambda t: on_road(45 - 3 * t, x=3.6)}
         wrong = Camera.for_frame(SHAPE, horizon=0.5, horizon_std_px=43.0)
         steps = play(scene, 6, seed=seed, noise=0.04, camera=wrong)
@@ -633,7 +633,7 @@ class TestDistance:
             assert track.distance_m == pytest.approx(distance, rel=0.15)
             assert abs(track.distance_m - distance) < 2.5 * track.distance_std_m
 
-    def test_another_camera_is_learned_anew(self):
+    def test_another_camera_resets_the_horizon(self):
         tracker = Tracker()
         for index in range(50):
             tracker.update(found(on_road(15 + 0.1 * index), on_road(40, x=3.6)), SHAPE)
@@ -642,84 +642,16 @@ class TestDistance:
 
     def test_a_given_camera_is_used(self):
         low, high = (Camera.for_frame(SHAPE, horizon=0.5, height_m=height) for height in (1.0, 2.0))
-        told = []
+        distances = []
         for camera in (low, high):
             tracker = Tracker(camera=camera)
             for _ in range(50):
                 (track,) = tracker.update(found([600.0, 400, 700, 490]), SHAPE)
-            told.append(track.distance_m)
-        assert told[1] > told[0] * 1.2
+            distances.append(track.distance_m)
+        assert distances[1] > distances[0] * 1.2
 
 
-class TestFilters:
-    def state(self):
-        mean, cov = _kalman.start(np.array([CAR, [100.0, 300, 180, 420]]), np.full((2, 4), 5.0))
-        mean[:, 4:] = [[30.0, -4.0, 6.0, 3.0], [-80.0, 2.0, 9.0, 8.0]]
-        return mean, cov, np.full((2, 4), 7.0)
-
-    def test_boxes_and_states_are_inverse(self):
-        mean, _, _ = self.state()
-        np.testing.assert_allclose(_kalman.boxes_of(mean), [CAR, [100.0, 300, 180, 420]])
-        np.testing.assert_allclose(_kalman.state_of(np.array(CAR)), mean[0, :4])
-
-    def test_two_predictions_equal_one_over_the_whole_time(self):
-        mean, cov, density = self.state()
-        once = _kalman.predict(mean, cov, 0.3, density)
-        twice = _kalman.predict(*_kalman.predict(mean, cov, 0.1, density), 0.2, density)
-        for one, two in zip(once, twice, strict=True):
-            np.testing.assert_allclose(one, two, atol=1e-9)
-
-    def test_no_time_changes_nothing(self):
-        mean, cov, density = self.state()
-        for before, after in zip((mean, cov), _kalman.predict(mean, cov, 0.0, density), strict=True):
-            np.testing.assert_array_equal(before, after)
-
-    def test_a_measured_box_draws_the_state_and_makes_it_surer(self):
-        mean, cov, density = self.state()
-        mean, cov = _kalman.predict(mean, cov, 0.04, density)
-        edges = _kalman.boxes_of(mean) + 4.0
-        after, spread, _ = _kalman.update(
-            mean, cov, np.zeros((2, 4)), edges, np.full((2, 4), 25.0), np.zeros(2, bool), 0.75
-        )
-        moved = _kalman.boxes_of(after) - _kalman.boxes_of(mean)
-        assert ((moved > 0) & (moved < 4)).all()
-        assert (np.linalg.eigvalsh(cov - spread) > -1e-9).all()
-
-    def test_edges_that_are_not_seen_do_not_count(self):
-        mean, cov, _ = self.state()
-        variance = np.array([[25.0, 25.0, _kalman.UNKNOWN, 25.0]] * 2)
-        results = []
-        for right in (0.0, 500.0):
-            edges = _kalman.boxes_of(mean) + np.array([3.0, 1.0, right, 1.0])
-            results.append(
-                _kalman.update(mean, cov, np.zeros((2, 4)), edges, variance, np.zeros(2, bool), 0.75)[0]
-            )
-        np.testing.assert_allclose(*results, atol=0.02)
-
-    def test_inputs_are_not_changed(self):
-        mean, cov, density = self.state()
-        copies = mean.copy(), cov.copy()
-        _kalman.predict(mean, cov, 0.1, density)
-        far = _kalman.boxes_of(mean) + 90.0
-        _kalman.update(mean, cov, np.full((2, 4), 5.0), far, density, np.zeros(2, bool), 0.75)
-        start, spread = _kalman.range_start(CAMERA)
-        start, spread = start[None], spread[None]
-        _kalman.range_update(
-            start,
-            spread,
-            np.array([CAR]),
-            np.zeros((1, 4), bool),
-            np.zeros(1),
-            CAMERA,
-            dt=0.04,
-            alike=0.04,
-        )
-        np.testing.assert_array_equal(mean, copies[0])
-        np.testing.assert_array_equal(cov, copies[1])
-        np.testing.assert_array_equal(start[0], _kalman.range_start(CAMERA)[0])
-
-
-class TestSameResult:
+class TestDeterminism:
     def drive(self, order):
         rng, shuffler = np.random.default_rng(5), np.random.default_rng(order)
         tracker, result = Tracker(), []
@@ -754,19 +686,19 @@ class TestSameResult:
 
 class TestArguments:
     @pytest.mark.parametrize("fps", [0, -25, math.nan, math.inf, None, "25"])
-    def test_refuses_a_frame_rate(self, fps):
+    def test_rejects_invalid_frame_rates(self, fps):
         with pytest.raises(InvalidInputError, match=r"fps must be a number.*; pass the video's frame rate"):
             Tracker(fps=fps)
 
-    def test_refuses_other_params_and_cameras(self):
+    def test_rejects_invalid_params_and_cameras(self):
         with pytest.raises(
             InvalidInputError, match=r"params must be a TrackParams, got .*pass TrackParams\(\)"
         ):
-            Tracker({"gate": 1})
+            Tracker({"max_distance": 1})
         with pytest.raises(InvalidInputError, match=r"camera must be a Camera, got 3 \(int\)"):
             Tracker(camera=3)
 
-    def test_refuses_malformed_frames_and_keeps_its_state(self):
+    def test_rejects_malformed_frames_and_keeps_its_state(self):
         tracker = Tracker()
         for _ in range(10):
             tracker.update(found(CAR), SHAPE)
@@ -785,43 +717,44 @@ class TestArguments:
         ("arguments", "message"),
         [
             ({"smoother": "mean"}, "smoother must be one of 'kalman', 'history', 'nearest'"),
-            ({"memory": 0}, "memory must be a number, greater than 0"),
+            ({"score_time_constant": 0}, "score_time_constant must be a number, greater than 0"),
             ({"confirm_hits": 0}, "confirm_hits must be an integer from 1"),
             ({"confirm_seconds": -1}, "confirm_seconds must be a number, at least 0"),
             ({"max_coast": 0.1}, "show_coast must be at most max_coast.*change both"),
-            ({"gate": math.nan}, "gate must be a number, greater than 0"),
-            ({"max_overlap": 1.5}, "max_overlap must be a number, at least 0 and at most 1"),
-            ({"box_noise": 0}, "box_noise must be a number, greater than 0"),
+            ({"max_distance": math.nan}, "max_distance must be a number, greater than 0"),
+            ({"max_iou": 1.5}, "max_iou must be a number, at least 0 and at most 1"),
+            ({"measurement_noise": 0}, "measurement_noise must be a number, greater than 0"),
             ({"nearest_weight": 0}, "nearest_weight must be a number, greater than 0"),
             ({"high_threshold": "low"}, "high_threshold must be a number"),
         ],
     )
-    def test_params_refuse(self, arguments, message):
+    def test_params_reject_invalid_values(self, arguments, message):
         with pytest.raises(InvalidInputError, match=message):
             TrackParams(**arguments)
 
-    def test_boxes_outside_the_frame_are_left_out(self):
+    def test_boxes_outside_the_frame_are_ignored(self):
         outside = found([1300.0, 400, 1400, 500], [-90.0, 10, -5, 60], [100.0, 100, 100, 200])
         assert Tracker().update(outside, SHAPE) == ()
 
-    def test_results_cannot_be_changed(self):
+    def test_results_are_immutable(self):
         (track,) = Tracker().update(found(CAR), SHAPE)
         with pytest.raises(ValueError, match="read-only"):
             track.box[0] = 1
         with pytest.raises(AttributeError):
             track.id = 7
 
-    def test_integer_boxes_are_taken(self):
+    def test_integer_boxes_are_accepted(self):
         tracker = Tracker()
         for _ in range(5):
             tracks = tracker.update(Detections(np.array([[600, 400, 700, 490]]), np.array([1.0])), SHAPE)
         assert tracks[0].box.dtype == np.float64
 
 
-def hand_over(truth, shape, *, seed, misses=0.1, clutter=0.3):
-    """Detections of a drawn drive as a good detector would make them, without drawing it.
+def simulated_detections(truth, shape, *, seed, misses=0.1, clutter=0.3):
+    """Simulate the detections of a good detector on a drive that is not rendered.
 
-    Edges are off by 3 pixels of a frame of 1280, one box in ten is missing, false ones come at random places.
+    Edges have an error of 3 pixels at a width of 1280, one box in ten is missing, and false positives have
+    random positions.
     """
     rng = np.random.default_rng(seed)
     height, width = shape
@@ -870,14 +803,14 @@ DRIVES = [
 
 
 @pytest.mark.parametrize(("scenario", "shape", "frames"), DRIVES)
-def test_the_tracker_does_its_part_of_the_drawn_drives(scenario, shape, frames):
-    """With boxes that are nearly right, what is left of the benchmark's errors is the tracker's own."""
+def test_rendered_drives_are_tracked_from_good_detections(scenario, shape, frames):
+    """With nearly correct detections, the remaining errors are those of the tracker."""
     drive = render_drive(frames=frames, scenario=scenario, shape=shape, random_state=21)
     camera = Camera.for_frame(shape, horizon=0.5, horizon_std_px=0.06 * shape[0])
     tracker = Tracker(fps=drive.fps, camera=camera)
     shown = [
         [track for track in tracker.update(boxes, shape) if track.shown]
-        for boxes in hand_over(drive.truth, shape, seed=1)
+        for boxes in simulated_detections(drive.truth, shape, seed=1)
     ]
     scores = evaluate_tracks(
         labels_of([[(track.id, track.box, False) for track in tracks] for tracks in shown]),
@@ -917,7 +850,7 @@ frame_strategy = st.tuples(
 
 @settings(max_examples=60)
 @given(st.lists(frame_strategy, min_size=1, max_size=25), st.sampled_from(["kalman", "history", "nearest"]))
-def test_whatever_comes_tracks_are_sound(frames, smoother):
+def test_arbitrary_detections_give_valid_tracks(frames, smoother):
     params = TrackParams(smoother=smoother, confirm_hits=1, confirm_seconds=0.0, confirm_score=-1.0)
     tracker, time, known = Tracker(params), 0.0, 0
     for rows, step, repeats in frames:
@@ -925,21 +858,21 @@ def test_whatever_comes_tracks_are_sound(frames, smoother):
         for _ in range(repeats):
             time += step
             tracks = tracker.update(detections, SHAPE, time=time)
-            believed = [track.id for track in tracks if track.id]
-            assert len(set(believed)) == len(believed)
-            assert believed == sorted(believed)
-            assert max(believed, default=0) <= known + len(detections)
-            known = max([known, *believed])
+            confirmed_ids = [track.id for track in tracks if track.id]
+            assert len(set(confirmed_ids)) == len(confirmed_ids)
+            assert confirmed_ids == sorted(confirmed_ids)
+            assert max(confirmed_ids, default=0) <= known + len(detections)
+            known = max([known, *confirmed_ids])
             for track in tracks:
-                assert_sound(track)
-            filters = tracker._filters
-            for cov in (filters.cov, filters.range_cov):
+                assert_valid(track)
+            states = tracker._states
+            for cov in (states.cov, states.range_cov):
                 assert np.isfinite(cov).all()
                 if len(cov):
                     assert np.linalg.eigvalsh(cov).min() > -1e-3
 
 
-def assert_sound(track: Track) -> None:
+def assert_valid(track: Track) -> None:
     x1, y1, x2, y2 = track.box
     assert 0 <= x1 < x2 <= 1280
     assert 0 <= y1 < y2 <= 720

@@ -1,11 +1,11 @@
-"""Frames out of the planes of video, and back."""
+"""Conversion of frames to planes and back."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vehicle_detection.video.yuv import Coding, planes_from_rgb, rgb_from_planes
+from vehicle_detection.video.yuv import ColorEncoding, planes_from_rgb, rgb_from_planes
 
 VALUES = st.integers(0, 255)
 SIZES = st.integers(1, 9)
@@ -18,13 +18,13 @@ def planes_of(frame):
     return planes
 
 
-def frame_of(planes, coding):
+def frame_of(planes, encoding):
     height, width = planes.shape[0] * 2 // 3, planes.shape[1]
-    return rgb_from_planes(planes, coding, np.empty((3, height, width), np.uint8))
+    return rgb_from_planes(planes, encoding, np.empty((3, height, width), np.uint8))
 
 
 @given(SIZES, SIZES, VALUES, VALUES, VALUES)
-def test_planes_hold_the_color_of_video(half_height, half_width, red, green, blue):
+def test_planes_have_the_values_of_bt601(half_height, half_width, red, green, blue):
     planes = planes_of(np.full((half_height * 2, half_width * 2, 3), (red, green, blue), np.uint8))
     luma = 0.299 * red + 0.587 * green + 0.114 * blue
     expected = (
@@ -39,9 +39,9 @@ def test_planes_hold_the_color_of_video(half_height, half_width, red, green, blu
 
 
 @given(VALUES, VALUES, VALUES, st.sampled_from(["unknown", "bt470bg", "bt709", "bt2020nc"]), st.booleans())
-def test_frames_follow_the_formula_of_their_coding(luma, blue, red, space, full):
+def test_frames_follow_the_formula_of_their_encoding(luma, blue, red, space, full):
     planes = np.array([[luma] * 2] * 2 + [[blue, red]], np.uint8)
-    frame = frame_of(planes, Coding(space, full))
+    frame = frame_of(planes, ColorEncoding(space, full))
     kr, kb = {"bt709": (0.2126, 0.0722), "bt2020nc": (0.2627, 0.0593)}.get(space, (0.299, 0.114))
     y = luma / 255 if full else (luma - 16) / 219
     u, v = ((value - 128) / (255 if full else 224) for value in (blue, red))
@@ -52,22 +52,22 @@ def test_frames_follow_the_formula_of_their_coding(luma, blue, red, space, full)
 
 
 @given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**32 - 1))
-def test_gray_survives_the_way_out_and_back(height, width, seed):
+def test_gray_is_unchanged_after_both_conversions(height, width, seed):
     gray = np.random.default_rng(seed).integers(0, 256, (height, width, 1), np.uint8).repeat(3, axis=2)
-    back = frame_of(planes_of(gray), Coding())
+    back = frame_of(planes_of(gray), ColorEncoding())
     assert np.abs(back[:height, :width].astype(int) - gray).max() <= 2
-    # An odd side grows by its last column or row.
+    # Odd sides are extended by their last column or row.
     assert (back[height:] == back[height - 1 : height]).all()
     assert (back[:, width:] == back[:, width - 1 : width]).all()
 
 
 def test_thin_lines_keep_their_color():
-    # The color of one pixel in four would be either red or black in every other column.
+    # The color of only one pixel of four would be pure red or black.
     lines = np.zeros((16, 16, 3), np.uint8)
     lines[:, 1::2] = (255, 0, 0)
     assert planes_of(lines)[16:].reshape(2, 8, 8)[1].mean() == pytest.approx(128 + 112 / 2, abs=1.5)
 
 
-def test_a_coding_of_an_unknown_color_space_says_so():
-    assert Coding("bt709").known
-    assert not Coding("ycgco").known
+def test_an_encoding_knows_whether_it_is_supported():
+    assert ColorEncoding("bt709").supported
+    assert not ColorEncoding("ycgco").supported

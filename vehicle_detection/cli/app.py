@@ -1,6 +1,6 @@
-"""The command line: ``vehicle-detection ...``.
+"""The command line, ``vehicle-detection``: errors and exit codes, and the commands on images and video.
 
-Heavy imports stand in the commands, so that ``--help`` answers at once.
+Commands import heavy libraries when they run, so that ``--help`` is fast.
 """
 
 from __future__ import annotations
@@ -13,51 +13,64 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperArgument, TyperGroup
 
 from vehicle_detection import __version__
 from vehicle_detection.cli.output import (
     capture_stderr,
     check_distinct_paths,
+    option_names,
     output_folder,
     print_error,
     print_facts,
+    rename_argument,
 )
 from vehicle_detection.cli.train import fetch, info, train, train_frames
 from vehicle_detection.cli.tune import tune
-from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
+from vehicle_detection.errors import DatasetError, InvalidInputError, VehicleDetectionError
 
 if TYPE_CHECKING:
     from vehicle_detection.boxes import Detections
-    from vehicle_detection.classifier import VehicleClassifier
     from vehicle_detection.detector import VehicleDetector
-    from vehicle_detection.mixture import TemplateMixture
 
-BAD_INPUT, INTERRUPTED = 2, 130
+FAILURE, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
 
 
 class _Commands(TyperGroup):
-    """Commands whose expected errors end in one line on standard error."""
+    """Commands whose expected errors become one line on standard error."""
 
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
+        except (InvalidInputError, DatasetError) as error:
+            print_error(f"error: {rename_argument(str(error), self._option_names(ctx))}")
+            raise typer.Exit(BAD_INPUT) from None
         except VehicleDetectionError as error:
             print_error(f"error: {error}")
             raise typer.Exit(BAD_INPUT) from None
-        except OSError as error:  # the disk is full, a name is too long
+        except OSError as error:  # such as a full disk
             if error.errno == errno.EPIPE:
                 raise
-            print_error(f"error: {error}")
-            raise typer.Exit(1) from None
+            reason = error.strerror or str(error)
+            print_error(f"error: {error.filename}: {reason}" if error.filename else f"error: {reason}")
+            raise typer.Exit(FAILURE) from None
         except KeyboardInterrupt:
             print_error("interrupted")
             raise typer.Exit(INTERRUPTED) from None
 
+    def _option_names(self, ctx: Any) -> dict[str, str]:
+        """Map the arguments of the command's function to the names that its user knows."""
+        command = self.get_command(ctx, ctx.invoked_subcommand)
+        return {
+            param.name: str(param.metavar) if isinstance(param, TyperArgument) else param.opts[-1]
+            for param in (command.params if command else ())
+            if param.name
+        }
+
 
 app = typer.Typer(
     cls=_Commands,
-    help="Find and follow vehicles in dash-cam images and video.",
+    help="Detect and track vehicles in dash-cam images and video.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -80,7 +93,7 @@ def _show_version(wanted: bool) -> None:
 
 
 @app.callback()
-def _start(
+def _global_options(
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
     ] = False,
@@ -90,29 +103,28 @@ def _start(
 
 Model = Annotated[
     str,
-    typer.Option("--model", metavar="NAME|FILE", help='"default": any road; "highway": fastest; or a file.'),
+    typer.Option(
+        metavar="NAME|FILE", help='"default" (any road), "highway" (fastest), or the path of a model file.'
+    ),
 ]
-Horizon = Annotated[
-    float | None,
-    typer.Option(metavar="F", help="Height of the horizon as a share of the frame's height, 0 at the top."),
-]
+HORIZON_HELP = "Height of the horizon as a fraction of the frame's height, 0 at the top."
 
 
 @app.command()
+@option_names(random_state="--seed")
 def demo(
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to write to.")] = Path(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to write.")] = Path(
         "demo"
     ),
-    frames: Annotated[int, typer.Option(metavar="N", help="Length of the drive.")] = 120,
-    seed: Annotated[int, typer.Option(metavar="N", help="Seed of the drive.")] = 0,
+    frames: Annotated[int, typer.Option(metavar="N", help="Number of frames.")] = 120,
+    seed: Annotated[int, typer.Option(metavar="N", help="Random seed of the scene.")] = 0,
 ) -> None:
-    """Draw a drive, annotate it with the shipped model and score it against the truth."""
+    """Draw a drive, annotate it with the default model and score it against the ground truth."""
     from vehicle_detection.cli.demo import FILES, run_demo
     from vehicle_detection.detector import VehicleDetector
 
-    with output_folder(output, "-o"), VehicleDetector() as detector:
-        result = run_demo(output, detector, frames=frames, random_state=seed, progress=True)
-    scores = result.scores
+    with output_folder(output, "--output"), VehicleDetector() as detector:
+        report, scores = run_demo(output, detector, frames=frames, random_state=seed)
     print_facts(
         f"{scores.frames} drawn frames of 1280x720, {scores.vehicles} vehicles, {scores.tracks} tracks",
         {
@@ -120,7 +132,7 @@ def demo(
             "mean IoU": f"{scores.mean_iou:.3f}",
             "MOTA": f"{scores.mota:.3f}",
             "identity switches": scores.id_switches,
-            "speed": f"{result.report.frames_per_second:.1f} frames/s",
+            "speed": f"{report.frames_per_second:.1f} frames/s",
         },
     )
     typer.echo(f"wrote {', '.join(FILES)} in {output}")
@@ -136,30 +148,30 @@ def detect(
         Path | None, typer.Option(metavar="FILE.csv", help="Table of all boxes, by file name.")
     ] = None,
     model: Model = "default",
-    horizon: Horizon = None,
+    horizon: Annotated[float | None, typer.Option(metavar="F", help=HORIZON_HELP)] = None,
 ) -> None:
-    """Find the vehicles of images."""
+    """Detect the vehicles of images."""
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.export import write_boxes
-    from vehicle_detection.mixture import load_model
 
     _check_images(images, output, boxes)
-    with VehicleDetector(load_model(model), horizon=horizon) as detector, output_folder(output, "-o"):
+    with VehicleDetector(model, horizon=horizon) as detector, output_folder(output, "--output"):
         found = _detect_each(images, detector, output)
         if boxes is None:
             for _ in found:
                 pass
         else:
-            rows = write_boxes(found, boxes)
+            with option_names(path="--boxes"):
+                rows = write_boxes(found, boxes)
             typer.echo(f"wrote {rows} boxes to {boxes}")
 
 
 def _check_images(images: list[Path], output: Path | None, boxes: Path | None) -> None:
-    """Refuse what would fail, or overwrite something, after a part of the work is done."""
+    """Refuse images that would fail, or be overwritten, after a part of the work is done."""
     for image in images:
         if image.is_dir():
             raise InvalidInputError(
-                f"IMAGE {image} is a folder; name the files in it, such as {image / '*.jpg'}"
+                f"IMAGE {image} is a folder; choose files in it, such as {image / '*.jpg'}"
             )
         if not image.exists():
             raise InvalidInputError(f"IMAGE {image} does not exist; check the path")
@@ -167,21 +179,22 @@ def _check_images(images: list[Path], output: Path | None, boxes: Path | None) -
             raise InvalidInputError(f"--boxes {boxes} is one of the images; choose another name")
         if output is not None and output.exists() and output.samefile(image.parent):
             raise InvalidInputError(
-                f"-o {output} is the folder of {image.name}, which would be overwritten; choose another"
+                f"--output {output} is the folder of {image.name}, which would be overwritten; choose another"
             )
     by_name: dict[str, Path] = {}
     for image in images:
         other = by_name.setdefault(image.name, image)
         if other != image and (output is not None or boxes is not None):
             raise InvalidInputError(
-                f"IMAGE {other} and {image} have the same name, by which results go; take a folder at a time"
+                f"IMAGE {other} and {image} have the same file name, which identifies the results; "
+                "process one folder at a time"
             )
 
 
 def _detect_each(
     images: list[Path], detector: VehicleDetector, output: Path | None
 ) -> Iterator[tuple[str, Detections]]:
-    """Search one image after the other, print what is found, and write the annotated image."""
+    """Detect the vehicles of each image, print them, and write the annotated image."""
     import cv2
 
     from vehicle_detection.drawing import draw_boxes
@@ -207,10 +220,14 @@ def _detect_each(
 
 
 @app.command()
+@option_names(target="--output")
 def video(
     source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Video to read.")],
-    target: Annotated[
-        Path, typer.Argument(metavar="TARGET", help="Video to write: .mp4, .m4v, .mov or .mkv.")
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--output", metavar="TARGET", help="Annotated video to write: .mp4, .m4v, .mov or .mkv."
+        ),
     ],
     tracks: Annotated[
         Path | None, typer.Option(metavar="FILE.csv", help="Table of all tracks: .csv, .jsonl or .txt (MOT).")
@@ -224,50 +241,50 @@ def video(
         typer.Option("--diagnostics", help="Show frame, positive windows, heat map and tracks side by side."),
     ] = False,
     model: Model = "default",
-    start: Annotated[float | None, typer.Option(metavar="S", help="Second to start at.")] = None,
-    end: Annotated[float | None, typer.Option(metavar="S", help="Second to end at.")] = None,
+    start: Annotated[float | None, typer.Option(metavar="S", help="Start time in seconds.")] = None,
+    end: Annotated[float | None, typer.Option(metavar="S", help="End time in seconds.")] = None,
     preset: Annotated[
         str, typer.Option(metavar="P", help="Speed of the H.264 encoder, ultrafast to placebo.")
     ] = "veryfast",
     horizon: Annotated[
         str | None,
         typer.Option(
-            metavar="F|auto",
-            help='Height of the horizon as a share of the frame\'s height, 0 at the top; "auto": look at the '
-            "vehicles first.",
+            metavar="F|auto", help=f'{HORIZON_HELP} "auto" estimates it from vehicles in a sample of frames.'
         ),
     ] = None,
-    no_audio: Annotated[bool, typer.Option("--no-audio", help="Leave out the sound.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors.")] = False,
-    profile: Annotated[bool, typer.Option("--profile", help="Show the time of each stage.")] = False,
+    no_audio: Annotated[bool, typer.Option("--no-audio", help="Write no sound.")] = False,
+    quiet: Annotated[bool, typer.Option("-q", "--quiet", help="Print errors only.")] = False,
+    profile: Annotated[bool, typer.Option("--profile", help="Print the time of each stage.")] = False,
 ) -> None:
-    """Follow the vehicles of a video and write it again with their boxes."""
+    """Track the vehicles of a video and write an annotated copy."""
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.export import TrackWriter
     from vehicle_detection.mixture import load_model
     from vehicle_detection.report import ReportWriter
     from vehicle_detection.video import process_video
 
-    named = {"--tracks": tracks, "--report": report}
-    outputs = {name: path for name, path in named.items() if path is not None}
-    check_distinct_paths(outputs, {"SOURCE": source, "TARGET": target})
+    outputs = {"--output": output, "--tracks": tracks, "--report": report}
+    check_distinct_paths(outputs, {"SOURCE": source})
     with contextlib.ExitStack() as stack:
         writers: list[Callable[[Any], object]] = []
         if tracks is not None:
-            writers.append(stack.enter_context(TrackWriter(tracks)))
+            with option_names(path="--tracks"):
+                writers.append(stack.enter_context(TrackWriter(tracks)))
         loaded = load_model(model)
         if horizon == "auto":
-            share = _look_for_horizon(source, loaded, start, end, quiet)
+            with VehicleDetector(loaded) as detector:
+                fraction = _estimate_horizon(source, detector, start, end, quiet)
         else:
-            share = None if horizon is None else _as_share(horizon)
-        detector = stack.enter_context(VehicleDetector(loaded, horizon=share, diagnostics=diagnostics))
+            fraction = None if horizon is None else _parse_horizon(horizon)
+        detector = stack.enter_context(VehicleDetector(loaded, horizon=fraction, diagnostics=diagnostics))
         page = None
         if report is not None:
-            page = ReportWriter(report, video=target, source=source, detector=detector)
+            with option_names(path="--report"):
+                page = ReportWriter(report, video=output, source=source, detector=detector)
             writers.append(page)
         done = process_video(
             source,
-            target,
+            output,
             detector,
             start=start,
             end=end,
@@ -282,64 +299,61 @@ def video(
         lines = str(done).splitlines()
         typer.echo("\n".join(lines if profile else lines[:1]))
     if not quiet:
-        typer.echo(f"wrote {' and '.join(map(str, (target, *outputs.values())))}")
+        typer.echo(f"wrote {', '.join(str(path) for path in outputs.values() if path is not None)}")
 
 
-def _as_share(horizon: str) -> float:
+def _parse_horizon(text: str) -> float:
     try:
-        return float(horizon)
+        return float(text)
     except ValueError:
         raise InvalidInputError(
-            f"--horizon must be a share of the frame's height, such as 0.55, or auto; got {horizon!r}"
+            f"--horizon must be a fraction of the frame's height, such as 0.55, or auto; got {text!r}"
         ) from None
 
 
-def _look_for_horizon(
-    source: Path,
-    model: VehicleClassifier | TemplateMixture,
-    start: float | None,
-    end: float | None,
-    quiet: bool,
+def _estimate_horizon(
+    source: Path, detector: VehicleDetector, start: float | None, end: float | None, quiet: bool
 ) -> float | None:
-    """Estimate the horizon of a video from its vehicles, and say what came of it."""
-    from vehicle_detection.detector import VehicleDetector
+    """Estimate the horizon of a video from its vehicles, and print the result."""
     from vehicle_detection.video import estimate_video_horizon
 
-    with VehicleDetector(model) as detector:
-        found = estimate_video_horizon(source, detector, start=start, end=end)
-    if not quiet and found is None:
-        print_error("warning: --horizon auto: the vehicles do not tell the horizon; it is left open")
-    elif not quiet and found is not None:
-        typer.echo(f"horizon {found.horizon:.3f}, give or take {found.error:.3f}, from {found.boxes} boxes")
-    return None if found is None else found.horizon
+    found = estimate_video_horizon(source, detector, start=start, end=end)
+    if found is None:
+        if not quiet:
+            print_error(
+                "warning: --horizon auto: too few vehicles to estimate the horizon; searching all rows"
+            )
+        return None
+    if not quiet:
+        typer.echo(
+            f"horizon {found.horizon:.3f} (standard error {found.horizon_std:.3f}, {found.n_boxes} boxes)"
+        )
+    return found.horizon
 
 
 @app.command()
 def evaluate(
     predictions: Annotated[Path, typer.Argument(metavar="PREDICTIONS.csv", help="Boxes or tracks.")],
     labels: Annotated[Path, typer.Argument(metavar="LABELS.csv", help="True boxes.")],
-    iou: Annotated[float, typer.Option(metavar="F", help="Overlap from which a box is right.")] = 0.5,
-    regions: Annotated[
+    iou: Annotated[float, typer.Option(metavar="F", help="Minimum IoU of a correct box.")] = 0.5,
+    ignored_as_regions: Annotated[
         bool,
-        typer.Option(
-            "--regions/--no-regions", help="Do not judge boxes of which half lies in an ignored box."
-        ),
+        typer.Option("--ignored-as-regions", help="Ignore boxes of which half lies in an ignored box."),
     ] = False,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="File for all scores.")] = None,
 ) -> None:
-    """Score boxes, and tracks where there are any, against labels."""
+    """Score boxes, and tracks if there are any, against labels."""
     from json import dumps
 
     from vehicle_detection._common import atomic_write, check_target
     from vehicle_detection.evaluation import evaluate_detections, evaluate_tracks, read_labels
 
     if json is not None:
-        check_distinct_paths(
-            {"--json": check_target(json, "--json")}, {"PREDICTIONS": predictions, "LABELS": labels}
-        )
+        check_target(json, "--json")
+        check_distinct_paths({"--json": json}, {"PREDICTIONS": predictions, "LABELS": labels})
     found, true = read_labels(predictions), read_labels(labels)
     scores: dict[str, Any] = {
-        "detections": evaluate_detections(found, true, iou=iou, ignored_as_regions=regions)
+        "detections": evaluate_detections(found, true, iou=iou, ignored_as_regions=ignored_as_regions)
     }
     if (found.tracks >= 0).any() and (true.tracks >= 0).any():
         scores["tracks"] = evaluate_tracks(found, true, iou=iou)

@@ -1,4 +1,4 @@
-"""What the command line writes: lines, tables, folders that go again if nothing came of them."""
+"""Output of the commands: lines, tables, files and folders, and errors that name options."""
 
 from __future__ import annotations
 
@@ -18,17 +18,32 @@ from vehicle_detection.errors import InvalidInputError
 
 Result = TypeVar("Result")
 
-# Wide enough for a fingerprint: a table in a file or pipe is not to be folded.
+# Width of tables that are not printed to a terminal; fits a fingerprint in one line.
 _PIPE_WIDTH = 120
 
 
 def print_error(message: str) -> None:
-    """Write one line to standard error, whatever line breaks the message has."""
+    """Print one line to standard error, without the line breaks of the message."""
     typer.echo(" ".join(message.split()), err=True)
 
 
+def rename_argument(message: str, options: Mapping[str, str]) -> str:
+    """Replace the library's argument at the start of an error message by the command's option."""
+    argument, space, rest = message.partition(" ")
+    return f"{options.get(argument, argument)}{space}{rest}"
+
+
+@contextlib.contextmanager
+def option_names(**options: str) -> Iterator[None]:
+    """Name the options of arguments in errors; for options named differently from the library's arguments."""
+    try:
+        yield
+    except InvalidInputError as error:
+        raise InvalidInputError(rename_argument(str(error), options)) from None
+
+
 def print_table(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table; columns of numbers stand to the right."""
+    """Print a table, with columns of numbers aligned to the right."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -43,7 +58,7 @@ def print_table(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]])
 
 
 def print_facts(title: str, facts: Mapping[str, Any]) -> None:
-    """Print a title, and under it names and values in two columns."""
+    """Print a title, and below it names and values in two columns."""
     typer.secho(title, bold=True)
     width = max(map(len, facts), default=0)
     for name, value in facts.items():
@@ -52,61 +67,62 @@ def print_facts(title: str, facts: Mapping[str, Any]) -> None:
         typer.echo(f"  {name:<{width}}  {text}")
 
 
-def check_distinct_paths(targets: Mapping[str, Path], sources: Mapping[str, Path]) -> None:
-    """Refuse a target that is a source, or another target."""
+def check_distinct_paths(targets: Mapping[str, Path | None], sources: Mapping[str, Path]) -> None:
+    """Refuse a target that is also a source or another target."""
     seen = {path.resolve(): f"{name} {path}" for name, path in sources.items()}
     for name, path in targets.items():
+        if path is None:
+            continue
         other = seen.setdefault(path.resolve(), f"{name} {path}")
         if other != f"{name} {path}":
-            raise InvalidInputError(f"{name} {path} is {other} as well; choose another name")
+            raise InvalidInputError(f"{name} {path} is also {other}; choose another name")
 
 
 @contextlib.contextmanager
 def capture_stderr() -> Iterator[list[str]]:
-    """Collect what image codecs, being no Python, write to standard error; the list is filled at the end."""
+    """Collect the lines that C libraries, such as image codecs, write to standard error in the block."""
     lines: list[str] = []
     sys.stderr.flush()
-    kept = os.dup(2)
+    original = os.dup(2)
     try:
         with tempfile.TemporaryFile() as file:
             os.dup2(file.fileno(), 2)
             try:
                 yield lines
             finally:
-                os.dup2(kept, 2)
+                os.dup2(original, 2)
             file.seek(0)
             lines += file.read().decode("utf-8", "replace").splitlines()
     finally:
-        os.close(kept)
+        os.close(original)
 
 
 @contextlib.contextmanager
 def output_folder(folder: Path | None, option: str) -> Iterator[None]:
-    """Make a folder for results; after an error or an interrupt it goes again, unless something is in it."""
+    """Create a folder for results; after an error or an interrupt, remove it again if it is empty."""
     if folder is None:
         yield
         return
-    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    created = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InvalidInputError(
-            f"{option} must be a folder, {folder} cannot be made: {error.strerror}; choose another"
+            f"{option} must be a folder, {folder} cannot be created: {error.strerror}; choose another"
         ) from error
     try:
         yield
     except BaseException:
-        for path in made:
+        for path in created:
             with contextlib.suppress(OSError):
                 path.rmdir()
         raise
 
 
-def interruptible(function: Callable[[], Result]) -> Result:
-    """Call a function that computes for long without listening, so that Ctrl-C takes effect at once.
+def run_interruptible(function: Callable[[], Result]) -> Result:
+    """Call a function that computes for seconds without returning to Python, so that Ctrl-C acts at once.
 
-    The solver of the SVM does not return to Python for seconds. It runs in a thread that the process does not
-    wait for: nothing that must be tidied up belongs in `function`.
+    After an interrupt its thread is abandoned, so `function` must not need any cleanup.
     """
     outcome: Future[Result] = Future()
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vehicle_detection.cli.output import check_distinct_paths, interruptible, print_table
+from vehicle_detection.cli.output import check_distinct_paths, print_table, run_interruptible
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def tune(
             )
         return compare_configurations(patches, expand_grid(values), splits=split, seeds=(seed,), **options)
 
-    table = interruptible(work)
+    table = run_interruptible(work)
     if whole:
         write_results(table, out)
     final = table[table["stage"] == ("final" if halving else "compare")]

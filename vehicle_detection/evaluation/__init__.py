@@ -16,12 +16,13 @@ from vehicle_detection.evaluation.labelled_frames import (
     keyed_frames,
     keys_of,
 )
-from vehicle_detection.evaluation.matching import match_detections, prepare_evaluation
+from vehicle_detection.evaluation.matching import DetectionMatches, match_detections, prepare_evaluation
 from vehicle_detection.evaluation.readers import read_labels
 from vehicle_detection.evaluation.tracks import TrackScores, evaluate_tracks
 
 __all__ = [
     "NO_TRACK",
+    "DetectionMatches",
     "DetectionScores",
     "FrameBoxes",
     "FrameKey",

@@ -1,169 +1,111 @@
-"""An explorer for notebooks: turn the parameters and see at once what they find in a frame.
+"""An explorer for notebooks: change the detector's parameters and see what it finds in a frame.
 
-`Explorer` holds the state and answers with pictures and boxes, without any widget. The scores of all windows
-of a frame are computed once for each horizon and kept; everything else is chosen from them. The widgets, made
-by `Explorer.widget`, are a thin layer that hands on what the sliders say.
+`Explorer` keeps the parameters and computes windows, boxes and images without any widget. A frame is searched
+once per model, horizon and set of bands; thresholds and region parameters only select from the cached result.
+`Explorer.widget` adds sliders that set the same parameters.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar, cast
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_choice, check_image, check_integer, check_type, describe
+from vehicle_detection._common import check_choice, check_image, check_integer, describe
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera
-from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier, load_classifier
+from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.drawing import TRACK_COLORS, draw_boxes
+from vehicle_detection.drawing import TRACK_COLORS, blend, draw_boxes, heat_image
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
-from vehicle_detection.explorer.widgets import Panel, lay_out
+from vehicle_detection.explorer.widgets import Panel, build_widgets
 from vehicle_detection.heatmap import frame_heat, label_boxes
 from vehicle_detection.images import read_image
-from vehicle_detection.params import HeatParams, RegionParams, SearchParams
+from vehicle_detection.mixture import TemplateMixture
+from vehicle_detection.params import HeatParams, PyramidParams, RegionParams, SearchParams
 from vehicle_detection.regions import find_vehicles
-from vehicle_detection.search import BandSearch
 
 Image = NDArray[np.uint8]
-Frames = Sequence[Image | str | os.PathLike[str]] | Mapping[str, Image | str | os.PathLike[str]] | FrameSet
-
-Key = TypeVar("Key")
-
-# Score at which a window has the brightest color.
-_BRIGHTEST = 2.0
-
-
-def named_sources(frames: object) -> dict[str, Callable[[], Image]]:
-    """Name each frame and say how to get it; images are checked at once, files when they are read."""
-    if isinstance(frames, FrameSet):
-        return {name: _reader(frames.folder / name) for name in frames.names}
-    if isinstance(frames, Mapping):
-        pairs = [(str(name), frame) for name, frame in frames.items()]
-    elif isinstance(frames, (list, tuple)):
-        paths = [isinstance(frame, (str, os.PathLike)) for frame in frames]
-        pairs = [
-            (Path(frame).name if path else f"frame {number}", frame)
-            for number, (frame, path) in enumerate(zip(frames, paths))
-        ]
-        if len({name for name, _ in pairs}) < len(pairs):
-            pairs = [(str(frame) if path else name, frame) for (name, frame), path in zip(pairs, paths)]
-    else:
-        raise InvalidInputError(
-            f"frames must be a list of images or paths, or a mapping from names to them; "
-            f"got {describe(frames)}; wrap a single one in a list"
-        )
-    if not pairs:
-        raise InvalidInputError("frames must hold at least one image; got none")
-    return {
-        name: _reader(frame) if isinstance(frame, (str, os.PathLike)) else _holder(frame, name)
-        for name, frame in pairs
-    }
-
-
-def _reader(path: str | os.PathLike[str]) -> Callable[[], Image]:
-    return lambda: read_image(path)
-
-
-def _holder(image: object, name: str) -> Callable[[], Image]:
-    checked = check_image(image, f"frames[{name!r}]")
-    return lambda: checked
-
-
-def remember(memory: OrderedDict[Key, Value], key: Key, make: Callable[[], Value], most: int) -> Value:
-    """Return the value of a key, made if it is not known; the one unused for longest is forgotten."""
-    if key not in memory:
-        memory[key] = make()
-        while len(memory) > most:
-            memory.popitem(last=False)
-    memory.move_to_end(key)
-    return memory[key]
-
-
-def _palette() -> Image:
-    """Plasma from dark to bright, ``(256, 3)`` RGB."""
-    ramp = np.arange(256, dtype=np.uint8)[:, None]
-    return np.asarray(cv2.applyColorMap(ramp, cv2.COLORMAP_PLASMA)[:, 0, ::-1], np.uint8)
-
-
-def put_windows(picture: Image, windows: Detections, shrink: float) -> None:
-    """Draw windows by their scores into a picture, the best last."""
-    order = np.argsort(windows.scores, kind="stable")
-    levels = (windows.scores[order] * (255 / _BRIGHTEST)).clip(100, 255).astype(int)
-    colors = _palette()[levels].tolist()
-    for (x1, y1, x2, y2), color in zip((windows.boxes[order] * shrink).round().astype(int).tolist(), colors):
-        cv2.rectangle(picture, (x1, y1), (x2 - 1, y2 - 1), color, 1)
-
-
-def lay_heat(picture: Image, heat: NDArray[np.float32]) -> Image:
-    """Blend heat over a copy of a picture, the stronger the hotter."""
-    small = np.asarray(cv2.resize(heat, picture.shape[1::-1]), np.float32)
-    peak = float(small.max())
-    level = (small * (255 / peak if peak > 0 else 0)).clip(0, 255).astype(np.uint8)
-    hot = cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
-    return np.asarray(cv2.addWeighted(picture, 0.45, hot, 0.75, 0), np.uint8)
-
-
-__all__ = ["VIEWS", "Explorer"]
-
-Regions = Literal["fitted", "heat"]
+PathLike = str | os.PathLike[str]
+Frames = Sequence[Image | PathLike] | Mapping[str, Image | PathLike] | FrameSet
+Method = Literal["groups", "heat"]
 View = Literal["boxes", "windows", "heat"]
 
+METHODS: tuple[Method, ...] = ("groups", "heat")
+"""How windows become boxes: groups of agreeing windows (or the model's own boxes), or a heat map."""
+
 VIEWS: tuple[View, ...] = ("boxes", "windows", "heat")
-"""What the picture shows besides the boxes: nothing, the positive windows, or their heat."""
+"""What an image shows: the boxes alone, or also the positive windows or their heat map."""
 
 _ALL_SCORES = -1e6
-_KEPT_SEARCHES, _KEPT_IMAGES = 64, 8
-_BOX, _HORIZON = TRACK_COLORS[1], (255, 255, 255)
+_CACHED_SEARCHES, _CACHED_FRAMES = 64, 8
+_BOX_COLOR, _HORIZON_COLOR = TRACK_COLORS[1], (255, 255, 255)
+# Windows of this score or more are drawn in the brightest color.
+_MAX_COLOR_SCORE = 2.0
+
 Value = TypeVar("Value")
-Params = TypeVar("Params", SearchParams, HeatParams, RegionParams)
+Params = TypeVar("Params", HeatParams, RegionParams)
 
 
-class _Scored(NamedTuple):
-    """All windows of a frame, with the number of the band of each."""
+class _FrameImage(NamedTuple):
+    """A frame, and a copy not wider than the explorer's images."""
+
+    full: Image
+    small: Image
+
+
+class _FrameWindows(NamedTuple):
+    """The cached result of a search."""
 
     windows: Detections
-    bands: NDArray[np.intp]
+    bands: NDArray[np.intp] | None  # band number of each window; None for a search without bands
+    vehicles: Detections | None  # boxes predicted by the model
 
 
 class Explorer:
-    """The detector on chosen frames, with parameters that can be turned one by one.
+    """Run the detector on a few frames and change its parameters one by one.
 
-    In a notebook, an explorer as the value of a cell shows its widgets.
+    In a notebook, an explorer as the value of a cell shows sliders.
 
     Parameters
     ----------
     frames
-        Images ``(H, W, 3)`` uint8 RGB or paths of image files, in a list or by name; or a `FrameSet`.
-    classifier
-        The trained model; None loads the one that the package ships. The fast search must take its features.
-    regions
-        ``"fitted"`` or ``"heat"``, as in `VehicleDetector`.
-    search, heat, fit, camera, horizon
-        Where to begin, as in `VehicleDetector`.
+        ``(H, W, 3)`` uint8 RGB images or paths of image files, in a list or by name; or a `FrameSet`.
+    model, search_params, region_params, camera, horizon
+        As in `VehicleDetector`.
     width
-        Pictures are shrunk to this width, so that they are quickly shown.
+        Images are reduced to this width in pixels, so that they are displayed quickly.
 
     Attributes
     ----------
     names
         Names of the frames.
-    search, heat, fit
-        The parameters as they stand. ``search.bands`` are all bands, those that are switched off too.
-    frame, bands, kind, view
-        Name of the frame, numbers of the bands that are searched, ``"fitted"`` or ``"heat"``, and what is
-        shown, out of `VIEWS`.
+    model
+        The model.
+    frame, view
+        Name of the current frame, and what images show.
+    search_params
+        Current search parameters; for a classifier of patches with all bands, searched or not.
+    bands
+        Numbers of the bands that are searched; empty for a model without bands.
+    method
+        ``"groups"``: boxes from groups of agreeing windows, or those that the model predicts. ``"heat"``:
+        boxes from the heat map.
+    group_params, heat_params
+        Current `RegionParams` of ``"groups"`` and `HeatParams` of ``"heat"``.
 
     Raises
     ------
+    ModelFileError
+        If the model file is missing or damaged.
     InvalidInputError
         If an argument is malformed.
 
@@ -179,51 +121,56 @@ class Explorer:
     def __init__(
         self,
         frames: Frames,
-        classifier: VehicleClassifier | None = None,
+        model: PathLike | VehicleClassifier | TemplateMixture = "default",
         *,
-        regions: Regions = "fitted",
-        search: SearchParams | None = None,
-        heat: HeatParams | None = None,
-        fit: RegionParams | None = None,
+        search_params: SearchParams | PyramidParams | None = None,
+        region_params: RegionParams | HeatParams | None = None,
         camera: Camera | None = None,
         horizon: float | None = None,
         width: int = 960,
     ) -> None:
-        self._sources = named_sources(frames)
-        if classifier is not None:
-            check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
-        for name, value, kind in (
-            ("search", search, SearchParams),
-            ("heat", heat, HeatParams),
-            ("fit", fit, RegionParams),
-            ("camera", camera, Camera),
-        ):
-            if value is not None:
-                check_type(value, name, kind, "leave it out for the project's own")
-        check_choice(regions, "regions", ("fitted", "heat"))
-        self._classifier = classifier or load_classifier()
-        self._searcher = BandSearch(self._classifier, n_jobs=1)
-        self._camera = camera
+        self._readers = _frame_readers(frames)
+        detector = VehicleDetector(
+            model, search_params=search_params, region_params=region_params, camera=camera, horizon=horizon
+        )
         self._width = check_integer(width, "width", low=16, high=10_000)
-        self._images: OrderedDict[str, tuple[Image, Image]] = OrderedDict()
-        self._answers: OrderedDict[Any, dict[str, Any]] = OrderedDict()
-        self._searches: OrderedDict[tuple[str, float], _Scored] = OrderedDict()
-        self.names = tuple(self._sources)
+        self._camera = camera
+        self._search = detector.model.open_search()
+        self._read_frame = functools.lru_cache(_CACHED_FRAMES)(self._read_frame_uncached)
+        self._search_frame = functools.lru_cache(_CACHED_SEARCHES)(self._search_frame_uncached)
+        self._state: tuple[Any, ...] = ()
+        self._results: dict[str, Any] = {}
+        self.model = detector.model
+        self.names = tuple(self._readers)
         self.frame = self.names[0]
-        self.search = (search or SearchParams.preset()).with_horizon(horizon)
-        self.bands = tuple(range(len(self.search.bands)))
-        self.kind: Regions = regions
-        self.heat = heat or HeatParams()
-        self.fit = fit or RegionParams()
         self.view: View = "windows"
+        self.search_params = detector.search_params
+        self.bands = tuple(range(len(self._all_bands)))
+        given = detector.region_params
+        self.method: Method = "heat" if isinstance(given, HeatParams) else "groups"
+        self.heat_params = given if isinstance(given, HeatParams) else HeatParams()
+        self.group_params = given if isinstance(given, RegionParams) else RegionParams()
+
+    @property
+    def region_params(self) -> RegionParams | HeatParams:
+        """Parameters of the current method."""
+        return self.heat_params if self.method == "heat" else self.group_params
+
+    @property
+    def _all_bands(self) -> tuple[Any, ...]:
+        return getattr(self.search_params, "bands", ())
 
     def set_frame(self, frame: int | str) -> None:
-        """Look at another frame, by its name or its number."""
+        """Select a frame by its name or number."""
         if isinstance(frame, (int, np.integer)):
-            self.frame = self.names[check_integer(frame, "frame", low=0, high=len(self.names) - 1)]
-            return
+            frame = self.names[check_integer(frame, "frame", low=0, high=len(self.names) - 1)]
         check_choice(frame, "frame", self.names)
         self.frame = frame
+
+    def set_view(self, view: View) -> None:
+        """Select what images show, one of `VIEWS`."""
+        check_choice(view, "view", VIEWS)
+        self.view = view
 
     def set_search(
         self,
@@ -232,27 +179,30 @@ class Explorer:
         horizon: float | None = None,
         bands: Iterable[int] | None = None,
     ) -> None:
-        """Change what counts as a hit, where the bands lie, and which of them are searched.
+        """Change search parameters; None keeps a value.
 
         Parameters
         ----------
         min_score
-            Windows with a score above this are positive.
+            Minimum score of positive windows. The boxes that a mixture predicts do not depend on it.
         horizon
-            Height of the horizon as a share of the frame's height. Only this needs a new search.
+            Height of the horizon as a fraction of the frame's height; the frame is searched again.
         bands
-            Numbers of the bands of ``search.bands``, from 0; none finds nothing.
+            Numbers of the bands of ``search_params.bands`` to search, from 0; an empty list finds nothing.
         """
-        chosen = self.bands
+        params = self.search_params.with_horizon(horizon)
+        if min_score is not None:
+            params = dataclasses.replace(params, min_score=min_score)
         if bands is not None:
-            last = len(self.search.bands) - 1
-            chosen = tuple(sorted({check_integer(band, "bands", low=0, high=last) for band in bands}))
-        self.search = _replaced(self.search, {"min_score": min_score, "horizon": horizon})
-        self.bands = chosen
+            if not self._all_bands:
+                raise InvalidInputError("bands must be None for this model; its search has no bands")
+            last = len(self._all_bands) - 1
+            self.bands = tuple(sorted({check_integer(band, "bands", low=0, high=last) for band in bands}))
+        self.search_params = params
 
     def set_regions(
         self,
-        kind: Regions | None = None,
+        method: Method | None = None,
         *,
         threshold: float | None = None,
         peak_fraction: float | None = None,
@@ -260,195 +210,250 @@ class Explorer:
         min_peak: float | None = None,
         min_evidence: float | None = None,
     ) -> None:
-        """Change how windows become boxes.
+        """Change how windows become boxes; None keeps a value.
 
         Parameters
         ----------
-        kind
-            ``"fitted"``: a box from each group of agreeing windows. ``"heat"``: regions of a heat map.
-        threshold, share, weighting
-            Of `HeatParams`, for ``"heat"``.
+        method
+            ``"groups"`` or ``"heat"``.
+        threshold, peak_fraction, weighting
+            Fields of `HeatParams`, for ``"heat"``.
         min_peak, min_evidence
-            Of `RegionParams`, for ``"fitted"``.
+            Fields of `RegionParams`, for ``"groups"``; no effect if the model predicts boxes.
         """
-        if kind is not None:
-            check_choice(kind, "kind", ("fitted", "heat"))
-        heat = _replaced(
-            self.heat, {"threshold": threshold, "peak_fraction": peak_fraction, "weighting": weighting}
+        if method is not None:
+            check_choice(method, "method", METHODS)
+        heat = _replace(
+            self.heat_params, threshold=threshold, peak_fraction=peak_fraction, weighting=weighting
         )
-        fit = _replaced(self.fit, {"min_peak": min_peak, "min_evidence": min_evidence})
-        self.kind, self.heat, self.fit = kind or self.kind, heat, fit
-
-    def set_view(self, view: View) -> None:
-        """Choose what the picture shows besides the boxes, out of `VIEWS`."""
-        check_choice(view, "view", VIEWS)
-        self.view = view
+        groups = _replace(self.group_params, min_peak=min_peak, min_evidence=min_evidence)
+        self.method, self.heat_params, self.group_params = method or self.method, heat, groups
 
     def windows(self) -> Detections:
-        """Positive windows of the frame, of the chosen bands."""
-        return self._remembered("windows", self._choose_windows)
+        """Positive windows of the current frame."""
+        return self._cached(self._select_windows)
 
     def heat_map(self) -> NDArray[np.float32]:
-        """Heat of the positive windows, ``(H, W)`` float32."""
-        shape = self._image()[0].shape
-        return self._remembered("heat", lambda: frame_heat(shape, self.windows(), self.heat))
+        """Heat map of the positive windows, ``(H, W)`` float32."""
+        return self._cached(self._compute_heat)
 
     def boxes(self) -> Detections:
-        """Boxes of the vehicles: what `VehicleDetector.detect` finds with these parameters."""
-        return self._remembered("boxes", self._find_boxes)
+        """Boxes of the vehicles, equal to those of `VehicleDetector.detect` with these parameters."""
+        return self._cached(self._find_boxes)
 
     def detector(self, **options: Any) -> VehicleDetector:
-        """Make a detector with the parameters as they stand, for a script or a video.
+        """Create a detector with the current parameters, for a script or a video.
 
         Parameters
         ----------
         **options
-            Further arguments of `VehicleDetector`, such as ``track``.
+            Further arguments of `VehicleDetector`, such as ``track_params``.
 
         Raises
         ------
         InvalidInputError
-            If no band is chosen.
+            If no band is selected.
         """
-        bands = tuple(self.search.bands[band] for band in self.bands)
+        params: Any = self.search_params
+        if self._all_bands:
+            selected = tuple(self._all_bands[number] for number in self.bands)
+            params = dataclasses.replace(params, bands=selected)
         return VehicleDetector(
-            self._classifier,
-            search_params=dataclasses.replace(self.search, bands=bands),
-            region_params=self.fit if self.kind == "fitted" else self.heat,
+            self.model,
+            search_params=params,
+            region_params=self.region_params,
             camera=self._camera,
             **options,
         )
 
     def render(self) -> Image:
-        """Draw the frame with its boxes, the horizon, and what the view shows.
+        """Draw the current frame with its boxes, the horizon, and the windows or heat map of the view.
 
         Returns
         -------
         numpy.ndarray
             ``(h, w, 3)`` uint8 RGB, not wider than `width`.
         """
-        whole, small = self._image()
-        shrink = small.shape[1] / whole.shape[1]
-        picture = lay_heat(small, self.heat_map()) if self.view == "heat" else small.copy()
-        row = min(round(self.search.horizon * small.shape[0]), small.shape[0] - 1)
-        picture[row, ::4] = _HORIZON
+        full, small = self._read_frame(self.frame)
+        scale = small.shape[1] / full.shape[1]
+        image = small.copy()
+        if self.view == "heat":
+            heat = np.asarray(cv2.resize(self.heat_map(), small.shape[1::-1]), np.float32)
+            image = blend(image, heat_image(heat), 0.6)
+        if self.search_params.horizon is not None:
+            row = min(round(self.search_params.horizon * len(image)), len(image) - 1)
+            image[row, ::4] = _HORIZON_COLOR
         if self.view == "windows":
-            put_windows(picture, self.windows(), shrink)
-        return draw_boxes(picture, self.boxes().boxes * shrink, color=_BOX, thickness=3)
+            _draw_windows(image, self.windows(), scale)
+        return draw_boxes(image, self.boxes().boxes * scale, color=_BOX_COLOR, thickness=3)
 
     def summary(self) -> str:
-        """Say in a line what was found."""
-        whole, _ = self._image()
-        total, hits, found = len(self._scored().windows), len(self.windows()), len(self.boxes())
+        """Describe in a line what was found."""
+        height, width = self._read_frame(self.frame).full.shape[:2]
+        found = self._find()
+        total = "" if found.bands is None else f" of {len(found.windows):,}"
+        windows, boxes = len(self.windows()), len(self.boxes())
         return (
-            f"{self.frame}, {whole.shape[1]}x{whole.shape[0]}: {hits:,} of {total:,} windows above "
-            f"{self.search.min_score:g}, {found} box{'es' * (found != 1)}"
+            f"{self.frame}, {width}x{height}: {windows:,}{total} windows above "
+            f"{self.search_params.min_score:g}, {boxes} box{'es' * (boxes != 1)}"
         )
 
     def widget(self) -> Any:
-        """Make the sliders and the picture, an ``ipywidgets.HBox``.
+        """Create the sliders and the image, an ``ipywidgets.HBox``.
 
         Raises
         ------
         InvalidInputError
             If ipywidgets is not installed.
         """
-        panel = lay_out(
+        panel = build_widgets(
             names=self.names,
             frame=self.frame,
             views=VIEWS,
             view=self.view,
-            search=self.search,
+            search_params=self.search_params,
             bands=self.bands,
-            kind=self.kind,
-            heat=self.heat,
-            fit=self.fit,
+            methods=METHODS,
+            method=self.method,
+            heat_params=self.heat_params,
+            group_params=self.group_params if self._all_bands else None,
         )
-        panel.watch(lambda: self._follow(panel))
-        return panel.whole
-
-    def _follow(self, panel: Panel) -> None:
-        """Take over what the controls say, and show what that gives."""
-        said = panel.values()
-        try:
-            self.set_frame(said["frame"])
-            self.set_view(said["view"])
-            self.set_search(min_score=said["min_score"], horizon=said["horizon"], bands=said["bands"])
-            self.set_regions(
-                said["kind"],
-                threshold=said["threshold"],
-                peak_fraction=said["peak_fraction"],
-                weighting=said["weighting"],
-                min_peak=said["min_peak"],
-                min_evidence=said["min_evidence"],
-            )
-            panel.show(self.render(), self.summary())
-        except VehicleDetectionError as error:
-            # Raised in a callback, it would be seen by nobody.
-            panel.tell(str(error))
+        panel.watch(lambda changes: self._update(panel, changes))
+        return panel.root
 
     def _ipython_display_(self) -> None:
         from IPython.display import display
 
         display(self.widget())  # type: ignore[no-untyped-call]
 
-    def _choose_windows(self) -> Detections:
-        scored = self._scored()
-        mask = scored.windows.scores > self.search.min_score
-        return scored.windows[mask & np.isin(scored.bands, self.bands)]
+    def _update(self, panel: Panel, changes: dict[str, Any]) -> None:
+        """Apply the changed values of the controls and show the result."""
+
+        def changed(*names: str) -> dict[str, Any]:
+            return {name: changes[name] for name in names if name in changes}
+
+        try:
+            self.set_frame(changes.get("frame", self.frame))
+            self.set_view(changes.get("view", self.view))
+            self.set_search(**changed("min_score", "horizon", "bands"))
+            self.set_regions(
+                **changed("method", "threshold", "peak_fraction", "weighting", "min_peak", "min_evidence")
+            )
+            panel.show(self.render(), self.summary())
+        except VehicleDetectionError as error:
+            # ipywidgets does not display exceptions of callbacks.
+            panel.show_error(str(error))
+
+    def _cached(self, compute: Callable[[], Value]) -> Value:
+        """Return the result of `compute` for the current parameters, computed once."""
+        state = (self.frame, self.search_params, self.bands, self.region_params)
+        if state != self._state:
+            self._state, self._results = state, {}
+        if compute.__name__ not in self._results:
+            self._results[compute.__name__] = compute()
+        result: Value = self._results[compute.__name__]
+        return result
+
+    def _select_windows(self) -> Detections:
+        found = self._find()
+        selected = found.windows.scores > self.search_params.min_score
+        if found.bands is not None:
+            selected &= np.isin(found.bands, self.bands)
+        return found.windows[selected]
+
+    def _compute_heat(self) -> NDArray[np.float32]:
+        return frame_heat(self._read_frame(self.frame).full.shape, self.windows(), self.heat_params)
 
     def _find_boxes(self) -> Detections:
-        if self.kind == "heat":
+        if self.method == "heat":
+            params = self.heat_params
             return label_boxes(
-                self.heat_map(), threshold=self.heat.threshold, peak_fraction=self.heat.peak_fraction
+                self.heat_map(), threshold=params.threshold, peak_fraction=params.peak_fraction
             )
-        shape = self._image()[0].shape[:2]
-        camera = self._camera or Camera.for_frame(shape, horizon=self.search.horizon)
-        return find_vehicles(self.windows(), camera, shape, self.fit)
+        found = self._find()
+        if found.vehicles is not None:
+            return found.vehicles
+        shape = self._read_frame(self.frame).full.shape[:2]
+        search_params: Any = self.search_params
+        camera = self._camera or Camera.for_frame(shape, horizon=search_params.horizon)
+        return find_vehicles(self.windows(), camera, shape, self.group_params)
 
-    def _remembered(self, name: str, make: Callable[[], Value]) -> Value:
-        """Return what the parameters as they stand give, made once: picture and summary ask for the same."""
-        key = (self.frame, self.search, self.bands, self.kind, self.heat, self.fit)
-        answers: dict[str, Any] = remember(self._answers, key, dict, 1)
-        if name not in answers:
-            answers[name] = make()
-        return cast(Value, answers[name])
+    def _read_frame_uncached(self, name: str) -> _FrameImage:
+        image = self._readers[name]()
+        height, width = image.shape[:2]
+        if width <= self._width:
+            return _FrameImage(image, image)
+        size = (self._width, max(1, round(height * self._width / width)))
+        return _FrameImage(image, np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8))
 
-    def _image(self) -> tuple[Image, Image]:
-        """Return the frame, and a copy of it in the size of the pictures."""
+    def _find(self) -> _FrameWindows:
+        """Search the current frame with a low threshold, which serves all higher ones."""
+        lowest = _ALL_SCORES if self._all_bands else min(0.0, self.search_params.min_score)
+        return self._search_frame(self.frame, dataclasses.replace(self.search_params, min_score=lowest))
 
-        def read() -> tuple[Image, Image]:
-            image = self._sources[self.frame]()
-            height, width = image.shape[:2]
-            if width <= self._width:
-                return image, image
-            size = (self._width, max(1, round(height * self._width / width)))
-            return image, np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-        return remember(self._images, self.frame, read, _KEPT_IMAGES)
-
-    def _scored(self) -> _Scored:
-        """Search all bands, or remember what was found."""
-        key = (self.frame, self.search.horizon)
-        return remember(self._searches, key, self._search_all, _KEPT_SEARCHES)
-
-    def _search_all(self) -> _Scored:
-        image, _ = self._image()
-        self.search.place(image.shape)  # Raises where no band fits.
-        whole = dataclasses.replace(self.search, min_score=_ALL_SCORES)
+    def _search_frame_uncached(self, name: str, params: Any) -> _FrameWindows:
+        image = self._read_frame(name).full
+        if not self._all_bands:
+            found = self._search.find(image, params)
+            return _FrameWindows(found.windows, None, found.vehicles)
+        params.place(image.shape)  # raises if no band fits
         parts, numbers = [], []
-        for number, band in enumerate(whole.bands):
-            if band.place(image.shape, whole.horizon, whole.horizontal_padding) is not None:
-                found = self._searcher.find_windows(image, dataclasses.replace(whole, bands=(band,)))
-                parts.append(found)
-                numbers.append(np.full(len(found), number))
+        for number, band in enumerate(params.bands):
+            if band.place(image.shape, params.horizon, params.horizontal_padding) is not None:
+                parts.append(self._search.find(image, dataclasses.replace(params, bands=(band,))).windows)
+                numbers.append(np.full(len(parts[-1]), number))
         boxes = np.concatenate([part.boxes for part in parts])
         scores = np.concatenate([part.scores for part in parts])
-        return _Scored(Detections(boxes, scores), np.concatenate(numbers))
+        return _FrameWindows(Detections(boxes, scores), np.concatenate(numbers), None)
 
 
-def _replaced(params: Params, changes: Mapping[str, Any]) -> Params:
-    """Replace the fields that are not None."""
+def _replace(params: Params, **changes: Any) -> Params:
+    """Replace the fields whose new value is not None."""
     return dataclasses.replace(
         params, **{name: value for name, value in changes.items() if value is not None}
     )
+
+
+def _draw_windows(image: Image, windows: Detections, scale: float) -> None:
+    """Draw windows into an image, colored by score, the best last."""
+    gray_levels = np.arange(256, dtype=np.uint8)[:, None]
+    palette = cv2.applyColorMap(gray_levels, cv2.COLORMAP_PLASMA)[:, 0, ::-1]
+    order = np.argsort(windows.scores, kind="stable")
+    levels = (windows.scores[order] * (255 / _MAX_COLOR_SCORE)).clip(100, 255).astype(int)
+    boxes = (windows.boxes[order] * scale).round().astype(int).tolist()
+    for (x1, y1, x2, y2), color in zip(boxes, palette[levels].tolist()):
+        cv2.rectangle(image, (x1, y1), (x2 - 1, y2 - 1), color, 1)
+
+
+def _frame_readers(frames: object) -> dict[str, Callable[[], Image]]:
+    """Name each frame and return a function that reads it; arrays are checked now, files when read."""
+    if isinstance(frames, FrameSet):
+        return {name: functools.partial(read_image, frames.folder / name) for name in frames.names}
+    if isinstance(frames, Mapping):
+        named = [(str(name), frame) for name, frame in frames.items()]
+    elif isinstance(frames, (list, tuple)):
+        default_names = [f"frame {number}" for number in range(len(frames))]
+        named = [(_path_name(frame) or name, frame) for frame, name in zip(frames, default_names)]
+        if len({name for name, _ in named}) < len(named):
+            # Two files of the same name: use their paths.
+            named = [(str(frame) if _path_name(frame) else name, frame) for name, frame in named]
+    else:
+        raise InvalidInputError(
+            f"frames must be a list of images or paths, or a mapping from names to them; "
+            f"got {describe(frames)}; wrap a single one in a list"
+        )
+    if not named:
+        raise InvalidInputError("frames must hold at least one image; got none")
+    return {name: _frame_reader(frame, name) for name, frame in named}
+
+
+def _path_name(frame: object) -> str:
+    """File name of a path; empty for anything else."""
+    return Path(frame).name if isinstance(frame, (str, os.PathLike)) else ""
+
+
+def _frame_reader(frame: Any, name: str) -> Callable[[], Image]:
+    if isinstance(frame, (str, os.PathLike)):
+        return functools.partial(read_image, frame)
+    checked = check_image(frame, f"frames[{name!r}]")
+    return lambda: checked

@@ -1,6 +1,6 @@
 """The mixture of templates: a model for any road, and its search."""
 
-from vehicle_detection.mixture.boxes import BoxRegressor, mostly_inside, overlaps, vote_boxes
+from vehicle_detection.mixture.boxes import BoxRegressor, mostly_inside, nms, vote_boxes
 from vehicle_detection.mixture.crops import (
     CROP_CELLS,
     N_COLOR_FEATURES,
@@ -48,7 +48,7 @@ __all__ = [
     "load_model",
     "mirror_channels",
     "mostly_inside",
-    "overlaps",
+    "nms",
     "pyramid_levels",
     "regression_features",
     "rescoring_features",

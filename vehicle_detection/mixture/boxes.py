@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer, finite_array
-from vehicle_detection.boxes import box_areas, clip_boxes, intersection_matrix
+from vehicle_detection.boxes import box_areas, clip_boxes, greedy_nms, iter_nms, overlap_matrices
 from vehicle_detection.mixture.crops import N_REGRESSION_FEATURES, regression_features
 
 MIN_MARGIN = -1.0
@@ -75,11 +76,8 @@ def mostly_inside(boxes: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 def overlaps(box: Floats, others: Floats) -> tuple[Floats, Floats]:
     """IoU of a box with others, and the covered fraction of the smaller of each pair."""
-    shared = intersection_matrix(box[None], others)[0]
-    area, areas = float(box_areas(box[None])[0]), box_areas(others)
-    return shared / np.maximum(area + areas - shared, 1e-9), shared / np.maximum(
-        np.minimum(area, areas), 1e-9
-    )
+    iou, coverage = overlap_matrices(box[None], others)
+    return iou[0], coverage[0]
 
 
 def vote_boxes(
@@ -90,49 +88,38 @@ def vote_boxes(
     `windows` are sorted, best first; those below `min_margin` vote but are not kept. Also returns the vote
     mass of each kept window: the sum of the voters' margins above `_VOTE_MARGIN`.
     """
-    remaining = np.flatnonzero(windows.margins >= min_margin)
+    order = np.flatnonzero(windows.margins >= min_margin)
     boxes: list[Floats] = []
     kept: list[int] = []
     vote_mass: list[float] = []
     strengths = np.maximum(windows.margins - _VOTE_MARGIN, 0)
     weights = strengths**2
-    # This loop runs for every group of every frame: columns are contiguous and areas computed once.
-    columns, areas = np.ascontiguousarray(windows.boxes.T), box_areas(windows.boxes)
-    while len(remaining) and len(kept) < max_boxes:
-        best = int(remaining[0])
-        low = np.maximum(columns[:2], columns[:2, best, None])
-        width, height = np.maximum(np.minimum(columns[2:], columns[2:, best, None]) - low, 0)
-        shared = width * height
-        iou = shared / np.maximum(areas + areas[best] - shared, 1e-9)
+    for best, iou in islice(iter_nms(windows.boxes, order, max_iou=_VOTE_IOU), max_boxes):
         voters = iou > _VOTE_IOU
         vote_mass.append(float(strengths @ voters))
         votes = weights * voters
         votes[best] = max(votes[best], 1e-9)
         boxes.append(votes @ windows.boxes / votes.sum())
         kept.append(best)
-        remaining = remaining[iou[remaining] <= _VOTE_IOU]
-        remaining = remaining[remaining != best]
     rows = np.array(kept, np.intp)
     groups = ScoredWindows(np.array(boxes).reshape(-1, 4), windows.margins[rows], windows.templates[rows])
     return groups, np.array(vote_mass)
 
 
 def nms(
-    boxes: Floats, scores: Floats, *, iou: float = _NMS_IOU, cover: float = _NMS_COVER
+    boxes: Floats,
+    scores: Floats,
+    *,
+    iou: float = _NMS_IOU,
+    cover: float = _NMS_COVER,
+    max_boxes: int | None = None,
 ) -> NDArray[np.intp]:
-    """Rows of the boxes that greedy suppression keeps, best first.
+    """Rows of the boxes that greedy suppression keeps, best first, at most `max_boxes`.
 
     A box is removed by a better one at an IoU above `iou`, or if more than `cover` of the smaller one is
     covered.
     """
-    remaining = np.argsort(-scores, kind="stable")
-    kept: list[int] = []
-    while len(remaining):
-        best, remaining = remaining[0], remaining[1:]
-        kept.append(best)
-        overlap, covered = overlaps(boxes[best], boxes[remaining])
-        remaining = remaining[(overlap <= iou) & (covered <= cover)]
-    return np.array(kept, np.intp)
+    return greedy_nms(boxes, scores, max_iou=iou, max_coverage=cover, max_boxes=max_boxes)
 
 
 @dataclass(frozen=True, eq=False)

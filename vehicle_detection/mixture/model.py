@@ -103,7 +103,7 @@ class TemplateMixture:
     def open_search(
         self, n_jobs: int | None = None, method: Literal["shared", "windows"] = "shared"
     ) -> MixtureSearch:
-        """Open a search of frames with this model, with threads and buffers kept from frame to frame.
+        """Open a search of frames with this model, with threads and memory kept from frame to frame.
 
         Parameters
         ----------

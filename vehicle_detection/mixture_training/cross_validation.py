@@ -1,59 +1,65 @@
-"""How good a mixture is on roads it was not trained on, and the probabilities that follow from it."""
+"""Cross-validation of a mixture by leaving out one source at a time, and its calibration from the folds."""
 
 from __future__ import annotations
 
+import csv
+import math
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import vehicle_detection
-from vehicle_detection._common import check_integer, resolve_jobs
+from vehicle_detection._common import atomic_write, check_integer, resolve_jobs
 from vehicle_detection.boxes import Detections
 from vehicle_detection.evaluation import (
+    DetectionMatches,
     FrameBoxes,
     LabelledFrames,
+    best_f1,
+    calibrate_scores,
     evaluate_detections,
     match_detections,
     precision_recall_curve,
 )
 from vehicle_detection.mixture import TemplateMixture
-from vehicle_detection.mixture_training.negatives import check_sources
-from vehicle_detection.mixture_training.train import FrameDataset, train_mixture
+from vehicle_detection.mixture_training.sources import FrameDataset, check_sources
+from vehicle_detection.mixture_training.train import train_mixture
 from vehicle_detection.params import MixtureParams
 
 Floats = NDArray[np.float64]
 
-# Least value of a box that is judged, and the thresholds that are tried.
-_LOWEST = -1.0
+# Smallest margin of an evaluated box, and the thresholds to choose from.
+_MIN_MARGIN = -1.0
 _THRESHOLDS = np.arange(-1.0, 1.5, 0.02)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FoldScore:
-    """What a mixture finds in a set of frames whose source it was not trained on.
+    """Scores on a set of frames whose source was left out of training.
 
     Attributes
     ----------
     name, source
         Names of the set and of its source.
     frames, vehicles
-        Number of frames, and of boxes that count.
+        Number of frames, and of scored labels.
     f1, precision, recall, mean_iou
-        At the threshold that the other sources tell.
+        At the threshold that is best for the other sources.
     false_per_frame, false_per_empty_frame
-        False boxes a frame, and on frames without any label; NaN where there are none.
+        False boxes per frame, and per frame without any label; NaN if there is none.
     threshold
-        That threshold, a value of the templates.
+        That threshold, an SVM margin.
     average_precision, best_f1
-        Over all thresholds, and at the best one.
+        Over all thresholds, and at the best threshold of this set.
     region_f1, region_average_precision
-        `f1` and `average_precision` where a box of which half or more lies in an ignored box is not judged,
-        as ``evaluate_detections(..., ignored_as_regions=True)`` scores it. Some labels put one ignored box
-        around a group of vehicles: then the plain figures count each one that is found there as false.
+        `f1` and `average_precision` with ``ignored_as_regions=True``, see `evaluate_detections`: for labels
+        with one ignored box around a group of vehicles, in which the other scores count detections as false.
     """
 
     name: str
@@ -73,118 +79,106 @@ class FoldScore:
     region_average_precision: float
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, rounded to four digits; what is not known is left out."""
-        values = asdict(self).items()
+        """Return plain values for JSON, rounded to four digits, without those that are NaN."""
         return {
             name: round(value, 4) if isinstance(value, float) else value
-            for name, value in values
-            if value == value  # NaN is not
+            for name, value in asdict(self).items()
+            if not (isinstance(value, float) and math.isnan(value))
         }
 
 
 @dataclass(frozen=True, eq=False)
 class FoldDetections:
-    """What models found in the frames of sources that they were not trained on.
-
-    Attributes
-    ----------
-    source
-        Name of the source.
-    frames
-        Labelled frames.
-    found
-        Boxes with the templates' values as scores.
-    """
+    """Detections in a set of frames whose source was left out of training."""
 
     source: str
     frames: LabelledFrames
-    found: FrameBoxes
+    predictions: FrameBoxes  # scores are SVM margins
 
     @property
-    def truth(self) -> FrameBoxes:
-        """Labels with all frames as frames."""
+    def labels(self) -> FrameBoxes:
+        """Labels that list all frames, also those without a box."""
         return replace(self.frames.labels, frame_keys=tuple(self.frames.keys))
 
     @property
-    def scores(self) -> Floats:
-        """Templates' value of each box."""
-        assert self.found.scores is not None
-        return self.found.scores
+    def margins(self) -> Floats:
+        """SVM margin of each prediction."""
+        assert self.predictions.scores is not None
+        return self.predictions.scores
+
+    @cached_property
+    def matches(self) -> DetectionMatches:
+        """Predictions matched to labels at IoU 0.5."""
+        return match_detections(self.predictions, self.labels, self.frames.keys, 0.5)
+
+    @property
+    def hits(self) -> tuple[Floats, NDArray[np.bool_]]:
+        """Margins of the predictions that are not ignored, and which of them match a vehicle."""
+        scored = ~self.matches.ignored
+        return self.margins[scored], self.matches.match[scored] >= 0
 
     def above(self, threshold: float) -> FrameBoxes:
-        """Boxes from a threshold on."""
-        return self.found[self.scores >= threshold]
+        """Predictions with a margin of at least `threshold`."""
+        return self.predictions[self.margins >= threshold]
 
 
 def cross_validate_mixture(
     sources: Sequence[FrameDataset],
     params: MixtureParams | None = None,
     *,
-    always: Sequence[FrameDataset] = (),
+    extra_sources: Sequence[FrameDataset] = (),
     patches: Sequence[NDArray[np.uint8]] = (),
     random_state: int = 0,
     n_jobs: int | None = None,
     on_step: Callable[[str], object] | None = None,
 ) -> tuple[TemplateMixture, list[FoldScore], list[FoldDetections]]:
-    """Train a mixture on all sources, calibrated and judged by leaving out one source after the other.
+    """Train a mixture on all sources, calibrated and evaluated by leaving out one source at a time.
 
     Parameters
     ----------
     sources
-        Labelled frames of two sources or more.
-    always
-        Further sources, that every model is trained on and none is judged by.
+        Labelled frames of at least two sources.
+    extra_sources
+        Further sources that every model is trained on and none is evaluated on.
     params, patches, random_state, n_jobs, on_step
-        As for `train_mixture`.
+        As in `train_mixture`.
 
     Returns
     -------
     tuple
-        The model trained on everything; a score for each set of frames, at the threshold that is best for the
-        other sources; what was found there.
+        The model trained on everything; a `FoldScore` for each set of frames, at the threshold that is best
+        for the other sources; and the detections in each set.
 
     Raises
     ------
     InvalidInputError
-        If there are not two sources, or `train_mixture` finds too few vehicles without one of them.
+        If there are fewer than two sources, or `train_mixture` finds too few vehicles without one of them.
 
     Notes
     -----
-    The threshold of the model is the best one over all sources left out, each vehicle with the same weight.
-    Log-odds are fitted to the same boxes (Platt, "Probabilistic outputs for support vector machines", 1999).
+    The threshold of the model has the best F1 over all left-out sources together, so every vehicle has the
+    same weight. The log-odds are fitted to the same detections (Platt, "Probabilistic outputs for support
+    vector machines", 1999).
     """
-    sources = check_sources(sources, least=2)
-    known = check_sources((*sources, *check_sources(always, least=0)))[len(sources) :]
+    sources = check_sources(sources, min_count=2)
+    extra = check_sources((*sources, *check_sources(extra_sources, min_count=0)))[len(sources) :]
     check_integer(random_state, "random_state", low=0, high=2**32 - 1)
-    tell = on_step or (lambda line: None)
-    held: list[FoldDetections] = []
-    for out in sources:
-        rest = [source for source in sources if source is not out] + [*known]
-        mixture = train_mixture(
-            rest,
-            params,
-            patches=patches,
-            random_state=random_state,
-            n_jobs=n_jobs,
-            on_step=lambda line: None,
-        )
-        held += detect_in_source(mixture, out, n_jobs=n_jobs)
-        tell(f"{out.name}: judged by a model that does not know it")
+    options: dict[str, Any] = {"patches": patches, "random_state": random_state, "n_jobs": n_jobs}
+    folds: list[FoldDetections] = []
+    for left_out in sources:
+        rest = [source for source in sources if source is not left_out]
+        mixture = train_mixture([*rest, *extra], params, on_step=lambda line: None, **options)
+        folds += detect_in_source(mixture, left_out, n_jobs=n_jobs)
+        if on_step:
+            on_step(f"{left_out.name}: evaluated a model trained without this source")
     scores = [
-        _score(part, _threshold([other for other in held if other.source != part.source])) for part in held
+        score_fold(fold, best_threshold([other for other in folds if other.source != fold.source]))
+        for fold in folds
     ]
-    slope, offset = _log_odds(held)
-    threshold = slope * _threshold(held) + offset
-    mixture = train_mixture(
-        [*sources, *known],
-        params,
-        patches=patches,
-        random_state=random_state,
-        n_jobs=n_jobs,
-        on_step=on_step,
-    )
-    calibrated = replace(mixture, slope=slope, offset=offset, threshold=threshold)
-    return calibrated, scores, held
+    mixture = train_mixture([*sources, *extra], params, on_step=on_step, **options)
+    slope, offset = fit_log_odds(folds)
+    threshold = slope * best_threshold(folds) + offset
+    return replace(mixture, slope=slope, offset=offset, threshold=threshold), scores, folds
 
 
 def detect_in_source(
@@ -195,7 +189,7 @@ def detect_in_source(
 
         def detect(pair: tuple[Any, NDArray[np.uint8]]) -> tuple[Any, Detections]:
             # An uncalibrated mixture has slope 1 and offset 0, so its scores are margins.
-            found = search.find(pair[1], min_vehicle_score=_LOWEST).vehicles
+            found = search.find(pair[1], min_vehicle_score=_MIN_MARGIN).vehicles
             assert found is not None
             return pair[0], found
 
@@ -205,83 +199,63 @@ def detect_in_source(
         ]
 
 
-def _score(part: FoldDetections, threshold: float) -> FoldScore:
-    truth, kept = part.truth, part.above(threshold)
-    scores = evaluate_detections(kept, truth)
-    lenient = evaluate_detections(kept, truth, ignored_as_regions=True)
-    precision, recall, _ = precision_recall_curve(part.found, truth)
-    every = evaluate_detections(part.found, truth, ignored_as_regions=True)
-    values, empty = _on_empty(part)
+def score_fold(fold: FoldDetections, threshold: float) -> FoldScore:
+    """Score the detections of a fold at a threshold and over all thresholds."""
+    labels, kept = fold.labels, fold.above(threshold)
+    scores = evaluate_detections(kept, labels)
+    region_scores = evaluate_detections(kept, labels, ignored_as_regions=True)
+    every = evaluate_detections(fold.predictions, labels)
+    every_region = evaluate_detections(fold.predictions, labels, ignored_as_regions=True)
+    empty = [key for key in fold.frames.keys if not len(labels.rows(key))]
+    false_on_empty = sum(len(kept.rows(key)) for key in empty)
     return FoldScore(
-        name=part.frames.name,
-        source=part.source,
-        frames=len(part.frames),
-        vehicles=int((~truth.ignore).sum()),
+        name=fold.frames.name,
+        source=fold.source,
+        frames=len(fold.frames),
+        vehicles=int((~labels.ignore).sum()),
         f1=scores.f1,
         precision=scores.precision,
         recall=scores.recall,
         mean_iou=scores.mean_iou,
         false_per_frame=scores.false_positives_per_frame,
-        false_per_empty_frame=int((values >= threshold).sum()) / empty if empty else float("nan"),
+        false_per_empty_frame=false_on_empty / len(empty) if empty else math.nan,
         threshold=threshold,
-        average_precision=evaluate_detections(part.found, truth).average_precision,
-        best_f1=float(_f1(precision, recall).max(initial=0.0)),
-        region_f1=lenient.f1,
-        region_average_precision=every.average_precision,
+        average_precision=every.average_precision,
+        best_f1=best_f1(*precision_recall_curve(fold.predictions, labels))[0],
+        region_f1=region_scores.f1,
+        region_average_precision=every_region.average_precision,
     )
 
 
-def _f1(precision: Floats, recall: Floats) -> Floats:
-    """F1 for each threshold; 0 where no vehicle is labelled."""
-    recall = np.nan_to_num(recall)
-    return np.asarray(2 * precision * recall / np.maximum(precision + recall, 1e-9), np.float64)
+def best_threshold(folds: Sequence[FoldDetections]) -> float:
+    """Threshold with the best F1 over all vehicles of the folds together.
 
-
-def _on_empty(part: FoldDetections) -> tuple[Floats, int]:
-    """Values of the boxes on frames without any label, all of them false, and the number of the frames."""
-    empty = [key for key in part.frames.keys if not len(part.frames.labels.rows(key))]
-    rows = np.concatenate([np.empty(0, np.intp), *(part.found.rows(key) for key in empty)])
-    return part.scores[rows], len(empty)
-
-
-def _threshold(held: Sequence[FoldDetections]) -> float:
-    """Choose the threshold with the best F1 over all vehicles of these sets together.
-
-    A mean of the sets' own F1 would let a few dozen vehicles decide as much as hundreds.
+    The mean of their F1 would give a fold with a few dozen vehicles the same weight as one with hundreds.
     """
     right, shown, vehicles = np.zeros(len(_THRESHOLDS)), np.zeros(len(_THRESHOLDS)), 0
-    for part in held:
-        match = match_detections(part.found, part.truth, list(part.frames.keys), 0.5)
-        found = part.scores[~match.ignored][:, None] >= _THRESHOLDS
-        right += found[match.match[~match.ignored] >= 0].sum(axis=0)
-        shown += found.sum(axis=0)
-        vehicles += int((~part.truth.ignore).sum())
-    f1 = 2 * right / np.maximum(shown + vehicles, 1)
-    return float(_THRESHOLDS[f1.argmax()])
+    for fold in folds:
+        margins, hit = fold.hits
+        above = margins[:, None] >= _THRESHOLDS
+        right += above[hit].sum(axis=0)
+        shown += above.sum(axis=0)
+        vehicles += len(fold.matches.usable)
+    return best_f1(right / np.maximum(shown, 1), right / max(vehicles, 1), _THRESHOLDS)[1]
 
 
-def _log_odds(held: Sequence[FoldDetections]) -> tuple[float, float]:
-    """Slope and offset that turn values into log-odds, by what was found in sources left out."""
-    from sklearn.linear_model import LogisticRegression
-
-    values, right = [], []
-    for part in held:
-        match = match_detections(part.found, part.truth, list(part.frames.keys), 0.5)
-        judged = ~match.ignored
-        values += part.scores[judged].tolist()
-        right += (match.match[judged] >= 0).tolist()
-    if len(set(right)) < 2:
+def fit_log_odds(folds: Sequence[FoldDetections]) -> tuple[float, float]:
+    """Slope and offset that turn margins into log-odds, fitted to the detections of all folds."""
+    margins, hits = (np.concatenate(side) for side in zip(*(fold.hits for fold in folds)))
+    if len(set(hits.tolist())) < 2:
         return 1.0, 0.0
-    fitted = LogisticRegression(C=1e6).fit(np.array(values)[:, None], right)
-    slope = float(fitted.coef_[0, 0])
-    # Of a few boxes the better ones may be the wrong ones: such a line would turn the order round.
-    return (slope, float(fitted.intercept_[0])) if slope > 0 else (1.0, 0.0)
+    platt = calibrate_scores(margins, hits, prior=False)
+    # Among few boxes the better ones may be false; a negative slope would reverse their order.
+    return (-platt.a, -platt.b) if platt.a < 0 else (1.0, 0.0)
 
 
-def as_metadata(
+def training_metadata(
     scores: Sequence[FoldScore], sources: Sequence[FrameDataset], seed: int, patches: int = 0
 ) -> dict[str, Any]:
-    """Collect what a model file tells of its training."""
+    """Metadata of a cross-validated model for its file."""
     data = {source.name: sum(len(part) for part in source.sets) for source in sources}
     return {
         "metrics": {"left_out": {score.name: score.to_dict() for score in scores}},
@@ -289,3 +263,13 @@ def as_metadata(
         "training": {"random_state": seed},
         "versions": {"vehicle_detection": vehicle_detection.__version__},
     }
+
+
+def write_curves(path: str | os.PathLike[str], folds: Sequence[FoldDetections]) -> None:
+    """Write the precision-recall curve of every fold as CSV, one row for each threshold."""
+    with atomic_write(path, "path") as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["frames", "margin", "precision", "recall"])
+        for fold in folds:
+            for precision, recall, margin in zip(*precision_recall_curve(fold.predictions, fold.labels)):
+                writer.writerow([fold.frames.name, f"{margin:.4f}", f"{precision:.4f}", f"{recall:.4f}"])

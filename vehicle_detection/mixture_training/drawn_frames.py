@@ -1,4 +1,4 @@
-"""Frames of the project's own drawn drives, as one more source to train on."""
+"""Frames of synthetic drives, as an additional data set to train on."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import numpy as np
 
 from vehicle_detection._common import check_integer
 from vehicle_detection.evaluation import FrameBoxes, FrameKey, LabelledFrames
-from vehicle_detection.mixture_training.negatives import FrameDataset
+from vehicle_detection.mixture_training.sources import FrameDataset
 from vehicle_detection.synthetic import Drive, render_drive
 
 DRAWN = "drawn"
-"""Name of the source of drawn frames."""
+"""Name of the data set of synthetic frames."""
 
+# Options of `render_drive`; "truncated" chooses frames in which the border truncates a vehicle.
 _CASES: tuple[dict[str, Any], ...] = (
     {},
     {"scenario": "overtaking"},
@@ -29,34 +30,31 @@ _CASES: tuple[dict[str, Any], ...] = (
     {"shape": (1080, 1920)},
     {"light": "night", "rain": 0.6},
     {"light": "night", "shape": (540, 960)},
-    {"scenario": "overtaking", "cut": True},
-    {"scenario": "overtaking", "light": "night", "cut": True},
+    {"scenario": "overtaking", "truncated": True},
+    {"scenario": "overtaking", "light": "night", "truncated": True},
 )
-"""Options of `render_drive` for each kind; "cut": shown where the frame's border cuts a vehicle."""
 
 _FRAMES = 200
-# Share of a vehicle outside the frame from which on the border cuts it.
-_CUT = 0.2
-# Frames from one that is looked at for such a vehicle to the next.
-_STEP = 5
+# Smallest fraction of a truncated vehicle outside the frame; one frame in so many is searched for one.
+_MIN_TRUNCATED, _STEP = 0.2, 5
 
 
 def drawn_source(*, drives: int = 2 * len(_CASES), frames: int = 2, random_state: int = 0) -> FrameDataset:
-    """Draw frames of different roads, lights and sizes, with their vehicles.
+    """Render frames of different roads, lights and sizes, with their vehicles as labels.
 
     Parameters
     ----------
     drives
-        Number of drives, one of each kind in turn.
+        Number of drives; the kinds of drives take turns.
     frames
-        Frames of each drive, at equal distances.
+        Number of frames of each drive, equally spaced.
     random_state
-        Seed; every drive has a seed of its own that follows from it.
+        Seed, from which the seed of every drive follows.
 
     Returns
     -------
     FrameDataset
-        A set of frames for each drive.
+        One set of frames for each drive.
 
     Raises
     ------
@@ -68,24 +66,24 @@ def drawn_source(*, drives: int = 2 * len(_CASES), frames: int = 2, random_state
     >>> drawn_source(drives=1, frames=2).sets
     (LabelledFrames('drawn 1', 2 frames, 16 boxes),)
     """
-    count = check_integer(drives, "drives", low=1)
-    taken = check_integer(frames, "frames", low=1, high=_FRAMES)
+    n_drives = check_integer(drives, "drives", low=1)
+    n_frames = check_integer(frames, "frames", low=1, high=_FRAMES)
     check_integer(random_state, "random_state", low=0, high=2**32 - 1)
     parts = []
-    for number, case in zip(range(count), itertools.cycle(_CASES)):
-        # Two numbers: a drive that somebody draws from one number is another one.
+    for number, case in zip(range(n_drives), itertools.cycle(_CASES)):
+        # A seed of two numbers differs from every seed of one number that a user may pass to render_drive.
         rng = np.random.default_rng([random_state, number])
-        options = {name: value for name, value in case.items() if name != "cut"}
+        options = {name: value for name, value in case.items() if name != "truncated"}
         drive = render_drive(frames=_FRAMES, random_state=rng, **options)
-        parts.append(_sampled(f"{DRAWN} {number + 1}", drive, taken, cut=case.get("cut", False)))
+        chosen = np.linspace(0, len(drive) - 1, n_frames + 2)[1:-1].astype(int).tolist()
+        if case.get("truncated", False):
+            chosen = [_closest_truncation(drive, index) for index in chosen]
+        parts.append(_labelled(f"{DRAWN} {number + 1}", drive, chosen))
     return FrameDataset(DRAWN, tuple(parts))
 
 
-def _sampled(name: str, drive: Drive, frames: int, *, cut: bool) -> LabelledFrames:
-    """Take frames at equal distances from a drive, or those near them in which the border cuts a vehicle."""
-    chosen = np.linspace(0, len(drive) - 1, frames + 2)[1:-1].astype(int).tolist()
-    if cut:
-        chosen = [_where_cut(drive, index) for index in chosen]
+def _labelled(name: str, drive: Drive, chosen: list[int]) -> LabelledFrames:
+    """Render the chosen frames of a drive with their labels."""
     scenes = {index: drive[index] for index in chosen}
     images: dict[FrameKey, Any] = {index: scene.image for index, scene in scenes.items()}
     rows = [(index, row) for index, scene in scenes.items() for row in scene.truth]
@@ -99,9 +97,9 @@ def _sampled(name: str, drive: Drive, frames: int, *, cut: bool) -> LabelledFram
     return LabelledFrames(name, images, labels)
 
 
-def _where_cut(drive: Drive, index: int) -> int:
-    """Find the frame next to this one in which the border cuts a vehicle; this one if there is none."""
+def _closest_truncation(drive: Drive, index: int) -> int:
+    """Find the closest frame to `index` in which the border truncates a vehicle; `index` if there is none."""
     for other in sorted(range(index % _STEP, len(drive), _STEP), key=lambda other: abs(other - index)):
-        if any(row.truncated > _CUT and not row.ignore for row in drive[other].truth):
+        if any(row.truncated > _MIN_TRUNCATED and not row.ignore for row in drive[other].truth):
             return other
     return index

@@ -1,4 +1,4 @@
-"""What the templates of a mixture are trained to find: vehicles as each template sees them."""
+"""Positive samples of each template: vehicles in frames and on patches, shifted, relit and truncated."""
 
 from __future__ import annotations
 
@@ -16,66 +16,74 @@ from vehicle_detection.mixture import (
     crop_channels,
     mirror_channels,
 )
-from vehicle_detection.mixture_training.negatives import Frame
+from vehicle_detection.mixture_training.sources import TrainingFrame
 from vehicle_detection.params import MixtureParams
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 VehicleSamples = Iterator[tuple[Image, Floats]]
-"""Images and the place of a vehicle in each."""
+"""Images, each with the box of one vehicle."""
 
-# A vehicle is cut by a border that it comes nearer to than this, in pixels; share of a vehicle that is left
-# where it is cut on purpose.
-_AT_BORDER, _SHOWN = 3, (0.3, 0.85)
-# Where the vehicle is on most patches, in shares of their sides; what share of a cell may lie beyond one.
-_ON_PATCH, _SLACK = np.array([0.05, 0.14, 0.95, 0.89]), 0.3
+# A box this close to a border, in pixels, counts as truncated by it.
+_BORDER_DISTANCE = 3
+# Range of the fraction of a vehicle that stays visible when it is truncated artificially.
+_VISIBLE_RANGE = (0.3, 0.85)
+# Typical box of the vehicle on a patch, as fractions of its sides.
+_BOX_ON_PATCH = np.array([0.05, 0.14, 0.95, 0.89])
+# A cell counts as inside an image if less than this fraction of it lies outside.
+_MAX_OUTSIDE = 0.3
 
 
 def window_features(image: Image, box: Floats, template: MixtureTemplate) -> NDArray[np.float32]:
-    """Features of a box as a template sees it, ``(28, rows, columns)``."""
-    inside = template.box_cells
+    """Features of the template's window around a box, ``(28, rows, columns)``."""
+    box_cells = template.box_cells
     rows, columns = template.weights.shape[:2]
-    step_x, step_y = (box[2] - box[0]) / inside[0], (box[3] - box[1]) / inside[1]
+    step_x, step_y = (box[2] - box[0]) / box_cells[0], (box[3] - box[1]) / box_cells[1]
     cell = FINE if np.sqrt(step_x * step_y) < COARSE else COARSE
     if template.border:
-        # The window ends with the box: its margin is part of what is warped.
-        box, inside = box - [template.padding[0] * step_x, 0, 0, 0], (float(columns), inside[1])
-    return crop_channels(image, box.tolist(), inside, (columns, rows), cell)
+        # The window ends with the box, so its padding is warped as a part of the box.
+        box, box_cells = box - [template.padding[0] * step_x, 0, 0, 0], (float(columns), box_cells[1])
+    return crop_channels(image, box.tolist(), box_cells, (columns, rows), cell)
 
 
 def whole_vehicles(
-    frames: Sequence[Frame], params: MixtureParams, rng: np.random.Generator
+    frames: Sequence[TrainingFrame], params: MixtureParams, rng: np.random.Generator
 ) -> VehicleSamples:
-    """Vehicles where they are, moved a little, and at other exposures."""
+    """Yield the vehicles at their boxes, at shifted boxes, and in relit frames."""
     for frame in frames:
         boxes = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.min_width]
         for box in boxes:
-            for copy in range(params.jitter):
-                shift = rng.uniform(-1, 1, 4) * params.jitter_scale * np.tile(box[2:] - box[:2], 2)
-                yield frame.image, box + shift * (copy > 0)
-        for _ in range(params.exposures if len(boxes) else 0):
+            for copy in range(params.copies):
+                yield frame.image, _shifted(box, copy, params, rng)
+        for _ in range(params.relit_copies if len(boxes) else 0):
             image = relight(frame.image, rng)
             for box in boxes:
                 yield image, box
 
 
 def truncated_vehicles(
-    frames: Sequence[Frame], params: MixtureParams, rng: np.random.Generator
+    frames: Sequence[TrainingFrame], params: MixtureParams, rng: np.random.Generator
 ) -> VehicleSamples:
-    """Vehicles that the right border cuts, and whole ones in images that are cut through them."""
+    """Yield vehicles truncated by the right border, and others in images cropped through them."""
     for frame in frames:
         width = frame.image.shape[1]
         mirrored = np.ascontiguousarray(frame.image[:, ::-1])
         for image, boxes in (frame.image, frame.boxes), (mirrored, mirror_boxes(frame.boxes, width)):
             for box in boxes[boxes[:, 2] - boxes[:, 0] >= params.min_width]:
-                sides = np.tile(box[2:] - box[:2], 2)
-                if box[2] >= width - _AT_BORDER:
-                    for copy in range(params.border_jitter):
-                        x1, y1, _, y2 = box + rng.uniform(-1, 1, 4) * params.jitter_scale * sides * (copy > 0)
+                if box[2] >= width - _BORDER_DISTANCE:
+                    for copy in range(params.border_copies):
+                        x1, y1, _, y2 = _shifted(box, copy, params, rng)
                         yield image, np.array([x1, y1, width, y2])
-                end = round(box[0] + rng.uniform(*_SHOWN) * sides[0])
-                if box[0] > _AT_BORDER and params.min_width <= end - box[0] and end < width - _AT_BORDER:
+                end = round(box[0] + rng.uniform(*_VISIBLE_RANGE) * (box[2] - box[0]))
+                wide_enough = params.min_width <= end - box[0] and end < width - _BORDER_DISTANCE
+                if box[0] > _BORDER_DISTANCE and wide_enough:
                     yield image[:, :end], np.array([*box[:2], end, box[3]])
+
+
+def _shifted(box: Floats, copy: int, params: MixtureParams, rng: np.random.Generator) -> Floats:
+    """Shift the edges of a box randomly; copy 0 is not shifted."""
+    shift = rng.uniform(-1, 1, 4) * params.jitter_scale * np.tile(box[2:] - box[:2], 2)
+    return np.asarray(box + shift * (copy > 0))
 
 
 def mirror_boxes(boxes: Floats, width: float) -> Floats:
@@ -84,45 +92,30 @@ def mirror_boxes(boxes: Floats, width: float) -> Floats:
 
 
 def vehicle_features(
-    vehicles: VehicleSamples, templates: Sequence[MixtureTemplate], params: MixtureParams
+    samples: VehicleSamples, templates: Sequence[MixtureTemplate], params: MixtureParams
 ) -> list[NDArray[np.float32]]:
-    """Features of the vehicles of each template, ``(N, length)``."""
+    """Features of the samples of each template, ``(N, length)``; whole vehicles are mirrored, too."""
     found: list[list[NDArray[np.float32]]] = [[] for _ in templates]
-    for image, box in vehicles if templates else ():
-        for index in _alike(box, templates, params.near):
-            planes = window_features(image, box, templates[index])
-            # At the border every vehicle comes from both sides already.
-            found[index] += (
-                _rows(planes) if templates[index].border else _rows(planes, mirror_channels(planes))
-            )
-    return _stacked(found, templates)
+    for image, box in samples if templates else ():
+        for index in _matching_templates(box, templates, params.aspect_tolerance):
+            channels = window_features(image, box, templates[index])
+            # The samples of border templates already come from both sides.
+            views = (channels,) if templates[index].border else (channels, mirror_channels(channels))
+            found[index] += _flatten(*views)
+    return _stack(found, templates)
 
 
 def patch_features(
     patches: Sequence[Image],
-    placing: BoxRegressor,
+    regressor: BoxRegressor,
     templates: Sequence[MixtureTemplate],
     known: Sequence[NDArray[np.float32]],
     params: MixtureParams,
 ) -> list[NDArray[np.float32]]:
-    """Features of the vehicles on patches, each of which one vehicle mostly fills, for each template.
+    """Features of the vehicles on patches for templates of whole vehicles, as in `vehicle_features`.
 
-    Parameters
-    ----------
-    patches
-        Images of any size.
-    placing
-        Finds the vehicle on its patch: a correction of boxes.
-    templates
-        Of whole vehicles.
-    known
-        Features of vehicles in frames, as `vehicle_features` gives them. A patch does not show what is around
-        a vehicle: what a template looks at there is what it sees on the average around those.
-
-    Returns
-    -------
-    list of numpy.ndarray
-        As `vehicle_features` gives them.
+    A patch does not show the surroundings of its vehicle, so cells outside it take the mean over the features
+    of vehicles in frames, `known`. The regressor locates the vehicle on its patch.
     """
     found: list[list[NDArray[np.float32]]] = [[] for _ in templates]
     means = [
@@ -130,48 +123,48 @@ def patch_features(
         for template, rows in zip(templates, known)
     ]
     for image in patches:
-        box = place_on_patch(image, placing)
-        for index in _alike(box, templates, params.near):
-            planes = window_features(image, box, templates[index]).copy()
-            unseen = _beyond(image, box, templates[index])
-            planes[:, unseen] = means[index][:, unseen]
-            found[index] += _rows(planes, mirror_channels(planes))
-    return _stacked(found, templates)
+        box = locate_on_patch(image, regressor)
+        for index in _matching_templates(box, templates, params.aspect_tolerance):
+            channels = window_features(image, box, templates[index]).copy()
+            outside = _outside_cells(image, box, templates[index])
+            channels[:, outside] = means[index][:, outside]
+            found[index] += _flatten(channels, mirror_channels(channels))
+    return _stack(found, templates)
 
 
-def place_on_patch(image: Image, placing: BoxRegressor) -> Floats:
-    """Box of the vehicle on a patch: where it is on most of them, corrected twice."""
+def locate_on_patch(image: Image, regressor: BoxRegressor) -> Floats:
+    """Box of the vehicle on a patch: the typical box, corrected twice."""
     size = np.tile(image.shape[1::-1], 2)
-    box = _ON_PATCH * size
+    box = _BOX_ON_PATCH * size
     for _ in range(2):
-        box = box + placing.shifts(image, box[None])[0] * np.tile(box[2:] - box[:2], 2)
+        box = box + regressor.shifts(image, box[None])[0] * np.tile(box[2:] - box[:2], 2)
     return np.asarray(np.clip(box, 0, size), np.float64)
 
 
-def _beyond(image: Image, box: Floats, template: MixtureTemplate) -> NDArray[np.bool_]:
-    """Which cells of a template lie beyond the image by more than a part of a cell, ``(rows, columns)``."""
+def _outside_cells(image: Image, box: Floats, template: MixtureTemplate) -> NDArray[np.bool_]:
+    """Which cells of a template's window lie outside the image, ``(rows, columns)``."""
     outside = []
-    for axis, (cells, margin, inside) in enumerate(
+    for axis, (cells, padding, box_cells) in enumerate(
         zip(template.weights.shape[1::-1], template.padding, template.box_cells)
     ):
-        step = (box[axis + 2] - box[axis]) / inside
-        start = (box[axis] + (np.arange(cells) - margin) * step) / step
-        outside.append((start < -_SLACK) | (start + 1 > image.shape[1 - axis] / step + _SLACK))
+        step = (box[axis + 2] - box[axis]) / box_cells
+        start = (box[axis] + (np.arange(cells) - padding) * step) / step
+        outside.append((start < -_MAX_OUTSIDE) | (start + 1 > image.shape[1 - axis] / step + _MAX_OUTSIDE))
     return np.asarray(outside[1][:, None] | outside[0][None], np.bool_)
 
 
-def _alike(box: Floats, templates: Sequence[MixtureTemplate], near: float) -> list[int]:
-    """Templates of about a box's aspect ratio, the nearest one in any case."""
+def _matching_templates(box: Floats, templates: Sequence[MixtureTemplate], tolerance: float) -> list[int]:
+    """Templates with a similar log aspect ratio to that of a box, and the closest one in any case."""
     aspects = np.log([template.box_cells[0] / template.box_cells[1] for template in templates])
-    apart = np.abs(np.log((box[2] - box[0]) / (box[3] - box[1])) - aspects)
-    return [int(index) for index in np.flatnonzero((apart == apart.min()) | (apart < near))]
+    distance = np.abs(np.log((box[2] - box[0]) / (box[3] - box[1])) - aspects)
+    return [int(index) for index in np.flatnonzero((distance == distance.min()) | (distance < tolerance))]
 
 
-def _rows(*views: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+def _flatten(*views: NDArray[np.float32]) -> list[NDArray[np.float32]]:
     return [view.transpose(1, 2, 0).ravel() for view in views]
 
 
-def _stacked(
+def _stack(
     found: Sequence[Sequence[NDArray[np.float32]]], templates: Sequence[MixtureTemplate]
 ) -> list[NDArray[np.float32]]:
     return [np.array(rows, np.float32).reshape(-1, t.weights.size) for rows, t in zip(found, templates)]
@@ -180,30 +173,30 @@ def _stacked(
 def align_mirrored(
     rows: NDArray[np.float32], rng: np.random.Generator, tries: int = 5
 ) -> NDArray[np.float32]:
-    """Choose of each vehicle and its mirror image, which are neighboring rows, the one like the others.
+    """Keep one of each two neighboring rows, a sample and its mirror image, so that all show the same side.
 
-    Two clusters that are each other's mirror image, by k-means from a few random starts.
+    k-means with two clusters that are each other's mirror image, from a few random starts.
     """
     if not len(rows):
         return rows
     pairs = rows.reshape(len(rows) // 2, 2, -1)
-    centerd = pairs - pairs.mean(axis=(0, 1))
-    number = np.arange(len(pairs))
-    best, length = np.zeros(len(pairs), np.intp), -1.0
+    centered = pairs - pairs.mean(axis=(0, 1))
+    numbers = np.arange(len(pairs))
+    best, best_norm = np.zeros(len(pairs), np.intp), -1.0
     for _ in range(tries):
         chosen = rng.integers(0, 2, len(pairs))
         for _ in range(15):
-            mean = centerd[number, chosen].mean(axis=0)
-            chosen = (centerd @ mean).argmax(axis=1)
-        if float(np.linalg.norm(mean)) > length:
-            best, length = chosen, float(np.linalg.norm(mean))
-    return np.ascontiguousarray(pairs[number, best])
+            mean = centered[numbers, chosen].mean(axis=0)
+            chosen = (centered @ mean).argmax(axis=1)
+        if float(np.linalg.norm(mean)) > best_norm:
+            best, best_norm = chosen, float(np.linalg.norm(mean))
+    return np.ascontiguousarray(pairs[numbers, best])
 
 
 def jitter_boxes(boxes: Floats, rng: np.random.Generator) -> Floats:
-    """Boxes as a search may find them: beside their vehicles, too small or too large, of another shape."""
+    """Shift and resize boxes randomly, about as much as a search misplaces them."""
     sides = boxes[:, 2:] - boxes[:, :2]
     centers = boxes[:, :2] + sides * (0.5 + rng.uniform(-0.2, 0.2, sides.shape))
-    size, shape = rng.uniform(-0.45, 0.3, (len(boxes), 1)), rng.uniform(-0.15, 0.15, sides.shape)
-    halves = sides / 2 * np.exp(size + shape)
+    log_scale, log_aspect = rng.uniform(-0.45, 0.3, (len(boxes), 1)), rng.uniform(-0.15, 0.15, sides.shape)
+    halves = sides / 2 * np.exp(log_scale + log_aspect)
     return np.concatenate([centers - halves, centers + halves], axis=1)

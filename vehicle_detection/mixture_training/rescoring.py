@@ -1,4 +1,4 @@
-"""Train the second opinion on what the templates of a mixture found in labelled frames."""
+"""Train the rescorer, a second-stage RBF SVM, on the boxes that the templates propose."""
 
 from __future__ import annotations
 
@@ -20,146 +20,123 @@ from vehicle_detection.mixture import (
     mirror_channels,
     rescoring_features,
 )
-from vehicle_detection.mixture_training.negatives import Frame, is_negative
+from vehicle_detection.mixture_training.negatives import is_negative
 from vehicle_detection.mixture_training.positives import jitter_boxes
+from vehicle_detection.mixture_training.sources import TrainingFrame
 from vehicle_detection.params import MixtureParams, PyramidParams
 
 Floats = NDArray[np.float64]
-Rows = tuple[NDArray[np.float32], NDArray[np.float32]]
-"""Edges and colors of some crops, as `rescoring_features` gives them."""
+Crops = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""Edge and color features of some crops, as `rescoring_features` returns them."""
 
-# Principal components that are kept of edges and colors, and the weight of the colors' spread.
-_EDGE_AXES, _COLOUR_AXES, _COLOUR_WEIGHT = 200, 40, 0.5
-# The kernel, where the spread of all edges is 1, and the inverse strength of the regularisation.
+# Numbers of principal components, and the standard deviation that the color components are scaled to.
+_EDGE_COMPONENTS, _COLOR_COMPONENTS, _COLOR_STD = 200, 40, 0.5
+# RBF kernel, for edge components with a standard deviation of 1, and inverse regularization strength.
 _GAMMA, _C = 0.5, 3.0
-# IoU from which on a found box shows its vehicle; between which a moved one shows too little of it.
-_RIGHT, _WRONG = 0.55, (0.15, 0.45)
-# Copies of a labelled box, by how much of their sides all but the first are moved, and boxes beside it.
-_COPIES, _SHAKE, _BESIDE = 3, 0.06, 2
-# What the templates give the weakest boxes that are trained on: below what is ever verified.
-_LEAST = -1.1
+# IoU from which on a proposed box is positive, and range of IoU in which a jittered box is negative.
+_MIN_POSITIVE_IOU, _NEGATIVE_IOU = 0.55, (0.15, 0.45)
+# Positive copies of a labelled box, the jitter of all but the first, and negatives beside each labelled box.
+_COPIES, _JITTER_SCALE, _BESIDE = 3, 0.06, 2
+# Margin of the weakest proposals to train on, lower than that of any box that is rescored.
+_MIN_MARGIN = -1.1
 
 
 def train_rescorer(
-    frames: Sequence[Frame],
+    frames: Sequence[TrainingFrame],
     search: MixtureSearch,
     params: MixtureParams,
     rng: np.random.Generator,
     pool: ThreadPoolExecutor,
 ) -> Rescorer | None:
-    """Train a second opinion on the boxes that a search finds.
+    """Train a rescorer on the boxes that a search proposes; None if one of the classes has no sample.
 
-    Parameters
-    ----------
-    frames
-        Labelled frames.
-    search
-        Search with the templates and the correction of boxes.
-    params
-        Share of the opinion, and width of the narrowest vehicle.
-    rng
-        Draws the moved boxes, and the seed of the principal components.
-    pool
-        Threads.
-
-    Returns
-    -------
-    Rescorer or None
-        None where nothing false was found, nor anything right.
-
-    Notes
-    -----
-    Vehicles are the labelled boxes, a little moved too, and what was found at them; the others are what was
-    found where no vehicle is, and boxes that show a part of one only.
+    Positives are the labelled boxes, also slightly shifted, and the proposals on them. Negatives are the
+    proposals where no vehicle is, and boxes that show only a part of one.
     """
     seeds = rng.integers(2**32, size=len(frames)).tolist()
 
-    def views(frame: Frame, seed: int) -> tuple[Rows, Rows]:
-        right, wrong = _boxes(frame, search, params, np.random.default_rng(seed))
-        return rescoring_features(frame.image, right), rescoring_features(frame.image, wrong)
+    def crops(frame: TrainingFrame, seed: int) -> tuple[Crops, Crops]:
+        positive, negative = _sample_boxes(frame, search, params, np.random.default_rng(seed))
+        return rescoring_features(frame.image, positive), rescoring_features(frame.image, negative)
 
-    found = list(pool.map(views, frames, seeds))
-    vehicles, clutter = (_joined(rows) for rows in zip(*found))
-    if not (len(vehicles[0]) and len(clutter[0])):
+    positives, negatives = (_join(parts) for parts in zip(*pool.map(crops, frames, seeds)))
+    if not (len(positives[0]) and len(negatives[0])):
         return None
-    # Of clutter there is enough: each piece is taken as it is or mirrored.
-    shown = _joined([vehicles, _mirrored(vehicles)])
-    align_mirrored = rng.random((len(clutter[0]), 1)) < 0.5
-    back_edges, back_colors = _mirrored(clutter)
-    empty = (
-        np.where(align_mirrored, back_edges, clutter[0]),
-        np.where(align_mirrored, back_colors, clutter[1]),
+    # Negatives are plentiful, so each is taken either as it is or mirrored; positives are taken both ways.
+    positives = _join([positives, _mirror(positives)])
+    flipped = rng.random((len(negatives[0]), 1)) < 0.5
+    mirrored = _mirror(negatives)
+    negatives = (
+        np.where(flipped, mirrored[0], negatives[0]),
+        np.where(flipped, mirrored[1], negatives[1]),
     )
-    is_vehicle = np.repeat([True, False], [len(shown[0]), len(clutter[0])])
-    edges, colors = _joined([shown, empty])
+    is_vehicle = np.repeat([True, False], [len(positives[0]), len(negatives[0])])
+    edges, colors = _join([positives, negatives])
     seed = int(rng.integers(2**31))
-    to_edges = _principal(edges, _EDGE_AXES, 1.0, seed)
-    to_colors = _principal(colors, _COLOUR_AXES, _COLOUR_WEIGHT, seed)
+    to_edges = _fit_projection(edges, _EDGE_COMPONENTS, 1.0, seed)
+    to_colors = _fit_projection(colors, _COLOR_COMPONENTS, _COLOR_STD, seed)
     points = np.hstack([to_edges(edges), to_colors(colors)])
-    return _fit(to_edges, to_colors, points, is_vehicle, params.rescorer)
+    return _fit_svm(to_edges, to_colors, points, is_vehicle, params.blend_weight)
 
 
-def _boxes(
-    frame: Frame, search: MixtureSearch, params: MixtureParams, rng: np.random.Generator
+def _sample_boxes(
+    frame: TrainingFrame, search: MixtureSearch, params: MixtureParams, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Boxes of a frame that show a vehicle, and boxes that do not."""
-    windows = search.score_windows(frame.image, PyramidParams())
-    found, _ = search.model.propose_boxes(frame.image, windows, min_margin=_LEAST)
-    wrong = found[is_negative(found, frame)]
-    right = found[iou_matrix(found, frame.boxes).max(axis=1, initial=0) >= _RIGHT]
+    """Positive and negative boxes of a frame."""
+    proposals = _propose_boxes(search, frame.image)
+    negatives = proposals[is_negative(proposals, frame)]
+    positives = proposals[iou_matrix(proposals, frame.boxes).max(axis=1, initial=0) >= _MIN_POSITIVE_IOU]
     wide = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.min_width]
     copies = np.tile(wide, (_COPIES, 1))
-    shifts = rng.uniform(-1, 1, copies.shape) * _SHAKE * np.tile(copies[:, 2:] - copies[:, :2], 2)
+    shifts = rng.uniform(-1, 1, copies.shape) * _JITTER_SCALE * np.tile(copies[:, 2:] - copies[:, :2], 2)
     shifts[: len(wide)] = 0
     beside = jitter_boxes(np.tile(wide, (3 * _BESIDE, 1)), rng)
     overlap = iou_matrix(beside, frame.boxes).max(axis=1, initial=0)
-    beside = beside[(overlap > _WRONG[0]) & (overlap < _WRONG[1])][: _BESIDE * len(wide)]
-    return np.concatenate([copies + shifts, right]), np.concatenate([wrong, beside])
+    beside = beside[(overlap > _NEGATIVE_IOU[0]) & (overlap < _NEGATIVE_IOU[1])][: _BESIDE * len(wide)]
+    return np.concatenate([copies + shifts, positives]), np.concatenate([negatives, beside])
 
 
-def _joined(parts: Sequence[Rows]) -> Rows:
+def _propose_boxes(search: MixtureSearch, image: NDArray[np.uint8]) -> Floats:
+    """Boxes that the search proposes in a denoised frame, before rescoring."""
+    windows = search.score_windows(image, PyramidParams())
+    return search.model.propose_boxes(image, windows, min_margin=_MIN_MARGIN)[0]
+
+
+def _join(parts: Sequence[Crops]) -> Crops:
     edges = np.concatenate([np.empty((0, N_EDGE_FEATURES), np.float32), *(each for each, _ in parts)])
     colors = np.concatenate([np.empty((0, N_COLOR_FEATURES), np.float32), *(each for _, each in parts)])
     return edges, colors
 
 
-def _mirrored(rows: Rows) -> Rows:
-    """Rows of the mirrored crops."""
-    edges, colors = rows
-    count = len(edges)
-    planes = edges.reshape(count, N_CHANNELS, CROP_CELLS, CROP_CELLS).transpose(1, 0, 2, 3)
-    align_mirrored = mirror_channels(planes.reshape(N_CHANNELS, count * CROP_CELLS, CROP_CELLS))
-    align_mirrored = (
-        align_mirrored.reshape(N_CHANNELS, count, CROP_CELLS, CROP_CELLS)
-        .transpose(1, 0, 2, 3)
-        .reshape(count, N_EDGE_FEATURES)
-    )
-    return align_mirrored, colors.reshape(count, 3 * CROP_CELLS, CROP_CELLS)[:, :, ::-1].reshape(
-        count, N_COLOR_FEATURES
-    )
+def _mirror(crops: Crops) -> Crops:
+    """Features of the mirrored crops."""
+    edges, colors = crops
+    # All crops at once, one below the other.
+    channels = edges.reshape(-1, N_CHANNELS, CROP_CELLS, CROP_CELLS).swapaxes(0, 1)
+    mirrored = mirror_channels(channels.reshape(N_CHANNELS, -1, CROP_CELLS)).reshape(channels.shape)
+    mirrored_colors = colors.reshape(-1, 3 * CROP_CELLS, CROP_CELLS)[:, :, ::-1]
+    return mirrored.swapaxes(0, 1).reshape(edges.shape), mirrored_colors.reshape(colors.shape)
 
 
-def _principal(rows: NDArray[np.float32], count: int, weight: float, seed: int) -> Projection:
-    """Principal components, scaled so that what they give has a spread of `weight`."""
+def _fit_projection(rows: NDArray[np.float32], count: int, std: float, seed: int) -> Projection:
+    """Principal components, scaled so that the projected rows have a total standard deviation of `std`."""
     from sklearn.decomposition import PCA
 
-    fitted = PCA(min(count, *rows.shape), svd_solver="randomized", random_state=seed).fit(rows)
-    scale = weight / max(np.sqrt(fitted.explained_variance_.sum()), 1e-9)
-    return Projection(fitted.mean_, fitted.components_ * scale)
+    pca = PCA(min(count, *rows.shape), svd_solver="randomized", random_state=seed).fit(rows)
+    scale = std / max(np.sqrt(pca.explained_variance_.sum()), 1e-9)
+    return Projection(pca.mean_, pca.components_ * scale)
 
 
-def _fit(
+def _fit_svm(
     edges: Projection,
     colors: Projection,
     points: NDArray[np.float32],
     is_vehicle: NDArray[np.bool_],
     blend_weight: float,
 ) -> Rescorer:
-    """Train the kernel machine."""
+    """Train the RBF SVM on projected samples, ``(N, components)``."""
     from sklearn.svm import SVC
 
-    machine = SVC(C=_C, gamma=_GAMMA, cache_size=2000).fit(points, is_vehicle)
-    bias = float(machine.intercept_[0])
-    return Rescorer(
-        edges, colors, machine.support_vectors_, machine.dual_coef_[0], bias, _GAMMA, blend_weight
-    )
+    svm = SVC(C=_C, gamma=_GAMMA, cache_size=2000).fit(points, is_vehicle)
+    bias = float(svm.intercept_[0])
+    return Rescorer(edges, colors, svm.support_vectors_, svm.dual_coef_[0], bias, _GAMMA, blend_weight)

@@ -1,98 +1,164 @@
-"""The labelled frames of a data folder, by source."""
+"""Labelled frames to train on: data sets, the folder they are read from, and loaded frames."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection.datasets import load_frames, load_patches
+from vehicle_detection._common import check_number, check_type, describe
+from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, read_labels
-from vehicle_detection.mixture_training.negatives import FrameDataset
-
-COURSE = "course"
-"""Source of everything that is not below ``frames``: the images and clips of the course's road."""
-
-# Frames a second of the clips that are trained on; neighbors show the same.
-_CLIP_RATE = 3.0
-# Sources that leave small vehicles of the background unlabelled, and the width from which on they do not.
-_COMPLETE_FROM = {"indonesia": 60.0}
-# One of so many of the course's patches are trained on; neighbors show the same car.
-_PATCH_STEP = 6
+from vehicle_detection.evaluation import LabelledFrames, read_labels
+from vehicle_detection.params import entries
 
 
-def find_sources(folder: str | os.PathLike[str]) -> list[FrameDataset]:
-    """Find the labelled frames of a folder.
+@dataclass(frozen=True, eq=False)
+class FrameDataset:
+    """Labelled frames of one camera or country.
+
+    Attributes
+    ----------
+    name
+        Name of the data set.
+    sets
+        Its sets of labelled frames.
+    min_labelled_width
+        Width in pixels from which on every vehicle is labelled; narrower windows are never negatives.
+
+    Raises
+    ------
+    InvalidInputError
+        If the name is empty, or there are no frames.
+
+    Examples
+    --------
+    >>> from vehicle_detection.evaluation import FrameBoxes
+    >>> labels = FrameBoxes([0], None, [[9, 9, 60, 50]])
+    >>> road = LabelledFrames("road", [np.zeros((90, 120, 3), np.uint8)], labels)
+    >>> FrameDataset("camera", [road], min_labelled_width=40).sets
+    (LabelledFrames('road', 1 frame, 1 box),)
+    """
+
+    name: str
+    sets: tuple[LabelledFrames, ...]
+    min_labelled_width: float = 0.0
+
+    def __post_init__(self) -> None:
+        name: object = self.name
+        if not isinstance(name, str) or not name:
+            raise InvalidInputError(f"name must be a non-empty string, got {describe(name)}")
+        sets = entries(self.sets, "sets")
+        for part in sets:
+            check_type(part, "sets", LabelledFrames, "pass the frames with their labels as LabelledFrames")
+        check_number(self.min_labelled_width, "min_labelled_width", low=0)
+        object.__setattr__(self, "sets", sets)
+
+
+def check_sources(sources: object, *, min_count: int = 1) -> tuple[FrameDataset, ...]:
+    """Return at least `min_count` data sets with different names."""
+    if not isinstance(sources, (tuple, list)):
+        raise InvalidInputError(f"sources must be a list of FrameDataset, got {describe(sources)}")
+    for source in sources:
+        check_type(source, "sources", FrameDataset, "wrap the frames of each camera or country in one")
+    names = [source.name for source in sources]
+    if len(names) < min_count:
+        expected = "at least two, so that one can be left out" if min_count > 1 else "at least one"
+        raise InvalidInputError(f"sources must be {expected}; got {len(names)}: add labelled frames")
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise InvalidInputError(
+            f"sources must have different names, got {min(twice)!r} twice; merge them into one"
+        )
+    return tuple(sources)
+
+
+def find_sources(
+    folder: str | os.PathLike[str],
+    *,
+    min_labelled_widths: Mapping[str, float] | None = None,
+    clip_rate: float = 3.0,
+) -> list[FrameDataset]:
+    """Read a folder of labelled frames, as one data set for each file ``labels/NAME.csv``.
 
     Parameters
     ----------
     folder
-        Holds ``labels/NAME.csv`` for each set of frames, and these in ``frames/NAME/`` (a source of its own),
-        ``NAME/`` or ``videos/NAME.mp4`` (together the source ``"course"``).
+        Holds the frames of each file in ``frames/NAME/``, ``NAME/`` or ``videos/NAME.mp4``.
+    min_labelled_widths
+        ``min_labelled_width`` of data sets by name; 0 for the others.
+    clip_rate
+        Frames per second to take from a video; neighboring frames show nearly the same.
 
     Returns
     -------
     list of FrameDataset
-        By name, the course last.
+        In order of their names.
 
     Raises
     ------
     DatasetError
-        If there are no labels, or frames to labels are missing.
+        If there are no labels, or the frames of a file of labels are missing.
     InvalidInputError
-        If a file of labels is damaged, or knows none of its frames.
+        If a file of labels is invalid, or contains none of its frames.
     """
     root = Path(folder)
     if not root.is_dir():
-        raise DatasetError(f"folder {root} does not exist; name the folder of the labelled frames")
+        raise DatasetError(f"folder {root} does not exist; pass the folder of the labelled frames")
     files = sorted(root.glob("labels/*.csv"))
     if not files:
-        raise DatasetError(f"folder {root} has no labels/NAME.csv; name the folder of the labelled frames")
-    sources, course = [], []
+        raise DatasetError(f"folder {root} has no labels/NAME.csv; pass the folder of the labelled frames")
+    widths = min_labelled_widths or {}
+    sources = []
     for file in files:
-        name, labels = file.stem, read_labels(file)
-        frames, images, video = root / "frames" / name, root / name, root / "videos" / f"{name}.mp4"
         try:
-            if frames.is_dir():
-                part = LabelledFrames(name, load_frames(frames), labels)
-                sources.append(FrameDataset(name, (part,), _COMPLETE_FROM.get(name, 0.0)))
-            elif images.is_dir():
-                course.append(LabelledFrames(name, load_frames(images), labels))
-            elif video.is_file():
-                course.append(_sampled(video, labels))
-            else:
-                raise DatasetError(
-                    f"{file} has no frames: neither {frames}, {images} nor {video} exists; add them"
-                )
+            frames = _read_frames(root, file, clip_rate)
         except InvalidInputError as error:
             raise InvalidInputError(f"{file}: {error}") from error
-    return sources + ([FrameDataset(COURSE, tuple(course))] if course else [])
+        sources.append(FrameDataset(file.stem, (frames,), widths.get(file.stem, 0.0)))
+    return sources
 
 
-def find_patches(folder: str | os.PathLike[str]) -> list[NDArray[np.uint8]]:
-    """Take some of the course's vehicle patches, ``(64, 64, 3)`` each, from a folder; none where it has none.
-
-    Parameters
-    ----------
-    folder
-        May hold ``vehicles.zip``, or what it unpacks to in ``vehicles/``.
-
-    Raises
-    ------
-    DatasetError
-        As in `datasets.load_patches`.
-    """
-    for place in (Path(folder) / "vehicles.zip", Path(folder) / "vehicles"):
-        if place.exists():
-            return list(load_patches(place, label=1).patches[::_PATCH_STEP])
-    return []
-
-
-def _sampled(video: Path, labels: FrameBoxes) -> LabelledFrames:
+def _read_frames(root: Path, file: Path, clip_rate: float) -> LabelledFrames:
+    """Frames of one file of labels, from a folder of images or a video."""
     from vehicle_detection.video import probe_video
 
-    every = max(1, round(float(probe_video(video).fps) / _CLIP_RATE))
-    return LabelledFrames.from_video(video, labels, every=every)
+    name, labels = file.stem, read_labels(file)
+    video = root / "videos" / f"{name}.mp4"
+    folders = root / "frames" / name, root / name
+    images = next((place for place in folders if place.is_dir()), None)
+    if images is not None:
+        return LabelledFrames(name, load_frames(images), labels)
+    if video.is_file():
+        every = max(1, round(float(probe_video(video).fps) / clip_rate))
+        return LabelledFrames.from_video(video, labels, every=every)
+    raise DatasetError(f"{file} has no frames: add {folders[0]}, {folders[1]} or {video}")
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingFrame:
+    """A loaded frame and its labels."""
+
+    image: NDArray[np.uint8]  # (H, W, 3) RGB, denoised
+    boxes: NDArray[np.float64]  # (N, 4) vehicles
+    ignored: NDArray[np.float64]  # (M, 4) ignored boxes
+    min_labelled_width: float  # width in pixels from which on every vehicle is labelled
+
+
+def load_training_frames(sources: Sequence[FrameDataset]) -> list[TrainingFrame]:
+    """Load all frames of some data sets into memory."""
+    # Imported here, because mypy takes the name for a module if it is the only one imported at the top.
+    from vehicle_detection.mixture import denoise
+
+    loaded = []
+    for source in sources:
+        for part in source.sets:
+            for key, image in part:
+                labels = part.labels.frame(key)
+                boxes, ignored = labels.boxes[~labels.ignore], labels.boxes[labels.ignore]
+                loaded.append(TrainingFrame(denoise(image), boxes, ignored, source.min_labelled_width))
+    return loaded

@@ -1,4 +1,4 @@
-"""How windows become vehicles: by heat, as in the course, or by groups of windows that agree."""
+"""Parameters of the step from windows to boxes: the course's heat map, or groups of windows."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ from vehicle_detection._common import check_choice, check_integer, check_number
 
 @dataclass(frozen=True, kw_only=True)
 class HeatParams:
-    """How windows become regions.
+    """How windows become boxes by a heat map, as in the course.
 
     Attributes
     ----------
     weighting
-        ``"score"``: a window adds its score to the heat; ``"count"``: it adds 1, as in the course.
+        ``"score"``: each window adds its score to the heat; ``"count"``: it adds 1, as in the course.
     frames
-        Number of last frames whose heat is averaged in a video.
+        Number of frames of a video over which the heat is averaged.
     threshold
-        Heat at or below this is no vehicle.
+        Heat at or below this value is set to zero.
     peak_fraction
-        A region reaches out to this share of its own peak, in [0, 1); 0 is the plain course way.
+        A region is reduced to the part around its peak that has at least this fraction of the peak's heat,
+        in [0, 1); 0 keeps whole regions, as in the course.
     """
 
     weighting: Literal["score", "count"] = "score"
@@ -38,56 +39,55 @@ class HeatParams:
 
 @dataclass(frozen=True, kw_only=True)
 class RegionParams:
-    """How agreeing windows become the boxes of vehicles; lengths are shares of a window's side.
+    """How groups of overlapping windows become boxes; lengths are fractions of a window's side.
 
     Attributes
     ----------
     min_peak
-        Best score that a group of windows needs.
+        Minimum of the best score in a group.
     min_evidence
-        Sum of positive scores that it needs.
-    overlap
-        Windows that overlap the best one by more than this (IoU) join its group.
-    power
-        A window counts in the mean with this power of its score.
-    reach
-        Windows with a center this near to a group's are used up by it.
+        Minimum of the sum of positive scores in a group.
+    min_iou
+        Windows whose IoU with the best window exceeds this join its group.
+    score_power
+        The weight of a window in the group's mean is proportional to this power of its score.
+    suppression_radius
+        Windows whose center is this near to the center of a group start no group of their own.
     face_width, face_height
-        Part of the window that a vehicle's face fills, on the training patches and their like.
+        Size of the vehicle's face (front or rear) in a window, as on the training patches.
     face_offset_y
-        How far the face's middle lies below the window's.
+        Distance of the face's center below the window's center.
     flank_length_m
-        Length of a vehicle's flank in meters, as far as it shows.
-    covered
-        A group whose face lies inside the box of a better one by more than this share is no vehicle.
-    flank_peak
-        Such a group goes even before a weaker one, if it only lies on its flank and the other has more than
-        this share of its peak.
+        Length of the visible side of a vehicle in meters.
     flank_shift
-        Share of the visible flank by which the box's middle moves towards the vanishing point.
+        Fraction of the visible side by which the box's center moves towards the vanishing point.
+    max_coverage
+        A group is dropped if more than this fraction of its face lies inside the box of a better group.
+    flank_peak_ratio
+        A group whose face lies on the visible side of another vehicle is dropped even if it is the better
+        one, unless the other peak is at most this fraction of its own.
     """
 
     min_peak: float = 0.7
     min_evidence: float = 1.75
-    overlap: float = 0.5
-    power: float = 2.0
-    reach: float = 0.6
+    min_iou: float = 0.5
+    score_power: float = 2.0
+    suppression_radius: float = 0.6
     face_width: float = 0.84
     face_height: float = 0.79
     face_offset_y: float = -0.04
     flank_length_m: float = 6.0
     flank_shift: float = 0.27
-    covered: float = 0.5
-    flank_peak: float = 0.5
+    max_coverage: float = 0.5
+    flank_peak_ratio: float = 0.5
 
     def __post_init__(self) -> None:
         for name in ("min_peak", "min_evidence"):
             check_number(getattr(self, name), name, low=0, high=1e9)
-        check_number(self.overlap, "overlap", low=0, high=1)
-        check_number(self.covered, "covered", low=0, high=1)
-        check_number(self.flank_peak, "flank_peak", low=0, high=1)
-        check_number(self.power, "power", low=0, high=20)
-        for name in ("reach", "face_width", "face_height", "flank_shift"):
+        for name in ("min_iou", "max_coverage", "flank_peak_ratio"):
+            check_number(getattr(self, name), name, low=0, high=1)
+        check_number(self.score_power, "score_power", low=0, high=20)
+        for name in ("suppression_radius", "face_width", "face_height", "flank_shift"):
             check_number(getattr(self, name), name, above=0, high=2)
         check_number(self.face_offset_y, "face_offset_y", low=-1, high=1)
         check_number(self.flank_length_m, "flank_length_m", low=0, high=100)

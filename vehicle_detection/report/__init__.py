@@ -1,4 +1,4 @@
-"""The report: one self-contained HTML page about a run over a video."""
+"""The report: one self-contained HTML page about a run of `process_video`."""
 
 from vehicle_detection.report.writer import ReportWriter
 

@@ -1,8 +1,8 @@
-"""Charts over the time of a video, as SVG.
+"""SVG charts over the time of a video.
 
-Times are shares of the chart's width, so that a chart fits a telephone as well as a screen; texts and the
-height are in pixels, so that they stay readable on both. Curves stand in a frame of their own that is
-stretched to the width, and their lines are not.
+Horizontal positions are percentages of the chart's width, so that a chart fits any screen; text sizes and
+heights are pixels, so that they stay readable. Curves are drawn in a nested SVG that is stretched to the
+width, with lines of constant width.
 """
 
 from __future__ import annotations
@@ -15,81 +15,64 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection.report.history import Floats, TrackHistory, binned, runs
-from vehicle_detection.report.html import clock, tag, text
+from vehicle_detection.report.formatting import format_time, format_value, svg_element
+from vehicle_detection.report.history import Floats, TrackHistory, bin_means, split_runs
 
-COLORS = 7
-"""Number of colors, as many as `draw_tracks` has; classes ``c0``, ``c1``, ..."""
+MAX_ROWS = 14
+"""Largest number of tracks that get a row each in `gantt`; more tracks share rows."""
 
-ROWS = 14
-"""Tracks that have a row each; more of them share rows."""
-
-_WIDTH = 1000  # of a curve's frame
-_POINTS = 800  # at most, along a curve
-_FOOT = 20  # pixels below a chart for its times
-_ROW, _BAR = 22, 14  # pixels of a track's row and of its bar
-_LABEL_SHARE, _LABEL_HEIGHT = 5.0, 13.0  # percent and pixels that a label takes
-_NAME_SHARE = 0.08  # of the video that a track needs to be named, where that is not the only name
-_STEPS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200)
+_CURVE_WIDTH = 1000  # units across the nested SVG of the curves
+_MAX_POINTS = 800  # along a curve
+_TIMES_HEIGHT = 20  # pixels below a chart for its times
+_ROW_HEIGHT, _BAR_HEIGHT = 22, 14  # pixels
+_LABEL_WIDTH, _LABEL_HEIGHT = 5.0, 13.0  # percent of the chart's width, pixels
+_MIN_LABELED = 0.08  # fraction of the video that a track must last to be labeled inside a chart
+_TICK_STEPS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200)  # seconds
 
 
 class Label(NamedTuple):
-    """A text at a point of a chart: percent across, pixels down, and the track it names."""
+    """The label of a track in a chart."""
 
-    x: float
-    y: float
+    x: float  # percent
+    y: float  # pixels from the top
     track: int
 
 
 @dataclass(frozen=True)
-class Clock:
-    """The time axis: frames and their rate.
-
-    Attributes
-    ----------
-    frames
-        Number of frames, at least 1.
-    fps
-        Frames a second.
-    """
+class TimeAxis:
+    """The horizontal axis: at least one frame, and the frame rate."""
 
     frames: int
     fps: float
 
     @property
     def seconds(self) -> float:
-        """Length of the video."""
+        """Duration of the video."""
         return self.frames / self.fps
 
     @property
-    def step(self) -> int:
-        """Frames that share a point of a curve."""
-        return math.ceil(self.frames / _POINTS)
+    def bin_width(self) -> int:
+        """Frames per point of a curve."""
+        return math.ceil(self.frames / _MAX_POINTS)
 
     def percent(self, frame: float) -> str:
-        """Place of a frame's beginning in percent of the width."""
-        return f"{_short(frame / self.frames * 100)}%"
+        """Position of the beginning of a frame, as a percentage of the width."""
+        return f"{_decimal(frame / self.frames * 100)}%"
 
-    def ticks(self, most: int = 6) -> list[float]:
-        """Round seconds along the axis, from 0 on, about `most` of them at the most."""
-        step = next((step for step in _STEPS if self.seconds / step < most), 0)
-        step = step or 3600 * math.ceil(self.seconds / 3600 / most)
+    def x(self, frame: float) -> str:
+        """Position of a frame in the nested SVG of the curves."""
+        return _decimal(min(frame / self.frames, 1.0) * _CURVE_WIDTH)
+
+    def ticks(self, max_ticks: int = 6) -> list[float]:
+        """Round times in seconds from 0 on, at most about `max_ticks`."""
+        step = next((step for step in _TICK_STEPS if self.seconds / step < max_ticks), 0)
+        step = step or 3600 * math.ceil(self.seconds / 3600 / max_ticks)
         return [number * step for number in range(int(self.seconds / step) + 1)]
 
 
 @dataclass(frozen=True)
-class Scale:
-    """The value axis: round numbers from `low` at the bottom to `high` at the top.
-
-    Attributes
-    ----------
-    low, high
-        Ends of the axis.
-    height
-        Pixels between them.
-    ticks
-        Round values from `low` to `high`.
-    """
+class ValueAxis:
+    """The vertical axis: round values from `low` (bottom) to `high` (top), `height` pixels apart."""
 
     low: float
     high: float
@@ -97,12 +80,14 @@ class Scale:
     ticks: tuple[float, ...]
 
     @classmethod
-    def around(cls, low: float, high: float, height: int, *, whole: bool = False, most: int = 4) -> Scale:
-        """Make the least round axis that holds `low` and `high`."""
-        reach = max(high - low, 1e-6)
-        power = 10.0 ** math.floor(math.log10(reach / most))
-        step = next(factor * power for factor in (1, 2, 5, 10) if factor * power * most >= reach * 0.999)
-        step = max(step, 1.0) if whole else step
+    def covering(
+        cls, low: float, high: float, height: int, *, integers: bool = False, max_steps: int = 4
+    ) -> ValueAxis:
+        """Smallest axis with round ticks that contains `low` and `high`."""
+        extent = max(high - low, 1e-6)
+        power = 10.0 ** math.floor(math.log10(extent / max_steps))
+        step = next(each * power for each in (1, 2, 5, 10) if each * power * max_steps >= extent * 0.999)
+        step = max(step, 1.0) if integers else step
         first = math.floor(low / step + 1e-9)
         last = max(math.ceil(high / step - 1e-9), first + 1)
         return cls(first * step, last * step, height, tuple(n * step for n in range(first, last + 1)))
@@ -112,187 +97,196 @@ class Scale:
         return (self.high - value) / (self.high - self.low) * self.height
 
 
-def chart(content: str, axis: Clock, scale: Scale, *, label: str, labels: Iterable[Label] = ()) -> str:
-    """Put curves on axes: `content` stands in a frame of 1000 by the scale's height."""
-    lines = [
-        tag("line", class_="zero" if not value and scale.low < 0 else "grid", x1=0, x2="100%", y1=y, y2=y)
-        for value in scale.ticks
-        for y in [_short(scale.y(value))]
-    ]
-    curves = tag(
+def chart(
+    content: str,
+    time_axis: TimeAxis,
+    value_axis: ValueAxis,
+    *,
+    label: str,
+    track_labels: Iterable[Label] = (),
+) -> str:
+    """Draw curves or bars (markup) on their axes; `label` is the text alternative."""
+    height = value_axis.height
+    grid, values = [], []
+    for value in value_axis.ticks:
+        y = value_axis.y(value)
+        line = "zero" if not value and value_axis.low < 0 else "grid"
+        grid.append(svg_element("line", class_=line, x1=0, x2="100%", y1=_decimal(y), y2=_decimal(y)))
+        text = format_value(float(value))
+        values.append(svg_element("text", text, x="100%", dx=-6, y=_decimal(y + 4), text_anchor="end"))
+    curves = svg_element(
         "svg",
         content,
-        viewBox=f"0 0 {_WIDTH} {scale.height}",
+        viewBox=f"0 0 {_CURVE_WIDTH} {height}",
         preserveAspectRatio="none",
         width="100%",
-        height=scale.height,
+        height=height,
     )
-    names = [
-        tag("text", f"#{each.track}", class_="name", x=f"{_short(each.x)}%", y=_short(each.y), dx=dx, **rest)
-        for each in _apart(labels, scale.height)
-        for dx, rest in [(4, {}) if each.x < 90 else (-4, {"text_anchor": "end"})]
-    ]
-    values = [
-        tag("text", _plain(value), x="100%", dx=-6, y=_short(scale.y(value) + 4), text_anchor="end")
-        for value in scale.ticks
-    ]
-    return _graph(values, [*lines, curves, *names], axis, scale.height, role="img", label=label)
+    names = []
+    for each in _separate_labels(track_labels, height):
+        place: dict[str, object] = {"dx": 4} if each.x < 90 else {"dx": -4, "text_anchor": "end"}
+        place |= {"x": f"{_decimal(each.x)}%", "y": _decimal(each.y)}
+        names.append(svg_element("text", f"#{each.track}", class_="track-name", **place))
+    return _graph(values, [*grid, curves, *names], time_axis, height, role="img", label=label)
 
 
-def gantt(tracks: Sequence[TrackHistory], axis: Clock, *, label: str) -> str:
-    """Draw a bar for each time that a track is shown: a row for each track, or a shared one if they are many.
-
-    Parameters
-    ----------
-    tracks
-        In the order in which they appeared.
-    axis
-        The time axis.
-    label
-        What the chart shows, for those who do not see it.
-    """
-    shared = len(tracks) > ROWS
-    rows = _lanes(tracks, axis) if shared else range(len(tracks))
-    sides, bars, names = [], [], []
+def gantt(tracks: Sequence[TrackHistory], axis: TimeAxis, *, label: str) -> str:
+    """Draw bars of the times at which tracks are shown; `tracks` are in the order of their first frames."""
+    share_rows = len(tracks) > MAX_ROWS
+    rows = _assign_rows(tracks, axis) if share_rows else range(len(tracks))
+    row_names, bars, names = [], [], []
     for track, row in zip(tracks, rows):
-        middle = (row + 0.5) * _ROW
-        name = {"y": _short(middle + 4)}
-        if not shared:
-            sides.append(tag("text", f"#{track.id}", x="100%", dx=-6, text_anchor="end", **name))
-        elif len(track.frames) > _NAME_SHARE * axis.frames:
-            place = axis.percent(track.first)
-            names.append(tag("text", f"#{track.id}", class_="name", x=place, dx=3, **name))
-        begin, end = clock(track.first / axis.fps), clock((track.last + 1) / axis.fps)
+        middle = (row + 0.5) * _ROW_HEIGHT
+        name, y = f"#{track.id}", _decimal(middle + 4)
+        if not share_rows:
+            row_names.append(svg_element("text", name, x="100%", dx=-6, y=y, text_anchor="end"))
+        elif len(track.frames) > _MIN_LABELED * axis.frames:
+            x = axis.percent(track.first)
+            names.append(svg_element("text", name, class_="track-name", x=x, dx=3, y=y))
+        times = f"{format_time(track.first / axis.fps)} to {format_time((track.last + 1) / axis.fps)}"
         bars.append(
-            tag(
+            svg_element(
                 "g",
-                tag("title", f"#{track.id}, {begin} to {end}"),
-                *_bar(track, middle - _BAR / 2, axis),
-                class_=_class("bar", track),
+                svg_element("title", f"{name}, {times}"),
+                *_track_bars(track, middle - _BAR_HEIGHT / 2, axis),
+                class_=f"bar c{track.color}",
                 role="button",
                 tabindex=0,
-                aria_label=f"Track {track.id}, {begin} to {end}: show in the video",
+                aria_label=f"Track {track.id}, {times}: show in the video",
                 data_frame=track.first,
                 data_track=track.id,
             )
         )
-    height = _ROW * (max(rows, default=-1) + 1)
-    return _graph(sides, [*bars, *names], axis, height, role="group", label=label)
+    height = _ROW_HEIGHT * (max(rows, default=-1) + 1)
+    return _graph(row_names, [*bars, *names], axis, height, role="group", label=label)
 
 
-def _lanes(tracks: Sequence[TrackHistory], axis: Clock) -> list[int]:
-    """Choose a row for each track: the first one in which it does not touch another."""
-    gap = axis.frames // 200
-    ends: list[int] = []
-    lanes = []
+def _assign_rows(tracks: Sequence[TrackHistory], axis: TimeAxis) -> list[int]:
+    """Row of each track: the first in which it does not touch an earlier track."""
+    min_gap = axis.frames // 200
+    ends: list[int] = []  # last frame in each row
+    rows = []
     for track in tracks:
-        free = (lane for lane, end in enumerate(ends) if end + gap < track.first)
-        lane = next(free, len(ends))
-        ends[lane:] = [track.last, *ends[lane + 1 :]]
-        lanes.append(lane)
-    return lanes
+        free = (row for row, end in enumerate(ends) if end + min_gap < track.first)
+        row = next(free, len(ends))
+        ends[row : row + 1] = [track.last]
+        rows.append(row)
+    return rows
 
 
-def _bar(track: TrackHistory, y: float, axis: Clock) -> list[str]:
-    gap = max(1, axis.frames // _WIDTH)
+def _track_bars(track: TrackHistory, y: float, axis: TimeAxis) -> list[str]:
     return [
-        tag(
+        svg_element(
             "rect",
             x=axis.percent(start),
             width=axis.percent(stop - start),
-            y=_short(y),
-            height=_BAR,
+            y=_decimal(y),
+            height=_BAR_HEIGHT,
             rx=3,
         )
-        for start, stop in track.spans(gap)
+        for start, stop in track.spans(max(1, axis.frames // _CURVE_WIDTH))
     ]
 
 
-def _graph(values: list[str], parts: list[str], axis: Clock, height: int, *, role: str, label: str) -> str:
-    """Put a chart beside its values and over its times, with the marks that the script moves."""
+def _graph(
+    values: list[str], content: list[str], axis: TimeAxis, height: int, *, role: str, label: str
+) -> str:
+    """Put a chart beside its values and above its times, with the two lines that the script moves."""
     times = []
-    tenths = axis.ticks()[1:2] < [1.0]
-    for seconds in axis.ticks():
-        x = seconds * axis.fps / axis.frames * 100
-        anchor = "end" if x > 97 else "middle"
-        place = axis.percent(seconds * axis.fps)
-        times.append(tag("line", class_="grid", x1=place, x2=place, y1=0, y2=height))
-        name = clock(seconds, tenths=tenths)
-        times.append(tag("text", name, x=place, y=height + 15, text_anchor=anchor))
-    marks = [tag("line", class_=name, x1=0, x2=0, y1=0, y2=height) for name in ("mark", "now")]
-    side = tag("svg", *values, class_="values", width=44, height=height + _FOOT, aria_hidden="true")
-    plot = tag(
+    ticks = axis.ticks()
+    tenths = ticks[1:2] < [1.0]
+    for seconds in ticks:
+        frame = seconds * axis.fps
+        x, anchor = axis.percent(frame), "end" if frame / axis.frames > 0.97 else "middle"
+        times.append(svg_element("line", class_="grid", x1=x, x2=x, y1=0, y2=height))
+        text = format_time(seconds, tenths=tenths)
+        times.append(svg_element("text", text, x=x, y=height + 15, text_anchor=anchor))
+    lines = [svg_element("line", class_=name, x1=0, x2=0, y1=0, y2=height) for name in ("cursor", "playhead")]
+    total = height + _TIMES_HEIGHT
+    side = svg_element("svg", *values, class_="values", width=44, height=total, aria_hidden="true")
+    plot = svg_element(
         "svg",
         *times,
-        *parts,
-        *marks,
+        *content,
+        *lines,
         class_="plot",
         width="100%",
-        height=height + _FOOT,
+        height=total,
         role=role,
         aria_label=label,
     )
-    return tag("div", side, plot, class_="graph")
+    return f'<div class="graph">{side}{plot}</div>'
 
 
-def curve(track: TrackHistory, name: str, axis: Clock, scale: Scale, *, band: str | None = None) -> str:
-    """Draw a column of a track as a line, and another one as a band of that width on either side of it."""
-    bins, values = binned(track.frames, track.columns[name], axis.step)
+def curve(
+    track: TrackHistory, name: str, time_axis: TimeAxis, value_axis: ValueAxis, *, std: str | None = None
+) -> str:
+    """Draw a column of a track as a line; `std` names the column whose values give a band around it."""
+    bins, values = bin_means(track.frames, track.columns[name], time_axis.bin_width)
+    half_widths = np.zeros(len(bins))
+    if std is not None:
+        # Standard errors of the frames with a known value only, as for the line.
+        known = np.where(np.isfinite(track.columns[name]), track.columns[std], np.nan)
+        std_bins, std_values = bin_means(track.frames, known, time_axis.bin_width)
+        half_widths[np.searchsorted(bins, std_bins)] = std_values
     lines, bands = [], []
-    errors = np.zeros(len(bins))
-    if band is not None:
-        # The same frames for both: an error without its value says nothing.
-        known = np.where(np.isfinite(track.columns[name]), track.columns[band], np.nan)
-        error_bins, error_values = binned(track.frames, known, axis.step)
-        errors[np.searchsorted(bins, error_bins)] = error_values
-    for part in runs(bins):
-        lines.append(_line(_points(bins[part], values[part], axis, scale), axis))
-        if band is not None:
-            upper = _points(bins[part], values[part] + errors[part], axis, scale)
-            lower = _points(bins[part], values[part] - errors[part], axis, scale)
+    for run in split_runs(bins):
+        lines.append(_line(_points(bins[run], values[run], time_axis, value_axis), time_axis))
+        if std is not None:
+            upper = _points(bins[run], values[run] + half_widths[run], time_axis, value_axis)
+            lower = _points(bins[run], values[run] - half_widths[run], time_axis, value_axis)
             bands.append(f"M{' '.join(upper + lower[::-1])}Z")
-    pieces = [tag("path", class_="band", d="".join(bands))] if bands else []
-    pieces += [tag("path", class_="line", d="".join(lines))] if lines else []
-    return tag("g", *pieces, class_=_class("curve", track), data_track=track.id) if pieces else ""
+    if not lines:
+        return ""
+    paths = [svg_element("path", class_="band", d="".join(bands))] if bands else []
+    paths.append(svg_element("path", class_="line", d="".join(lines)))
+    return svg_element("g", *paths, class_=f"curve c{track.color}", data_track=track.id)
 
 
-def end_label(track: TrackHistory, name: str, axis: Clock, scale: Scale) -> Label | None:
-    """Name a track at the end of its line, unless it is too short for a name."""
-    known = np.flatnonzero(np.isfinite(track.columns[name]))
-    if not known.size or track.frames[known[-1]] - track.frames[known[0]] < _NAME_SHARE * axis.frames:
-        return None
-    bins, values = binned(track.frames, track.columns[name], axis.step)
-    x = min((bins[-1] + 0.5) * axis.step / axis.frames, 1.0) * 100
-    return Label(float(x), scale.y(float(values[-1])) - 4, track.id)
+def end_labels(
+    tracks: Iterable[TrackHistory], name: str, time_axis: TimeAxis, value_axis: ValueAxis
+) -> list[Label]:
+    """Labels at the ends of the tracks' lines; short lines get none."""
+    labels = []
+    for track in tracks:
+        known = np.flatnonzero(np.isfinite(track.columns[name]))
+        if known.size and np.ptp(track.frames[known]) >= _MIN_LABELED * time_axis.frames:
+            bins, values = bin_means(track.frames, track.columns[name], time_axis.bin_width)
+            x = min((bins[-1] + 0.5) * time_axis.bin_width / time_axis.frames, 1.0) * 100
+            labels.append(Label(float(x), value_axis.y(float(values[-1])) - 4, track.id))
+    return labels
 
 
-def steps(heights: Sequence[float], edges: Sequence[float], axis: Clock, scale: Scale) -> str:
-    """Draw a bar from each of the `edges`, in frames, to the next."""
-    down = _short(scale.y(0))
-    pieces = [
-        f"M{_x(start, axis)},{down}V{_short(scale.y(height))}H{_x(stop, axis)}V{down}Z"
+def count_bars(
+    heights: Sequence[float], edges: Sequence[float], time_axis: TimeAxis, value_axis: ValueAxis
+) -> str:
+    """Draw a bar from each edge (in frames) to the next."""
+    bottom = _decimal(value_axis.y(0))
+    bars = [
+        f"M{time_axis.x(start)},{bottom}V{_decimal(value_axis.y(height))}H{time_axis.x(stop)}V{bottom}Z"
         for height, start, stop in zip(heights, edges, edges[1:])
         if height
     ]
-    return tag("path", class_="count", d="".join(pieces))
+    return svg_element("path", class_="count", d="".join(bars))
 
 
-def share_bar(share: float) -> str:
-    """Draw a share, 0-1, as a small bar."""
-    bar = tag("rect", class_="count", width=f"{_short(min(max(share, 0), 1) * 100)}%", height=10)
-    return tag("svg", bar, class_="share", height=10, aria_hidden="true")
+def fraction_bar(fraction: float) -> str:
+    """Draw a fraction in [0, 1] as a small bar."""
+    width = f"{_decimal(min(max(fraction, 0), 1) * 100)}%"
+    bar = svg_element("rect", class_="count", width=width, height=10)
+    return svg_element("svg", bar, class_="fraction", height=10, aria_hidden="true")
 
 
-def _apart(labels: Iterable[Label], height: int) -> list[Label]:
-    """Move labels down, or up where the chart ends, until none lies on another."""
+def _separate_labels(labels: Iterable[Label], height: int) -> list[Label]:
+    """Move labels down, or up where the chart ends, until none overlap; drop those without room."""
     placed: list[Label] = []
     for label in sorted(labels, key=lambda each: (each.y, each.x)):
-        near = sorted(other.y for other in placed if abs(other.x - label.x) < _LABEL_SHARE)
+        near = sorted(other.y for other in placed if abs(other.x - label.x) < _LABEL_WIDTH)
         y = max(label.y, _LABEL_HEIGHT)
         for taken in near:
             if abs(taken - y) < _LABEL_HEIGHT:
                 y = taken + _LABEL_HEIGHT
-        if y > height - 2:  # no room below: the first free place above
+        if y > height - 2:  # no room below: take the first free place above
             y = height - 2.0
             for taken in reversed(near):
                 if abs(taken - y) < _LABEL_HEIGHT:
@@ -302,34 +296,24 @@ def _apart(labels: Iterable[Label], height: int) -> list[Label]:
     return placed
 
 
-def _points(bins: NDArray[np.int64], values: Floats, axis: Clock, scale: Scale) -> list[str]:
-    reach = scale.high - scale.low  # far outside, a number has no more digits than inside
-    inside = np.clip(values, scale.low - reach, scale.high + reach)
+def _points(bins: NDArray[np.int64], values: Floats, time_axis: TimeAxis, value_axis: ValueAxis) -> list[str]:
+    """Coordinates of the points of a curve, in the middle of each bin."""
+    extent = value_axis.high - value_axis.low
+    # Clip values far outside the axis, whose coordinates would have many digits.
+    clipped = np.clip(values, value_axis.low - extent, value_axis.high + extent)
     return [
-        f"{_x((number + 0.5) * axis.step, axis)},{_short(scale.y(value))}"
-        for number, value in zip(bins.tolist(), inside.tolist())
+        f"{time_axis.x((number + 0.5) * time_axis.bin_width)},{_decimal(value_axis.y(value))}"
+        for number, value in zip(bins.tolist(), clipped.tolist())
     ]
 
 
-def _line(points: list[str], axis: Clock) -> str:
+def _line(points: list[str], axis: TimeAxis) -> str:
     if len(points) > 1:
         return f"M{' '.join(points)}"
-    wide = _short(max(axis.step / axis.frames * _WIDTH, 2))
-    return f"M{points[0]}h{wide}"  # a line without length would not be seen
+    # A single point gets a short line, as a line without length is invisible.
+    return f"M{points[0]}h{_decimal(max(axis.bin_width / axis.frames * _CURVE_WIDTH, 2))}"
 
 
-def _x(frame: float, axis: Clock) -> str:
-    return _short(min(frame / axis.frames, 1.0) * _WIDTH)
-
-
-def _class(name: str, track: TrackHistory) -> str:
-    return f"{name} c{(track.id - 1) % COLORS}"
-
-
-def _short(value: float) -> str:
-    """Write a number with two decimals at the most."""
+def _decimal(value: float) -> str:
+    """Format a number with at most two decimals."""
     return f"{value:.2f}".rstrip("0").rstrip(".")
-
-
-def _plain(value: float) -> str:
-    return text(f"{value:g}".replace("-", "\N{MINUS SIGN}"))

@@ -1,4 +1,4 @@
-"""What a report keeps of a run: a few numbers for each vehicle of each frame, and no frame."""
+"""Track data that a report keeps: a few numbers per track and frame, and no images."""
 
 from __future__ import annotations
 
@@ -13,101 +13,96 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer, check_number, describe
+from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.errors import InvalidInputError
 
 Floats = NDArray[np.float64]
 
 COLUMNS = ("distance_m", "distance_std_m", "speed_mps", "speed_std_mps", "score")
-"""What is kept of a track in each frame; NaN where it is unknown."""
+"""Attributes of a track that are kept for each frame; NaN if unknown."""
 
-NEAREST_SECONDS = 1 / 3
-"""A nearest approach is a median over this time: a single frame does not make one."""
+# The closest approach is a median over this time, so that a single outlier does not count.
+_APPROACH_SECONDS = 1 / 3
+_MAX_VALUE = 1e9
 
-_BOUND = 1e9
 
-
-class Nearest(NamedTuple):
-    """How near a vehicle came: in which frame, meters, and their standard error (NaN if unknown)."""
+class ClosestApproach(NamedTuple):
+    """Smallest distance of a track."""
 
     frame: int
-    meters: float
-    error: float
+    distance_m: float
+    std_m: float | None
 
 
 @dataclass(frozen=True, eq=False)
 class TrackHistory:
-    """A vehicle over the whole video.
-
-    Attributes
-    ----------
-    id
-        Its number.
-    frames
-        ``(N,)`` int64, the frames in which it was shown, counted from 0, ascending.
-    columns
-        For each name of ``COLUMNS``, ``(N,)`` float64.
-    """
+    """One track over the whole video."""
 
     id: int
-    frames: NDArray[np.int64]
-    columns: dict[str, Floats]
+    frames: NDArray[np.int64]  # (N,) indices of the frames that show the track, ascending
+    columns: dict[str, Floats]  # (N,) for each name of COLUMNS
 
     @property
     def first(self) -> int:
-        """First frame that shows it."""
+        """First frame that shows the track."""
         return int(self.frames[0])
 
     @property
     def last(self) -> int:
-        """Last frame that shows it."""
+        """Last frame that shows the track."""
         return int(self.frames[-1])
 
-    def spans(self, gap: int = 1) -> list[tuple[int, int]]:
-        """Return the runs of frames that show it, half-open; up to `gap` frames apart they are one."""
-        ends = np.flatnonzero(np.diff(self.frames) > gap)
-        starts = [0, *(ends + 1)]
+    @property
+    def color(self) -> int:
+        """Index of the track's color in `TRACK_COLORS`, as in the video."""
+        return (self.id - 1) % len(TRACK_COLORS)
+
+    @property
+    def mean_score(self) -> float | None:
+        """Mean of the known scores; None if none is known."""
+        scores = self.columns["score"]
+        known = scores[np.isfinite(scores)]
+        return float(known.mean()) if known.size else None
+
+    def spans(self, max_step: int = 1) -> list[tuple[int, int]]:
+        """Half-open ranges of frames that show the track; frames up to `max_step` apart share a range."""
         return [
-            (int(self.frames[start]), int(self.frames[stop]) + 1)
-            for start, stop in zip(starts, [*ends, len(self.frames) - 1])
+            (int(self.frames[run.start]), int(self.frames[run.stop - 1]) + 1)
+            for run in split_runs(self.frames, max_step)
         ]
 
-    def nearest(self, fps: float) -> Nearest | None:
-        """Return the least distance, as a median over ``NEAREST_SECONDS``; None where none is known."""
-        meters, errors = self.columns["distance_m"], self.columns["distance_std_m"]
-        known = np.flatnonzero(np.isfinite(meters))
+    def closest_approach(self, fps: float) -> ClosestApproach | None:
+        """Minimum of the running median of the distance; None if no distance is known."""
+        distances, stds = self.columns["distance_m"], self.columns["distance_std_m"]
+        known = np.flatnonzero(np.isfinite(distances))
         if not known.size:
             return None
-        width = min(max(round(NEAREST_SECONDS * fps), 1), known.size)
-        medians = np.median(np.lib.stride_tricks.sliding_window_view(meters[known], width), axis=1)
+        width = min(max(round(_APPROACH_SECONDS * fps), 1), known.size)
+        medians = np.median(np.lib.stride_tricks.sliding_window_view(distances[known], width), axis=1)
         start = int(np.argmin(medians))
         window = known[start : start + width]
-        # The frame of the window that is most like its median, where the video is to stop.
-        place = window[int(np.argmin(np.abs(meters[window] - medians[start])))]
-        return Nearest(int(self.frames[place]), float(medians[start]), float(np.median(errors[window])))
+        # The frame to seek to: the one whose distance is closest to the median.
+        best = window[int(np.argmin(np.abs(distances[window] - medians[start])))]
+        std = float(np.median(stds[window]))
+        return ClosestApproach(
+            int(self.frames[best]), float(medians[start]), std if math.isfinite(std) else None
+        )
 
 
 class TrackLog:
-    """Collects the vehicles of each frame; 48 bytes for each that is shown.
-
-    Attributes
-    ----------
-    first_time
-        Time of the first frame in the source in seconds, None where it is not known.
-    counts
-        Number of vehicles shown in each frame so far.
-    """
+    """Collects the shown tracks of each frame, 48 bytes for each track and frame."""
 
     def __init__(self) -> None:
-        self.first_time: float | None = None
-        self.counts = array("q")
+        self.first_time: float | None = None  # of the first frame in the source, in seconds
+        self.counts = array("q")  # shown tracks in each frame
         self._columns: dict[int, tuple[array[int], dict[str, array[float]]]] = {}
 
     def add(self, index: int, time: float | None, tracks: Iterable[Any]) -> None:
-        """Take the tracks of the next frame."""
+        """Add the tracks of the next frame."""
         expected = len(self.counts)
         if check_integer(index, "frame_index", low=0) != expected:
             raise InvalidInputError(
-                f"frame_index must be {expected}, as frames come one by one from 0; got {index}; "
+                f"frame_index must be {expected}, as frames are written in order from 0; got {index}; "
                 "use a new writer for another video"
             )
         if time is not None:
@@ -116,28 +111,29 @@ class TrackLog:
         if not expected:
             self.first_time = time
         self.counts.append(len(rows))
-        for number, values in rows:
-            if number not in self._columns:
-                self._columns[number] = (array("q"), {name: array("d") for name in COLUMNS})
-            frames, columns = self._columns[number]
+        for track_id, values in rows:
+            if track_id not in self._columns:
+                self._columns[track_id] = (array("q"), {name: array("d") for name in COLUMNS})
+            frames, columns = self._columns[track_id]
             frames.append(expected)
             for name, value in zip(COLUMNS, values):
                 columns[name].append(value)
 
     def histories(self) -> list[TrackHistory]:
-        """Return the vehicles, in the order in which they appeared."""
-        found = (
+        """Return the tracks in the order of their first frames."""
+        histories = (
             TrackHistory(
-                number,
+                track_id,
                 np.array(frames, np.int64),
                 {name: np.array(column, np.float64) for name, column in columns.items()},
             )
-            for number, (frames, columns) in self._columns.items()
+            for track_id, (frames, columns) in self._columns.items()
         )
-        return sorted(found, key=lambda track: (track.first, track.id))
+        return sorted(histories, key=lambda track: (track.first, track.id))
 
 
 def _rows(tracks: object) -> Iterator[tuple[int, list[float]]]:
+    """Id and values of `COLUMNS` of each shown track."""
     if isinstance(tracks, (str, bytes)) or not isinstance(tracks, Iterable):
         raise InvalidInputError(f"tracks must be Track objects, got {describe(tracks)}; pass result.tracks")
     seen = set()
@@ -148,54 +144,49 @@ def _rows(tracks: object) -> Iterator[tuple[int, list[float]]]:
             )
         if not getattr(track, "shown", True):
             continue
-        number = check_integer(track.id, "track.id", low=0)
-        if number in seen:
+        track_id = check_integer(track.id, "track.id", low=0)
+        if track_id in seen:
             raise InvalidInputError(
-                f"tracks must have an id each, got {number} twice in one frame; pass result.tracks"
+                f"tracks must have unique ids, got {track_id} twice in one frame; pass result.tracks"
             )
-        seen.add(number)
-        yield number, [_number(getattr(track, name, None), name) for name in COLUMNS]
+        seen.add(track_id)
+        yield track_id, [_number(getattr(track, name, None), name) for name in COLUMNS]
 
 
 def _number(value: Any, name: str) -> float:
-    """Return a value of a track as a float; NaN where it is unknown or beyond all use."""
+    """Return a value of a track as a float; NaN if it is unknown, infinite or absurdly large."""
     if value is None:
         return math.nan
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-        raise InvalidInputError(f"track.{name} must be a number or None, got {describe(value)}; drop it")
+        raise InvalidInputError(f"track.{name} must be a number or None, got {describe(value)}; omit it")
     try:
         number = float(value)
     except OverflowError:
         return math.nan
-    return number if abs(number) < _BOUND else math.nan
+    return number if abs(number) < _MAX_VALUE else math.nan
 
 
-def binned(frames: NDArray[np.int64], values: Floats, step: int) -> tuple[NDArray[np.int64], Floats]:
-    """Take the mean of the known values in each run of `step` frames.
-
-    Returns
-    -------
-    tuple of numpy.ndarray
-        Numbers of the runs that hold a known value, ascending, and the mean in each.
+def bin_means(frames: NDArray[np.int64], values: Floats, width: int) -> tuple[NDArray[np.int64], Floats]:
+    """Mean of the known values in bins of `width` frames: indices of the bins with known values, and means.
 
     Examples
     --------
-    >>> bins, means = binned(np.arange(5), np.array([1.0, 3.0, np.nan, np.nan, 7.0]), 2)
+    >>> bins, means = bin_means(np.arange(5), np.array([1.0, 3.0, np.nan, np.nan, 7.0]), 2)
     >>> bins.tolist(), means.tolist()
     ([0, 2], [2.0, 7.0])
     """
     known = np.isfinite(values)
-    bins, place, counts = np.unique(frames[known] // step, return_inverse=True, return_counts=True)
-    return bins, np.bincount(place, values[known], len(bins)) / counts
+    bins, inverse, counts = np.unique(frames[known] // width, return_inverse=True, return_counts=True)
+    return bins, np.bincount(inverse, values[known], len(bins)) / counts
 
 
-def runs(bins: NDArray[np.int64]) -> list[slice]:
-    """Slices of the stretches in which numbers follow each other without a gap.
+def split_runs(numbers: NDArray[np.int64], max_step: int = 1) -> list[slice]:
+    """Slices of an ascending array in which each number is at most `max_step` above the one before.
 
     Examples
     --------
-    >>> [(part.start, part.stop) for part in runs(np.array([3, 4, 5, 9]))]
+    >>> [(run.start, run.stop) for run in split_runs(np.array([3, 4, 5, 9]))]
     [(0, 3), (3, 4)]
     """
-    edges = [0, *(np.flatnonzero(np.diff(bins) > 1) + 1).tolist(), len(bins)]
+    edges = [0, *(np.flatnonzero(np.diff(numbers) > max_step) + 1).tolist(), len(numbers)]
     return [slice(start, stop) for start, stop in pairwise(edges) if stop > start]

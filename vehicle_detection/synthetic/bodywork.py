@@ -34,21 +34,21 @@ class BodyPainter:
         outline = np.concatenate([np.column_stack([x, y]), np.column_stack([-x, y])[::-1]])
         return self.canvas.polygon(outline, soften=soften)
 
-    def box(
+    def paint_box(
         self, x: float, y: float, width: float, height: float, color: ArrayLike, opacity: float,
         radius: float = 0.0,
     ) -> None:  # fmt: skip
         """Paint a box centered at ``(x, y)``."""
         self.canvas.paint(self.canvas.box(x, y, width, height, radius=radius), color, opacity)
 
-    def window(self, low: float, high: float, ratio: float, inset: float, radius: float) -> Mask:
+    def paint_window(self, low: float, high: float, ratio: float, inset: float, radius: float) -> Mask:
         """Paint a window across the body."""
         bottom, top = (float(self.body.half_width(y)) * ratio - inset for y in (low, high))
-        return self.glass(
+        return self.paint_glass(
             round_corners([(-bottom, low), (bottom, low), (top, high), (-top, high)], radius), seats=True
         )
 
-    def glass(self, outline: Outline, *, seats: bool) -> Mask:
+    def paint_glass(self, outline: Outline, *, seats: bool) -> Mask:
         """Paint a pane: a dark cabin behind it, the reflected sky on it, a dark seal around it."""
         canvas, look = self.canvas, self.look
         gain = self.by_light(0.3, 1.0)
@@ -69,18 +69,18 @@ class BodyPainter:
         )
         return pane
 
-    def plate(self, y: float) -> None:
+    def paint_plate(self, y: float) -> None:
         """Paint a license plate with its recess."""
         light, look = self.light, self.look
         gain = self.by_light(max(0.5, light.lamps * 0.7), min(1.1, light.ambient + 0.6 * light.sun))
-        self.box(0, y, 0.6, 0.185, self.body.color * 0.35, 0.55, radius=0.03)
-        self.box(0, y, 0.52, 0.115, np.array(look.plate_color) * gain, 1.0)
+        self.paint_box(0, y, 0.6, 0.185, self.body.color * 0.35, 0.55, radius=0.03)
+        self.paint_box(0, y, 0.52, 0.115, np.array(look.plate_color) * gain, 1.0)
         rng = np.random.default_rng(look.seed)
         for x in np.linspace(-0.2, 0.2, 8):
             if rng.random() < 0.85:
-                self.box(x, y, rng.uniform(0.02, 0.045), 0.066, (40, 42, 48), 0.8)
+                self.paint_box(x, y, rng.uniform(0.02, 0.045), 0.066, (40, 42, 48), 0.8)
 
-    def lamp(self, outline: Outline, color: Color) -> None:
+    def paint_lamp(self, outline: Outline, color: Color) -> None:
         """Paint a lamp: its glass, darker at the rim, and its light."""
         canvas, lamps = self.canvas, self.light.lamps
         mask = canvas.polygon(outline)
@@ -106,9 +106,9 @@ class BodyPainter:
         lower_edge = self.band(dims.clearance - 0.02, dims.clearance + 0.09, 0.82, soften=0.02)
         canvas.paint(lower_edge, (24, 24, 26), 0.9)
         for side in (-1, 1):
-            self.box(side * 0.62, dims.clearance + 0.16, 0.16, 0.035, (120, 20, 20), 0.8, radius=0.01)
+            self.paint_box(side * 0.62, dims.clearance + 0.16, 0.16, 0.035, (120, 20, 20), 0.8, radius=0.01)
         if look.exhaust:
-            self.box(-0.5, dims.clearance + 0.02, 0.11, 0.05, (150, 150, 150), 0.7, radius=0.02)
+            self.paint_box(-0.5, dims.clearance + 0.02, 0.11, 0.05, (150, 150, 150), 0.7, radius=0.02)
         # Gaps around the tailgate and a crease under the window.
         low = dims.belt + (0.11 if sedan else 0.03)
         high = dims.height - (0.075 if sedan else 0.11)
@@ -122,22 +122,22 @@ class BodyPainter:
             edge = self.band(dims.belt - 0.06, dims.belt - 0.005, 0.9, 0.02, soften=0.01)
             canvas.multiply(edge, 1.12)
         if not look.windowless:
-            self.window(low, high, 0.86 if sedan else 0.93, 0.0 if sedan else 0.035, 0.1)
+            self.paint_window(low, high, 0.86 if sedan else 0.93, 0.0 if sedan else 0.035, 0.1)
             if not sedan:
-                self.box(-0.12, low + 0.03, 0.42, 0.018, (14, 14, 14), 0.8)
+                self.paint_box(-0.12, low + 0.03, 0.42, 0.018, (14, 14, 14), 0.8)
         if look.rear_doors:
             middle, length = (dims.clearance + dims.height) / 2 + 0.1, dims.height - dims.clearance - 0.4
-            self.box(0, middle, 0.05, length, self.body.color * 0.6, 0.9)
+            self.paint_box(0, middle, 0.05, length, self.body.color * 0.6, 0.9)
             canvas.multiply(canvas.box(0, middle, 0.014, length), 0.3)
         roof = self.band(high + 0.035, dims.height - 0.015, 0.86, 0.04, soften=0.008)
         canvas.paint(roof, self.reflection * 0.5 + self.body.color * 0.55 * self.by_light(0.3, 1), 0.35)
-        self.box(0, high + 0.02, 0.34, 0.022, (110, 20, 20), 0.8)
+        self.paint_box(0, high + 0.02, 0.34, 0.022, (110, 20, 20), 0.8)
         self._paint_tail_lamps(bumper_top, low)
         metal = self.by_light(0.3, 0.9)
         if look.chrome:
-            self.box(0, dims.belt - 0.15, 0.56, 0.028, np.array((196, 198, 200)) * metal, 0.8)
-        self.plate(dims.belt - 0.24 if look.plate_high else dims.clearance + 0.24)
-        self.box(0, dims.belt - 0.09, 0.07, 0.07, np.array((190, 192, 196)) * metal, 0.8, radius=0.035)
+            self.paint_box(0, dims.belt - 0.15, 0.56, 0.028, np.array((196, 198, 200)) * metal, 0.8)
+        self.paint_plate(dims.belt - 0.24 if look.plate_high else dims.clearance + 0.24)
+        self.paint_box(0, dims.belt - 0.09, 0.07, 0.07, np.array((190, 192, 196)) * metal, 0.8, radius=0.035)
 
     def _paint_tail_lamps(self, bumper_top: float, window_low: float) -> None:
         look, half_width = self.look, self.body.half_width
@@ -156,13 +156,13 @@ class BodyPainter:
         reverse_light = np.array((226, 206, 200)) * self.by_light(0.4, 0.9)
         for side in (-1, 1):
             outline = round_corners(corners * (side, 1), 0.05)
-            self.lamp(outline, (136, 20, 24))
+            self.paint_lamp(outline, (136, 20, 24))
             x, y = outline.mean(0)
             if look.tall_lamps:
                 lens = (x, low + 0.3 * look.lamp_height, look.lamp_width * 0.6, 0.055)
             else:
                 lens = (x - side * 0.3 * look.lamp_width, y, 0.07, look.lamp_height * 0.5)
-            self.box(*lens, reverse_light, 0.65, radius=0.02)
+            self.paint_box(*lens, reverse_light, 0.65, radius=0.02)
 
     def paint_front(self) -> None:
         """Paint the front of a vehicle: windshield, hood, headlamps, grille, bumper, plate."""
@@ -174,30 +174,30 @@ class BodyPainter:
         )
         low = min(max(low, dims.belt), dims.height - 0.5)
         high = 2.4 if dims.is_box else dims.height - 0.1
-        pane = self.window(low, high, 0.92, 0.02, 0.09)
+        pane = self.paint_window(low, high, 0.92, 0.02, 0.09)
         mirror = canvas.box(0, high - 0.07, 0.2, 0.06, radius=0.03)
         canvas.paint(mirror & pane, (20, 22, 24), 0.9)
         # The gap at the front edge of the hood.
         canvas.multiply(self.band(nose - 0.01, nose + 0.008, 0.86, 0.05), 0.5)
         dark = np.array([22, 22, 24]) * self.by_light(0.5, 1.0)
         grille_y = nose - 0.06 - look.grille_height / 2
-        self.box(0, grille_y, 0.72, look.grille_height, dark, 0.92, radius=0.04)
+        self.paint_box(0, grille_y, 0.72, look.grille_height, dark, 0.92, radius=0.04)
         if look.chrome:
-            self.box(0, grille_y, 0.7, 0.02, (190, 192, 196), 0.7)
-        self.box(0, dims.clearance + 0.13, 1.05, 0.13, dark, 0.9, radius=0.05)
+            self.paint_box(0, grille_y, 0.7, 0.02, (190, 192, 196), 0.7)
+        self.paint_box(0, dims.clearance + 0.13, 1.05, 0.13, dark, 0.9, radius=0.05)
         top = nose - 0.02
         outer = float(self.body.half_width(top)) * 0.97
         corners = np.array([(0, 0.03), (-0.4, -0.03), (-0.36, -0.17), (-0.02, -0.13)])
         corners += (outer, top)
         for side in (-1, 1):
-            self.box(side * 0.66, dims.clearance + 0.14, 0.17, 0.1, dark, 0.7, radius=0.04)
+            self.paint_box(side * 0.66, dims.clearance + 0.14, 0.17, 0.1, dark, 0.7, radius=0.04)
             outline = round_corners(corners * (side, 1), 0.05)
-            self.lamp(outline, (186, 190, 196))
+            self.paint_lamp(outline, (186, 190, 196))
             if light.lamps > 0.3:
                 x, y = outline.mean(0)
-                self.box(x, y, 0.2, 0.15, (255, 252, 236), light.lamps, radius=0.07)
+                self.paint_box(x, y, 0.2, 0.15, (255, 252, 236), light.lamps, radius=0.07)
         canvas.multiply(self.band(dims.clearance + 0.4, dims.clearance + 0.415, 0.98), 0.6)
-        self.plate(dims.clearance + 0.27)
+        self.paint_plate(dims.clearance + 0.27)
         canvas.paint(self.band(dims.clearance - 0.02, dims.clearance + 0.05, 0.86, soften=0.02), dark, 0.9)
 
     def paint_box_rear(self) -> None:
@@ -213,14 +213,14 @@ class BodyPainter:
         canvas.multiply(canvas.box(0, middle, 0.025, dims.height - 1.1), 0.35)
         for x in (-0.75, -0.3, 0.3, 0.75):
             canvas.multiply(canvas.box(x, middle, 0.03, dims.height - 1.15), 0.72)
-            self.box(x, 1.6, 0.09, 0.06, np.array([90, 90, 92]) * gain, 0.8)
+            self.paint_box(x, 1.6, 0.09, 0.06, np.array([90, 90, 92]) * gain, 0.8)
         canvas.paint(self.band(dims.clearance, 1.0, 1.0), np.array([30, 30, 32]) * self.by_light(0.5, 1))
-        self.box(0, 0.55, dims.width * 0.92, 0.12, np.array([120, 120, 120]) * gain, 0.8)
+        self.paint_box(0, 0.55, dims.width * 0.92, 0.12, np.array([120, 120, 120]) * gain, 0.8)
         for side in (-1, 1):
             outer, inner = side * (half - 0.1), side * (half - 0.5)
             outline = round_corners([(outer, 0.78), (outer, 0.94), (inner, 0.94), (inner, 0.78)], 0.03)
-            self.lamp(outline, (176, 24, 26))
-        self.plate(0.8)
+            self.paint_lamp(outline, (176, 24, 26))
+        self.paint_plate(0.8)
 
     def paint_flank(self) -> None:
         """Paint a flank: outline, windows with pillars, wheels in their arches, doors, sill."""
@@ -263,15 +263,15 @@ class BodyPainter:
         near = np.maximum(profile_at(body.end, y) + 0.1, first)
         far = np.minimum(dims.length - profile_at(body.far_end, y) - 0.1, last)
         pane = np.array([(near[0], low), (far[0], low), (far[1], high), (near[1], high)])
-        canvas.multiply(self.glass(round_corners(pane, 0.06), seats=False), 0.85)
+        canvas.multiply(self.paint_glass(round_corners(pane, 0.06), seats=False), 0.85)
         if dims.is_box:
             return
         for position in (0.3, 0.62):
             x = near[0] + (far[0] - near[0]) * position
-            self.box(x, (low + high) / 2, 0.07, high - low, body.color * self.by_light(0.12, 0.4), 0.9)
+            self.paint_box(x, (low + high) / 2, 0.07, high - low, body.color * self.by_light(0.12, 0.4), 0.9)
             gap = canvas.box(x, (dims.clearance + low) / 2 + 0.06, 0.014, low - dims.clearance - 0.12)
             canvas.multiply(gap, 0.55)
-            self.box(x + 0.2, dims.belt - 0.11, 0.17, 0.03, body.color * 0.7, 0.6)
+            self.paint_box(x + 0.2, dims.belt - 0.11, 0.17, 0.03, body.color * 0.7, 0.6)
 
     def _paint_wheels(self, dark: NDArray[np.float64], gain: float) -> None:
         canvas, dims, body = self.canvas, self.dims, self.body

@@ -60,7 +60,7 @@ def make_light(name: str, rain: float, rng: np.random.Generator) -> Light:
     sun = np.array([side, 0.35 if dusk else rng.uniform(0.7, 1.3), rng.uniform(-0.8, 0.3)])
     right, up, ahead = (sun / np.linalg.norm(sun)).tolist()
     to_sun = (right, up, ahead)
-    # All presets draw their values, so that the choice of the light does not change what is drawn later.
+    # Every preset draws its values, so that those of one do not depend on which is requested.
     presets = {
         "day": Light(
             (74, 122, 178), (178, 202, 220), rng.uniform(0.56, 0.68), rng.uniform(0.45, 0.6), to_sun,

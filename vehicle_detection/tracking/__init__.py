@@ -1,4 +1,4 @@
-"""Tracking: detections in, vehicles with steady identities out."""
+"""Tracking: detections of single frames in, vehicles with constant identities out."""
 
 from vehicle_detection.tracking.track import Track
 from vehicle_detection.tracking.tracker import Tracker

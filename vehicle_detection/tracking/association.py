@@ -1,120 +1,88 @@
-"""Which detection belongs to which track, and which boxes show the same vehicle."""
+"""Assignment of detections to tracks, and tests of whether boxes show the same vehicle."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from vehicle_detection.boxes import box_areas, intersection_matrix
+from vehicle_detection.boxes import (
+    Floats,
+    box_areas,
+    intersection_matrix,
+    iter_nms,
+    overlap_matrices,
+)
+from vehicle_detection.params import TrackParams
 
-Floats = NDArray[np.float64]
-
-_FORBIDDEN = 1e3
-_AREA_RATIO = 4.0
-_COVERED, _FITTING = 0.7, 0.7
-
-
-def overlap_matrices(first: Floats, second: Floats) -> tuple[Floats, Floats, Floats]:
-    """Overlap of ``(N, 4)`` with ``(M, 4)`` boxes, each ``(N, M)`` in [0, 1].
-
-    Returns
-    -------
-    tuple
-        IoU; share of each first box that the second covers; share of the smaller of both that both cover.
-    """
-    shared = intersection_matrix(first, second)
-    areas, others = np.maximum(box_areas(first), 1e-9)[:, None], np.maximum(box_areas(second), 1e-9)[None]
-    return shared / (areas + others - shared), shared / areas, shared / np.minimum(areas, others)
+_FORBIDDEN_COST = 1e3
+_MAX_AREA_RATIO = 4.0
+# A detection shows two vehicles if it covers more than this fraction of both, and has a lower IoU with both.
+_MIN_MERGED_COVERAGE, _MAX_MERGED_IOU = 0.7, 0.7
 
 
-def match_boxes(predicted: Floats, measured: Floats, gate: Floats) -> list[tuple[int, int]]:
-    """Assign measured boxes to predicted ones so that the sum of the costs is least.
+def match_boxes(predicted: Floats, measured: Floats, max_distance: Floats) -> list[tuple[int, int]]:
+    """Pairs ``(predicted, measured)`` of indices by the Hungarian method, with minimum total cost.
 
-    The cost joins IoU, the distance of the centers in box sizes and the ratio of the areas. The assignment is
-    the Hungarian one (Kuhn, *Naval Research Logistics Quarterly*, 1955).
-
-    Parameters
-    ----------
-    predicted, measured
-        ``(N, 4)`` and ``(M, 4)`` boxes.
-    gate
-        ``(N,)`` farthest distance of the centers, in mean widths and heights.
-
-    Returns
-    -------
-    list
-        Pairs of indices ``(predicted, measured)``, those within the gate only.
+    The cost is the sum of ``1 - IoU``, of the distance between centers in units of `max_distance` ``(N,)``,
+    and of the weighted logarithm of the ratio of areas (Kuhn, *Naval Research Logistics Quarterly*, 1955).
     """
     if not len(predicted) or not len(measured):
         return []
-    iou = overlap_matrices(predicted, measured)[0]
-    distance = _center_distances(predicted, measured) / gate[:, None]
+    iou, _ = overlap_matrices(predicted, measured)
+    distance = center_distances(predicted, measured) / max_distance[:, None]
     areas, others = (np.log(np.maximum(box_areas(boxes), 1.0)) for boxes in (predicted, measured))
-    ratio = np.abs(areas[:, None] - others[None])
-    cost = (1 - iou) + distance + 0.3 * ratio
-    cost[(distance > 1) | (ratio > math.log(_AREA_RATIO))] = _FORBIDDEN
+    area_ratio = np.abs(areas[:, None] - others[None])
+    cost = (1 - iou) + distance + 0.3 * area_ratio
+    cost[(distance > 1) | (area_ratio > math.log(_MAX_AREA_RATIO))] = _FORBIDDEN_COST
     rows, columns = linear_sum_assignment(cost)
-    return [(int(r), int(c)) for r, c in zip(rows, columns) if cost[r, c] < _FORBIDDEN]
+    return [(int(r), int(c)) for r, c in zip(rows, columns) if cost[r, c] < _FORBIDDEN_COST]
 
 
-def match_nearest(predicted: Floats, measured: Floats, gate: Floats) -> list[tuple[int, int]]:
-    """Pair boxes by the distance of their centers alone, nearest first (the course's first system)."""
-    pairs: list[tuple[int, int]] = []
-    distance = _center_distances(predicted, measured) / gate[:, None]
-    for flat in np.argsort(distance, axis=None, kind="stable"):
-        row, column = divmod(int(flat), len(measured))
-        if distance[row, column] <= 1 and all(row != r and column != c for r, c in pairs):
-            pairs.append((row, column))
-    return pairs
-
-
-def _center_distances(first: Floats, second: Floats) -> Floats:
-    """``(N, M)`` distances of the centers, in mean widths and heights of the two boxes."""
+def center_distances(first: Floats, second: Floats) -> Floats:
+    """``(N, M)`` distances between the centers, in mean widths and heights of the two boxes."""
     sides, others = (np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0) for boxes in (first, second))
     apart = (first[:, :2] + first[:, 2:])[:, None] - (second[:, :2] + second[:, 2:])[None]
-    # Sums of both edges over sums of both sides: the halves cancel.
+    # Sums of both edges over sums of both sides: the factors of one half cancel.
     apart = apart / (sides[:, None] + others[None])
     return np.asarray(np.hypot(apart[:, :, 0], apart[:, :, 1]))
 
 
-def same_vehicle(box: Floats, others: Floats, max_overlap: float, max_cover: float) -> bool:
-    """Whether a box overlaps one of `others` so much that both show one vehicle."""
-    if not len(others):
-        return False
-    iou, _, cover = overlap_matrices(box[None], others)
-    return bool(((iou > max_overlap) | (cover > max_cover)).any())
+def covered_fractions(boxes: Floats, others: Floats) -> Floats:
+    """``(N, M)`` fraction of each of `boxes` that each of `others` covers."""
+    return intersection_matrix(boxes, others) / np.maximum(box_areas(boxes), 1e-9)[:, None]
 
 
-def merged_regions(
-    predicted: Floats, measured: Floats, own: dict[int, int]
+def distinct_vehicles(boxes: Floats, order: Sequence[int], known: Floats, params: TrackParams) -> list[int]:
+    """Rows of `order` (best first) whose box shows neither a vehicle of `known` nor one of an earlier row."""
+    iou, coverage = overlap_matrices(boxes, known)
+    is_known = np.any((iou > params.max_iou) | (coverage > params.max_coverage), axis=1).tolist()
+    rows = np.array([row for row in order if not is_known[row]], np.intp)
+    kept = iter_nms(boxes, rows, max_iou=params.max_iou, max_coverage=params.max_coverage)
+    return [row for row, _ in kept]
+
+
+def merged_detections(
+    predicted: Floats, measured: Floats, assigned: dict[int, int]
 ) -> tuple[set[int], dict[int, int]]:
-    """Find detections that show two vehicles as one region: they cover both, and fit neither.
+    """Find detections that show two vehicles in one box: they cover both predictions, and fit neither.
 
-    Parameters
-    ----------
-    predicted, measured
-        ``(N, 4)`` boxes of the tracks and ``(M, 4)`` boxes of the detections.
-    own
-        The detection of each track that has one.
-
-    Returns
-    -------
-    tuple
-        Tracks whose own detection is such a region, and the region of each other track that one shows.
+    `assigned` maps tracks to their detections. Returns the tracks whose own detection is merged, and the
+    merged detection of each track that has none of its own.
     """
     merged: set[int] = set()
-    region: dict[int, int] = {}
-    alone = np.ones(len(predicted), np.bool_)
-    alone[list(own)] = False
-    if own and alone.any():
-        iou, covered, _ = overlap_matrices(predicted, measured)
-        fits = (covered > _COVERED) & (iou < _FITTING)
-        for row, column in own.items():
-            others = np.flatnonzero(fits[:, column] & alone).tolist()
-            if fits[row, column] and others:
+    shared: dict[int, int] = {}
+    unassigned = np.ones(len(predicted), np.bool_)
+    unassigned[list(assigned)] = False
+    if assigned and unassigned.any():
+        iou, _ = overlap_matrices(predicted, measured)
+        covered = covered_fractions(predicted, measured)
+        is_part = (covered > _MIN_MERGED_COVERAGE) & (iou < _MAX_MERGED_IOU)
+        for row, column in assigned.items():
+            others = np.flatnonzero(is_part[:, column] & unassigned).tolist()
+            if is_part[row, column] and others:
                 merged.add(row)
-                region |= dict.fromkeys(others, column)
-    return merged, region
+                shared |= dict.fromkeys(others, column)
+    return merged, shared

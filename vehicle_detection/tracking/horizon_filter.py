@@ -1,10 +1,10 @@
-"""The horizon of a video, learned from the vehicles that are followed.
+"""Estimates the horizon of a video from the tracked vehicles.
 
-On a flat road a foot lies below the horizon by the width of the vehicle in pixels, times the camera's height
-over the vehicle's width: a straight line for each vehicle, whose value at the width 0 is the horizon. Its
-slope differs from vehicle to vehicle, as their widths do, around one that is known roughly. All lines are
-fitted together, the slopes as random effects (Laird and Ware, *Biometrics*, 1982), so that one vehicle that
-stays where it is says little, several ones more, and one that comes nearer most.
+On a flat road the bottom edge of a box lies below the horizon by the box's width times the ratio of the
+camera's height to the vehicle's width: a straight line for each vehicle, whose value at width 0 is the
+horizon. The slopes differ between vehicles, as their widths do, around a mean that is roughly known. All
+lines are fitted together, with the slopes as random effects (Laird and Ware, *Biometrics*, 1982). A vehicle
+at constant distance therefore contributes little, several vehicles more, and an approaching one most.
 """
 
 from __future__ import annotations
@@ -15,121 +15,100 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection.camera import Camera, inner_edges, width_times_distance
+from vehicle_detection.boxes import Floats
+from vehicle_detection.camera import Camera, FrameShape, lateral_offsets
 
-Floats = NDArray[np.float64]
-
-# The errors of a vehicle's boxes stay alike for the first time; memory fades in the second, and in the third
-# where no vehicle fits it.
-_ALIKE_SECONDS, _MEMORY_SECONDS, _RETHINK_SECONDS = 0.5, 30.0, 3.0
-# Standard errors beyond which a vehicle is no car on this road; least weight of one that is remembered, as a
-# share of the greatest.
-_FAR_OFF, _LEAST = 3.0, 1e-4
-# No less than this standard error is ever claimed, in pixels of the reference camera.
-_SUREST = 1.0
+# Times (s): correlation of the errors of a vehicle's boxes; decay of the sums; faster decay of the sums where
+# no vehicle fits them.
+_CORRELATION_TIME, _MEMORY_TIME, _MISFIT_TIME = 0.5, 30.0, 3.0
+# Standard errors beyond which a vehicle is an outlier; minimum weight of a vehicle, relative to the largest.
+_OUTLIER, _MIN_WEIGHT = 3.0, 1e-4
+# Minimum standard error of the estimate, in pixels of the reference camera.
+_MIN_STD_PX = 1.0
 
 
 class HorizonFilter:
-    """What the vehicles of a video tell about the camera's horizon.
+    """Recursive estimate of the camera's horizon from the tracked vehicles.
 
-    Parameters
-    ----------
-    camera
-        The camera; a horizon without doubt is left as it is.
-
-    Attributes
-    ----------
-    given, camera
-        The camera as it was given, and as it is known by now.
+    `prior_camera` is the camera as given, whose horizon is fixed if its standard error is 0, and `camera` the
+    current estimate.
     """
 
     def __init__(self, camera: Camera) -> None:
-        self.given = self.camera = camera
+        self.prior_camera = self.camera = camera
         self._ids = np.empty(0, np.int64)
-        # For each vehicle the sums of 1, width, width squared, foot, and width times foot, over variances.
+        # Weighted sums of 1, width, width², bottom and width * bottom for each vehicle.
         self._sums = np.empty((0, 5))
 
-    def take(self, ids: NDArray[np.int64], boxes: Floats, frame: tuple[int, int], dt: float) -> None:
-        """Learn from the vehicles of a frame.
-
-        Parameters
-        ----------
-        ids
-            ``(N,)`` numbers of the vehicles.
-        boxes
-            ``(N, 4)`` boxes that the frame's border does not cut.
-        frame
-            ``(height, width)``.
-        dt
-            Seconds since the last frame.
-        """
-        if not self.given.horizon_std_px or not len(boxes):
+    def update(self, ids: NDArray[np.int64], boxes: Floats, frame: FrameShape, dt: float) -> None:
+        """Add the vehicles of a frame: ids ``(N,)`` and boxes ``(N, 4)`` that are not truncated."""
+        if not self.prior_camera.horizon_std_px or not len(boxes):
             return
-        camera, scale = self.camera, self.given.pixel_scale
+        camera, scale = self.camera, self.prior_camera.pixel_scale
         sides = boxes[:, 2:] - boxes[:, :2]
-        # The width that the face alone has, and its foot.
-        straight = camera.focal_px * camera.vehicle_width_m
-        width = sides[:, 0] * straight / width_times_distance(camera, inner_edges(boxes, frame))
+        # The width of the near face alone.
+        face_scale = camera.focal_px * camera.vehicle_width_m
+        width = sides[:, 0] * face_scale / camera.width_times_distance(lateral_offsets(boxes, frame))
         slope = camera.height_m / camera.vehicle_width_m
-        edge = np.hypot(camera.bottom_std_px * scale, camera.box_error * sides)
+        edge_std = np.hypot(camera.bottom_std_px * scale, camera.box_std * sides)
         variance = (
-            np.square(edge[:, 1])
-            + 2 * np.square(slope * edge[:, 0])
-            + np.square(camera.horizon_error_px * scale)
+            np.square(edge_std[:, 1])
+            + 2 * np.square(slope * edge_std[:, 0])
+            + np.square(camera.pitch_std_px * scale)
         )
-        off = boxes[:, 3] - (camera.horizon_px + slope * width)
-        allowed = variance + camera.horizon_std_px**2 + np.square(self._slope_errors()[1] * width)
-        good = np.square(off) < _FAR_OFF**2 * allowed
-        # Where most vehicles do not fit what is remembered, it is that which is wrong.
-        strange = 1 - float(good.mean())
-        self._sums *= math.exp(-dt / _MEMORY_SECONDS - dt * strange**2 / _RETHINK_SECONDS)
-        weight = min(dt / _ALIKE_SECONDS, 1.0) / variance[good]
-        x, y = width[good], boxes[good, 3]
+        residual = boxes[:, 3] - (camera.horizon_px + slope * width)
+        expected = variance + camera.horizon_std_px**2 + np.square(self._slope_std()[1] * width)
+        fits = np.square(residual) < _OUTLIER**2 * expected
+        # If most vehicles do not fit the estimate, the estimate is wrong: forget it faster.
+        misfit = 1 - float(fits.mean())
+        self._sums *= math.exp(-dt / _MEMORY_TIME - dt * misfit**2 / _MISFIT_TIME)
+        weight = min(dt / _CORRELATION_TIME, 1.0) / variance[fits]
+        x, y = width[fits], boxes[fits, 3]
         self._add(
-            ids[good], np.stack([weight, weight * x, weight * x * x, weight * y, weight * x * y], axis=1)
+            ids[fits], np.stack([weight, weight * x, weight * x * x, weight * y, weight * x * y], axis=1)
         )
         self._solve()
 
     def _add(self, ids: NDArray[np.int64], sums: Floats) -> None:
-        """Add to the sums of the vehicles; those of which next to nothing is remembered go."""
-        fresh = ids[~np.isin(ids, self._ids)]
-        self._ids = np.concatenate((self._ids, fresh))
-        self._sums = np.concatenate((self._sums, np.zeros((len(fresh), 5))))
+        """Add to the sums of these vehicles, and drop vehicles whose weight has decayed."""
+        new = ids[~np.isin(ids, self._ids)]
+        self._ids = np.concatenate((self._ids, new))
+        self._sums = np.concatenate((self._sums, np.zeros((len(new), 5))))
         if len(ids):
             self._sums[(self._ids[None] == ids[:, None]).argmax(axis=1)] += sums
-        kept = self._sums[:, 0] > _LEAST * self._sums[:, 0].max(initial=0.0)
+        kept = self._sums[:, 0] > _MIN_WEIGHT * self._sums[:, 0].max(initial=0.0)
         self._ids, self._sums = self._ids[kept], self._sums[kept]
 
-    def _slope_errors(self) -> tuple[float, float]:
-        """Spread of the slope that all vehicles have in common, and that of one vehicle's."""
-        camera = self.given
+    def _slope_std(self) -> tuple[float, float]:
+        """Return the standard deviations of the mean slope, and of the slope of one vehicle."""
+        camera = self.prior_camera
         slope = camera.height_m / camera.vehicle_width_m
-        common = slope * camera.height_std_m / camera.height_m
-        own = slope * camera.vehicle_width_std_m / camera.vehicle_width_m
-        return common, math.hypot(common, own)
+        mean_std = slope * camera.height_std_m / camera.height_m
+        vehicle_std = slope * camera.vehicle_width_std_m / camera.vehicle_width_m
+        return mean_std, math.hypot(mean_std, vehicle_std)
 
     def _solve(self) -> None:
-        """Find the horizon, and with it the camera as it is known now."""
-        camera = self.given
+        """Solve for horizon and mean slope, and update `camera`."""
+        camera = self.prior_camera
         slope = camera.height_m / camera.vehicle_width_m
-        common, both = self._slope_errors()
-        own = max(both**2 - common**2, 1e-12)
+        mean_std, total_std = self._slope_std()
+        vehicle_variance = max(total_std**2 - mean_std**2, 1e-12)
         n, x, xx, y, xy = self._sums.T
-        # Information about (horizon, common slope) of each line, its own part of the slope integrated out.
-        left = 1 / (xx + 1 / own)
-        matrix = np.array(
+        # Information of each line about (horizon, mean slope), with its own part of the slope integrated out.
+        factor = 1 / (xx + 1 / vehicle_variance)
+        information = np.array(
             [
-                [(n - x * x * left).sum(), (x - x * xx * left).sum()],
-                [(x - x * xx * left).sum(), (xx - xx * xx * left).sum()],
+                [(n - x * x * factor).sum(), (x - x * xx * factor).sum()],
+                [(x - x * xx * factor).sum(), (xx - xx * xx * factor).sum()],
             ]
         )
-        vector = np.array([(y - x * xy * left).sum(), (xy - xx * xy * left).sum()])
-        prior = np.array([1 / camera.horizon_std_px**2, 1 / max(common, 1e-6) ** 2])
-        matrix[[0, 1], [0, 1]] += prior
+        vector = np.array([(y - x * xy * factor).sum(), (xy - xx * xy * factor).sum()])
+        prior = np.array([1 / camera.horizon_std_px**2, 1 / max(mean_std, 1e-6) ** 2])
+        information[[0, 1], [0, 1]] += prior
         vector += prior * (camera.horizon_px, slope)
-        spread = np.linalg.inv(matrix)
-        horizon = float((spread @ vector)[0])
-        error = max(math.sqrt(max(float(spread[0, 0]), 0.0)), _SUREST * camera.pixel_scale)
+        cov = np.linalg.inv(information)
+        horizon = float((cov @ vector)[0])
+        std = max(math.sqrt(max(float(cov[0, 0]), 0.0)), _MIN_STD_PX * camera.pixel_scale)
         self.camera = dataclasses.replace(
-            camera, horizon_px=horizon, horizon_std_px=min(error, camera.horizon_std_px)
+            camera, horizon_px=horizon, horizon_std_px=min(std, camera.horizon_std_px)
         )

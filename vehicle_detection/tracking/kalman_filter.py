@@ -1,249 +1,377 @@
-"""Kalman filters over many tracks at once, as pure functions: boxes in the image, distances on the road.
+"""Kalman filters over many tracks at once: boxes in the image, and distances on the road.
 
-The box's state is ``[cx, cy, w, h]`` and their speeds a second, moved on at constant velocity and corrected
-by the measured edges (Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Tracking and
-Navigation*, chapter 6; on boxes: Bewley et al., *Simple Online and Realtime Tracking*, ICIP 2016). Edges, not
-centers, are measured, since one edge may be hidden by the frame's border while the others are seen.
+The state of a box is ``[cx, cy, w, h]`` and its velocity in pixels per second. It is predicted at constant
+velocity and corrected by the measured edges (Bar-Shalom, Li and Kirubarajan, *Estimation with Applications
+to Tracking and Navigation*, chapter 6; for boxes: Bewley et al., *Simple Online and Realtime Tracking*, ICIP
+2016). Edges are measured, not centers, because the frame's border may truncate one edge alone.
+
+The state of a distance is ``[distance in m, speed in m/s, log(width / camera.vehicle_width_m)]``. The width
+is part of the state: a truck seems near by its width until its bottom edge has corrected it, and from then
+on its growth in the image gives the speed.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection.camera import Camera, width_times_distance
+from vehicle_detection.boxes import Floats
+from vehicle_detection.camera import Camera, FrameShape, lateral_offsets, truncated_edges
+from vehicle_detection.params import TrackParams
+from vehicle_detection.tracking.association import match_boxes
+from vehicle_detection.tracking.track import TrackState
 
-Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+OUTWARD = np.array([-1.0, -1.0, 1.0, 1.0])
+"""Direction in which each edge of a box faces."""
 
 UNKNOWN = 1e9
-"""Variance of a measurement that says nothing; large, yet small enough to keep the sums exact."""
+"""Variance of an edge that is not measured: large, but small enough to keep the sums exact."""
 
-_EDGES = np.array([[1, 0, -0.5, 0], [0, 1, 0, -0.5], [1, 0, 0.5, 0], [0, 1, 0, 0.5]], np.float64)
-_STATES = np.linalg.inv(_EDGES)
-# The blocks of a state's transition and process noise: places among themselves, places by speeds, speeds.
-_STAY, _GO, _PLACES, _SPEEDS = (
-    np.eye(8),
-    np.eye(8, k=4),
-    np.diag([1.0] * 4 + [0.0] * 4),
-    np.diag([0.0] * 4 + [1.0] * 4),
-)
-_LEAST_SIZE = 4.0
-_FOUR = np.arange(4)
-# Standard errors beyond which an edge is far off, and that count at most; the share of a lasting error that
-# the place of an edge is then uncertain by.
-_FAR_OFF, _MOST, _DOUBT = 2.5, 6.0, 0.25
-# Speeds of a new box, in box sizes a second: of its center, of its size.
-_START_SPEEDS = np.array([1.0, 0.6, 0.35, 0.35])
+# Box edges from ``[cx, cy, w, h]``, and the inverse.
+_TO_EDGES = np.array([[1, 0, -0.5, 0], [0, 1, 0, -0.5], [1, 0, 0.5, 0], [0, 1, 0, 0.5]], np.float64)
+_FROM_EDGES = np.linalg.inv(_TO_EDGES)
+# Blocks of the transition matrix and of the process noise.
+_IDENTITY, _POSITION_BY_VELOCITY = np.eye(8), np.eye(8, k=4)
+_POSITIONS, _VELOCITIES = np.diag([1.0] * 4 + [0.0] * 4), np.diag([0.0] * 4 + [1.0] * 4)
+_DIAGONAL = np.arange(4)
+_MIN_SIZE = 4.0
+# Standard deviation of a new box's velocity ``[cx, cy, w, h]``, in box sizes per second.
+_INITIAL_SPEED_STD = np.array([1.0, 0.6, 0.35, 0.35])
+# Innovations in standard errors: above the first an edge is an outlier; the second is the clipping limit.
+_OUTLIER, _MAX_INNOVATION = 2.5, 6.0
+# Standard error that a persistent innovation adds to an edge of the track, as a fraction of the innovation.
+_PERSISTENT_STD = 0.25
+# Time constant (s) of the innovation's mean, and minimum weight of its past from frame to frame.
+_INNOVATION_TIME, _MIN_INNOVATION_DECAY = 0.15, 0.75
+# Time constants (s) with which the velocity ``[cx, cy, w, h]`` of a coasting track decays.
+_VELOCITY_DECAY = np.array([1.5, 1.5, 0.5, 0.5])
+# Maximum relative change of size per second that is interpreted as an approach.
+_MAX_GROWTH = 1.5
+# Prior aspect ratio (width to height) of a box that the frame's border truncates, and its relative error.
+_TRUNCATED_ASPECT, _TRUNCATED_STD = 1.5, 0.3
+# Limits of standard errors: positions and velocities in box sizes.
+_MAX_STD = np.array([0.5] * 4 + [2.0] * 4)
 
 
-def boxes_of(mean: Floats) -> Floats:
+class KalmanStates(NamedTuple):
+    """States of both filters as columns with one row per track."""
+
+    mean: Floats  # (N, 8) box and its velocity
+    cov: Floats  # (N, 8, 8)
+    innovation_mean: Floats  # (N, 4) moving average of each edge's innovation in standard errors
+    range_mean: Floats  # (N, 3) distance, speed and logarithm of the relative width
+    range_cov: Floats  # (N, 3, 3)
+
+    @classmethod
+    def empty(cls) -> KalmanStates:
+        """States of no tracks."""
+        shapes = (0, 8), (0, 8, 8), (0, 4), (0, 3), (0, 3, 3)
+        return cls(*(np.empty(shape) for shape in shapes))
+
+    def boxes(self) -> Floats:
+        """``(N, 4)`` boxes, including parts outside the frame."""
+        return boxes_from_states(self.mean)
+
+    def take(self, rows: Sequence[int]) -> KalmanStates:
+        """Return these rows, in this order."""
+        if list(rows) == list(range(len(self.mean))):
+            return self
+        index = np.array(rows, np.intp)
+        return KalmanStates(*(column[index] for column in self))
+
+    def put(self, rows: Sequence[int], other: KalmanStates) -> KalmanStates:
+        """Return a copy with these rows replaced by those of `other`."""
+        index = np.array(rows, np.intp)
+        columns = [column.copy() for column in self]
+        for column, new in zip(columns, other):
+            column[index] = new
+        return KalmanStates(*columns)
+
+    def join(self, other: KalmanStates) -> KalmanStates:
+        """Return the rows of both."""
+        return KalmanStates(*(np.concatenate(pair) for pair in zip(self, other)))
+
+
+class Measurements(NamedTuple):
+    """Detections assigned to tracks in one frame, as columns with one row per track."""
+
+    boxes: Floats  # (N, 4)
+    truncated: Bools  # (N, 4) edges at the frame's border
+    lateral_px: Floats  # (N,) distance of the inner edge from the frame's middle column
+    merged: Bools  # (N,) whether the box shows another vehicle too
+
+    @classmethod
+    def from_boxes(cls, boxes: Floats, frame: FrameShape, merged: ArrayLike = False) -> Measurements:
+        """Measure boxes in a frame of this shape."""
+        merged = np.broadcast_to(np.asarray(merged, np.bool_), len(boxes))
+        return cls(boxes, truncated_edges(boxes, frame), lateral_offsets(boxes, frame), merged)
+
+
+class KalmanSmoother:
+    """Initiates, predicts and corrects boxes by a constant-velocity Kalman filter."""
+
+    match = staticmethod(match_boxes)
+
+    def __init__(self, params: TrackParams) -> None:
+        self._params = params
+
+    def initiate(self, measured: Measurements) -> tuple[Floats, Floats]:
+        """Means ``(N, 8)`` and covariances ``(N, 8, 8)`` of new tracks."""
+        boxes, sides = measured.boxes.copy(), measured.boxes[:, 2:] - measured.boxes[:, :2]
+        std = np.tile(sides, 2) * self._params.measurement_noise
+        # Extend a truncated box beyond the frame: then the motion of its inner edge is not taken for growth.
+        width = np.maximum(sides[:, 0], _TRUNCATED_ASPECT * sides[:, 1])
+        for outer, inner in ((0, 2), (2, 0)):
+            rows = measured.truncated[:, outer] & ~measured.truncated[:, inner]
+            boxes[rows, outer] = boxes[rows, inner] + width[rows] * OUTWARD[outer]
+            std[rows, outer] = _TRUNCATED_STD * width[rows]
+        return initiate(boxes, std)
+
+    def predict(self, states: KalmanStates, coasting: Bools, dt: float) -> KalmanStates:
+        """Predict boxes: detected vehicles keep their speed on the road, ``coasting`` ones slow down."""
+        mean = states.mean
+        # A constant speed on the road accelerates in the image as the box grows: v' = 2 v w'/w.
+        growth = np.clip((mean[:, 6:] / mean[:, 2:4]).mean(axis=1), -_MAX_GROWTH, _MAX_GROWTH)
+        rates = np.where(coasting[:, None], -1 / _VELOCITY_DECAY, 2 * growth[:, None])
+        factors = np.concatenate((np.ones_like(rates), np.exp(dt * rates)), axis=1)
+        # The error of a velocity grows like the velocity; that of the growth also through the rate itself.
+        std_factors = factors.copy()
+        std_factors[:, 6:] *= 1 + dt * np.maximum(2 * growth[:, None], 0) * ~coasting[:, None]
+        mean = mean * factors
+        cov = states.cov * std_factors[:, :, None] * std_factors[:, None, :]
+        position, size = self._params.process_noise_position, self._params.process_noise_size
+        noise = mean[:, [2, 3, 2, 3]] * np.array([position, position, size, size])
+        mean, cov = predict(mean, cov, dt, np.square(noise))
+        return states._replace(mean=mean, cov=limit_covariance(mean, cov))
+
+    def correct(
+        self, states: KalmanStates, tracks: Sequence[TrackState], measured: Measurements, dt: float
+    ) -> KalmanStates:
+        """Correct the boxes of tracks by a measurement each."""
+        params, mean, boxes = self._params, states.mean, measured.boxes
+        # A truncated edge says only that the vehicle reaches the border: no correction if it is predicted to.
+        beyond = measured.truncated & ((boxes_from_states(mean) - boxes) * OUTWARD >= 0)
+        correlated_frames = max(1.0, params.measurement_correlation_time / dt)
+        noise = np.square(mean[:, [2, 3, 2, 3]] * params.measurement_noise) * correlated_frames
+        variance = np.where(beyond, UNKNOWN, noise)
+        decay = max(math.exp(-dt / _INNOVATION_TIME), _MIN_INNOVATION_DECAY)
+        corrected = update(*states[:3], boxes, variance, measured.merged, decay)
+        return KalmanStates(*corrected, *states[3:])
+
+
+def boxes_from_states(mean: Floats) -> Floats:
     """``(N, 4)`` boxes of ``(N, 8)`` states."""
-    return np.asarray(mean[:, :4] @ _EDGES.T)
+    return np.asarray(mean[:, :4] @ _TO_EDGES.T)
 
 
-def state_of(box: Floats) -> Floats:
-    """Center and size ``[cx, cy, w, h]`` of one box."""
-    return np.asarray(_STATES @ box)
+def centers_and_sizes(boxes: Floats) -> Floats:
+    """``(N, 4)`` rows ``[cx, cy, w, h]`` of boxes."""
+    return np.asarray(boxes @ _FROM_EDGES.T)
 
 
-def start(boxes: Floats, edge_error: Floats) -> tuple[Floats, Floats]:
-    """States ``(N, 8)`` and covariances ``(N, 8, 8)`` of boxes at their first sight, standing still.
-
-    Parameters
-    ----------
-    boxes, edge_error
-        ``(N, 4)`` measured edges and their standard errors in pixels.
-    """
+def initiate(boxes: Floats, edge_std: Floats) -> tuple[Floats, Floats]:
+    """Means ``(N, 8)`` and covariances ``(N, 8, 8)`` of boxes at rest whose edges have these errors."""
     mean = np.zeros((len(boxes), 8))
-    mean[:, :4] = boxes @ _STATES.T
+    mean[:, :4] = centers_and_sizes(boxes)
     cov = np.zeros((len(boxes), 8, 8))
-    cov[:, :4, :4] = (_STATES * np.square(edge_error)[:, None, :]) @ _STATES.T
-    speeds = np.tile(mean[:, 2:4], 2) * _START_SPEEDS
-    cov[:, 4:, 4:] = np.square(speeds)[:, :, None] * np.eye(4)
+    cov[:, :4, :4] = (_FROM_EDGES * np.square(edge_std)[:, None, :]) @ _FROM_EDGES.T
+    speed_std = np.tile(mean[:, 2:4], 2) * _INITIAL_SPEED_STD
+    cov[:, 4:, 4:] = np.square(speed_std)[:, :, None] * np.eye(4)
     return mean, cov
 
 
-def predict(mean: Floats, cov: Floats, dt: float, density: Floats) -> tuple[Floats, Floats]:
-    """Move ``(N, 8)`` states `dt` seconds on, at constant velocity.
+def predict(mean: Floats, cov: Floats, dt: float, noise_density: Floats) -> tuple[Floats, Floats]:
+    """Predict states by `dt` seconds at constant velocity.
 
-    Parameters
-    ----------
-    mean, cov
-        States and their covariances ``(N, 8, 8)``.
-    dt
-        Elapsed time in seconds, 0 or more.
-    density
-        ``(N, 4)`` variance that each of the four speeds gains in a second (white acceleration).
+    `noise_density` ``(N, 4)`` is the variance that each velocity gains per second (white acceleration).
     """
-    step = _STAY + dt * _GO
-    moved = mean @ step.T
-    moved[:, 2:4] = np.maximum(moved[:, 2:4], _LEAST_SIZE)
-    noise = (dt**3 / 3) * _PLACES + (dt**2 / 2) * (_GO + _GO.T) + dt * _SPEEDS
-    spread = step @ cov @ step.T + noise * density[:, [0, 1, 2, 3, 0, 1, 2, 3], None]
-    return moved, spread
+    transition = _IDENTITY + dt * _POSITION_BY_VELOCITY
+    predicted = mean @ transition.T
+    predicted[:, 2:4] = np.maximum(predicted[:, 2:4], _MIN_SIZE)
+    cross = _POSITION_BY_VELOCITY + _POSITION_BY_VELOCITY.T
+    noise = (dt**3 / 3) * _POSITIONS + (dt**2 / 2) * cross + dt * _VELOCITIES
+    cov = transition @ cov @ transition.T + noise * noise_density[:, [0, 1, 2, 3, 0, 1, 2, 3], None]
+    return predicted, cov
 
 
 def update(
     mean: Floats,
     cov: Floats,
-    drift: Floats,
+    innovation_mean: Floats,
     edges: Floats,
     variance: Floats,
-    reject: NDArray[np.bool_],
-    keep: float,
+    reject_outliers: Bools,
+    decay: float,
 ) -> tuple[Floats, Floats, Floats]:
-    """Correct ``(N, 8)`` states by measured edges.
+    """Correct states by measured edges; returns means, covariances and innovation means.
 
-    An edge that lies far off is given less weight (Huber, *Robust Statistics*, chapter 7), so that one wrong
-    box does not throw the track. If it stays off to the same side, it is the track that is wrong: the edge's
-    place is then taken to be uncertain again.
-
-    Parameters
-    ----------
-    mean, cov
-        States and their covariances.
-    drift
-        ``(N, 4)`` running mean of how far off each edge was, in standard errors; 0 at the start.
-    edges
-        ``(N, 4)`` measured boxes ``[x1, y1, x2, y2]``.
-    variance
-        ``(N, 4)`` variance of each edge; `UNKNOWN` where the edge is not seen.
-    reject
-        ``(N,)``: whether edges that lie off are left out altogether.
-    keep
-        Weight of the past in `drift`, 0-1.
-
-    Returns
-    -------
-    tuple
-        States, covariances and drifts.
+    The weight of an outlier is reduced (Huber, *Robust Statistics*, chapter 7), so that one wrong box does
+    not distort the track. If an edge deviates persistently to one side, the track is wrong: the variance of
+    that edge's position is increased instead. `variance` ``(N, 4)`` is `UNKNOWN` for edges that are not
+    visible. `reject_outliers` ``(N,)`` ignores outliers. `decay` is the weight of the past in
+    `innovation_mean`.
     """
-    crossed = cov[:, :, :4] @ _EDGES.T  # cov @ H.T, as H is zero for the speeds
-    expected = _EDGES @ crossed[:, :4]
-    off = edges - boxes_of(mean)
-    standard = off / np.sqrt(expected[:, _FOUR, _FOUR] + variance)
-    drift = keep * drift + (1 - keep) * np.where(reject[:, None], 0.0, np.clip(standard, -_MOST, _MOST))
-    moved = (np.abs(drift) > _FAR_OFF) & (drift * standard > 0)
-    if moved.any():
-        doubt = np.where(moved, np.square(_DOUBT * off), 0.0)
+    cross = cov[:, :, :4] @ _TO_EDGES.T  # cov @ H.T, because H is zero for the velocities
+    innovation_cov = _TO_EDGES @ cross[:, :4]
+    innovation = edges - boxes_from_states(mean)
+    normalized = innovation / np.sqrt(innovation_cov[:, _DIAGONAL, _DIAGONAL] + variance)
+    clipped = np.where(reject_outliers[:, None], 0.0, np.clip(normalized, -_MAX_INNOVATION, _MAX_INNOVATION))
+    innovation_mean = decay * innovation_mean + (1 - decay) * clipped
+    persistent = (np.abs(innovation_mean) > _OUTLIER) & (innovation_mean * normalized > 0)
+    if persistent.any():
+        added = np.where(persistent, np.square(_PERSISTENT_STD * innovation), 0.0)
         cov = cov.copy()
-        cov[:, :4, :4] += (_STATES * doubt[:, None, :]) @ _STATES.T
-        crossed = cov[:, :, :4] @ _EDGES.T
-        expected = _EDGES @ crossed[:, :4]
-    penalty = np.where(moved, 1.0, np.maximum(np.square(standard / _FAR_OFF), 1.0))
-    noise = np.where(reject[:, None] & (penalty > 1), UNKNOWN, np.minimum(variance * penalty, UNKNOWN))
-    expected[:, _FOUR, _FOUR] += noise
-    gain = np.linalg.solve(expected, crossed.transpose(0, 2, 1)).transpose(0, 2, 1)
-    corrected = mean + (gain @ off[:, :, None])[:, :, 0]
-    corrected[:, 2:4] = np.maximum(corrected[:, 2:4], _LEAST_SIZE)
-    spread = cov - gain @ crossed.transpose(0, 2, 1)
-    return corrected, (spread + spread.transpose(0, 2, 1)) / 2, drift
+        cov[:, :4, :4] += (_FROM_EDGES * added[:, None, :]) @ _FROM_EDGES.T
+        cross = cov[:, :, :4] @ _TO_EDGES.T
+        innovation_cov = _TO_EDGES @ cross[:, :4]
+    penalty = np.where(persistent, 1.0, np.maximum(np.square(normalized / _OUTLIER), 1.0))
+    rejected = reject_outliers[:, None] & (penalty > 1)
+    noise = np.where(rejected, UNKNOWN, np.minimum(variance * penalty, UNKNOWN))
+    innovation_cov[:, _DIAGONAL, _DIAGONAL] += noise
+    gain = np.linalg.solve(innovation_cov, cross.transpose(0, 2, 1)).transpose(0, 2, 1)
+    corrected = mean + (gain @ innovation[:, :, None])[:, :, 0]
+    corrected[:, 2:4] = np.maximum(corrected[:, 2:4], _MIN_SIZE)
+    cov = cov - gain @ cross.transpose(0, 2, 1)
+    return corrected, (cov + cov.transpose(0, 2, 1)) / 2, innovation_mean
 
 
-def bound(mean: Floats, cov: Floats, place: float = 0.5, speed: float = 2.0) -> Floats:
-    """Covariances whose standard errors stay below shares of the box's size, for tracks that are not seen."""
-    limit = mean[:, [2, 3] * 4] * np.array([place] * 4 + [speed] * 4)
-    spread = np.sqrt(np.maximum(cov[:, np.arange(8), np.arange(8)], 1e-12))
-    shrink = np.minimum(limit / spread, 1.0)
-    return np.asarray(cov * shrink[:, :, None] * shrink[:, None, :])
+def limit_covariance(mean: Floats, cov: Floats) -> Floats:
+    """Covariances scaled so that no standard error exceeds its limit, which coasting tracks would reach."""
+    limit = mean[:, [2, 3] * 4] * _MAX_STD
+    std = np.sqrt(np.maximum(cov[:, np.arange(8), np.arange(8)], 1e-12))
+    scale = np.minimum(limit / std, 1.0)
+    return np.asarray(cov * scale[:, :, None] * scale[:, None, :])
 
 
-# The road: [distance in m, its speed in m/s, logarithm of the width over the camera's vehicle_width_m].
-# The width is part of the state: a truck looks near by its width until its foot has told otherwise, and
-# from then on its growth in the image gives the speed.
-
-_SPEED_SPREAD, _ACCELERATION, _WIDTH_SECONDS, _PITCH_SECONDS = 20.0, 1.5, 20.0, 2.0
-_NEAREST, _FARTHEST, _FAR_SPREAD = 1.0, 500.0, 1e3
+def coasted_distance(mean: Floats, seconds: Floats) -> Floats:
+    """Distance in box sizes that tracks have moved in these seconds ``(N,)`` without a detection."""
+    speed = np.abs(mean[:, 4:6] / mean[:, 2:4]).max(axis=1)
+    return np.asarray(speed * _VELOCITY_DECAY[0] * np.expm1(seconds / _VELOCITY_DECAY[0]))
 
 
-def range_start(camera: Camera) -> tuple[Floats, Floats]:
-    """State ``(3,)`` and covariance ``(3, 3)`` of a vehicle about which nothing is known."""
-    spread = np.array([_FAR_SPREAD, _SPEED_SPREAD, camera.vehicle_width_std_m / camera.vehicle_width_m])
-    return np.array([30.0, 0.0, 0.0]), np.diag(np.square(spread))
+_INITIAL_DISTANCE, _INITIAL_DISTANCE_STD, _INITIAL_RANGE_SPEED_STD = 30.0, 1e3, 20.0
+_MIN_DISTANCE, _MAX_DISTANCE = 1.0, 500.0
+_MIN_LOG_WIDTH, _MAX_LOG_WIDTH = -0.7, 0.9
+# Process noise of the speed (m/s per square root of a second).
+_ACCELERATION = 1.5
+# Times (s) in which the width's prior variance is added to its process noise, and over which the pitch of the
+# camera is correlated.
+_WIDTH_TIME, _PITCH_TIME = 20.0, 2.0
+# Mean innovation of an edge above which a track's distance is uncertain, and its relative error per second.
+_UNSETTLED, _UNSETTLED_STD = 1.5, 0.5
+# Maximum relative error of a reported distance, age of its last measurement (s), and error of a speed (m/s).
+_MAX_RANGE_STD, _MAX_RANGE_AGE, _MAX_RANGE_SPEED_STD = 0.4, 0.5, 6.0
 
 
-def range_predict(mean: Floats, cov: Floats, dt: float, camera: Camera) -> tuple[Floats, Floats]:
-    """Move ``(N, 3)`` distances `dt` seconds on."""
-    step = np.eye(3)
-    step[0, 1] = dt
-    moved = mean @ step.T
-    moved[:, 0] = np.clip(moved[:, 0], _NEAREST, _FARTHEST)
+def initiate_states(mean: Floats, cov: Floats, camera: Camera) -> KalmanStates:
+    """Return the states of new tracks, whose distance is unknown, from those of their boxes."""
+    count, width_std = len(mean), camera.vehicle_width_std_m / camera.vehicle_width_m
+    range_std = np.array([_INITIAL_DISTANCE_STD, _INITIAL_RANGE_SPEED_STD, width_std])
+    range_mean = np.tile([_INITIAL_DISTANCE, 0.0, 0.0], (count, 1))
+    range_cov = np.tile(np.diag(np.square(range_std)), (count, 1, 1))
+    return KalmanStates(mean, cov, np.zeros((count, 4)), range_mean, range_cov)
+
+
+def predict_ranges(states: KalmanStates, dt: float, camera: Camera) -> KalmanStates:
+    """Predict distances by `dt` seconds."""
+    transition = np.eye(3)
+    transition[0, 1] = dt
+    mean = states.range_mean @ transition.T
+    mean[:, 0] = np.clip(mean[:, 0], _MIN_DISTANCE, _MAX_DISTANCE)
     noise = np.array([[dt**3 / 3, dt**2 / 2, 0], [dt**2 / 2, dt, 0], [0, 0, 0]]) * _ACCELERATION**2
-    noise[2, 2] = (camera.vehicle_width_std_m / camera.vehicle_width_m) ** 2 * dt / _WIDTH_SECONDS
-    return moved, step @ cov @ step.T + noise
+    noise[2, 2] = (camera.vehicle_width_std_m / camera.vehicle_width_m) ** 2 * dt / _WIDTH_TIME
+    return states._replace(range_mean=mean, range_cov=transition @ states.range_cov @ transition.T + noise)
 
 
-def range_update(
-    mean: Floats,
-    cov: Floats,
-    boxes: Floats,
-    cut: NDArray[np.bool_],
-    aside: Floats,
-    camera: Camera,
-    dt: float,
-    alike: float,
-) -> tuple[Floats, Floats]:
-    """Correct ``(N, 3)`` distances by the foot and the width of measured boxes (an extended Kalman filter).
+def update_ranges(
+    states: KalmanStates, measured: Measurements, camera: Camera, dt: float, correlation_time: float
+) -> KalmanStates:
+    """Correct distances by the bottom edge and the width of boxes (extended Kalman filter).
 
-    Parameters
-    ----------
-    mean, cov
-        States and covariances ``(N, 3, 3)``.
-    boxes, cut
-        ``(N, 4)`` measured boxes, and which of their edges the frame's border cuts off.
-    aside
-        ``(N,)`` how far their inner edges lie from the frame's middle.
-    camera
-        The camera.
-    dt
-        Time in seconds that this measurement stands for, above 0.
-    alike
-        Time in seconds over which a box's errors stay alike.
+    The errors of a vehicle's boxes are correlated over `correlation_time` seconds.
     """
-    mean = mean.copy()
+    mean, cov = states.range_mean.copy(), states.range_cov.copy()
+    # While the edges of a box have not settled, its distance is uncertain.
+    unsettled = (np.abs(states.innovation_mean) > _UNSETTLED).any(axis=1)
+    cov[:, 0, 0] += unsettled * np.square(_UNSETTLED_STD * mean[:, 0]) * dt
+    # A merged box shows neither the bottom nor the width of its vehicles.
+    visible = ~(measured.truncated | measured.merged[:, None])
+    bottom_visible, width_visible = visible[:, 3], visible[:, 0] & visible[:, 2]
+    boxes, lateral_px = measured.boxes, measured.lateral_px
     sides = np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0)
-    edge = np.hypot(camera.bottom_std_px * camera.pixel_scale, camera.box_error * sides)
-    tilt = camera.tilt_error_px
-    fast, slow = max(1.0, alike / dt), max(1.0, _PITCH_SECONDS / dt)
-    below = boxes[:, 3] - camera.horizon_px
-    foot_seen, width_seen = ~cut[:, 3], ~(cut[:, 0] | cut[:, 2])
+    edge_std = np.hypot(camera.bottom_std_px * camera.pixel_scale, camera.box_std * sides)
+    horizon_std = camera.total_horizon_std_px
+    box_frames, pitch_frames = max(1.0, correlation_time / dt), max(1.0, _PITCH_TIME / dt)
+    below_horizon = boxes[:, 3] - camera.horizon_px
 
-    drop, unit = camera.focal_px * camera.height_m, width_times_distance(camera, aside)
-    fresh = cov[:, 0, 0] > _FAR_SPREAD**2 / 2
-    if fresh.any():
-        # Nothing is known yet: the first measurement itself is the point at which to linearise.
-        plain = foot_seen & (below > 2 * np.hypot(edge[:, 1], tilt))
-        first = np.where(plain, drop / np.where(plain, below, 1.0), unit / sides[:, 0])
-        known = fresh & (plain | width_seen)
-        mean[known, 0] = np.clip(first[known], _NEAREST, _FARTHEST)
-        foot_seen &= plain | ~fresh
+    bottom_scale = camera.focal_px * camera.height_m
+    width_scale = camera.width_times_distance(lateral_px)
+    unknown = cov[:, 0, 0] > _INITIAL_DISTANCE_STD**2 / 2
+    if unknown.any():
+        # Linearize at the first measurement itself.
+        below = bottom_visible & (below_horizon > 2 * np.hypot(edge_std[:, 1], horizon_std))
+        first = np.where(below, bottom_scale / np.where(below, below_horizon, 1.0), width_scale / sides[:, 0])
+        known = unknown & (below | width_visible)
+        mean[known, 0] = np.clip(first[known], _MIN_DISTANCE, _MAX_DISTANCE)
+        bottom_visible &= below | ~unknown
 
-    # Pixels below the horizon: drop / distance.
-    expected = drop / mean[:, 0]
-    lasting = tilt**2 + np.square(expected * camera.height_std_m / camera.height_m)
-    variance = np.square(edge[:, 1]) * fast + lasting * slow
-    slope = np.zeros_like(mean)
-    slope[:, 0] = -expected / mean[:, 0]
-    mean, cov = _scalar_update(mean, cov, slope, below - expected, np.where(foot_seen, variance, np.inf))
-    np.clip(mean[:, 0], _NEAREST, _FARTHEST, out=mean[:, 0])
+    # Pixels below the horizon: bottom_scale / distance.
+    expected = bottom_scale / mean[:, 0]
+    systematic = horizon_std**2 + np.square(expected * camera.height_std_m / camera.height_m)
+    variance = np.square(edge_std[:, 1]) * box_frames + systematic * pitch_frames
+    jacobian = np.zeros_like(mean)
+    jacobian[:, 0] = -expected / mean[:, 0]
+    variance = np.where(bottom_visible, variance, np.inf)
+    mean, cov = _scalar_update(mean, cov, jacobian, below_horizon - expected, variance)
+    np.clip(mean[:, 0], _MIN_DISTANCE, _MAX_DISTANCE, out=mean[:, 0])
 
-    # Logarithm of the width in pixels: log(unit) + log(width) - log(distance).
-    off = np.log(sides[:, 0] / unit) - mean[:, 2] + np.log(mean[:, 0])
-    flank = np.square(aside * camera.vehicle_length_std_m / unit)
-    variance = np.square(edge[:, 0] / sides[:, 0]) * 2 * fast + flank * slow
-    slope[:, 0], slope[:, 2] = -1 / mean[:, 0], 1.0
-    mean, cov = _scalar_update(mean, cov, slope, off, np.where(width_seen, variance, np.inf))
-    np.clip(mean[:, 0], _NEAREST, _FARTHEST, out=mean[:, 0])
-    mean[:, 2] = np.clip(mean[:, 2], -0.7, 0.9)
-    return mean, cov
+    # Logarithm of the width in pixels: log(width_scale) + log(relative width) - log(distance).
+    innovation = np.log(sides[:, 0] / width_scale) - mean[:, 2] + np.log(mean[:, 0])
+    systematic = np.square(lateral_px * camera.vehicle_length_std_m / width_scale)
+    variance = np.square(edge_std[:, 0] / sides[:, 0]) * 2 * box_frames + systematic * pitch_frames
+    jacobian[:, 0], jacobian[:, 2] = -1 / mean[:, 0], 1.0
+    variance = np.where(width_visible, variance, np.inf)
+    mean, cov = _scalar_update(mean, cov, jacobian, innovation, variance)
+    np.clip(mean[:, 0], _MIN_DISTANCE, _MAX_DISTANCE, out=mean[:, 0])
+    mean[:, 2] = np.clip(mean[:, 2], _MIN_LOG_WIDTH, _MAX_LOG_WIDTH)
+    return states._replace(range_mean=mean, range_cov=cov)
 
 
 def _scalar_update(
-    mean: Floats, cov: Floats, slope: Floats, off: Floats, variance: Floats, limit: float = 2.5
+    mean: Floats, cov: Floats, jacobian: Floats, innovation: Floats, variance: Floats
 ) -> tuple[Floats, Floats]:
-    """Correct states by one number each, `off` its expected value; infinite variance changes nothing."""
-    crossed = (cov @ slope[:, :, None])[:, :, 0]
-    expected = (slope * crossed).sum(axis=1)
-    penalty = np.maximum(np.square(off) / (expected + variance) / limit**2, 1.0)
-    gain = crossed / (expected + variance * penalty)[:, None]
-    return mean + gain * off[:, None], cov - gain[:, :, None] * crossed[:, None, :]
+    """Correct each state by one scalar measurement; an infinite variance changes nothing."""
+    cross = (cov @ jacobian[:, :, None])[:, :, 0]
+    expected = (jacobian * cross).sum(axis=1)
+    penalty = np.maximum(np.square(innovation) / (expected + variance) / _OUTLIER**2, 1.0)
+    gain = cross / (expected + variance * penalty)[:, None]
+    return mean + gain * innovation[:, None], cov - gain[:, :, None] * cross[:, None, :]
+
+
+def estimate_ranges(
+    states: KalmanStates, time_since_update: Floats, camera: Camera
+) -> list[dict[str, float | None]]:
+    """Distance and speed of each track with standard errors, as fields of `Track`; None where unknown."""
+    distance, speed = states.range_mean[:, 0], states.range_mean[:, 1]
+    distance_std, speed_std = np.sqrt(np.maximum(states.range_cov[:, [0, 1], [0, 1]], 0)).T
+    # The focal length scales all measurements alike, so no filter averages its error out.
+    distance_std = np.hypot(distance_std, distance * camera.focal_std)
+    speed_std = np.hypot(speed_std, speed * camera.focal_std)
+    known = (distance_std <= _MAX_RANGE_STD * distance) & (time_since_update <= _MAX_RANGE_AGE)
+    speed_known = known & (speed_std <= _MAX_RANGE_SPEED_STD)
+    columns = {
+        "distance_m": (distance, known),
+        "distance_std_m": (distance_std, known),
+        "speed_mps": (speed, speed_known),
+        "speed_std_mps": (speed_std, speed_known),
+    }
+    return [
+        {name: float(values[row]) if mask[row] else None for name, (values, mask) in columns.items()}
+        for row in range(len(distance))
+    ]

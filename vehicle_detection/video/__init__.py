@@ -1,4 +1,4 @@
-"""Video in and out: ffmpeg, the threaded pipeline, and the annotated video."""
+"""Reading and writing video: ffmpeg, the threaded pipeline and the annotated video."""
 
 from vehicle_detection.video.ffmpeg import VideoInfo
 from vehicle_detection.video.horizon import estimate_video_horizon

@@ -1,7 +1,7 @@
-"""The ffmpeg binary that moviepy uses: a process of it that ends with us, and the facts of a video file.
+"""ffmpeg processes, and the properties of a video file.
 
-moviepy's own probe (2.2) rounds 59.94 frames/s and, with a current ffmpeg, overlooks the rotation of phone
-videos; this one asks ffmpeg's filter graph, which knows the exact rate and the upright size.
+moviepy's own probe (2.2) rounds 59.94 frames/s and, with a current ffmpeg, ignores the rotation of phone
+videos. This one reads the log of ffmpeg's filter graph, which has the exact rate and the upright size.
 """
 
 from __future__ import annotations
@@ -22,40 +22,40 @@ from pathlib import Path
 from typing import IO, Any
 
 from vehicle_detection.errors import VideoError
-from vehicle_detection.video.yuv import Coding
+from vehicle_detection.video.yuv import ColorEncoding
 
-PIPE_SIZE = 1 << 18
+_PIPE_BYTES = 1 << 18
 
 
 @dataclass(frozen=True, kw_only=True)
 class VideoInfo:
-    """Facts of a video file.
+    """Properties of a video file.
 
     Attributes
     ----------
     width, height
-        Size in pixels of an upright frame: a rotation that the file asks for is already applied.
+        Size of a frame in pixels, after the rotation stored in the file.
     fps
-        Exact frame rate, as 30000/1001; ``float(info.fps)`` is 29.97. For a file whose rate varies, the rate
-        that its frames are brought to.
+        Exact frame rate, such as 30000/1001; ``float(info.fps)`` is 29.97. If the file's rate varies, the
+        constant rate to which its frames are converted.
     frames
-        Number of frames, estimated from the duration; 0 where the file does not tell.
+        Number of frames, estimated from the duration; 0 if unknown.
     duration
-        Length in seconds; 0.0 where the file does not tell.
+        Length in seconds; 0.0 if unknown.
     rotation
-        Clockwise degrees by which the stored frames are turned to stand upright.
+        Clockwise rotation in degrees from the stored frames to upright ones.
     constant_rate
-        Whether the frames come at a constant rate.
-    first_time
-        Second at which the first frame is shown, where the sound starts earlier; else 0.0.
+        Whether the file's frame rate is constant.
+    start_time
+        Time of the first frame in seconds, if the sound starts earlier; otherwise 0.0.
     pixel_aspect
-        Width over height of a pixel; 1 but for anamorphic video.
+        Width over height of a pixel; other than 1 for anamorphic video.
     pixel_format
-        ffmpeg's name of how pixels are stored, as ``"yuv420p"``; empty where it is not known.
-    coding
-        How the numbers of a pixel mean colors.
+        ffmpeg's name of the pixel format, such as ``"yuv420p"``; empty if unknown.
+    color_encoding
+        How luma and chroma encode colors.
     audio_track, audio_codec
-        Number among the audio tracks, and codec (``"aac"``), of the first that can be decoded; else None.
+        Index and codec (such as ``"aac"``) of the first audio track that can be decoded; None without one.
     """
 
     width: int
@@ -65,16 +65,16 @@ class VideoInfo:
     duration: float
     rotation: int = 0
     constant_rate: bool = True
-    first_time: float = 0.0
+    start_time: float = 0.0
     pixel_aspect: Fraction = Fraction(1)
     pixel_format: str = ""
-    coding: Coding = field(default_factory=Coding)
+    color_encoding: ColorEncoding = field(default_factory=ColorEncoding)
     audio_track: int | None = None
     audio_codec: str | None = None
 
     @property
     def has_audio(self) -> bool:
-        """Whether there is an audio track that can be decoded."""
+        """Whether there is a decodable audio track."""
         return self.audio_track is not None
 
     @property
@@ -84,83 +84,83 @@ class VideoInfo:
 
 
 def probe(path: Path) -> VideoInfo:
-    """Ask ffmpeg for the facts of a video, decoding its first frame; :class:`VideoError` if it is none."""
-    # In a thread, where Ctrl-C cannot strike between the start of ffmpeg and the moment when we hold it.
-    with ThreadPoolExecutor(1, thread_name_prefix="vehicle-probe") as helper:
-        return helper.submit(_probe, path).result()
+    """Read the properties of a video and decode its first frame; raise a VideoError if there is none."""
+    # Python raises KeyboardInterrupt in the main thread only; another thread cannot lose the started process.
+    with ThreadPoolExecutor(1, thread_name_prefix="vehicle-probe") as thread:
+        return thread.submit(_probe, path).result()
 
 
 def _probe(path: Path) -> VideoInfo:
-    # V leaves out cover pictures; showinfo is the one place where ffmpeg prints the exact rate.
+    # "V" excludes cover pictures. Only the showinfo filter prints the exact frame rate.
     options = ("-map", "0:V:0", "-frames:v", "1", "-vf", "showinfo", "-f", "null", "-")
     with contextlib.closing(Process(("-nostdin", "-i", f"file:{path}", *options), level="info")) as process:
         process.wait()
         log = process.log()
     header, mapped, decoded = log.partition("Stream mapping:")
     if not re.search(r"^Input #0", header, re.MULTILINE):
-        cut = "moov atom not found" in log
-        reason = "its index is missing: the recording or the copy was cut off" if cut else last_line(log)
-        raise VideoError(f"{path} is no video that ffmpeg can read ({reason}); record or copy it again")
+        truncated = "moov atom not found" in log
+        reason = "its index is missing: the recording or copy is incomplete" if truncated else last_line(log)
+        raise VideoError(f"{path} is not a video that ffmpeg can read ({reason}); record or copy it again")
     if not mapped:
-        raise VideoError(f"{path} has no video track; pass a file with moving pictures")
+        raise VideoError(f"{path} has no video track; choose a file with one")
     frame = re.search(r"n: *0 .*?pts_time:(\S+).*? sar:(\d+)/(\d+) s:(\d+)x(\d+)", decoded)
     if frame is None:
         raise VideoError(f"{path} has no frame that can be decoded ({last_line(log)}); copy it again")
-    first_time, width, height = frame[1], int(frame[4]), int(frame[5])
-    pixel = int(frame[2]), int(frame[3])
-    pixels = re.search(r"n: *0 .*? fmt:(\w+)", decoded)
+    start_time, width, height = frame[1], int(frame[4]), int(frame[5])
+    aspect = int(frame[2]), int(frame[3])
+    pixel_format = re.search(r"n: *0 .*? fmt:(\w+)", decoded)
     colors = re.search(r"color_range:(\w+) color_space:(\w+)", decoded)
-    number = re.search(r"Stream #0:(\d+)", decoded)
-    stream = _stream_lines(header, int(number[1]) if number else 0)
-    fps, constant = _frame_rate(decoded, stream)
-    if re.search(r"^Input #0, matroska", header, re.MULTILINE):  # its header's rate is a wish
-        fps, constant = _true_rate(fps, _frame_times(path))
-    span = re.search(r"^  Duration: (\d+):(\d+):([\d.]+)", header, re.MULTILINE)
-    duration = int(span[1]) * 3600 + int(span[2]) * 60 + float(span[3]) if span else 0.0
-    turn = re.search(r"rotation of (-?[\d.]+) degrees", stream)
+    index = re.search(r"Stream #0:(\d+)", decoded)
+    stream = _stream_lines(header, int(index[1]) if index else 0)
+    fps, constant = frame_rate(decoded, stream)
+    if re.search(r"^Input #0, matroska", header, re.MULTILINE):  # the rate in its header may be wrong
+        fps, constant = _rate_of_times(fps, _frame_times(path))
+    length = re.search(r"^  Duration: (\d+):(\d+):([\d.]+)", header, re.MULTILINE)
+    duration = int(length[1]) * 3600 + int(length[2]) * 60 + float(length[3]) if length else 0.0
+    rotation = re.search(r"rotation of (-?[\d.]+) degrees", stream)
     codecs = re.findall(r"^  Stream #0:\d+.*?: Audio: (\w+)", header, re.MULTILINE)
-    track = next((place for place, codec in enumerate(codecs) if codec != "none"), None)
+    track = next((number for number, codec in enumerate(codecs) if codec != "none"), None)
     return VideoInfo(
         width=width,
         height=height,
         fps=fps,
         frames=round(duration * fps),
         duration=duration,
-        rotation=round(-float(turn[1])) % 360 if turn else 0,
+        rotation=round(-float(rotation[1])) % 360 if rotation else 0,
         constant_rate=constant,
-        # The frames of a varying rate are filled up from 0 on.
-        first_time=float(first_time) if constant and first_time[-1].isdigit() else 0.0,
-        pixel_aspect=Fraction(*pixel) if all(pixel) else Fraction(1),
-        pixel_format=pixels[1] if pixels else "",
-        coding=Coding(colors[2], colors[1] == "pc") if colors else Coding(),
+        # With a varying rate, the gap before the first frame is filled with copies of it.
+        start_time=float(start_time) if constant and start_time[-1].isdigit() else 0.0,
+        pixel_aspect=Fraction(*aspect) if all(aspect) else Fraction(1),
+        pixel_format=pixel_format[1] if pixel_format else "",
+        color_encoding=ColorEncoding(colors[2], colors[1] == "pc") if colors else ColorEncoding(),
         audio_track=track,
         audio_codec=None if track is None else codecs[track],
     )
 
 
-def _stream_lines(header: str, number: int) -> str:
-    """Take the lines that describe one stream out of ffmpeg's description of a file."""
+def _stream_lines(header: str, index: int) -> str:
+    """Lines of ffmpeg's log that describe one stream of a file."""
     for block in re.split(r"^(?=  Stream #)", header, flags=re.MULTILINE):
-        if re.match(rf"  Stream #0:{number}\b", block):
+        if re.match(rf"  Stream #0:{index}\b", block):
             return block
     return ""
 
 
-def _frame_rate(decoded: str, stream: str) -> tuple[Fraction, bool]:
-    """Return the exact rate, and whether the frames really come at it, from what ffmpeg says."""
+def frame_rate(decoded: str, stream: str) -> tuple[Fraction, bool]:
+    """Frame rate, and whether it is constant, from ffmpeg's log."""
     exact = re.search(r"frame_rate: (\d+)/(\d+)", decoded)
     printed = re.search(r"([\d.]+)(k?) fps", stream)
     mean = Fraction(printed[1]) * (1000 if printed[2] else 1) if printed else Fraction(0)
     rate = Fraction(int(exact[1]), int(exact[2])) if exact and int(exact[1]) and int(exact[2]) else mean
     if not rate:
         return Fraction(25), False
-    # ffmpeg prints the mean rate with two decimals.
+    # Tolerance: ffmpeg prints the mean rate with two decimals.
     constant = not mean or abs(rate - mean) <= Fraction(6, 1000)
-    return (rate if constant else _sensible_rate(rate, mean)), constant
+    return (rate if constant else _resampling_rate(rate, mean)), constant
 
 
 def _frame_times(path: Path) -> list[float]:
-    """List the seconds of all frames, without decoding them."""
+    """List the times of all frames in seconds, without decoding them."""
     options = ("-nostdin", "-i", f"file:{path}", "-map", "0:V:0", "-c", "copy", "-f", "framecrc", "pipe:1")
     with contextlib.closing(Process(options, stdout=True)) as process:
         listing = process.stdout.read().decode()
@@ -170,34 +170,33 @@ def _frame_times(path: Path) -> list[float]:
     return sorted(int(tick) * int(unit[1]) / int(unit[2]) for tick in ticks) if unit else []
 
 
-def _true_rate(rate: Fraction, times: Sequence[float]) -> tuple[Fraction, bool]:
-    """Return the rate at which frames are to be shown, and whether they come at it."""
-    steps = float(rate)
-    if all(abs((moment - times[0]) * steps - n) < 0.75 for n, moment in enumerate(times)):
+def _rate_of_times(rate: Fraction, times: Sequence[float]) -> tuple[Fraction, bool]:
+    """Frame rate, and whether it is constant, from a nominal rate and the times of all frames."""
+    if all(abs((moment - times[0]) * float(rate) - n) < 0.75 for n, moment in enumerate(times)):
         return rate, True
-    return _sensible_rate(rate, Fraction((len(times) - 1) / ((times[-1] - times[0]) or 1.0))), False
+    return _resampling_rate(rate, Fraction((len(times) - 1) / ((times[-1] - times[0]) or 1.0))), False
 
 
-def _sensible_rate(rate: Fraction, mean: Fraction) -> Fraction:
-    """Choose a rate for frames that have none: screen recorders call a clock of 1000 ticks theirs."""
+def _resampling_rate(rate: Fraction, mean: Fraction) -> Fraction:
+    """Choose the constant rate for a varying one; screen recorders state their 1000 Hz clock as the rate."""
     return mean.limit_denominator(1001) if rate > 60 and rate > 2 * mean else rate
 
 
 class Process:
-    """A running ffmpeg. Its messages go to a file: no pipe of them can fill up and block it."""
+    """A running ffmpeg. Its log goes to a file, because a full pipe would block it."""
 
     def __init__(
         self, options: Sequence[str], *, level: str = "error", stdin: bool = False, stdout: bool = False
     ) -> None:
-        from moviepy.config import FFMPEG_BINARY  # the binary that the user told moviepy to take
+        from moviepy.config import FFMPEG_BINARY  # set by moviepy or by the user
 
-        # A group of its own: Ctrl-C in the terminal reaches Python alone, which ends ffmpeg. No session of
-        # its own: Linux shares out the processor by session, and on a busy machine that costs a third.
+        # In its own process group, so that Ctrl-C in the terminal reaches only Python, which ends ffmpeg. Not
+        # in its own session: Linux schedules by session, which costs a third of the speed on a busy machine.
         group: dict[str, Any] = {"process_group": 0}
         if sys.platform == "win32":
             group = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
         self.cpu_seconds = 0.0
-        """Processor time, once the process has ended, where the system tells."""
+        """Processor time, known after the process has ended, on systems that report it."""
         self._reaping = threading.Lock()
         with contextlib.ExitStack() as on_error:
             self._log = on_error.enter_context(tempfile.TemporaryFile())
@@ -216,25 +215,25 @@ class Process:
                 ) from error
             on_error.pop_all()
         for pipe in (self._popen.stdin, self._popen.stdout):
-            _widen(pipe)
+            _enlarge(pipe)
 
     @property
     def stdin(self) -> IO[bytes]:
-        """The pipe into the process."""
+        """Pipe to the process."""
         assert self._popen.stdin is not None
         return self._popen.stdin
 
     @property
     def stdout(self) -> IO[bytes]:
-        """The pipe out of the process."""
+        """Pipe from the process."""
         assert self._popen.stdout is not None
         return self._popen.stdout
 
     def wait(self) -> int:
-        """Wait for the end of the process and return its code."""
+        """Wait until the process has ended and return its exit code."""
         if sys.platform == "win32":
             return self._popen.wait()
-        # wait4 tells the processor time. It must not block with the lock in hand: another thread may kill.
+        # wait4 reports the processor time. It must not block while it holds the lock that `kill` needs.
         while True:
             with self._reaping:
                 if self._popen.returncode is None:
@@ -247,13 +246,13 @@ class Process:
             time.sleep(0.002)
 
     def kill(self) -> None:
-        """End the process at once, which also wakes a thread that reads from it or writes to it."""
+        """End the process at once; threads that read from it or write to it stop waiting."""
         with self._reaping:
             if self._popen.returncode is None:
                 self._popen.kill()
 
     def close(self) -> None:
-        """End the process if it still runs, and close its pipes."""
+        """End the process if it is still running, and close its pipes."""
         self.kill()
         self.wait()
         for stream in (self._popen.stdin, self._popen.stdout, self._log):
@@ -261,22 +260,22 @@ class Process:
                 stream.close()
 
     def log(self) -> str:
-        """Return the messages, or the last of them where a damaged file makes very many."""
+        """Return the log, or its last 256 KiB."""
         size = self._log.seek(0, os.SEEK_END)
         self._log.seek(max(0, size - (1 << 18)))
         return self._log.read().decode("utf-8", "replace")
 
 
-def _widen(pipe: IO[bytes] | None) -> None:
-    """Give a pipe the room of a part of a frame, where the system can: fewer switches to and fro."""
+def _enlarge(pipe: IO[bytes] | None) -> None:
+    """Enlarge the buffer of a pipe on Linux, for fewer context switches per frame."""
     if pipe is not None and sys.platform == "linux":
         import fcntl
 
-        with contextlib.suppress(OSError):  # an unprivileged user has only so much; 64 kB work too
-            fcntl.fcntl(pipe.fileno(), fcntl.F_SETPIPE_SZ, PIPE_SIZE)
+        with contextlib.suppress(OSError):  # limited for unprivileged users; the default of 64 KiB works too
+            fcntl.fcntl(pipe.fileno(), fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
 
 
 def last_line(log: str) -> str:
-    """Take the last message out of ffmpeg's log, without the `[part @ address]` in front."""
+    """Last message of ffmpeg's log, without the prefix ``[component @ address]``."""
     lines = [re.sub(r"^(\[[^\]]*\] *)+", "", line).strip() for line in log.splitlines()]
     return next((line for line in reversed(lines) if line), "no reason given")

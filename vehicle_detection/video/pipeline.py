@@ -1,4 +1,4 @@
-"""The line of threads of a video: read, search side by side, follow and draw in order, write."""
+"""The threads of a video run: decode, search frames in parallel, track and draw in order, encode."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import threading
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from typing import Any, Generic, Protocol, TypeVar
@@ -22,207 +22,187 @@ Item = TypeVar("Item")
 Frame = NDArray[np.uint8]
 
 
-class SupportsTrack(Protocol):
-    """A vehicle of one frame, as far as a video needs it."""
-
-    @property
-    def id(self) -> int:
-        """Number that the vehicle keeps."""
-
-
-class SupportsResult(Protocol):
-    """What a detector says of one frame, as far as a video needs it."""
-
-    @property
-    def tracks(self) -> Sequence[SupportsTrack]:
-        """The vehicles."""
-
-    @property
-    def seconds(self) -> Mapping[str, float]:
-        """Time of each stage, by name."""
-
-
-class SupportsFrames(Protocol):
-    """What :func:`process_video` asks of a detector; :class:`VehicleDetector` is one."""
+class VideoDetector(Protocol):
+    """The methods of a detector that :func:`process_video` calls, such as :class:`VehicleDetector`."""
 
     def search(self, frame: Frame, /) -> Any:
-        """Find windows in one frame; runs in any thread and ahead of the order."""
+        """Search one frame; called from several threads, and before earlier frames are tracked."""
 
     def track(self, found: Any, /, *, time: float | None) -> Any:
-        """Update the tracks with one frame's search result, in frame order, and return the frame's result."""
+        """Update the tracks with a frame's search result, in frame order, and return the frame's result.
+
+        Its ``tracks`` have an ``id`` each; its ``seconds`` map each stage to its time.
+        """
 
     def annotate(self, frame: Frame, result: Any, /) -> Frame:
         """Draw a result on a copy of its frame."""
 
     def reset(self, *, fps: float) -> None:
-        """Forget all frames so far."""
+        """Forget all frames."""
 
 
-class Closed(Exception):  # noqa: N818 - a signal between threads, not an error
-    """The other side wants no more."""
+class QueueClosed(Exception):  # noqa: N818 - a signal between threads, not an error
+    """The other side has closed the queue."""
 
 
-class Channel(Generic[Item]):
-    """A queue of bounded length between two threads, which either side can end.
+class ClosableQueue(Generic[Item]):
+    """A bounded queue between two threads that either side can close.
 
-    ``queue.Queue`` cannot: a producer would wait for ever for a consumer that has failed.
+    With ``queue.Queue`` a producer would wait forever for a consumer that has failed.
     """
 
     def __init__(self, size: int) -> None:
         self._items: deque[Item] = deque()
         self._size = size
-        self._change = threading.Condition()
+        self._changed = threading.Condition()
         self._finished = self._aborted = False
         self._error: BaseException | None = None
 
     def put(self, item: Item) -> None:
-        """Add an item, waiting for room; an error of the other side is raised here."""
-        with self._change:
+        """Append an item when there is space; raise the error of `abort`, or `QueueClosed`."""
+        with self._changed:
             while len(self._items) >= self._size and not self._aborted:
-                self._change.wait()
+                self._changed.wait()
             if self._aborted:
-                raise self._error or Closed
+                raise self._error or QueueClosed
             self._items.append(item)
-            self._change.notify_all()
+            self._changed.notify_all()
 
     def finish(self, error: BaseException | None = None) -> None:
-        """Say, as the producer, that no item follows; the consumer gets the rest, then the error."""
-        with self._change:
+        """Close the queue after the last item; the consumer gets the remaining items, then the error."""
+        with self._changed:
             self._finished = True
             self._error = self._error or error
-            self._change.notify_all()
+            self._changed.notify_all()
 
     def abort(self, error: BaseException | None = None) -> None:
-        """End both sides at once; waiting items are dropped."""
-        with self._change:
+        """Close the queue for both sides at once; waiting items are dropped."""
+        with self._changed:
             self._aborted = True
             self._error = self._error or error
             self._items.clear()
-            self._change.notify_all()
+            self._changed.notify_all()
 
     def __iter__(self) -> Iterator[Item]:
         while True:
-            with self._change:
+            with self._changed:
                 while not self._items and not self._finished and not self._aborted:
-                    self._change.wait()
+                    self._changed.wait()
                 if not self._items:
                     if self._aborted or self._error is not None:
-                        raise self._error or Closed
+                        raise self._error or QueueClosed
                     return
                 item = self._items.popleft()
-                self._change.notify_all()
+                self._changed.notify_all()
             yield item
 
 
-class Line:
-    """The line of threads from one ffmpeg to the other.
+class FramePipeline:
+    """The threads that process a video.
 
-    A reading thread hands frames to the workers and queues them in order; the following thread takes them
-    from there, follows and draws; a writing thread feeds ffmpeg. Whichever fails first ends the others. The
-    calling thread does nothing but take the results: Ctrl-C, which Python raises in the main thread wherever
-    that may be, finds no process half started and no file half removed there.
+    The decoding thread submits frames to the search workers and queues them in order; the tracking thread
+    takes them from the queue, tracks and draws; the encoding thread writes to ffmpeg. The first error stops
+    all of them. The calling thread only receives results: Python raises KeyboardInterrupt in the main thread,
+    where it must not interrupt the start of a process or the removal of a file.
 
-    Parameters
-    ----------
-    open_reader
-        Opens the source.
-    open_writer
-        Opens the target; on leaving its context the file must be whole, or gone after an error.
+    `open_writer` returns a context that, on exit, completes the target or removes it after an error.
     """
 
     def __init__(
         self,
         open_reader: Callable[[], FrameReader],
         open_writer: Callable[[], AbstractContextManager[FrameWriter]] | None,
-        detector: SupportsFrames,
+        detector: VideoDetector,
         workers: int,
     ) -> None:
         self._seconds: defaultdict[str, float] = defaultdict(float)
         self._open_reader, self._open_writer = open_reader, open_writer
         self._detector, self._workers = detector, workers
-        self._found: Channel[tuple[float, Frame, Future[tuple[Any, float]]]] = Channel(workers + 1)
-        self._drawn: Channel[Frame] = Channel(2)
-        self._results: Channel[Any] = Channel(4)
-        self._running: list[FrameReader | FrameWriter] = []
-        self._starting = threading.Lock()
+        self._searched: ClosableQueue[tuple[float, Frame, Future[tuple[Any, float]]]] = ClosableQueue(
+            workers + 1
+        )
+        self._drawn: ClosableQueue[Frame] = ClosableQueue(2)
+        self._results: ClosableQueue[Any] = ClosableQueue(4)
+        self._streams: list[FrameReader | FrameWriter] = []
+        self._lock = threading.Lock()
         self._aborted = False
 
     @property
-    def stages(self) -> dict[str, float]:
-        """Seconds of work of each stage, in the order in which a frame passes them."""
-        ends = {"decode": -2, "search": -1, "draw": 1, "encode": 2}
-        return dict(sorted(self._seconds.items(), key=lambda stage: ends.get(stage[0], 0)))
+    def stage_seconds(self) -> dict[str, float]:
+        """Seconds of work per stage, in the order of processing."""
+        order = {"decode": -2, "search": -1, "draw": 1, "encode": 2}
+        return dict(sorted(self._seconds.items(), key=lambda stage: order.get(stage[0], 0)))
 
     def run(self) -> Generator[Any]:
-        """Yield the result of each frame, in order; closing the generator ends everything at once."""
-        follower = threading.Thread(target=self._follow, name="vehicle-follow")
+        """Yield the result of each frame, in order; closing the generator stops all threads."""
+        thread = threading.Thread(target=self._track_in_thread, name="vehicle-track")
         try:
-            follower.start()
+            thread.start()
             yield from self._results
         finally:
-            self._abort()  # on the good way out nothing runs any more
-            if follower.is_alive():
-                follower.join()
+            self._abort()  # no effect after a complete run
+            if thread.is_alive():
+                thread.join()
 
     def _abort(self) -> None:
-        """End what runs and let nothing start any more."""
-        with self._starting:
+        """Stop all threads and streams, and prevent new ones."""
+        with self._lock:
             self._aborted = True
-            running = list(self._running)
-        for channel in (self._found, self._drawn, self._results):
-            channel.abort()
-        for stream in running:
+            streams = list(self._streams)
+        for queue in (self._searched, self._drawn, self._results):
+            queue.abort()
+        for stream in streams:
             stream.kill()
 
     def _register(self, stream: FrameReader | FrameWriter) -> None:
-        with self._starting:
+        with self._lock:
             if self._aborted:
-                raise Closed
-            self._running.append(stream)
+                raise QueueClosed
+            self._streams.append(stream)
 
-    def _follow(self) -> None:
+    def _track_in_thread(self) -> None:
         try:
             with contextlib.ExitStack() as stack:
-                # The threads have ended before the pipes close, and those before an unfinished file goes.
+                # Exit order: the threads end, then the pipes close, then an unfinished file is removed.
                 writer = stack.enter_context(self._open_writer()) if self._open_writer else None
                 reader = stack.enter_context(self._open_reader())
                 for stream in (reader, writer):
                     if stream is not None:
                         self._register(stream)
-                self._flow(reader, writer)
-        except Closed:
+                self._run_threads(reader, writer)
+        except QueueClosed:
             return
-        except BaseException as error:  # the calling thread raises it
+        except BaseException as error:  # raised in the calling thread
             self._results.finish(error)
         else:
             self._results.finish()
 
-    def _flow(self, reader: FrameReader, writer: FrameWriter | None) -> None:
-        """Let all frames pass."""
+    def _run_threads(self, reader: FrameReader, writer: FrameWriter | None) -> None:
+        """Decode and encode in threads, search in a pool, and track and draw in this thread."""
         pool = ThreadPoolExecutor(self._workers, thread_name_prefix="vehicle-search")
-        threads = [threading.Thread(target=self._read, args=(reader, pool), name="vehicle-decode")]
+        threads = [threading.Thread(target=self._decode, args=(reader, pool), name="vehicle-decode")]
         if writer is not None:
-            threads.append(threading.Thread(target=self._write, args=(writer,), name="vehicle-encode"))
+            threads.append(threading.Thread(target=self._encode, args=(writer,), name="vehicle-encode"))
         try:
             for thread in threads:
                 thread.start()
-            for moment, frame, search in self._found:
-                windows, seconds = search.result()
-                result = self._detector.track(windows, time=moment)
-                self._count(result, seconds)
+            for moment, frame, search in self._searched:
+                found, seconds = search.result()
+                result = self._detector.track(found, time=moment)
+                self._add_times(result, seconds)
                 if writer is not None:
                     self._drawn.put(self._draw(frame, result))
-                del frame, windows, search  # not one frame more in memory than needed
+                del frame, found, search  # free the frame before waiting for the next one
                 self._results.put(result)
             self._drawn.finish()
             for thread in threads:
                 thread.join()
-            for _ in self._drawn:  # raises what the writing thread met after the last frame
+            for _ in self._drawn:  # raises an error of the encoding thread after the last frame
                 pass
         finally:
-            self._found.abort()
+            self._searched.abort()
             self._drawn.abort()
-            for stream in self._running:
+            for stream in self._streams:
                 stream.kill()
             pool.shutdown(cancel_futures=True)
             for thread in threads:
@@ -232,48 +212,48 @@ class Line:
         if writer is not None:
             self._seconds["encode"] += writer.cpu_seconds
 
-    def _read(self, reader: FrameReader, pool: ThreadPoolExecutor) -> None:
+    def _decode(self, reader: FrameReader, pool: ThreadPoolExecutor) -> None:
         try:
             for _, moment, frame in reader:
-                self._found.put((moment, frame, pool.submit(self._search, frame)))
-        except Closed:
+                self._searched.put((moment, frame, pool.submit(self._search, frame)))
+        except QueueClosed:
             return
-        except BaseException as error:  # the following thread raises it
-            self._found.finish(error)
+        except BaseException as error:  # raised in the tracking thread
+            self._searched.finish(error)
         else:
-            self._found.finish()
+            self._searched.finish()
         finally:
             self._seconds["decode"] += time.thread_time()
 
     def _search(self, frame: Frame) -> tuple[Any, float]:
-        began = time.perf_counter()
-        return self._detector.search(frame), time.perf_counter() - began
+        start = time.perf_counter()
+        return self._detector.search(frame), time.perf_counter() - start
 
-    def _count(self, result: SupportsResult, search_seconds: float) -> None:
+    def _add_times(self, result: Any, search_seconds: float) -> None:
         self._seconds["search"] += search_seconds
         for name, seconds in result.seconds.items():
-            if name != "search":  # measured here, as a detector may leave it out
+            if name != "search":  # measured here, because a detector may omit it
                 self._seconds[name] += seconds
 
     def _draw(self, frame: Frame, result: Any) -> Frame:
-        began = time.perf_counter()
-        picture = self._detector.annotate(frame, result)
-        if getattr(picture, "shape", None) != frame.shape or picture.dtype != np.uint8:
+        start = time.perf_counter()
+        drawn = self._detector.annotate(frame, result)
+        if getattr(drawn, "shape", None) != frame.shape or drawn.dtype != np.uint8:
             raise InvalidInputError(
-                f"detector.annotate must return a {frame.shape} uint8 array, got {describe(picture)}; "
+                f"detector.annotate must return a {frame.shape} uint8 array, got {describe(drawn)}; "
                 "draw on a copy of the frame"
             )
-        self._seconds["draw"] += time.perf_counter() - began
-        return np.ascontiguousarray(picture)
+        self._seconds["draw"] += time.perf_counter() - start
+        return np.ascontiguousarray(drawn)
 
-    def _write(self, writer: FrameWriter) -> None:
+    def _encode(self, writer: FrameWriter) -> None:
         try:
-            for picture in self._drawn:
-                writer.write(picture)
+            for drawn in self._drawn:
+                writer.write(drawn)
             writer.finish()
-        except Closed:
+        except QueueClosed:
             return
-        except BaseException as error:  # the following thread raises it at its next frame
+        except BaseException as error:  # raised in the tracking thread at its next frame
             self._drawn.abort(error)
         finally:
             self._seconds["encode"] += time.thread_time()

@@ -1,7 +1,7 @@
-"""RGB frames out of the planes of video, and planes out of frames.
+"""Conversion between RGB frames and the YUV 4:2:0 planes of video.
 
-Video is stored as yuv420p: a plane of luma and two of chroma of half the size, half the bytes of RGB. They go
-through the pipes as they are, and the conversion costs a fraction of ffmpeg's, which besides rounds down.
+A plane of luma and two of chroma of half the size take half the bytes of RGB in the pipes to ffmpeg, and the
+conversion here takes a fraction of the time of ffmpeg's own, which also rounds down.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from vehicle_detection._kernels import channels_from_planes, planes_from_channel
 FORMATS = ("yuv420p", "yuvj420p")
 """ffmpeg's names of the pixel formats that are read as planes."""
 
-# Weights of red and blue in luma, by ffmpeg's name of the color space; of green the rest.
+# Weights of red and blue in luma, by ffmpeg's name of the color space; green has the rest.
 _BT_601 = (0.299, 0.114)
-_LUMA = {
+_LUMA_WEIGHTS = {
     "unknown": _BT_601,
     "bt470bg": _BT_601,
     "smpte170m": _BT_601,
@@ -32,82 +32,56 @@ Planes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class Coding:
-    """How the numbers of a video mean colors.
+class ColorEncoding:
+    """How luma and chroma encode colors."""
 
-    Attributes
-    ----------
-    space
-        ffmpeg's name of the color space: ``"bt709"``, ``"bt470bg"``, ``"smpte170m"``, ``"bt2020nc"``, or
-        ``"unknown"``, which is taken for BT.601.
-    full
-        Whether luma uses 0-255, as phones have it; else 16-235.
-    """
-
-    space: str = "unknown"
-    full: bool = False
+    space: str = "unknown"  # ffmpeg's name, such as "bt709"; "unknown" is read as BT.601
+    full_range: bool = False  # luma is 0-255, as in videos of phones, instead of 16-235
 
     @property
-    def known(self) -> bool:
-        """Whether frames can be made here; else ffmpeg has to."""
-        return self.space in _LUMA
+    def supported(self) -> bool:
+        """Whether this module can convert it; otherwise ffmpeg does."""
+        return self.space in _LUMA_WEIGHTS
 
     def constants(self) -> tuple[np.int32, ...]:
-        """Zero of luma, and the factors of luma and chroma in red, green and blue, times 2**14."""
-        red, blue = _LUMA[self.space]
-        luma, chroma = (1.0, 1.0) if self.full else (255 / 219, 255 / 224)
+        """Zero of luma, and the factors of luma and chroma in red, green and blue, scaled by 2**14."""
+        red, blue = _LUMA_WEIGHTS[self.space]
+        luma, chroma = (1.0, 1.0) if self.full_range else (255 / 219, 255 / 224)
         to_red, to_blue = 2 * (1 - red) * chroma, 2 * (1 - blue) * chroma
         green = 1 - red - blue
         factors = (luma, to_red, -to_blue * blue / green, -to_red * red / green, to_blue)
-        return np.int32(0 if self.full else 16), *(np.int32(round(value * (1 << 14))) for value in factors)
+        zero = np.int32(0 if self.full_range else 16)
+        return zero, *(np.int32(round(value * (1 << 14))) for value in factors)
 
 
-def _parts(planes: Planes) -> tuple[Planes, Planes, Planes]:
-    """Luma and the two planes of chroma, as views."""
+def _split_planes(planes: Planes) -> tuple[Planes, Planes, Planes]:
+    """Return views of the luma plane and the two chroma planes."""
     height, width = planes.shape[0] * 2 // 3, planes.shape[1]
     blue, red = planes[height:].reshape(2, height // 2, width // 2)
     return planes[:height], blue, red
 
 
-def rgb_from_planes(planes: Planes, coding: Coding, channels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Make a frame from its planes; a chroma value colors four pixels.
+def rgb_from_planes(
+    planes: Planes, encoding: ColorEncoding, channels: NDArray[np.uint8]
+) -> NDArray[np.uint8]:
+    """Convert planes of even height and width to a new ``(H, W, 3)`` frame; one chroma value colors 4 pixels.
 
-    Parameters
-    ----------
-    planes
-        ``(H * 3 / 2, W)`` uint8, `H` and `W` even.
-    coding
-        What the numbers mean.
-    channels
-        ``(3, H, W)`` uint8, memory that is written over.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(H, W, 3)`` uint8 RGB, a new array.
+    `channels` is a ``(3, H, W)`` uint8 scratch array.
     """
-    channels_from_planes(*_parts(planes), *coding.constants(), channels)
+    channels_from_planes(*_split_planes(planes), *encoding.constants(), channels)
     return np.asarray(cv2.merge(list(channels)), np.uint8)
 
 
 def planes_from_rgb(frame: NDArray[np.uint8], planes: Planes, channels: NDArray[np.uint8]) -> None:
-    """Convert a frame to planes by BT.601 in the range 16-235; a chroma value is the mean of four pixels.
+    """Convert an ``(H, W, 3)`` frame to BT.601 `planes` (output) in the range 16-235.
 
-    An odd side grows by one pixel, which repeats the last column or row.
-
-    Parameters
-    ----------
-    frame
-        ``(H, W, 3)`` uint8 RGB.
-    planes
-        Output, ``(H' * 3 / 2, W')`` uint8, with `H` and `W` rounded up to even numbers.
-    channels
-        ``(3, H', W')`` uint8, memory that is written over.
+    A chroma value is the mean of four pixels. Odd sides are extended by one pixel, which repeats the last
+    column or row. `channels` is a ``(3, H', W')`` uint8 scratch array with the even sides.
     """
     height, width = channels.shape[1:]
     if frame.shape[:2] != (height, width):
-        grown = height - frame.shape[0], width - frame.shape[1]
-        grown_frame = cv2.copyMakeBorder(frame, 0, grown[0], 0, grown[1], cv2.BORDER_REPLICATE)
-        frame = np.asarray(grown_frame, np.uint8)
+        bottom, right = height - frame.shape[0], width - frame.shape[1]
+        extended = cv2.copyMakeBorder(frame, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
+        frame = np.asarray(extended, np.uint8)
     cv2.split(frame, list(channels))
-    planes_from_channels(channels, *_parts(planes))
+    planes_from_channels(channels, *_split_planes(planes))

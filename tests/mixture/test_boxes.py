@@ -1,0 +1,112 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vehicle_detection.boxes import iou_matrix, overlap_matrices
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.mixture import N_REGRESSION_FEATURES, BoxRegressor, vote_boxes
+from vehicle_detection.mixture.boxes import ScoredWindows, nms
+
+
+def random_windows(count, seed):
+    rng = np.random.default_rng(seed)
+    corners, sides = rng.uniform(0, 100, (count, 2)), rng.uniform(5, 60, (count, 2))
+    margins = -np.sort(-rng.normal(0, 1, count).round(1))
+    return ScoredWindows(np.hstack([corners, corners + sides]), margins, rng.integers(0, 3, count))
+
+
+@given(
+    count=st.integers(0, 40),
+    seed=st.integers(0, 1000),
+    min_margin=st.floats(-1.5, 1.5),
+    max_boxes=st.integers(1, 9),
+)
+def test_voting_keeps_the_best_window_of_each_group(count, seed, min_margin, max_boxes):
+    windows = random_windows(count, seed)
+    kept, vote_mass = vote_boxes(windows, min_margin=min_margin, max_boxes=max_boxes)
+    assert len(kept) <= max_boxes
+    assert kept.boxes.shape == (len(kept), 4)
+    assert (kept.margins >= min_margin).all()
+    assert (np.diff(kept.margins) <= 0).all()
+    assert len(kept) > 0 or not (windows.margins >= min_margin).any()
+    if len(kept):
+        assert kept.margins[0] == windows.margins[0]
+        assert (kept.boxes >= windows.boxes.min(axis=0) - 1e-9).all()
+        assert (kept.boxes <= windows.boxes.max(axis=0) + 1e-9).all()
+        # Windows below the minimum change boxes only, not which windows are kept.
+        strong = windows[windows.margins >= min_margin]
+        again, lower_mass = vote_boxes(strong, min_margin=min_margin, max_boxes=max_boxes)
+        assert again.margins.tolist() == kept.margins.tolist()
+        # A window votes for itself, and more windows only add votes.
+        assert (vote_mass >= np.maximum(kept.margins + 1.1, 0) - 1e-9).all()
+        assert (lower_mass <= vote_mass + 1e-9).all()
+
+
+def test_a_box_is_the_mean_of_its_voters():
+    boxes = np.array([[0.0, 0, 40, 40], [4, 0, 44, 40], [200, 0, 240, 40]])
+    windows = ScoredWindows(boxes, np.array([1.0, 1.0, 0.5]), np.array([0, 1, 2]))
+    kept, vote_mass = vote_boxes(windows, min_margin=0.0)
+    np.testing.assert_allclose(kept.boxes, [[2, 0, 42, 40], [200, 0, 240, 40]])
+    np.testing.assert_allclose(vote_mass, [4.2, 1.6])
+    assert kept.templates.tolist() == [0, 2]
+
+
+@given(count=st.integers(0, 30), seed=st.integers(0, 1000))
+def test_nms_removes_the_weaker_of_two_overlapping_boxes(count, seed):
+    windows = random_windows(count, seed)
+    order = np.random.default_rng(seed).permutation(count)
+    boxes, scores = windows.boxes[order], windows.margins[order]
+    rows = nms(boxes, scores)
+    assert len(set(rows.tolist())) == len(rows)
+    assert (np.diff(scores[rows]) <= 0).all()
+    kept = boxes[rows]
+    assert (np.triu(iou_matrix(kept, kept), 1) <= 0.35).all()
+    for row in set(range(count)) - set(rows.tolist()):
+        iou, cover = (matrix[0] for matrix in overlap_matrices(boxes[row, None], kept))
+        better = scores[rows] >= scores[row]
+        assert (((iou > 0.35) | (cover > 0.75)) & better).any()
+    assert nms(kept, scores[rows]).tolist() == list(range(len(rows)))
+
+
+@given(seed=st.integers(0, 100), count=st.integers(0, 6))
+@settings(max_examples=15)
+def test_regressed_boxes_are_inside_the_image(seed, count):
+    windows = random_windows(count, seed)
+    image = np.random.default_rng(seed).integers(0, 256, (90, 110, 3), dtype=np.uint8)
+    strong = BoxRegressor(np.random.default_rng(seed).normal(0, 0.1, (N_REGRESSION_FEATURES, 4)), np.zeros(4))
+    for regressor in (strong, dataclasses.replace(strong, n_iterations=3), BoxRegressor.none()):
+        boxes, margins = regressor.apply(image, windows)
+        assert len(boxes) == len(margins) <= count
+        assert (boxes[:, :2] >= 0).all()
+        assert (boxes[:, 2:] <= (110, 90)).all()
+        assert (boxes[:, 2:] > boxes[:, :2]).all()
+    assert not BoxRegressor.none().shifts(image, windows.boxes).any()
+
+
+def test_regression_is_repeated_while_a_box_moves():
+    image = np.random.default_rng(1).integers(0, 256, (200, 200, 3), dtype=np.uint8)
+    windows = ScoredWindows(np.array([[50.0, 50.0, 100.0, 100.0]]), np.array([1.0]), np.array([0]))
+    weights = np.zeros((N_REGRESSION_FEATURES, 4))
+    for shift, n_iterations, expected in [
+        (0.2, 1, [50, 50, 110, 100]),
+        (0.2, 3, [50, 50, 136.4, 100]),
+        (0.1, 3, [50, 50, 105, 100]),
+        (0.9, 2, [50, 50, 134.5, 100]),
+    ]:
+        regressor = BoxRegressor(weights, np.array([0, 0, shift, 0]), n_iterations)
+        boxes, _ = regressor.apply(image, windows)
+        np.testing.assert_allclose(boxes, [expected], rtol=1e-6)
+    assert windows.boxes.tolist() == [[50, 50, 100, 100]]
+
+
+@pytest.mark.parametrize("side", [N_REGRESSION_FEATURES - 1, 0])
+def test_invalid_regressors_are_rejected(side):
+    with pytest.raises(
+        InvalidInputError, match=rf"box_regressor.weights must be .* \({N_REGRESSION_FEATURES}, 4\)"
+    ):
+        BoxRegressor(np.zeros((side, 4)), np.zeros(4))
+    with pytest.raises(InvalidInputError, match=r"box_regressor.bias must be finite numbers of shape \(4\)"):
+        BoxRegressor(np.zeros((N_REGRESSION_FEATURES, 4)), np.zeros(3))

@@ -1,0 +1,126 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.helpers import mixture_template
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.mixture import (
+    N_CHANNELS,
+    FeatureMap,
+    MixtureTemplate,
+    feature_maps,
+    image_pyramid,
+    mirror_channels,
+)
+from vehicle_detection.mixture.features import PyramidLevel
+
+BORDER_TEMPLATE = mixture_template(5, 6, seed=4, border=True)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(1, 1), (2, 5), (3, 4), (8, 9)])
+@pytest.mark.parametrize("shape", [(8, 9), (9, 12), (12, 30)])
+def test_margins_are_sums_of_products(rows, columns, shape):
+    rng = np.random.default_rng(7)
+    channels = rng.uniform(0, 0.4, (N_CHANNELS, *shape)).astype(np.float32)
+    template = mixture_template(columns, rows, bias=0.25, padding=(0.0, 0.0))
+    expected = np.empty((shape[0] - rows + 1, shape[1] - columns + 1))
+    for y in range(expected.shape[0]):
+        for x in range(expected.shape[1]):
+            window = channels[:, y : y + rows, x : x + columns].transpose(1, 2, 0).astype(np.float64)
+            expected[y, x] = (window * template.weights).sum() + 0.25
+    found = template.margins(channels)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_a_map_smaller_than_a_template_has_no_window():
+    template = mixture_template(9, 8)
+    for shape in ((7, 20), (20, 8), (1, 1)):
+        assert template.margins(np.zeros((N_CHANNELS, *shape), np.float32)).size == 0
+
+
+def test_a_mirrored_template_gives_the_same_margins_on_a_mirrored_map():
+    channels = np.random.default_rng(1).uniform(0, 0.4, (N_CHANNELS, 12, 20)).astype(np.float32)
+    template = mixture_template()
+    weights = mirror_channels(template.weights.transpose(2, 0, 1)).transpose(1, 2, 0)
+    mirrored = MixtureTemplate(weights, template.bias, template.padding)
+    np.testing.assert_allclose(
+        mirrored.margins(mirror_channels(channels)), template.margins(channels)[:, ::-1], atol=1e-5
+    )
+
+
+def test_boxes_exclude_the_padding():
+    template = mixture_template(9, 8, padding=(1.0, 0.5))
+    assert template.box_cells == (7, 7)
+    ((_, level),) = feature_maps(
+        image_pyramid(np.zeros((160, 160, 3), np.uint8)), PyramidLevel(None, 8.0), (0, 160)
+    )
+    first = np.array([0])
+    (box,) = template.boxes(level, first, first)
+    assert box.tolist() == [level.left + 8, level.top + 4, level.left + 64, level.top + 60]
+    (box,) = template.boxes(level, first + 3, first + 5)
+    assert box.tolist() == [level.left + 48, level.top + 28, level.left + 104, level.top + 84]
+
+
+def test_a_border_template_has_padding_on_one_side():
+    assert BORDER_TEMPLATE.box_cells == (4, 4)
+
+
+@given(seed=st.integers(0, 1000), columns=st.integers(3, 12), rows=st.integers(4, 9))
+def test_both_borders_give_the_same_windows(seed, columns, rows):
+    rng = np.random.default_rng(seed)
+    channels = rng.uniform(0, 0.3, (N_CHANNELS, rows, columns)).astype(np.float32)
+    feature_map = FeatureMap(channels, 0.0, 4.0, 8.0, 8.0)
+    mirrored = dataclasses.replace(feature_map, channels=mirror_channels(channels))
+    template, width = BORDER_TEMPLATE, columns * 8.0
+    boxes, margins = template.border_windows(feature_map, width, left=False, min_margin=-9.0)
+    assert len(boxes) == (rows - 5 if columns >= 5 and rows >= 6 else 0)
+    assert (boxes[:, 2] == width).all()
+    assert (boxes[:, 2:] - boxes[:, :2] == 32).all()
+    others, same = template.border_windows(mirrored, 0.0, left=True, min_margin=-9.0)
+    np.testing.assert_array_equal(same, margins)
+    np.testing.assert_array_equal(others[:, [1, 3]], boxes[:, [1, 3]])
+    np.testing.assert_array_equal(others[:, [0, 2]], width - boxes[:, [2, 0]])
+    if len(boxes):
+        inside = feature_map.channels[:, :, columns - 5 :]
+        np.testing.assert_allclose(template.margins(np.ascontiguousarray(inside))[:, 0], margins)
+
+
+def test_weights_are_copied_and_read_only():
+    weights = np.zeros((3, 4, N_CHANNELS), np.float32)
+    template = MixtureTemplate(weights, 0.0, (0.0, 0.0))
+    weights[0] = 1
+    assert not template.weights.any()
+    with pytest.raises(ValueError, match="read-only"):
+        template.weights[0] = 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"weights": np.zeros((3, 4, 27))},
+            r"weights must be finite numbers of shape \(any, any, 28\), got an",
+        ),
+        ({"weights": np.zeros((4, N_CHANNELS))}, r"weights must be .*; train again"),
+        ({"weights": np.zeros((0, 4, N_CHANNELS))}, "weights must be finite numbers"),
+        ({"weights": np.full((3, 4, N_CHANNELS), np.nan)}, "weights must be finite numbers"),
+        ({"weights": "none"}, "weights must be finite numbers"),
+        ({"bias": np.inf}, "bias must be a number"),
+        (
+            {"padding": (2.0, 0.0)},
+            r"padding must be less than half of the window's 4x3 cells, got \(2.0, 0.0\)",
+        ),
+        ({"padding": (0.0, 1.5)}, "padding must be less than half"),
+        ({"padding": 1.0}, "padding must be two numbers of cells, got 1.0"),
+        ({"padding": (np.nan, 0.0)}, "padding must be a number"),
+        ({"border": 1}, "border must be True or False, got 1"),
+    ],
+)
+def test_invalid_templates_are_rejected(changes, message):
+    options = {"weights": np.zeros((3, 4, N_CHANNELS)), "bias": 0.0, "padding": (0.0, 0.0)}
+    with pytest.raises(InvalidInputError, match=message):
+        MixtureTemplate(**(options | changes))

@@ -1,0 +1,74 @@
+"""The data that a report keeps of a run."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.report.helpers import track
+from vehicle_detection.report.history import TrackHistory, TrackLog, bin_means
+
+PRESENCE = st.lists(st.sets(st.integers(1, 4)), max_size=40)
+
+
+def log_of(frames):
+    """Log of the ids of the tracks in each frame."""
+    log = TrackLog()
+    for index, numbers in enumerate(frames):
+        log.add(index, None, [track(number, distance=index + number) for number in sorted(numbers)])
+    return log
+
+
+@given(PRESENCE)
+def test_the_log_keeps_the_frames_and_values_of_each_track(frames):
+    log = log_of(frames)
+    assert list(log.counts) == [len(numbers) for numbers in frames]
+    histories = log.histories()
+    assert {each.id for each in histories} == set().union(*frames)
+    for each in histories:
+        assert each.frames.tolist() == [index for index, numbers in enumerate(frames) if each.id in numbers]
+        assert each.columns["distance_m"].tolist() == [index + each.id for index in each.frames]
+        spans = each.spans()
+        assert [index for start, stop in spans for index in range(start, stop)] == each.frames.tolist()
+        assert all(stop < start for (_, stop), (start, _) in pairwise(spans))
+    order = [(each.first, each.id) for each in histories]
+    assert order == sorted(order)
+
+
+@given(st.sets(st.integers(0, 60), min_size=1), st.integers(1, 10), st.data())
+def test_bins_hold_the_means_of_known_values(frames, width, data):
+    frames = np.array(sorted(frames))
+    size = {"min_size": len(frames), "max_size": len(frames)}
+    values = np.array(data.draw(st.lists(st.floats(-100, 100) | st.just(math.nan), **size)))
+    bins, means = bin_means(frames, values, width)
+    groups = {}
+    for frame, value in zip(frames, values):
+        if not math.isnan(value):
+            groups.setdefault(frame // width, []).append(value)
+    assert bins.tolist() == sorted(groups)
+    assert means == pytest.approx([np.mean(groups[number]) for number in sorted(groups)], abs=1e-9)
+
+
+def history(frames, distances):
+    columns = {name: np.full(len(frames), math.nan) for name in ("speed_mps", "speed_std_mps", "score")}
+    columns["distance_m"] = np.array(distances, float)
+    columns["distance_std_m"] = np.ones(len(frames))
+    return TrackHistory(1, np.array(frames, np.int64), columns)
+
+
+def test_an_outlier_is_not_the_closest_approach():
+    distances = [30.0 - index / 10 for index in range(100)]
+    distances[3] = 1.0
+    approach = history(range(100), distances).closest_approach(25.0)
+    assert approach.distance_m == pytest.approx(20.5, abs=0.2)
+    assert approach.frame > 90
+    assert approach.std_m == 1.0
+
+
+def test_the_closest_approach_of_few_known_distances():
+    assert history([5], [12.0]).closest_approach(25.0) == (5, 12.0, 1.0)
+    assert history([5, 6], [math.nan, 12.0]).closest_approach(0.1).frame == 6
+    assert history([5], [math.nan]).closest_approach(25.0) is None

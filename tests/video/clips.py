@@ -1,0 +1,65 @@
+"""Test clips, and what they contain."""
+
+import contextlib
+import subprocess
+import threading
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from moviepy.config import FFMPEG_BINARY
+
+from vehicle_detection.video import read_frames
+
+LEVELS = 10  # gray levels from one frame of a test clip to the next: much more than the codec's errors
+NTSC = Fraction(30000, 1001)
+
+
+def ffmpeg(*options, data=None):
+    command = [FFMPEG_BINARY, "-v", "error", "-y", *map(str, options)]
+    return subprocess.run(command, input=data, capture_output=True, check=True).stdout
+
+
+def ffmpeg_log(path):
+    """Return ffmpeg's description of a file."""
+    command = [FFMPEG_BINARY, "-hide_banner", "-i", str(path)]
+    return subprocess.run(command, capture_output=True, text=True).stderr
+
+
+def write_clip(path, frames, *, fps=25, sound=False, options=()):
+    height, width = frames[0].shape[:2]
+    video = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", fps, "-i", "pipe:0"]
+    tone = ["-f", "lavfi", "-t", float(len(frames) / Fraction(fps)), "-i", "sine=440"] if sound else []
+    encoder = ["-c:v", "libx264", "-preset", "ultrafast", "-crf", 4, "-pix_fmt", "yuv420p"]
+    ffmpeg(*video, *tone, *encoder, *options, path, data=b"".join(frame.tobytes() for frame in frames))
+    return path
+
+
+def gray_frames(count, width=64, height=48):
+    return [np.full((height, width, 3), 10 + LEVELS * n, np.uint8) for n in range(count)]
+
+
+def frame_numbers(path):
+    """Return which frames of `gray_frames` a video contains, from their brightness."""
+    with read_frames(path) as frames:
+        return [round((float(frame[8:-8, 8:-8].mean()) - 10) / LEVELS) for _, _, frame in frames]
+
+
+def sound_seconds(path):
+    return len(ffmpeg("-i", path, "-map", "0:a:0", "-f", "s16le", "-ac", 1, "-ar", 8000, "-")) / 16000
+
+
+def child_processes():
+    tasks = Path("/proc/self/task")
+    if not tasks.is_dir():
+        pytest.skip("processes cannot be listed without /proc")
+    found = set()
+    for task in tasks.iterdir():
+        with contextlib.suppress(FileNotFoundError):  # the thread has ended
+            found.update((task / "children").read_text().split())
+    return found
+
+
+def running_threads():
+    return [thread for thread in threading.enumerate() if thread.name.startswith("vehicle-")]

@@ -1,0 +1,95 @@
+"""Properties of video files."""
+
+import os
+from fractions import Fraction
+
+import pytest
+
+from tests.helpers import StubDetector
+from tests.video.clips import NTSC, ffmpeg, gray_frames, write_clip
+from vehicle_detection.errors import VideoError
+from vehicle_detection.video import probe_video, process_video, read_frames
+from vehicle_detection.video.ffmpeg import frame_rate
+
+
+@pytest.mark.parametrize("fps", [NTSC, Fraction(60000, 1001), Fraction(24000, 1001), 25, 30, Fraction(25, 2)])
+def test_probe_reads_the_exact_frame_rate(folder, fps):
+    info = probe_video(write_clip(folder / "rate.mp4", gray_frames(10), fps=fps))
+    assert info.fps == fps
+    assert float(info.fps) == pytest.approx(float(fps))
+    assert (info.frames, info.shape, info.constant_rate) == (10, (48, 64, 3), True)
+
+
+def test_probe_reads_the_sound(clip, folder):
+    info = probe_video(clip)
+    assert info.has_audio
+    assert info.audio_codec == "aac"
+    assert info.duration == pytest.approx(20 / NTSC, abs=0.05)
+    assert not probe_video(write_clip(folder / "silent.mp4", gray_frames(3))).has_audio
+
+
+def test_anamorphic_pixels_are_kept(folder):
+    path = write_clip(folder / "wide_pixels.mp4", gray_frames(4), options=["-vf", "setsar=4/3"])
+    assert probe_video(path).pixel_aspect == Fraction(4, 3)
+    process_video(path, folder / "out.mp4", StubDetector())
+    assert probe_video(folder / "out.mp4").pixel_aspect == Fraction(4, 3)
+
+
+@pytest.mark.parametrize(
+    ("exact", "printed", "rate", "constant"),
+    [
+        ("30000/1001", "29.97", NTSC, True),
+        ("30/1", "29.83", Fraction(30), False),
+        ("1000/1", "24.51", Fraction(2451, 100), False),
+        ("90000/1", "1k", Fraction(1000), False),
+        ("0/0", "15", Fraction(15), True),
+        ("25/1", None, Fraction(25), True),
+        ("0/0", None, Fraction(25), False),
+    ],
+)
+def test_frame_rates_from_the_log_of_ffmpeg(exact, printed, rate, constant):
+    line = f"  Stream #0:0: Video: vp8, {printed} fps, 1k tbr" if printed else "  Stream #0:0: Video: vp8"
+    assert frame_rate(f"config in time_base: 1/1000, frame_rate: {exact}", line) == (rate, constant)
+
+
+def test_a_file_without_its_index(truncated):
+    with pytest.raises(VideoError, match=r"its index is missing: .* is incomplete"):
+        probe_video(truncated("cut_index.mp4"))
+
+
+def test_files_without_video(folder, tmp_path, clip):
+    text = folder / "text.mp4"
+    text.write_text("not a video at all, but a text of some length\n" * 100)
+    empty = folder / "empty.mp4"
+    empty.write_bytes(b"")
+    sound = folder / "sound.mp4"
+    ffmpeg("-i", clip, "-vn", "-c:a", "copy", sound)
+    no_frame = folder / "no_frame.mp4"
+    ffmpeg("-i", clip, "-an", "-frames:v", 0, "-c:v", "libx264", no_frame)
+    cover = folder / "cover.m4a"
+    still = folder / "still.png"
+    ffmpeg("-i", clip, "-frames:v", 1, still)
+    ffmpeg(
+        "-i", sound, "-i", still, "-map", 0, "-map", 1, "-c", "copy", "-disposition:v", "attached_pic", cover
+    )
+    for path, message in (
+        (text, r"text.mp4 is not a video that ffmpeg can read \(.*\); record or copy it again"),
+        (empty, r"empty.mp4 is not a video that ffmpeg can read"),
+        (sound, r"sound.mp4 has no video track; choose"),
+        (cover, r"cover.m4a has no video track; choose"),
+        (no_frame, r"no_frame.mp4 (has no frame that can be decoded|has no video track|is not a video)"),
+    ):
+        for call in (
+            probe_video,
+            read_frames,
+            lambda p: process_video(p, tmp_path / "out.mp4", StubDetector()),
+        ):
+            with pytest.raises(VideoError, match=message):
+                call(path)
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_missing_ffmpeg(clip, monkeypatch):
+    monkeypatch.setattr("moviepy.config.FFMPEG_BINARY", "/nowhere/ffmpeg")
+    with pytest.raises(VideoError, match=r"ffmpeg cannot be started .* reinstall imageio-ffmpeg"):
+        probe_video(clip)

@@ -1,0 +1,181 @@
+"""Threads, errors and interrupts."""
+
+import contextlib
+import gc
+import os
+import signal
+import sys
+import threading
+import time
+import weakref
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.helpers import StubDetector, start_interruptible
+from tests.video.clips import child_processes, ffmpeg, frame_numbers, gray_frames, running_threads, write_clip
+from vehicle_detection.errors import InvalidInputError, VideoError
+from vehicle_detection.video import process, process_video
+
+
+def test_the_result_does_not_depend_on_the_number_of_workers(clip, tmp_path):
+    outcomes = []
+    for workers in (1, 2, 5):
+        target, results = tmp_path / f"{workers}.mp4", []
+        detector = StubDetector(pause=0.01)
+        process_video(clip, target, detector, workers=workers, on_result=results.append)
+        outcomes.append((target.read_bytes(), results))
+    assert outcomes[0] == outcomes[1] == outcomes[2]
+
+
+def test_memory_does_not_grow_with_the_length_of_the_video(tmp_path):
+    source = write_clip(tmp_path / "long.mp4", gray_frames(20) * 4)
+    alive, max_alive = 0, 0
+
+    def freed():
+        nonlocal alive
+        alive -= 1
+
+    class CountingDetector(StubDetector):
+        def search(self, frame):
+            nonlocal alive, max_alive
+            alive += 1
+            max_alive = max(max_alive, alive)
+            weakref.finalize(frame, freed)
+            return super().search(frame)
+
+    process_video(source, tmp_path / "out.mp4", CountingDetector(), workers=2)
+    assert max_alive <= 6
+    assert alive == 0
+
+
+class ExpectedError(Exception):
+    pass
+
+
+@pytest.mark.parametrize("method", ["search", "track", "annotate", "on_result"])
+@pytest.mark.parametrize(("call", "workers"), [(0, 3), (7, 1), (19, 2)])
+def test_an_error_is_raised_unchanged_and_leaves_no_file(clip, tmp_path, method, call, workers):
+    target = tmp_path / "out.mp4"
+    target.write_bytes(b"an existing file")
+    error, calls = ExpectedError("unchanged"), []
+    lock = threading.Lock()
+
+    def fail(*args, **kwargs):
+        with lock:
+            calls.append(method)
+            if len(calls) == call + 1:
+                raise error
+        return getattr(StubDetector, method)(stub, *args, **kwargs) if method != "on_result" else None
+
+    stub = StubDetector()
+    if method != "on_result":
+        setattr(stub, method, fail)
+    with pytest.raises(ExpectedError, match="unchanged") as caught:
+        process_video(clip, target, stub, workers=workers, on_result=fail if method == "on_result" else None)
+    assert caught.value is error
+    assert os.listdir(tmp_path) == ["out.mp4"]
+    assert target.read_bytes() == b"an existing file"
+    assert not running_threads()
+
+
+def test_a_killed_encoder_is_an_error(clip, tmp_path, monkeypatch):
+    writers = []
+    open_writer = process.FrameWriter.__init__
+
+    def remember(self, *args, **kwargs):
+        writers.append(self)
+        open_writer(self, *args, **kwargs)
+
+    monkeypatch.setattr(process.FrameWriter, "__init__", remember)
+
+    def kill(result):
+        if result.index == 5:
+            os.kill(writers[0]._process._popen.pid, signal.SIGKILL)
+            time.sleep(0.05)
+
+    with pytest.raises(VideoError, match="cannot be written: ffmpeg reports"):
+        process_video(clip, tmp_path / "out.mp4", StubDetector(), on_result=kill)
+    assert os.listdir(tmp_path) == []
+
+
+def test_an_encoder_that_does_not_start_is_an_error(clip, tmp_path, monkeypatch):
+    monkeypatch.setattr(process, "PRESETS", ("no such speed",))
+    with pytest.raises(VideoError, match="cannot be written: ffmpeg reports"):
+        process_video(clip, tmp_path / "out.mp4", StubDetector(), preset="no such speed")
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("drawn", [None, np.zeros((48, 64), np.uint8), np.zeros((48, 64, 3))])
+def test_a_drawing_of_another_shape_is_refused(clip, tmp_path, drawn):
+    stub = StubDetector()
+    stub.annotate = lambda frame, result: drawn
+    with pytest.raises(InvalidInputError, match=r"annotate must return a \(48, 64, 3\) uint8 array"):
+        process_video(clip, tmp_path / "out.mp4", stub)
+
+
+def test_a_drawing_that_is_not_contiguous_is_accepted(clip, tmp_path):
+    stub = StubDetector()
+    stub.annotate = lambda frame, result: np.asfortranarray(frame)
+    process_video(clip, tmp_path / "out.mp4", stub)
+    assert frame_numbers(tmp_path / "out.mp4") == list(range(20))
+
+
+INTERRUPTED = """
+import sys, time
+from pathlib import Path
+from tests.helpers import StubDetector
+from vehicle_detection.video import process_video
+
+def slow(result):
+    if result.index == 3:
+        tasks = Path("/proc/self/task").iterdir()
+        print(*[(task / "children").read_text() for task in tasks], flush=True)
+    time.sleep(0.3)
+
+process_video(sys.argv[1], sys.argv[2], StubDetector(), on_result=slow)
+"""
+
+
+def test_ctrl_c_leaves_no_file_and_no_process(folder, tmp_path):
+    # The frames do not all fit into the pipes, so both processes are running at the interrupt.
+    source, target = folder / "large.mp4", tmp_path / "out.mp4"
+    ffmpeg("-f", "lavfi", "-i", "testsrc=s=640x360:r=25", "-frames:v", 30, "-pix_fmt", "yuv420p", source)
+    run = start_interruptible(sys.executable, "-c", INTERRUPTED, source, target)
+    processes = [int(pid) for pid in run.stdout.readline().split()]
+    names = [Path(f"/proc/{pid}/cmdline").read_bytes() for pid in processes]
+    assert len(processes) == 2
+    assert all(b"ffmpeg" in name for name in names), names
+    os.killpg(run.pid, signal.SIGINT)  # to the process group, like a terminal
+    _, errors = run.communicate(timeout=10)
+    assert run.returncode == -signal.SIGINT
+    assert errors.rstrip().endswith("KeyboardInterrupt")
+    assert "Error" not in errors
+    assert os.listdir(tmp_path) == []
+    assert not [pid for pid in processes if Path(f"/proc/{pid}").exists()]
+
+
+def test_an_interrupt_at_any_time_leaves_no_file_and_no_process(clip, tmp_path):
+    # An alarm instead of Ctrl-C, which pytest handles itself. Both raise in the main thread, at any place.
+    def interrupt(number, frame):
+        raise ExpectedError
+
+    before, earlier = child_processes(), signal.signal(signal.SIGALRM, interrupt)
+    try:
+        for step in range(15):
+            with contextlib.suppress(ExpectedError):
+                signal.setitimer(signal.ITIMER_REAL, 0.003 + 0.009 * step)
+                process_video(clip, tmp_path / "out.mp4", StubDetector())
+                signal.setitimer(signal.ITIMER_REAL, 0)
+            for _ in range(100):  # nobody waits for a process that is being started
+                gc.collect()
+                left = [name for name in os.listdir(tmp_path) if name != "out.mp4"]
+                if child_processes() == before and not left and not running_threads():
+                    break
+                time.sleep(0.01)
+            assert not left
+            assert child_processes() == before
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, earlier)

@@ -1,0 +1,185 @@
+"""Annotated videos and their reports."""
+
+import io
+import os
+import re
+import sys
+from fractions import Fraction
+from pathlib import Path
+
+import pytest
+from moviepy import VideoFileClip
+
+from tests.helpers import StubDetector
+from tests.video.clips import NTSC, ffmpeg, ffmpeg_log, frame_numbers, sound_seconds
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.video import VideoReport, probe_video, process_video, read_frames
+
+
+def test_a_complete_video_keeps_frames_rate_and_sound(clip, tmp_path):
+    target = tmp_path / "out.mp4"
+    results = []
+    stub = StubDetector()
+    report = process_video(clip, target, stub, on_result=results.append)
+    assert frame_numbers(target) == list(range(20))
+    assert [result.index for result in results] == list(range(20))
+    assert [result.time for result in results] == pytest.approx([float(n / NTSC) for n in range(20)])
+    assert stub.fps == float(NTSC)
+    info = probe_video(target)
+    assert (info.fps, info.frames, info.shape) == (NTSC, 20, (48, 64, 3))
+    facts = ffmpeg_log(target)
+    assert re.search(r"Video: h264.*yuv420p\(tv, smpte170m/bt709/bt709, .*29\.97 fps, 29\.97 tbr", facts), (
+        facts
+    )
+    sound = [ffmpeg("-i", path, "-map", "0:a", "-c", "copy", "-f", "md5", "-") for path in (clip, target)]
+    assert sound[0] == sound[1]
+    data = target.read_bytes()
+    assert data.index(b"moov") < data.index(b"mdat")
+    with read_frames(target) as frames:
+        assert all(frame[2, 2].min() > 200 for _, _, frame in frames)
+    assert (report.frames, report.fps, report.shape, report.tracks) == (20, NTSC, (48, 64, 3), 4)
+    assert list(report.stages) == ["decode", "search", "heat", "track", "draw", "encode"]
+    assert report.stages["heat"] == pytest.approx(0.02)
+    assert min(report.stages.values()) > 0
+    assert sum(report.stage_fractions.values()) == pytest.approx(1)
+    assert os.listdir(tmp_path) == ["out.mp4"]
+    assert target.stat().st_mode & 0o444 == 0o444
+
+
+def test_a_part_of_a_video_with_its_sound(clip, tmp_path):
+    target = tmp_path / "out.mp4"
+    report = process_video(clip, target, StubDetector(), start=float(5 / NTSC), end=float(15 / NTSC))
+    assert report.frames == 10
+    assert frame_numbers(target) == list(range(5, 15))
+    assert sound_seconds(target) == pytest.approx(float(10 / NTSC), abs=0.03)
+
+
+def test_an_end_after_the_video_is_ignored(clip, tmp_path):
+    assert process_video(clip, tmp_path / "out.mp4", StubDetector(), start=0.5, end=1e3).frames == 5
+
+
+def test_sound_can_be_omitted(clip, tmp_path):
+    process_video(clip, tmp_path / "out.mp4", StubDetector(), audio=False)
+    assert not probe_video(tmp_path / "out.mp4").has_audio
+
+
+def test_without_a_target_nothing_is_drawn(clip, tmp_path):
+    results = []
+    stub = StubDetector()
+    stub.annotate = lambda frame, result: pytest.fail("a frame was drawn")
+    report = process_video(clip, None, stub, on_result=results.append)
+    assert len(results) == report.frames == 20
+    assert list(report.stages) == ["decode", "search", "heat", "track"]
+    assert report.stages["search"] > 0
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # moviepy leaves pipes open
+def test_an_image_transform_of_moviepy_can_be_a_detector(clip, tmp_path):
+    target = tmp_path / "moviepy.mp4"
+    with VideoFileClip(str(clip)) as source:
+        source.image_transform(StubDetector()).write_videofile(
+            str(target), preset="ultrafast", logger=None, temp_audiofile_path=str(tmp_path)
+        )
+    assert frame_numbers(target) == list(range(20))
+
+
+def test_progress_is_shown_on_a_terminal_only(clip, monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    shown = {}
+    for name, stream, progress in (("terminal", Terminal(), True), ("off", Terminal(), False)):
+        monkeypatch.setattr(sys, "stderr", stream)
+        process_video(clip, None, StubDetector(), progress=progress)
+        shown[name] = stream.getvalue()
+    monkeypatch.setattr(sys, "stderr", file := io.StringIO())
+    process_video(clip, None, StubDetector())
+    assert "20/20" in shown["terminal"]
+    assert shown["off"] == file.getvalue() == ""
+
+
+def test_a_report_without_frames():
+    report = VideoReport(
+        frames=0, fps=Fraction(25), shape=(2, 2, 3), seconds=0.0, stages={"draw": 0.0}, tracks=1
+    )
+    assert report.stage_fractions == {"draw": 0.0}
+    assert "1 vehicle" in str(report)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"start": -1}, "start must be a number, at least 0"),
+        ({"end": "2"}, "end must be a number"),
+        ({"start": float("nan")}, "start must be a number"),
+        ({"start": 2, "end": 1}, "end must be later than the start; got 2 s to 1 s"),
+        ({"end": 0}, "end must be later than the start; got 0 s to 0 s"),
+        ({"start": 60}, r"start must be less than the video's length of 0\.\d+ s; got 60 s"),
+        (
+            {"start": 0.001, "end": 0.002},
+            "end must be at least one frame later than the start, at 29.97 frames/s",
+        ),
+        ({"preset": "warp"}, "preset must be one of 'ultrafast'"),
+        ({"workers": 0}, "workers must be an integer at least 1"),
+        ({"on_result": 3}, "on_result must be a function"),
+        ({"detector": object()}, "detector must have the methods .* without search; pass a VehicleDetector"),
+        ({"source": "missing.mp4"}, "source missing.mp4 does not exist"),
+        ({"source": "."}, "is a folder; choose a video file"),
+        ({"source": None}, "source must be the path of a video file"),
+        ({"source": os.devnull}, "is not a regular file"),
+        ({"target": "missing/out.mp4"}, "target needs an existing folder"),
+        ({"target": "."}, "target must be a file, got the folder"),
+        ({"target": "out.gif"}, r"target must end in .mp4, .m4v, .mov, .mkv; got 'out.gif', use 'out.mp4'"),
+        ({"target": 7}, "target must be the path"),
+    ],
+)
+def test_bad_arguments(clip, tmp_path, monkeypatch, options, message):
+    monkeypatch.chdir(tmp_path)
+    given_ = {"source": clip, "target": "out.mp4", "detector": StubDetector(), **options}
+    source, target, detector = (given_.pop(name) for name in ("source", "target", "detector"))
+    with pytest.raises(InvalidInputError, match=message):
+        process_video(source, target, detector, **given_)
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_target_that_is_the_source(clip, tmp_path, monkeypatch):
+    source = tmp_path / "in.mp4"
+    source.write_bytes(clip.read_bytes())
+    (tmp_path / "link.mp4").symlink_to(source)
+    monkeypatch.chdir(tmp_path)
+    for target in (source, "in.mp4", f"../{tmp_path.name}/in.mp4", "link.mp4"):
+        with pytest.raises(InvalidInputError, match="is the source; choose another name"):
+            process_video(source, target, StubDetector())
+    assert source.read_bytes() == clip.read_bytes()
+
+
+def test_a_read_only_folder_and_an_unreadable_file(clip, tmp_path, monkeypatch):
+    # The tests may run as root, to whom the system grants any access.
+    monkeypatch.setattr(os, "access", lambda path, mode: mode == os.R_OK)
+    with pytest.raises(InvalidInputError, match="target needs a writable folder"):
+        process_video(clip, tmp_path / "out.mp4", StubDetector())
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(InvalidInputError, match="is not readable; change its permissions"):
+        probe_video(clip)
+
+
+@pytest.mark.parametrize("name", ["-dash.mp4", "a:b.mp4", "100%d.mp4", "spaced name é.mp4", "http:x.mp4"])
+def test_any_file_name(clip, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    Path(name).write_bytes(clip.read_bytes())
+    process_video(name, f"out {name}", StubDetector())
+    assert frame_numbers(f"out {name}") == list(range(20))
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("name", "frames", "sound"), [("test_video.mp4", 38, True), ("lane_lines_960x540.mp4", 221, True)]
+)
+def test_real_clips_keep_frames_and_sound(real_data, tmp_path, name, frames, sound):
+    source, target = real_data / "videos" / name, tmp_path / "out.mp4"
+    report = process_video(source, target, StubDetector(), preset="ultrafast")
+    before, after = probe_video(source), probe_video(target)
+    assert report.frames == frames
+    assert (after.frames, after.fps, after.shape) == (before.frames, before.fps, before.shape)
+    assert after.has_audio == sound

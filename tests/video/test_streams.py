@@ -1,0 +1,236 @@
+"""Frames and sound read from files and written to files."""
+
+import gc
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from moviepy import VideoFileClip
+
+from tests.helpers import StubDetector
+from tests.video.clips import (
+    LEVELS,
+    NTSC,
+    child_processes,
+    ffmpeg,
+    frame_numbers,
+    gray_frames,
+    sound_seconds,
+    write_clip,
+)
+from vehicle_detection.errors import VideoError
+from vehicle_detection.video import probe_video, process_video, read_frames
+
+
+@pytest.fixture(scope="module")
+def corners():
+    """A frame with four different corners."""
+    image = np.full((48, 64, 3), 40, np.uint8)
+    image[:24, :32], image[:24, 32:], image[24:, :32] = (220, 40, 40), (40, 200, 40), (40, 40, 220)
+    return image
+
+
+@pytest.mark.parametrize(("degrees", "turns"), [(90, 1), (180, 2), (-90, 3)])
+def test_rotated_video_is_read_and_written_upright(folder, corners, degrees, turns):
+    flat = write_clip(folder / "flat.mp4", [corners] * 4)
+    rotated = folder / f"rotated{turns}.mp4"
+    ffmpeg("-display_rotation", degrees, "-i", flat, "-c", "copy", rotated)
+    upright = np.rot90(corners, turns)
+    info = probe_video(rotated)
+    assert info.shape == upright.shape
+    assert info.rotation == -degrees % 360
+    stub, target = StubDetector(), folder / "upright.mp4"
+    process_video(rotated, target, stub)
+    assert stub.shapes == {upright.shape}
+    assert probe_video(target).rotation == 0
+    for path in (rotated, target):
+        with read_frames(path) as frames:
+            _, _, frame = next(frames)
+        assert np.abs(frame[12::8, 12::8].astype(int) - upright[12::8, 12::8]).max() < 20
+
+
+def test_portrait_video_of_a_phone(folder):
+    flat = folder / "wide.mp4"
+    ffmpeg("-f", "lavfi", "-i", "testsrc=s=160x90:r=30", "-frames:v", 10, "-pix_fmt", "yuv420p", flat)
+    phone = folder / "phone.mov"
+    ffmpeg("-display_rotation", -90, "-i", flat, "-c", "copy", phone)
+    report = process_video(phone, folder / "phone.mp4", StubDetector())
+    assert report.shape == (160, 90, 3)
+    assert probe_video(folder / "phone.mp4").shape == (160, 90, 3)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # moviepy leaves pipes open
+def test_frames_equal_those_of_moviepy_except_for_rounding(folder):
+    path = folder / "pattern.mp4"
+    ffmpeg("-f", "lavfi", "-i", "testsrc2=s=160x90:r=25", "-frames:v", 12, "-pix_fmt", "yuv420p", path)
+    with VideoFileClip(str(path), audio=False) as moviepy_clip, read_frames(path) as frames:
+        for (index, seconds, frame), reference in zip(frames, moviepy_clip.iter_frames(), strict=True):
+            assert seconds == index / 25
+            assert frame.flags.owndata
+            assert frame.flags.writeable
+            # moviepy's ffmpeg rounds down; the errors of luma and of two chroma values add up.
+            difference = frame.astype(int) - reference
+            assert np.abs(difference).max() <= 4
+            assert -1 <= difference.mean() <= 2
+
+
+@settings(max_examples=12)
+@given(st.integers(0, 19), st.integers(0, 30), st.sampled_from([0.0, 0.3, 0.9]))
+def test_a_time_range_selects_its_frames(clip, first, length, part):
+    start = max(0.0, float((first - part) / NTSC))
+    end = float((first + length + 0.5) / NTSC)
+    with read_frames(clip, start=start, end=end) as frames:
+        found = [(index, round((float(frame.mean()) - 10) / LEVELS)) for index, _, frame in frames]
+    expected = [n for n in range(20) if start - 1e-6 <= n / NTSC < end]
+    assert found == [(n, n) for n in expected]
+
+
+def test_frames_of_a_video_that_starts_after_its_sound(folder):
+    late = folder / "late.mp4"
+    flat = write_clip(folder / "flat_late.mp4", gray_frames(10))
+    tone = ["-f", "lavfi", "-t", 1, "-i", "sine=440"]
+    ffmpeg("-itsoffset", 0.4, "-i", flat, *tone, "-map", "0:v", "-map", "1:a", "-c:v", "copy", late)
+    assert probe_video(late).start_time == pytest.approx(0.4, abs=0.03)
+    target = folder / "late_out.mp4"
+    process_video(late, target, StubDetector())
+    assert frame_numbers(target) == list(range(10))
+    assert probe_video(target).start_time == pytest.approx(0.4, abs=0.03)
+    with read_frames(late, start=0.2, end=0.3) as frames:
+        assert [index for index, _, _ in frames] == [5, 6, 7]
+    process_video(late, target, StubDetector(), start=0.2)
+    assert frame_numbers(target) == [5, 6, 7, 8, 9]
+    assert sound_seconds(target) == pytest.approx(0.4, abs=0.06)
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_a_varying_rate_becomes_constant(folder, suffix):
+    # Frames 0-9 at 10 frames/s, then every third one, as recorded by a phone in the dark.
+    path = folder / f"vfr.{suffix}"
+    thin = ["-vf", r"select=lt(n\,10)+not(mod(n\,3))", "-fps_mode", "vfr", "-bf", 0]
+    write_clip(path, gray_frames(22), fps=10, options=thin)
+    info = probe_video(path)
+    assert not info.constant_rate
+    assert info.fps == 10
+    shown = [*range(10), 9, 9, 12, 12, 12, 15, 15, 15, 18, 18, 18, 21]
+    report = process_video(path, folder / "cfr.mp4", StubDetector())
+    assert frame_numbers(folder / "cfr.mp4") == shown
+    assert report.frames == 22
+    assert probe_video(folder / "cfr.mp4").constant_rate
+    for start in (3, 10, 11, 12, 20):
+        with read_frames(path, start=start / 10, end=start / 10 + 0.2) as frames:
+            assert [index for index, _, _ in frames] == [start, start + 1]
+        process_video(path, folder / "part.mp4", StubDetector(), start=start / 10)
+        assert frame_numbers(folder / "part.mp4") == shown[start:]
+
+
+def test_ffmpeg_ends_however_reading_stops(clip):
+    before = child_processes()
+    for way in ("break", "with", "close", "drop", "error"):
+        frames = read_frames(clip)
+        next(frames)
+        assert len(child_processes() - before) == 1
+        if way == "with":
+            with frames:
+                next(frames)
+        elif way == "close":
+            frames.close()
+            assert list(frames) == []
+        elif way == "break":
+            for _ in frames:
+                break
+            del frames
+            gc.collect()
+        elif way == "drop":
+            del frames
+            gc.collect()
+        else:
+            with pytest.raises(ZeroDivisionError), frames:
+                raise ZeroDivisionError
+        assert child_processes() == before, way
+
+
+@pytest.mark.parametrize("suffix", [".mov", ".mkv", ".MP4", ".m4v"])
+def test_other_containers(clip, tmp_path, suffix):
+    target = tmp_path / f"out{suffix}"
+    process_video(clip, target, StubDetector())
+    assert frame_numbers(target) == list(range(20))
+    assert probe_video(target).has_audio
+
+
+def test_sound_that_mp4_does_not_support_is_encoded(clip, tmp_path):
+    source = tmp_path / "in.mkv"
+    ffmpeg("-i", clip, "-c:v", "copy", "-c:a", "pcm_s16le", source)
+    process_video(source, tmp_path / "out.mp4", StubDetector())
+    assert probe_video(tmp_path / "out.mp4").audio_codec == "aac"
+    assert sound_seconds(tmp_path / "out.mp4") == pytest.approx(20 / NTSC, abs=0.06)
+    assert frame_numbers(tmp_path / "out.mp4") == list(range(20))
+
+
+@pytest.mark.parametrize(("width", "height"), [(63, 48), (64, 47), (63, 47)])
+def test_odd_sizes_are_extended_by_one_pixel(tmp_path, width, height):
+    image = np.full((height, width, 3), (200, 120, 40), np.uint8)
+    options = ["-pix_fmt", "yuv444p"]
+    source = write_clip(tmp_path / "odd.mp4", [image] * 4, options=options)
+    stub = StubDetector()
+    report = process_video(source, tmp_path / "even.mp4", stub)
+    assert report.shape == (height, width, 3)
+    assert stub.shapes == {(height, width, 3)}
+    with read_frames(tmp_path / "even.mp4") as frames:
+        _, _, frame = next(frames)
+    assert frame.shape == (height + height % 2, width + width % 2, 3)
+    assert np.abs(frame[-1, 8:].astype(int) - (200, 120, 40)).max() < 10
+    assert np.abs(frame[8:, -1].astype(int) - (200, 120, 40)).max() < 10
+
+
+@pytest.mark.parametrize(
+    ("pixels", "space", "range_"),
+    [
+        ("yuv420p", "bt709", "tv"),
+        ("yuv420p", "smpte170m", "tv"),
+        ("yuv420p", "bt2020nc", "tv"),
+        ("yuvj420p", "bt709", "pc"),
+        ("yuv444p", "bt709", "tv"),
+        ("yuv420p", "smpte240m", "tv"),
+    ],
+)
+def test_frames_have_the_colors_of_ffmpeg(tmp_path, pixels, space, range_):
+    # A smooth image, for which the interpolation of chroma does not matter.
+    y, x = np.mgrid[:96, :128]
+    picture = np.stack([60 + x, 40 + 2 * y, 250 - x - y // 2], axis=2).astype(np.uint8)
+    matrix = f"scale=out_color_matrix={space}:out_range={range_},format={pixels}"
+    tags = ["-pix_fmt", pixels, "-colorspace", space, "-color_range", range_]
+    source = write_clip(tmp_path / "in.mp4", [picture] * 2, options=["-vf", matrix, *tags])
+    with read_frames(source) as frames:
+        found = [frame for _, _, frame in frames]
+    decoded = ffmpeg("-i", source, "-frames:v", 1, "-pix_fmt", "rgb24", "-f", "rawvideo", "-")
+    expected = np.frombuffer(decoded, np.uint8).reshape(picture.shape)
+    assert np.abs(found[0].astype(int) - expected).max() <= 4
+    assert np.abs(found[0].astype(int) - picture).mean() < 3
+
+
+def test_colors_are_unchanged_after_writing_and_reading(tmp_path):
+    # The colors of a wrong matrix would differ by at least 15.
+    colors = [(220, 40, 40), (40, 200, 40), (40, 40, 220), (230, 230, 30), (128, 128, 128)]
+    source = write_clip(tmp_path / "in.mp4", [np.full((48, 64, 3), rgb, np.uint8) for rgb in colors])
+    process_video(source, tmp_path / "out.mp4", StubDetector())
+    with read_frames(tmp_path / "out.mp4") as frames:
+        for (_, _, frame), rgb in zip(frames, colors, strict=True):
+            assert np.abs(frame[16:, 16:].mean(axis=(0, 1)) - rgb).max() < 6
+
+
+@pytest.mark.parametrize(
+    ("name", "options"), [("truncated.mp4", ["-movflags", "+faststart", "-g", 10]), ("truncated.mkv", [])]
+)
+def test_the_error_for_an_incomplete_file_states_the_readable_part(truncated, tmp_path, name, options):
+    source, target = truncated(name, *options), tmp_path / "out.mp4"
+    target.write_bytes(b"an existing file")
+    message = r"is incomplete: (\d+) of about 100 frames can be decoded; .* or end at ([\d.]+) s"
+    with pytest.raises(VideoError, match=message) as caught:
+        process_video(source, target, StubDetector())
+    assert target.read_bytes() == b"an existing file"
+    frames, end = re.search(message, str(caught.value)).groups()
+    assert 20 < int(frames) < 90
+    # The remedy works, and processes all readable frames.
+    assert process_video(source, target, StubDetector(), end=float(end)).frames == int(frames)

@@ -1,0 +1,110 @@
+"use strict";
+const data = JSON.parse(document.getElementById("data").textContent);
+const video = document.querySelector("video");
+const readout = document.querySelector(".readout");
+
+// Some browsers play a blob: URL, but no data: URL.
+const source = video && video.querySelector('source[src^="data:"]');
+if (source) {
+  const url = source.getAttribute("src"), comma = url.indexOf(",");
+  const text = atob(url.slice(comma + 1)), bytes = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+  source.remove();
+  video.src = URL.createObjectURL(new Blob([bytes], {type: source.type}));
+}
+
+// As format_time in Python, with tenths.
+function formatTime(seconds) {
+  const tenths = Math.round(seconds * 10), minutes = Math.floor(tenths / 600);
+  const end = ((tenths % 600) / 10).toFixed(1).padStart(4, "0");
+  if (minutes < 60) return minutes + ":" + end;
+  return Math.floor(minutes / 60) + ":" + String(minutes % 60).padStart(2, "0") + ":" + end;
+}
+
+function clampFrame(frame) {
+  return Math.min(Math.max(frame, 0), data.frames - 1);
+}
+
+// Move the line of a class, "cursor" or "playhead", to a frame in all charts.
+function moveLine(name, frame) {
+  const x = (frame + .5) / data.frames * 100 + "%";
+  for (const line of document.querySelectorAll("." + name)) {
+    line.setAttribute("x1", x);
+    line.setAttribute("x2", x);
+    line.classList.add("visible");
+  }
+}
+
+// Show the time of a frame and the distances and speeds of its vehicles.
+function showReadout(frame) {
+  const visible = data.tracks.filter(track => track.spans.some(([from, to]) => from <= frame && frame < to));
+  const time = document.createElement("b");
+  time.textContent = formatTime(frame / data.fps) + (visible.length ? "" : " no vehicle");
+  readout.replaceChildren(time, ...visible.map(track => {
+    const index = Math.floor(frame / data.step) - track.first, name = document.createElement("span");
+    const meters = track.distance[index], speed = track.speed[index];
+    name.className = "c" + track.color;
+    name.textContent = "#" + track.id;
+    if (meters != null) name.textContent += " " + meters.toFixed(0) + " m";
+    if (speed != null) {
+      const sign = speed > 0 ? "+" : speed < 0 ? "\u2212" : "";
+      name.textContent += " " + sign + Math.abs(speed).toFixed(1) + " m/s";
+    }
+    return name;
+  }));
+}
+
+let current = 0, hovering = false;
+function updatePlayhead() {
+  if (video) current = clampFrame(Math.floor(video.currentTime * data.fps + .01));
+  moveLine("playhead", current);
+  if (!hovering) showReadout(current);
+  if (video && !video.paused && !video.ended) requestAnimationFrame(updatePlayhead);
+}
+function seek(frame) {
+  if (video) video.currentTime = (clampFrame(frame) + .5) / data.fps;
+}
+if (video) {
+  for (const name of ["play", "timeupdate", "seeking", "seeked"]) video.addEventListener(name, updatePlayhead);
+}
+updatePlayhead();
+
+for (const plot of document.querySelectorAll(".plot")) {
+  const frameAt = event => {
+    const box = plot.getBoundingClientRect();
+    return clampFrame(Math.floor((event.clientX - box.left) / box.width * data.frames));
+  };
+  plot.addEventListener("pointermove", event => {
+    hovering = true;
+    moveLine("cursor", frameAt(event));
+    showReadout(frameAt(event));
+    if (event.buttons) seek(frameAt(event));
+  });
+  plot.addEventListener("pointerleave", () => {
+    hovering = false;
+    for (const line of document.querySelectorAll(".cursor")) line.classList.remove("visible");
+    showReadout(current);
+  });
+  plot.addEventListener("click", event => {
+    if (!event.target.closest("[data-frame]")) seek(frameAt(event));
+  });
+}
+
+// Fade all tracks but one; null fades none.
+function highlightTrack(id) {
+  for (const element of document.querySelectorAll("[data-track]"))
+    element.classList.toggle("faded", id !== null && element.dataset.track !== id);
+}
+for (const element of document.querySelectorAll("[data-frame]")) {
+  const seekTo = () => seek(Number(element.dataset.frame));
+  element.addEventListener("click", seekTo);
+  if (!element.dataset.track) continue;  // a <button>, which handles keys itself
+  element.addEventListener("keydown", event => {
+    if (event.key !== "Enter" && event.key !== " ") return;
+    event.preventDefault();
+    seekTo();
+  });
+  for (const name of ["pointerenter", "focus"])
+    element.addEventListener(name, () => highlightTrack(element.dataset.track));
+  for (const name of ["pointerleave", "blur"]) element.addEventListener(name, () => highlightTrack(null));
+}
