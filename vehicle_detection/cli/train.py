@@ -172,7 +172,7 @@ def fetch(
 
 def info(
     model: Annotated[
-        str, typer.Argument(metavar="[MODEL]", help='"default", "highway" or the path of a model file.')
+        str, typer.Argument(metavar="MODEL", help='"default", "highway" or the path of a model file.')
     ] = "default",
 ) -> None:
     """Show a model's parameters, accuracy, training data and versions."""
