@@ -1,4 +1,4 @@
-"""`VehicleDetector`: search, detection and tracking combined; with `tracking`, the only state between frames."""
+"""`VehicleDetector`: search, detection and tracking combined; keeps state between frames, as `tracking` does."""
 
 from __future__ import annotations
 
