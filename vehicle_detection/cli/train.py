@@ -119,34 +119,13 @@ def train(
 
 
 def _print_report(report: TrainingReport) -> None:
-    from vehicle_detection.training import SPLITS
+    from vehicle_detection.training import SCORE_COLUMNS, SPLITS, score_rows
 
-    heads = (
-        "tested on",
-        "trained",
-        "tested",
-        "accuracy",
-        "missed vehicles",
-        "false vehicles",
-        "near duplicates",
-    )
-    rows = [
-        (
-            SPLITS[name],
-            f"{score.train:,}",
-            f"{score.test:,}",
-            f"{score.accuracy:.4f}",
-            f"{score.false_negative_rate:.2%}",
-            f"{score.false_positive_rate:.2%}",
-            f"{score.leakage:.1%}",
-        )
-        for name, score in report.splits.items()
-    ]
     print_table(
         f"{report.features}: {report.vehicles:,} vehicles, {report.non_vehicles:,} others, accuracy "
         f"{report.accuracy:.4f} on the split {report.split!r}",
-        heads,
-        rows,
+        SCORE_COLUMNS,
+        score_rows(report),
     )
     if report.calibration_error is not None:
         typer.echo(f"calibration error on the split 'sequences': {report.calibration_error:.4f}")
