@@ -117,7 +117,7 @@ def test_degraded_copies_have_their_weight(patches, labels):
     [
         ({"degraded": 1.5}, "degraded must be a number, at least 0 and at most 1; got 1.5"),
         ({"gamma": -0.1}, "gamma must be a number, at least 0 and at most 2; got -0.1"),
-        ({"gamma": 0.4, "mirror": False}, "gamma must be 0 with mirror=False, .*; got 0.4"),
+        ({"gamma": 0.4, "mirror": False}, "gamma must be 0 without mirrored patches, .*; got 0.4"),
     ],
 )
 def test_invalid_augmentation(patches, labels, options, message):
