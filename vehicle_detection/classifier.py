@@ -321,6 +321,10 @@ class TrainingOptions:
         """Training weight of each copy of the patches, in the order of `patch_features`."""
         return (1.0, *(1.0,) * self.mirror, *(self.degraded, self.degraded) * (self.degraded > 0))
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the options of `train_classifier` as JSON values."""
+        return {name: value for name, value in asdict(self).items() if name != "positive_weight"}
+
 
 def train_classifier(
     patches: NDArray[np.uint8],
@@ -436,7 +440,7 @@ def fit_features(
     vehicles = int(labels[chosen].sum())
     all_metadata = {
         "training": {
-            **{name: getattr(options, name) for name in ("C", "mirror", "gamma", "degraded", "random_state")},
+            **options.to_dict(),
             "vehicles": vehicles,
             "non_vehicles": len(chosen) - vehicles,
         },

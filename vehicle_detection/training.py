@@ -113,8 +113,9 @@ class TrainingReport:
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to JSON values."""
-        plain = asdict(self) | {"accuracy": self.accuracy, "balance": self.balance, "features": self.features}
-        plain |= plain.pop("options")
+        plain = {"params": asdict(self.params), **self.options.to_dict(), **asdict(self)}
+        del plain["options"]
+        plain |= {"accuracy": self.accuracy, "balance": self.balance, "features": self.features}
         plain["splits"] = {
             name: {"accuracy": score.accuracy, **asdict(score)} for name, score in self.splits.items()
         }
