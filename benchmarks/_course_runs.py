@@ -1,40 +1,31 @@
-"""The runs behind the course's tables, each kept in a file as soon as it is done."""
+"""The runs behind the course's tables; each is stored in a file as soon as it is done."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
-from vehicle_detection.classifier import Template, VehicleClassifier
-from vehicle_detection.datasets import (
-    PatchSet,
-    Split,
-    split_groups,
-    split_leakage,
-    split_random,
-    split_sequences,
-    split_sources,
-)
+from vehicle_detection.classifier import Template, TrainingOptions, VehicleClassifier, fit_features
+from vehicle_detection.datasets import PatchSet, Split, make_split, split_leakage
 from vehicle_detection.features import extract_features
 from vehicle_detection.params import FeatureParams, SearchParams
-from vehicle_detection.search import BandSearch
 from vehicle_detection.synthetic import render_scene
 from vehicle_detection.tuning import (
     FeatureCache,
-    Recipe,
-    ResultTable,
     RowStore,
+    TrialOptions,
     compare_configurations,
     digest_of,
-    fit_features,
+    make_table,
 )
 
 SEEDS = range(5)
@@ -56,7 +47,7 @@ def _changed(params: FeatureParams, **changes: Any) -> FeatureParams:
 
 @dataclass(frozen=True)
 class Plan:
-    """Configurations of one table, the values of C and the splits that they are judged on."""
+    """Configurations of one table, the values of C and the splits on which they are evaluated."""
 
     configurations: Mapping[str, FeatureParams]
     C: Sequence[float]
@@ -100,88 +91,90 @@ PLANS = {
 
 
 class Runs:
-    """Patches, their splits, and what was measured on them.
+    """Patches, their splits, and the measurements on them.
 
-    Parameters
-    ----------
-    patch_set
-        The course's patches.
-    folder
-        Where the rows of finished runs are kept; a killed run goes on from there.
+    `folder` holds the rows of finished runs, so that a killed run continues.
     """
 
     def __init__(self, patch_set: PatchSet, folder: Path) -> None:
         self.patch_set = patch_set
         self._svm_rows = folder / "rows.csv"
         self._extra = RowStore(folder / "extra_rows.csv", _EXTRA_COLUMNS)
-        # One set of features at a time: the next configuration needs the room.
+        # Keep one set of features at a time, to limit the memory.
         self.cache = FeatureCache(patch_set.patches, memory_mb=0)
+        seeds = {"random": SEEDS, "groups": SEEDS}
         self._splits = {
-            "random": [split_random(patch_set, random_state=seed) for seed in SEEDS],
-            "sequences": [split_sequences(patch_set)],
-            "groups": [split_groups(patch_set, random_state=seed) for seed in SEEDS],
-            "GTI to KITTI": [split_sources(patch_set)],
-            "KITTI to GTI": [split_sources(patch_set, train=("KITTI", "Extras"), test=("GTI",))],
+            name: [
+                make_split(patch_set, name.lower().replace(" ", "_"), random_state=seed)
+                for seed in seeds.get(name, SEEDS[:1])
+            ]
+            for name in SPLITS
         }
 
     def parts(self, splits: Sequence[str]) -> Iterator[tuple[str, int, Split]]:
-        """Name, seed and rows of each split; a random one once for each seed."""
+        """Name, seed and rows of each split; random splits once for each seed."""
         for name in splits:
             for seed, split in zip(SEEDS, self._splits[name]):
                 yield name, seed, split
 
-    def compare(self, plan: Plan) -> ResultTable:
-        """All trials of linear SVMs that a plan asks for."""
-        options: dict[str, Any] = {"C": plan.C, "mirror": False, "cache": self.cache}
-        options |= {"store": self._svm_rows, "time_search": False}
+    def compare(self, plan: Plan) -> pd.DataFrame:
+        """All trials of linear SVMs of a plan."""
+        options = TrialOptions(cache=self.cache, time_search=False)
         tables = [
             compare_configurations(
-                self.patch_set, {name: params}, splits={part: split}, seeds=[seed], **options
+                self.patch_set,
+                {name: params},
+                splits={part: split},
+                seeds=[seed],
+                C=plan.C,
+                mirror=False,
+                options=options,
+                store=self._svm_rows,
             )
             for name, params in plan.configurations.items()
             for part, seed, split in self.parts(plan.splits)
         ]
-        return ResultTable([row for table in tables for row in table])
+        return pd.concat(tables, ignore_index=True)
 
     @cached_property
     def search_times(self) -> dict[FeatureParams, float]:
-        """Milliseconds of the fast search of a 1280x720 frame, one core: the fastest of a few runs.
+        """Milliseconds of the fast search of a 1280x720 frame on one core: the fastest of several runs.
 
-        The configurations take turns, so that a load on the machine meets all of them.
+        The configurations alternate, so that other load on the machine affects all of them.
         """
         frame = render_scene(random_state=0).image
         search = SearchParams.preset()
         listed = {params for plan in PLANS.values() for params in plan.configurations.values()}
         with ExitStack() as stack:
             searches = {
-                params: stack.enter_context(BandSearch(_any_classifier(params), n_jobs=1))
+                params: stack.enter_context(closing(_zero_classifier(params).open_search(n_jobs=1)))
                 for params in listed
             }
             turns = [
                 {params: _seconds(partial(each.find, frame, search)) for params, each in searches.items()}
-                for _ in range(_TIMED_RUNS + 1)  # The first one compiles kernels.
+                for _ in range(_TIMED_RUNS + 1)  # The first run compiles kernels.
             ]
         return {params: min(turn[params] for turn in turns[1:]) * 1000 for params in listed}
 
-    def bayes(self) -> ResultTable:
+    def bayes(self) -> pd.DataFrame:
         """Gaussian naive Bayes on the second system's features."""
         rows = []
         for name, seed, split in self.parts(SPLITS[:3]):
             trial = digest_of(self.cache.digest, "bayes", split.train, split.test)
             if trial not in self._extra:
-                accuracy = self._judge_bayes(split)
+                accuracy = self._bayes_accuracy(split)
                 self._add(trial, "bayes", "naive Bayes", split=name, seed=seed, accuracy=accuracy)
             rows.append({"configuration": "naive Bayes", "C": None, **self._extra[trial]})
-        return ResultTable(rows)
+        return make_table(rows)
 
-    def _judge_bayes(self, split: Split) -> float:
+    def _bayes_accuracy(self, split: Split) -> float:
         bayes = GaussianBayes()
         bayes.fit(*self._side(SECOND, split.train))
         features, labels = self._side(SECOND, split.test)
         return float((bayes.predict(features) == labels).mean())
 
-    def first_answers(self, count: int = 15) -> ResultTable:
-        """What the first test samples of the first random split are, and what both classifiers say."""
+    def first_predictions(self, count: int = 15) -> pd.DataFrame:
+        """Labels and predictions of both classifiers for some test samples of the first random split."""
         split = self._splits["random"][0]
         chosen = np.random.default_rng(0).permutation(split.test)[:count]
         trial = digest_of(self.cache.digest, "answers", split.train, chosen)
@@ -191,15 +184,15 @@ class Runs:
             tested = self._side(SECOND, chosen)[0]
             bayes = GaussianBayes()
             bayes.fit(features.copy(), labels)
-            svm = fit_features(features, labels, Recipe(params=SECOND, C=COURSE_C, mirror=False), 0)
+            svm = _fit_svm(SECOND, features, labels)
             answers = (self._labels(chosen), bayes.predict(tested.copy()), svm.predict(tested))
-            for model, says in zip(models, answers):
-                text = "".join("V" if answer else "-" for answer in says)
+            for model, predicted in zip(models, answers):
+                text = "".join("V" if answer else "-" for answer in predicted)
                 self._add(f"{trial} {model}", "answers", model, answers=text)
-        return ResultTable([self._extra[f"{trial} {model}"] for model in models])
+        return make_table([self._extra[f"{trial} {model}"] for model in models], _EXTRA_COLUMNS)
 
-    def prediction_times(self) -> ResultTable:
-        """Milliseconds that the first system takes for the test samples of a random split, run by run."""
+    def prediction_times(self) -> pd.DataFrame:
+        """Milliseconds of the first system for the test samples of a random split, run by run."""
         split = self._splits["random"][0]
         trial = digest_of(self.cache.digest, "prediction", split.train, split.test)
         names = (
@@ -211,9 +204,7 @@ class Runs:
         if f"{trial} {names[-1]} {SEEDS[-1]}" not in self._extra:
             from sklearn.pipeline import make_pipeline
 
-            classifier = fit_features(
-                *self._side(FIRST, split.train), Recipe(params=FIRST, C=COURSE_C, mirror=False), 0
-            )
+            classifier = _fit_svm(FIRST, *self._side(FIRST, split.train))
             (_, scaler), (_, svm) = classifier.to_pipeline().steps[1:]
             both = make_pipeline(scaler, svm)
             patches = self.patch_set.patches[split.test]
@@ -233,20 +224,20 @@ class Runs:
                         f"{trial} {name} {run}", "prediction", name, seed=run, milliseconds=milliseconds
                     )
         rows = [self._extra[f"{trial} {name} {run}"] for name in names for run in SEEDS]
-        return ResultTable([{**row, "samples": len(split.test)} for row in rows])
+        return make_table({**row, "samples": len(split.test)} for row in rows)
 
-    def leakage(self, thresholds: Sequence[float] = (0.9, 0.95, 0.98)) -> ResultTable:
-        """Share of each split's test patches that have a near duplicate among those trained on."""
+    def leakage(self, thresholds: Sequence[float] = (0.9, 0.95, 0.98)) -> pd.DataFrame:
+        """Fraction of each split's test patches with a near duplicate in the training part."""
         rows = []
         for name, seed, split in self.parts(SPLITS):
-            shares = {
+            fractions = {
                 f"leakage_{limit:g}": split_leakage(self.patch_set, split, threshold=limit)
                 for limit in thresholds
             }
             rows.append(
-                {"split": name, "seed": seed, "train": len(split.train), "test": len(split.test), **shares}
+                {"split": name, "seed": seed, "train": len(split.train), "test": len(split.test), **fractions}
             )
-        return ResultTable(rows)
+        return make_table(rows)
 
     def _labels(self, rows: NDArray[np.intp]) -> NDArray[np.int64]:
         return self.patch_set.labels[rows].astype(np.int64)
@@ -262,14 +253,33 @@ class Runs:
         )
 
 
-def _any_classifier(params: FeatureParams) -> VehicleClassifier:
-    """A classifier that finds nothing: the time of a search does not depend on the weights."""
+def summarize(
+    table: pd.DataFrame,
+    by: Sequence[str] = ("configuration", "C", "split"),
+    values: Sequence[str] = ("accuracy",),
+) -> pd.DataFrame:
+    """Number of runs, mean and standard deviation of each group of rows, in the order of the rows."""
+    groups = table.dropna(subset=list(values)).groupby(list(by), sort=False, dropna=False)
+    columns = {"runs": groups.size()}
+    for name in values:
+        columns |= {name: groups[name].mean(), f"{name}_std": groups[name].std()}
+    return pd.DataFrame(columns).reset_index()
+
+
+def _fit_svm(
+    params: FeatureParams, features: NDArray[np.float32], labels: NDArray[np.int64]
+) -> VehicleClassifier:
+    return fit_features(features, labels, params, TrainingOptions(C=COURSE_C, mirror=False))
+
+
+def _zero_classifier(params: FeatureParams) -> VehicleClassifier:
+    """A classifier without detections: the time of a search does not depend on the weights."""
     ones = np.ones(params.length)
     return VehicleClassifier(params, (Template(0 * ones, ones, 0 * ones, -1.0),))
 
 
 class GaussianBayes:
-    """Scaler and Gaussian naive Bayes, as the second system tried it."""
+    """Scaler and Gaussian naive Bayes, like in the second system."""
 
     def __init__(self) -> None:
         from sklearn.naive_bayes import GaussianNB
@@ -279,11 +289,11 @@ class GaussianBayes:
         self._bayes = GaussianNB()
 
     def fit(self, features: NDArray[np.float32], labels: NDArray[np.int64]) -> None:
-        """Fit both; the features are scaled in place."""
+        """Fit both, scaling the features in place."""
         self._bayes.fit(self._scaler.fit_transform(features), labels)
 
     def predict(self, features: NDArray[np.float32]) -> NDArray[np.int64]:
-        """0 or 1 for each row; the features are scaled in place."""
+        """Predict 0 or 1 for each row, scaling the features in place."""
         return np.asarray(self._bayes.predict(self._scaler.transform(features)), np.int64)
 
 

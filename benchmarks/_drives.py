@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks._frames import shown_boxes
 from benchmarks._material import Context
-from benchmarks._report import Row, Target, at_least, at_most
+from benchmarks._report import Row, at_least, at_most
 from vehicle_detection import (
     FrameResult,
     VehicleDetector,
@@ -20,6 +19,7 @@ from vehicle_detection import (
     read_labels,
     render_drive,
 )
+from vehicle_detection.evaluation import FrameBoxes
 from vehicle_detection.synthetic import Drive
 
 FRAMES = 200
@@ -58,24 +58,16 @@ def drive_rows(name: str, drive: Drive, detector: VehicleDetector, context: Cont
     results = [detector.process(scene.image, index / drive.fps) for index, scene in enumerate(drive)]
     labels = context.work / f"{name}.csv"
     drive.write_labels(labels)
-    scores = evaluate_tracks(shown_boxes(results), read_labels(labels), frames=range(len(results)))
+    scores = evaluate_tracks(
+        FrameBoxes.from_results(results), read_labels(labels), frames=range(len(results))
+    )
     errors = range_errors(drive, results)
-    rows: list[tuple[str, float, str, Target]] = [
-        ("MOTA", scores.mota, "", at_least(0.95)),
-        ("IDF1", scores.idf1, "", at_least(0.95)),
-        ("median error of the distance", errors.distance, "%", at_most(15)),
-        ("median error of the speed", errors.speed, "m/s", at_most(1.5)),
-    ]
+    material, details = f"{FRAMES} rendered frames each", scores.to_dict()
     return [
-        Row(
-            f"{name}: {what}",
-            value,
-            unit=unit,
-            target=target,
-            material=f"{FRAMES} rendered frames each",
-            details=scores.to_dict() if what == "MOTA" else {},
-        )
-        for what, value, unit, target in rows
+        Row(f"{name}: MOTA", scores.mota, target=at_least(0.95), material=material, details=details),
+        Row(f"{name}: IDF1", scores.idf1, target=at_least(0.95)),
+        Row(f"{name}: median error of the distance", errors.distance, unit="%", target=at_most(15)),
+        Row(f"{name}: median error of the speed", errors.speed, unit="m/s", target=at_most(1.5)),
     ]
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from benchmarks._material import Context, clip
 from benchmarks._report import Row, at_least, at_most
 from benchmarks._timing import median_of, seconds_of
-from vehicle_detection import VehicleDetector, VideoReport, load_model, process_video
+from vehicle_detection import VehicleDetector, VideoReport, process_video
 
 ROUNDS = 3
 
@@ -20,7 +20,7 @@ def run(context: Context) -> list[Row]:
     reports: dict[str, list[VideoReport]] = {"highway": [], "default": []}
     moviepy_seconds = []
     with contextlib.ExitStack() as stack:
-        detectors = {name: stack.enter_context(VehicleDetector(load_model(name))) for name in reports}
+        detectors = {name: stack.enter_context(VehicleDetector(name)) for name in reports}
         for detector in detectors.values():
             process_video(source, target, detector, end=0.4, progress=False)
         rewrite(source, target, end=0.4)

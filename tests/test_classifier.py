@@ -18,8 +18,8 @@ from vehicle_detection._kernels import fit_svm
 from vehicle_detection.classifier import (
     KIND,
     Template,
+    TrainingOptions,
     VehicleClassifier,
-    copy_weights,
     load_classifier,
     patch_features,
     train_classifier,
@@ -51,7 +51,7 @@ def trained(patches, labels):
     return train_classifier(patches, labels, params=SMALL, metadata={"accuracy": 1.0})
 
 
-def test_a_trained_classifier_tells_its_patches_apart(trained, patches, labels):
+def test_a_trained_classifier_separates_its_patches(trained, patches, labels):
     scores = trained.decision_function(patches)
     assert scores.shape == (80,)
     assert scores.dtype == np.float64
@@ -63,7 +63,7 @@ def test_a_trained_classifier_tells_its_patches_apart(trained, patches, labels):
     assert trained.score(patches, 1 - labels) == 0.0
 
 
-def test_gains_are_those_of_scaled_features(patches, labels):
+def test_gains_multiply_the_scaled_features(patches, labels):
     params = dataclasses.replace(SMALL, coarse_hog=True, cell_per_block=1, hist_sqrt=True)
     gained = dataclasses.replace(params, hist_gain=3.0, coarse_gain=0.5)
     trained = train_classifier(patches, labels, params=gained, mirror=False, C=0.01)
@@ -77,16 +77,16 @@ def test_gains_are_those_of_scaled_features(patches, labels):
     assert np.abs(trained.decision_function(patches) - plain.decision_function(patches)).max() > 0.01
 
 
-def test_gamma_gives_mirrored_patches_another_brightness(patches, labels):
+def test_gamma_changes_the_brightness_of_mirrored_patches(patches, labels):
     plain = mirror_patches(patches)
     np.testing.assert_array_equal(plain, patches[:, :, ::-1])
     varied = mirror_patches(patches, gamma=0.4)
     ratios = varied.mean(axis=(1, 2, 3)) / plain.mean(axis=(1, 2, 3))
     assert (ratios < 0.95).any()
     assert (ratios > 1.05).any()
-    # Each patch decides for itself: neither its place nor its neighbors matter.
+    # The exponent of a patch does not depend on the other patches.
     np.testing.assert_array_equal(mirror_patches(patches[::-3], gamma=0.4), varied[::-3])
-    # Black stays black, white stays white, and no value overtakes another.
+    # The change is monotonic, and black and white stay.
     order = np.argsort(plain[0].ravel(), kind="stable")
     assert (np.diff(varied[0].ravel()[order].astype(int)) >= 0).all()
     extremes = np.concatenate([np.zeros_like(patches[:1]), np.full_like(patches[:1], 255)])
@@ -98,13 +98,13 @@ def test_gamma_gives_mirrored_patches_another_brightness(patches, labels):
     assert found.metadata["training"]["gamma"] == 0.4
 
 
-def test_degraded_copies_weigh_less(patches, labels):
-    features = patch_features(patches, SMALL, mirror=True, gamma=0.4, degraded=0.2)
+def test_degraded_copies_have_their_weight(patches, labels):
+    features = patch_features(patches, SMALL, TrainingOptions(gamma=0.4, degraded=0.2))
     copies = (patches, mirror_patches(patches, gamma=0.4), blur_patches(patches), degrade_patches(patches))
     np.testing.assert_array_equal(features, np.concatenate([extract_features(c, SMALL) for c in copies]))
-    assert copy_weights(True, 0.2) == (1, 1, 0.2, 0.2)
-    assert copy_weights(False, 0.2) == (1, 0.2, 0.2)
-    assert copy_weights(False, 0.0) == (1,)
+    assert TrainingOptions(degraded=0.2).copy_weights == (1, 1, 0.2, 0.2)
+    assert TrainingOptions(mirror=False, degraded=0.2).copy_weights == (1, 0.2, 0.2)
+    assert TrainingOptions(mirror=False).copy_weights == (1,)
     found = train_classifier(patches, labels, params=SMALL, gamma=0.4, degraded=0.2)
     fitted = fit_svm(features, np.tile(labels, 4), 1e-4 * np.repeat([1, 1, 0.2, 0.2], 80), gains=SMALL.gains)
     np.testing.assert_array_equal(found.templates[0].coef, fitted.coef)
@@ -120,18 +120,18 @@ def test_degraded_copies_weigh_less(patches, labels):
         ({"gamma": 0.4, "mirror": False}, "gamma must be 0 without mirrored patches, .*; got 0.4"),
     ],
 )
-def test_how_copies_are_made_is_checked(patches, labels, options, message):
+def test_invalid_augmentation(patches, labels, options, message):
     with pytest.raises(InvalidInputError, match=message):
         train_classifier(patches, labels, params=SMALL, **options)
 
 
-def test_the_new_features_survive_a_model_file(tmp_path):
+def test_saving_and_loading_keeps_the_features(tmp_path):
     params = FeatureParams.preset("lab-9432")
     random_classifier(params).save(tmp_path / "a.safetensors")
     assert load_classifier(tmp_path / "a.safetensors").params == params
 
 
-def test_patches_and_their_features_score_alike(trained, patches):
+def test_patches_and_their_features_have_the_same_score(trained, patches):
     features = extract_features(patches, SMALL)
     np.testing.assert_array_equal(trained.decision_function(features), trained.decision_function(patches))
     np.testing.assert_allclose(
@@ -140,7 +140,7 @@ def test_patches_and_their_features_score_alike(trained, patches):
     assert trained.decision_function(features[:0]).shape == (0,)
 
 
-def test_training_tells_what_it_did(trained):
+def test_metadata_of_training(trained):
     training = trained.metadata["training"]
     assert (training["vehicles"], training["non_vehicles"]) == (40, 40)
     assert training["random_state"] == 0
@@ -185,10 +185,10 @@ def test_labels_of_any_number_type(patches, labels, trained, kind):
         (np.repeat([1, -1], 40), r"labels must be 0 or 1; got \[-1, 1\]"),
         (np.repeat([1, 2], 40), "labels must be 0 or 1"),
         (np.repeat([0.5, 1], 40), "labels must be 0 or 1"),
-        (np.repeat([1, 0], 39), "labels must be one number for each of 80 patches; got an array of shape"),
-        (np.repeat([1, 0], 40)[:, None], "labels must be one number for each of 80 patches"),
-        (np.repeat(["car", "road"], 40), "labels must be one number for each of 80 patches"),
-        (None, "labels must be one number for each of 80 patches"),
+        (np.repeat([1, 0], 39), "labels must hold one number for each of 80 patches; got an array of shape"),
+        (np.repeat([1, 0], 40)[:, None], "labels must hold one number for each of 80 patches"),
+        (np.repeat(["car", "road"], 40), "labels must hold one number for each of 80 patches"),
+        (None, "labels must hold one number for each of 80 patches"),
     ],
 )
 def test_bad_labels(patches, bad, message):
@@ -250,17 +250,19 @@ def test_bad_rows(trained, X, message):
 
 
 @pytest.mark.parametrize("y", [[1], np.ones((80, 1)), 1, np.ones(79)])
-def test_score_wants_a_label_for_each_row(trained, patches, y):
-    with pytest.raises(InvalidInputError, match="y must be one label for each of 80 rows"):
+def test_score_needs_a_label_for_each_row(trained, patches, y):
+    with pytest.raises(InvalidInputError, match="y must hold one label for each of 80 rows"):
         trained.score(patches, y)
 
 
-def test_score_of_nothing_is_refused(trained):
-    with pytest.raises(InvalidInputError, match="y must be one label for each of 0 rows, at least one"):
+def test_score_without_patches(trained):
+    with pytest.raises(
+        InvalidInputError, match="y must hold one label for each of 0 rows \\(at least one\\)"
+    ):
         trained.score(np.empty((0, SMALL.length)), [])
 
 
-def test_folding_is_the_scaler_and_the_svm():
+def test_folding_combines_scaler_and_svm():
     template = random_template(SMALL, 3, bias=0.7)
     x = np.random.default_rng(0).uniform(0, 200, (5, SMALL.length))
     weights, bias = template.fold()
@@ -268,7 +270,7 @@ def test_folding_is_the_scaler_and_the_svm():
     np.testing.assert_allclose(x @ weights + bias, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_several_templates_give_the_best_score():
+def test_several_templates_give_the_maximum_score():
     many = random_classifier(SMALL, 5, templates=3)
     rows = np.random.default_rng(0).normal(
         many.templates[0].mean, many.templates[0].scale, (50, SMALL.length)
@@ -276,11 +278,11 @@ def test_several_templates_give_the_best_score():
     each = [VehicleClassifier(SMALL, (template,)).decision_function(rows) for template in many.templates]
     np.testing.assert_array_equal(many.decision_function(rows), np.max(each, axis=0))
     assert len({int(np.argmax(column)) for column in np.transpose(each)}) > 1
-    with pytest.raises(InvalidInputError, match="a pipeline holds one template; this model has 3"):
+    with pytest.raises(InvalidInputError, match="only a model with one template converts; this has 3"):
         many.to_pipeline()
 
 
-def test_a_template_is_a_copy_that_cannot_be_written():
+def test_a_template_is_a_read_only_copy():
     mean = np.zeros(4)
     template = Template(mean, np.ones(4), np.ones(4), 0.0)
     mean[0] = 5
@@ -292,7 +294,7 @@ def test_a_template_is_a_copy_that_cannot_be_written():
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        ((np.zeros(4), np.ones(3), np.ones(4), 0.0), "scale must be a vector as long as the features"),
+        ((np.zeros(4), np.ones(3), np.ones(4), 0.0), "scale must be a vector of the features' length"),
         ((np.zeros((2, 2)), np.ones(4), np.ones(4), 0.0), "mean must be a vector"),
         ((np.zeros(4), np.ones(4), np.full(4, np.nan), 0.0), "coef must be finite, got NaN or infinity"),
         ((np.zeros(4), np.zeros(4), np.ones(4), 0.0), "scale must be positive"),
@@ -300,19 +302,19 @@ def test_a_template_is_a_copy_that_cannot_be_written():
         ((np.zeros(4), np.ones(4), np.ones(4), np.inf), "intercept must be finite; got inf"),
     ],
 )
-def test_a_bad_template(columns, message):
+def test_invalid_templates(columns, message):
     with pytest.raises(InvalidInputError, match=message):
         Template(*columns)
 
 
-def test_a_classifier_whose_parts_do_not_fit():
+def test_templates_that_do_not_match_the_params():
     with pytest.raises(InvalidInputError, match="templates must hold at least one template; got none"):
         VehicleClassifier(SMALL, ())
     with pytest.raises(InvalidInputError, match=rf"templates must have {SMALL.length} weights, .* got 4"):
         VehicleClassifier(SMALL, (Template(np.zeros(4), np.ones(4), np.ones(4), 0.0),))
 
 
-def test_it_scores_as_its_pipeline_does(trained, patches):
+def test_scores_equal_those_of_the_pipeline(trained, patches):
     pipeline = trained.to_pipeline()
     # The pipeline scales in float32, as the features are.
     np.testing.assert_allclose(
@@ -328,7 +330,7 @@ def test_from_pipeline_and_back(trained, patches):
     assert again.metadata == trained.metadata
 
 
-def test_from_a_pipeline_of_ones_own(patches, labels):
+def test_from_an_own_pipeline(patches, labels):
     features = PatchFeatures(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
     pipeline = make_pipeline(features, StandardScaler(), LinearSVC(C=0.01, random_state=0))
     pipeline.fit(patches, labels.astype(bool))
@@ -339,7 +341,7 @@ def test_from_a_pipeline_of_ones_own(patches, labels):
 
 
 @pytest.mark.parametrize("options", [{"with_mean": False}, {"with_std": False}])
-def test_from_a_pipeline_with_half_a_scaler(patches, labels, options):
+def test_from_a_pipeline_without_mean_or_scale(patches, labels, options):
     rows = extract_features(patches, SMALL)
     pipeline = make_pipeline(StandardScaler(**options), LinearSVC(C=1e-3, random_state=0, max_iter=20_000))
     pipeline.fit(rows, labels)
@@ -349,7 +351,7 @@ def test_from_a_pipeline_with_half_a_scaler(patches, labels, options):
     )
 
 
-def test_pipelines_that_cannot_be_taken_over(patches, labels):
+def test_pipelines_that_cannot_be_converted(patches, labels):
     rows = extract_features(patches, SMALL)
 
     def take(pipeline):
@@ -390,7 +392,7 @@ def test_saving_and_loading_keeps_every_bit(tmp_path, params, templates):
     assert path.read_bytes() == first
 
 
-def test_metadata_that_is_no_json_is_refused(tmp_path):
+def test_metadata_that_is_not_json(tmp_path):
     model = VehicleClassifier(SMALL, random_classifier(SMALL).templates, {"when": object()})
     with pytest.raises(InvalidInputError, match="metadata must contain JSON values only"):
         model.save(tmp_path / "model.safetensors")
@@ -434,7 +436,7 @@ def write_model(path, tensors=None, **changes):
     return path
 
 
-def test_the_model_file_of_these_tests_is_sound(tmp_path):
+def test_the_model_file_of_these_tests_is_valid(tmp_path):
     assert load_classifier(write_model(tmp_path / "m.safetensors")).params == SMALL
 
 
@@ -445,12 +447,12 @@ def test_the_model_file_of_these_tests_is_sound(tmp_path):
         ({"0.mean": np.full(SMALL.length, np.inf)}, "mean must be finite"),
         ({"0.scale": np.zeros(SMALL.length)}, "scale must be positive"),
         ({"0.intercept": np.array([np.nan])}, "intercept must be finite"),
-        ({"0.coef": np.ones(5)}, "coef must be a vector as long as the features"),
+        ({"0.coef": np.ones(5)}, "coef must be a vector of the features' length"),
         ({"0.coef": np.ones((2, SMALL.length))}, "coef must be a vector"),
         ({"0.intercept": np.zeros(2)}, "cannot reshape"),
         (
             {"0.mean": np.zeros(5), "0.scale": np.ones(5), "0.coef": np.ones(5)},
-            f"templates must have {SMALL.length} weights, as the parameters say; got 5",
+            f"templates must have {SMALL.length} weights, the length of the features; got 5",
         ),
         ({"0.mean": None}, "'0.mean'"),
         ({"0.intercept": None}, "'0.intercept'"),
@@ -459,7 +461,7 @@ def test_the_model_file_of_these_tests_is_sound(tmp_path):
         (dict.fromkeys(("0.mean", "0.scale", "0.coef", "0.intercept")), "at least one template"),
     ],
 )
-def test_tensors_that_do_not_fit(tmp_path, tensors, message):
+def test_invalid_tensors(tmp_path, tensors, message):
     path = write_model(tmp_path / "m.safetensors", tensors)
     with pytest.raises(ModelFileError, match=rf"model file .* does not fit its own parameters: .*{message}"):
         load_classifier(path)
@@ -486,7 +488,7 @@ def test_tensors_that_do_not_fit(tmp_path, tensors, message):
         ({"params": '{"spatial_size": 16}'}, "does not fit its own parameters: templates must have 6156"),
     ],
 )
-def test_headers_that_do_not_fit(tmp_path, changes, message):
+def test_invalid_headers(tmp_path, changes, message):
     path = write_model(tmp_path / "m.safetensors", **changes)
     with pytest.raises(ModelFileError, match=message):
         load_classifier(path)
@@ -570,7 +572,7 @@ def test_a_missing_model_file(tmp_path, monkeypatch):
         load_classifier(tmp_path / "locked")
 
 
-def test_the_shipped_model_is_sound():
+def test_the_shipped_model_is_valid():
     model = load_classifier()
     assert all(template.coef.any() for template in model.templates)
     gray = np.full((1, 64, 64, 3), 100, np.uint8)
@@ -578,7 +580,7 @@ def test_the_shipped_model_is_sound():
     assert {"training", "versions"} <= model.metadata.keys()
 
 
-def test_scoring_many_rows_needs_no_wider_copy_of_them():
+def test_scoring_many_rows_does_not_copy_them_as_float64():
     model = random_classifier(SMALL)
     rows = np.zeros((8000, SMALL.length), np.float32)
     tracemalloc.start()

@@ -452,7 +452,7 @@ def test_what_is_no_classifier_is_refused(method):
 def test_features_that_cannot_be_shared_are_searched_window_by_window():
     params = FeatureParams(color_space="RGB", spatial_size=6, hist_feat=False, hog_feat=False)
     odd = VehicleClassifier(params, (Template(np.zeros(108), np.ones(108), np.ones(108), 0.0),))
-    with pytest.raises(InvalidInputError, match="spatial_size=6 has none; use search_windows"):
+    with pytest.raises(InvalidInputError, match="spatial_size=6; use search_windows"):
         VehicleDetector(odd, search_params=SEARCH)
     detector = VehicleDetector(odd, method="windows", search_params=SEARCH)
     assert len(detector.search(GOOD).windows) > 0

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from vehicle_detection import training
-from vehicle_detection.classifier import fit_features, load_classifier, patch_features, train_classifier
+from vehicle_detection.classifier import (
+    TrainingOptions,
+    fit_features,
+    load_classifier,
+    patch_features,
+    train_classifier,
+)
 from vehicle_detection.datasets import (
     PatchSet,
     load_training_patches,
@@ -26,7 +32,7 @@ SOURCES = {True: ("GTI_Far", "KITTI_extracted"), False: ("GTI", "Extras")}
 
 
 def named(patches, labels, sources):
-    """Give patches names as those of the course have, the sources of each class in turn."""
+    """Name the patches like those of the course, alternating between the sources of each class."""
     names = [
         f"{'vehicles' if label else 'non-vehicles'}/{sources[bool(label)][number % 2]}/{number}.png"
         for number, label in enumerate(labels)
@@ -40,12 +46,12 @@ def patch_set():
 
 
 @pytest.fixture(scope="module")
-def judged(patch_set):
+def trained(patch_set):
     return train_and_evaluate(patch_set, params=SMALL, random_state=3, seeds=2)
 
 
-def test_every_split_is_judged(judged, patch_set):
-    _, report = judged
+def test_every_split_is_evaluated(trained, patch_set):
+    _, report = trained
     assert list(report.splits) == list(SPLITS)
     assert report.skipped == {}
     assert (report.vehicles, report.non_vehicles, report.balance) == (80, 80, 0.5)
@@ -64,7 +70,7 @@ def test_every_split_is_judged(judged, patch_set):
 
 
 @pytest.mark.parametrize(("mirror", "gamma"), [(True, 0.0), (False, 0.0), (True, 0.4)])
-def test_the_scores_are_those_of_a_classifier_that_saw_the_training_part_alone(patch_set, mirror, gamma):
+def test_the_scores_equal_training_on_the_training_part_only(patch_set, mirror, gamma):
     _, report = train_and_evaluate(
         patch_set, params=SMALL, random_state=3, seeds=2, mirror=mirror, gamma=gamma
     )
@@ -90,33 +96,32 @@ def test_the_scores_are_those_of_a_classifier_that_saw_the_training_part_alone(p
         assert (score.train, score.test) == (len(each[0].train), len(each[0].test))
 
 
-def test_shares_of_wrong_answers():
+def test_error_rates():
     predicted, labels = np.array([1, 0, 0, 1, 0, 1]), np.array([1, 1, 1, 0, 0, 0])
-    accuracy, missed, false = training._shares(predicted, labels)
-    assert (accuracy, missed, false) == pytest.approx((0.5 - 1 / 6, 2 / 3, 2 / 3))
+    assert training._error_rates(predicted, labels) == pytest.approx((1 / 3, 2 / 3, 2 / 3))
 
 
-def test_the_model_is_that_of_all_patches(judged, patch_set):
-    classifier, report = judged
+def test_the_model_is_trained_on_all_patches(trained, patch_set):
+    classifier, report = trained
     plain = train_classifier(patch_set.patches, patch_set.labels, params=SMALL, random_state=3)
     for name in ("mean", "scale", "coef", "intercept"):
         np.testing.assert_array_equal(
             getattr(classifier.templates[0], name), getattr(plain.templates[0], name)
         )
-    facts = dict(classifier.metadata)
-    assert facts["training"] == plain.metadata["training"]
-    assert facts["versions"] == plain.metadata["versions"]
-    assert facts["data"] == {
+    metadata = dict(classifier.metadata)
+    assert metadata["training"] == plain.metadata["training"]
+    assert metadata["versions"] == plain.metadata["versions"]
+    assert metadata["data"] == {
         "fingerprint": patch_set.fingerprint,
         "sources": report.sources,
         "balance": 0.5,
     }
-    assert facts["metrics"]["accuracy"] == round(report.accuracy, 5)
-    assert set(facts["metrics"]["splits"]) == set(SPLITS)
+    assert metadata["metrics"]["accuracy"] == round(report.accuracy, 5)
+    assert set(metadata["metrics"]["splits"]) == set(SPLITS)
 
 
 @pytest.mark.parametrize("split", ["random", "sequences"])
-def test_again_it_is_the_same_file(patch_set, tmp_path, split):
+def test_training_again_writes_the_same_file(patch_set, tmp_path, split):
     before = patch_set.patches.copy()
     for name, jobs in (("a", 1), ("b", 3)):
         classifier, report = train_and_evaluate(
@@ -129,20 +134,20 @@ def test_again_it_is_the_same_file(patch_set, tmp_path, split):
     assert report.accuracy == report.splits[split].accuracy
 
 
-def test_features_are_fitted_as_they_are(patch_set):
-    features = patch_features(patch_set.patches, SMALL, mirror=True)
+def test_fitting_does_not_change_the_features(patch_set):
+    features = patch_features(patch_set.patches, SMALL, TrainingOptions())
     assert (features.shape, features.dtype) == ((320, SMALL.length), np.float32)
     np.testing.assert_array_equal(features[:160], extract_features(patch_set.patches, SMALL))
     mirrored = np.ascontiguousarray(patch_set.patches[:, :, ::-1])
     np.testing.assert_array_equal(features[160:], extract_features(mirrored, SMALL))
     before = features.copy()
     labels = patch_set.labels.astype(np.int64)
-    fitted = fit_features(features, labels, params=SMALL, C=1e-4, mirror=True, random_state=0)
+    fitted = fit_features(features, labels, SMALL, TrainingOptions())
     np.testing.assert_array_equal(features, before)
     assert fitted.metadata["training"]["vehicles"] == 80
 
 
-def test_splits_that_the_patches_do_not_allow_are_left_out():
+def test_impossible_splits_are_skipped():
     patches, labels = render_patches(24)
     own = named(patches, labels, {True: ("mine", "mine"), False: ("other", "other")})
     _, report = train_and_evaluate(own, params=SMALL, seeds=1)
@@ -157,7 +162,7 @@ def test_splits_that_the_patches_do_not_allow_are_left_out():
         train_and_evaluate(single, params=SMALL, split="sequences")
 
 
-def test_a_split_without_one_of_the_classes_is_left_out():
+def test_a_split_with_one_class_is_skipped():
     patches, labels = render_patches(24)
     # All vehicles are alone in their folders: the split by sequences tests on the others only.
     names = [f"{number}/1.png" if label else f"others/{number}.png" for number, label in enumerate(labels)]
@@ -165,8 +170,8 @@ def test_a_split_without_one_of_the_classes_is_left_out():
     assert report.skipped["sequences"] == "one side of the split lacks a class; pass more patches"
 
 
-def test_reports_are_json(judged):
-    _, report = judged
+def test_reports_are_json(trained):
+    _, report = trained
     plain = json.loads(json.dumps(report.to_dict()))
     assert plain["accuracy"] == report.accuracy
     assert plain["params"] == dataclasses.asdict(SMALL)
@@ -176,7 +181,7 @@ def test_reports_are_json(judged):
     assert dataclasses.replace(report, params=FeatureParams.preset("lab-8460")).features == "lab-8460"
 
 
-def test_a_bar_shows_on_a_terminal_alone(patch_set, monkeypatch, capsys):
+def test_the_progress_bar_is_shown_on_a_terminal_only(patch_set, monkeypatch, capsys):
     class Terminal(io.StringIO):
         def isatty(self):
             return True
@@ -194,12 +199,12 @@ def test_a_bar_shows_on_a_terminal_alone(patch_set, monkeypatch, capsys):
 # --- the card ---
 
 
-def test_the_card_tells_data_licence_accuracy_and_limits(judged):
-    classifier, report = judged
+def test_the_card_holds_data_license_accuracy_and_limitations(trained):
+    classifier, report = trained
     other = dataclasses.replace(report, params=FeatureParams.preset("luv-2384"))
     text = model_card(classifier, report, others=(other,), command="vehicle-detection train ...")
     assert "```bash\nvehicle-detection train ...\n```" in text
-    assert "80 patches of vehicles and 80 of anything else (50.0% vehicles)" in text
+    assert "80 patches of vehicles and 80 of non-vehicles (50.0% vehicles)" in text
     assert "| KITTI_extracted | 40 |" in text
     assert report.fingerprint in text
     assert "CC BY-NC-SA 3.0" in text
@@ -209,14 +214,14 @@ def test_the_card_tells_data_licence_accuracy_and_limits(judged):
         assert f"| {title} | {score.train} | {score.test} | {score.accuracy:.4f} |" in text
     assert "mean of 2 seeds" in text
     assert "| luv-2384 | 2384 |" in text
-    assert "`Extras` holds crops of the road of the course's project video" in text
+    assert "`Extras` holds crops of the road in the course's project video" in text
     assert "`KITTI_extracted` are shuffled" in text
     assert max(len(line) for line in text.splitlines() if not line.startswith("|")) <= 110
     for version in classifier.metadata["versions"].values():
         assert version in text
 
 
-def test_the_card_of_own_patches_says_nothing_of_the_course():
+def test_the_card_of_own_patches_does_not_mention_the_course():
     own = named(*render_patches(24), {True: ("mine", "mine"), False: ("other", "other")})
     classifier, report = train_and_evaluate(own, params=SMALL, seeds=1, mirror=False)
     text = model_card(classifier, report)
@@ -241,19 +246,19 @@ def test_the_card_of_own_patches_says_nothing_of_the_course():
         ({"n_jobs": 0}, "n_jobs must be an integer from 1"),
     ],
 )
-def test_bad_options_are_refused(patch_set, options, message):
+def test_invalid_options(patch_set, options, message):
     with pytest.raises(InvalidInputError, match=message):
         train_and_evaluate(patch_set, params=SMALL, **options)
 
 
-def test_bad_patches_are_refused(patch_set):
+def test_invalid_patches(patch_set):
     with pytest.raises(
         InvalidInputError, match=r"patch_set must be a PatchSet, got an array .* read one with"
     ):
         train_and_evaluate(patch_set.patches)
     with pytest.raises(InvalidInputError, match="labels must hold both classes"):
         train_and_evaluate(patch_set[patch_set.labels])
-    with pytest.raises(InvalidInputError, match="1 vehicles and 80 others are too few"):
+    with pytest.raises(InvalidInputError, match="1 vehicles and 80 non-vehicles are too few"):
         train_and_evaluate(patch_set[79:])
     tiny = PatchSet(np.zeros((12, 32, 32, 3), np.uint8), [1, 0] * 6, [f"{n}.png" for n in range(12)])
     with pytest.raises(InvalidInputError, match=r"source must be an \(N, 64, 64, 3\) uint8 RGB array"):

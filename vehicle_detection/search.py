@@ -21,7 +21,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import cv2
 import numpy as np
@@ -32,6 +32,7 @@ from vehicle_detection._common import (
     ThreadTeam,
     Workspace,
     check_image,
+    check_number,
     check_type,
     single_threaded_opencv,
 )
@@ -48,7 +49,7 @@ from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import convert_color, hog_source, pick_hog_channels
-from vehicle_detection.params import PATCH_SIZE, FeatureParams, PixelBand, SearchParams
+from vehicle_detection.params import PATCH_SIZE, FeatureParams, PixelBand, PyramidParams, SearchParams
 from vehicle_detection.windows import band_windows, search_windows
 
 _THUMBNAIL_SHAPE = (18, 32)
@@ -79,18 +80,6 @@ class SearchResult:
     thumbnail: NDArray[np.float32]
     seconds: float
 
-    @classmethod
-    def of(
-        cls, frame: NDArray[np.uint8], windows: Detections, vehicles: Detections | None, *, start: float
-    ) -> SearchResult:
-        """Build the result of a search of `frame` that began at ``time.perf_counter() == start``."""
-        height, width = frame.shape[:2]
-        # Subsampling is enough to detect a cut.
-        rows = np.linspace(0, height - 1, _THUMBNAIL_SHAPE[0]).astype(int)
-        columns = np.linspace(0, width - 1, _THUMBNAIL_SHAPE[1]).astype(int)
-        thumbnail = frame[np.ix_(rows, columns)].mean(axis=2, dtype=np.float32)
-        return cls(windows, vehicles, (height, width), thumbnail, time.perf_counter() - start)
-
 
 class FrameSearch(ABC):
     """What ``model.open_search()`` returns for either kind of model: threads and memory kept between frames.
@@ -98,15 +87,49 @@ class FrameSearch(ABC):
     Searches are thread-safe context managers.
     """
 
+    params_type: ClassVar[type[SearchParams] | type[PyramidParams]]
+
     def __init__(self, n_jobs: int | None) -> None:
         self._team = ThreadTeam(n_jobs, name="search")
         self._local = threading.local()
 
-    @abstractmethod
     def find(
         self, frame: NDArray[np.uint8], params: Any = None, *, min_vehicle_score: float = 0.0
     ) -> SearchResult:
-        """Search a frame."""
+        """Search a frame for windows and vehicles.
+
+        Parameters
+        ----------
+        frame
+            ``(H, W, 3)`` uint8 RGB.
+        params
+            `SearchParams` or `PyramidParams`, depending on the model; the default suits any dash-cam.
+        min_vehicle_score
+            Minimum score of a vehicle. It has no effect if vehicles are derived from the windows.
+
+        Raises
+        ------
+        InvalidInputError
+            If an argument is malformed, or a search with `SearchParams` has no window in the frame.
+        """
+        start = time.perf_counter()
+        check_image(frame, "frame")
+        params = self.params_type.default() if params is None else params
+        check_type(params, "params", self.params_type, "omit it for the default")
+        check_number(min_vehicle_score, "min_vehicle_score")
+        windows, vehicles = self._search(frame, params, min_vehicle_score)
+        height, width = frame.shape[:2]
+        # Subsampling is enough to detect a cut.
+        rows = np.linspace(0, height - 1, _THUMBNAIL_SHAPE[0]).astype(int)
+        columns = np.linspace(0, width - 1, _THUMBNAIL_SHAPE[1]).astype(int)
+        thumbnail = frame[np.ix_(rows, columns)].mean(axis=2, dtype=np.float32)
+        return SearchResult(windows, vehicles, (height, width), thumbnail, time.perf_counter() - start)
+
+    @abstractmethod
+    def _search(
+        self, frame: NDArray[np.uint8], params: Any, min_vehicle_score: float
+    ) -> tuple[Detections, Detections | None]:
+        """Windows and vehicles of a valid frame."""
 
     @property
     def workspace(self) -> Workspace:
@@ -171,22 +194,17 @@ def find_cars(
 class BandSearch(FrameSearch):
     """The fast search with one template or a few that share the features of a band."""
 
+    params_type = SearchParams
+
     def __init__(self, classifier: VehicleClassifier, *, n_jobs: int | None = None) -> None:
         check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
         super().__init__(n_jobs)
         self._filters = _Filters(classifier)
 
-    def find(
-        self,
-        frame: NDArray[np.uint8],
-        params: SearchParams | None = None,
-        *,
-        min_vehicle_score: float = 0.0,
-    ) -> SearchResult:
-        """Search a frame; `min_vehicle_score` has no effect because vehicles are derived from the windows."""
-        start = time.perf_counter()
-        windows = self.find_windows(frame, params or SearchParams.preset())
-        return SearchResult.of(frame, windows, None, start=start)
+    def _search(
+        self, frame: NDArray[np.uint8], params: SearchParams, min_vehicle_score: float
+    ) -> tuple[Detections, None]:
+        return self.find_windows(frame, params), None
 
     def find_windows(self, image: NDArray[np.uint8], params: SearchParams) -> Detections:
         """Windows of all bands that score above ``params.min_score``."""
@@ -214,29 +232,21 @@ class BandSearch(FrameSearch):
 class ReferenceSearch(FrameSearch):
     """The reference search: the windows of the same bands by `search_windows`, one patch per window."""
 
+    params_type = SearchParams
+
     def __init__(self, classifier: VehicleClassifier, *, n_jobs: int | None = None) -> None:
         check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
         super().__init__(n_jobs)
         self._classifier, self._n_jobs = classifier, n_jobs
 
-    def find(
-        self,
-        frame: NDArray[np.uint8],
-        params: SearchParams | None = None,
-        *,
-        min_vehicle_score: float = 0.0,
-    ) -> SearchResult:
-        """Search a frame; see `BandSearch.find`."""
-        start = time.perf_counter()
-        params = params or SearchParams.preset()
-        check_image(frame, "frame")
+    def _search(
+        self, frame: NDArray[np.uint8], params: SearchParams, min_vehicle_score: float
+    ) -> tuple[Detections, None]:
         windows = np.concatenate([band_windows(band) for band in params.place(frame.shape)])
         # `search_windows` needs windows inside the frame.
         windows = windows[(windows[:, 0] >= 0) & (windows[:, 2] <= frame.shape[1])]
-        found = search_windows(
-            frame, windows, self._classifier, min_score=params.min_score, n_jobs=self._n_jobs
-        )
-        return SearchResult.of(frame, found, None, start=start)
+        min_score, n_jobs = params.min_score, self._n_jobs
+        return search_windows(frame, windows, self._classifier, min_score=min_score, n_jobs=n_jobs), None
 
 
 def resized_shape(band: PixelBand) -> tuple[int, int]:

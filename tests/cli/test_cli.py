@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 import vehicle_detection
 from tests.helpers import SMALL_MIXTURE, drawn, start_interruptible, write_frame_set
-from vehicle_detection import classifier, datasets, detector, training, video
+from vehicle_detection import classifier, datasets, detector, mixture_training, training, video
 from vehicle_detection._common import files as _files
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import HorizonEstimate
@@ -30,8 +30,6 @@ from vehicle_detection.cli.output import output_folder, run_interruptible
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.mixture import load_model
-from vehicle_detection.mixture_training import cross_validation as mixture_report
-from vehicle_detection.mixture_training import drawn_frames as _drawn_frames
 from vehicle_detection.synthetic import render_drive, render_patches
 from vehicle_detection.video import probe_video, read_frames
 
@@ -289,7 +287,7 @@ def bad_images(material, tmp):
         r"cut_road.png must be a complete image file": [material / "cut_road.png"],
         r"nothing.png must be a complete image file": [tmp / "nothing.png"],
         r"floats.tiff must be a complete image file": [floats],
-        r"image of 12x12 pixels holds no search window": [tiny, "--model", "highway"],
+        r"image of 12x12 pixels has no room for a search window": [tiny, "--model", "highway"],
         r"--horizon must be a number, at least 0 and at most 1; got 2": [road, "--horizon", 2],
         r"--horizon must be a number, .* got nan": [road, "--horizon", "nan"],
         r"--output \S+ is the folder of road.png, which would be overwritten": [road, "-o", material],
@@ -442,7 +440,7 @@ def bad_videos(material, tmp):
         r"text.mp4 is not a video that ffmpeg can read": [material / "text.mp4", "-o", target],
         r"cut_clip.mp4 is not a video .*its index is missing": [material / "cut_clip.mp4", "-o", target],
         r"none.mp4 (has no|is not a video)": [tmp / "none.mp4", "-o", target],
-        r"image of 32x32 pixels holds no search window": [tiny, "-o", target, "--model", "highway"],
+        r"image of 32x32 pixels has no room for a search window": [tiny, "-o", target, "--model", "highway"],
         r"--output \S+clip.mp4 is also SOURCE": [clip, "-o", clip],
         r"--output needs an existing folder, \S+none is not one": [clip, "-o", tmp / "none" / "out.mp4"],
         r"--output must end in .mp4, .* got 'out.gif'": [clip, "-o", tmp / "out.gif"],
@@ -731,94 +729,62 @@ def test_models_by_name(picture):
 @pytest.fixture
 def small_training(monkeypatch):
     """Train with the few windows that a handful of drawn frames has."""
-    validate = functools.partial(mixture_report.cross_validate_mixture, params=SMALL_MIXTURE)
-    monkeypatch.setattr(mixture_report, "cross_validate_mixture", validate)
+    validate = functools.partial(mixture_training.cross_validate_mixture, params=SMALL_MIXTURE)
+    monkeypatch.setattr(mixture_training, "cross_validate_mixture", validate)
 
 
 @pytest.fixture(scope="module")
 def drawn_roads(tmp_path_factory):
     folder = tmp_path_factory.mktemp("roads")
     write_frame_set(folder, "town", drawn(range(6)))
-    write_frame_set(folder, "stills", drawn(range(6, 10)), place=".")
-    cars = folder / "vehicles" / "cars"
-    cars.mkdir(parents=True)
-    for number, patch in enumerate(render_patches(14, random_state=0)[0][:7]):
-        write_image(cars / f"{number}.png", patch)
+    write_frame_set(folder, "coast", drawn(range(6, 10)))
+    for number, patch in enumerate(render_patches(4, random_state=0)[0][:2]):
+        (folder / "patches" / "cars").mkdir(parents=True, exist_ok=True)
+        write_image(folder / "patches" / "cars" / f"{number}.png", patch)
     return folder
 
 
-PICTURES = ("curves", "town-missed", "town-false", "stills-missed", "stills-false")
-
-
 def test_train_frames(drawn_roads, small_training, tmp_path):
-    names = [tmp_path / f"road.{suffix}" for suffix in ("safetensors", "md", "csv")]
-    words = [
-        "train-frames",
-        drawn_roads,
-        "-o",
-        names[0],
-        "--card",
-        names[1],
-        "--curves",
-        names[2],
-        "--seed",
-        5,
-        "--no-drawn",
-        "--pictures",
-        tmp_path / "pictures",
-    ]
+    model, curves = tmp_path / "road.safetensors", tmp_path / "curves.csv"
+    words = ["train-frames", drawn_roads, "-o", model, "--curves", curves, "--seed", 5, "--no-drawn"]
+    words += ["--patches", drawn_roads / "patches"]
     out = succeed(*words)
-    pictures = [tmp_path / "pictures" / f"{name}.png" for name in PICTURES]
-    assert "town: judged by a model that does not know it" in out
+    assert "town: evaluated a model trained without this source" in out
     assert "on sources left out of training, IoU 0.5" in out
-    assert out.endswith(f"wrote {', '.join(map(str, names + pictures))}\n")
-    assert [picture.read_bytes()[:4] for picture in pictures] == 5 * [b"\x89PNG"]
-    model = load_model(names[0])
-    assert [template.box_cells for template in model.templates] == [(6, 5)]
-    assert model.metadata["training"] == {"random_state": 5}
-    assert model.metadata["data"] == {"town": 6, "course": 4, "patches": 2}
-    assert "- 2 vehicles on the course's patches" in names[1].read_text()
-    assert "KITTI (CC BY-NC-SA 3.0)" in names[1].read_text()
-    assert names[1].read_text().startswith("# Model card: road")
-    assert names[2].read_text().startswith("frames,value,precision,recall\ntown,")
-    shown = succeed("info", names[0])
-    assert re.search(r"town\W+\d\.\d{3}", shown)
-    first = names[0].read_bytes()
+    assert out.endswith(f"wrote {model}, {curves}\n")
+    trained = load_model(model)
+    assert [template.box_cells for template in trained.templates] == [(6, 5)]
+    assert trained.metadata["training"] == {"random_state": 5}
+    assert trained.metadata["data"] == {"coast": 4, "town": 6, "patches": 2}
+    assert curves.read_text().startswith("frames,margin,precision,recall\ncoast,")
+    assert re.search(r"town\W+\d\.\d{3}", succeed("info", model))
+    first = model.read_bytes()
     succeed(*words)
-    assert names[0].read_bytes() == first
+    assert model.read_bytes() == first
 
 
 def test_train_frames_adds_drawn_frames(drawn_roads, small_training, tmp_path, monkeypatch):
-    few = functools.partial(_drawn_frames.drawn_source, drives=1, frames=1)
-    monkeypatch.setattr(_drawn_frames, "drawn_source", few)
-    card = tmp_path / "m.md"
-    succeed("train-frames", drawn_roads, "-o", tmp_path / "m.safetensors", "--card", card)
+    few = functools.partial(mixture_training.drawn_source, drives=1, frames=1)
+    monkeypatch.setattr(mixture_training, "drawn_source", few)
+    succeed("train-frames", drawn_roads, "-o", tmp_path / "m.safetensors")
     data = load_model(tmp_path / "m.safetensors").metadata["data"]
-    assert data == {"town": 6, "course": 4, "drawn": 1, "patches": 2}
-    assert "- drawn: 1 frames" in card.read_text()
+    assert data == {"coast": 4, "town": 6, "drawn": 1}
 
 
 def test_train_frames_refuses_bad_input_before_it_trains(drawn_roads, tmp_path, monkeypatch):
-    monkeypatch.setattr(mixture_report, "train_mixture", None)
+    monkeypatch.setattr(mixture_training, "cross_validate_mixture", None)
     one = tmp_path / "one"
     write_frame_set(one, "town", drawn(range(2)))
     model = tmp_path / "m.safetensors"
     (tmp_path / "empty").mkdir()
     cases = {
-        r"folder \S+none does not exist; name the folder of the labelled": [tmp_path / "none", "-o", model],
+        r"folder \S+none does not exist; pass the folder of the labelled": [tmp_path / "none", "-o", model],
         r"folder \S+empty has no labels/NAME.csv": [tmp_path / "empty", "-o", model],
-        r"DATA must be two or more, .*; got 1": [one, "-o", model],
+        r"DATA must be at least two, .*; got 1": [one, "-o", model],
         r"--output needs an existing folder": [drawn_roads, "-o", tmp_path / "none" / "m.safetensors"],
         r"--output must be a file, got the folder": [drawn_roads, "-o", tmp_path],
-        r"--card needs an existing folder": [drawn_roads, "-o", model, "--card", tmp_path / "none" / "m.md"],
         r"--curves \S+ is also --output \S+;": [drawn_roads, "-o", model, "--curves", model],
-        r"--pictures must be a folder, .* cannot be created": [
-            drawn_roads,
-            "-o",
-            model,
-            "--pictures",
-            one / "labels" / "town.csv" / "x",
-        ],
+        r"none does not exist": [drawn_roads, "-o", model, "--patches", tmp_path / "none"],
         r"--seed must be an integer from 0": [drawn_roads, "-o", model, "--seed", -1],
     }
     for message, words in cases.items():

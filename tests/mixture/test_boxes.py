@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vehicle_detection.boxes import iou_matrix
+from vehicle_detection.boxes import iou_matrix, overlap_matrices
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture import N_REGRESSION_FEATURES, BoxRegressor, overlaps, vote_boxes
+from vehicle_detection.mixture import N_REGRESSION_FEATURES, BoxRegressor, vote_boxes
 from vehicle_detection.mixture.boxes import ScoredWindows, nms
 
 
@@ -65,7 +65,7 @@ def test_nms_removes_the_weaker_of_two_overlapping_boxes(count, seed):
     kept = boxes[rows]
     assert (np.triu(iou_matrix(kept, kept), 1) <= 0.35).all()
     for row in set(range(count)) - set(rows.tolist()):
-        iou, cover = overlaps(boxes[row], kept)
+        (iou,), (cover,) = overlap_matrices(boxes[row, None], kept)
         better = scores[rows] >= scores[row]
         assert (((iou > 0.35) | (cover > 0.75)) & better).any()
     assert nms(kept, scores[rows]).tolist() == list(range(len(rows)))

@@ -5,47 +5,42 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.helpers import SMALL_MIXTURE, drawn, scene_of
+from tests.helpers import SMALL_MIXTURE, scene_of
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture import N_CHANNELS, BoxRegressor, MixtureTemplate, mirror_channels
-from vehicle_detection.mixture_training import FrameDataset, train_mixture
-from vehicle_detection.mixture_training.negatives import Frame, frames_of
+from vehicle_detection.mixture_training import train_mixture
 from vehicle_detection.mixture_training.positives import (
     align_mirrored,
     jitter_boxes,
+    locate_on_patch,
     patch_features,
-    place_on_patch,
     truncated_vehicles,
     vehicle_features,
     whole_vehicles,
     window_features,
 )
-
-
-@pytest.fixture(scope="module")
-def source():
-    return FrameDataset("drawn", (drawn(range(12)),))
+from vehicle_detection.mixture_training.sources import TrainingFrame, load_training_frames
 
 
 def blank(columns=8, rows=7):
     return MixtureTemplate(np.zeros((rows, columns, N_CHANNELS)), 0.0, (1.0, 1.0))
 
 
-def test_vehicles_are_taken_at_other_exposures_too(drawn_source):
-    frames = frames_of([source])
+def test_whole_vehicles_are_also_taken_from_relit_frames(drawn_source):
+    frames = load_training_frames([drawn_source])
     wide = [box for frame in frames for box in frame.boxes if box[2] - box[0] >= SMALL_MIXTURE.min_width]
-    for exposures in (0, 2):
-        params = dataclasses.replace(SMALL_MIXTURE, jitter=3, exposures=exposures)
+    for count in (0, 2):
+        params = dataclasses.replace(SMALL_MIXTURE, copies=3, relit_copies=count)
         seen = list(whole_vehicles(frames, params, np.random.default_rng(0)))
-        assert len(seen) == (3 + exposures) * len(wide)
-        others = [box for image, box in seen if not any(image is frame.image for frame in frames)]
-        assert len(others) == exposures * len(wide)
-        assert {tuple(box) for box in others} == ({tuple(box) for box in wide} if exposures else set())
+        assert len(seen) == (3 + count) * len(wide)
+        relit = [box for image, box in seen if not any(image is frame.image for frame in frames)]
+        assert len(relit) == count * len(wide)
+        assert {tuple(box) for box in relit} == ({tuple(box) for box in wide} if count else set())
 
 
 @given(seed=st.integers(0, 1000), count=st.integers(0, 8))
-def test_moved_boxes_still_show_their_vehicles(seed, count):
+def test_jittered_boxes_still_overlap_their_vehicles(seed, count):
     rng = np.random.default_rng(seed)
     corners = rng.uniform(0, 500, (count, 2))
     boxes = np.hstack([corners, corners + rng.uniform(20, 200, (count, 2))])
@@ -58,9 +53,9 @@ def test_moved_boxes_still_show_their_vehicles(seed, count):
         assert (ratio < np.exp(0.45) + 1e-9).all()
 
 
-def test_what_is_learnt_at_the_border_ends_there(drawn_source):
+def test_truncated_vehicles_end_at_the_border(drawn_source):
     params = dataclasses.replace(SMALL_MIXTURE, border_shapes=((4, 5),))
-    frames = frames_of([source])
+    frames = load_training_frames([drawn_source])
     seen = list(truncated_vehicles(frames, params, np.random.default_rng(0)))
     assert len(seen) > len(frames)
     for image, box in seen:
@@ -68,10 +63,12 @@ def test_what_is_learnt_at_the_border_ends_there(drawn_source):
         assert box[2] - box[0] >= params.min_width * (1 - params.jitter_scale)
 
 
-def test_a_vehicle_that_the_border_cuts_is_shown_in_several_places():
-    cut = Frame(np.zeros((90, 160, 3), np.uint8), np.array([[110.0, 20, 160, 60]]), np.empty((0, 4)), 0.0)
+def test_a_vehicle_truncated_by_the_border_is_copied():
+    cut = TrainingFrame(
+        np.zeros((90, 160, 3), np.uint8), np.array([[110.0, 20, 160, 60]]), np.empty((0, 4)), 0.0
+    )
     for copies in (1, 5):
-        params = dataclasses.replace(SMALL_MIXTURE, border_jitter=copies)
+        params = dataclasses.replace(SMALL_MIXTURE, border_copies=copies)
         seen = [
             box for _, box in truncated_vehicles([cut], params, np.random.default_rng(0)) if box[2] == 160
         ]
@@ -80,7 +77,7 @@ def test_a_vehicle_that_the_border_cuts_is_shown_in_several_places():
         assert len({tuple(box) for box in seen}) == len(seen)
 
 
-def test_turned_vehicles_face_the_same_way():
+def test_aligned_samples_show_the_same_side():
     rng = np.random.default_rng(5)
     side = rng.normal(0, 1, (4, 6, N_CHANNELS)).astype(np.float32)
     mirrored = mirror_channels(side.transpose(2, 0, 1)).transpose(1, 2, 0)
@@ -97,11 +94,8 @@ def test_turned_vehicles_face_the_same_way():
     assert align_mirrored(np.empty((0, 8), np.float32), rng).shape == (0, 8)
 
 
-# Patches.
-
-
 def patch_of(seed):
-    """Cut a square around the widest vehicle of a scene; return its box on it as well, None if it is cut."""
+    """Square patch around the widest vehicle of a scene, and its box; None if the patch leaves the image."""
     scene = scene_of(seed)
     box = np.array(max((v.box for v in scene.truth), key=lambda box: box[2] - box[0], default=(0, 0, 0, 0)))
     side = round(1.1 * max(box[2] - box[0], box[3] - box[1]))
@@ -112,23 +106,25 @@ def patch_of(seed):
     return scene.image[top : top + side, left : left + side], box - np.tile([left, top], 2)
 
 
-def test_a_vehicle_is_placed_on_its_patch(drawn_source):
-    model = train_mixture([source], dataclasses.replace(SMALL_MIXTURE, rounds=(0.2,)), n_jobs=1)
+def test_a_vehicle_is_located_on_its_patch(drawn_source):
+    model = train_mixture(
+        [drawn_source], dataclasses.replace(SMALL_MIXTURE, mining_schedule=(0.2,)), n_jobs=1
+    )
     found = [patch for patch in map(patch_of, range(100, 140)) if patch is not None]
     assert len(found) > 5
     before, after = (
-        [iou_matrix([place_on_patch(image, placing)], [box])[0, 0] for image, box in found]
+        [iou_matrix([locate_on_patch(image, placing)], [box])[0, 0] for image, box in found]
         for placing in (BoxRegressor.none(), model.box_regressor)
     )
     assert np.mean(after) > np.mean(before)
     assert np.mean(after) > 0.75
     image, _ = found[0]
-    inside = place_on_patch(image, model.box_regressor)
+    inside = locate_on_patch(image, model.box_regressor)
     assert (inside[:2] >= 0).all()
     assert (inside[2:] <= image.shape[1::-1]).all()
 
 
-def test_around_a_patch_the_template_sees_what_it_sees_on_the_average():
+def test_cells_outside_a_patch_take_the_mean_features():
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (60, 80, 3), np.uint8)
     template, none = blank(), BoxRegressor.none()
@@ -140,24 +136,25 @@ def test_around_a_patch_the_template_sees_what_it_sees_on_the_average():
     ring = np.zeros((7, 8), bool)
     ring[:, [0, -1]] = True
     np.testing.assert_allclose(plain[ring], mean[ring], rtol=1e-6)
-    own = window_features(image, place_on_patch(image, none), template).transpose(1, 2, 0)
+    own = window_features(image, locate_on_patch(image, none), template).transpose(1, 2, 0)
     np.testing.assert_array_equal(plain[~ring], own[~ring])
     back = mirror_channels(mirrored.transpose(2, 0, 1)).transpose(1, 2, 0)
     np.testing.assert_array_equal(back, plain)
 
 
-def test_a_patch_with_room_around_its_vehicle_shows_it_all():
+def test_a_patch_with_a_wide_margin_needs_no_mean_features():
     image = np.random.default_rng(0).integers(0, 256, (200, 200, 3), np.uint8)
-    # A correction that makes every box smaller.
+    # A regressor that shrinks every box.
     shrink = BoxRegressor(np.zeros_like(BoxRegressor.none().weights), [0.2, 0.2, -0.2, -0.2])
     known = np.zeros((1, blank().weights.size), np.float32)
     (rows,) = patch_features([image], shrink, [blank()], [known], SMALL_MIXTURE)
-    own = window_features(image, place_on_patch(image, shrink), blank())
+    own = window_features(image, locate_on_patch(image, shrink), blank())
     np.testing.assert_array_equal(rows[0], own.transpose(1, 2, 0).ravel())
 
 
-def test_patches_train_the_templates_of_their_shape(drawn_source):
-    frames, params = frames_of([source]), dataclasses.replace(SMALL_MIXTURE, near=0.0)
+def test_patches_train_templates_of_their_shape(drawn_source):
+    frames = load_training_frames([drawn_source])
+    params = dataclasses.replace(SMALL_MIXTURE, aspect_tolerance=0.0)
     templates = [blank(8, 7), blank(5, 12)]
     known = vehicle_features(whole_vehicles(frames, params, np.random.default_rng(0)), templates, params)
     known = [
@@ -177,21 +174,21 @@ def test_patches_train_the_templates_of_their_shape(drawn_source):
     ],
     ids=["number", "gray", "float"],
 )
-def test_what_is_no_patch_is_refused(drawn_source, patches, message):
+def test_invalid_patches(drawn_source, patches, message):
     with pytest.raises(InvalidInputError, match=message):
-        train_mixture([source], SMALL_MIXTURE, patches=patches, n_jobs=1)
+        train_mixture([drawn_source], SMALL_MIXTURE, patches=patches, n_jobs=1)
 
 
-def test_patches_are_further_vehicles(drawn_source):
+def test_patches_add_positive_samples(drawn_source):
     patches = [patch[0] for patch in map(patch_of, range(100, 140)) if patch is not None]
-    params = dataclasses.replace(SMALL_MIXTURE, rounds=(0.2,))
+    params = dataclasses.replace(SMALL_MIXTURE, mining_schedule=(0.2,))
     lines = []
     models = [
-        train_mixture([source], params, patches=given, n_jobs=jobs, on_step=lines.append)
+        train_mixture([drawn_source], params, patches=given, n_jobs=jobs, on_step=lines.append)
         for given, jobs in (((), 1), (patches, 1), (patches, 2))
     ]
     plain, one, two = (model.templates[0].weights for model in models)
     assert (plain != one).any()
     np.testing.assert_array_equal(one, two)
-    counts = [int(line.split("]")[0][1:]) for line in lines if line.endswith(" vehicles")]
+    counts = [int(line.split()[-1]) for line in lines if line.startswith("vehicles per template: ")]
     assert counts[1] - counts[0] == 2 * len(patches)

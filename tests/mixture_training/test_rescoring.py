@@ -5,10 +5,10 @@ import numpy as np
 
 from tests.helpers import SMALL_MIXTURE, drawn
 from vehicle_detection.boxes import iou_matrix
-from vehicle_detection.mixture import MixtureSearch, mirror_channels, rescoring_features
+from vehicle_detection.mixture import mirror_channels, rescoring_features
 from vehicle_detection.mixture_training import FrameDataset, train_mixture
-from vehicle_detection.mixture_training.negatives import Frame, frames_of
-from vehicle_detection.mixture_training.rescoring import _boxes, _mirrored, train_rescorer
+from vehicle_detection.mixture_training.rescoring import _mirror, _sample_boxes, train_rescorer
+from vehicle_detection.mixture_training.sources import TrainingFrame, load_training_frames
 from vehicle_detection.params import MixtureParams
 
 
@@ -17,20 +17,20 @@ def test_mirrored_features_equal_those_of_the_mirrored_image():
     whole = np.array([[16.0, 16.0, 80.0, 80.0]])
     seen = rescoring_features(image, whole)
     expected = rescoring_features(np.ascontiguousarray(image[:, ::-1]), whole)
-    for found, wanted in zip(_mirrored(seen), expected):
+    for found, wanted in zip(_mirror(seen), expected):
         np.testing.assert_allclose(found, wanted, atol=1e-4)
     channels = mirror_channels(seen[0].reshape(28, 12, 12))
-    np.testing.assert_array_equal(_mirrored(seen)[0].reshape(28, 12, 12), channels)
+    np.testing.assert_array_equal(_mirror(seen)[0].reshape(28, 12, 12), channels)
 
 
 def test_a_trained_rescorer_separates_vehicles_from_clutter(small_mixture):
     rescorer = small_mixture.rescorer
     assert rescorer is not None
-    assert rescorer.blend_weight == MixtureParams().rescorer
-    search, rng = MixtureSearch(small_mixture, n_jobs=1), np.random.default_rng(0)
+    assert rescorer.blend_weight == MixtureParams().blend_weight
+    search, rng = small_mixture.open_search(n_jobs=1), np.random.default_rng(0)
     right, wrong = [], []
-    for frame in frames_of([FrameDataset("others", (drawn(range(12, 18)),))]):
-        vehicles, clutter = _boxes(frame, search, SMALL_MIXTURE, rng)
+    for frame in load_training_frames([FrameDataset("others", (drawn(range(12, 18)),))]):
+        vehicles, clutter = _sample_boxes(frame, search, SMALL_MIXTURE, rng)
         for boxes, values in (vehicles, right), (clutter, wrong):
             values += rescorer.decision_function(
                 rescorer.project(*rescoring_features(frame.image, boxes))
@@ -41,9 +41,9 @@ def test_a_trained_rescorer_separates_vehicles_from_clutter(small_mixture):
 
 
 def test_boxes_to_train_on_agree_with_the_labels(drawn_source, small_mixture):
-    search = MixtureSearch(small_mixture, n_jobs=1)
-    for frame in frames_of([drawn_source])[:4]:
-        right, wrong = _boxes(frame, search, SMALL_MIXTURE, np.random.default_rng(1))
+    search = small_mixture.open_search(n_jobs=1)
+    for frame in load_training_frames([drawn_source])[:4]:
+        right, wrong = _sample_boxes(frame, search, SMALL_MIXTURE, np.random.default_rng(1))
         assert (iou_matrix(right, frame.boxes).max(axis=1, initial=0) > 0.5).all()
         assert (iou_matrix(wrong, frame.boxes).max(axis=1, initial=0) < 0.45).all()
         wide = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= SMALL_MIXTURE.min_width]
@@ -51,12 +51,12 @@ def test_boxes_to_train_on_agree_with_the_labels(drawn_source, small_mixture):
 
 
 def test_a_weight_of_zero_trains_no_rescorer(drawn_source):
-    params = dataclasses.replace(SMALL_MIXTURE, rescorer=0.0, rounds=(0.5,))
+    params = dataclasses.replace(SMALL_MIXTURE, blend_weight=0.0, mining_schedule=(0.5,))
     assert train_mixture([drawn_source], params, n_jobs=1).rescorer is None
 
 
 def test_frames_without_vehicles_train_no_rescorer(small_mixture):
-    search = MixtureSearch(small_mixture, n_jobs=1)
-    empty = Frame(np.full((200, 356, 3), 90, np.uint8), np.empty((0, 4)), np.empty((0, 4)), 0.0)
+    search = small_mixture.open_search(n_jobs=1)
+    empty = TrainingFrame(np.full((200, 356, 3), 90, np.uint8), np.empty((0, 4)), np.empty((0, 4)), 0.0)
     with ThreadPoolExecutor(1) as pool:
         assert train_rescorer([empty], search, SMALL_MIXTURE, np.random.default_rng(0), pool) is None

@@ -107,7 +107,7 @@ def test_gains_apply_to_their_parts():
     [
         ({"color_space": "BGR"}, "color_space must be one of 'RGB', 'HSV', .*; got 'BGR'"),
         ({"spatial_feat": 1}, "spatial_feat must be True or False; got 1"),
-        ({"spatial_feat": False, "hist_feat": False, "hog_feat": False}, "all False; switch one on"),
+        ({"spatial_feat": False, "hist_feat": False, "hog_feat": False}, "all False; set one to True"),
         ({"spatial_size": 65}, "spatial_size must be an integer from 1 to 64; got 65"),
         ({"spatial_size": (32, 32)}, "spatial_size must be an integer"),
         ({"hist_bins": 257}, "hist_bins must be an integer from 1 to 256"),
@@ -120,7 +120,7 @@ def test_gains_apply_to_their_parts():
         ({"coarse_hog": 1}, "coarse_hog must be True or False; got 1"),
         (
             {"coarse_hog": True, "cell_per_block": 5},
-            "coarse_hog must be False where no block of 5 cells of 16 pixels fits into a patch; got True",
+            "coarse_hog must be False, because a block of 5 cells of 16 pixels does not fit .*; got True",
         ),
         ({"hist_gain": 0}, "hist_gain must be a number, at least 0.01 and at most 100; got 0"),
         ({"coarse_gain": 101}, "coarse_gain must be a number, at least 0.01 and at most 100; got 101"),

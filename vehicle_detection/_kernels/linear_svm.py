@@ -38,26 +38,11 @@ def fit_svm(
 ) -> LinearSVM:
     """Fit a scaler and a linear SVM with squared hinge loss; the same input and seed give the same result.
 
-    Parameters
-    ----------
-    features
-        ``(N, length)`` float32; neither changed nor copied.
-    labels
-        ``(N,)`` zeros and ones.
-    costs
-        ``(N,)`` positive: the `C` of ``LinearSVC`` times the weight of each row.
-    rows
-        Distinct rows to fit; all if None.
-    gains
-        Factor of each scaled feature.
-    random_state
-        Seed of the order in which rows are visited.
-
-    Notes
-    -----
-    Hsieh et al., "A dual coordinate descent method for large-scale linear SVM" (ICML 2008), with shrinking:
-    the solver of ``LinearSVC(dual=True)``, which regularizes the intercept too. Rows are standardized as they
-    are read.
+    `features` is ``(N, length)`` float32 and neither changed nor copied, `labels` ``(N,)`` zeros and ones,
+    `costs` ``(N,)`` the `C` of ``LinearSVC`` times the weight of each row, `rows` the rows to fit (default:
+    all), and `gains` the factor of each scaled feature. Hsieh et al., "A dual coordinate descent method for
+    large-scale linear SVM" (ICML 2008), with shrinking: the solver of ``LinearSVC(dual=True)``, which
+    regularizes the intercept too. Rows are standardized as they are read.
     """
     chosen = np.arange(len(features)) if rows is None else rows
     mean, scale = _moments(features, chosen)

@@ -24,20 +24,6 @@ from vehicle_detection.cli.output import (
 if TYPE_CHECKING:
     from vehicle_detection.training import TrainingReport
 
-# Columns of the table of fold scores: titles and decimals.
-_COLUMNS = {
-    "f1": ("F1", 3),
-    "best_f1": ("best F1", 3),
-    "average_precision": ("AP", 3),
-    "precision": ("precision", 3),
-    "recall": ("recall", 3),
-    "mean_iou": ("mean IoU", 3),
-    "false_per_frame": ("false", 2),
-    "false_per_empty_frame": ("on empty", 2),
-    "region_f1": ("region F1", 3),
-    "region_average_precision": ("region AP", 3),
-}
-
 
 @option_names(random_state="--seed")
 def train(
@@ -112,7 +98,8 @@ def train(
         command = shlex.join(["vehicle-detection", "train", *words])
         with atomic_write(card) as part:
             part.write_text(
-                model_card(classifier, evaluated, others=others, command=command), encoding="utf-8"
+                model_card(classifier, evaluated, name=output.stem, others=others, command=command),
+                encoding="utf-8",
             )
     typer.echo(f"wrote {', '.join(map(str, targets.values()))}")
 
@@ -209,14 +196,10 @@ def _print_metrics(metrics: object) -> bool:
 
 def print_fold_scores(scores: Mapping[str, Mapping[str, Any]]) -> None:
     """Print a table of the values of `FoldScore`, with a row per set of frames."""
-    rows = [
-        (
-            name,
-            *(f"{values[key]:.{digits}f}" if key in values else "" for key, (_, digits) in _COLUMNS.items()),
-        )
-        for name, values in scores.items()
-    ]
-    titles = (title for title, _ in _COLUMNS.values())
+    from vehicle_detection.mixture_training import FOLD_COLUMNS, format_fold
+
+    titles = (title for title, _ in FOLD_COLUMNS.values())
+    rows = [(name, *format_fold(values)) for name, values in scores.items()]
     print_table("on sources left out of training, IoU 0.5", ("frames", *titles), rows)
 
 
@@ -225,60 +208,45 @@ def train_frames(
     data: Annotated[
         Path,
         typer.Argument(
-            metavar="DATA",
-            help="Folder with labels/NAME.csv and frames/NAME/ or videos/NAME.mp4, and optionally the "
-            "course's patches in vehicles.zip or vehicles/.",
+            metavar="DATA", help="Folder with labels/NAME.csv and frames/NAME/ or videos/NAME.mp4."
         ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Model file to write.")],
-    card: Annotated[
-        Path | None, typer.Option(metavar="FILE.md", help="Model card to write, from these measurements.")
+    patches: Annotated[
+        Path | None, typer.Option(metavar="PATH", help="Folder or zip of patches with more vehicles.")
     ] = None,
     curves: Annotated[
         Path | None,
         typer.Option(metavar="FILE.csv", help="Precision and recall on each source left out of training."),
     ] = None,
     drawn: Annotated[bool, typer.Option("--drawn/--no-drawn", help="Also train on drawn frames.")] = True,
-    pictures: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Folder for images of the curves and the worst errors."),
-    ] = None,
     seed: Annotated[int, typer.Option(metavar="N", help="Random seed.")] = 0,
 ) -> None:
     """Train a model for any road on labelled frames, and evaluate it by cross-validation over the sources."""
     from vehicle_detection._common import check_target
+    from vehicle_detection.datasets import load_patches
     from vehicle_detection.mixture_training import (
-        as_metadata,
         check_sources,
         cross_validate_mixture,
         drawn_source,
-        find_patches,
         find_sources,
-        write_card,
+        training_metadata,
         write_curves,
     )
 
-    named = {"--output": output, "--card": card, "--curves": curves}
+    named = {"--output": output, "--curves": curves}
     targets = {name: check_target(path, name) for name, path in named.items() if path is not None}
     check_distinct_paths(targets, {"DATA": data})
     sources = find_sources(data)
-    check_sources(sources, least=2)
-    patches = find_patches(data)
-    always = [drawn_source(random_state=seed)] if drawn else []
-    with output_folder(pictures, "--pictures"):
-        trained, scores, held = cross_validate_mixture(
-            sources, always=always, patches=patches, random_state=seed, on_step=typer.echo
-        )
-        sources += always
-        trained.with_metadata(as_metadata(scores, sources, seed, len(patches))).save(output)
-        if card is not None:
-            write_card(card, trained, scores, sources, seed, len(patches))
-        if curves is not None:
-            write_curves(curves, held)
-        written = [*targets.values()]
-        if pictures is not None:
-            from vehicle_detection.mixture_training import write_pictures
-
-            written += [pictures / name for name in write_pictures(pictures, scores, held)]
+    check_sources(sources, min_count=2)
+    vehicles = [] if patches is None else list(load_patches(patches, label=1).patches)
+    extra = [drawn_source(random_state=seed)] if drawn else []
+    model, scores, folds = cross_validate_mixture(
+        sources, extra_sources=extra, patches=vehicles, random_state=seed, on_step=typer.echo
+    )
+    metadata = training_metadata(scores, [*sources, *extra], seed, len(vehicles))
+    model.with_metadata(metadata).save(output)
+    if curves is not None:
+        write_curves(curves, folds)
     print_fold_scores({score.name: score.to_dict() for score in scores})
-    typer.echo(f"wrote {', '.join(map(str, written))}")
+    typer.echo(f"wrote {', '.join(map(str, targets.values()))}")

@@ -133,12 +133,12 @@ def list_patches(source: str | os.PathLike[str], name: str) -> Listing:
         raise InvalidInputError(f"{name} must be the path of a folder or zip, got {describe(source)}")
     path = Path(source)
     if not path.exists():
-        raise DatasetError(f"{name} {path} does not exist; check the path or use fetch_patches")
+        raise DatasetError(f"{name} {path} does not exist; check the path, or download the course's patches")
     is_zip = not path.is_dir()
     found = _list_zip(path) if is_zip else _list_folder(path)
     if not found:
         zips = [] if is_zip else sorted(file.name for file in path.glob("*.zip"))
-        remedy = f"pass one of its zip files ({', '.join(zips)})" if zips else "use fetch_patches"
+        remedy = f"pass one of its zip files ({', '.join(zips)})" if zips else "download the course's patches"
         raise DatasetError(f"{name} {path} holds no PNG or JPEG patches; {remedy}")
     names = tuple(sorted(found, key=natural_key))
     return Listing(path, is_zip, names, tuple(found[each] for each in names))
@@ -228,7 +228,7 @@ def _decode_rows(listing: Listing, rows: range, out: NDArray[np.uint8], update: 
                 height, width = image.shape[:2]
                 raise DatasetError(
                     f"{where} is {width}x{height} pixels, expected {side}x{side}; "
-                    f"resize it with cv2.resize(image, ({side}, {side}))"
+                    f"resize it to {side}x{side} pixels"
                 )
             out[row] = image
             update()
@@ -328,7 +328,7 @@ def _fetch(target: Path, address: str, counts: dict[str, int], progress: bool) -
             f"folder {target.parent} cannot be created: {error.strerror}; choose another"
         ) from error
     _remove_stale_parts(target)
-    with atomic_write(target, "folder") as part:
+    with atomic_write(target) as part:
         _LOGGER.info("downloading %s", address)
         _download(address, part, progress)
         verify_archive(part, counts, shown=address)
@@ -363,11 +363,11 @@ def _download(address: str, part: Path, progress: bool) -> None:
             f"{address} returns {status}; pass the url of a folder with {' and '.join(ARCHIVES)}"
         ) from error
     except requests.exceptions.ChunkedEncodingError as error:
-        raise DatasetError(f"the download of {address} was cut off; call again to restart it") from error
+        raise DatasetError(f"{address} was cut off during the download; call again to restart it") from error
     except (requests.ConnectionError, requests.Timeout) as error:
         raise DatasetError(
             f"{address} cannot be reached ({type(error).__name__}); check the network and call again, "
-            "or download the file in a browser and pass its path to load_training_patches"
+            "or download the file in a browser"
         ) from error
     except requests.RequestException as error:
         raise DatasetError(f"{address} cannot be downloaded ({type(error).__name__}); check url") from error

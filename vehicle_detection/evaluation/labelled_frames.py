@@ -55,7 +55,7 @@ def check_frame_boxes(keys: Sequence[FrameKey], labels: object, name: str = "lab
         known = f"such as {labels.frame_keys[0]!r}" if labels.frame_keys else "but it is empty"
         raise InvalidInputError(
             f"{name} contain none of the frames, such as {keys[0]!r}, {known}; "
-            "convert the keys with FrameBoxes.renamed"
+            "use the same keys on both sides"
         )
     return labels
 

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import (
     Workspace,
-    check_image,
-    check_number,
     check_type,
     single_threaded_opencv,
 )
@@ -28,52 +24,27 @@ from vehicle_detection.mixture.features import (
 from vehicle_detection.mixture.model import TemplateMixture
 from vehicle_detection.mixture.template import MixtureTemplate, smallest_box
 from vehicle_detection.params import PyramidParams
-from vehicle_detection.search import FrameSearch, SearchResult
+from vehicle_detection.search import FrameSearch
 
 _MAX_WINDOWS = 2000
 
 
 class MixtureSearch(FrameSearch):
-    """The search of frames with a mixture of templates."""
+    """The search of frames with a mixture of templates.
+
+    Vehicles lie inside the frame; windows may extend beyond it. Sensor noise is removed first.
+    """
+
+    params_type = PyramidParams
 
     def __init__(self, model: TemplateMixture, *, n_jobs: int | None = None) -> None:
         check_type(model, "model", TemplateMixture, 'load_model("default") or train_mixture return one')
         super().__init__(n_jobs)
         self.model = model
 
-    def find(
-        self,
-        frame: NDArray[np.uint8],
-        params: PyramidParams | None = None,
-        *,
-        min_vehicle_score: float = 0.0,
-    ) -> SearchResult:
-        """Find the windows and the vehicles of a frame.
-
-        Parameters
-        ----------
-        frame
-            ``(H, W, 3)`` uint8 RGB; sensor noise is removed first.
-        params
-            Sizes and positions of the windows; by default those for any dash-cam.
-        min_vehicle_score
-            Minimum score of a vehicle, in log-odds above the model's threshold.
-
-        Returns
-        -------
-        SearchResult
-            Boxes in pixels of the frame. Vehicles lie inside it; windows may extend beyond it.
-
-        Raises
-        ------
-        InvalidInputError
-            If an argument is malformed. An image smaller than a template contains no vehicle.
-        """
-        start = time.perf_counter()
-        params = params if params is not None else PyramidParams()
-        check_type(params, "params", PyramidParams, "a mixture of templates is searched on a pyramid")
-        check_number(min_vehicle_score, "min_vehicle_score")
-        check_image(frame, "frame")
+    def _search(
+        self, frame: NDArray[np.uint8], params: PyramidParams, min_vehicle_score: float
+    ) -> tuple[Detections, Detections]:
         model = self.model
         with single_threaded_opencv():
             image = denoise(frame)
@@ -83,9 +54,7 @@ class MixtureSearch(FrameSearch):
             )
         scores = model.scores(found.margins)
         shown = scores >= params.min_score
-        windows = Detections(found.boxes[shown], scores[shown])
-        vehicles = Detections(boxes, model.scores(margins))
-        return SearchResult.of(frame, windows, vehicles, start=start)
+        return Detections(found.boxes[shown], scores[shown]), Detections(boxes, model.scores(margins))
 
     def score_windows(self, image: NDArray[np.uint8], params: PyramidParams) -> ScoredWindows:
         """Windows with their templates' margins, best first; weak ones are included because they vote.

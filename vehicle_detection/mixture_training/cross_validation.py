@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -37,6 +37,20 @@ Floats = NDArray[np.float64]
 # Smallest margin of an evaluated box, and the thresholds to choose from.
 _MIN_MARGIN = -1.0
 _THRESHOLDS = np.arange(-1.0, 1.5, 0.02)
+
+FOLD_COLUMNS = {
+    "f1": ("F1", 3),
+    "best_f1": ("best F1", 3),
+    "average_precision": ("AP", 3),
+    "precision": ("precision", 3),
+    "recall": ("recall", 3),
+    "mean_iou": ("mean IoU", 3),
+    "false_per_frame": ("false", 2),
+    "false_per_empty_frame": ("on empty", 2),
+    "region_f1": ("region F1", 3),
+    "region_average_precision": ("region AP", 3),
+}
+"""Columns of a table of `FoldScore`: titles and decimals."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -250,6 +264,14 @@ def fit_log_odds(folds: Sequence[FoldDetections]) -> tuple[float, float]:
     platt = calibrate_scores(margins, hits, prior=False)
     # Among few boxes the better ones may be false; a negative slope would reverse their order.
     return (-platt.a, -platt.b) if platt.a < 0 else (1.0, 0.0)
+
+
+def format_fold(values: Mapping[str, Any], *, missing: str = "") -> list[str]:
+    """Format the values of ``FoldScore.to_dict()`` as the cells of `FOLD_COLUMNS`."""
+    return [
+        f"{values[name]:.{decimals}f}" if name in values else missing
+        for name, (_, decimals) in FOLD_COLUMNS.items()
+    ]
 
 
 def training_metadata(

@@ -12,9 +12,6 @@ from vehicle_detection.evaluation import FrameBoxes, FrameKey, LabelledFrames
 from vehicle_detection.mixture_training.sources import FrameDataset
 from vehicle_detection.synthetic import Drive, render_drive
 
-DRAWN = "drawn"
-"""Name of the data set of synthetic frames."""
-
 # Options of `render_drive`; "truncated" chooses frames in which the border truncates a vehicle.
 _CASES: tuple[dict[str, Any], ...] = (
     {},
@@ -78,8 +75,8 @@ def drawn_source(*, drives: int = 2 * len(_CASES), frames: int = 2, random_state
         chosen = np.linspace(0, len(drive) - 1, n_frames + 2)[1:-1].astype(int).tolist()
         if case.get("truncated", False):
             chosen = [_closest_truncation(drive, index) for index in chosen]
-        parts.append(_labelled(f"{DRAWN} {number + 1}", drive, chosen))
-    return FrameDataset(DRAWN, tuple(parts))
+        parts.append(_labelled(f"drawn {number + 1}", drive, chosen))
+    return FrameDataset("drawn", tuple(parts))
 
 
 def _labelled(name: str, drive: Drive, chosen: list[int]) -> LabelledFrames:

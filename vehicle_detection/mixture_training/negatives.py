@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import single_threaded_opencv
-from vehicle_detection.boxes import box_areas, intersection_matrix, iou_matrix
+from vehicle_detection.boxes import box_areas, greedy_nms, intersection_matrix, iou_matrix
 from vehicle_detection.mixture import (
     FeatureMap,
     MixtureTemplate,
@@ -19,7 +19,6 @@ from vehicle_detection.mixture import (
     image_pyramid,
     mirror_channels,
     mostly_inside,
-    nms,
     pyramid_levels,
     smallest_box,
 )
@@ -178,7 +177,7 @@ def _select(frame: TrainingFrame, boxes: Floats, margins: Floats, max_count: int
     inside = np.flatnonzero(mostly_inside(boxes, frame.image.shape))
     rows = inside[is_negative(boxes[inside], frame)]
     rows = rows[np.argsort(-margins[rows], kind="stable")][: 20 * max_count]
-    kept = nms(boxes[rows], margins[rows], iou=_DUPLICATE_IOU, cover=np.inf, max_boxes=max_count)
+    kept = greedy_nms(boxes[rows], margins[rows], max_iou=_DUPLICATE_IOU, max_boxes=max_count)
     return [int(row) for row in rows[kept]]
 
 

@@ -111,17 +111,11 @@ def _join(parts: Sequence[Crops]) -> Crops:
 def _mirror(crops: Crops) -> Crops:
     """Features of the mirrored crops."""
     edges, colors = crops
-    count = len(edges)
-    channels = edges.reshape(count, N_CHANNELS, CROP_CELLS, CROP_CELLS).transpose(1, 0, 2, 3)
-    mirrored = mirror_channels(channels.reshape(N_CHANNELS, count * CROP_CELLS, CROP_CELLS))
-    mirrored = (
-        mirrored.reshape(N_CHANNELS, count, CROP_CELLS, CROP_CELLS)
-        .transpose(1, 0, 2, 3)
-        .reshape(count, N_EDGE_FEATURES)
-    )
-    return mirrored, colors.reshape(count, 3 * CROP_CELLS, CROP_CELLS)[:, :, ::-1].reshape(
-        count, N_COLOR_FEATURES
-    )
+    # All crops at once, one below the other.
+    channels = edges.reshape(-1, N_CHANNELS, CROP_CELLS, CROP_CELLS).swapaxes(0, 1)
+    mirrored = mirror_channels(channels.reshape(N_CHANNELS, -1, CROP_CELLS)).reshape(channels.shape)
+    mirrored_colors = colors.reshape(-1, 3 * CROP_CELLS, CROP_CELLS)[:, :, ::-1]
+    return mirrored.swapaxes(0, 1).reshape(edges.shape), mirrored_colors.reshape(colors.shape)
 
 
 def _fit_projection(rows: NDArray[np.float32], count: int, std: float, seed: int) -> Projection:

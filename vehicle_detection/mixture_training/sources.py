@@ -14,7 +14,6 @@ from vehicle_detection._common import check_number, check_type, describe
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation import LabelledFrames, read_labels
-from vehicle_detection.mixture import denoise
 from vehicle_detection.params import entries
 
 
@@ -152,6 +151,9 @@ class TrainingFrame:
 
 def load_training_frames(sources: Sequence[FrameDataset]) -> list[TrainingFrame]:
     """Load all frames of some data sets into memory."""
+    # Imported here, because mypy takes the name for a module if it is the only one imported at the top.
+    from vehicle_detection.mixture import denoise
+
     loaded = []
     for source in sources:
         for part in source.sets:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from vehicle_detection._common import check_choice, check_integer, check_number, describe
 from vehicle_detection.errors import InvalidInputError
@@ -154,7 +154,7 @@ class SearchParams:
         """
         presets = {"three-scales": _three_scales, "130-windows": _window_list, "default": _default_bands}
         check_choice(name, "preset", presets)
-        return cls(**presets[name]())
+        return presets[name]()
 
     def with_horizon(self, horizon: float | None) -> SearchParams:
         """Return the same parameters with another horizon; None keeps it."""
@@ -185,7 +185,7 @@ def _check_pair(value: object, name: str, *, low: float, high: float) -> None:
         check_number(number, f"{name}[{index}]", low=low, high=high)
 
 
-def _window_list() -> dict[str, Any]:
+def _window_list() -> SearchParams:
     rows = (
         ((96.0, 96.0), (395, 530), (0.9, 0.5)),
         ((110.0, 145.0), (380, 590), (0.7, 0.6)),
@@ -196,15 +196,15 @@ def _window_list() -> dict[str, Any]:
         SearchBand(window=window, y=(top - 400.0, bottom - 400.0), x=(650 / 1280, 1.0), overlap=overlap)
         for window, (top, bottom), overlap in rows
     )
-    return {"bands": bands, "horizon": 400 / 720, "min_score": 0.0}
+    return SearchParams(bands=bands, horizon=400 / 720)
 
 
-def _three_scales() -> dict[str, Any]:
+def _three_scales() -> SearchParams:
     bands = tuple(SearchBand(window=(64 * s, 64 * s), y=(0.0, 256.0)) for s in (1.5, 1.0, 0.8))
-    return {"bands": bands, "horizon": 400 / 720, "min_score": 0.0}
+    return SearchParams(bands=bands, horizon=400 / 720)
 
 
-def _default_bands() -> dict[str, Any]:
+def _default_bands() -> SearchParams:
     """Windows from 64 pixels up, in steps of 1.25, wherever a vehicle on a flat road may be.
 
     With the camera `c` meters above the road, the bottom of a vehicle whose face fills 0.84 of a window of
@@ -216,7 +216,7 @@ def _default_bands() -> dict[str, Any]:
     bands = tuple(
         SearchBand(window=(side, side), y=(-0.35 * side - margin, 0.95 * side + margin)) for side in sides
     )
-    return {"bands": bands, "horizon": 0.58, "min_score": 0.0, "horizontal_padding": 0.5}
+    return SearchParams(bands=bands, horizontal_padding=0.5)
 
 
 @dataclass(frozen=True, kw_only=True)

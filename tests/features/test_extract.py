@@ -6,64 +6,28 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sklearn.base import clone
-from sklearn.model_selection import GridSearchCV
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
-from sklearn.svm import LinearSVC
-from sklearn.utils import estimator_checks
-from sklearn.utils.estimator_checks import check_estimator
 
+from tests.features.cases import BLANK, PATCHES
 from vehicle_detection._kernels import bin_of_value, degree_bounds, orientation_cotangents, sqrt_gradients
 from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import (
-    PatchFeatures,
     bin_spatial,
     color_hist,
     convert_color,
     extract_features,
     get_hog_features,
-    hog_blocks,
     hog_image,
     single_img_features,
 )
+from vehicle_detection.features.extract import hog_blocks
 from vehicle_detection.images import decode_image, write_image
 from vehicle_detection.params import COLOR_SPACES, HOG_CHANNELS, FeatureParams
 from vehicle_detection.synthetic import render_patches
 
 PRESETS = sorted(FeatureParams.PRESETS)
-BLANK = np.zeros((64, 64, 3), np.uint8)
 # The kernels work in float32, the reference in float64; HOG values lie in 0-1.
 TOLERANCE = 1e-5
-
-
-def make_patches():
-    """Noise of several grains, flat patches, hard edges, ramps and blurred shapes: like and unlike photos."""
-    rng = np.random.default_rng(7)
-    noise = rng.integers(0, 256, (6, 64, 64, 3), dtype=np.uint8)
-    flat = [np.full((64, 64, 3), value, np.uint8) for value in (0, 255, (10, 200, 90))]
-    smooth = [cv2.GaussianBlur(patch, (0, 0), sigma) for patch, sigma in zip(noise, (1, 2, 4, 8))]
-    ramp = np.arange(64, dtype=np.uint8)
-    ramps = [
-        np.broadcast_to((ramp * 4)[:, None, None], (64, 64, 3)),
-        np.broadcast_to((255 - ramp * 4)[None, :, None], (64, 64, 3)),
-        # Both gradients are equal everywhere: 45 and 135 degrees, on the bounds of 4, 8 and 12 bins.
-        np.repeat((ramp[:, None] + ramp[None, :])[..., None], 3, axis=2),
-        np.repeat((ramp[:, None] + ramp[None, ::-1])[..., None], 3, axis=2),
-    ]
-    few_values = rng.choice(np.array([0, 1, 4, 9, 64, 255], np.uint8), (3, 64, 64, 3))
-    checks = np.kron(rng.integers(0, 2, (8, 8, 1)), np.ones((8, 8, 3))).astype(np.uint8) * 255
-    drawn = np.full((64, 64, 3), 120, np.uint8)
-    cv2.rectangle(drawn, (8, 20), (56, 50), (180, 20, 30), -1)
-    cv2.circle(drawn, (18, 50), 7, (15, 15, 15), -1)
-    cv2.circle(drawn, (46, 50), 7, (15, 15, 15), -1)
-    cv2.line(drawn, (12, 20), (24, 8), (230, 230, 240), 2, cv2.LINE_AA)
-    photo = np.clip(smooth[2].astype(int) // 2 + rng.normal(60, 6, (64, 64, 3)), 0, 255).astype(np.uint8)
-    return np.stack([*noise[4:], *flat, *smooth, *ramps, *few_values, checks, drawn, photo])
-
-
-PATCHES = make_patches()
 
 
 def assert_equals_the_reference(patches, params):
@@ -214,7 +178,7 @@ def reference_bins(gx, gy, orient):
 
 
 @pytest.mark.parametrize("orient", [1, 2, 3, 4, 5, 6, 8, 9, 12, 16, 18, 36, 180])
-def test_every_uint8_gradient_falls_into_the_references_bin(orient):
+def test_bins_of_all_uint8_gradients_equal_the_reference(orient):
     # The comparison of `_hog_kernels.hog_cells`, operation by operation.
     _, gx, gy = all_gradients()
     some = (gx != 0) | (gy != 0)
@@ -228,14 +192,14 @@ def test_every_uint8_gradient_falls_into_the_references_bin(orient):
     for k in range(1, orient):
         past = quotient <= cotangents[k]
         found[past] = k
-        # The kernel's sums are cumulative: what is past a bound is past those before it as well.
+        # The kernel adds cumulatively: a gradient past a bound is past all lower bounds.
         assert not (past & (expected < k)).any()
     wrong = found != expected
     assert not wrong.any(), list(zip(gx[wrong], gy[wrong]))[:5]
 
 
 @pytest.mark.parametrize("orient", [4, 6, 8, 9, 12])
-def test_the_kernel_puts_every_uint8_gradient_into_the_references_bin(orient):
+def test_the_kernel_bins_all_uint8_gradients_like_the_reference(orient):
     image, gx, gy = all_gradients()
     expected = reference_bins(gx, gy, orient)
     length = np.hypot(gx, gy)
@@ -252,11 +216,11 @@ def test_the_kernel_puts_every_uint8_gradient_into_the_references_bin(orient):
         assert ((middles != 0).sum(axis=0) == filled).all()
 
 
-def test_reference_bins_are_those_of_scikit_image():
+def test_reference_bins_equal_scikit_image():
     rng = np.random.default_rng(0)
     channel = rng.choice(np.array([0, 10, 20, 200], np.uint8), (66, 66))
     for orient in (4, 9, 12):
-        # A block of one cell is normalized on its own: which bins are filled is all that is left.
+        # Blocks of one cell are normalized separately, so only test which bins are filled.
         found = hog_blocks(channel, orient, 2, 1)[:, :, 0, 0] > 0
         values = channel.astype(int)
         gx, gy = np.zeros_like(values), np.zeros_like(values)
@@ -269,7 +233,7 @@ def test_reference_bins_are_those_of_scikit_image():
 
 
 @given(st.integers(1, 256))
-def test_bin_of_value_is_that_of_numpy(bins):
+def test_histogram_bins_equal_numpy(bins):
     values = np.arange(256)
     expected = [int(np.histogram([value], bins=bins, range=(0, 256))[0].argmax()) for value in values[::5]]
     assert bin_of_value(bins)[::5].tolist() == expected
@@ -290,7 +254,7 @@ def test_sqrt_gradients_are_zero_at_the_border():
 @pytest.mark.parametrize("preset", ["luv-2384", "ycrcb-6156"])
 def test_threads_do_not_change_the_features(preset):
     params = FeatureParams.preset(preset)
-    # More than two of the chunks that threads take.
+    # More than two batches.
     patches = np.random.default_rng(3).integers(0, 256, (600, 64, 64, 3), dtype=np.uint8)
     one = extract_features(patches, params, n_jobs=1)
     for n_jobs in (2, 3):
@@ -298,7 +262,7 @@ def test_threads_do_not_change_the_features(preset):
     np.testing.assert_array_equal(extract_features(patches[590:], params), one[590:])
 
 
-def test_array_list_generator_and_paths_give_the_same(tmp_path):
+def test_all_kinds_of_sources_give_the_same_features(tmp_path):
     patches = PATCHES[:5]
     expected = extract_features(patches)
     paths = [tmp_path / f"{index}.png" for index in range(5)]
@@ -320,12 +284,12 @@ def test_array_list_generator_and_paths_give_the_same(tmp_path):
 
 
 @pytest.mark.parametrize("empty", [[], np.empty((0, 64, 64, 3), np.uint8), iter(())])
-def test_no_patches_have_no_features(empty):
+def test_no_patches(empty):
     assert extract_features(empty).shape == (0, 6156)
 
 
 def test_png_and_jpeg_have_the_same_range(tmp_path):
-    # matplotlib's imread gives 0-1 for PNG and 0-255 for JPEG: the classic trap.
+    # Unlike matplotlib's imread, which scales PNG to 0-1 and JPEG to 0-255.
     patch = cv2.GaussianBlur(PATCHES[0], (0, 0), 6)
     write_image(tmp_path / "a.png", patch)
     write_image(tmp_path / "a.jpg", patch)
@@ -336,7 +300,7 @@ def test_png_and_jpeg_have_the_same_range(tmp_path):
     assert np.abs(png - jpg).mean() < 3
 
 
-def test_extracting_changes_nothing(capsys):
+def test_extraction_does_not_change_its_input(capsys):
     before = PATCHES.copy()
     extract_features(PATCHES)
     single_img_features(PATCHES[0])
@@ -366,18 +330,18 @@ def test_progress_goes_to_standard_error(capsys):
         (["missing.png"], "image file missing.png does not exist"),
     ],
 )
-def test_extract_features_refuses(source, message):
+def test_invalid_sources(source, message):
     with pytest.raises(InvalidInputError, match=message):
         extract_features(source)
 
 
-def test_a_file_of_another_size_is_refused(tmp_path):
+def test_a_file_of_another_size(tmp_path):
     write_image(tmp_path / "a.png", BLANK[:32])
     with pytest.raises(InvalidInputError, match=r"source\[0\] must be 64x64 pixels, got 64x32"):
         extract_features([tmp_path / "a.png"])
 
 
-def test_single_img_features_refuses():
+def test_invalid_arguments_of_single_img_features():
     with pytest.raises(InvalidInputError, match=r"image\[0\] must be 64x64 pixels, got 64x32"):
         single_img_features(BLANK[:32])
     with pytest.raises(InvalidInputError, match=r"image\[0\] must be an \(H, W, 3\)"):
@@ -385,13 +349,13 @@ def test_single_img_features_refuses():
 
 
 @pytest.mark.parametrize("params", ["luv-2384", {"orient": 9}, FeatureParams, 5, False])
-def test_parameters_of_another_kind_are_refused(params):
+def test_invalid_params(params):
     for extract in (lambda: extract_features(PATCHES, params), lambda: single_img_features(BLANK, params)):
         with pytest.raises(InvalidInputError, match=r"params must be a FeatureParams, got .*; pass Feature"):
             extract()
 
 
-def test_the_vector_is_spatial_then_histogram_then_hog():
+def test_the_order_of_the_features():
     params = FeatureParams(color_space="RGB", spatial_size=8, hist_bins=4, orient=6, hog_channel=1)
     patch = PATCHES[-1]
     vector = single_img_features(patch, params)
@@ -400,7 +364,7 @@ def test_the_vector_is_spatial_then_histogram_then_hog():
     np.testing.assert_array_equal(vector[204:], get_hog_features(patch[..., 1], 6))
 
 
-def test_the_coarse_hog_is_that_of_larger_cells():
+def test_the_coarse_hog_equals_hog_of_larger_cells():
     fine = FeatureParams(hog_channel=0, orient=8)
     params = dataclasses.replace(fine, coarse_hog=True)
     patch = PATCHES[-1]
@@ -411,45 +375,13 @@ def test_the_coarse_hog_is_that_of_larger_cells():
         np.testing.assert_allclose(vector[fine.length :], coarse, atol=TOLERANCE)
 
 
-def test_roots_of_the_histogram():
+def test_square_roots_of_the_histogram():
     plain = FeatureParams(spatial_feat=False, hog_feat=False)
     counts = extract_features(PATCHES, plain)
     roots = extract_features(PATCHES, dataclasses.replace(plain, hist_sqrt=True))
     np.testing.assert_allclose(roots**2, counts, rtol=1e-6)
-    # Every patch has as many pixels: the roots of a channel's counts have one length.
+    # The counts of a channel sum to the number of pixels.
     np.testing.assert_allclose((roots**2).sum(axis=1), 3 * 64 * 64, rtol=1e-6)
-
-
-@pytest.mark.parametrize("color_space", COLOR_SPACES)
-def test_convert_color(color_space):
-    patch = PATCHES[0]
-    before = patch.copy()
-    converted = convert_color(patch, color_space)
-    assert converted.shape == patch.shape
-    assert converted.dtype == np.uint8
-    assert not np.shares_memory(converted, patch)
-    np.testing.assert_array_equal(convert_color(patch, f"RGB2{color_space}"), converted)
-    out = np.empty_like(patch)
-    assert np.shares_memory(convert_color(patch, color_space, out=out), out)
-    np.testing.assert_array_equal(out, converted)
-    np.testing.assert_array_equal(patch, before)
-    # A part of an image, and one that is turned, converts as the whole does.
-    np.testing.assert_array_equal(convert_color(patch[8:40, ::-2], color_space), converted[8:40, ::-2])
-
-
-def test_convert_color_knows_what_red_is():
-    red = np.full((1, 1, 3), (255, 0, 0), np.uint8)
-    assert convert_color(red, "HSV")[0, 0].tolist() == [0, 255, 255]
-    assert convert_color(red, "HLS")[0, 0].tolist() == [0, 128, 255]
-    assert convert_color(red, "YCrCb")[0, 0].tolist() == [76, 255, 85]
-    assert convert_color(red, "RGB")[0, 0].tolist() == [255, 0, 0]
-
-
-def test_convert_color_refuses():
-    with pytest.raises(InvalidInputError, match=r"color_space must be one of 'RGB', .*; got 'BGR'"):
-        convert_color(BLANK, "BGR")
-    with pytest.raises(InvalidInputError, match="image must be an"):
-        convert_color(BLANK / 255)
 
 
 @pytest.mark.parametrize(
@@ -464,7 +396,7 @@ def test_the_shape_of_hog(height, width, orient, cell, block):
     assert get_hog_features(channel, orient, cell, block).shape == (rows * columns * block * block * orient,)
 
 
-def test_hog_is_a_share_and_ignores_contrast_and_brightness():
+def test_hog_ignores_contrast_and_brightness():
     channel = cv2.GaussianBlur(PATCHES[0][..., 0] // 3, (0, 0), 2)
     values = get_hog_features(channel)
     assert ((values >= 0) & (values <= 1)).all()
@@ -482,7 +414,7 @@ def test_one_edge_fills_one_orientation():
     assert horizontal.argmax() == 4
 
 
-def test_hog_of_nothing_is_nothing():
+def test_hog_of_a_uniform_image_is_zero():
     assert not get_hog_features(BLANK[..., 0]).any()
     assert not extract_features([BLANK], FeatureParams(spatial_feat=False, hist_feat=False)).any()
 
@@ -495,23 +427,23 @@ def test_hog_of_nothing_is_nothing():
         ({"img": BLANK[..., 0] / 255}, r"img must be one \(H, W\) uint8 channel"),
         ({"orient": 0}, "orient must be an integer at least 1"),
         ({"pix_per_cell": 0}, "pix_per_cell must be an integer at least 1"),
-        ({"pix_per_cell": 65}, "img must be at least one block large"),
+        ({"pix_per_cell": 65}, "img must have at least the size of a block"),
     ],
 )
-def test_hog_refuses(function, arguments, message):
+def test_invalid_arguments_of_hog(function, arguments, message):
     with pytest.raises(InvalidInputError, match=message):
         function(**{"img": BLANK[..., 0], **arguments})
 
 
-def test_the_exact_size_that_hog_takes():
+def test_the_smallest_image_for_hog():
     assert get_hog_features(np.zeros((24, 24), np.uint8), 9, 8, 3).shape == (81,)
-    with pytest.raises(InvalidInputError, match=r"at least one block large \(24x24 pixels\); got 24x23"):
+    with pytest.raises(InvalidInputError, match=r"at least the size of a block \(24x24 pixels\); got 24x23"):
         get_hog_features(np.zeros((23, 24), np.uint8), 9, 8, 3)
     with pytest.raises(InvalidInputError, match="cell_per_block must be an integer at least 1"):
         hog_blocks(BLANK[..., 0], 9, 8, 0)
 
 
-def test_hog_picture_draws_where_edges_are():
+def test_hog_image_shows_edges():
     channel = np.zeros((64, 64), np.uint8)
     channel[:, 20:] = 200
     picture = hog_image(channel)
@@ -520,7 +452,7 @@ def test_hog_picture_draws_where_edges_are():
     assert picture[:, 40:].sum() == 0
 
 
-def test_bin_spatial_goes_channel_by_channel():
+def test_bin_spatial_is_ordered_by_channel():
     image = np.zeros((64, 64, 3), np.uint8)
     image[..., 1] = 7
     assert bin_spatial(image, 2).tolist() == [0] * 4 + [7] * 4 + [0] * 4
@@ -531,12 +463,12 @@ def test_bin_spatial_goes_channel_by_channel():
 
 
 @pytest.mark.parametrize("size", [0, (32, 0), (1, 2, 3), 1.5, "32", None])
-def test_bin_spatial_refuses_a_size(size):
+def test_invalid_size_of_bin_spatial(size):
     with pytest.raises(InvalidInputError, match="size must be"):
         bin_spatial(PATCHES[0], size)
 
 
-def test_color_hist_counts_every_pixel():
+def test_color_hist_counts_all_pixels():
     counts = color_hist(PATCHES[0], 10)
     assert counts.shape == (30,)
     assert counts.dtype.kind == "i"
@@ -547,72 +479,3 @@ def test_color_hist_counts_every_pixel():
         color_hist(image, 0)
     with pytest.raises(InvalidInputError, match="img must be an"):
         color_hist(image / 255)
-
-
-def test_the_transformer_is_extract_features():
-    transformer = PatchFeatures(color_space="LUV", orient=6, n_jobs=1)
-    params = FeatureParams(color_space="LUV", orient=6)
-    assert transformer.to_params() == params
-    expected = extract_features(PATCHES, params)
-    np.testing.assert_array_equal(transformer.transform(PATCHES), expected)
-    np.testing.assert_array_equal(transformer.fit_transform(list(PATCHES)), expected)
-    assert transformer.fit(PATCHES) is transformer
-
-
-def test_the_transformer_has_the_arguments_and_defaults_of_the_parameters():
-    arguments = PatchFeatures().get_params()
-    assert arguments.pop("n_jobs") is None
-    assert arguments == dataclasses.asdict(FeatureParams())
-
-
-def test_the_transformer_can_be_cloned_and_set():
-    transformer = PatchFeatures(orient=6)
-    copy = clone(transformer)
-    assert copy is not transformer
-    assert copy.get_params() == transformer.get_params()
-    assert copy.set_params(orient=7).to_params().orient == 7
-
-
-def test_the_transformer_checks_when_it_is_fitted():
-    transformer = PatchFeatures(color_space="BGR")
-    with pytest.raises(InvalidInputError, match="color_space must be one of"):
-        transformer.fit(PATCHES)
-    with pytest.raises(InvalidInputError, match="source must be an"):
-        PatchFeatures().fit_transform(PATCHES / 255)
-
-
-def test_the_transformer_names_its_features():
-    transformer = PatchFeatures(spatial_size=2, hist_bins=2, orient=4, pix_per_cell=32, hog_channel=0)
-    names = transformer.get_feature_names_out()
-    assert len(names) == transformer.to_params().length
-    assert names[0] == "spatial0"
-    assert names[12] == "hist0"
-    assert names[-1] == "hog15"
-
-
-@pytest.mark.filterwarnings("ignore:Can't test estimator:sklearn.exceptions.SkipTestWarning")
-def test_the_transformer_is_an_estimator():
-    # scikit-learn feeds tables of numbers to most of its checks; those that need none remain.
-    check_estimator(PatchFeatures())
-    for check in (
-        estimator_checks.check_parameters_default_constructible,
-        estimator_checks.check_no_attributes_set_in_init,
-        estimator_checks.check_get_params_invariance,
-        estimator_checks.check_set_params,
-    ):
-        check("PatchFeatures", PatchFeatures())
-
-
-def test_the_transformer_in_a_grid_search():
-    patches = np.concatenate([PATCHES[:4]] * 2 + [PATCHES[5:9]] * 2)
-    labels = np.repeat([1, 0], 8)
-    pipeline = make_pipeline(
-        PatchFeatures(spatial_size=8, hist_bins=8, n_jobs=1),
-        StandardScaler(),
-        LinearSVC(C=1e-3, random_state=0),
-    )
-    grid = {"patchfeatures__orient": [4, 6], "patchfeatures__hog_channel": [0, "GRAY"]}
-    search = GridSearchCV(pipeline, grid, cv=2, error_score="raise").fit(patches, labels)
-    assert len(search.cv_results_["params"]) == 4
-    assert search.predict(patches).shape == (16,)
-    assert search.best_estimator_.score(patches, labels) > 0.9

@@ -1,0 +1,271 @@
+import http.server
+import io
+import os
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.datasets.cases import OTHERS, VEHICLES, png, write_zip
+from vehicle_detection.datasets import archives, fetch_patches, load_training_patches
+from vehicle_detection.errors import DatasetError, InvalidInputError
+
+# Natural order
+
+
+@given(st.lists(st.integers(0, 10**30), min_size=1))
+def test_natural_order_is_the_order_of_the_numbers(numbers):
+    names = [f"vehicles/GTI/image{number}.png" for number in numbers]
+    ordered = sorted(names, key=archives.natural_key)
+    assert ordered == [f"vehicles/GTI/image{number}.png" for number in sorted(numbers)]
+
+
+@given(st.lists(st.text("a01/9-", max_size=6), unique=True))
+def test_natural_order_is_total(names):
+    backwards = names[::-1]
+    assert sorted(names, key=archives.natural_key) == sorted(backwards, key=archives.natural_key)
+
+
+# Downloads from a local server
+
+
+class Handler(http.server.BaseHTTPRequestHandler):
+    def do_GET(self):
+        self.server.requests.append(self.path)
+        answer = self.server.answers.get(self.path)
+        if answer is None:
+            self.send_error(404)
+            return
+        body, length = answer
+        self.send_response(200)
+        self.send_header("Content-Length", str(length))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *args):
+        pass
+
+
+class Server(http.server.ThreadingHTTPServer):
+    """Answers each path of `answers` with a body and the length that it claims to have."""
+
+    def __init__(self):
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.answers, self.requests = {}, []
+        self.url = f"http://127.0.0.1:{self.server_port}/data"
+
+    def put(self, name, body, length=None):
+        self.answers[f"/data/{name}"] = (body, len(body) if length is None else length)
+
+
+def zip_bytes(members):
+    buffer = io.BytesIO()
+    write_zip(buffer, members)
+    return buffer.getvalue()
+
+
+@pytest.fixture
+def server(monkeypatch):
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    counts = {
+        "vehicles.zip": {"vehicles/GTI_Far": 2, "vehicles/KITTI_extracted": 1},
+        "non-vehicles.zip": {"non-vehicles/Extras": 1, "non-vehicles/GTI": 1},
+    }
+    monkeypatch.setattr(archives, "ARCHIVES", counts)
+    with Server() as running:
+        running.put("vehicles.zip", zip_bytes(VEHICLES))
+        running.put("non-vehicles.zip", zip_bytes(OTHERS))
+        thread = threading.Thread(target=running.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        yield running
+        running.shutdown()
+        thread.join()
+
+
+def test_both_archives_arearchivesed_once(server, tmp_path, capsys):
+    folder = tmp_path / "new" / "cache"
+    paths = fetch_patches(folder, url=server.url, progress=False)
+    assert paths == (folder / "vehicles.zip", folder / "non-vehicles.zip")
+    assert load_training_patches(*paths).counts() == {
+        "Extras": 1,
+        "GTI": 1,
+        "GTI_Far": 2,
+        "KITTI_extracted": 1,
+    }
+    assert sorted(os.listdir(folder)) == ["non-vehicles.zip", "vehicles.zip"]
+    assert server.requests == ["/data/vehicles.zip", "/data/non-vehicles.zip"]
+    assert fetch_patches(folder, url=f"{server.url}/", progress=False) == paths
+    assert len(server.requests) == 2
+    captured = capsys.readouterr()
+    assert captured.out == captured.err == ""
+
+
+def test_a_damaged_existing_archive_isarchivesed_again(server, tmp_path, caplog):
+    (tmp_path / "vehicles.zip").write_bytes(zip_bytes(VEHICLES).replace(b"IDAT", b"iDAT"))
+    fetch_patches(tmp_path, url=server.url, progress=False)
+    assert (tmp_path / "vehicles.zip").read_bytes() == zip_bytes(VEHICLES)
+    assert "is damaged at 'vehicles/GTI_Far/image10.png'" in caplog.text
+
+
+def test_the_default_folder_is_the_user_cache(server, tmp_path, monkeypatch):
+    monkeypatch.setattr("pooch.os_cache", lambda project: tmp_path / project)
+    vehicles, _ = fetch_patches(url=server.url, progress=False)
+    assert vehicles == tmp_path / "vehicle_detection" / "vehicles.zip"
+
+
+def test_a_progress_bar_is_shown(server, tmp_path, capsys):
+    fetch_patches(tmp_path, url=server.url)
+    assert "100%" in capsys.readouterr().err
+
+
+def replaced(members, old, new):
+    return {new if name == old else name: data for name, data in members.items()}
+
+
+BROKEN = {
+    "cut": (zip_bytes(OTHERS)[:-300], len(zip_bytes(OTHERS)), "was cut off during the download; call again"),
+    "short": (zip_bytes(OTHERS)[:-300], None, "is a damaged or incomplete zip; download it again"),
+    "page": (b"\n<!DOCTYPE html><html>sign in</html>", None, "is a web page, not a zip"),
+    "text": (b"out of order", None, "is not a zip"),
+    "empty": (b"", None, "is not a zip"),
+    "wrong member": (
+        zip_bytes({**OTHERS, "non-vehicles/GTI/setup.exe": b"MZ"}),
+        None,
+        "holds 'non-vehicles/GTI/setup.exe', which is not a patch of the course; pass the url",
+    ),
+    "wrong folder": (
+        zip_bytes({**OTHERS, "vehicles/GTI_Far/1.png": png(1)}),
+        None,
+        "holds 'vehicles/GTI_Far/1.png', which is not a patch",
+    ),
+    "parent": (zip_bytes({**OTHERS, "../evil.png": b""}), None, "holds the unsafe member '../evil.png'"),
+    "hidden parent": (
+        zip_bytes({**OTHERS, "non-vehicles/../../.bashrc": b""}),
+        None,
+        r"holds the unsafe member 'non-vehicles/../../.bashrc'",
+    ),
+    "windows parent": (zip_bytes({**OTHERS, "..\\evil.png": b""}), None, "holds the unsafe member"),
+    "absolute": (zip_bytes({**OTHERS, "/etc/evil.png": b""}), None, "holds the unsafe member '/etc/evil"),
+    "drive": (zip_bytes({**OTHERS, "C:/evil.png": b""}), None, "holds the unsafe member 'C:/evil.png'"),
+    "too few": (
+        zip_bytes({"non-vehicles/GTI/image1.png": png(1)}),
+        None,
+        "holds 0 patches in non-vehicles/Extras, expected 1",
+    ),
+    "too many": (
+        zip_bytes({**OTHERS, "non-vehicles/GTI/image2.png": png(1)}),
+        None,
+        "holds 2 patches in non-vehicles/GTI, expected 1",
+    ),
+    "damaged": (
+        zip_bytes(OTHERS).replace(b"IDAT", b"iDAT"),
+        None,
+        "is damaged at 'non-vehicles/Extras/extra1.png'; download it again",
+    ),
+    "missing": (None, None, "non-vehicles.zip returns 404; pass the url of a folder with"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+@pytest.mark.parametrize("earlier", [False, True])
+def test_a_failedarchives_changes_no_file(server, tmp_path, case, earlier, caplog):
+    body, length, message = BROKEN[case]
+    if earlier:
+        (tmp_path / "non-vehicles.zip").write_bytes(b"an earlier file")
+    if body is None:
+        del server.answers["/data/non-vehicles.zip"]
+    else:
+        server.put("non-vehicles.zip", body, length)
+    with pytest.raises(DatasetError, match=message) as caught:
+        fetch_patches(tmp_path, url=server.url, progress=False)
+    assert str(caught.value).startswith(f"{server.url}/non-vehicles.zip ")
+    assert "\n" not in str(caught.value)
+    assert sorted(os.listdir(tmp_path)) == ["non-vehicles.zip", "vehicles.zip"][not earlier :]
+    if earlier:
+        assert (tmp_path / "non-vehicles.zip").read_bytes() == b"an earlier file"
+        assert "the existing file is not the archive" in caplog.text
+
+    server.put("non-vehicles.zip", zip_bytes(OTHERS))
+    vehicles, others = fetch_patches(tmp_path, url=server.url, progress=False)
+    assert len(load_training_patches(vehicles, others)) == 5
+    assert server.requests.count("/data/vehicles.zip") == 1
+
+
+def test_an_unreachable_server(server, tmp_path):
+    with http.server.HTTPServer(("127.0.0.1", 0), Handler) as closed:
+        url = f"http://127.0.0.1:{closed.server_port}"
+    with pytest.raises(
+        DatasetError, match=r"vehicles.zip cannot be reached \(ConnectionError\); check the network"
+    ):
+        fetch_patches(tmp_path, url=url, progress=False)
+    assert os.listdir(tmp_path) == []
+
+
+def test_an_invalid_address(tmp_path):
+    with pytest.raises(InvalidInputError, match=r"url must start with http:// or https://; got 'data'"):
+        fetch_patches(tmp_path, url="data")
+    with pytest.raises(DatasetError, match=r"cannot be downloaded \(InvalidURL\); check url"):
+        fetch_patches(tmp_path, url="http://", progress=False)
+
+
+def test_the_folder_must_be_writable(server, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InvalidInputError, match=r"folder .*file cannot be created: .*choose another"):
+        fetch_patches(tmp_path / "file", url=server.url, progress=False)
+    assert server.requests == []
+    monkeypatch.setattr(os, "access", lambda *args: False)
+    with pytest.raises(
+        InvalidInputError, match=r"target needs a writable folder, .* is read-only; choose another"
+    ):
+        fetch_patches(tmp_path, url=server.url, progress=False)
+    assert server.requests == []
+
+
+def test_verified_archives_in_a_read_only_folder_are_used(server, tmp_path, monkeypatch):
+    fetch_patches(tmp_path, url=server.url, progress=False)
+    monkeypatch.setattr(os, "access", lambda *args: False)
+    fetch_patches(tmp_path, url=server.url, progress=False)
+    assert len(server.requests) == 2
+
+
+def test_a_full_disk(server, tmp_path, monkeypatch):
+    def full(*args):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pooch.HTTPDownloader.__call__", full)
+    with pytest.raises(
+        DatasetError, match=r"cannot be stored in .*: No space left on device; free some space"
+    ):
+        fetch_patches(tmp_path, url=server.url, progress=False)
+    assert os.listdir(tmp_path) == []
+
+
+def test_partial_files_of_killedarchivess_are_removed(server, tmp_path):
+    stale, running = tmp_path / ".vehicles.old.zip", tmp_path / ".vehicles.new.zip"
+    for part in (stale, running):
+        part.write_bytes(b"PK")
+    past = time.time() - 2 * archives.STALE_SECONDS
+    os.utime(stale, (past, past))
+    fetch_patches(tmp_path, url=server.url, progress=False)
+    assert not stale.exists()
+    assert running.exists()
+
+
+def test_an_interrupt_removes_the_partial_file(server, tmp_path, monkeypatch):
+    def interrupt(self, address, file, pooch):
+        Path(file).write_bytes(b"PK")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pooch.HTTPDownloader.__call__", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        fetch_patches(tmp_path, url=server.url, progress=False)
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.realdata
+def test_the_real_archives_verify_without_a_request(real_data):
+    paths = fetch_patches(real_data, url="http://127.0.0.1:1")
+    assert paths == (real_data / "vehicles.zip", real_data / "non-vehicles.zip")

@@ -1,0 +1,321 @@
+import io
+import os
+import re
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.datasets.cases import IN_ORDER, VEHICLES, make_set, patch_image, png, unpack, write_zip
+from vehicle_detection.datasets import PatchSet, archives, load_patches, load_training_patches
+from vehicle_detection.errors import DatasetError, InvalidInputError
+from vehicle_detection.images import write_image
+
+# PatchSet
+
+
+def test_attributes_have_fixed_types():
+    patches = make_set(["a/x/1.png", "a/y/2.png"], [0, 1])
+    assert patches.labels.dtype == np.bool_
+    assert patches.names == ("a/x/1.png", "a/y/2.png")
+    assert patches.sources.tolist() == ["x", "y"]
+    assert len(patches) == 2
+    assert patches.balance == 0.5
+    assert repr(patches) == "PatchSet(2 patches of 1x1 pixels: 1 vehicles, 1 non-vehicles)"
+
+
+def test_a_notebook_shows_the_counts_as_a_table():
+    html = make_set(["a/x/1.png", "a/y10/2.png", "a/y9/2.png"], [0, 1, 1])._repr_html_()
+    cells = re.findall(r"<t[hd]>(.*?)</t[hd]>", html)
+    header, rows = cells[:4], np.reshape(cells[4:], (4, 4)).tolist()
+    assert header == ["", "vehicles", "non-vehicles", "total"]
+    assert rows == [["x", *"011"], ["y9", *"101"], ["y10", *"101"], ["total", *"213"]]
+    assert "total" in make_set(["a.png"])[[]]._repr_html_()
+
+
+def test_counts_are_in_natural_order():
+    patches = make_set(["a/GTI10/1.png", "a/GTI9/1.png", "b/GTI9/1.png", "alone.png"])
+    assert list(patches.counts().items()) == [("", 1), ("GTI9", 2), ("GTI10", 1)]
+
+
+@pytest.mark.parametrize("rows", [[2, 0], np.array([True, False, True]), slice(None, None, -1), []])
+def test_selecting_rows(rows):
+    patches = PatchSet(np.stack([patch_image(i) for i in range(3)]), [1, 0, 1], ["0.png", "1.png", "2.png"])
+    taken = patches[rows]
+    expected = np.arange(3)[rows]
+    assert taken.names == tuple(f"{row}.png" for row in expected)
+    np.testing.assert_array_equal(taken.patches, patches.patches[expected])
+    np.testing.assert_array_equal(taken.labels, patches.labels[expected])
+
+
+def test_a_single_row_is_rejected():
+    with pytest.raises(InvalidInputError, match=r"rows must be a slice.*got 0.*patches\[index\]"):
+        make_set(["a.png"])[0]
+
+
+@pytest.mark.parametrize(
+    ("patches", "labels", "names", "message"),
+    [
+        (np.zeros((2, 4, 4, 3)), [1, 1], ["a", "b"], r"patches must be an \(N, 4, 4, 3\) uint8.*float64"),
+        (np.zeros((2, 4, 5, 3), np.uint8), [1, 1], ["a", "b"], r"patches must be .*\(2, 4, 5, 3\)"),
+        ("a.png", [1], ["a"], "patches must be an .*load_patches"),
+        (np.zeros((2, 4, 4, 3), np.uint8), [1], ["a", "b"], "labels must hold one entry .* 2 patches, got 1"),
+        (np.zeros((2, 4, 4, 3), np.uint8), [1, 1], ["a"], "names must hold one entry .* 2 patches, got 1"),
+        (np.zeros((2, 4, 4, 3), np.uint8), [1, -1], ["a", "b"], "labels must be .*labels > 0"),
+        (np.zeros((2, 4, 4, 3), np.uint8), [1.0, 0.5], ["a", "b"], "labels must be one boolean"),
+        (np.zeros((2, 4, 4, 3), np.uint8), [1, 1], ["a", Path("b")], "names must be strings"),
+    ],
+)
+def test_invalid_attributes(patches, labels, names, message):
+    with pytest.raises(InvalidInputError, match=message):
+        PatchSet(patches, labels, names)
+
+
+def test_an_empty_set_has_no_balance():
+    empty = make_set(["a.png"])[[]]
+    assert len(empty) == 0
+    assert np.isnan(empty.balance)
+    assert empty.counts() == {}
+
+
+@given(st.data())
+def test_concatenating_the_parts_gives_the_whole(data):
+    count = data.draw(st.integers(1, 8))
+    patches = PatchSet(
+        np.arange(count * 3, dtype=np.uint8).reshape(count, 1, 1, 3),
+        data.draw(st.lists(st.booleans(), min_size=count, max_size=count)),
+        [f"a/{index}.png" for index in range(count)],
+    )
+    cut = data.draw(st.integers(0, count))
+    whole = PatchSet.concatenate([patches[:cut], patches[cut:]])
+    assert whole.names == patches.names
+    np.testing.assert_array_equal(whole.patches, patches.patches)
+    np.testing.assert_array_equal(whole.labels, patches.labels)
+    order = data.draw(st.permutations(range(count)))
+    assert patches[order].fingerprint == patches.fingerprint
+
+
+def test_sets_of_different_patch_sizes_do_not_concatenate():
+    with pytest.raises(InvalidInputError, match=r"of the same patch size; got \[\(1, 1, 3\), \(2, 2, 3\)\]"):
+        PatchSet.concatenate([make_set(["a"]), make_set(["b"], side=2)])
+    with pytest.raises(InvalidInputError, match=r"sets must be one or more"):
+        PatchSet.concatenate([])
+
+
+def test_the_fingerprint_depends_on_names_labels_and_pixels():
+    patches = make_set(["a", "b"], [0, 1])
+    changed = patches.patches.copy()
+    changed[0, 0, 0, 0] = 1
+    others = [
+        PatchSet(changed, patches.labels, patches.names),
+        PatchSet(patches.patches, [1, 1], patches.names),
+        PatchSet(patches.patches, patches.labels, ["a", "c"]),
+    ]
+    assert len({patches.fingerprint, *(other.fingerprint for other in others)}) == 4
+    assert len(patches.fingerprint) == 64
+
+
+# Loading
+
+
+def test_a_zip_and_the_folder_it_unpacks_to_are_the_same_set(vehicles_zip, tmp_path):
+    from_zip = load_patches(vehicles_zip)
+    from_folder = load_patches(unpack(vehicles_zip, tmp_path / "out") / "vehicles")
+    assert from_zip.names == from_folder.names == IN_ORDER
+    np.testing.assert_array_equal(from_zip.patches, np.stack([patch_image(seed) for seed in (9, 10, 1)]))
+    np.testing.assert_array_equal(from_zip.patches, from_folder.patches)
+    assert from_zip.labels.all()
+    assert from_zip.fingerprint == from_folder.fingerprint
+
+
+def test_the_order_in_the_zip_does_not_matter(vehicles_zip, tmp_path):
+    backwards = write_zip(tmp_path / "backwards.zip", dict(reversed(VEHICLES.items())))
+    assert load_patches(backwards).names == load_patches(vehicles_zip).names
+
+
+@pytest.mark.parametrize("n_jobs", [1, 2, 7])
+def test_the_number_of_threads_does_not_matter(vehicles_zip, n_jobs):
+    patches = load_patches(vehicles_zip, n_jobs=n_jobs)
+    np.testing.assert_array_equal(patches.patches, load_patches(vehicles_zip).patches)
+
+
+def test_the_folder_may_be_the_working_folder(vehicles_zip, tmp_path, monkeypatch):
+    monkeypatch.chdir(unpack(vehicles_zip, tmp_path / "out") / "vehicles")
+    assert load_patches(".").names == IN_ORDER
+
+
+def test_a_zip_without_a_top_folder_takes_its_own_name(tmp_path):
+    bare = {name.partition("/")[2]: data for name, data in VEHICLES.items() if name.endswith(".png")}
+    assert load_patches(write_zip(tmp_path / "vehicles.zip", bare), label=0).names == IN_ORDER
+    flat = write_zip(tmp_path / "mine.zip", {"2.png": png(1), "10.PNG": png(2)})
+    assert load_patches(flat, label=1).names == ("mine/2.png", "mine/10.PNG")
+    pictures = write_zip(tmp_path / "dotted.zip", {"./cars/2.png": png(1)})
+    assert load_patches(pictures).names == ("cars/2.png",)
+
+
+def test_jpeg_patches_are_read_and_other_files_are_not(tmp_path):
+    folder = tmp_path / "cars"
+    for name in ("1.jpg", "2.JPEG", "3.png"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        write_image(folder / name, np.full((64, 64, 3), 200, np.uint8))
+    (folder / "notes.txt").write_text("no patch")
+    (folder / ".hidden.png").write_bytes(b"no patch")
+    (folder / ".cache").mkdir()
+    (folder / ".cache" / "4.png").write_bytes(b"no patch")
+    patches = load_patches(folder)
+    assert patches.names == ("cars/1.jpg", "cars/2.JPEG", "cars/3.png")
+    assert np.abs(patches.patches.astype(int) - 200).max() <= 1
+
+
+def test_the_innermost_class_folder_gives_the_label(vehicles_zip, others_zip, tmp_path):
+    unpack(vehicles_zip, tmp_path / "cars")
+    unpack(others_zip, tmp_path / "cars")
+    patches = load_patches(tmp_path / "cars")
+    assert patches.labels.tolist() == [name.startswith("cars/vehicles") for name in patches.names]
+    assert load_patches(others_zip).balance == 0
+    assert load_patches(others_zip, label=1).balance == 1
+
+
+def test_a_folder_without_a_class_name_needs_a_label(tmp_path):
+    write_image(tmp_path / "1.png", patch_image(1))
+    with pytest.raises(InvalidInputError, match=r"label must be 1 or 0 .* pass label=1"):
+        load_patches(tmp_path)
+    with pytest.raises(InvalidInputError, match=r"label must be one of None, 0, 1; got 2"):
+        load_patches(tmp_path, label=2)
+
+
+def test_patches_of_another_size_are_named(tmp_path):
+    source = write_zip(tmp_path / "cars.zip", {"cars/1.png": png(1), "cars/2.png": png(2, side=32)})
+    with pytest.raises(
+        DatasetError, match=r"cars/2.png of .*cars.zip is 32x32 pixels, expected 64x64; resize it to 64x64"
+    ):
+        load_patches(source)
+    half = write_zip(tmp_path / "half.zip", {"cars/2.png": png(2, side=32)})
+    assert load_patches(half, size=32).patches.shape == (1, 32, 32, 3)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"size": 0}, "size must be an integer from 1 to 4096; got 0"),
+        ({"n_jobs": 0}, "n_jobs must be an integer at least 1; got 0"),
+    ],
+)
+def test_invalid_options(vehicles_zip, options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        load_patches(vehicles_zip, **options)
+
+
+def test_a_source_must_be_a_path():
+    with pytest.raises(InvalidInputError, match=r"source must be the path of a folder or zip, got 3"):
+        load_patches(3)
+
+
+def test_a_missing_source_is_named(tmp_path):
+    with pytest.raises(DatasetError, match=r"source .*nowhere does not exist; check the path, or download"):
+        load_patches(tmp_path / "nowhere")
+
+
+def test_a_source_without_patches(tmp_path):
+    with pytest.raises(DatasetError, match=r"source .* holds no PNG or JPEG patches; download the course's"):
+        load_patches(tmp_path)
+    hidden = write_zip(tmp_path / "hidden.zip", {"vehicles/.DS_Store": b"", "__MACOSX/a.png": b""})
+    with pytest.raises(DatasetError, match=r"hidden.zip holds no PNG or JPEG patches"):
+        load_patches(hidden)
+    with pytest.raises(
+        DatasetError, match=r"holds no PNG or JPEG patches; pass one of its zip files \(hidden.zip\)"
+    ):
+        load_patches(tmp_path)
+
+
+def test_a_file_that_is_not_a_zip(tmp_path):
+    (tmp_path / "a.png").write_bytes(png(1))
+    with pytest.raises(DatasetError, match=r"a.png is not a zip; pass a folder of patches or a .zip file"):
+        load_patches(tmp_path / "a.png")
+    (tmp_path / "b.zip").write_text("<html>sign in</html>")
+    with pytest.raises(DatasetError, match=r"b.zip is a web page, not a zip"):
+        load_patches(tmp_path / "b.zip")
+
+
+def test_a_zip_cut_anywhere_is_rejected(tmp_path):
+    data = write_zip(tmp_path / "cars.zip", {"cars/1.png": png(1, 4), "cars/2.png": png(2, 4)}).read_bytes()
+    for length in range(len(data)):
+        (tmp_path / "cars.zip").write_bytes(data[:length])
+        with pytest.raises(DatasetError, match=r"cars.zip is (a damaged or incomplete zip|not a zip)"):
+            load_patches(tmp_path / "cars.zip", size=4)
+
+
+@given(st.data())
+def test_a_damaged_zip_gives_its_patches_or_a_dataset_error(tmp_path_factory, data):
+    members = {"cars/1.png": png(1, 4)}
+    buffer = io.BytesIO()
+    write_zip(buffer, members, compression=zipfile.ZIP_DEFLATED)
+    damaged = bytearray(buffer.getvalue())
+    damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path_factory.mktemp("damaged") / "cars.zip"
+    path.write_bytes(damaged)
+    try:
+        patches = load_patches(path, size=4, label=1)
+    except DatasetError:
+        return
+    np.testing.assert_array_equal(patches.patches[0], patch_image(1, 4))
+
+
+def test_an_unreadable_patch_is_named(tmp_path):
+    source = write_zip(tmp_path / "cars.zip", {"cars/1.png": png(1), "cars/2.png": png(2)[:-100]})
+    with pytest.raises(DatasetError, match=r"cars/2.png of .*cannot be decoded; replace or remove it"):
+        load_patches(source)
+
+
+def test_an_unreadable_folder_is_not_skipped(vehicles_zip, tmp_path, monkeypatch):
+    folder = unpack(vehicles_zip, tmp_path / "out")
+    scandir = os.scandir
+
+    def forbid(path):
+        if str(path).endswith("GTI_Far"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", forbid)
+    with pytest.raises(
+        DatasetError, match=r"GTI_Far cannot be read: Permission denied; check its permissions"
+    ):
+        load_patches(folder)
+
+
+def test_progress_is_shown_on_request(vehicles_zip, capsys):
+    load_patches(vehicles_zip)
+    assert capsys.readouterr().err == ""
+    load_patches(vehicles_zip, progress=True)
+    assert "3/3" in capsys.readouterr().err
+
+
+def test_the_argument_gives_the_label_of_training_patches(vehicles_zip, others_zip):
+    patches = load_training_patches(vehicles_zip, others_zip)
+    assert patches.labels.tolist() == [True, True, True, False, False]
+    assert patches.counts() == {"Extras": 1, "GTI": 1, "GTI_Far": 2, "KITTI_extracted": 1}
+    whole = PatchSet.concatenate([load_patches(vehicles_zip), load_patches(others_zip)])
+    assert patches.fingerprint == whole.fingerprint
+    assert load_training_patches(others_zip, vehicles_zip).balance == 0.4
+
+
+def test_training_patches_need_both_classes(vehicles_zip, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DatasetError, match=r"non_vehicles .*empty holds no PNG or JPEG patches"):
+        load_training_patches(vehicles_zip, tmp_path / "empty")
+    with pytest.raises(DatasetError, match=r"vehicles .*none.zip does not exist"):
+        load_training_patches(tmp_path / "none.zip", vehicles_zip)
+
+
+@pytest.mark.realdata
+def test_the_real_patches_are_complete(real_patches):
+    assert len(real_patches) == 17760
+    counts = {
+        name.rpartition("/")[2]: n for folders in archives.ARCHIVES.values() for name, n in folders.items()
+    }
+    assert real_patches.counts() == counts
+    assert real_patches.balance == pytest.approx(8792 / 17760)
+    assert real_patches.patches[::100].std() > 40  # 0-255, not 0-1

@@ -1,0 +1,256 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.datasets.cases import (
+    FOLDERS,
+    assert_covers,
+    copies_of,
+    fractions,
+    named_patches,
+    patch_image,
+    set_of,
+)
+from vehicle_detection.datasets import (
+    PatchSet,
+    Split,
+    find_near_duplicates,
+    split_groups,
+    split_leakage,
+    split_random,
+    split_sequences,
+    split_sources,
+)
+from vehicle_detection.errors import InvalidInputError
+
+
+@given(st.lists(st.booleans(), min_size=20, max_size=100), fractions, st.integers(0, 2**32 - 1))
+def test_a_random_split_covers_all_patches_and_keeps_the_balance(labels, fraction, seed):
+    labels = np.array([*labels, *[True] * 20, *[False] * 20])
+    split = split_random(labels, test_size=fraction, random_state=seed)
+    assert_covers(split, len(labels))
+    assert len(split.test) == np.ceil(fraction * len(labels))
+    for label in (True, False):
+        expected = len(split.test) * np.mean(labels == label)
+        assert abs(np.sum(labels[split.test] == label) - expected) <= 1
+
+
+def test_a_random_split_depends_on_the_seed_only():
+    patches = set_of([(folder, number) for folder in FOLDERS for number in range(10)])
+    first, again = (split_random(patches, random_state=1) for _ in range(2))
+    np.testing.assert_array_equal(first.test, again.test)
+    np.testing.assert_array_equal(first.test, split_random(patches.labels, random_state=1).test)
+    assert first.test.tolist() != split_random(patches, random_state=2).test.tolist()
+
+
+@pytest.mark.parametrize(
+    ("labels", "options", "message"),
+    [
+        (
+            [1, 1, 1, 0],
+            {},
+            "patches_or_labels cannot be split with test_size=0.2: 3 vehicles and 1 non-vehicles",
+        ),
+        ([], {}, "patches_or_labels cannot be split.*0 vehicles and 0 non-vehicles"),
+        ([1, 1, 0, 0], {"test_size": 1}, r"test_size must be a fraction in \(0, 1\), got 1"),
+        ([1, 1, 0, 0], {"test_size": 0}, "test_size must be a number, greater than 0; got 0"),
+        ([1, 1, 0, 0], {"random_state": None}, "random_state must be an integer"),
+        ([-1, 1, 0, 0], {}, "patches_or_labels must be one boolean"),
+    ],
+)
+def test_an_impossible_random_split(labels, options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        split_random(labels, **{"random_state": 0, **options})
+
+
+@given(named_patches, fractions)
+def test_a_sequence_split_tests_on_the_end_of_each_folder(entries, fraction):
+    folders = [folder for folder, _ in entries]
+    counts = {folder: folders.count(folder) for folder in folders}
+    if max(counts.values()) < 2:
+        with pytest.raises(InvalidInputError, match=r"no folder of two or more patches; use split_random"):
+            split_sequences(set_of(entries), test_size=fraction)
+        return
+    split = split_sequences(set_of(entries), test_size=fraction)
+    assert_covers(split, len(entries))
+    for folder, count in counts.items():
+        train, test = ([entries[row][1] for row in rows if entries[row][0] == folder] for rows in split)
+        assert train
+        assert bool(test) == (count > 1)
+        assert not test or max(train) < min(test)
+        assert count == 1 or abs(len(test) - fraction * count) <= 1
+
+
+@given(named_patches)
+def test_a_split_by_source_separates_the_sources(entries):
+    patches = set_of(entries)
+    if len(patches.counts()) < 4:
+        with pytest.raises(InvalidInputError, match=r"(train|test) must name sources of"):
+            split_sources(patches)
+        return
+    split = split_sources(patches)
+    assert_covers(split, len(entries))
+    assert set(patches.sources[split.train]) == {"GTI", "GTI_Far"}
+    assert set(patches.sources[split.test]) == {"KITTI_extracted", "Extras"}
+    reverse = split_sources(patches, train=("KITTI", "Extras"), test="GTI")
+    np.testing.assert_array_equal(reverse.train, split.test)
+    np.testing.assert_array_equal(reverse.test, split.train)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"train": ("Kitty",)}, r"train must name sources of patch_set \(Extras, GTI, .*got 'Kitty'"),
+        ({"train": ("",)}, "train must name sources of patch_set .*got ''"),
+        ({"test": ("KITTI",)}, r"test must name sources of vehicles and of non-vehicles, got \('KITTI',\)"),
+        ({"train": ()}, "train must name sources of vehicles and of non-vehicles"),
+        ({"test": ("KITTI", "GTI")}, r"must not share sources, both match \['GTI', 'GTI_Far'\]"),
+    ],
+)
+def test_an_impossible_split_by_source(options, message):
+    patches = set_of([(folder, 1) for folder in FOLDERS])
+    with pytest.raises(InvalidInputError, match=message):
+        split_sources(patches, **options)
+
+
+def test_sources_of_neither_part_are_left_out():
+    patches = set_of([(folder, 1) for folder in (*FOLDERS, "non-vehicles/mined")])
+    split = split_sources(patches)
+    assert 4 not in [*split.train, *split.test]
+
+
+@pytest.mark.parametrize(
+    ("train", "test", "message"),
+    [
+        ([0, 1], [1], "train and test must not share or repeat rows"),
+        ([0, 0], [1], "train and test must not share or repeat rows"),
+        ([], [1], "train must be a list of row numbers"),
+        ([0], [-1], "test must be a list of row numbers"),
+        ([0.5], [1], "train must be a list of row numbers"),
+    ],
+)
+def test_an_invalid_split(train, test, message):
+    with pytest.raises(InvalidInputError, match=message):
+        Split(train, test)
+
+
+# Groups of near duplicates
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 15), st.sampled_from(FOLDERS)), min_size=2, max_size=60),
+    fractions,
+    st.integers(0, 2**32 - 1),
+)
+def test_a_split_by_groups_keeps_near_duplicates_together(entries, fraction, seed):
+    seeds, folders = map(np.array, zip(*entries))
+    patches = copies_of(seeds.tolist(), folders.tolist())
+    try:
+        split = split_groups(patches, test_size=fraction, random_state=seed)
+    except InvalidInputError as error:
+        assert "no group of near duplicates" in str(error)  # noqa: PT017
+        return
+    assert_covers(split, len(entries))
+    assert not set(seeds[split.train]) & set(seeds[split.test])
+    assert split_leakage(patches, split, threshold=0.9) == 0
+    for folder in set(folders):
+        count, tested = np.sum(folders == folder), np.sum(folders[split.test] == folder)
+        assert tested <= min(max(round(count * fraction), 1), count - 1)
+    again = split_groups(patches, test_size=fraction, random_state=seed)
+    np.testing.assert_array_equal(split.test, again.test)
+
+
+def test_a_split_by_groups_without_duplicates_is_stratified():
+    folders = [folder for folder in FOLDERS for _ in range(10)]
+    patches = copies_of(list(range(40)), folders)
+    splits = [split_groups(patches, test_size=0.3, random_state=seed) for seed in (0, 1)]
+    assert [patches[split.test].counts() for split in splits] == [dict.fromkeys(patches.counts(), 3)] * 2
+    assert splits[0].test.tolist() != splits[1].test.tolist()
+    np.testing.assert_array_equal(split_groups(patches, test_size=0.3).test, splits[0].test)
+    loose = PatchSet(patches.patches, patches.labels, [f"{row}.png" for row in range(40)])
+    assert loose[split_groups(loose, test_size=0.3).test].balance == 0.5
+
+
+def test_duplicates_of_duplicates_are_one_group():
+    # Each thumbnail is alike to the next only: 0.95 from one to the next, 0.81 over two.
+    steps = np.arange(8) * np.arccos(0.95)
+    rng = np.random.default_rng(0)
+    axes = np.linalg.qr(np.column_stack([np.ones(256), rng.normal(size=(256, 2))]))[0][:, 1:]
+    waves = 128 + 400 * np.column_stack([np.cos(steps), np.sin(steps)]) @ axes.T
+    chain = np.repeat(waves.round().astype(np.uint8).reshape(8, 16, 16, 1), 3, axis=3)
+    alone = np.stack([patch_image(seed, 16) for seed in range(4)])
+    rows = np.random.default_rng(0).permutation(12)
+    patches = PatchSet(np.concatenate([chain, alone])[rows], [1] * 12, [f"{row}.png" for row in range(12)])
+    for seed in range(5):
+        split = split_groups(patches, test_size=0.3, random_state=seed)
+        assert sorted(rows[split.test]) == [8, 9, 10, 11]
+    assert len(find_near_duplicates(patches, threshold=0.9)) == 8
+
+
+def test_groups_are_found_across_chunks():
+    seeds = [*range(1098), 3, 700]
+    split = split_groups(copies_of(seeds), test_size=0.5)
+    sides = {row: side for side, rows in enumerate(split) for row in rows.tolist()}
+    assert (sides[1098], sides[1099]) == (sides[3], sides[700])
+    assert len(split.test) == 550
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"test_size": 1}, r"test_size must be a fraction in \(0, 1\), got 1"),
+        ({"threshold": 0}, "threshold must be a number, greater than 0 .*at most 1; got 0"),
+        ({"random_state": None}, "random_state must be an integer"),
+        ({}, "no group of near duplicates .* fits into test_size=0.2 .*raise test_size or threshold"),
+    ],
+)
+def test_an_impossible_split_by_groups(options, message):
+    patches = copies_of([1] * 10)
+    with pytest.raises(InvalidInputError, match=message):
+        split_groups(patches, **options)
+    with pytest.raises(InvalidInputError, match=message):
+        split_groups(patches[[]], **options)
+
+
+def test_leakage_is_a_fraction_of_the_test_patches():
+    patches = np.stack([patch_image(seed) for seed in (0, 1, 0, 1, 2, 3, 3)])
+    patch_set = PatchSet(patches, [1] * 7, [f"{row}.png" for row in range(7)])
+    assert split_leakage(patch_set, Split([0, 1], [2, 3, 4])) == pytest.approx(2 / 3)
+    assert split_leakage(patch_set, Split([0, 1], [5, 6])) == 0  # near duplicates within the test do not leak
+
+
+@pytest.mark.realdata
+def test_the_sizes_of_the_real_splits(real_patches):
+    sequences = split_sequences(real_patches)
+    assert real_patches[sequences.test].counts() == {
+        "Extras": 1014,
+        "GTI": 780,
+        "GTI_Far": 167,
+        "GTI_Left": 182,
+        "GTI_MiddleClose": 84,
+        "GTI_Right": 133,
+        "KITTI_extracted": 1193,
+    }
+    assert_covers(sequences, 17760)
+    assert len(split_random(real_patches, random_state=0).test) == 3552
+    assert len(split_sources(real_patches).train) == 6726
+
+
+@pytest.mark.realdata
+def test_the_real_splits_leak_as_documented(real_patches):
+    sequences = split_sequences(real_patches)
+    assert split_leakage(real_patches, split_random(real_patches, random_state=0)) > 0.2
+    assert split_leakage(real_patches, split_sources(real_patches)) < 0.03
+    # GTI is numbered through its drives, KITTI is not.
+    for source, low, high in (("GTI_", 0, 0.01), ("KITTI", 0.4, 0.5)):
+        test = sequences.test[np.char.startswith(real_patches.sources[sequences.test], source)]
+        assert low <= split_leakage(real_patches, Split(sequences.train, test)) <= high
+
+
+@pytest.mark.realdata
+def test_the_real_groups_do_not_leak(real_patches):
+    split = split_groups(real_patches)
+    assert_covers(split, 17760)
+    assert split_leakage(real_patches, split, threshold=0.9) == 0
+    assert real_patches[split.test].counts() == real_patches[split_sequences(real_patches).test].counts()
