@@ -104,7 +104,7 @@ def test_a_glyph_is_parallel_to_the_edge(ahead, slope):
 
 
 def test_malformed_options_of_hog_are_rejected():
-    with pytest.raises(InvalidInputError, match="img must be at least one block large"):
+    with pytest.raises(InvalidInputError, match="img must have at least the size of a block"):
         plotting.plot_hog(gray_image(30, 30), pix_per_cell=[16])
     with pytest.raises(InvalidInputError, match="pix_per_cell must be an integer at least 2"):
         plotting.plot_hog(gray_image(), pix_per_cell=[1])
