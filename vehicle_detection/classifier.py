@@ -18,6 +18,7 @@ from vehicle_detection._common import (
     check_integer,
     check_number,
     check_patches,
+    check_type,
     degrade_patches,
     describe,
     mirror_patches,
@@ -285,6 +286,42 @@ class VehicleClassifier:
         write_model(path, KIND, asdict(self.params), tensors, self.metadata)
 
 
+@dataclass(frozen=True, kw_only=True)
+class TrainingOptions:
+    """Options of the training, checked; `train_classifier` documents them.
+
+    A misclassified vehicle costs `positive_weight` times a misclassified non-vehicle.
+    """
+
+    C: float = DEFAULT_C
+    mirror: bool = True
+    gamma: float = 0.0
+    degraded: float = 0.0
+    positive_weight: float = 1.0
+    random_state: int = 0
+
+    def __post_init__(self) -> None:
+        checked = {
+            "C": check_number(self.C, "C", above=0, high=1e12),
+            "gamma": check_number(self.gamma, "gamma", low=0, high=2),
+            "degraded": check_number(self.degraded, "degraded", low=0, high=1),
+            "positive_weight": check_number(self.positive_weight, "positive_weight", above=0, high=1e6),
+            "random_state": check_integer(self.random_state, "random_state", low=0, high=2**32 - 1),
+        }
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+        check_type(self.mirror, "mirror", bool, "pass True or False")
+        if self.gamma and not self.mirror:
+            raise InvalidInputError(
+                f"gamma must be 0 with mirror=False, as it changes the mirrored patches; got {self.gamma:g}"
+            )
+
+    @property
+    def copy_weights(self) -> tuple[float, ...]:
+        """Training weight of each copy of the patches, in the order of `patch_features`."""
+        return (1.0, *(1.0,) * self.mirror, *(self.degraded, self.degraded) * (self.degraded > 0))
+
+
 def train_classifier(
     patches: NDArray[np.uint8],
     labels: ArrayLike,
@@ -345,98 +382,61 @@ def train_classifier(
     params = params or FeatureParams()
     images = check_patches(patches, PATCH_SIZE)
     targets = check_labels(labels, len(images))
-    check_number(C, "C", above=0, high=1e12)
-    check_gamma(gamma, mirror)
-    check_number(degraded, "degraded", low=0, high=1)
-    check_integer(random_state, "random_state", low=0, high=2**32 - 1)
-    features = patch_features(images, params, mirror=mirror, gamma=gamma, degraded=degraded, n_jobs=n_jobs)
-    return fit_features(
-        features,
-        targets,
-        params=params,
-        C=C,
-        mirror=mirror,
-        gamma=gamma,
-        degraded=degraded,
-        random_state=random_state,
-        metadata=metadata,
-    )
+    options = TrainingOptions(C=C, mirror=mirror, gamma=gamma, degraded=degraded, random_state=random_state)
+    features = patch_features(images, params, options, n_jobs=n_jobs)
+    return fit_features(features, targets, params, options, metadata=metadata)
 
 
 def patch_features(
-    images: NDArray[np.uint8],
-    params: FeatureParams,
-    *,
-    mirror: bool,
-    gamma: float = 0.0,
-    degraded: float = 0.0,
-    n_jobs: int | None = None,
+    images: NDArray[np.uint8], params: FeatureParams, options: TrainingOptions, *, n_jobs: int | None = None
 ) -> NDArray[np.float32]:
     """Features of all patches, followed by those of their mirrored, blurred and degraded copies."""
-    count, n_copies = len(images), len(copy_weights(mirror, degraded))
-    features = np.empty((n_copies * count, params.length), np.float32)
-    for copy, variant in enumerate(_augmented_copies(images, mirror, gamma, degraded)):
+    count = len(images)
+    features = np.empty((len(options.copy_weights) * count, params.length), np.float32)
+    for copy, variant in enumerate(_augmented_copies(images, options)):
         features[copy * count : (copy + 1) * count] = extract_features(variant, params, n_jobs=n_jobs)
     return features
 
 
-def _augmented_copies(
-    images: NDArray[np.uint8], mirror: bool, gamma: float, degraded: float
-) -> Iterator[NDArray[np.uint8]]:
+def _augmented_copies(images: NDArray[np.uint8], options: TrainingOptions) -> Iterator[NDArray[np.uint8]]:
     """Yield the patches and their copies one after the other, to save memory."""
     yield images
-    if mirror:
-        yield mirror_patches(images, gamma=gamma)
-    if degraded:
-        yield blur_patches(images, mirror=mirror)
-        yield degrade_patches(images, mirror=mirror)
-
-
-def copy_weights(mirror: bool, degraded: float) -> tuple[float, ...]:
-    """Training weight of each copy of the patches, in the order of `patch_features`."""
-    return (1.0, *(1.0,) * mirror, *(degraded, degraded) * (degraded > 0))
+    if options.mirror:
+        yield mirror_patches(images, gamma=options.gamma)
+    if options.degraded:
+        yield blur_patches(images, mirror=options.mirror)
+        yield degrade_patches(images, mirror=options.mirror)
 
 
 def fit_features(
     features: NDArray[np.float32],
     labels: NDArray[np.int64],
-    *,
     params: FeatureParams,
-    C: float,
-    mirror: bool,
-    gamma: float = 0.0,
-    degraded: float = 0.0,
-    positive_weight: float = 1.0,
-    random_state: int,
+    options: TrainingOptions,
+    *,
     rows: NDArray[np.intp] | None = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> VehicleClassifier:
-    """Train on features that `patch_features` computed with the same options; arguments are not checked.
+    """Train on the features that `patch_features` returned for the same options.
 
     `features` is ``(copies * N, length)`` float32 and is not copied; `labels` is ``(N,)`` 0 or 1 with both
-    classes. `rows` are the patches to train on, with all their copies; None takes all. A misclassified
-    vehicle costs `positive_weight` times a misclassified non-vehicle.
+    classes. `rows` are the patches to train on, with all their copies; None for all.
     """
-    weights = copy_weights(mirror, degraded)
-    count = len(labels)
+    weights, count = options.copy_weights, len(labels)
     chosen = np.arange(count) if rows is None else rows
     all_labels = np.tile(labels, len(weights))
     fitted = fit_svm(
         features,
         all_labels,
-        C * np.repeat(weights, count) * np.where(all_labels == 1, positive_weight, 1.0),
+        options.C * np.repeat(weights, count) * np.where(all_labels == 1, options.positive_weight, 1.0),
         rows=np.concatenate([chosen + copy * count for copy in range(len(weights))]),
         gains=params.gains,
-        random_state=random_state,
+        random_state=options.random_state,
     )
     vehicles = int(labels[chosen].sum())
     all_metadata = {
         "training": {
-            "C": C,
-            "mirror": mirror,
-            "gamma": gamma,
-            "degraded": degraded,
-            "random_state": random_state,
+            **{name: getattr(options, name) for name in ("C", "mirror", "gamma", "degraded", "random_state")},
             "vehicles": vehicles,
             "non_vehicles": len(chosen) - vehicles,
         },
@@ -464,16 +464,6 @@ def check_labels(labels: ArrayLike, count: int) -> NDArray[np.int64]:
     if count == 0 or array.min() == array.max():
         raise InvalidInputError("labels must hold both classes: vehicles (1) and non-vehicles (0)")
     return array.astype(np.int64)
-
-
-def check_gamma(gamma: object, mirror: bool) -> float:
-    """Return `gamma` if it is in range, and 0 without mirrored patches."""
-    number = check_number(gamma, "gamma", low=0, high=2)
-    if number and not mirror:
-        raise InvalidInputError(
-            f"gamma must be 0 with mirror=False, as it changes the mirrored patches; got {number:g}"
-        )
-    return number
 
 
 def load_classifier(path: str | os.PathLike[str] | None = None) -> VehicleClassifier:

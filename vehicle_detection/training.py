@@ -18,15 +18,14 @@ from numpy.typing import NDArray
 from vehicle_detection._common import (
     check_choice,
     check_integer,
-    check_number,
     describe,
     progress_bar,
     resolve_jobs,
 )
 from vehicle_detection.classifier import (
     DEFAULT_C,
+    TrainingOptions,
     VehicleClassifier,
-    check_gamma,
     check_labels,
     fit_features,
     patch_features,
@@ -85,11 +84,7 @@ class TrainingReport:
     """Options and results of `train_and_evaluate`."""
 
     params: FeatureParams
-    C: float
-    mirror: bool
-    gamma: float
-    degraded: float
-    random_state: int
+    options: TrainingOptions
     split: str  # Split whose accuracy is reported as the model's.
     sources: dict[str, int]  # Number of patches of each source folder.
     vehicles: int  # Number of patches.
@@ -119,6 +114,7 @@ class TrainingReport:
     def to_dict(self) -> dict[str, Any]:
         """Convert to JSON values."""
         plain = asdict(self) | {"accuracy": self.accuracy, "balance": self.balance, "features": self.features}
+        plain |= plain.pop("options")
         plain["splits"] = {
             name: {"accuracy": score.accuracy, **asdict(score)} for name, score in self.splits.items()
         }
@@ -193,26 +189,21 @@ def train_and_evaluate(
         )
     labels = check_labels(patch_set.labels, len(patch_set))
     params = params or FeatureParams()
-    check_number(C, "C", above=0, high=1e12)
-    check_gamma(gamma, mirror)
-    check_number(degraded, "degraded", low=0, high=1)
+    options = TrainingOptions(C=C, mirror=mirror, gamma=gamma, degraded=degraded, random_state=random_state)
     check_choice(split, "split", ("random", "sequences"))
     check_integer(seeds, "seeds", low=1, high=1000)
     check_integer(random_state, "random_state", low=0, high=2**32 - seeds)
     splits, skipped = _make_splits(patch_set, split, range(random_state, random_state + seeds))
     inner = _inner_split(patch_set, splits["sequences"][0]) if "sequences" in splits else None
-    options: dict[str, Any] = {"mirror": mirror, "gamma": gamma, "degraded": degraded}
     seconds: dict[str, float] = {}
     n_fits = sum(map(len, splits.values())) + (inner is not None) + 1
     with ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool, _timed_steps(progress, n_fits, seconds) as step:
         with step("features", fits=0):
-            features = patch_features(patch_set.patches, params, n_jobs=n_jobs, **options)
+            features = patch_features(patch_set.patches, params, options, n_jobs=n_jobs)
 
         def train(name: str, rows: NDArray[np.intp] | None = None) -> VehicleClassifier:
             with step(name):
-                return fit_features(
-                    features, labels, params=params, C=C, random_state=random_state, rows=rows, **options
-                )
+                return fit_features(features, labels, params, options, rows=rows)
 
         def test_scores(name: str, parts: Split) -> NDArray[np.float64]:
             return train(name, parts.train).decision_function(features[parts.test])
@@ -243,11 +234,7 @@ def train_and_evaluate(
             pool.shutdown(cancel_futures=True)
     report = TrainingReport(
         params=params,
-        C=C,
-        mirror=mirror,
-        gamma=gamma,
-        degraded=degraded,
-        random_state=random_state,
+        options=options,
         split=split,
         sources=patch_set.counts(),
         vehicles=int(labels.sum()),
@@ -397,15 +384,15 @@ def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str
 
 
 def _card_model(classifier: VehicleClassifier, report: TrainingReport, command: str | None) -> list[str]:
-    params = report.params
+    params, options = report.params, report.options
     lengths = f"{params.spatial_length} spatial bins, {params.hist_length} histogram, {params.hog_length} HOG"
     versions = ", ".join(f"{name} {text}" for name, text in classifier.metadata["versions"].items())
-    copies = "with mirrored patches" if report.mirror else "without mirrored patches"
-    copies += f" of varied brightness (gamma {report.gamma:g})" if report.gamma else ""
-    copies += f" and degraded copies (weight {report.degraded:g})" if report.degraded else ""
+    copies = "with mirrored patches" if options.mirror else "without mirrored patches"
+    copies += f" of varied brightness (gamma {options.gamma:g})" if options.gamma else ""
+    copies += f" and degraded copies (weight {options.degraded:g})" if options.degraded else ""
     items = [
         f"Features: {report.features}, in {params.color_space}, {params.length} values ({lengths})",
-        f"Training: C = {report.C:g}, {copies}, seed {report.random_state}",
+        f"Training: C = {options.C:g}, {copies}, seed {options.random_state}",
         f"Versions: {versions}",
     ]
     text = [
