@@ -51,7 +51,7 @@ def check_frame_boxes(keys: Sequence[FrameKey], labels: FrameBoxes) -> FrameBoxe
     if keys and not set(keys) & set(labels.frame_keys):
         known = f"such as {labels.frame_keys[0]!r}" if labels.frame_keys else "but it is empty"
         raise InvalidInputError(
-            f"{name} contain none of the frames, such as {keys[0]!r}, {known}; "
+            f"labels contain none of the frames, such as {keys[0]!r}, {known}; "
             "use the same keys on both sides"
         )
     return labels
