@@ -329,17 +329,17 @@ def model_card(
     return "\n\n".join(parts) + "\n"
 
 
-def _markdown_text(text: str, mark: str = "") -> str:
+def markdown_text(text: str, mark: str = "") -> str:
     """Wrap a paragraph, or a list item that starts with `mark`, to 110 columns."""
     indent = " " * len(mark)
     return textwrap.fill(text, 110, initial_indent=mark, subsequent_indent=indent, break_on_hyphens=False)
 
 
 def _markdown_list(items: Sequence[str]) -> str:
-    return "\n".join(_markdown_text(item, "- ") for item in items)
+    return "\n".join(markdown_text(item, "- ") for item in items)
 
 
-def _markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [columns, ["---"] * len(columns), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
@@ -382,10 +382,32 @@ def _card_data(report: TrainingReport) -> list[str]:
     patches = [(name, f"{count:,}") for name, count in report.sources.items()]
     return [
         "## Data",
-        _markdown_text(counts),
-        _markdown_table(("source", "patches"), patches),
+        markdown_text(counts),
+        markdown_table(("source", "patches"), patches),
         f"Fingerprint of the patches (SHA-256): `{report.fingerprint}`",
-        _markdown_text(license_text),
+        markdown_text(license_text),
+    ]
+
+
+SCORE_COLUMNS = (
+    "tested on", "trained", "tested", "accuracy", "false negatives", "false positives", "near duplicates",
+)  # fmt: skip
+"""Column titles of `score_rows`."""
+
+
+def score_rows(report: TrainingReport) -> list[tuple[str, ...]]:
+    """Scores of each split as text, for a table."""
+    return [
+        (
+            SPLITS[name],
+            f"{score.train:,}",
+            f"{score.test:,}",
+            f"{score.accuracy:.4f}",
+            f"{score.false_negative_rate:.2%}",
+            f"{score.false_positive_rate:.2%}",
+            f"{score.leakage:.1%}",
+        )
+        for name, score in report.splits.items()
     ]
 
 
@@ -398,27 +420,13 @@ def _card_accuracy(report: TrainingReport, others: Sequence[TrainingReport]) -> 
     if "random" in report.splits:
         seeds = len(report.splits["random"].accuracies)
         method += f" The random split is the mean of {seeds} seed{'s' * (seeds > 1)}."
-    columns = ("tested on", "trained", "tested", "accuracy", "false negatives", "false positives")
-    scores = [
-        (
-            SPLITS[name],
-            f"{score.train:,}",
-            f"{score.test:,}",
-            f"{score.accuracy:.4f}",
-            f"{score.false_negative_rate:.2%}",
-            f"{score.false_positive_rate:.2%}",
-            f"{score.leakage:.1%}",
-        )
-        for name, score in report.splits.items()
-    ]
-    table = _markdown_table((*columns, "near duplicates"), scores)
-    text = ["## Accuracy", _markdown_text(method), table]
+    text = ["## Accuracy", markdown_text(method), markdown_table(SCORE_COLUMNS, score_rows(report))]
     if report.calibration_error is not None:
         calibration = (
             f"The expected calibration error of the probabilities is {report.calibration_error:.4f} on "
             "the last fifth of each folder. Platt's sigmoid is fitted on the last fifth of the rest."
         )
-        text.append(_markdown_text(calibration))
+        text.append(markdown_text(calibration))
     if others:
         names = [name for name in SPLITS if name in report.splits]
         accuracies = [
@@ -426,7 +434,7 @@ def _card_accuracy(report: TrainingReport, others: Sequence[TrainingReport]) -> 
             for each in (report, *others)
         ]
         heads = ("features", "length", *(SPLITS[name] for name in names))
-        text += ["Other features, trained and evaluated in the same way:", _markdown_table(heads, accuracies)]
+        text += ["Other features, trained and evaluated in the same way:", markdown_table(heads, accuracies)]
     return text
 
 
