@@ -54,9 +54,10 @@ def _nan_to_none(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
-def rates(tp: int, fp: int, fn: int) -> tuple[int, int, int, float, float, float]:
-    """Return the counts followed by precision, recall and F1."""
-    return tp, fp, fn, ratio(tp, tp + fp), ratio(tp, tp + fn), ratio(2 * tp, 2 * tp + fp + fn)
+def rates(tp: int, fp: int, fn: int) -> dict[str, Any]:
+    """Return the counts with precision, recall and F1, named as the fields of the scores."""
+    ratios = {"precision": ratio(tp, tp + fp), "recall": ratio(tp, tp + fn)}
+    return {"tp": tp, "fp": fp, "fn": fn, **ratios, "f1": ratio(2 * tp, 2 * tp + fp + fn)}
 
 
 def ratio(part: float, whole: float) -> float:
@@ -211,21 +212,16 @@ def evaluate_detections(
     for name, (low, high) in SIZES.items():
         sides = label_widths[found.match[hit]], widths[false], label_widths[missed]
         tp, fp, fn = ((low <= width) & (width < high) for width in sides)
-        counts = int(tp.sum()), int(fp.sum()), int(fn.sum())
-        by_size[name] = SizeScores(*rates(*counts), mean(found.iou[hit][tp]))
-    tp_all, fp_all, fn_all, precision, recall, f1 = rates(int(hit.sum()), int(false.sum()), len(missed))
+        counts = rates(int(tp.sum()), int(fp.sum()), int(fn.sum()))
+        by_size[name] = SizeScores(**counts, mean_iou=mean(found.iou[hit][tp]))
+    counts = rates(int(hit.sum()), int(false.sum()), len(missed))
     return DetectionScores(
         frames=len(keys),
         iou=min_iou,
-        tp=tp_all,
-        fp=fp_all,
-        fn=fn_all,
+        **counts,
         ignored=int(found.ignored.sum()),
-        precision=precision,
-        recall=recall,
-        f1=f1,
         average_precision=_average_precision(*_curve(predictions, found)[:2]),
-        false_positives_per_frame=ratio(fp_all, len(keys)),
+        false_positives_per_frame=ratio(counts["fp"], len(keys)),
         mean_iou=mean(found.iou[hit]),
         by_size=by_size,
     )

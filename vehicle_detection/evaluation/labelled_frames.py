@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_image, check_integer, check_number, describe
+from vehicle_detection._common import check_image, check_integer, check_number, check_type, describe
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.frame_boxes import FrameBoxes, FrameKey, count_noun
@@ -19,7 +19,7 @@ Frames = Mapping[FrameKey, NDArray[np.uint8]] | FrameSet | Sequence[NDArray[np.u
 """Images by key, a `FrameSet`, or a list of images that are numbered from 0."""
 
 
-def keyed_frames(frames: Frames, name: str = "frames") -> Mapping[FrameKey, NDArray[np.uint8]] | FrameSet:
+def keyed_frames(frames: Frames) -> Mapping[FrameKey, NDArray[np.uint8]] | FrameSet:
     """Return frames with keys; the images of a list are numbered from 0."""
     given: object = frames
     if isinstance(given, (FrameSet, Mapping)):
@@ -27,37 +27,9 @@ def keyed_frames(frames: Frames, name: str = "frames") -> Mapping[FrameKey, NDAr
     if isinstance(given, (list, tuple)):
         return dict(enumerate(given))
     raise InvalidInputError(
-        f"{name} must be a list of images, a mapping from key to image, or the frames of load_frames; "
+        "frames must be a list of images, a mapping from key to image, or the frames of load_frames; "
         f"got {describe(given)}"
     )
-
-
-def iterate_frames(
-    frames: Mapping[FrameKey, NDArray[np.uint8]] | FrameSet,
-) -> Iterator[tuple[FrameKey, NDArray[np.uint8]]]:
-    """Yield each key with its checked image."""
-    for key, image in frames.items() if isinstance(frames, Mapping) else frames:
-        yield key, check_image(image, f"frame {key!r}")
-
-
-def keys_of(frames: Mapping[FrameKey, NDArray[np.uint8]] | FrameSet) -> tuple[FrameKey, ...]:
-    """List the frames' keys."""
-    return tuple(frames) if isinstance(frames, Mapping) else frames.names
-
-
-def check_frame_boxes(keys: Sequence[FrameKey], labels: object, name: str = "labels") -> FrameBoxes:
-    """Return `labels` if they contain at least one of the frames `keys`."""
-    if not isinstance(labels, FrameBoxes):
-        raise InvalidInputError(
-            f"{name} must be FrameBoxes, got {describe(labels)}; read a file with read_labels"
-        )
-    if keys and not set(keys) & set(labels.frame_keys):
-        known = f"such as {labels.frame_keys[0]!r}" if labels.frame_keys else "but it is empty"
-        raise InvalidInputError(
-            f"{name} contain none of the frames, such as {keys[0]!r}, {known}; "
-            "convert the keys with FrameBoxes.renamed"
-        )
-    return labels
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -92,16 +64,21 @@ class LabelledFrames:
         name: object = self.name
         if not isinstance(name, str) or not name:
             raise InvalidInputError(f"name must be a non-empty string, got {describe(name)}")
-        frames = keyed_frames(self.frames)
-        keys = keys_of(frames)
+        object.__setattr__(self, "frames", keyed_frames(self.frames))
+        keys, labels = self.keys, self.labels
         if not keys:
             raise InvalidInputError("frames must hold at least one image, got none")
-        labels = check_frame_boxes(keys, self.labels)
+        check_type(labels, "labels", FrameBoxes, "read a file with read_labels")
+        if not set(keys) & set(labels.frame_keys):
+            other = f"such as {labels.frame_keys[0]!r}" if labels.frame_keys else "but it is empty"
+            raise InvalidInputError(
+                f"labels contain none of the frames, such as {keys[0]!r}, {other}; "
+                "convert the keys with FrameBoxes.renamed"
+            )
         if self.horizon is not None:
             check_number(self.horizon, "horizon", low=0, high=1)
         known = set(keys)
         mask = np.array([key in known for key in labels.frames], np.bool_)
-        object.__setattr__(self, "frames", frames)
         object.__setattr__(self, "labels", labels[mask])
 
     def __repr__(self) -> str:
@@ -111,13 +88,14 @@ class LabelledFrames:
     @property
     def keys(self) -> tuple[FrameKey, ...]:
         """Keys of the frames."""
-        return keys_of(self.frames)
+        return tuple(self.frames) if isinstance(self.frames, Mapping) else self.frames.names
 
     def __len__(self) -> int:
         return len(self.keys)
 
     def __iter__(self) -> Iterator[tuple[FrameKey, NDArray[np.uint8]]]:
-        return iterate_frames(self.frames)
+        for key, image in self.frames.items() if isinstance(self.frames, Mapping) else self.frames:
+            yield key, check_image(image, f"frame {key!r}")
 
     @classmethod
     def from_video(

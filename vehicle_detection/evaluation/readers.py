@@ -10,7 +10,7 @@ import os
 import re
 from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -380,18 +380,19 @@ def _assemble(rows: list[Row], keys: list[FrameKey], shape: tuple[int, ...] | No
                     f"{row.where}: box {list(row.box)} lies outside the {shape[1]}x{shape[0]} image; "
                     "check that shape is (height, width) of these frames"
                 )
-    distance, speed = (np.array([getattr(row, name) for row in rows]) for name in ("distance_m", "speed_mps"))
+    columns: dict[str, Any] = {
+        name: np.array([getattr(row, name) for row in rows])
+        for name in ("occluded", "truncated", "ignore", "distance_m", "speed_mps")
+    }
+    for name in ("distance_m", "speed_mps"):
+        columns[name] = None if np.isnan(columns[name]).all() else columns[name]
     return FrameBoxes(
         [row.frame for row in rows],
         np.array([row.track for row in rows], np.int64),
         boxes,
-        occluded=np.array([row.occluded for row in rows], np.int64),
-        truncated=np.array([row.truncated for row in rows], np.float64),
-        ignore=np.array([row.ignore for row in rows], np.bool_),
         scores=np.array([row.score for row in rows], np.float64) if rows and scored[0] else None,
-        distance_m=None if np.isnan(distance).all() else distance,
-        speed_mps=None if np.isnan(speed).all() else speed,
         frame_keys=keys,
+        **columns,
     )
 
 

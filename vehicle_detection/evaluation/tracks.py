@@ -150,8 +150,7 @@ def evaluate_tracks(
     overlaps = [overlap for frame in matched for *_, overlap in frame.pairs]
     histories = _histories(predictions, labels, matched)
     false_rows = [row for frame in matched for row in frame.false]
-    fn = sum(len(frame.missed) for frame in matched)
-    tp, fp, fn, precision, recall, f1 = rates(len(overlaps), len(false_rows), fn)
+    tp, fp, fn = len(overlaps), len(false_rows), sum(len(frame.missed) for frame in matched)
     switches = sum(_count_switches(history) for history in histories.values())
     counted = [*false_rows, *(row for frame in matched for _, row, _ in frame.pairs)]
     return TrackScores(
@@ -159,13 +158,8 @@ def evaluate_tracks(
         iou=min_iou,
         vehicles=len(histories),
         tracks=len(np.unique(predictions.tracks[counted])),
-        tp=tp,
-        fp=fp,
-        fn=fn,
+        **rates(tp, fp, fn),
         ignored=sum(frame.ignored for frame in matched),
-        precision=precision,
-        recall=recall,
-        f1=f1,
         mean_iou=mean(overlaps),
         jitter=_jitter(predictions, labels, matched),
         mota=1 - ratio(fn + fp + switches, tp + fn),
