@@ -18,7 +18,7 @@ FOLDER = Path(vehicle_detection.__file__).parent
 FILES = {".".join(path.relative_to(FOLDER).with_suffix("").parts): path for path in FOLDER.rglob("*.py")}
 TREES = {name: ast.parse(path.read_text()) for name, path in FILES.items()}
 
-# Lowest first. A module imports from its own layer and lower ones, without cycles between modules or packages.
+# Lowest first. A module imports from its own layer and lower ones; neither modules nor packages form cycles.
 LAYERS = [
     "errors",
     "_common",

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from vehicle_detection.cli.output import (
     capture_stderr,
@@ -27,34 +28,28 @@ if TYPE_CHECKING:
 
 @option_names(random_state="--seed")
 def train(
-    vehicles: Annotated[Path, typer.Option(metavar="PATH", help="Folder or zip of patches of vehicles.")],
-    non_vehicles: Annotated[Path, typer.Option(metavar="PATH", help="Folder or zip of other patches.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Model file to write.")],
+    vehicles: Annotated[Path, Option(metavar="PATH", help="Folder or zip of patches of vehicles.")],
+    non_vehicles: Annotated[Path, Option(metavar="PATH", help="Folder or zip of other patches.")],
+    output: Annotated[Path, Option("-o", "--output", metavar="FILE", help="Model file to write.")],
     features: Annotated[
-        str, typer.Option(metavar="PRESET", help="lab-9432, lab-8460, ycrcb-8460, ycrcb-6156 or luv-2384.")
+        str, Option(metavar="PRESET", help="lab-9432, lab-8460, ycrcb-8460, ycrcb-6156 or luv-2384.")
     ] = "lab-9432",
     split: Annotated[
-        str, typer.Option(metavar="random|sequences", help="Split whose accuracy is reported as the model's.")
+        str, Option(metavar="random|sequences", help="Split whose accuracy is reported as the model's.")
     ] = "random",
-    C: Annotated[float, typer.Option("--C", metavar="F", help="Inverse regularization strength.")] = 1e-4,
-    seed: Annotated[int, typer.Option(metavar="N", help="Random seed of solver and first split.")] = 0,
-    no_mirror: Annotated[
-        bool, typer.Option("--no-mirror", help="Train without mirrored copies of the patches.")
-    ] = False,
-    gamma: Annotated[
-        float, typer.Option(metavar="F", help="Brightness range of mirrored copies, such as 0.4.")
-    ] = 0.0,
+    C: Annotated[float, Option("--C", metavar="F", help="Inverse regularization strength.")] = 1e-4,
+    seed: Annotated[int, Option(metavar="N", help="Random seed of solver and first split.")] = 0,
+    no_mirror: Annotated[bool, Option("--no-mirror", help="Train without mirrored copies.")] = False,
+    gamma: Annotated[float, Option(metavar="F", help="Brightness range of mirrored copies.")] = 0.0,
     degraded: Annotated[
-        float,
-        typer.Option(metavar="W", help="Weight of blurred, pale and compressed copies of each patch, 0-1."),
+        float, Option(metavar="W", help="Weight of blurred, pale and compressed copies of each patch, 0-1.")
     ] = 0.0,
     report: Annotated[
-        Path | None, typer.Option(metavar="FILE.json", help="Accuracy on every split, counts, timings.")
+        Path | None, Option(metavar="FILE.json", help="Scores on every split, timings.")
     ] = None,
-    card: Annotated[Path | None, typer.Option(metavar="FILE.md", help="Model card to write.")] = None,
+    card: Annotated[Path | None, Option(metavar="FILE.md", help="Model card to write.")] = None,
     compare: Annotated[
-        list[str] | None,
-        typer.Option(metavar="PRESET", help="Also evaluate these features for the card; may be repeated."),
+        list[str] | None, Option(metavar="PRESET", help="Other features to evaluate; repeatable.")
     ] = None,
 ) -> None:
     """Train a model on patches, and evaluate it on held-out patches."""
@@ -122,8 +117,7 @@ def _print_report(report: TrainingReport) -> None:
 
 def fetch(
     output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="DIR", help="Folder to write; by default the user's cache."),
+        Path | None, Option("-o", "--output", metavar="DIR", help="Folder; default: user's cache.")
     ] = None,
 ) -> None:
     """Download the course's training patches (110 MB) once."""
@@ -137,7 +131,7 @@ def fetch(
 
 def info(
     model: Annotated[
-        str, typer.Argument(metavar="[MODEL]", help='"default", "highway" or the path of a model file.')
+        str, Argument(metavar="MODEL", help='"default", "highway" or a model file.')
     ] = "default",
 ) -> None:
     """Show a model's parameters, accuracy, training data and versions."""
@@ -186,20 +180,18 @@ def print_fold_scores(scores: Mapping[str, Mapping[str, Any]]) -> None:
 def train_frames(
     data: Annotated[
         Path,
-        typer.Argument(
-            metavar="DATA", help="Folder with labels/NAME.csv and frames/NAME/ or videos/NAME.mp4."
-        ),
+        Argument(metavar="DATA", help="Folder with labels/NAME.csv and frames/NAME/ or videos/NAME.mp4."),
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Model file to write.")],
+    output: Annotated[Path, Option("-o", "--output", metavar="FILE", help="Model file to write.")],
     patches: Annotated[
-        Path | None, typer.Option(metavar="PATH", help="Folder or zip of patches with more vehicles.")
+        Path | None, Option(metavar="PATH", help="Folder or zip of patches with more vehicles.")
     ] = None,
     curves: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.csv", help="Precision and recall on each source left out of training."),
+        Option(metavar="FILE.csv", help="Precision and recall on each source left out of training."),
     ] = None,
-    drawn: Annotated[bool, typer.Option("--drawn/--no-drawn", help="Also train on drawn frames.")] = True,
-    seed: Annotated[int, typer.Option(metavar="N", help="Random seed.")] = 0,
+    drawn: Annotated[bool, Option("--drawn/--no-drawn", help="Also train on drawn frames.")] = True,
+    seed: Annotated[int, Option(metavar="N", help="Random seed.")] = 0,
 ) -> None:
     """Train a model for any road on labelled frames, and evaluate it by cross-validation over the sources."""
     from vehicle_detection._common import check_target

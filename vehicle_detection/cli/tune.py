@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Option
 
 from vehicle_detection.cli.output import check_distinct_paths, option_names, print_table, run_interruptible
 from vehicle_detection.errors import InvalidInputError
@@ -23,14 +24,14 @@ _MAX_ROWS = 15
 
 @option_names(random_state="--seed", seeds="--seed", n_finalists="--finalists", store="--output")
 def tune(
-    vehicles: Annotated[Path, typer.Option(metavar="PATH", help="Folder or zip of patches of vehicles.")],
-    non_vehicles: Annotated[Path, typer.Option(metavar="PATH", help="Folder or zip of other patches.")],
+    vehicles: Annotated[Path, Option(metavar="PATH", help="Folder or zip of patches of vehicles.")],
+    non_vehicles: Annotated[Path, Option(metavar="PATH", help="Folder or zip of other patches.")],
     grid: Annotated[
-        str, typer.Option(metavar="GRID", help="Values to try: 'orient=8,9 color_space=YCrCb,LAB C=1e-4,1'.")
+        str, Option(metavar="GRID", help="Values to try: 'orient=8,9 color_space=YCrCb,LAB C=1e-4,1'.")
     ],
     output: Annotated[
         Path,
-        typer.Option(
+        Option(
             "-o",
             "--output",
             metavar="FILE.csv",
@@ -38,31 +39,19 @@ def tune(
             "resumes an interrupted run.",
         ),
     ],
-    plot: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", help="Figure of accuracy against search time.")
-    ] = None,
-    split: Annotated[
-        str, typer.Option(metavar="sequences|groups|random", help="How patches are held out.")
-    ] = "sequences",
+    plot: Annotated[Path | None, Option(metavar="FILE.png", help="Accuracy against search time.")] = None,
+    split: Annotated[str, Option(metavar="sequences|groups|random", help="Held-out patches.")] = "sequences",
     halving: Annotated[
-        bool,
-        typer.Option("--halving", help="Eliminate poor configurations on few patches (successive halving)."),
+        bool, Option("--halving", help="Eliminate poor configurations on few patches (successive halving).")
     ] = False,
     finalists: Annotated[
-        int, typer.Option(metavar="N", help="Configurations that --halving measures on all patches.")
+        int, Option(metavar="N", help="Configurations to measure fully after --halving.")
     ] = 3,
-    frames: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Labelled frames to score each model on.")
-    ] = None,
-    labels: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="True boxes of --frames.")] = None,
-    horizon: Annotated[
-        float | None,
-        typer.Option(metavar="F", help="Height of the horizon of --frames as a fraction, 0 at the top."),
-    ] = None,
-    seed: Annotated[int, typer.Option(metavar="N", help="Random seed of splits and training.")] = 0,
-    cache: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder that keeps features for the next run.")
-    ] = None,
+    frames: Annotated[Path | None, Option(metavar="DIR", help="Labelled frames to score models on.")] = None,
+    labels: Annotated[Path | None, Option(metavar="FILE.csv", help="True boxes of --frames.")] = None,
+    horizon: Annotated[float | None, Option(metavar="F", help="Horizon of --frames, 0 (top) to 1.")] = None,
+    seed: Annotated[int, Option(metavar="N", help="Random seed of splits and training.")] = 0,
+    cache: Annotated[Path | None, Option(metavar="DIR", help="Folder to keep features in.")] = None,
 ) -> None:
     """Train and measure every combination of a grid of parameters, and show the best."""
     from vehicle_detection._common import check_choice, check_target
