@@ -299,7 +299,7 @@ class TrainingOptions:
         check_type(self.mirror, "mirror", bool, "pass True or False")
         if self.gamma and not self.mirror:
             raise InvalidInputError(
-                f"gamma must be 0 with mirror=False, as it changes the mirrored patches; got {self.gamma:g}"
+                f"gamma must be 0 without mirrored patches, whose brightness it changes; got {self.gamma:g}"
             )
 
     @property

@@ -624,7 +624,7 @@ def bad_training(material, tmp):
         r"small.zip is not a zip": ["--vehicles", tmp / "small.zip", "--non-vehicles", others, *model],
         r"--non-vehicles \S+ is also --vehicles \S+;": [
             "--vehicles", vehicles, "--non-vehicles", vehicles, *model],
-        r"cannot be split at test_size=0.2: 1 vehicles": [
+        r"1 vehicles and 20 non-vehicles are too few": [
             "--vehicles", tmp / "one", "--non-vehicles", others, *model],
         r"--output needs an existing folder": [*good, "-o", tmp / "none" / "m.safetensors"],
         r"--output must be a file, got the folder": [*good, "-o", tmp],

@@ -98,7 +98,7 @@ def test_frames_are_scored(patches, material, tmp_path):
 
 
 def test_an_interrupt_keeps_the_measured_rows(patches, tmp_path, monkeypatch):
-    measure = trials.TrialEvaluator.evaluate
+    evaluate = trials.TrialEvaluator.evaluate
     done = []
 
     def interrupted(self, *arguments, **options):

@@ -244,10 +244,10 @@ def load_training_patches(
 
     Examples
     --------
-    >>> load_training_patches("v.zip", "n.zip")
+    >>> load_training_patches("v.zip", "n.zip")  # doctest: +ELLIPSIS
     Traceback (most recent call last):
     ...
-    vehicle_detection.errors.DatasetError: vehicles v.zip does not exist; check the path or use fetch_patches
+    vehicle_detection.errors.DatasetError: vehicles v.zip does not exist; check the path, ...
     """
     listings = [list_patches(vehicles, "vehicles"), list_patches(non_vehicles, "non_vehicles")]
     patches = decode_listings(listings, size=PATCH_SIZE, n_jobs=n_jobs, progress=progress)
