@@ -102,8 +102,8 @@ def split_random(
         )
     except ValueError as error:
         raise InvalidInputError(
-            f"patches_or_labels cannot be split with test_size={fraction:g}: {labels.sum()} vehicles and "
-            f"{(~labels).sum()} non-vehicles are too few; pass more patches or another test_size"
+            f"patches_or_labels must have enough patches to hold out {fraction:.0%} of each class, got "
+            f"{labels.sum()} vehicles and {(~labels).sum()} non-vehicles; add patches"
         ) from error
     return Split(np.sort(train), np.sort(test))
 
