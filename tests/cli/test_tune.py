@@ -105,7 +105,7 @@ def test_an_interrupt_keeps_the_measured_rows(patches, tmp_path, monkeypatch):
         if done:
             raise KeyboardInterrupt
         done.append(1)
-        return measure(self, *arguments, **options)
+        return evaluate(self, *arguments, **options)
 
     monkeypatch.setattr(trials.TrialEvaluator, "evaluate", interrupted)
     result = run(*patches, "--grid", f"orient=3,4 {SMALL}", "-o", tmp_path / "table.csv")
