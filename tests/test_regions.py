@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from vehicle_detection.boxes import Detections, iou_matrix
 from vehicle_detection.camera import Camera
 from vehicle_detection.params import RegionParams
-from vehicle_detection.regions import WindowGroups, find_vehicles, fit_boxes, group_windows
+from vehicle_detection.regions import find_vehicles, fit_boxes, group_windows
 
 SHAPE = (720, 1280)
 CAMERA = Camera.for_frame(SHAPE)
@@ -46,7 +46,7 @@ def concatenated(*parts):
 def groups_of(boxes, peaks=None):
     boxes = np.array(boxes, float).reshape(-1, 4)
     peaks = np.full(len(boxes), 2.0) if peaks is None else np.array(peaks, float)
-    return WindowGroups(boxes, peaks, peaks * 3)
+    return Detections(boxes, peaks)
 
 
 def window(x, side=100, y=450):
@@ -67,7 +67,7 @@ def test_windows_around_a_vehicle_are_one_group_at_its_place():
     groups = group_windows(around((640.0, 420.0), 96), PLAIN)
     assert len(groups) == 1
     np.testing.assert_allclose(groups.boxes[0], [592, 372, 688, 468], atol=1e-6)
-    assert groups.peaks.tolist() == [2.0]
+    assert groups.scores.tolist() == [2.0]
 
 
 def test_the_mean_is_more_precise_than_the_step():
@@ -96,7 +96,7 @@ def test_windows_that_overlap_too_little_do_not_join():
     found = Detections([window(640), window(690), window(690)], [2.0, 1.9, 1.9])
     groups = group_windows(found, PLAIN)
     np.testing.assert_allclose(groups.boxes, [window(640)])
-    assert groups.evidence.tolist() == [2.0]
+    assert groups.scores.tolist() == [2.0]
     narrow = dataclasses.replace(PLAIN, suppression_radius=0.3)
     assert len(group_windows(found, narrow)) == 2
 
@@ -106,7 +106,7 @@ def test_two_vehicles_are_two_groups_best_first():
     groups = group_windows(found, PLAIN)
     assert len(groups) == 2
     assert (groups.boxes[:, 0] < 500).tolist() == [False, True]
-    assert groups.peaks.tolist() == [2.5, 1.5]
+    assert groups.scores.tolist() == [2.5, 1.5]
 
 
 def test_low_scores_and_single_windows_form_no_group():
@@ -122,7 +122,7 @@ def test_windows_at_or_below_zero_are_ignored():
     with_bad = group_windows(concatenated(bad, good), PLAIN)
     alone = group_windows(good, PLAIN)
     np.testing.assert_array_equal(with_bad.boxes, alone.boxes)
-    np.testing.assert_array_equal(with_bad.evidence, alone.evidence)
+    np.testing.assert_array_equal(with_bad.scores, alone.scores)
 
 
 def test_windows_without_area_are_ignored():
@@ -134,7 +134,7 @@ def test_windows_without_area_are_ignored():
 def test_no_windows_give_no_groups():
     groups = group_windows(Detections.empty(), DEFAULT)
     assert groups.boxes.shape == (0, 4)
-    assert len(groups) == len(groups.peaks) == len(groups.evidence) == 0
+    assert len(groups) == len(groups.scores) == 0
     assert len(fit_boxes(groups, CAMERA, SHAPE, DEFAULT)) == 0
     assert len(find_vehicles(Detections.empty(), CAMERA, SHAPE)) == 0
 
@@ -143,14 +143,11 @@ def test_no_windows_give_no_groups():
 def test_groups_satisfy_the_thresholds(found):
     before = found.boxes.copy(), found.scores.copy()
     groups = group_windows(found, PLAIN)
-    assert (groups.peaks >= PLAIN.min_peak).all()
-    assert (groups.evidence >= PLAIN.min_evidence).all()
-    assert (groups.evidence >= groups.peaks - 1e-9).all()
-    assert (np.diff(groups.peaks) <= 0).all()
+    assert (groups.scores >= PLAIN.min_peak).all()
+    assert (np.diff(groups.scores) <= 0).all()
     assert np.isfinite(groups.boxes).all()
     assert (groups.boxes[:, 2:] > groups.boxes[:, :2]).all()
-    assert np.isin(groups.peaks, found.scores).all()
-    assert groups.evidence.sum() <= found.scores.clip(0).sum() + 1e-9
+    assert np.isin(groups.scores, found.scores).all()
     np.testing.assert_array_equal(found.boxes, before[0])
     np.testing.assert_array_equal(found.scores, before[1])
 
@@ -225,7 +222,7 @@ def test_results_are_symmetric_to_left_and_right(found):
     groups = group_windows(found, PLAIN)
     mirrored = groups.boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1) + (1280, 0, 1280, 0)
     boxes = fit_boxes(groups, CAMERA, SHAPE, PLAIN)
-    other = fit_boxes(WindowGroups(mirrored, groups.peaks, groups.evidence), CAMERA, SHAPE, PLAIN)
+    other = fit_boxes(Detections(mirrored, groups.scores), CAMERA, SHAPE, PLAIN)
     expected = other.boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1) + (1280, 0, 1280, 0)
     np.testing.assert_allclose(boxes.boxes, expected, atol=1e-6)
 

@@ -72,10 +72,9 @@ def iou_matrix(first: ArrayLike, second: ArrayLike) -> Floats:
     >>> iou_matrix([[0, 0, 10, 10]], [[0, 0, 10, 10], [5, 0, 15, 10], [20, 20, 30, 30]]).round(2)
     array([[1.  , 0.33, 0.  ]])
     """
-    a, b = (
-        check_boxes(boxes, name).astype(np.float64) for boxes, name in ((first, "first"), (second, "second"))
-    )
-    return _iou(intersection_matrix(a, b), box_areas(a)[:, None], box_areas(b)[None])
+    a = check_boxes(first, "first").astype(np.float64)
+    b = check_boxes(second, "second").astype(np.float64)
+    return overlap_matrices(a, b)[0]
 
 
 def clip_boxes(boxes: ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
@@ -83,10 +82,8 @@ def clip_boxes(boxes: ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
 
     Parameters
     ----------
-    boxes
-        ``(N, 4)`` boxes.
-    shape
-        ``(height, width, ...)``, as ``image.shape``.
+    boxes, shape
+        ``(N, 4)`` boxes, and ``(height, width, ...)`` of the image.
 
     Returns
     -------
@@ -153,10 +150,8 @@ def non_max_suppression(boxes: ArrayLike, scores: ArrayLike, *, threshold: float
 
     Parameters
     ----------
-    boxes
-        ``(N, 4)`` boxes.
-    scores
-        ``(N,)`` numbers, higher is better.
+    boxes, scores
+        ``(N, 4)`` boxes, and ``(N,)`` numbers, higher is better.
     threshold
         IoU in [0, 1] above which the box with the lower score is dropped.
 
@@ -186,10 +181,8 @@ class Detections:
 
     Attributes
     ----------
-    boxes
-        ``(N, 4)`` boxes ``[x1, y1, x2, y2]``.
-    scores
-        ``(N,)`` float64 scores, finite.
+    boxes, scores
+        ``(N, 4)`` boxes ``[x1, y1, x2, y2]``, and ``(N,)`` finite float64 scores.
 
     Raises
     ------

@@ -24,10 +24,8 @@ FrameShape = tuple[int, int]
 
 # Focal length in pixels of the reference camera, a 1280x720 dash-cam, for which pixel errors are given.
 _REFERENCE_FOCAL_PX = 0.9 * 1280
-# A box that ends this near to the frame's border, or within this fraction of its size, may be truncated.
-_BORDER_PX, _BORDER_FRACTION = 1.5, 0.04
-# Boxes that `estimate_horizon` requires, and uses at most; bootstrap samples for the standard error.
-_MIN_BOXES, _MAX_BOXES, _N_BOOTSTRAP = 12, 250, 60
+# Boxes that `estimate_horizon` requires, and uses at most.
+_MIN_BOXES, _MAX_BOXES = 12, 250
 
 
 def check_shape(shape: object, name: str = "shape") -> FrameShape:
@@ -47,11 +45,9 @@ class Camera:
     ----------
     focal_px
         Focal length in pixels: the frame's width over ``2 * tan(half the horizontal field of view)``.
-    horizon_px
-        Row of the horizon.
-    horizon_std_px
-        Standard error of `horizon_px` in pixels of the frame where the row is a guess; 0 where it was
-        measured. The tracker estimates the row from the vehicles it tracks, with this prior.
+    horizon_px, horizon_std_px
+        Row of the horizon, and its standard error if the row is a guess (0 if it was measured). The tracker
+        estimates the row from the vehicles it tracks, with this prior.
     height_m
         Height of the lens above the road.
     vehicle_width_m, vehicle_width_std_m
@@ -110,22 +106,15 @@ class Camera:
 
         Parameters
         ----------
-        shape
-            ``(height, width, ...)``, as ``image.shape``.
+        shape, height_m
+            ``(height, width, ...)``, and the height of the lens above the road in meters.
         horizon
             Row of the horizon as a fraction of the height, 0 at the top; a guess if ``horizon_std_px`` is
             passed too.
         field_of_view
             Angle of view along the frame's longer side in degrees.
-        height_m
-            Height of the lens above the road in meters.
         **known
             Other attributes of the class, such as ``focal_std=0.01`` for a calibrated lens.
-
-        Raises
-        ------
-        InvalidInputError
-            If a value is out of range or no attribute has that name.
         """
         height, width = check_shape(shape)
         horizon = check_number(horizon, "horizon", low=-10, high=10)
@@ -169,8 +158,7 @@ def truncated_edges(boxes: NDArray[Any], shape: FrameShape) -> NDArray[np.bool_]
 
     A search may end up to one step short of the border, so the tolerance grows with the box.
     """
-    sides = boxes[:, 2:] - boxes[:, :2]
-    margin = np.maximum(_BORDER_FRACTION * sides, _BORDER_PX)
+    margin = np.maximum(0.04 * (boxes[:, 2:] - boxes[:, :2]), 1.5)
     limit = np.array([shape[1], shape[0]], np.float64)
     return np.concatenate((boxes[:, :2] <= margin, boxes[:, 2:] >= limit - margin), axis=1)
 
@@ -181,10 +169,9 @@ class HorizonEstimate:
 
     Attributes
     ----------
-    horizon
-        Row of the horizon as a fraction of the frame's height, 0 at the top.
-    horizon_std
-        Its standard error in the same unit; treat the estimate as a guess if it exceeds 0.05.
+    horizon, horizon_std
+        Row of the horizon as a fraction of the frame's height, 0 at the top, and its standard error; treat
+        the estimate as a guess if it exceeds 0.05.
     camera_height_m
         Height of the camera above the road in meters, assuming that vehicles are 1.8 m wide.
     n_boxes
@@ -210,10 +197,8 @@ def estimate_horizon(boxes: ArrayLike, shape: tuple[int, ...], *, random_state: 
     ----------
     boxes
         ``(N, 4)`` boxes ``[x1, y1, x2, y2]``, at least 12 of them not truncated, and of different widths.
-    shape
-        ``(height, width, ...)`` of the frames.
-    random_state
-        Seed of the bootstrap that estimates the standard error.
+    shape, random_state
+        ``(height, width, ...)`` of the frames, and the seed of the bootstrap for the standard error.
 
     Raises
     ------
@@ -250,10 +235,8 @@ def estimate_horizon(boxes: ArrayLike, shape: tuple[int, ...], *, random_state: 
         whole, width = whole[rows], width[rows]
     bottom = whole[:, 3]
     horizon, slope = _theil_sen(width, bottom)
-    resampled = []
-    for _ in range(_N_BOOTSTRAP):
-        rows = rng.integers(len(width), size=len(width))
-        resampled.append(_theil_sen(width[rows], bottom[rows])[0])
+    samples = [rng.integers(len(width), size=len(width)) for _ in range(60)]
+    resampled = [_theil_sen(width[rows], bottom[rows])[0] for rows in samples]
     return HorizonEstimate(
         horizon=horizon / frame[0],
         horizon_std=float(np.std(resampled)) / frame[0],

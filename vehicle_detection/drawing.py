@@ -38,10 +38,8 @@ MAX_SPEED_STD = 3.0
 LABEL_FIELDS = ("id", "score", "distance", "speed", "std")
 """Fields of a track's label; ``"std"`` adds standard errors to distance and speed."""
 
-_BLACK, _WHITE, _TENTATIVE_COLOR = (0, 0, 0), (255, 255, 255), (160, 160, 160)
+_BLACK, _WHITE = (0, 0, 0), (255, 255, 255)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-# The opacity of a coasting track falls from 1 to the minimum within these seconds.
-_FADE_SECONDS, _MIN_ALPHA = 0.5, 0.35
 
 
 def draw_boxes(image: Image, boxes: ArrayLike, *, color: Color = (0, 0, 255), thickness: int = 6) -> Image:
@@ -54,10 +52,8 @@ def draw_boxes(image: Image, boxes: ArrayLike, *, color: Color = (0, 0, 255), th
     boxes
         ``(N, 4)`` boxes ``[x1, y1, x2, y2]``, or a list of ``((x1, y1), (x2, y2))`` as in the course; parts
         outside the image are clipped.
-    color
-        RGB, 0-255 each.
-    thickness
-        Width of the lines in pixels; they lie inside the box.
+    color, thickness
+        RGB, 0-255 each, and width in pixels of the lines, which lie inside the box.
 
     Returns
     -------
@@ -77,9 +73,12 @@ def draw_boxes(image: Image, boxes: ArrayLike, *, color: Color = (0, 0, 255), th
     ([0, 0, 255], [0, 0, 255], 76)
     """
     result = check_image(image).copy()
-    rgb, width = _check_color(color), check_integer(thickness, "thickness", low=1, high=10_000)
+    if np.shape(color) != (3,):
+        raise InvalidInputError(f"color must be (red, green, blue), 0-255 each; got {describe(color)}")
+    red, green, blue = (check_integer(value, "color", low=0, high=255) for value in color)
+    width = check_integer(thickness, "thickness", low=1, high=10_000)
     for box in _corner_array(boxes):
-        _draw_outline(result, _round_box(box), rgb, width)
+        _draw_outline(result, _round_box(box), (red, green, blue), width)
     return result
 
 
@@ -113,10 +112,21 @@ def draw_labeled_bboxes(image: Image, labels: tuple[NDArray[Any], int]) -> Image
     >>> np.argwhere(drawn.any(axis=2)).min(axis=0).tolist()
     [10, 20]
     """
-    checked = check_image(image)
-    array, count = _check_labels(labels, checked.shape[:2])
+    given: Any = labels
+    if not isinstance(given, tuple) or len(given) != 2 or not isinstance(given[0], np.ndarray):
+        raise InvalidInputError(
+            f"labels must be the pair (label array, number of regions), got {describe(labels)}; "
+            "pass what scipy.ndimage.label returns"
+        )
+    array, count = labels[0], check_integer(labels[1], "labels[1]", low=0)
+    shape = check_image(image).shape[:2]
+    if array.shape != shape or array.dtype.kind not in "iu":
+        raise InvalidInputError(
+            f"labels[0] must be integers of the image's shape {shape}, got {describe(array)}; "
+            "label the heat map of this image"
+        )
     regions = [region for region in ndimage.find_objects(array, max_label=count) if region is not None]
-    return draw_boxes(checked, [[x.start, y.start, x.stop, y.stop] for y, x in regions])
+    return draw_boxes(image, [[x.start, y.start, x.stop, y.stop] for y, x in regions])
 
 
 def draw_tracks(
@@ -128,10 +138,8 @@ def draw_tracks(
 
     Parameters
     ----------
-    image
-        ``(H, W, 3)`` uint8 RGB.
-    tracks
-        What `Tracker.update` returned for this frame.
+    image, tracks
+        ``(H, W, 3)`` uint8 RGB, and what `Tracker.update` returned for it.
     show
         Fields of the label: ``"id"``, ``"score"``, ``"distance"`` (m), ``"speed"`` (m/s relative to the
         camera, positive when moving away) and ``"std"`` (adds standard errors). Unknown values are omitted.
@@ -170,19 +178,17 @@ def draw_diagnostics(
 
     Parameters
     ----------
-    frame
-        ``(H, W, 3)`` uint8 RGB.
+    frame, tracks
+        ``(H, W, 3)`` uint8 RGB, and its tracks.
     windows
         Positive windows, as `Detections` or boxes in any form that `draw_boxes` accepts.
     heat
         ``(h, w)`` finite numbers, of the frame's size or smaller; drawn from black (0) to yellow (maximum).
-    tracks
-        The tracks of this frame.
 
     Returns
     -------
     numpy.ndarray
-        ``(H, W, 3)`` uint8 RGB, of the frame's shape; an odd side ends with a black line.
+        An image of the frame's shape; an odd side ends with a black line.
 
     Raises
     ------
@@ -222,33 +228,27 @@ def blend(image: NDArray[Any], overlay: ArrayLike, alpha: float) -> NDArray[Any]
 
 def heat_image(heat: NDArray[Any]) -> Image:
     """Color an ``(h, w)`` heat map from black (0) to yellow (its maximum), as ``(h, w, 3)`` uint8 RGB."""
-    values = _check_heat(heat)
+    values = np.asarray(heat)
+    if values.ndim != 2 or not values.size or values.dtype.kind not in "iufb":
+        raise InvalidInputError(
+            f"heat must be an (h, w) array of numbers, got {describe(heat)}; pass a heat map"
+        )
+    values = values.astype(np.float32)
+    if not np.isfinite(values).all():
+        raise InvalidInputError("heat must be finite, got NaN or infinity; build it with add_heat")
     peak = float(values.max())
     gray = np.clip(values * (255 / peak if peak > 0 else 0.0), 0, 255).astype(np.uint8)
-    return np.asarray(
-        cv2.cvtColor(cv2.applyColorMap(gray, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB), np.uint8
-    )
+    colored = cv2.applyColorMap(gray, cv2.COLORMAP_INFERNO)
+    return np.asarray(cv2.cvtColor(colored, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def track_color(track: Track) -> Color:
     """RGB color of a track, chosen by its id; gray for a tentative track."""
-    return TRACK_COLORS[(track.id - 1) % len(TRACK_COLORS)] if track.id > 0 else _TENTATIVE_COLOR
+    return TRACK_COLORS[(track.id - 1) % len(TRACK_COLORS)] if track.id > 0 else (160, 160, 160)
 
 
 def track_text(track: Track, show: Collection[str]) -> str:
-    """Text of a track's label; empty if no field of `show` is known.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> track = Track(
-    ...     id=3, box=np.array([0.0, 0, 9, 9]), score=1.5, state="confirmed", shown=True, age=1.0, misses=0,
-    ...     time_since_update=0.0, velocity=(0.0, 0.0), distance_m=23.6, distance_std_m=2.2, speed_mps=-1.25,
-    ...     speed_std_mps=0.5,
-    ... )
-    >>> track_text(track, ("id", "score", "distance", "speed"))
-    '#3  1.5  24 m  -1.2 m/s'
-    """
+    """Text of a track's label, such as "#3  24 m  -1.2 m/s"; empty if no field of `show` is known."""
     with_std = "std" in show
     parts = [f"#{track.id}"] if "id" in show else []
     if "score" in show:
@@ -261,8 +261,8 @@ def track_text(track: Track, show: Collection[str]) -> str:
 
 
 def _alpha(track: Track) -> float:
-    """Opacity of a track, which decreases while it coasts."""
-    return max(_MIN_ALPHA, 1 - track.time_since_update / _FADE_SECONDS * (1 - _MIN_ALPHA))
+    """Opacity of a track, which decreases to 0.35 within half a second while it coasts."""
+    return max(0.35, 1 - track.time_since_update / 0.5 * (1 - 0.35))
 
 
 def _draw_label(
@@ -279,8 +279,7 @@ def _draw_label(
     rectangles = [(x, y, x + width, y + height) for y in tops]
     free = [one for one in rectangles if not any(_intersect(one, other) for other in occupied)]
     x, y, *_ = (free or rectangles)[0]
-    red, green, blue = color
-    ink = _BLACK if 0.299 * red + 0.587 * green + 0.114 * blue > 110 else _WHITE
+    ink = _BLACK if np.dot(color, (0.299, 0.587, 0.114)) > 110 else _WHITE
     return _draw_text(image, text, ink, x, y, scale, color, _alpha(track))
 
 
@@ -343,39 +342,6 @@ def _intersect(first: Rectangle, second: Rectangle) -> bool:
     """Whether two rectangles have a pixel in common."""
     overlap_x = first[0] < second[2] and second[0] < first[2]
     return overlap_x and first[1] < second[3] and second[1] < first[3]
-
-
-def _check_color(color: object) -> Color:
-    if not isinstance(color, (tuple, list)) or len(color) != 3:
-        raise InvalidInputError(f"color must be (red, green, blue), 0-255 each; got {describe(color)}")
-    red, green, blue = (check_integer(value, "color", low=0, high=255) for value in color)
-    return red, green, blue
-
-
-def _check_labels(labels: object, shape: tuple[int, ...]) -> tuple[NDArray[Any], int]:
-    if not isinstance(labels, tuple) or len(labels) != 2 or not isinstance(labels[0], np.ndarray):
-        raise InvalidInputError(
-            f"labels must be the pair (label array, number of regions), got {describe(labels)}; "
-            "pass what scipy.ndimage.label returns"
-        )
-    array, count = labels[0], check_integer(labels[1], "labels[1]", low=0)
-    if array.shape != shape or array.dtype.kind not in "iu":
-        raise InvalidInputError(
-            f"labels[0] must be integers of the image's shape {shape}, got {describe(array)}; "
-            "label the heat map of this image"
-        )
-    return array, count
-
-
-def _check_heat(heat: object) -> NDArray[np.float32]:
-    if not isinstance(heat, np.ndarray) or heat.ndim != 2 or not heat.size or heat.dtype.kind not in "iufb":
-        raise InvalidInputError(
-            f"heat must be an (h, w) array of numbers, got {describe(heat)}; pass a heat map"
-        )
-    values = heat.astype(np.float32)
-    if not np.isfinite(values).all():
-        raise InvalidInputError("heat must be finite, got NaN or infinity; build it with add_heat")
-    return values
 
 
 def _check_tracks(tracks: object) -> list[Track]:

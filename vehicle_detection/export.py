@@ -13,11 +13,18 @@ import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, Literal, NamedTuple, TypeAlias
+from typing import IO, Any, Literal, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
-from vehicle_detection._common import atomic_write, check_choice, check_target, describe, write_parquet
+from vehicle_detection._common import (
+    atomic_write,
+    check_choice,
+    check_number,
+    check_target,
+    describe,
+    write_parquet,
+)
 from vehicle_detection.errors import InvalidInputError
 
 BOX_COLUMNS = ("frame", "track_id", "x1", "y1", "x2", "y2", "score")
@@ -77,6 +84,7 @@ def _rows_of(item: Any, number: int) -> list[Row]:
 def _check_row(item: Any, number: int, *, stills: bool = False) -> Row:
     """Check and round one row; `number` counts rows from 0 for the error message."""
     columns = BOX_COLUMNS if stills else TRACK_COLUMNS
+    values: list[Any] = []
     if isinstance(item, Mapping):
         missing = [name for name in BOX_COLUMNS if name not in item and not (stills and name == "track_id")]
         if missing:
@@ -86,35 +94,22 @@ def _check_row(item: Any, number: int, *, stills: bool = False) -> Row:
         values = [item.get(name) for name in columns]
     elif isinstance(item, (Sequence, np.ndarray)) and not isinstance(item, (str, bytes)):
         values = list(item)
-    else:
-        values = []
     if not len(BOX_COLUMNS) <= len(values) <= len(columns):
         raise InvalidInputError(
             f"row {number} must be a FrameResult or the values {', '.join(columns)}, got {describe(item)}"
         )
-    frame = _file_name(values[0], number) if stills else _whole_number(values[0], number, "frame", low=0)
-    untracked = stills and _is_missing(values[1])
-    track = None if untracked else _whole_number(values[1], number, "track_id")
-    x1, y1, x2, y2, score = (_number(value, number, name) for name, value in zip(columns[2:], values[2:7]))
-    if x2 < x1 or y2 < y1:
+    optional = ("track_id",) if stills else ("distance_m", "speed_mps")
+    checked: list[Any] = [
+        None if name in optional and _is_missing(value) else _check_value(value, number, name, stills)
+        for name, value in zip(columns, values)
+    ]
+    row = Row(*checked)
+    if row.x2 < row.x1 or row.y2 < row.y1:
         raise InvalidInputError(
-            f"row {number} must have x1 <= x2 and y1 <= y2, got {[x1, y1, x2, y2]}; "
+            f"row {number} must have x1 <= x2 and y1 <= y2, got {list(row[2:6])}; "
             "boxes given as x, y, width, height need x + width and y + height"
         )
-    extra = [
-        None if _is_missing(value) else _number(value, number, name)
-        for name, value in zip(columns[7:], values[7:])
-    ]
-    return Row(frame, track, x1, y1, x2, y2, score, *extra)
-
-
-def _file_name(value: Any, number: int) -> str:
-    if not isinstance(value, (str, os.PathLike)):
-        raise InvalidInputError(
-            f"row {number}: frame must be the image's file name, got {describe(value)}; "
-            "write the frames of a video with write_tracks"
-        )
-    return os.fspath(value)
+    return row
 
 
 def _is_missing(value: Any) -> bool:
@@ -124,27 +119,23 @@ def _is_missing(value: Any) -> bool:
     return value is None or str(value) == "<NA>"
 
 
-def _is_number(value: Any) -> bool:
-    is_number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-    return is_number and math.isfinite(value)
-
-
-def _whole_number(value: Any, number: int, name: str, *, low: float = -math.inf) -> int:
+def _check_value(value: Any, number: int, name: str, stills: bool) -> Any:
+    """Check and round one value of a row."""
+    where = f"row {number}: {name}"
+    if name == "frame" and stills:
+        if not isinstance(value, (str, os.PathLike)):
+            raise InvalidInputError(
+                f"{where} must be the image's file name, got {describe(value)}; "
+                "write the frames of a video with write_tracks"
+            )
+        return os.fspath(value)
+    checked = check_number(value, where, low=0 if name == "frame" else -math.inf)
+    if name in DIGITS:
+        return round(checked, DIGITS[name]) + 0.0  # + 0.0 turns -0.0 into 0.0
     # A pandas column with missing values holds whole numbers as floats.
-    if not _is_number(value) or value != int(value) or value < low:
-        expected = "a whole number" if low < 0 else f"a whole number of at least {low:g}"
-        raise InvalidInputError(
-            f"row {number}: {name} must be {expected}, got {describe(value)}; drop the row"
-        )
+    if not checked.is_integer():
+        raise InvalidInputError(f"{where} must be a whole number, got {describe(value)}; drop the row")
     return int(value)
-
-
-def _number(value: Any, number: int, name: str) -> float:
-    if not _is_number(value):
-        raise InvalidInputError(
-            f"row {number}: {name} must be a finite number, got {describe(value)}; drop the row"
-        )
-    return round(float(value), DIGITS[name]) + 0.0  # + 0.0 turns -0.0 into 0.0
 
 
 Format: TypeAlias = Literal["csv", "jsonl", "parquet", "mot", "coco"]
@@ -174,12 +165,10 @@ def write_tracks(
         One :class:`FrameResult` for each frame, of which the shown tracks are written; or rows, each a
         mapping or a sequence of ``frame, track_id, x1, y1, x2, y2, score[, distance_m, speed_mps]``; or a
         pandas table of such rows.
-    path
-        File to write.
-    format
-        ``"csv"``, ``"jsonl"`` (one JSON object per line), ``"parquet"`` (needs pyarrow), ``"mot"``
-        (MOTChallenge text) or ``"coco"`` (JSON). None: chosen by the suffix .csv, .jsonl, .ndjson,
-        .parquet, .txt or .json.
+    path, format
+        File to write, and its format: ``"csv"``, ``"jsonl"`` (one JSON object per line), ``"parquet"`` (needs
+        pyarrow), ``"mot"`` (MOTChallenge text) or ``"coco"`` (JSON). None chooses by the suffix: .csv,
+        .jsonl, .ndjson, .parquet, .txt or .json.
     shape
         ``(height, width, ...)`` of a frame, which COCO viewers need.
 
@@ -221,8 +210,7 @@ def write_tracks(
     for item in check_items(results):
         frames += [int(item.index)] if is_result(item) else []
         rows += _rows_of(item, len(rows))
-    _write_rows(rows, frames, path, kind, TRACK_COLUMNS, shape)
-    return len(rows)
+    return _write_rows(rows, frames, path, kind, TRACK_COLUMNS, shape)
 
 
 def write_boxes(
@@ -239,10 +227,8 @@ def write_boxes(
         Pairs of an image's file name and its :class:`Detections`; or rows, each a mapping or a sequence of
         ``frame, track_id, x1, y1, x2, y2, score`` with the file name as ``frame``, and None as ``track_id``
         unless the boxes are numbered.
-    path
-        File to write.
-    format
-        ``"csv"``, ``"jsonl"``, ``"parquet"`` or ``"coco"``; None: chosen by the suffix, as in `write_tracks`.
+    path, format
+        As in `write_tracks`, without ``"mot"``.
 
     Returns
     -------
@@ -278,8 +264,7 @@ def write_boxes(
             ]
         else:
             rows.append(_check_row(item, len(rows), stills=True))
-    _write_rows(rows, names, path, kind, BOX_COLUMNS, None)
-    return len(rows)
+    return _write_rows(rows, names, path, kind, BOX_COLUMNS)
 
 
 class TrackWriter:
@@ -289,10 +274,8 @@ class TrackWriter:
 
     Parameters
     ----------
-    path
-        File to write.
-    format
-        ``"csv"``, ``"jsonl"`` or ``"mot"``; None: chosen by the suffix .csv, .jsonl, .ndjson or .txt.
+    path, format
+        As in `write_tracks`; only ``"csv"``, ``"jsonl"`` and ``"mot"``.
 
     Attributes
     ----------
@@ -330,24 +313,17 @@ class TrackWriter:
     def __enter__(self) -> TrackWriter:
         with contextlib.ExitStack() as stack:
             part = stack.enter_context(atomic_write(self._path, "path"))
-            file = stack.enter_context(_open_text(part))
+            file = stack.enter_context(part.open("w", encoding="utf-8", newline=""))
             self._write_row = _row_writer(file, self._kind, TRACK_COLUMNS)
             self._stack = stack.pop_all()
         self.rows = 0
         return self
 
     def __call__(self, result: Any) -> None:
-        """Write the shown tracks of one frame's result, or one row.
-
-        Raises
-        ------
-        InvalidInputError
-            If the result is malformed, or the writer is called outside its ``with`` block.
-        """
+        """Write the shown tracks of one frame's result, or one row."""
         if self._write_row is None:
             raise InvalidInputError(
-                "TrackWriter must be called inside its with block, got a call outside; use "
-                "with TrackWriter(path) as write: ..."
+                "TrackWriter must be called inside its with block; use with TrackWriter(path) as write: ..."
             )
         for row in _rows_of(result, self.rows):
             self._write_row(row)
@@ -365,22 +341,16 @@ def _check_format(path: object, name: str | None, allowed: Iterable[Format]) -> 
             f"path must be a file name, got {describe(path)}; pass a name such as 'tracks.csv'"
         )
     choices = tuple(dict.fromkeys(allowed))
-    kind = name
-    if name is None:
-        kind = FORMATS.get(Path(path).suffix.lower())
-        if kind not in choices:
-            suffixes = [suffix for suffix, meant in FORMATS.items() if meant in choices]
-            raise InvalidInputError(
-                f"path must end in {', '.join(suffixes)}, got {Path(path).name!r}; "
-                f"or set the format to {', '.join(map(repr, choices))}"
-            )
+    kind = FORMATS.get(Path(path).suffix.lower()) if name is None else name
+    if name is None and kind not in choices:
+        suffixes = [suffix for suffix, meant in FORMATS.items() if meant in choices]
+        raise InvalidInputError(
+            f"path must end in {', '.join(suffixes)}, got {Path(path).name!r}; "
+            f"or set the format to {', '.join(map(repr, choices))}"
+        )
     check_choice(kind, "format", choices)
     check_target(path, "path")
-    return next(choice for choice in choices if choice == kind)
-
-
-def _open_text(path: Path) -> IO[str]:
-    return path.open("w", encoding="utf-8", newline="")
+    return cast("Format", kind)
 
 
 def _row_writer(file: IO[str], kind: Format, columns: Sequence[str]) -> Callable[[Row], object]:
@@ -388,15 +358,15 @@ def _row_writer(file: IO[str], kind: Format, columns: Sequence[str]) -> Callable
     if kind == "csv":
         table = csv.writer(file, lineterminator="\n")
         table.writerow(columns)
-        return lambda row: table.writerow(_csv_cells(row, columns))
+        return lambda row: table.writerow(_csv_cells(row)[: len(columns)])
     if kind == "jsonl":
         return lambda row: file.write(json.dumps(dict(zip(columns, row)), ensure_ascii=False) + "\n")
     return lambda row: file.write(_mot_line(row) + "\n")
 
 
-def _csv_cells(row: Row, columns: Sequence[str]) -> list[Any]:
-    numbers = zip(columns[2:], row[2:])
-    return [*row[:2], *("" if value is None else f"{value:.{DIGITS[name]}f}" for name, value in numbers)]
+def _csv_cells(row: Row) -> list[Any]:
+    numbers = zip(row[2:], DIGITS.values())
+    return [*row[:2], *("" if value is None else f"{value:.{digits}f}" for value, digits in numbers)]
 
 
 def _mot_line(row: Row) -> str:
@@ -412,21 +382,22 @@ def _write_rows(
     path: str | os.PathLike[str],
     kind: Format,
     columns: Sequence[str],
-    shape: tuple[int, ...] | None,
-) -> None:
-    """Write all rows at once, in any format."""
+    shape: tuple[int, ...] | None = None,
+) -> int:
+    """Write all rows at once, in any format; return their number."""
     if kind == "parquet":
         frame = "string" if columns == BOX_COLUMNS else "int64"
         types = {"frame": frame, "track_id": "int64"} | dict.fromkeys(columns[2:], "double")
         write_parquet(path, {name: [getattr(row, name) for row in rows] for name in columns}, types=types)
-        return
-    with atomic_write(path, "path") as part, _open_text(part) as file:
+        return len(rows)
+    with atomic_write(path, "path") as part, part.open("w", encoding="utf-8", newline="") as file:
         if kind == "coco":
             json.dump(_coco_document(rows, frames, shape), file, ensure_ascii=False)
         else:
             write_row = _row_writer(file, kind, columns)
             for row in rows:
                 write_row(row)
+    return len(rows)
 
 
 def _coco_document(

@@ -34,10 +34,8 @@ def add_heat(
 
     Parameters
     ----------
-    heatmap
-        ``(H, W)``; not changed.
-    boxes
-        ``(N, 4)`` windows, rounded to whole pixels and clipped to the map.
+    heatmap, boxes
+        ``(H, W)`` map, and ``(N, 4)`` windows, which are rounded to whole pixels and clipped to the map.
     scores
         ``(N,)`` heat that each window adds; by default 1 each, as in the course.
 
@@ -81,10 +79,8 @@ def apply_threshold(heatmap: NDArray[Any], threshold: float) -> NDArray[np.float
 
     Parameters
     ----------
-    heatmap
-        ``(H, W)``; not changed.
-    threshold
-        Highest heat that is removed.
+    heatmap, threshold
+        ``(H, W)`` map, and the highest heat that is removed.
 
     Returns
     -------
@@ -107,10 +103,8 @@ def label_boxes(heatmap: NDArray[Any], *, threshold: float = 0.0, peak_fraction:
 
     Parameters
     ----------
-    heatmap
-        ``(H, W)`` heat.
-    threshold
-        Heat at or below this belongs to no region.
+    heatmap, threshold
+        ``(H, W)`` heat; heat at or below `threshold` belongs to no region.
     peak_fraction
         0 gives the box of the whole region, as in the course. Otherwise the box of the part around the
         region's peak that has at least this fraction of the peak's heat, in [0, 1): windows extend beyond
@@ -164,12 +158,10 @@ def bounding_boxes(
 
     Parameters
     ----------
-    shape
-        ``(height, width, ...)`` of the frame.
-    windows
-        Positive windows with scores.
+    shape, windows
+        ``(height, width, ...)`` of the frame, and its positive windows.
     params
-        Weighting, threshold and fraction of the peak; by default ``HeatParams()``.
+        By default ``HeatParams()``.
 
     Returns
     -------
@@ -195,12 +187,7 @@ def frame_heat(shape: tuple[int, ...], windows: Detections, params: HeatParams) 
 
 
 class HeatHistory:
-    """Mean heat over the last frames, which smooths regions and suppresses short false positives.
-
-    Parameters
-    ----------
-    frames
-        Number of frames in the mean.
+    """Mean heat over the last `frames`, which smooths regions and suppresses short false positives.
 
     Examples
     --------
@@ -214,10 +201,7 @@ class HeatHistory:
         self._maps: deque[NDArray[np.float32]] = deque(maxlen=check_integer(frames, "frames", low=1))
 
     def add(self, heatmap: NDArray[Any]) -> NDArray[np.float32]:
-        """Add a frame's heat and return the mean over the last frames, ``(H, W)`` float32.
-
-        A map of another size clears the history first.
-        """
+        """Add ``(H, W)`` heat and return the mean, float32; another size clears the history first."""
         heat = _check_heat(heatmap).astype(np.float32)
         if self._maps and self._maps[-1].shape != heat.shape:
             self._maps.clear()

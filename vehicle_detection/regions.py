@@ -9,7 +9,6 @@ and with it the difference between window and box.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,18 +26,6 @@ from vehicle_detection.camera import Camera
 from vehicle_detection.params import RegionParams
 
 
-@dataclass(frozen=True, eq=False)
-class WindowGroups:
-    """Groups of overlapping windows as columns, best peak first."""
-
-    boxes: Floats  # (N, 4) weighted mean window
-    peaks: Floats  # (N,) best score
-    evidence: Floats  # (N,) sum of positive scores
-
-    def __len__(self) -> int:
-        return len(self.boxes)
-
-
 def find_vehicles(
     windows: Detections, camera: Camera, shape: tuple[int, ...], params: RegionParams | None = None
 ) -> Detections:
@@ -48,10 +35,8 @@ def find_vehicles(
     ----------
     windows
         Windows with scores; those at or below zero are ignored.
-    camera
-        Gives the focal length, and with it the distance at which a face fills a window.
-    shape
-        ``(height, width, ...)`` of the frame; the camera's optical axis is its middle column.
+    camera, shape
+        The camera, whose optical axis is the middle column, and ``(height, width, ...)`` of the frame.
     params
         Thresholds and geometry; by default ``RegionParams()``.
 
@@ -79,11 +64,11 @@ def find_vehicles(
     return fit_boxes(group_windows(windows, params), camera, shape, params)
 
 
-def group_windows(windows: Detections, params: RegionParams) -> WindowGroups:
-    """Group the positive windows around the best ones, greedily, and average each group."""
+def group_windows(windows: Detections, params: RegionParams) -> Detections:
+    """Group the positive windows greedily around the best ones: mean windows and best scores, best first."""
     left = Detections(windows.boxes.astype(np.float64), windows.scores)
     left = left[(left.scores > 0) & (box_areas(left.boxes) > 0)]
-    boxes, peaks, evidence = [], [], []
+    boxes, peaks = [], []
     while len(left):
         best = int(left.scores.argmax())
         peak = float(left.scores[best])
@@ -94,16 +79,14 @@ def group_windows(windows: Detections, params: RegionParams) -> WindowGroups:
         # Small windows are denser. Weights proportional to the area give every size the same influence.
         weights = (left.scores[joined] / peak) ** params.score_power * box_areas(left.boxes[joined])
         box = _mean_box(left.boxes[joined], weights)
-        total = float(left.scores[joined].sum())
-        if total >= params.min_evidence:
+        if left.scores[joined].sum() >= params.min_evidence:
             boxes.append(box)
             peaks.append(peak)
-            evidence.append(total)
         # Windows of other sizes and offsets on the same vehicle start no group of their own.
         centers = (left.boxes[:, :2] + left.boxes[:, 2:]) / 2
         middle, radius = (box[:2] + box[2:]) / 2, params.suppression_radius * (box[2:] - box[:2])
         left = left[~(joined | (np.abs(centers - middle) < radius).all(axis=1))]
-    return WindowGroups(np.array(boxes).reshape(-1, 4), np.array(peaks), np.array(evidence))
+    return Detections(np.array(boxes), np.array(peaks))
 
 
 def _mean_box(boxes: NDArray[Any], weights: Floats) -> Floats:
@@ -114,9 +97,7 @@ def _mean_box(boxes: NDArray[Any], weights: Floats) -> Floats:
     return np.concatenate([center - half, center + half])
 
 
-def fit_boxes(
-    groups: WindowGroups, camera: Camera, shape: tuple[int, ...], params: RegionParams
-) -> Detections:
+def fit_boxes(groups: Detections, camera: Camera, shape: tuple[int, ...], params: RegionParams) -> Detections:
     """Turn mean windows into boxes of the vehicles that they show, clipped to the frame."""
     size = groups.boxes[:, 2:] - groups.boxes[:, :2]
     center = (groups.boxes[:, 2:] + groups.boxes[:, :2]) / 2
@@ -132,8 +113,8 @@ def fit_boxes(
     half = (face + np.stack([flank, np.zeros_like(flank)], axis=1)) / 2
     boxes = clip_boxes(np.concatenate([center + shift - half, center + shift + half], axis=1), shape)
     faces = clip_boxes(np.concatenate([center - face / 2, center + face / 2], axis=1), shape)
-    kept = ~_on_other_vehicles(faces, boxes, groups.peaks, params) & (box_areas(boxes) > 0)
-    return Detections(boxes[kept], groups.peaks[kept])
+    kept = ~_on_other_vehicles(faces, boxes, groups.scores, params) & (box_areas(boxes) > 0)
+    return Detections(boxes[kept], groups.scores[kept])
 
 
 def _on_other_vehicles(

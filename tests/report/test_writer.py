@@ -27,10 +27,6 @@ def test_a_large_video_is_linked(tmp_path):
     assert len(embedded) > 2_000_000 * 4 / 3
 
 
-def test_the_limit_is_sixty_megabytes():
-    assert writer.EMBED_LIMIT == 60_000_000
-
-
 @pytest.mark.parametrize("size", range(9))
 def test_a_video_is_embedded_in_pieces(tmp_path, monkeypatch, size):
     monkeypatch.setattr(page, "_CHUNK", 3)

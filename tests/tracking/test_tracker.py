@@ -687,7 +687,7 @@ class TestDeterminism:
 class TestArguments:
     @pytest.mark.parametrize("fps", [0, -25, math.nan, math.inf, None, "25"])
     def test_rejects_invalid_frame_rates(self, fps):
-        with pytest.raises(InvalidInputError, match=r"fps must be a number.*; pass the video's frame rate"):
+        with pytest.raises(InvalidInputError, match="fps must be a number, greater than 0"):
             Tracker(fps=fps)
 
     def test_rejects_invalid_params_and_cameras(self):
@@ -695,7 +695,7 @@ class TestArguments:
             InvalidInputError, match=r"params must be a TrackParams, got .*pass TrackParams\(\)"
         ):
             Tracker({"max_distance": 1})
-        with pytest.raises(InvalidInputError, match=r"camera must be a Camera, got 3 \(int\)"):
+        with pytest.raises(InvalidInputError, match=r"camera must be a Camera, got 3;"):
             Tracker(camera=3)
 
     def test_rejects_malformed_frames_and_keeps_its_state(self):

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from vehicle_detection.training import TrainingReport
 
 
-@option_names(random_state="--seed")
+@option_names(random_state="--seed", patches_or_labels="--vehicles and --non-vehicles")
 def train(
     vehicles: Annotated[Path, Option(metavar="PATH", help="Folder or zip of patches of vehicles.")],
     non_vehicles: Annotated[Path, Option(metavar="PATH", help="Folder or zip of other patches.")],

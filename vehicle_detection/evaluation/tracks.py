@@ -13,14 +13,7 @@ from numpy.typing import NDArray
 from vehicle_detection._common import check_number
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation.detections import (
-    Scores,
-    format_number,
-    format_summary,
-    mean,
-    rates,
-    ratio,
-)
+from vehicle_detection.evaluation.detections import Scores, format_number, format_summary, mean, rates, ratio
 from vehicle_detection.evaluation.frame_boxes import NO_TRACK, FrameBoxes, FrameKey
 from vehicle_detection.evaluation.matching import find_ignored, prepare_evaluation
 

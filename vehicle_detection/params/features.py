@@ -16,6 +16,7 @@ PATCH_SIZE = 64
 
 COLOR_SPACES = ("RGB", "HSV", "LUV", "HLS", "YUV", "YCrCb", "LAB")
 HOG_CHANNELS: tuple[int | str, ...] = (0, 1, 2, "ALL", "GRAY")
+_LAB = {"color_space": "LAB", "spatial_size": 32}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,28 +28,22 @@ class FeatureParams:
     Attributes
     ----------
     color_space
-        Color space of all three parts: ``"RGB"``, ``"HSV"``, ``"LUV"``, ``"HLS"``, ``"YUV"``, ``"YCrCb"`` or
+        Color space of all parts: ``"RGB"``, ``"HSV"``, ``"LUV"``, ``"HLS"``, ``"YUV"``, ``"YCrCb"`` or
         ``"LAB"``.
     spatial_feat, hist_feat, hog_feat
         Which of the three parts to compute.
     spatial_size
         Side length of the grid of spatial bins, which gives ``spatial_size**2 * 3`` values.
-    hist_bins
-        Number of bins of each channel's histogram over 0-255.
-    hist_sqrt
-        Use the square roots of the histogram's counts, so that a full bin dominates less.
-    orient
-        Number of HOG orientations over 0-180 degrees.
-    pix_per_cell
-        Side length of a HOG cell in pixels.
-    cell_per_block
-        Side length of a HOG block in cells.
+    hist_bins, hist_sqrt
+        Number of bins of each channel's histogram over 0-255, and whether to use the square roots of the
+        counts, so that a full bin dominates less.
+    orient, pix_per_cell, cell_per_block
+        Number of HOG orientations over 0-180 degrees, and side lengths of a HOG cell in pixels and of a block
+        in cells.
     hog_channel
         Channel of HOG: 0, 1, 2, ``"ALL"``, or ``"GRAY"`` for the gray image in any `color_space`.
-    transform_sqrt
-        Compute HOG on the square root of the pixel values.
-    coarse_hog
-        Append the HOG of cells of ``2 * pix_per_cell`` pixels.
+    transform_sqrt, coarse_hog
+        Compute HOG on the square root of the pixel values; append the HOG of cells of twice the size.
     hist_gain, coarse_gain
         Factors of the scaled histogram and the scaled coarse HOG in training. A larger factor weakens the
         regularization of these few features. The gains change the weights only, not the features.
@@ -92,15 +87,8 @@ class FeatureParams:
         },
         "ycrcb-6156": {},
         "ycrcb-8460": {"spatial_size": 32},
-        "lab-8460": {"color_space": "LAB", "spatial_size": 32},
-        "lab-9432": {
-            "color_space": "LAB",
-            "spatial_size": 32,
-            "hist_sqrt": True,
-            "coarse_hog": True,
-            "hist_gain": 4.0,
-            "coarse_gain": 3.0,
-        },
+        "lab-8460": _LAB,
+        "lab-9432": {**_LAB, "hist_sqrt": True, "coarse_hog": True, "hist_gain": 4.0, "coarse_gain": 3.0},
     }
 
     def __post_init__(self) -> None:
@@ -125,8 +113,7 @@ class FeatureParams:
                 f"{2 * self.pix_per_cell} pixels does not fit into a patch; got True"
             )
         for name in ("hist_gain", "coarse_gain"):
-            gain = check_number(getattr(self, name), name, low=0.01, high=100)
-            object.__setattr__(self, name, float(gain))
+            object.__setattr__(self, name, check_number(getattr(self, name), name, low=0.01, high=100))
 
     def _check_integer(self, name: str, low: int, high: int) -> None:
         # Convert numpy integers, which JSON does not support.
@@ -134,12 +121,7 @@ class FeatureParams:
 
     @classmethod
     def preset(cls, name: str) -> FeatureParams:
-        """Parameters by name.
-
-        ``"luv-2384"``, ``"ycrcb-6156"`` and ``"ycrcb-8460"`` are the features of three course projects.
-        ``"lab-9432"`` is used by the shipped model ``"highway"``: ``"lab-8460"`` with `hist_sqrt` and
-        `coarse_hog`.
-        """
+        """Parameters by name: of three course projects, or ``"lab-9432"`` of the shipped model "highway"."""
         check_choice(name, "preset", cls.PRESETS)
         return cls(**cls.PRESETS[name])
 
@@ -176,13 +158,15 @@ class FeatureParams:
     @property
     def hog_length(self) -> int:
         """Number of HOG features, including the coarse ones."""
-        values = self.blocks**2 * self.cell_per_block**2 * self.orient * self.hog_channels
-        return values + self.coarse_length if self.hog_feat else 0
+        return self._block_values(self.blocks) + self.coarse_length
 
     @property
     def coarse_length(self) -> int:
         """Number of coarse HOG features, the last ones of the vector."""
-        values = self.coarse_blocks**2 * self.cell_per_block**2 * self.orient * self.hog_channels
+        return self._block_values(self.coarse_blocks)
+
+    def _block_values(self, blocks: int) -> int:
+        values = blocks**2 * self.cell_per_block**2 * self.orient * self.hog_channels
         return values if self.hog_feat else 0
 
     @property

@@ -18,13 +18,11 @@ class MixtureParams:
 
     Attributes
     ----------
-    shapes
-        Size of the vehicle's box in cells, ``(columns, rows)``, for each template.
+    shapes, padding
+        Size of the vehicle's box in cells, ``(columns, rows)``, for each template, and cells of context.
     mirrored
         For each template, whether it shows one side of a vehicle: its samples are aligned to the same side,
         and the mirrored template is searched too.
-    padding
-        Cells of context around the box.
     border_shapes
         Size in cells of the visible part of a vehicle that the left or right border of the frame truncates,
         for each border template; () trains none.
@@ -38,30 +36,24 @@ class MixtureParams:
         Inverse regularization strength, as in ``LinearSVC``, of the templates and of the border templates.
     positive_weight
         Total weight of all positives of a template; each negative weighs 1.
-    size_prior_weight, vote_weight
-        As in `TemplateMixture`.
-    n_iterations
-        Maximum number of regression steps of a box, as in `BoxRegressor`.
-    blend_weight
-        Weight of the rescorer in a vehicle's score, as in `Rescorer`; 0 trains no rescorer.
+    size_prior_weight, vote_weight, n_iterations, blend_weight
+        As in `TemplateMixture`, `BoxRegressor` and `Rescorer`; with a `blend_weight` of 0 no rescorer is
+        trained.
     min_width
         Width in pixels of the narrowest box to train on.
     aspect_tolerance
         A box trains every template whose log aspect ratio differs by less than this, and the closest one.
     copies, jitter_scale
         Copies of each box; all but the first are shifted randomly by up to `jitter_scale` of their sides.
-    border_copies
-        Copies of each box that a border truncates. These are few, and show other sides of a vehicle than
-        those that are truncated artificially.
-    relit_copies
-        Additional copies of each box from frames with random exposure and contrast.
+    border_copies, relit_copies
+        Copies of each box that a border truncates, which are few; and additional copies of each box from
+        frames with random exposure and contrast.
     mining_schedule
         Fraction of the frames that each mining round searches. Mining stops early when a round over all
         frames adds less than 1% new negatives.
-    max_per_frame
-        Maximum number of negatives per frame, template and round.
-    max_negatives
-        Maximum number of negatives kept per template; those with the lowest margins are dropped.
+    max_per_frame, max_negatives
+        Maximum number of negatives per frame, template and round, and of those kept per template, which have
+        the highest margins.
     search
         Window sizes at which negatives are searched.
 

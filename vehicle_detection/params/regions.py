@@ -16,10 +16,8 @@ class HeatParams:
     ----------
     weighting
         ``"score"``: each window adds its score to the heat; ``"count"``: it adds 1, as in the course.
-    frames
-        Number of frames of a video over which the heat is averaged.
-    threshold
-        Heat at or below this value is set to zero.
+    frames, threshold
+        Number of frames over which the heat is averaged, and the highest heat that is removed.
     peak_fraction
         A region is reduced to the part around its peak that has at least this fraction of the peak's heat,
         in [0, 1); 0 keeps whole regions, as in the course.
@@ -43,24 +41,20 @@ class RegionParams:
 
     Attributes
     ----------
-    min_peak
-        Minimum of the best score in a group.
-    min_evidence
-        Minimum of the sum of positive scores in a group.
+    min_peak, min_evidence
+        Minimum of the best score, and of the sum of positive scores in a group.
     min_iou
         Windows whose IoU with the best window exceeds this join its group.
     score_power
         The weight of a window in the group's mean is proportional to this power of its score.
     suppression_radius
         Windows whose center is this near to the center of a group start no group of their own.
-    face_width, face_height
-        Size of the vehicle's face (front or rear) in a window, as on the training patches.
-    face_offset_y
-        Distance of the face's center below the window's center.
-    flank_length_m
-        Length of the visible side of a vehicle in meters.
-    flank_shift
-        Fraction of the visible side by which the box's center moves towards the vanishing point.
+    face_width, face_height, face_offset_y
+        Size of the vehicle's face (front or rear) in a window, as on the training patches, and distance of
+        its center below the window's center.
+    flank_length_m, flank_shift
+        Length of the visible side of a vehicle in meters, and fraction of the visible side by which the box's
+        center moves towards the vanishing point.
     max_coverage
         A group is dropped if more than this fraction of its face lies inside the box of a better group.
     flank_peak_ratio

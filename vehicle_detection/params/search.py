@@ -13,36 +13,19 @@ from vehicle_detection.errors import InvalidInputError
 REFERENCE_WIDTH = 1280
 """Search windows are given in pixels of a frame whose longer side has this length."""
 
-# Minimum side of a window in pixels of the frame: smaller ones are too blurred when enlarged to a patch.
-_MIN_WINDOW = 16
-# Typical width of a vehicle in meters.
-_VEHICLE_WIDTH_M = 1.8
-# Tolerance of a horizon that the user states, as a fraction of the frame's height.
-_KNOWN_HORIZON_TOLERANCE = 0.06
-
 Pair = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class PixelBand:
-    """A search band in integer pixels of one frame.
-
-    Attributes
-    ----------
-    x1, y1, x2, y2
-        Half-open rectangle of the band. It may extend beyond the frame's left and right border.
-    window
-        Width and height of the windows.
-    step
-        Horizontal and vertical step between windows.
-    """
+    """A search band in integer pixels of one frame; it may extend beyond the left and right border."""
 
     x1: int
     y1: int
     x2: int
     y2: int
-    window: tuple[int, int]
-    step: tuple[int, int]
+    window: tuple[int, int]  # width and height
+    step: tuple[int, int]  # horizontal and vertical
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,10 +36,9 @@ class SearchBand:
     ----------
     window
         Width and height of the windows.
-    y
-        Top and bottom of the band relative to the horizon, positive downwards.
-    x
-        Left and right end as fractions of the frame's width, 0-1.
+    y, x
+        Top and bottom of the band relative to the horizon, positive downwards; left and right end as
+        fractions of the frame's width, 0-1.
     overlap
         Horizontal and vertical overlap of neighboring windows as fractions of their size, in [0, 1).
     """
@@ -86,7 +68,8 @@ class SearchBand:
         window_w, window_h = (round(side * scale) for side in self.window)
         y1, y2 = (min(max(round(horizon * height + side * scale), 0), height) for side in self.y)
         x1, x2 = round(self.x[0] * width), round(self.x[1] * width)
-        if min(window_w, window_h) < _MIN_WINDOW or x2 - x1 < window_w or y2 - y1 < window_h:
+        # Smaller windows than 16 pixels are too blurred when enlarged to a patch.
+        if min(window_w, window_h) < 16 or x2 - x1 < window_w or y2 - y1 < window_h:
             return None
         padding = round(horizontal_padding * window_w)
         x1 -= padding if x1 == 0 else 0
@@ -104,10 +87,8 @@ class SearchParams:
 
     Attributes
     ----------
-    bands
-        Bands of windows, each with its window size.
-    horizon
-        Row of the horizon as a fraction of the frame's height, 0 at the top.
+    bands, horizon
+        Bands of windows, and row of the horizon as a fraction of the frame's height, 0 at the top.
     min_score
         Minimum score of a hit (exclusive).
     horizontal_padding
@@ -131,10 +112,10 @@ class SearchParams:
 
     def __post_init__(self) -> None:
         bands: object = self.bands
-        if not isinstance(bands, (tuple, list)) or not all(isinstance(band, SearchBand) for band in bands):
-            raise InvalidInputError(f"bands must be a tuple of SearchBand; got {describe(bands)}")
-        if not bands:
-            raise InvalidInputError("bands must be a tuple of SearchBand, at least one; got none")
+        if not (isinstance(bands, (tuple, list)) and bands and all(isinstance(b, SearchBand) for b in bands)):
+            raise InvalidInputError(
+                f"bands must be a tuple of SearchBand, at least one; got {describe(bands)}"
+            )
         object.__setattr__(self, "bands", tuple(bands))
         check_number(self.horizon, "horizon", low=0, high=1)
         check_number(self.min_score, "min_score", low=-1e6, high=1e6)
@@ -147,11 +128,7 @@ class SearchParams:
 
     @classmethod
     def preset(cls, name: str = "default") -> SearchParams:
-        """Return the project's bands (``"default"``) or those of a system of the course, for 1280x720 frames.
-
-        ``"130-windows"`` is the window list of the first system, ``"three-scales"`` the dense search of the
-        third.
-        """
+        """Return "default", or "130-windows" or "three-scales" of the course's first or third system."""
         presets = {"three-scales": _three_scales, "130-windows": _window_list, "default": _default_bands}
         check_choice(name, "preset", presets)
         return presets[name]()
@@ -161,13 +138,7 @@ class SearchParams:
         return self if horizon is None else dataclasses.replace(self, horizon=horizon)
 
     def place(self, shape: tuple[int, ...]) -> tuple[PixelBand, ...]:
-        """Bands in pixels of a frame of `shape` (height, width, ...).
-
-        Raises
-        ------
-        InvalidInputError
-            If no window fits into the frame.
-        """
+        """Bands in pixels of a frame of `shape` (height, width, ...), in which some window must fit."""
         placed = [band.place(shape, self.horizon, self.horizontal_padding) for band in self.bands]
         fitting = tuple(band for band in placed if band is not None)
         if not fitting:
@@ -211,11 +182,8 @@ def _default_bands() -> SearchParams:
     side `s` is ``0.84 * s * c / 1.8`` below the horizon. For cameras at 0.9 to 2 m the window is between
     -0.35 `s` and 0.95 `s`; the margin allows for hills and an inexact horizon.
     """
-    margin = 16.0
     sides = [64.0 * 1.25**step for step in range(8)]
-    bands = tuple(
-        SearchBand(window=(side, side), y=(-0.35 * side - margin, 0.95 * side + margin)) for side in sides
-    )
+    bands = tuple(SearchBand(window=(side, side), y=(-0.35 * side - 16, 0.95 * side + 16)) for side in sides)
     return SearchParams(bands=bands, horizontal_padding=0.5)
 
 
@@ -225,10 +193,8 @@ class PyramidParams:
 
     Attributes
     ----------
-    min_width
-        Minimum width of a vehicle in pixels.
-    max_height
-        Maximum height of a vehicle as a fraction of the frame's height.
+    min_width, max_height
+        Minimum width of a vehicle in pixels, and maximum height as a fraction of the frame's height.
     per_octave
         Number of sizes per doubling.
     horizon
@@ -282,7 +248,7 @@ class PyramidParams:
         """Return the same parameters with a known horizon and a lower tolerance; None changes nothing."""
         if horizon is None:
             return self
-        return dataclasses.replace(self, horizon=horizon, horizon_tolerance=_KNOWN_HORIZON_TOLERANCE)
+        return dataclasses.replace(self, horizon=horizon, horizon_tolerance=0.06)
 
     def sizes(self, columns: float, rows: float, shape: tuple[int, ...]) -> list[float]:
         """Cell sizes in pixels of the frame, for boxes of `columns` by `rows` cells in a frame of `shape`."""
@@ -299,7 +265,8 @@ class PyramidParams:
         """
         if self.horizon is None:
             return 0, shape[0]
-        low, high = (camera_height * width / _VEHICLE_WIDTH_M for camera_height in self.camera_height_m)
+        # Vehicles are typically 1.8 m wide.
+        low, high = (camera_height * width / 1.8 for camera_height in self.camera_height_m)
         slack = self.horizon_tolerance * shape[0]
         top = (self.horizon * shape[0]) + low - slack - height
         bottom = (self.horizon * shape[0]) + high + slack

@@ -34,14 +34,13 @@ class TrackParams:
     instant_confirm_score
         In the first frame, and in the first one after a scene cut, a detection with this score is confirmed
         at once, because no earlier frame could have shown it.
-    tentative_coast
-        A track that is not confirmed ends after this time without a detection.
+    tentative_coast, max_coast
+        A tentative and a confirmed track end after these times without a detection; while a vehicle is hidden
+        by another one, time counts half.
     show_coast
         A confirmed track is shown for this time without a detection, and no longer than it was detected since
         its confirmation. While another vehicle hides it, it is shown up to `max_coast`, and no longer than it
         was detected. It is not shown once it must have moved by half of its size.
-    max_coast
-        A confirmed track ends after this time without a detection; while it is hidden, time counts half.
     max_gap
         A longer gap between two frames ends all tracks.
     max_distance
@@ -49,17 +48,15 @@ class TrackParams:
     max_iou, max_coverage
         A detection starts no track if its IoU with a track exceeds `max_iou`, or if the two share more than
         the fraction `max_coverage` of the smaller box.
-    measurement_noise
-        Standard error of a detection's edges.
-    measurement_correlation_time
-        Time over which that error is correlated, so that twice the frame rate is not twice the evidence.
+    measurement_noise, measurement_correlation_time
+        Standard error of a detection's edges, and time over which it is correlated, so that twice the frame
+        rate is not twice the evidence.
     process_noise_position, process_noise_size
         Process noise of the center and of the size: standard deviation by which their speeds change in a
         second, in sizes per second.
-    history_seconds
-        Length of the mean of the smoother ``"history"``.
-    nearest_weight
-        Fraction of the way that the smoother ``"nearest"`` moves in 0.04 seconds, in (0, 1].
+    history_seconds, nearest_weight
+        Length of the mean of the smoother ``"history"``, and fraction of the way that the smoother
+        ``"nearest"`` moves in 0.04 seconds, in (0, 1].
 
     Examples
     --------
@@ -68,7 +65,7 @@ class TrackParams:
     >>> TrackParams(confirm_hits=0)
     Traceback (most recent call last):
     ...
-    vehicle_detection.errors.InvalidInputError: confirm_hits must be an integer from 1 to 10000; got 0 (int)
+    vehicle_detection.errors.InvalidInputError: confirm_hits must be an integer from 1 to 10000; got 0
     """
 
     smoother: Literal["kalman", "history", "nearest"] = "kalman"

@@ -2,6 +2,4 @@
 
 from vehicle_detection.report.writer import ReportWriter
 
-__all__ = [
-    "ReportWriter",
-]
+__all__ = ["ReportWriter"]

@@ -22,8 +22,6 @@ MAX_ROWS = 14
 """Largest number of tracks that get a row each in `gantt`; more tracks share rows."""
 
 _CURVE_WIDTH = 1000  # units across the nested SVG of the curves
-_MAX_POINTS = 800  # along a curve
-_TIMES_HEIGHT = 20  # pixels below a chart for its times
 _ROW_HEIGHT, _BAR_HEIGHT = 22, 14  # pixels
 _LABEL_WIDTH, _LABEL_HEIGHT = 5.0, 13.0  # percent of the chart's width, pixels
 _MIN_LABELED = 0.08  # fraction of the video that a track must last to be labeled inside a chart
@@ -52,8 +50,8 @@ class TimeAxis:
 
     @property
     def bin_width(self) -> int:
-        """Frames per point of a curve."""
-        return math.ceil(self.frames / _MAX_POINTS)
+        """Frames per point of a curve, of which there are at most 800."""
+        return math.ceil(self.frames / 800)
 
     def percent(self, frame: float) -> str:
         """Position of the beginning of a frame, as a percentage of the width."""
@@ -114,13 +112,9 @@ def chart(
         grid.append(svg_element("line", class_=line, x1=0, x2="100%", y1=_decimal(y), y2=_decimal(y)))
         text = format_value(float(value))
         values.append(svg_element("text", text, x="100%", dx=-6, y=_decimal(y + 4), text_anchor="end"))
+    view = f"0 0 {_CURVE_WIDTH} {height}"
     curves = svg_element(
-        "svg",
-        content,
-        viewBox=f"0 0 {_CURVE_WIDTH} {height}",
-        preserveAspectRatio="none",
-        width="100%",
-        height=height,
+        "svg", content, viewBox=view, preserveAspectRatio="none", width="100%", height=height
     )
     names = []
     for each in _separate_labels(track_labels, height):
@@ -144,11 +138,15 @@ def gantt(tracks: Sequence[TrackHistory], axis: TimeAxis, *, label: str) -> str:
             x = axis.percent(track.first)
             names.append(svg_element("text", name, class_="track-name", x=x, dx=3, y=y))
         times = f"{format_time(track.first / axis.fps)} to {format_time((track.last + 1) / axis.fps)}"
+        bar = {"y": _decimal(middle - _BAR_HEIGHT / 2), "height": _BAR_HEIGHT, "rx": 3}
         bars.append(
             svg_element(
                 "g",
                 svg_element("title", f"{name}, {times}"),
-                *_track_bars(track, middle - _BAR_HEIGHT / 2, axis),
+                *(
+                    svg_element("rect", x=axis.percent(start), width=axis.percent(stop - start), **bar)
+                    for start, stop in track.spans(max(1, axis.frames // _CURVE_WIDTH))
+                ),
                 class_=f"bar c{track.color}",
                 role="button",
                 tabindex=0,
@@ -168,24 +166,9 @@ def _assign_rows(tracks: Sequence[TrackHistory], axis: TimeAxis) -> list[int]:
     rows = []
     for track in tracks:
         free = (row for row, end in enumerate(ends) if end + min_gap < track.first)
-        row = next(free, len(ends))
-        ends[row : row + 1] = [track.last]
-        rows.append(row)
+        rows.append(next(free, len(ends)))
+        ends[rows[-1] : rows[-1] + 1] = [track.last]
     return rows
-
-
-def _track_bars(track: TrackHistory, y: float, axis: TimeAxis) -> list[str]:
-    return [
-        svg_element(
-            "rect",
-            x=axis.percent(start),
-            width=axis.percent(stop - start),
-            y=_decimal(y),
-            height=_BAR_HEIGHT,
-            rx=3,
-        )
-        for start, stop in track.spans(max(1, axis.frames // _CURVE_WIDTH))
-    ]
 
 
 def _graph(
@@ -202,19 +185,10 @@ def _graph(
         text = format_time(seconds, tenths=tenths)
         times.append(svg_element("text", text, x=x, y=height + 15, text_anchor=anchor))
     lines = [svg_element("line", class_=name, x1=0, x2=0, y1=0, y2=height) for name in ("cursor", "playhead")]
-    total = height + _TIMES_HEIGHT
+    total = height + 20  # the times are below the chart
     side = svg_element("svg", *values, class_="values", width=44, height=total, aria_hidden="true")
-    plot = svg_element(
-        "svg",
-        *times,
-        *content,
-        *lines,
-        class_="plot",
-        width="100%",
-        height=total,
-        role=role,
-        aria_label=label,
-    )
+    parts = [*times, *content, *lines]
+    plot = svg_element("svg", *parts, class_="plot", width="100%", height=total, role=role, aria_label=label)
     return f'<div class="graph">{side}{plot}</div>'
 
 
@@ -308,10 +282,9 @@ def _points(bins: NDArray[np.int64], values: Floats, time_axis: TimeAxis, value_
 
 
 def _line(points: list[str], axis: TimeAxis) -> str:
-    if len(points) > 1:
-        return f"M{' '.join(points)}"
     # A single point gets a short line, as a line without length is invisible.
-    return f"M{points[0]}h{_decimal(max(axis.bin_width / axis.frames * _CURVE_WIDTH, 2))}"
+    end = f"h{_decimal(max(axis.bin_width / axis.frames * _CURVE_WIDTH, 2))}" if len(points) == 1 else ""
+    return f"M{' '.join(points)}{end}"
 
 
 def _decimal(value: float) -> str:

@@ -7,13 +7,7 @@ from collections.abc import Mapping
 
 
 def format_time(seconds: float, *, tenths: bool = True) -> str:
-    """Format a time of a video.
-
-    Examples
-    --------
-    >>> format_time(3.24), format_time(75, tenths=False), format_time(3725.96)
-    ('0:03.2', '1:15', '1:02:06.0')
-    """
+    """Format a time of a video, such as "0:03.2" or "1:02:06"."""
     total = round(seconds, 1 if tenths else 0)
     minutes, rest = divmod(total, 60)
     hours, minutes = divmod(int(minutes), 60)
@@ -22,13 +16,7 @@ def format_time(seconds: float, *, tenths: bool = True) -> str:
 
 
 def pluralize(count: int, noun: str) -> str:
-    """Format a count with its noun.
-
-    Examples
-    --------
-    >>> pluralize(1, "vehicle"), pluralize(1200, "frame")
-    ('1 vehicle', '1,200 frames')
-    """
+    """Format a count with its noun: "1 vehicle", "1,200 frames"."""
     return f"{count:,} {noun}{'s' * (count != 1)}"
 
 
@@ -46,13 +34,7 @@ def format_value(value: object) -> str:
 
 
 def svg_element(name: str, *content: str, **attributes: object) -> str:
-    """Write an SVG element around `content` (markup); attribute values are escaped, underscores are hyphens.
-
-    Examples
-    --------
-    >>> svg_element("text", "#1", class_="name", text_anchor="end", aria_label='a "b"')
-    '<text class="name" text-anchor="end" aria-label="a &quot;b&quot;">#1</text>'
-    """
+    """Write an SVG element around `content` (markup); attributes are escaped, underscores are hyphens."""
     pairs = (
         f' {key.rstrip("_").replace("_", "-")}="{html.escape(str(value))}"'
         for key, value in attributes.items()

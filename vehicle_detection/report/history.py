@@ -21,10 +21,6 @@ Floats = NDArray[np.float64]
 COLUMNS = ("distance_m", "distance_std_m", "speed_mps", "speed_std_mps", "score")
 """Attributes of a track that are kept for each frame; NaN if unknown."""
 
-# The closest approach is a median over this time, so that a single outlier does not count.
-_APPROACH_SECONDS = 1 / 3
-_MAX_VALUE = 1e9
-
 
 class ClosestApproach(NamedTuple):
     """Smallest distance of a track."""
@@ -77,16 +73,16 @@ class TrackHistory:
         known = np.flatnonzero(np.isfinite(distances))
         if not known.size:
             return None
-        width = min(max(round(_APPROACH_SECONDS * fps), 1), known.size)
+        # A median over a third of a second, so that a single outlier does not count.
+        width = min(max(round(1 / 3 * fps), 1), known.size)
         medians = np.median(np.lib.stride_tricks.sliding_window_view(distances[known], width), axis=1)
         start = int(np.argmin(medians))
         window = known[start : start + width]
         # The frame to seek to: the one whose distance is closest to the median.
         best = window[int(np.argmin(np.abs(distances[window] - medians[start])))]
         std = float(np.median(stds[window]))
-        return ClosestApproach(
-            int(self.frames[best]), float(medians[start]), std if math.isfinite(std) else None
-        )
+        known_std = std if math.isfinite(std) else None
+        return ClosestApproach(int(self.frames[best]), float(medians[start]), known_std)
 
 
 class TrackLog:
@@ -121,23 +117,17 @@ class TrackLog:
 
     def histories(self) -> list[TrackHistory]:
         """Return the tracks in the order of their first frames."""
-        histories = (
-            TrackHistory(
-                track_id,
-                np.array(frames, np.int64),
-                {name: np.array(column, np.float64) for name, column in columns.items()},
-            )
-            for track_id, (frames, columns) in self._columns.items()
-        )
+        histories = []
+        for track_id, (frames, columns) in self._columns.items():
+            arrays = {name: np.array(column, np.float64) for name, column in columns.items()}
+            histories.append(TrackHistory(track_id, np.array(frames, np.int64), arrays))
         return sorted(histories, key=lambda track: (track.first, track.id))
 
 
 def _rows(tracks: object) -> Iterator[tuple[int, list[float]]]:
     """Id and values of `COLUMNS` of each shown track."""
-    if isinstance(tracks, (str, bytes)) or not isinstance(tracks, Iterable):
-        raise InvalidInputError(f"tracks must be Track objects, got {describe(tracks)}; pass result.tracks")
     seen = set()
-    for track in tracks:
+    for track in tracks if isinstance(tracks, Iterable) else [tracks]:
         if not hasattr(track, "id"):
             raise InvalidInputError(
                 f"tracks must be Track objects, got {describe(track)}; pass result.tracks"
@@ -159,34 +149,17 @@ def _number(value: Any, name: str) -> float:
         return math.nan
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise InvalidInputError(f"track.{name} must be a number or None, got {describe(value)}; omit it")
-    try:
-        number = float(value)
-    except OverflowError:
-        return math.nan
-    return number if abs(number) < _MAX_VALUE else math.nan
+    return float(value) if -1e9 < value < 1e9 else math.nan
 
 
 def bin_means(frames: NDArray[np.int64], values: Floats, width: int) -> tuple[NDArray[np.int64], Floats]:
-    """Mean of the known values in bins of `width` frames: indices of the bins with known values, and means.
-
-    Examples
-    --------
-    >>> bins, means = bin_means(np.arange(5), np.array([1.0, 3.0, np.nan, np.nan, 7.0]), 2)
-    >>> bins.tolist(), means.tolist()
-    ([0, 2], [2.0, 7.0])
-    """
+    """Return the indices of the bins of `width` frames with known values, and the means of the known values."""
     known = np.isfinite(values)
     bins, inverse, counts = np.unique(frames[known] // width, return_inverse=True, return_counts=True)
     return bins, np.bincount(inverse, values[known], len(bins)) / counts
 
 
 def split_runs(numbers: NDArray[np.int64], max_step: int = 1) -> list[slice]:
-    """Slices of an ascending array in which each number is at most `max_step` above the one before.
-
-    Examples
-    --------
-    >>> [(run.start, run.stop) for run in split_runs(np.array([3, 4, 5, 9]))]
-    [(0, 3), (3, 4)]
-    """
+    """Slices of an ascending array in which each number is at most `max_step` above the one before."""
     edges = [0, *(np.flatnonzero(np.diff(numbers) > max_step) + 1).tolist(), len(numbers)]
     return [slice(start, stop) for start, stop in pairwise(edges) if stop > start]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -30,16 +30,11 @@ from vehicle_detection.report.charts import (
     gantt,
 )
 from vehicle_detection.report.formatting import format_time, format_value, pluralize
-from vehicle_detection.report.history import TrackHistory, TrackLog, bin_means
+from vehicle_detection.report.history import Floats, TrackHistory, TrackLog, bin_means
 from vehicle_detection.training import SPLITS
 from vehicle_detection.video import VideoReport
 
-if TYPE_CHECKING:
-    from jinja2 import Template
-
-_CHART_HEIGHT = 150  # pixels
 _COUNT_SECONDS = (1, 2, 5, 10, 15, 30, 60, 120, 300)  # durations of a bar in the chart of counts
-_MAX_COUNT_BARS = 300
 _CHUNK = 3 << 18  # bytes; a multiple of 3, so that the chunks' base64 texts can be joined
 
 
@@ -101,10 +96,17 @@ def render_page(
     log: TrackLog, report: VideoReport, *, video: VideoEmbed | None, source: str | None, detector: Any
 ) -> Iterator[str]:
     """Render the page in pieces; `detector` may lack settings or a model, which are then left out."""
+    from jinja2 import Environment, StrictUndefined
+
     axis = TimeAxis(max(report.frames, len(log.counts), 1), float(report.fps))
     tracks = [_without_imprecise_speeds(track) for track in log.histories()]
     css, script = _read("report.css"), _read("report.js")
-    return _template().generate(
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters |= {"time": format_time, "plural": pluralize, "value": format_value}
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
+    return environment.from_string(_read("report.html.j2")).generate(
         css=css,
         script=script,
         css_hash=_csp_hash(css),
@@ -127,17 +129,6 @@ def render_page(
 
 def _read(name: str) -> str:
     return files("vehicle_detection.report").joinpath(name).read_text(encoding="utf-8")
-
-
-def _template() -> Template:
-    from jinja2 import Environment, StrictUndefined
-
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters |= {"time": format_time, "plural": pluralize, "value": format_value}
-    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
-    return environment.from_string(_read("report.html.j2"))
 
 
 def _csp_hash(code: str) -> str:
@@ -165,17 +156,20 @@ def _counts(tracks: Sequence[TrackHistory], log: TrackLog, report: VideoReport) 
 
 def _figures(tracks: Sequence[TrackHistory], log: TrackLog, axis: TimeAxis) -> list[Figure]:
     label = f"Bars of {pluralize(len(tracks), 'track')}: when each was shown, as in the table of tracks."
+    gantt_figure = Figure("Tracks", "When each vehicle was shown", gantt(tracks, axis, label=label))
+    distances = [track.columns["distance_m"] for track in tracks]
+    speeds = [bin_means(track.frames, track.columns["speed_mps"], axis.bin_width)[1] for track in tracks]
     return [
-        Figure("Tracks", "When each vehicle was shown", gantt(tracks, axis, label=label)),
+        gantt_figure,
         _count_figure(log, axis),
-        _distance_figure(tracks, axis),
-        _speed_figure(tracks, axis),
+        _curve_figure("distance", np.concatenate(distances), tracks, axis),
+        _curve_figure("relative speed", np.concatenate(speeds), tracks, axis),
     ]
 
 
 def _count_figure(log: TrackLog, axis: TimeAxis) -> Figure:
     counts = np.array(log.counts, np.int64)
-    seconds = next((each for each in _COUNT_SECONDS if axis.seconds / each <= _MAX_COUNT_BARS), 600)
+    seconds = next((each for each in _COUNT_SECONDS if axis.seconds / each <= 300), 600)
     edges = [0.0]
     while edges[-1] < axis.frames:  # a frame belongs to the second in which it begins
         edges.append(min(math.ceil(len(edges) * seconds * axis.fps - 1e-6), axis.frames))
@@ -187,37 +181,27 @@ def _count_figure(log: TrackLog, axis: TimeAxis) -> Figure:
     return Figure("Vehicles", f"Most shown at once in {interval}", svg)
 
 
-def _distance_figure(tracks: Sequence[TrackHistory], axis: TimeAxis) -> Figure:
-    title, name = "Distance", "distance_m"
-    distances = np.concatenate([track.columns[name] for track in tracks])
-    known = distances[np.isfinite(distances)]
+def _curve_figure(quantity: str, values: Floats, tracks: Sequence[TrackHistory], axis: TimeAxis) -> Figure:
+    """Lines of the distance or of the relative speed of each track."""
+    known = values[np.isfinite(values)]
     if not known.size:
-        return Figure(title, "No distance is known.")
-    values = ValueAxis.covering(0, float(known.max()), _CHART_HEIGHT)
-    curves = "".join(curve(track, name, axis, values, std="distance_std_m") for track in tracks)
-    label = (
-        f"Lines: distance of each track, from {known.min():.0f} to {known.max():.0f} meters. "
-        "The table of tracks lists the nearest ones."
+        return Figure(quantity.capitalize(), f"No {quantity} is known.")
+    low, high = float(known.min()), float(known.max())
+    if quantity == "distance":
+        name, std = "distance_m", "distance_std_m"
+        extent = f"{low:.0f} to {high:.0f} meters. The table of tracks lists the nearest ones."
+        note = "Meters along the road; the band is one standard error"
+    else:
+        name, std, extent = "speed_mps", None, f"{low:.1f} to {high:.1f} m/s."
+        note = f"Meters per second, above 0 when moving away; standard error at most {MAX_SPEED_STD:g} m/s"
+    value_axis = ValueAxis.covering(min(low, 0.0), max(high, 0.0), 150)
+    curves = "".join(curve(track, name, axis, value_axis, std=std) for track in tracks)
+    label, ends = (
+        f"Lines: {quantity} of each track, from {extent}",
+        end_labels(tracks, name, axis, value_axis),
     )
-    ends = end_labels(tracks, name, axis, values)
-    svg = chart(curves, axis, values, label=label, track_labels=ends)
-    return Figure(title, "Meters along the road; the band is one standard error", svg)
-
-
-def _speed_figure(tracks: Sequence[TrackHistory], axis: TimeAxis) -> Figure:
-    title, name = "Relative speed", "speed_mps"
-    known = np.concatenate(
-        [bin_means(track.frames, track.columns[name], axis.bin_width)[1] for track in tracks]
-    )
-    if not known.size:
-        return Figure(title, "No relative speed is known.")
-    values = ValueAxis.covering(min(float(known.min()), 0.0), max(float(known.max()), 0.0), _CHART_HEIGHT)
-    curves = "".join(curve(track, name, axis, values) for track in tracks)
-    label = f"Lines: relative speed of each track, from {known.min():.1f} to {known.max():.1f} m/s."
-    ends = end_labels(tracks, name, axis, values)
-    svg = chart(curves, axis, values, label=label, track_labels=ends)
-    note = f"Meters per second, above 0 when moving away; standard error at most {MAX_SPEED_STD:g} m/s"
-    return Figure(title, note, svg)
+    svg = chart(curves, axis, value_axis, label=label, track_labels=ends)
+    return Figure(quantity.capitalize(), note, svg)
 
 
 def _without_imprecise_speeds(track: TrackHistory) -> TrackHistory:
@@ -231,13 +215,11 @@ def _script_data(tracks: Sequence[TrackHistory], axis: TimeAxis) -> dict[str, An
     """Values that the script shows for each frame: numbers only."""
     listed = []
     for track in tracks:
-        first = track.first // axis.bin_width
-        count = track.last // axis.bin_width - first + 1
+        first, last = track.first // axis.bin_width, track.last // axis.bin_width
         points: dict[str, list[float | None]] = {}
         for key, name in (("distance", "distance_m"), ("speed", "speed_mps")):
-            points[key] = [None] * count
-            for number, value in zip(*bin_means(track.frames, track.columns[name], axis.bin_width)):
-                points[key][number - first] = round(float(value), 1)
+            means = dict(zip(*bin_means(track.frames, track.columns[name], axis.bin_width)))
+            points[key] = [round(float(means[n]), 1) if n in means else None for n in range(first, last + 1)]
         listed.append(
             {"id": track.id, "color": track.color, "spans": track.spans(), "first": first, **points}
         )
@@ -265,31 +247,24 @@ def _settings(detector: Any, shape: tuple[int, ...]) -> list[Group]:
         "Tracks": getattr(detector, "track_params", None),
         camera_title: camera,
     }
-    return [
-        Group(title, _fields(params), _band_table(bands) if bands and params is search else None)
-        for title, params in groups.items()
-        if dataclasses.is_dataclass(params)
-    ]
-
-
-def _fields(params: Any) -> dict[str, Any]:
-    names = (each.name for each in dataclasses.fields(params))
-    return {name: getattr(params, name) for name in names if name != "bands"}
+    found = []
+    for title, params in groups.items():
+        if dataclasses.is_dataclass(params):
+            names = (each.name for each in dataclasses.fields(params))
+            values = {name: getattr(params, name) for name in names if name != "bands"}
+            found.append(Group(title, values, _band_table(bands) if bands and params is search else None))
+    return found
 
 
 def _band_table(bands: Sequence[Any]) -> Table:
     def number(value: float) -> str:
         return format_value(float(round(value, 1)))
 
-    rows = [
-        [
-            "\N{NO-BREAK SPACE}\N{MULTIPLICATION SIGN}\N{NO-BREAK SPACE}".join(map(number, band.window)),
-            " to ".join(map(number, band.y)),
-            " to ".join(map(number, band.x)),
-            ", ".join(f"{fraction:.3g}" for fraction in band.overlap),
-        ]
-        for band in bands
-    ]
+    rows = []
+    for band in bands:
+        size = "\N{NO-BREAK SPACE}\N{MULTIPLICATION SIGN}\N{NO-BREAK SPACE}".join(map(number, band.window))
+        y, x = (" to ".join(map(number, each)) for each in (band.y, band.x))
+        rows.append([size, y, x, ", ".join(f"{fraction:.3g}" for fraction in band.overlap)])
     note = (
         "Pixels of a frame 1280 wide; rows count from the horizon, columns are fractions of the width, and "
         "overlaps fractions of a window."

@@ -14,9 +14,6 @@ from vehicle_detection.report.history import TrackLog
 from vehicle_detection.report.page import VideoEmbed, render_page
 from vehicle_detection.video import VideoReport
 
-EMBED_LIMIT = 60_000_000
-"""Default of `embed_limit`, in bytes."""
-
 
 class ReportWriter:
     """Collect the tracks of a video while it is processed, and write a page that shows them.
@@ -27,17 +24,13 @@ class ReportWriter:
 
     Parameters
     ----------
-    path
-        The page to write: .html or .htm.
-    video
-        The annotated video, the target of `process_video`; None if none is written.
-    source
-        The source video, for the title.
+    path, video, source
+        The page to write (.html or .htm), the annotated video (the target of `process_video`) if one is
+        written, and the source video for the title.
     detector
         The :class:`VehicleDetector`, for settings and model; None leaves them out.
     embed_limit
-        A video of more bytes than this is linked instead of embedded; the page and the video must then keep
-        their relative places.
+        A video of more bytes than this is linked instead of embedded; their relative places must then stay.
 
     Raises
     ------
@@ -59,12 +52,11 @@ class ReportWriter:
         video: str | os.PathLike[str] | None = None,
         source: str | os.PathLike[str] | None = None,
         detector: Any = None,
-        embed_limit: int = EMBED_LIMIT,
+        embed_limit: int = 60_000_000,
     ) -> None:
-        for name, value in (("path", path), ("video", video), ("source", source)):
-            if value is None and name != "path":
-                continue
-            if not isinstance(value, (str, os.PathLike)):
+        given: dict[str, Any] = {"path": path, "video": video, "source": source}
+        for name, value in given.items():
+            if not isinstance(value, (str, os.PathLike)) and (value is not None or name == "path"):
                 raise InvalidInputError(f"{name} must be a file name, got {describe(value)}; pass a name")
         self._path = Path(path)
         if self._path.suffix.lower() not in (".html", ".htm"):
@@ -88,35 +80,12 @@ class ReportWriter:
     def write(self, frame_index: int, time: float | None, tracks: Iterable[Any]) -> None:
         """Add the tracks of the next frame; only those with ``track.shown`` are kept.
 
-        Parameters
-        ----------
-        frame_index
-            Index of the frame, from 0 without gaps.
-        time
-            Its time in the source in seconds, None if unknown.
-        tracks
-            What `Tracker.update` returned for it.
-
-        Raises
-        ------
-        InvalidInputError
-            If the frame is not the next one, or `tracks` holds something else.
+        Frames are numbered from 0 without gaps; `time` is that in the source in seconds, None if unknown.
         """
         self._log.add(frame_index, time, tracks)
 
     def finish(self, report: VideoReport) -> None:
-        """Write the page, completely or not at all, after the video.
-
-        Parameters
-        ----------
-        report
-            What `process_video` returned.
-
-        Raises
-        ------
-        InvalidInputError
-            If `report` is something else, or the video is missing.
-        """
+        """Write the page, completely or not at all, with the `report` that `process_video` returned."""
         check_type(report, "report", VideoReport, "pass what process_video returned")
         pieces = render_page(
             self._log, report, video=self._embed(), source=self._source, detector=self._detector

@@ -3,7 +3,4 @@
 from vehicle_detection.tracking.track import Track
 from vehicle_detection.tracking.tracker import Tracker
 
-__all__ = [
-    "Track",
-    "Tracker",
-]
+__all__ = ["Track", "Tracker"]

@@ -8,17 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from vehicle_detection.boxes import (
-    Floats,
-    box_areas,
-    intersection_matrix,
-    iter_nms,
-    overlap_matrices,
-)
+from vehicle_detection.boxes import Floats, box_areas, intersection_matrix, iter_nms, overlap_matrices
 from vehicle_detection.params import TrackParams
 
-_FORBIDDEN_COST = 1e3
-_MAX_AREA_RATIO = 4.0
 # A detection shows two vehicles if it covers more than this fraction of both, and has a lower IoU with both.
 _MIN_MERGED_COVERAGE, _MAX_MERGED_IOU = 0.7, 0.7
 
@@ -36,9 +28,9 @@ def match_boxes(predicted: Floats, measured: Floats, max_distance: Floats) -> li
     areas, others = (np.log(np.maximum(box_areas(boxes), 1.0)) for boxes in (predicted, measured))
     area_ratio = np.abs(areas[:, None] - others[None])
     cost = (1 - iou) + distance + 0.3 * area_ratio
-    cost[(distance > 1) | (area_ratio > math.log(_MAX_AREA_RATIO))] = _FORBIDDEN_COST
-    rows, columns = linear_sum_assignment(cost)
-    return [(int(r), int(c)) for r, c in zip(rows, columns) if cost[r, c] < _FORBIDDEN_COST]
+    forbidden = (distance > 1) | (area_ratio > math.log(4))
+    rows, columns = linear_sum_assignment(np.where(forbidden, 1e3, cost))
+    return [(int(r), int(c)) for r, c in zip(rows, columns) if not forbidden[r, c]]
 
 
 def center_distances(first: Floats, second: Floats) -> Floats:

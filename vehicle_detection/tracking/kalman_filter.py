@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -354,9 +354,7 @@ def _scalar_update(
     return mean + gain * innovation[:, None], cov - gain[:, :, None] * cross[:, None, :]
 
 
-def estimate_ranges(
-    states: KalmanStates, time_since_update: Floats, camera: Camera
-) -> list[dict[str, float | None]]:
+def estimate_ranges(states: KalmanStates, time_since_update: Floats, camera: Camera) -> list[dict[str, Any]]:
     """Distance and speed of each track with standard errors, as fields of `Track`; None where unknown."""
     distance, speed = states.range_mean[:, 0], states.range_mean[:, 1]
     distance_std, speed_std = np.sqrt(np.maximum(states.range_cov[:, [0, 1], [0, 1]], 0)).T

@@ -21,26 +21,18 @@ class Track:
     ----------
     id
         Number of the vehicle, from 1 in order of confirmation; 0 while the track is tentative.
-    box
-        ``(4,)`` float64 box inside the frame; read-only.
+    box, velocity
+        ``(4,)`` box inside the frame, read-only, and velocity of its center in pixels per second.
     score
         Exponential moving average of the detections' scores; a frame without a detection counts as 0.
-    state
+    state, shown
         ``"tentative"`` (not confirmed yet), ``"confirmed"`` (detected in this frame) or ``"coasting"``
-        (confirmed, but not detected in this frame: the box is a prediction).
-    shown
-        Whether to draw it.
-    age
-        Seconds since the first detection.
-    misses, time_since_update
-        Frames and seconds since the last detection.
-    velocity
-        Velocity of the box's center in pixels per second, to the right and down.
-    distance_m, distance_std_m
-        Distance along the road in meters and its standard error; None where it is unknown.
-    speed_mps, speed_std_mps
-        Speed relative to the camera in meters per second, positive when moving away, and its standard
-        error; None where it is unknown.
+        (confirmed, but not detected in this frame: the box is a prediction); whether to draw the track.
+    age, misses, time_since_update
+        Seconds since the first detection, and frames and seconds since the last.
+    distance_m, distance_std_m, speed_mps, speed_std_mps
+        Distance along the road in meters, and speed relative to the camera in meters per second, positive
+        when moving away, with their standard errors; None where they are unknown.
     """
 
     id: int

@@ -18,13 +18,8 @@ from numpy.typing import NDArray
 from vehicle_detection._common import check_number, check_type
 from vehicle_detection.boxes import Detections, Floats, box_areas
 from vehicle_detection.camera import Camera, FrameShape, check_shape, truncated_edges
-from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import TrackParams
-from vehicle_detection.tracking.association import (
-    covered_fractions,
-    distinct_vehicles,
-    merged_detections,
-)
+from vehicle_detection.tracking.association import covered_fractions, distinct_vehicles, merged_detections
 from vehicle_detection.tracking.horizon_filter import HorizonFilter
 from vehicle_detection.tracking.kalman_filter import (
     OUTWARD,
@@ -44,8 +39,6 @@ from vehicle_detection.tracking.track import TIME_TOLERANCE, Track, TrackState
 _LEAVING, _LEFT, _HIDDEN = 0.5, 0.15, 0.5
 # Distance in box sizes that a track may coast before its position is only a guess.
 _MAX_COAST_DISTANCE = 0.5
-# Standard error of the default camera's horizon, as a fraction of the frame's height.
-_DEFAULT_HORIZON_STD = 0.05
 # Factors of `max_distance` for tentative tracks, and for low-score detections.
 _TENTATIVE_DISTANCE, _LOW_SCORE_DISTANCE = 0.6, 0.5
 
@@ -55,10 +48,8 @@ class Tracker:
 
     Parameters
     ----------
-    params
-        Thresholds, times and noise of the tracks; by default ``TrackParams()``.
-    fps
-        Frames per second, used where `update` is called without a time.
+    params, fps
+        Thresholds, times and noise of the tracks; frames per second where `update` is called without a time.
     camera
         The camera, for distances and speeds; by default ``Camera.for_frame`` of the frame's size, with a
         horizon that is estimated from the vehicles.
@@ -85,10 +76,7 @@ class Tracker:
             check_type(params, "params", TrackParams, "pass TrackParams()")
         if camera is not None:
             check_type(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
-        try:
-            self._frame_seconds = 1 / check_number(fps, "fps", above=0, high=1e6)
-        except InvalidInputError as error:
-            raise InvalidInputError(f"{error}; pass the video's frame rate, such as fps=25") from None
+        self._frame_seconds = 1 / check_number(fps, "fps", above=0, high=1e6)
         self.params = params or TrackParams()
         self._smoother = make_smoother(self.params)
         self._given_camera = camera
@@ -127,10 +115,8 @@ class Tracker:
 
         Parameters
         ----------
-        detections
-            Boxes and scores of this frame, in any order.
-        shape
-            ``(height, width, ...)`` of the frame.
+        detections, shape
+            Boxes and scores of this frame, and its ``(height, width, ...)``.
         time
             Time of the frame in seconds; by default one frame after the last. A frame with the same time as
             the last one changes nothing. An earlier time, a gap of more than ``params.max_gap`` and another
@@ -140,11 +126,6 @@ class Tracker:
         -------
         tuple of Track
             Confirmed tracks by id, then tentative ones.
-
-        Raises
-        ------
-        InvalidInputError
-            If an argument is malformed, or `time` is not finite.
         """
         check_type(detections, "detections", Detections, "pass Detections(boxes, scores)")
         frame = check_shape(shape)
@@ -156,7 +137,9 @@ class Tracker:
         boxes, scores = boxes[used], scores[used]
         unassigned = np.ones(len(boxes), np.bool_)
         if self._live:
-            self._predict(dt)
+            coasting = np.array([track.misses > 0 for track in self._live])
+            states = self._smoother.predict(self._states, coasting, dt)
+            self._states = predict_ranges(states, dt, self.camera)
             unassigned = self._correct(boxes, scores, frame, dt)
             self._end_expired(frame, dt)
         self._start(boxes[unassigned], scores[unassigned], frame, dt)
@@ -167,12 +150,10 @@ class Tracker:
 
     def _advance(self, frame: FrameShape, time: float | None) -> float:
         """Set the time of this frame and return the seconds since the last; end all tracks at a jump."""
-        last, usual = self._time, self._frame_seconds
-        if time is None:
-            now = 0.0 if last is None else last + usual
-        else:
-            now = check_number(time, "time", low=-1e12, high=1e12)
-        dt = usual if last is None else now - last
+        usual = self._frame_seconds
+        last = -usual if self._time is None else self._time
+        now = last + usual if time is None else check_number(time, "time", low=-1e12, high=1e12)
+        dt = usual if self._time is None else now - last
         jump = dt < 0 or dt > max(self.params.max_gap, 1.5 * usual)
         if jump or frame != self._shape:
             self.end_tracks()
@@ -181,12 +162,6 @@ class Tracker:
             self._horizon = HorizonFilter(self._given_camera or _default_camera(frame))
         self._time, self._shape = now, frame
         return dt
-
-    def _predict(self, dt: float) -> None:
-        """Predict the Kalman states of all tracks."""
-        coasting = np.array([track.misses > 0 for track in self._live])
-        states = self._smoother.predict(self._states, coasting, dt)
-        self._states = predict_ranges(states, dt, self.camera)
 
     def _correct(self, boxes: Floats, scores: Floats, frame: FrameShape, dt: float) -> NDArray[np.bool_]:
         """Correct the tracks by their detections; return which detections belong to no track."""
@@ -317,25 +292,20 @@ class Tracker:
         gap = np.array([track.time_since_update for track in self._live])
         ranges = estimate_ranges(self._states, gap, self.camera)
         velocities = self._states.mean[:, 4:6].tolist()
+        fields = ("id", "score", "state", "shown", "age", "misses", "time_since_update")
         return tuple(
             Track(
-                id=track.id,
                 box=box,
-                score=track.score,
-                state=track.state,
-                shown=track.shown,
-                age=track.age,
-                misses=track.misses,
-                time_since_update=track.time_since_update,
-                velocity=(velocity[0], velocity[1]),
+                velocity=tuple(velocity),
                 **estimate,
+                **{name: getattr(track, name) for name in fields},
             )
             for track, box, velocity, estimate in zip(self._live, boxes, velocities, ranges)
         )
 
 
 def _default_camera(frame: FrameShape) -> Camera:
-    return Camera.for_frame(frame, horizon_std_px=_DEFAULT_HORIZON_STD * frame[0])
+    return Camera.for_frame(frame, horizon_std_px=0.05 * frame[0])
 
 
 def _sorted_inside(detections: Detections, frame: FrameShape) -> tuple[Floats, Floats]:
