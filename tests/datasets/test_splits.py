@@ -52,7 +52,7 @@ def test_a_random_split_depends_on_the_seed_only():
             {},
             "patches_or_labels must have enough patches .* 20% .*, got 3 vehicles and 1 non-vehicles",
         ),
-        ([], {}, "patches_or_labels cannot be split.*0 vehicles and 0 non-vehicles"),
+        ([], {}, "patches_or_labels must have enough patches.*0 vehicles and 0 non-vehicles"),
         ([1, 1, 0, 0], {"test_size": 1}, r"test_size must be a fraction in \(0, 1\), got 1"),
         ([1, 1, 0, 0], {"test_size": 0}, "test_size must be a number, greater than 0; got 0"),
         ([1, 1, 0, 0], {"random_state": None}, "random_state must be an integer"),
