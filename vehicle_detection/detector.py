@@ -1,4 +1,4 @@
-"""`VehicleDetector`: search, detection and tracking combined; keeps state between frames, as `tracking` does."""
+"""`VehicleDetector`: search, detection and tracking combined, with the state between a video's frames."""
 
 from __future__ import annotations
 

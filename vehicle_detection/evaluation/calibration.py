@@ -15,11 +15,6 @@ from vehicle_detection.errors import InvalidInputError
 class Platt:
     """The sigmoid ``1 / (1 + exp(a * score + b))``; `a` is negative where higher scores are vehicles.
 
-    Attributes
-    ----------
-    a, b
-        Slope and intercept.
-
     Examples
     --------
     >>> platt = Platt(a=-2.0, b=0.0)
@@ -63,18 +58,17 @@ def calibrate_scores(scores: ArrayLike, labels: ArrayLike, *, prior: bool = True
     Parameters
     ----------
     scores
-        ``(N,)`` scores of samples that the model was not trained on; scores of its own training samples are
-        too good.
+        ``(N,)`` scores of samples that the model was not trained on.
     labels
         ``(N,)`` truth, 0 or 1 or bool, both present.
     prior
         Smooth the labels with Platt's prior on both classes. False fits plain logistic regression, whose
-        slope may grow without a useful limit if the scores separate the classes.
+        slope has no useful limit if the scores separate the classes.
 
     Returns
     -------
     Platt
-        Its probabilities can be checked with `calibration_error`.
+        The sigmoid, with the methods ``probability(scores)`` and ``score(probability)``.
 
     Raises
     ------
@@ -100,7 +94,20 @@ def calibrate_scores(scores: ArrayLike, labels: ArrayLike, *, prior: bool = True
     _check_truth(truth, values, "scores")
     if truth.min() == truth.max():
         raise InvalidInputError("labels must hold both classes: vehicles (1) and non-vehicles (0)")
-    return _fit(values.astype(np.float64), truth.astype(np.int64), prior)
+    from sklearn.linear_model import LogisticRegression
+
+    values, truth, scale = values.astype(np.float64), truth.astype(np.int64), 1.0
+    if prior:
+        # Each sample is split between both classes.
+        positives, negatives = np.bincount(truth)[::-1]
+        target = np.where(truth == 1, (positives + 1) / (positives + 2), 1 / (negatives + 2))
+        scale = float(values.std()) or 1.0
+        samples, classes = np.tile(values / scale, 2), np.repeat([1, 0], len(values))
+        regression = LogisticRegression(C=np.inf, tol=1e-8, max_iter=1000)
+        regression.fit(samples[:, None], classes, sample_weight=np.concatenate([target, 1 - target]))
+    else:
+        regression = LogisticRegression(C=1e6).fit(values[:, None], truth)
+    return Platt(-float(regression.coef_[0, 0]) / scale, -float(regression.intercept_[0]))
 
 
 def _check_truth(truth: NDArray[np.generic], values: NDArray[np.generic], name: str) -> None:
@@ -111,27 +118,6 @@ def _check_truth(truth: NDArray[np.generic], values: NDArray[np.generic], name: 
         )
 
 
-def _fit(values: NDArray[np.float64], truth: NDArray[np.int64], prior: bool) -> Platt:
-    """Logistic regression; for the prior, each sample is split between both classes."""
-    from sklearn.linear_model import LogisticRegression
-
-    scale = 1.0
-    if prior:
-        positives = int(truth.sum())
-        negatives = len(truth) - positives
-        target = np.where(truth == 1, (positives + 1) / (positives + 2), 1 / (negatives + 2))
-        scale = float(values.std()) or 1.0
-        regression = LogisticRegression(C=np.inf, tol=1e-8, max_iter=1000)
-        regression.fit(
-            np.tile(values / scale, 2)[:, None],
-            np.repeat([1, 0], len(values)),
-            sample_weight=np.concatenate([target, 1 - target]),
-        )
-    else:
-        regression = LogisticRegression(C=1e6).fit(values[:, None], truth)
-    return Platt(-float(regression.coef_[0, 0]) / scale, -float(regression.intercept_[0]))
-
-
 def calibration_error(probabilities: ArrayLike, labels: ArrayLike, *, bins: int = 15) -> float:
     """Measure the expected calibration error (ECE): probabilities against the observed fraction of vehicles.
 
@@ -140,10 +126,8 @@ def calibration_error(probabilities: ArrayLike, labels: ArrayLike, *, bins: int 
 
     Parameters
     ----------
-    probabilities
-        ``(N,)`` probabilities of a vehicle, in [0, 1].
-    labels
-        ``(N,)`` truth, 0 or 1 or bool.
+    probabilities, labels
+        ``(N,)`` probabilities of a vehicle in [0, 1], and the truth, 0 or 1 or bool.
     bins
         Number of bins over [0, 1].
 

@@ -1,13 +1,10 @@
 """Score detections against labelled frames: precision, recall, F1, average precision.
 
-Labels marked ``ignore`` are not scored, and a prediction on them is ignored: it counts neither as right nor
-as wrong. That holds for a prediction whose center lies in a region (``ignore`` with track -1), or that
-overlaps an ignored box by at least the IoU in use. Other labels are matched first, so a region over a vehicle
-does not remove its detection.
-
-If one ignored box covers several vehicles, such as touching cars in a class mask, no single prediction
-reaches that IoU. With ``ignored_as_regions`` a prediction is also ignored if half of it lies in an ignored
-box.
+Labels marked ``ignore`` are not scored. An unmatched prediction is ignored, so that it counts neither as
+right nor as wrong, if its center lies in a region (``ignore`` with track -1), or if it overlaps an ignored
+box by at least the IoU in use. If one ignored box covers several vehicles, such as touching cars in a class
+mask, no single prediction reaches that IoU: with ``ignored_as_regions`` a prediction is also ignored if half
+of it lies in an ignored box.
 
 A ratio whose denominator is 0 is NaN: ``n/a`` in a summary, None in ``to_dict``.
 """
@@ -42,21 +39,20 @@ class Scores:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers for JSON; NaN becomes None."""
-        return {key: _nan_to_none(value) for key, value in dataclasses.asdict(self).items()}
+        return dataclasses.asdict(self, dict_factory=_nan_to_none)
 
     def __str__(self) -> str:
         return self.summary()
 
 
-def _nan_to_none(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _nan_to_none(entry) for key, entry in value.items()}
-    return None if isinstance(value, float) and math.isnan(value) else value
+def _nan_to_none(fields: list[tuple[str, Any]]) -> dict[str, Any]:
+    return {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in fields}
 
 
-def rates(tp: int, fp: int, fn: int) -> tuple[int, int, int, float, float, float]:
-    """Return the counts followed by precision, recall and F1."""
-    return tp, fp, fn, ratio(tp, tp + fp), ratio(tp, tp + fn), ratio(2 * tp, 2 * tp + fp + fn)
+def rates(tp: int, fp: int, fn: int) -> dict[str, Any]:
+    """Return the counts, precision, recall and F1, by the names of the fields."""
+    precision, recall, f1 = ratio(tp, tp + fp), ratio(tp, tp + fn), ratio(2 * tp, 2 * tp + fp + fn)
+    return {"tp": tp, "fp": fp, "fn": fn, "precision": precision, "recall": recall, "f1": f1}
 
 
 def ratio(part: float, whole: float) -> float:
@@ -100,22 +96,16 @@ class DetectionScores(Scores):
 
     Attributes
     ----------
-    frames
-        Number of evaluated frames.
-    iou
-        Smallest IoU of a match.
-    tp, fp, fn
-        Numbers of vehicles found, false detections and vehicles missed.
-    ignored
-        Number of ignored detections, which count neither as right nor as wrong.
+    frames, iou
+        Number of evaluated frames, and smallest IoU of a match.
+    tp, fp, fn, ignored
+        Numbers of vehicles found, false detections, vehicles missed, and ignored detections.
     precision, recall, f1
         ``tp / (tp + fp)``, ``tp / (tp + fn)`` and ``2 tp / (2 tp + fp + fn)``.
     average_precision
         Area under the precision-recall curve with monotonic precision (PASCAL VOC since 2010).
-    false_positives_per_frame
-        ``fp / frames``.
-    mean_iou
-        Mean IoU of the matched pairs.
+    false_positives_per_frame, mean_iou
+        ``fp / frames``, and the mean IoU of the matched pairs.
     by_size
         The same for ``"small"`` (under 64 px wide), ``"medium"`` (under 128 px) and ``"large"`` vehicles.
     """
@@ -145,8 +135,7 @@ class DetectionScores(Scores):
             "false a frame": format_number(self.false_positives_per_frame),
             "boxes": f"{self.tp} found, {self.fn} missed, {self.fp} false, {self.ignored} ignored",
         }
-        for name, (low, high) in SIZES.items():
-            size = self.by_size[name]
+        for (name, size), (low, high) in zip(self.by_size.items(), SIZES.values()):
             limit = f"from {low:g} px" if high == math.inf else f"under {high:g} px"
             found = f"F1 {format_number(size.f1)}, {size.tp} of {size.tp + size.fn}, {size.fp} false"
             rows[f"{name}, {limit}"] = found
@@ -168,16 +157,14 @@ def evaluate_detections(
 
     Parameters
     ----------
-    predictions
-        Detected boxes; their tracks are not used. Without scores, all scores count as equal. Rows marked
-        ``ignore`` are left out.
-    labels
-        True boxes.
+    predictions, labels
+        Detected and true boxes; predictions marked ``ignore`` are left out. Without scores, all scores count
+        as equal.
     iou
         Smallest IoU, in (0, 1], at which a detection matches a label or is ignored with an ignored box.
     frames
-        All evaluated frames, so that those without label and prediction count too. Labels in other frames
-        are left out. None takes all frames of `predictions` and `labels`.
+        All evaluated frames; None takes those of `predictions` and `labels`. Labels in other frames are left
+        out.
     ignored_as_regions
         Also ignore a detection of which at least half lies in an ignored box: for labels whose ignored boxes
         cover several vehicles each.
@@ -211,23 +198,19 @@ def evaluate_detections(
     for name, (low, high) in SIZES.items():
         sides = label_widths[found.match[hit]], widths[false], label_widths[missed]
         tp, fp, fn = ((low <= width) & (width < high) for width in sides)
-        counts = int(tp.sum()), int(fp.sum()), int(fn.sum())
-        by_size[name] = SizeScores(*rates(*counts), mean(found.iou[hit][tp]))
-    tp_all, fp_all, fn_all, precision, recall, f1 = rates(int(hit.sum()), int(false.sum()), len(missed))
+        counts = rates(int(tp.sum()), int(fp.sum()), int(fn.sum()))
+        by_size[name] = SizeScores(**counts, mean_iou=mean(found.iou[hit][tp]))
+    precision, recall, _ = _curve(predictions, found)
+    monotonic = np.maximum.accumulate(precision[::-1])[::-1]
     return DetectionScores(
         frames=len(keys),
         iou=min_iou,
-        tp=tp_all,
-        fp=fp_all,
-        fn=fn_all,
         ignored=int(found.ignored.sum()),
-        precision=precision,
-        recall=recall,
-        f1=f1,
-        average_precision=_average_precision(*_curve(predictions, found)[:2]),
-        false_positives_per_frame=ratio(fp_all, len(keys)),
+        average_precision=float((np.diff(recall, prepend=0) * monotonic).sum()),
+        false_positives_per_frame=ratio(int(false.sum()), len(keys)),
         mean_iou=mean(found.iou[hit]),
         by_size=by_size,
+        **rates(int(hit.sum()), int(false.sum()), len(missed)),
     )
 
 
@@ -238,19 +221,14 @@ def precision_recall_curve(
 
     Parameters
     ----------
-    predictions
-        Detected boxes with scores.
-    labels
-        True boxes.
-    iou, ignored_as_regions
-        As in `evaluate_detections`.
+    predictions, labels, iou, ignored_as_regions
+        As in `evaluate_detections`; predictions need scores.
 
     Returns
     -------
     precision, recall, thresholds : numpy.ndarray
         Three ``(K,)`` float64 arrays with one entry for each distinct score, highest first: the values for
-        the detections with a score of at least ``thresholds[k]``. Recall never decreases along them; it is
-        NaN where no vehicle is labelled.
+        the detections with a score of at least ``thresholds[k]``. Recall is NaN if no vehicle is labelled.
 
     Raises
     ------
@@ -299,8 +277,3 @@ def _curve(
     last = np.flatnonzero(np.diff(scores[order], append=-np.inf))
     recall = hits[last] / len(found.usable) if len(found.usable) else np.full(len(last), np.nan)
     return hits[last] / (last + 1), recall, scores[order][last]
-
-
-def _average_precision(precision: NDArray[np.float64], recall: NDArray[np.float64]) -> float:
-    envelope = np.maximum.accumulate(precision[::-1])[::-1]
-    return float((np.diff(recall, prepend=0) * envelope).sum())

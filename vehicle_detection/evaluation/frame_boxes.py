@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -51,15 +52,20 @@ def frame_order(key: FrameKey) -> tuple[tuple[int, str], ...]:
 
 def _column(values: ArrayLike | None, name: str, rows: int, kinds: str, default: Any) -> NDArray[Any]:
     """Check one value per row of one of the dtype `kinds`; returned with the dtype of `default`."""
-    dtype = np.asarray(default).dtype
-    column = np.full(rows, default) if values is None else np.asarray(values)
+    filled = np.full(rows, default)
+    column = filled if values is None else np.asarray(values)
     if column.size == 0:
-        column = column.reshape(-1).astype(dtype)
+        column = column.reshape(-1).astype(filled.dtype)
     if column.shape != (rows,) or column.dtype.kind not in kinds:
         raise InvalidInputError(
             f"{name} must be one value for each of the {rows} boxes, got {describe(column)}"
         )
-    return column.astype(dtype)
+    return column.astype(filled.dtype)
+
+
+def none_if_unknown(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return a column, or None if all values are NaN."""
+    return None if np.isnan(values).all() else values
 
 
 def count_noun(number: int, noun: str, ending: str = "s") -> str:
@@ -76,21 +82,18 @@ class FrameBoxes:
     frames
         Frame key of each row: all int (counted from 0) or all str (the image's file name).
     tracks
-        ``(N,)`` int64, the vehicle's number within the clip, -1 for none. None: no box has one.
+        ``(N,)`` numbers of the vehicles within the clip, -1 for none; None if no box has one.
     boxes
-        ``(N, 4)`` float64 ``[x1, y1, x2, y2]``, half-open pixels.
-    occluded
-        ``(N,)`` int64, 0 visible (the default), 1 partly, 2 largely hidden.
-    truncated
-        ``(N,)`` float64, fraction of the vehicle outside the image, 0-1; default 0.
+        ``(N, 4)`` ``[x1, y1, x2, y2]`` in half-open pixels.
+    occluded, truncated
+        ``(N,)`` occlusion, 0 visible (the default), 1 partly, 2 largely hidden; and fraction of the vehicle
+        outside the image, 0-1 (default 0).
     ignore
-        ``(N,)`` bool, rows that are not scored; with track -1 the row is a region. Default False.
-    scores
-        ``(N,)`` float64 score of a prediction, or None.
-    distance_m, speed_mps
-        ``(N,)`` float64, NaN where unknown, or None.
+        ``(N,)`` rows that are not scored; with track -1 the row is a region. Default False.
+    scores, distance_m, speed_mps
+        ``(N,)`` values of predictions, or None. Unknown distances and speeds are NaN.
     frame_keys
-        All frames in order, including those without a box. Frames of the rows are added automatically.
+        All frames in order, including those without a box; the frames of the rows are added.
 
     Raises
     ------
@@ -141,24 +144,22 @@ class FrameBoxes:
         if (columns["tracks"] < NO_TRACK).any():
             lowest = columns["tracks"].min()
             raise InvalidInputError(f"tracks must be numbers from 0, or -1 for none; got {lowest}")
-        if not (columns["occluded"] >= 0).all():
+        if (columns["occluded"] < 0).any():
             raise InvalidInputError(
                 "occluded must be 0 (visible), 1 (partly) or 2 (largely hidden); got a negative value"
             )
         if not ((columns["truncated"] >= 0) & (columns["truncated"] <= 1)).all():
             raise InvalidInputError("truncated must be a fraction from 0 to 1; got a value outside")
-        seen: set[tuple[FrameKey, int]] = set()
-        for key, track in zip(frames, columns["tracks"].tolist()):
-            if track != NO_TRACK and (key, track) in seen:
+        for (key, track), count in Counter(zip(frames, columns["tracks"].tolist())).items():
+            if track != NO_TRACK and count > 1:
                 raise InvalidInputError(
                     f"frame {key!r} holds track {track} twice; give each vehicle its own number"
                 )
-            seen.add((key, track))
         keys = check_keys((*check_keys(self.frame_keys, "frame_keys"), *frames), "frame_keys")
         columns["frame_keys"] = tuple(sorted(set(keys), key=frame_order))
-        rows: dict[FrameKey, list[int]] = {}
+        rows: dict[FrameKey, list[int]] = defaultdict(list)
         for row, key in enumerate(frames):
-            rows.setdefault(key, []).append(row)
+            rows[key].append(row)
         columns["_rows"] = {key: np.array(found, np.intp) for key, found in rows.items()}
         for name, column in columns.items():
             object.__setattr__(self, name, column)
@@ -172,34 +173,21 @@ class FrameBoxes:
         >>> FrameBoxes.from_detections({0: Detections([[0, 0, 50, 40]], [1.5]), 1: Detections.empty()})
         FrameBoxes(1 box in 2 frames)
         """
-        parts = [np.empty((0, 4)), *(found.boxes for found in detections.values())]
+        parts = [Detections.empty(), *detections.values()]
         return cls(
             [key for key, found in detections.items() for _ in range(len(found))],
             None,  # type: ignore[arg-type]
-            np.concatenate(parts),
-            scores=np.concatenate([np.empty(0), *(found.scores for found in detections.values())]),
+            np.concatenate([found.boxes for found in parts]),
+            scores=np.concatenate([found.scores for found in parts]),
             frame_keys=tuple(detections),
         )
 
     @classmethod
     def from_results(cls, results: Iterable[Any]) -> FrameBoxes:
-        """Collect the tracks that a detector shows, without writing a file.
+        """Collect the tracks that a detector shows from the :class:`FrameResult` of each frame.
 
-        Parameters
-        ----------
-        results
-            One :class:`FrameResult` for each frame.
-
-        Returns
-        -------
-        FrameBoxes
-            Tracks with their scores, distances and speeds: what `read_labels` reads from the CSV file that
-            `write_tracks` writes, without its rounding. Frames without a track still count as frames.
-
-        Raises
-        ------
-        InvalidInputError
-            If an item is not a result.
+        They are what `read_labels` reads from the CSV file that `write_tracks` writes, without its rounding.
+        Frames without a track still count as frames.
 
         Examples
         --------
@@ -209,8 +197,7 @@ class FrameBoxes:
         array([1])
         """
         keys: list[FrameKey] = []
-        frames: list[FrameKey] = []
-        tracks: list[Any] = []
+        rows: list[tuple[FrameKey, Any]] = []  # frame and track
         for result in check_items(results):
             if not is_result(result):
                 raise InvalidInputError(
@@ -218,20 +205,18 @@ class FrameBoxes:
                     "read a file with read_labels"
                 )
             keys.append(int(result.index))
-            shown = shown_tracks(result)
-            frames += [int(result.index)] * len(shown)
-            tracks += shown
-        distance, speed = (
-            np.array([getattr(track, name) for track in tracks], np.float64)  # None becomes NaN
-            for name in ("distance_m", "speed_mps")
+            rows += [(int(result.index), track) for track in shown_tracks(result)]
+        scores, distances, speeds = (
+            np.array([getattr(track, name) for _, track in rows], np.float64)  # None becomes NaN
+            for name in ("score", "distance_m", "speed_mps")
         )
         return cls(
-            frames,
-            np.array([track.id for track in tracks], np.int64),
-            np.array([track.box for track in tracks], np.float64).reshape(-1, 4),
-            scores=np.array([track.score for track in tracks], np.float64),
-            distance_m=None if np.isnan(distance).all() else distance,
-            speed_mps=None if np.isnan(speed).all() else speed,
+            [key for key, _ in rows],
+            np.array([track.id for _, track in rows], np.int64),
+            np.array([track.box for _, track in rows], np.float64),
+            scores=scores,
+            distance_m=none_if_unknown(distances),
+            speed_mps=none_if_unknown(speeds),
             frame_keys=keys,
         )
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_image, check_integer, check_number, describe
+from vehicle_detection._common import check_image, check_integer, check_number, check_type, describe
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.frame_boxes import FrameBoxes, FrameKey, count_noun
@@ -19,7 +19,7 @@ Frames = Mapping[FrameKey, NDArray[np.uint8]] | FrameSet | Sequence[NDArray[np.u
 """Images by key, a `FrameSet`, or a list of images that are numbered from 0."""
 
 
-def keyed_frames(frames: Frames, name: str = "frames") -> Mapping[FrameKey, NDArray[np.uint8]] | FrameSet:
+def keyed_frames(frames: Frames) -> Mapping[FrameKey, NDArray[np.uint8]] | FrameSet:
     """Return frames with keys; the images of a list are numbered from 0."""
     given: object = frames
     if isinstance(given, (FrameSet, Mapping)):
@@ -27,7 +27,7 @@ def keyed_frames(frames: Frames, name: str = "frames") -> Mapping[FrameKey, NDAr
     if isinstance(given, (list, tuple)):
         return dict(enumerate(given))
     raise InvalidInputError(
-        f"{name} must be a list of images, a mapping from key to image, or the frames of load_frames; "
+        "frames must be a list of images, a mapping from key to image, or the frames of load_frames; "
         f"got {describe(given)}"
     )
 
@@ -45,16 +45,13 @@ def keys_of(frames: Mapping[FrameKey, NDArray[np.uint8]] | FrameSet) -> tuple[Fr
     return tuple(frames) if isinstance(frames, Mapping) else frames.names
 
 
-def check_frame_boxes(keys: Sequence[FrameKey], labels: object, name: str = "labels") -> FrameBoxes:
+def check_frame_boxes(keys: Sequence[FrameKey], labels: FrameBoxes) -> FrameBoxes:
     """Return `labels` if they contain at least one of the frames `keys`."""
-    if not isinstance(labels, FrameBoxes):
-        raise InvalidInputError(
-            f"{name} must be FrameBoxes, got {describe(labels)}; read a file with read_labels"
-        )
+    check_type(labels, "labels", FrameBoxes, "read a file with read_labels")
     if keys and not set(keys) & set(labels.frame_keys):
         known = f"such as {labels.frame_keys[0]!r}" if labels.frame_keys else "but it is empty"
         raise InvalidInputError(
-            f"{name} contain none of the frames, such as {keys[0]!r}, {known}; "
+            f"labels contain none of the frames, such as {keys[0]!r}, {known}; "
             "use the same keys on both sides"
         )
     return labels
@@ -99,10 +96,8 @@ class LabelledFrames:
         labels = check_frame_boxes(keys, self.labels)
         if self.horizon is not None:
             check_number(self.horizon, "horizon", low=0, high=1)
-        known = set(keys)
-        mask = np.array([key in known for key in labels.frames], np.bool_)
         object.__setattr__(self, "frames", frames)
-        object.__setattr__(self, "labels", labels[mask])
+        object.__setattr__(self, "labels", labels[sorted(row for key in keys for row in labels.rows(key))])
 
     def __repr__(self) -> str:
         frames, boxes = count_noun(len(self), "frame"), count_noun(len(self.labels), "box", "es")
@@ -129,20 +124,16 @@ class LabelledFrames:
         name: str | None = None,
         horizon: float | None = None,
     ) -> LabelledFrames:
-        """Read every n-th frame of a video whose labels are keyed by frame number.
+        """Read every n-th frame of a video, whose labels are keyed by frame number, into memory.
 
         Parameters
         ----------
-        path
-            A file that ffmpeg can read. The chosen frames are kept in memory.
-        labels
-            True boxes.
+        path, labels
+            A file that ffmpeg can read, and its true boxes.
         every
             Step between the chosen frames; neighboring frames show nearly the same.
-        name
-            Name of the set; None takes the file name without its suffix.
-        horizon
-            As in the class.
+        name, horizon
+            As in the class; None as `name` takes the file name without its suffix.
 
         Raises
         ------

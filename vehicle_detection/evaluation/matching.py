@@ -15,9 +15,6 @@ from vehicle_detection.boxes import box_areas, intersection_matrix, iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.frame_boxes import NO_TRACK, FrameBoxes, FrameKey, check_keys, frame_order
 
-# With ignored_as_regions: a detection is ignored from this fraction of its area inside an ignored box on.
-_MIN_INSIDE = 0.5
-
 
 def prepare_evaluation(
     predictions: FrameBoxes, labels: FrameBoxes, frames: Sequence[FrameKey] | None
@@ -38,33 +35,27 @@ def prepare_evaluation(
         raise InvalidInputError(
             f"frame keys must be all numbers or all names, got {listed}; use the same keys on both sides"
         )
-    if given is not None:
-        return predictions, labels, _check_frames(predictions, given)
-    # If no frame matches and names differ only by folder or suffix, that is a mistake, not an F1 of 0.
-    ours, theirs = set(predictions.frames), set(labels.frames)
-    if not ours & theirs:
+    if given is None:
+        # If no frame matches and names differ only by folder or suffix, that is a mistake, not an F1 of 0.
+        ours, theirs = set(predictions.frames), set(labels.frames)
         stems = [{PurePosixPath(str(key)).stem for key in side} for side in (ours, theirs)]
-        if stems[0] & stems[1]:
+        if not ours & theirs and stems[0] & stems[1]:
             raise InvalidInputError(
                 f"predictions and labels name their frames differently: {predictions.frames[0]!r} and "
                 f"{labels.frames[0]!r}; use the same names on both sides"
             )
-    return predictions, labels, sorted({*predictions.frame_keys, *labels.frame_keys}, key=frame_order)
-
-
-def _check_frames(predictions: FrameBoxes, frames: tuple[FrameKey, ...]) -> list[FrameKey]:
-    """Frames in order: numbers sorted, names as given."""
-    known = set(frames)
-    if len(known) < len(frames):
-        twice = next(key for key, count in Counter(frames).items() if count > 1)
-        raise InvalidInputError(f"frames must differ, got {twice!r} more than once; list each frame once")
-    unknown = next((key for key in predictions.frames if key not in known), None)
-    if unknown is not None:
+        return predictions, labels, sorted({*predictions.frame_keys, *labels.frame_keys}, key=frame_order)
+    for key, count in Counter(given).items():
+        if count > 1:
+            raise InvalidInputError(f"frames must differ, got {key!r} more than once; list each frame once")
+    unknown = set(predictions.frames) - set(given)
+    if unknown:
         raise InvalidInputError(
-            f"predictions hold frame {unknown!r}, which is not among the {len(frames)} frames; add it to "
-            "frames or drop these predictions"
+            f"predictions hold frame {min(unknown, key=frame_order)!r}, which is not among the {len(given)} "
+            "frames; add it to frames or drop these predictions"
         )
-    return sorted(frames, key=frame_order) if frames and isinstance(frames[0], int) else list(frames)
+    in_order = sorted(given, key=frame_order) if given and isinstance(given[0], int) else list(given)
+    return predictions, labels, in_order  # names stay in the given order
 
 
 def find_ignored(
@@ -86,7 +77,7 @@ def find_ignored(
     covers = iou_matrix(boxes, labels.boxes[ignored]) >= min_iou
     if as_regions:
         shared = intersection_matrix(boxes, labels.boxes[ignored])
-        covers |= shared >= np.maximum(_MIN_INSIDE * box_areas(boxes)[:, None], 1e-9)
+        covers |= shared >= np.maximum(box_areas(boxes)[:, None] / 2, 1e-9)
     return np.asarray(inside.all(axis=2).any(axis=1) | covers.any(axis=1))
 
 

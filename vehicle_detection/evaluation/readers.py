@@ -8,19 +8,25 @@ import json
 import math
 import os
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from vehicle_detection._common import check_choice
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import DatasetError
-from vehicle_detection.evaluation.frame_boxes import NO_TRACK, FrameBoxes, FrameKey, frame_order
+from vehicle_detection.evaluation.frame_boxes import (
+    NO_TRACK,
+    FrameBoxes,
+    FrameKey,
+    frame_order,
+    none_if_unknown,
+)
+from vehicle_detection.export import BOX_COLUMNS
 
 LABEL_COLUMNS = ("frame", "track", "x1", "y1", "x2", "y2", "occluded", "truncated", "ignore")
-PREDICTION_COLUMNS = ("frame", "track_id", "x1", "y1", "x2", "y2", "score")
 
 VEHICLE_CLASSES = ("car", "van", "truck", "bus", "vehicle")
 LOOKALIKE_CLASSES = ("tram", "train", "misc", "trailer", "caravan", "autorickshaw", "vehicle fallback")
@@ -40,7 +46,7 @@ class Row(NamedTuple):
     occluded: int = 0
     truncated: float = 0.0
     ignore: bool = False
-    score: float | None = None
+    score: float = math.nan  # of predictions; NaN for labels
     distance_m: float = math.nan
     speed_mps: float = math.nan
 
@@ -56,6 +62,13 @@ def _read_text(file: Path) -> str:
         raise DatasetError(f"{file} is not UTF-8 text; save it as UTF-8") from None
     except OSError as error:
         raise DatasetError(f"{file} cannot be read: {error.strerror}") from error
+
+
+def _read_lines(file: Path) -> Iterator[tuple[str, str]]:
+    """Yield the lines that are not blank, each after its place for error messages."""
+    for number, line in enumerate(_read_text(file).splitlines(), 1):
+        if line.strip(", \t"):
+            yield f"{file} line {number}", line.strip()
 
 
 def _split_words(line: str) -> list[str]:
@@ -88,8 +101,7 @@ def _integer(text: str, name: str, where: str, *, low: int) -> int:
 def _read_csv(source: Path, classes: Collection[str] | None) -> Rows:
     del classes  # these files hold vehicles only
     text = _read_text(source)
-    header = text.split("\n", 1)[0]
-    separator = max(",;\t", key=header.count)
+    separator = max(",;\t", key=text.split("\n", 1)[0].count)
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
     try:
         lines = [(reader.line_num, line) for line in reader]
@@ -97,12 +109,12 @@ def _read_csv(source: Path, classes: Collection[str] | None) -> Rows:
         raise DatasetError(f"{source} line {reader.line_num}: not CSV text ({error})") from None
     names = [" ".join(name.split()).lower() for name in lines[0][1]] if lines else []
     predicted = "track_id" in names or ("score" in names and "track" not in names)
-    expected = PREDICTION_COLUMNS if predicted else LABEL_COLUMNS
+    expected = BOX_COLUMNS if predicted else LABEL_COLUMNS
     missing = [name for name in expected if name not in names]
     if missing:
         raise DatasetError(
             f"{source} lacks the columns {', '.join(missing)}; found {', '.join(names) or 'an empty file'}; "
-            f"labels have {','.join(LABEL_COLUMNS)}, predictions {','.join(PREDICTION_COLUMNS)}"
+            f"labels have {','.join(LABEL_COLUMNS)}, predictions {','.join(BOX_COLUMNS)}"
         )
     twice = sorted({name for name in expected if names.count(name) > 1})
     if twice:
@@ -126,47 +138,32 @@ def _csv_row(where: str, record: dict[str, str], predicted: bool, counted: bool)
     frame: FrameKey = _integer(record["frame"], "frame", where, low=0) if counted else record["frame"]
     x1, y1, x2, y2 = (_number(record[name], name, where) for name in ("x1", "y1", "x2", "y2"))
     if predicted:
-        track = record["track_id"]
-        optional = {name: record.get(name, "") for name in ("distance_m", "speed_mps")}
-        distance, speed = (
-            math.nan if text.lower() in ("", "nan") else _number(text, name, where)
-            for name, text in optional.items()
-        )
-        return Row(
-            where,
-            frame,
-            _integer(track, "track_id", where, low=NO_TRACK) if track else NO_TRACK,
-            (x1, y1, x2, y2),
-            score=_number(record["score"], "score", where),
-            distance_m=distance,
-            speed_mps=speed,
-        )
+        track = _integer(record["track_id"] or str(NO_TRACK), "track_id", where, low=NO_TRACK)
+        score = _number(record["score"], "score", where)
+        optional: dict[str, Any] = {
+            name: _number(record[name], name, where)
+            for name in ("distance_m", "speed_mps")
+            if record.get(name, "").lower() not in ("", "nan")
+        }
+        return Row(where, frame, track, (x1, y1, x2, y2), score=score, **optional)
+    track = _integer(record["track"], "track", where, low=NO_TRACK)
+    occluded = _integer(record["occluded"], "occluded", where, low=0)
+    truncated = _number(record["truncated"], "truncated", where, low=0, high=1)
     flag = {"0": False, "1": True, "false": False, "true": True}.get(record["ignore"].lower())
     if flag is None:
         raise DatasetError(f"{where}: ignore must be 0 or 1, got {record['ignore']!r}")
-    return Row(
-        where,
-        frame,
-        _integer(record["track"], "track", where, low=NO_TRACK),
-        (x1, y1, x2, y2),
-        _integer(record["occluded"], "occluded", where, low=0),
-        _number(record["truncated"], "truncated", where, low=0, high=1),
-        flag,
-    )
+    return Row(where, frame, track, (x1, y1, x2, y2), occluded, truncated, flag)
 
 
 def _read_kitti(source: Path, classes: Collection[str] | None) -> Rows:
-    files = (
-        sorted(source.glob("*.txt"), key=lambda file: frame_order(file.name)) if source.is_dir() else [source]
-    )
+    files = list(source.glob("*.txt")) if source.is_dir() else [source]
     if not files:
         raise DatasetError(f"{source} holds no .txt file; name a KITTI label_2 folder or a label file")
     rows: list[Row] = []
-    for file in files:
-        for number, line in enumerate(_read_text(file).splitlines(), 1):
-            if line.strip():
-                row = _kitti_row(f"{file} line {number}", file.stem, len(rows), line.split(), classes)
-                rows += [row] if row else []
+    for file in sorted(files, key=lambda file: frame_order(file.name)):
+        for where, line in _read_lines(file):
+            row = _kitti_row(where, file.stem, len(rows), line.split(), classes)
+            rows += [row] if row else []
     return rows, [file.stem for file in files]
 
 
@@ -177,10 +174,8 @@ def _kitti_row(
     if len(words) not in (15, 16):
         raise DatasetError(f"{where}: a KITTI object has 15 values (16 with a score), found {len(words)}")
     name = words[0].lower()
-    x1, y1, x2, y2 = (
-        _number(word, corner, where) for word, corner in zip(words[4:8], ("x1", "y1", "x2", "y2"))
-    )
-    score = _number(words[15], "score", where) if len(words) == 16 else None
+    x1, y1, x2, y2 = (_number(word, "corner of the box", where) for word in words[4:8])
+    score = _number(words[15], "score", where) if len(words) == 16 else math.nan
     if name == "dontcare":
         return Row(where, frame, NO_TRACK, (x1, y1, x2, y2), ignore=True, score=score)
     wanted = name in (VEHICLE_CLASSES if classes is None else classes)
@@ -190,30 +185,26 @@ def _kitti_row(
     truncated = min(max(_number(words[1], "truncated", where), 0.0), 1.0)
     occluded = min(max(int(_number(words[2], "occluded", where)), 0), _HIDDEN)
     unscored = occluded >= _HIDDEN or truncated > _MAX_TRUNCATED or x2 - x1 < _MIN_WIDTH
-    ignore = not wanted or (unscored and score is None)
+    ignore = not wanted or (unscored and math.isnan(score))
     return Row(where, frame, number, (x1, y1, x2, y2), occluded, truncated, ignore, score)
 
 
 def _read_mot(source: Path, classes: Collection[str] | None) -> Rows:
     rows: list[Row] = []
-    for number, line in enumerate(_read_text(source).splitlines(), 1):
-        words, where = _split_words(line.strip().rstrip(",")), f"{source} line {number}"
-        if words == [""]:
-            continue
+    for where, line in _read_lines(source):
+        words = _split_words(line.rstrip(","))
         if len(words) < 6:
             raise DatasetError(f"{where}: expected frame, id, x, y, width, height, found {len(words)} values")
         frame = _integer(words[0], "frame (counted from 1)", where, low=1) - 1
         track = _integer(words[1], "id", where, low=NO_TRACK)
-        x, y, width, height = (
-            _number(word, name, where) for word, name in zip(words[2:6], ("x", "y", "width", "height"))
-        )
+        x, y, width, height = (_number(word, "side of the box", where) for word in words[2:6])
         box = (x, y, x + width, y + height)
         # Ground truth has nine columns, the last ones flag, class, visibility. Results have class -1 or ten.
         if len(words) == 9 and words[7] != "-1":
             if classes is None or words[7] in classes:
                 rows.append(Row(where, frame, track, box, ignore=_number(words[6], "flag", where) == 0))
         else:
-            score = _number(words[6], "score", where) if len(words) > 6 else None
+            score = _number(words[6], "score", where) if len(words) > 6 else math.nan
             rows.append(Row(where, frame, track, box, score=score))
     return rows, []
 
@@ -223,10 +214,10 @@ def _read_coco(source: Path, classes: Collection[str] | None) -> Rows:
         data = json.loads(_read_text(source))
     except json.JSONDecodeError as error:
         raise DatasetError(f"{source} line {error.lineno}: not JSON text ({error.msg})") from None
-    parts = data if isinstance(data, dict) else {}
-    missing = [
-        name for name in ("images", "annotations", "categories") if not isinstance(parts.get(name), list)
-    ]
+    lists = (
+        {name for name, part in data.items() if isinstance(part, list)} if isinstance(data, dict) else set()
+    )
+    missing = [name for name in ("images", "annotations", "categories") if name not in lists]
     if missing:
         raise DatasetError(f"{source} is not a COCO file: it lacks the lists {', '.join(missing)}")
     try:
@@ -259,28 +250,15 @@ def _read_coco(source: Path, classes: Collection[str] | None) -> Rows:
             ) from None
         if name not in wanted and name not in LOOKALIKE_CLASSES:
             continue
-        score = entry.get("score")
-        track = entry.get("track_id", number if score is None else NO_TRACK)
-        crowd = bool(entry.get("iscrowd"))
-        rows.append(
-            Row(
-                where,
-                frame,
-                NO_TRACK if crowd or track is None else _integer(str(track), "track_id", where, low=NO_TRACK),
-                (x, y, x + width, y + height),
-                ignore=crowd or bool(entry.get("ignore")) or name not in wanted,
-                score=None if score is None else _number(str(score), "score", where),
-            )
-        )
+        score = math.nan if entry.get("score") is None else _number(str(entry["score"]), "score", where)
+        track = entry.get("track_id", number if math.isnan(score) else NO_TRACK)
+        if entry.get("iscrowd") or track is None:
+            track = NO_TRACK
+        track = _integer(str(track), "track_id", where, low=NO_TRACK)
+        ignore = bool(entry.get("iscrowd") or entry.get("ignore") or name not in wanted)
+        box = (x, y, x + width, y + height)
+        rows.append(Row(where, frame, track, box, ignore=ignore, score=score))
     return rows, list(images.values())
-
-
-_READERS: dict[str, Callable[[Path, Collection[str] | None], Rows]] = {
-    "csv": _read_csv,
-    "kitti": _read_kitti,
-    "mot": _read_mot,
-    "coco": _read_coco,
-}
 
 
 def read_labels(
@@ -296,9 +274,8 @@ def read_labels(
     ----------
     path
         A CSV file (``frame,track,x1,y1,x2,y2,occluded,truncated,ignore`` or, for predictions,
-        ``frame,track_id,x1,y1,x2,y2,score[,distance_m,speed_mps]``; further columns are skipped, the
-        separator is a comma, semicolon or tab), a KITTI ``label_2`` folder, a MOTChallenge text file or
-        a COCO JSON file.
+        ``frame,track_id,x1,y1,x2,y2,score[,distance_m,speed_mps]``, separated by commas, semicolons or tabs),
+        a KITTI ``label_2`` folder, a MOTChallenge text file or a COCO JSON file.
     format
         ``"csv"``, ``"kitti"``, ``"mot"`` or ``"coco"``; None chooses by suffix and content.
     classes
@@ -310,16 +287,14 @@ def read_labels(
     Returns
     -------
     FrameBoxes
-        Boxes in half-open pixels. CSV frames are int if all of them are whole numbers, else str. KITTI
-        frames are the files' names without ``.txt``, COCO frames the images' ``file_name``, and MOT frames,
-        which count from 1 in the file, count from 0.
+        CSV frames are int if all of them are whole numbers, else str. KITTI frames are the files' names
+        without ``.txt``, COCO frames the images' ``file_name``; MOT frames count from 0, in the file from 1.
 
     Raises
     ------
     DatasetError
         If the file is missing, has none of these formats, or holds an invalid row; the message names the
-        line: a value that is not a finite number, a box without area, a track twice in a frame, a box
-        outside `shape`.
+        line.
     InvalidInputError
         If `format` or `shape` is none of the values above.
 
@@ -337,9 +312,10 @@ def read_labels(
     ...
     vehicle_detection.errors.DatasetError: labels/missing.csv does not exist; check the path
     """
+    readers = {"csv": _read_csv, "kitti": _read_kitti, "mot": _read_mot, "coco": _read_coco}
     source = Path(path)
     if format is not None:
-        check_choice(format, "format", tuple(_READERS))
+        check_choice(format, "format", readers)
     if not source.exists():
         raise DatasetError(f"{source} does not exist; check the path")
     kind = format or _guess_format(source)
@@ -348,14 +324,13 @@ def read_labels(
             f"{source} is a folder, and {kind} labels are one file; pass the path of that file"
         )
     chosen = None if classes is None else frozenset(str(name).lower() for name in classes)
-    rows, keys = _READERS[kind](source, chosen)
-    return _assemble(rows, keys, shape)
+    return _assemble(*readers[kind](source, chosen), shape)
 
 
 def _assemble(rows: list[Row], keys: list[FrameKey], shape: tuple[int, ...] | None) -> FrameBoxes:
     """Check the rows of any format, and return them as columns."""
-    boxes = np.array([row.box for row in rows], np.float64).reshape(-1, 4)
-    scored = [row.score is not None for row in rows]
+    boxes = np.array([row.box for row in rows], np.float64)
+    scored = [not math.isnan(row.score) for row in rows]
     first: dict[tuple[FrameKey, int], str] = {}
     for row, has_score in zip(rows, scored):
         x1, y1, x2, y2 = row.box
@@ -380,17 +355,17 @@ def _assemble(rows: list[Row], keys: list[FrameKey], shape: tuple[int, ...] | No
                     f"{row.where}: box {list(row.box)} lies outside the {shape[1]}x{shape[0]} image; "
                     "check that shape is (height, width) of these frames"
                 )
-    distance, speed = (np.array([getattr(row, name) for row in rows]) for name in ("distance_m", "speed_mps"))
+    columns = {name: np.array([getattr(row, name) for row in rows]) for name in Row._fields[4:]}
     return FrameBoxes(
         [row.frame for row in rows],
         np.array([row.track for row in rows], np.int64),
         boxes,
-        occluded=np.array([row.occluded for row in rows], np.int64),
-        truncated=np.array([row.truncated for row in rows], np.float64),
-        ignore=np.array([row.ignore for row in rows], np.bool_),
-        scores=np.array([row.score for row in rows], np.float64) if rows and scored[0] else None,
-        distance_m=None if np.isnan(distance).all() else distance,
-        speed_mps=None if np.isnan(speed).all() else speed,
+        occluded=columns["occluded"],
+        truncated=columns["truncated"],
+        ignore=columns["ignore"],
+        scores=none_if_unknown(columns["score"]),
+        distance_m=none_if_unknown(columns["distance_m"]),
+        speed_mps=none_if_unknown(columns["speed_mps"]),
         frame_keys=keys,
     )
 

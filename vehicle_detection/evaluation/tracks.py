@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate, pairwise
+from itertools import accumulate, groupby, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,30 +31,21 @@ class TrackScores(Scores):
 
     Attributes
     ----------
-    frames
-        Number of evaluated frames.
-    iou
-        Smallest IoU of a match.
+    frames, iou, precision, recall, f1, mean_iou
+        As in `DetectionScores`.
     vehicles, tracks
         Number of labelled vehicles, and of predicted tracks with a box that is not ignored.
-    tp, fp, fn
-        Numbers of boxes on a vehicle, boxes on none, and vehicles without a box, summed over the frames.
-    ignored
-        Number of ignored boxes, which count neither as right nor as wrong.
-    precision, recall, f1
-        Ratios of the tracked boxes, as in `DetectionScores`.
-    mean_iou
-        Mean IoU of the matched pairs.
+    tp, fp, fn, ignored
+        Numbers of boxes on a vehicle, boxes on none, vehicles without a box, and ignored boxes, summed over
+        the frames.
     jitter
         Mean change of the four edge errors of a matched box from one frame to the next, in pixels.
     mota
         ``1 - (fn + fp + id_switches) / (tp + fn)``; at most 1, and below 0 if errors outnumber vehicles.
     idf1
         F1 of the boxes under the best one-to-one assignment of tracks to vehicles over the whole clip.
-    id_switches
-        Number of times a vehicle is matched by another track than the one that matched it last.
-    fragmentations
-        Number of times a vehicle is lost and found again.
+    id_switches, fragmentations
+        Number of times a vehicle is matched by another track than last, and is lost and found again.
     longest_false_positive_run
         Largest number of consecutive evaluated frames in which one track is a false positive.
     """
@@ -80,11 +71,11 @@ class TrackScores(Scores):
 
     def summary(self) -> str:
         """Return the scores as a few aligned lines."""
-        f1, precision, recall = map(format_number, (self.f1, self.precision, self.recall))
+        precision, recall = format_number(self.precision), format_number(self.recall)
         rows = {
             "MOTA": format_number(self.mota),
             "IDF1": format_number(self.idf1),
-            "F1": f"{f1} (precision {precision}, recall {recall})",
+            "F1": f"{format_number(self.f1)} (precision {precision}, recall {recall})",
             "mean IoU": format_number(self.mean_iou),
             "jitter": f"{format_number(self.jitter)} px a frame",
             "identity switches": str(self.id_switches),
@@ -107,14 +98,10 @@ def evaluate_tracks(
 
     Parameters
     ----------
-    predictions
-        Tracked boxes, each with its track. Rows marked ``ignore`` are left out.
-    labels
-        True boxes, each with its track unless it is marked ``ignore``.
-    iou
-        Smallest IoU, in (0, 1], at which a tracked box matches a label or is ignored with an ignored box.
-    frames
-        All evaluated frames, as in `evaluate_detections`; names keep the given order.
+    predictions, labels
+        Tracked and true boxes, each with its track unless it is marked ``ignore``.
+    iou, frames
+        As in `evaluate_detections`; names of frames keep the given order.
 
     Returns
     -------
@@ -148,31 +135,36 @@ def evaluate_tracks(
     matched = _match_tracks(predictions, labels, keys, min_iou)
 
     overlaps = [overlap for frame in matched for *_, overlap in frame.pairs]
-    histories = _histories(predictions, labels, matched)
+    found_rows = [row for frame in matched for _, row, _ in frame.pairs]
     false_rows = [row for frame in matched for row in frame.false]
-    fn = sum(len(frame.missed) for frame in matched)
-    tp, fp, fn, precision, recall, f1 = rates(len(overlaps), len(false_rows), fn)
-    switches = sum(_count_switches(history) for history in histories.values())
-    counted = [*false_rows, *(row for frame in matched for _, row, _ in frame.pairs)]
+    tp, fp, fn = len(found_rows), len(false_rows), sum(len(frame.missed) for frame in matched)
+    # The tracks that matched each vehicle, frame by frame; None where it was missed.
+    histories: dict[int, list[int | None]] = defaultdict(list)
+    for frame in matched:
+        for target, row, _ in frame.pairs:
+            histories[int(labels.tracks[target])].append(int(predictions.tracks[row]))
+        for target in frame.missed:
+            histories[int(labels.tracks[target])].append(None)
+    switches = fragmentations = 0
+    for history in histories.values():
+        tracks = [track for track in history if track is not None]
+        switches += sum(before != after for before, after in pairwise(tracks))
+        found_runs = sum(found for found, _ in groupby(track is not None for track in history))
+        fragmentations += max(found_runs - 1, 0)
     return TrackScores(
         frames=len(keys),
         iou=min_iou,
         vehicles=len(histories),
-        tracks=len(np.unique(predictions.tracks[counted])),
-        tp=tp,
-        fp=fp,
-        fn=fn,
+        tracks=len(np.unique(predictions.tracks[found_rows + false_rows])),
         ignored=sum(frame.ignored for frame in matched),
-        precision=precision,
-        recall=recall,
-        f1=f1,
         mean_iou=mean(overlaps),
         jitter=_jitter(predictions, labels, matched),
         mota=1 - ratio(fn + fp + switches, tp + fn),
         idf1=ratio(2 * _identity_true_positives(matched), 2 * tp + fp + fn),
         id_switches=switches,
-        fragmentations=sum(_count_fragmentations(history) for history in histories.values()),
+        fragmentations=fragmentations,
         longest_false_positive_run=_longest_false_run(predictions, matched),
+        **rates(tp, fp, fn),
     )
 
 
@@ -186,10 +178,6 @@ class _MatchedFrame:
     false: list[int]  # prediction rows
     ignored: int
     overlapping: list[tuple[int, int]]  # vehicle and track of every pair that overlaps enough, matched or not
-
-
-# The tracks that matched a vehicle, frame by frame; None where it was missed.
-_History = list[int | None]
 
 
 def _check_tracks(side: FrameBoxes, name: str, keys: list[FrameKey]) -> None:
@@ -242,9 +230,7 @@ def _match_tracks(
 
 def _positions(keys: list[FrameKey]) -> list[int]:
     """Assign positions to frames: consecutive ones differ by 1, others by more."""
-    numbers = [key for key in keys if isinstance(key, int)]
-    if not numbers:
-        return list(range(len(keys)))
+    numbers = [key if isinstance(key, int) else index for index, key in enumerate(keys)]
     steps = [after - before for before, after in pairwise(numbers)]
     min_step = min(steps, default=1)
     return list(accumulate((1 if step == min_step else 2 for step in steps), initial=0))
@@ -264,40 +250,15 @@ def _assign_rest(
     return [(int(i), int(j)) for i, j in zip(*chosen) if allowed[i, j]]
 
 
-def _histories(
-    predictions: FrameBoxes, labels: FrameBoxes, matched: list[_MatchedFrame]
-) -> dict[int, _History]:
-    """Tracks that matched each labelled vehicle, in frame order."""
-    histories: dict[int, _History] = defaultdict(list)
-    for frame in matched:
-        for target, row, _ in frame.pairs:
-            histories[int(labels.tracks[target])].append(int(predictions.tracks[row]))
-        for target in frame.missed:
-            histories[int(labels.tracks[target])].append(None)
-    return histories
-
-
-def _count_switches(history: _History) -> int:
-    tracks = [track for track in history if track is not None]
-    return sum(before != after for before, after in pairwise(tracks))
-
-
-def _count_fragmentations(history: _History) -> int:
-    found = [track is not None for track in history]
-    regained = sum(not before and after for before, after in pairwise(found))
-    return regained - (any(found) and not found[0])
-
-
 def _identity_true_positives(matched: list[_MatchedFrame]) -> int:
     """Count the right boxes under the best one-to-one assignment of tracks to vehicles (IDTP)."""
     from scipy.optimize import linear_sum_assignment
 
-    counts = Counter(pair for frame in matched for pair in frame.overlapping)
-    vehicles = {vehicle: index for index, vehicle in enumerate(sorted({v for v, _ in counts}))}
-    tracks = {track: index for index, track in enumerate(sorted({t for _, t in counts}))}
+    pairs = np.array([pair for frame in matched for pair in frame.overlapping], np.int64).reshape(-1, 2)
+    vehicles, rows = np.unique(pairs[:, 0], return_inverse=True)
+    tracks, columns = np.unique(pairs[:, 1], return_inverse=True)
     table = np.zeros((len(vehicles), len(tracks)))
-    for (vehicle, track), count in counts.items():
-        table[vehicles[vehicle], tracks[track]] = count
+    np.add.at(table, (rows, columns), 1)
     return int(table[linear_sum_assignment(table, maximize=True)].sum())
 
 
