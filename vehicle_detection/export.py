@@ -92,7 +92,15 @@ def _check_row(item: Any, number: int, *, stills: bool = False) -> Row:
         raise InvalidInputError(
             f"row {number} must be a FrameResult or the values {', '.join(columns)}, got {describe(item)}"
         )
-    frame = _file_name(values[0], number) if stills else _whole_number(values[0], number, "frame", low=0)
+    if not stills:
+        frame: int | str = _whole_number(values[0], number, "frame", low=0)
+    elif isinstance(values[0], (str, os.PathLike)):
+        frame = os.fspath(values[0])
+    else:
+        raise InvalidInputError(
+            f"row {number}: frame must be the image's file name, got {describe(values[0])}; "
+            "write the frames of a video with write_tracks"
+        )
     untracked = stills and _is_missing(values[1])
     track = None if untracked else _whole_number(values[1], number, "track_id")
     x1, y1, x2, y2, score = (_number(value, number, name) for name, value in zip(columns[2:], values[2:7]))
@@ -106,15 +114,6 @@ def _check_row(item: Any, number: int, *, stills: bool = False) -> Row:
         for name, value in zip(columns[7:], values[7:])
     ]
     return Row(frame, track, x1, y1, x2, y2, score, *extra)
-
-
-def _file_name(value: Any, number: int) -> str:
-    if not isinstance(value, (str, os.PathLike)):
-        raise InvalidInputError(
-            f"row {number}: frame must be the image's file name, got {describe(value)}; "
-            "write the frames of a video with write_tracks"
-        )
-    return os.fspath(value)
 
 
 def _is_missing(value: Any) -> bool:

@@ -57,38 +57,23 @@ FOLD_COLUMNS = {
 class FoldScore:
     """Scores on a set of frames whose source was left out of training.
 
-    Attributes
-    ----------
-    name, source
-        Names of the set and of its source.
-    frames, vehicles
-        Number of frames, and of scored labels.
-    f1, precision, recall, mean_iou
-        At the threshold that is best for the other sources.
-    false_per_frame, false_per_empty_frame
-        False boxes per frame, and per frame without any label; NaN if there is none.
-    threshold
-        That threshold, an SVM margin.
-    average_precision, best_f1
-        Over all thresholds, and at the best threshold of this set.
-    region_f1, region_average_precision
-        `f1` and `average_precision` with ``ignored_as_regions=True``, see `evaluate_detections`: for labels
-        with one ignored box around a group of vehicles, in which the other scores count detections as false.
+    The region scores are those with ``ignored_as_regions=True``, see `evaluate_detections`: for labels with
+    one ignored box around a group of vehicles, in which the other scores count detections as false.
     """
 
     name: str
     source: str
     frames: int
-    vehicles: int
-    f1: float
+    vehicles: int  # scored labels
+    f1: float  # this and the next three at the threshold that is best for the other sources
     precision: float
     recall: float
     mean_iou: float
     false_per_frame: float
-    false_per_empty_frame: float
-    threshold: float
+    false_per_empty_frame: float  # per frame without any label; NaN if there is none
+    threshold: float  # an SVM margin
     average_precision: float
-    best_f1: float
+    best_f1: float  # at the best threshold of this set
     region_f1: float
     region_average_precision: float
 

@@ -39,27 +39,9 @@ _MIN_TRUNCATED, _STEP = 0.2, 5
 def drawn_source(*, drives: int = 2 * len(_CASES), frames: int = 2, random_state: int = 0) -> FrameDataset:
     """Render frames of different roads, lights and sizes, with their vehicles as labels.
 
-    Parameters
-    ----------
-    drives
-        Number of drives; the kinds of drives take turns.
-    frames
-        Number of frames of each drive, equally spaced.
-    random_state
-        Seed, from which the seed of every drive follows.
+    The kinds of drives take turns, and the frames of a drive are equally spaced. The seed of every drive
+    follows from `random_state`.
 
-    Returns
-    -------
-    FrameDataset
-        One set of frames for each drive.
-
-    Raises
-    ------
-    InvalidInputError
-        If a number is out of range.
-
-    Examples
-    --------
     >>> drawn_source(drives=1, frames=2).sets
     (LabelledFrames('drawn 1', 2 frames, 16 boxes),)
     """
