@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from vehicle_detection.classifier import Template, VehicleClassifier, fit_features
+from vehicle_detection.classifier import Template, TrainingOptions, VehicleClassifier, fit_features
 from vehicle_detection.datasets import PatchSet, Split, make_split, split_leakage
 from vehicle_detection.features import extract_features
 from vehicle_detection.params import FeatureParams, SearchParams
@@ -269,7 +269,7 @@ def summarize(
 def _fit_svm(
     params: FeatureParams, features: NDArray[np.float32], labels: NDArray[np.int64]
 ) -> VehicleClassifier:
-    return fit_features(features, labels, params=params, C=COURSE_C, mirror=False, random_state=0)
+    return fit_features(features, labels, params, TrainingOptions(C=COURSE_C, mirror=False))
 
 
 def _zero_classifier(params: FeatureParams) -> VehicleClassifier:

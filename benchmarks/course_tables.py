@@ -12,7 +12,7 @@ import logging
 import math
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -62,21 +62,27 @@ def main(arguments: Sequence[str] | None = None) -> None:
         part.write_text("\n".join(parts), encoding="utf-8")
 
 
-def _systems(runs: Runs, folder: Path) -> str:
-    table = _with_times(runs, "systems")
-    return _section(
-        folder, "systems", "The three systems", table,
+def _svm_section(name: str) -> Callable[[Runs, Path], str]:
+    title, text = _SVM_TEXTS[name]
+    return lambda runs, folder: _section(folder, name, title, _with_times(runs, name), text)
+
+
+_SVM_TEXTS = {
+    "systems": (
+        "The three systems",
         "C = 1 is the course's value (scikit-learn's default), C = 1e-4 this library's.",
-    )  # fmt: skip
-
-
-def _third(runs: Runs, folder: Path) -> str:
-    table = _with_times(runs, "third_configurations")
-    return _section(
-        folder, "third_configurations", "Five configurations (third system)", table,
-        "(orientations, pixels per cell, cells per block, channels) of YCrCb HOG, with 32x32 spatial bins and "
-        "32 histogram bins, C = 1.",
-    )  # fmt: skip
+    ),
+    "third_configurations": (
+        "Five configurations (third system)",
+        "(orientations, pixels per cell, cells per block, channels) of YCrCb HOG, with 32x32 spatial bins "
+        "and 32 histogram bins, C = 1.",
+    ),
+    "second_ideas": (
+        "8 orientations, HLS with the S channel (second system's discussion)",
+        "16x16 spatial bins, 32 histogram bins, 8 pixels per cell, 2 cells per block, C = 1.",
+    ),
+    "luv_channels": ("One or three HOG channels in LUV (first system)", "2384 and 5520 features, C = 1."),
+}
 
 
 def _bayes(runs: Runs, folder: Path) -> str:
@@ -98,22 +104,6 @@ def _bayes(runs: Runs, folder: Path) -> str:
     return text + "\n".join([*lines, "```", ""])
 
 
-def _ideas(runs: Runs, folder: Path) -> str:
-    table = _with_times(runs, "second_ideas")
-    return _section(
-        folder, "second_ideas", "8 orientations, HLS with the S channel (second system's discussion)", table,
-        "16x16 spatial bins, 32 histogram bins, 8 pixels per cell, 2 cells per block, C = 1.",
-    )  # fmt: skip
-
-
-def _luv(runs: Runs, folder: Path) -> str:
-    table = _with_times(runs, "luv_channels")
-    return _section(
-        folder, "luv_channels", "One or three HOG channels in LUV (first system)", table,
-        "2384 and 5520 features, C = 1.",
-    )  # fmt: skip
-
-
 def _prediction(runs: Runs, folder: Path) -> str:
     table = runs.prediction_times()
     samples = table["samples"][0]
@@ -124,7 +114,8 @@ def _prediction(runs: Runs, folder: Path) -> str:
     )
     lines = [
         "## Prediction time (first system)", "",
-        f"Milliseconds for {samples:,} test samples of 2384 features: mean ± standard deviation of five runs.", "",
+        f"Milliseconds for {samples:,} test samples of 2384 features: mean ± standard deviation of five",
+        "runs.", "",
         "| what | ms |", "|---|---|",
     ]  # fmt: skip
     lines += [
@@ -181,7 +172,16 @@ _SPLIT_KEYS = {
     "GTI to KITTI": "gti_to_kitti",
     "KITTI to GTI": "kitti_to_gti",
 }
-_SECTIONS = (_leakage, _systems, _shipped, _third, _bayes, _ideas, _luv, _prediction)
+_SECTIONS = (
+    _leakage,
+    _svm_section("systems"),
+    _shipped,
+    _svm_section("third_configurations"),
+    _bayes,
+    _svm_section("second_ideas"),
+    _svm_section("luv_channels"),
+    _prediction,
+)
 
 
 def _with_times(runs: Runs, name: str) -> pd.DataFrame:

@@ -1,13 +1,11 @@
-"""What the notebooks work on: drawn by the project itself, or real where you have it.
+"""Data of the notebooks: rendered by the project, or real data if available.
 
-Where the environment variable ``VEHICLE_DETECTION_DATA`` names a folder, the notebooks take the
-real patches, images and clips in it; without it they need nothing but the project. What they show
-of the library they import from the library.
+If the environment variable ``VEHICLE_DETECTION_DATA`` names a folder, the notebooks use the real
+patches, images and videos in it; otherwise they need only this project.
 """
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,93 +14,93 @@ from typing import Any
 
 import cv2
 import numpy as np
-from IPython.display import Markdown
+import pandas as pd
 from numpy.typing import NDArray
 
 import vehicle_detection as vd
-from vehicle_detection.datasets import PatchSet
-from vehicle_detection.evaluation import FrameBoxes
 from vehicle_detection.synthetic import SceneVehicle
 
 Image = NDArray[np.uint8]
 
 ROOT = Path(__file__).resolve().parent.parent
-"""The project."""
+"""The project's folder."""
 
 _FOLDER = os.environ.get("VEHICLE_DETECTION_DATA")
 
 DATA = Path(_FOLDER) if _FOLDER else None
-"""Folder of the real data; None where there is none."""
+"""Folder of the real data, or None."""
 
-DRAWN_HORIZON = 0.56
-"""Where the horizon of a drawn scene lies, as a share of its height."""
+SYNTHETIC_HORIZON = 0.56
+"""Horizon of rendered scenes, as a fraction of the frame's height."""
+
+# Seed, light and rain of the rendered drives that patches are cut from, and the fraction of these
+# patches that is available after each drive.
+_DRIVES = ((0, "day", 0.0, 0.4), (2, "overcast", 0.6, 0.8), (3, "dusk", 0.0, 1.0))
+
+CARS = ("hatchback", "estate", "sedan", "mpv", "suv")
+HEAVY = ("van", "truck")
 
 
-def patches(drawn: int = 400, real: int = 3000) -> PatchSet:
-    """Training patches, about so many: drawn ones, or an even choice of the course's 17,760.
+def patches(synthetic: int = 400, real: int = 3000) -> vd.PatchSet:
+    """About this many training patches: rendered, or evenly spaced ones of the course's 17,760.
 
-    Half of the drawn ones come from `render_patches` (source ``studio``), each of another vehicle,
-    and half are cut out of drawn drives (source ``drive``), frame after frame.
+    Half of the rendered ones are those of `render_patches` (source ``studio``), each of another
+    vehicle; the other half is cut from the frames of rendered drives (source ``drive``).
     """
     if DATA is None:
-        images, labels = vd.render_patches(drawn // 2)
+        images, labels = vd.render_patches(synthetic // 2)
         names = [f"{_folder(label)}/studio/{row:04}.png" for row, label in enumerate(labels)]
-        return PatchSet.concatenate(
-            [PatchSet(images, labels, names), _drive_patches(drawn - len(images))]
+        return vd.PatchSet.concatenate(
+            [vd.PatchSet(images, labels, names), _drive_patches(synthetic - len(images))]
         )
-    whole = vd.load_training_patches(DATA / "vehicles.zip", DATA / "non-vehicles.zip")
-    return whole[:: max(1, len(whole) // real)]
+    patch_set = vd.load_training_patches(DATA / "vehicles.zip", DATA / "non-vehicles.zip")
+    return patch_set[:: max(1, len(patch_set) // real)]
 
 
 def _folder(label: bool) -> str:
     return "vehicles" if label else "non-vehicles"
 
 
-# Seed, light and rain of the drives, and the share of all patches that is cut out by their end.
-_DRIVES = ((0, "day", 0.0, 0.4), (2, "overcast", 0.6, 0.8), (3, "dusk", 0.0, 1.0))
-
-
-def _drive_patches(count: int) -> PatchSet:
-    """Cut patches out of drawn drives: their vehicles, and as many places without any."""
+def _drive_patches(count: int) -> vd.PatchSet:
+    """Cut patches from rendered drives: the vehicles, and as many places without vehicles."""
     rng = np.random.default_rng(0)
-    cut: dict[bool, list[Image]] = {True: [], False: []}
-    for seed, light, rain, share in _DRIVES:
-        wanted = round(share * count / 2)
+    crops: dict[bool, list[Image]] = {True: [], False: []}
+    for seed, light, rain, fraction in _DRIVES:
         drive = vd.render_drive(
             frames=3 * count, shape=(540, 960), light=light, rain=rain, random_state=seed
         )
         for scene in (drive[frame] for frame in range(0, len(drive), 3)):
             boxes = np.array([row.box for row in scene.truth], float).reshape(-1, 4)
-            whole = [
+            visible = [
                 not row.ignore and row.occluded < 2 and row.truncated < 0.2 for row in scene.truth
             ]
-            seen = boxes[np.array(whole, bool)]
-            for x1, y1, x2, y2 in seen:
-                # A vehicle fills nine tenths of its patch, as in the course's.
+            vehicles = boxes[np.array(visible, bool)]
+            for x1, y1, x2, y2 in vehicles:
+                # A vehicle fills 90% of its patch, as in the course's patches.
                 side = max(x2 - x1, y2 - y1) / 0.9
-                cut[True].append(
-                    _square(scene.image, (x1 + x2 - side) / 2, (y1 + y2 - side) / 2, side)
-                )
-            for _ in range(2 * len(seen)):
+                left, top = (x1 + x2 - side) / 2, (y1 + y2 - side) / 2
+                crops[True].append(_crop(scene.image, left, top, side))
+            for _ in range(2 * len(vehicles)):
                 side = float(rng.integers(40, 130))
                 x, y = rng.uniform(0, 960 - side), rng.uniform(230, 420 - side / 2)
                 free = not (vd.iou_matrix([[x, y, x + side, y + side]], boxes) > 0.02).any()
-                if free and len(cut[False]) < len(cut[True]):
-                    cut[False].append(_square(scene.image, x, y, side))
-            if min(map(len, cut.values())) >= wanted:
+                if free and len(crops[False]) < len(crops[True]):
+                    crops[False].append(_crop(scene.image, x, y, side))
+            if min(map(len, crops.values())) >= round(fraction * count / 2):
                 break
-    rows = [
+    selected = [
         (label, row, image)
-        for label, found in cut.items()
-        for row, image in enumerate(found[:wanted])
+        for label, images in crops.items()
+        for row, image in enumerate(images[: round(count / 2)])
     ]
-    names = [f"{_folder(label)}/drive/{row:04}.png" for label, row, _ in rows]
-    return PatchSet(np.stack([image for *_, image in rows]), [label for label, *_ in rows], names)
+    names = [f"{_folder(label)}/drive/{row:04}.png" for label, row, _ in selected]
+    images = np.stack([image for *_, image in selected])
+    return vd.PatchSet(images, [label for label, *_ in selected], names)
 
 
-def _square(image: Image, x: float, y: float, side: float) -> Image:
-    x1, y1, wide = round(max(x, 0)), round(max(y, 0)), round(side)
-    return np.asarray(cv2.resize(image[y1 : y1 + wide, x1 : x1 + wide], (64, 64)), np.uint8)
+def _crop(image: Image, x: float, y: float, side: float) -> Image:
+    left, top, size = round(max(x, 0)), round(max(y, 0)), round(side)
+    return np.asarray(cv2.resize(image[top : top + size, left : left + size], (64, 64)), np.uint8)
 
 
 def road_images() -> vd.LabelledFrames:
@@ -115,41 +113,39 @@ def road_images() -> vd.LabelledFrames:
 
 
 def scenes(count: int = 24) -> vd.LabelledFrames:
-    """Frames with their true boxes: drawn scenes, or every n-th frame of the course's clip."""
+    """Frames with their true boxes: rendered scenes, or evenly spaced frames of a course video."""
     if DATA is not None:
         labels = vd.read_labels(DATA / "labels" / "project_clip.csv")
         path = DATA / "videos" / "project_clip.mp4"
         every = max(1, len(labels.frame_keys) // count)
         return vd.LabelledFrames.from_video(path, labels, every=every, name="clip")
     lights = ("day", "overcast", "dusk")
-    drawn = [
+    rendered = [
         vd.render_scene(shape=(540, 960), light=lights[seed % 3], random_state=seed)
         for seed in range(count)
     ]
-    return labelled("drawn scenes", drawn)
-
-
-CARS = ("hatchback", "estate", "sedan", "mpv", "suv")
-HEAVY = ("van", "truck")
+    return _label("rendered scenes", rendered)
 
 
 def other_roads(count: int = 8) -> list[vd.LabelledFrames]:
-    """So many frames of each of several kinds of roads: drawn ones, or those of other countries."""
+    """About `count` frames of each of several kinds of roads: rendered, or of other countries."""
     if DATA is not None:
-        return [_thinned(name, 3 * count) for name in ("camvid", "india", "indonesia")]
+        return [_subsample(name, 3 * count) for name in ("camvid", "india", "indonesia")]
     return [
-        labelled("cars from behind", _queue(count, CARS)),
-        labelled("cars from the front", _queue(count, CARS, view="front")),
-        labelled("vans and trucks", _queue(count, HEAVY)),
-        labelled("rain at dusk", _queue(count, CARS + HEAVY, light="dusk", rain=0.8)),
-        labelled("night", _queue(count, CARS + HEAVY, light="night")),
+        _label("cars from behind", _render_traffic(count, CARS)),
+        _label("cars from the front", _render_traffic(count, CARS, view="front")),
+        _label("vans and trucks", _render_traffic(count, HEAVY)),
+        _label("rain at dusk", _render_traffic(count, CARS + HEAVY, light="dusk", rain=0.8)),
+        _label("night", _render_traffic(count, CARS + HEAVY, light="night")),
     ]
 
 
-def _queue(count: int, kinds: Sequence[str], *, view: str = "rear", **options: Any) -> list[Any]:
-    """Draw scenes with a vehicle in each of three lanes."""
+def _render_traffic(
+    count: int, kinds: Sequence[str], *, view: str = "rear", **options: Any
+) -> list[Any]:
+    """Render scenes with a vehicle in each of three lanes."""
     rng = np.random.default_rng(0)
-    drawn = []
+    rendered = []
     for seed in range(count):
         vehicles = [
             SceneVehicle(
@@ -160,35 +156,34 @@ def _queue(count: int, kinds: Sequence[str], *, view: str = "rear", **options: A
             )
             for lateral in (-3.6, 0.0, 3.6)
         ]
-        drawn.append(
-            vd.render_scene(
-                shape=(432, 768), lane=1, vehicles=vehicles, random_state=seed, **options
-            )
+        scene = vd.render_scene(
+            shape=(432, 768), lane=1, vehicles=vehicles, random_state=seed, **options
         )
-    return drawn
+        rendered.append(scene)
+    return rendered
 
 
-def _thinned(name: str, count: int) -> vd.LabelledFrames:
-    """Take every n-th frame of a folder of real frames."""
+def _subsample(name: str, count: int) -> vd.LabelledFrames:
+    """Read evenly spaced frames of a folder of real frames."""
     assert DATA is not None
     frames = vd.load_frames(DATA / "frames" / name)
     labels = vd.read_labels(DATA / "labels" / f"{name}.csv")
     step = max(1, len(frames) // count)
-    chosen = {frames.names[row]: frames[row] for row in range(0, len(frames), step)}
-    return vd.LabelledFrames(name, chosen, labels)
+    selected = {frames.names[row]: frames[row] for row in range(0, len(frames), step)}
+    return vd.LabelledFrames(name, selected, labels)
 
 
-def labelled(name: str, drawn: Sequence[Any]) -> vd.LabelledFrames:
-    """Put drawn scenes and their truth together under a name."""
-    rows = [(number, row) for number, scene in enumerate(drawn) for row in scene.truth]
-    labels = FrameBoxes(
+def _label(name: str, rendered: Sequence[Any]) -> vd.LabelledFrames:
+    """Combine rendered scenes and their true boxes."""
+    rows = [(number, row) for number, scene in enumerate(rendered) for row in scene.truth]
+    labels = vd.FrameBoxes(
         [number for number, _ in rows],
         np.array([row.track for _, row in rows], int),
         np.array([row.box for _, row in rows], float).reshape(-1, 4),
         ignore=np.array([row.ignore for _, row in rows], bool),
-        frame_keys=range(len(drawn)),
+        frame_keys=range(len(rendered)),
     )
-    return vd.LabelledFrames(name, [scene.image for scene in drawn], labels)
+    return vd.LabelledFrames(name, [scene.image for scene in rendered], labels)
 
 
 @dataclass(frozen=True)
@@ -200,24 +195,24 @@ class Clip:
     path
         The file.
     horizon
-        Where its horizon lies, as a share of the height.
+        Its horizon, as a fraction of the frame's height.
     end
-        How many of its seconds to take.
+        Number of seconds to process.
     labels
-        Its true boxes.
+        The true boxes.
     truth
-        The same; of a drawn drive with distances and speeds.
+        The same; for a rendered drive with distances and speeds.
     """
 
     path: Path
     horizon: float
     end: float
-    labels: FrameBoxes
+    labels: vd.FrameBoxes
     truth: Any
 
 
 def clip(folder: str | os.PathLike[str], frames: int = 50) -> Clip:
-    """Write a drawn drive of so many frames to a folder, or take as many of the course's clip."""
+    """Write a rendered drive to a folder, or use the first frames of a course video."""
     if DATA is not None:
         labels = vd.read_labels(DATA / "labels" / "project_clip.csv")
         path = DATA / "videos" / "project_clip.mp4"
@@ -228,14 +223,15 @@ def clip(folder: str | os.PathLike[str], frames: int = 50) -> Clip:
 
     drive = vd.render_drive(frames=frames, shape=(540, 960))
     path, table = Path(folder) / "drive.mp4", Path(folder) / "truth.csv"
-    film = ImageSequenceClip([scene.image for scene in drive], fps=drive.fps)
-    film.write_videofile(str(path), preset="veryfast", audio=False, logger=None)
+    video = ImageSequenceClip([scene.image for scene in drive], fps=drive.fps)
+    video.write_videofile(str(path), preset="veryfast", audio=False, logger=None)
     drive.write_labels(table)
-    return Clip(path, DRAWN_HORIZON, frames / drive.fps, vd.read_labels(table), drive.truth)
+    end = frames / drive.fps
+    return Clip(path, SYNTHETIC_HORIZON, end, vd.read_labels(table), drive.truth)
 
 
 def zoom(figure: Any, top: float = 0.45, bottom: float = 0.82) -> Any:
-    """Show of each picture of a figure only the rows between two shares of its height: the road."""
+    """Restrict the images of a figure to rows between two fractions of their height: the road."""
     for panel in figure.axes:
         if panel.images:
             low, high = sorted(panel.get_ylim())
@@ -244,19 +240,14 @@ def zoom(figure: Any, top: float = 0.45, bottom: float = 0.82) -> Any:
     return figure
 
 
-def table(rows: Sequence[Mapping[str, object]]) -> Markdown:
-    """Show rows as a table; numbers with few digits."""
-    columns = list(rows[0])
-    lines = [" | ".join(columns), " | ".join("---" for _ in columns)]
-    lines += [" | ".join(_cell(row.get(column)) for column in columns) for row in rows]
-    return Markdown("\n".join(f"| {line} |" for line in lines))
+def score_table(scores: Mapping[Any, vd.DetectionScores]) -> pd.DataFrame:
+    """Tabulate detection scores, one row per entry."""
+    columns = {"F1": "f1", "found": "tp", "missed": "fn", "false": "fp", "mean IoU": "mean_iou"}
+    rows = {
+        name: {column: getattr(score, field) for column, field in columns.items()}
+        for name, score in scores.items()
+    }
+    return pd.DataFrame.from_dict(rows, orient="index")
 
 
-def _cell(value: object) -> str:
-    if value is None or (isinstance(value, float) and math.isnan(value)):
-        return ""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.4g}" if abs(value) < 1 else f"{value:,.2f}"
-    return f"{value:,}" if isinstance(value, (int, np.integer)) else str(value)
+pd.set_option("display.precision", 3)

@@ -1,13 +1,12 @@
-"""Run the notebooks again and save them with their results.
+"""Run the notebooks and save them with their outputs.
 
-``python notebooks/refresh.py`` runs all, ``python notebooks/refresh.py 4 7`` two of them. They run
-on what the project draws itself, whatever `VEHICLE_DETECTION_DATA` says, each in a kernel of its
-own and in this folder. What would change from one run to the next is not kept: times of execution,
-and widgets, of which a page shows nothing without a kernel. Measured times do change: cells with
-the tag ``timing`` keep their results while everything else in the notebook stays the same, unless
+``python notebooks/refresh.py`` runs all notebooks, ``python notebooks/refresh.py 4 7`` two of them,
+each in its own kernel, on the rendered data (`VEHICLE_DETECTION_DATA` is ignored). Execution times
+and widgets are not saved, so a second run changes nothing. Cells with the tag ``timing`` show
+measured times: they keep their saved outputs while the rest of the notebook is unchanged, unless
 ``--timings`` is given.
 
-The first picture of a cell with the tag ``gallery`` goes to ``docs/gallery`` as well.
+The first image of a cell with the tag ``gallery`` is also written to ``docs/gallery``.
 """
 
 from __future__ import annotations
@@ -27,14 +26,12 @@ from nbclient import NotebookClient
 HERE = Path(__file__).resolve().parent
 GALLERY = HERE.parent / "docs" / "gallery"
 
-LIMIT = 150
-"""Seconds that a notebook may take."""
-
-MOST_BYTES = 1_500_000
-"""Size that a notebook may have."""
+MAX_SECONDS = 150
+MAX_BYTES = 1_500_000
+"""Limits of the run time and the file size of a notebook."""
 
 _PNG, _JPEG = "image/png", "image/jpeg"
-_QUALITY = 86
+_JPEG_QUALITY = 86
 _GALLERY_WIDTH = 640
 _METADATA = {
     "kernelspec": {"display_name": "Python 3 (ipykernel)", "language": "python", "name": "python3"},
@@ -43,7 +40,7 @@ _METADATA = {
 
 
 def notebooks() -> list[Path]:
-    """List the notebooks in the order of their numbers."""
+    """Return the paths of the notebooks in order."""
     return sorted(HERE.glob("[0-9]*.ipynb"))
 
 
@@ -52,25 +49,25 @@ def read(path: Path) -> Any:
     return nbformat.read(path, as_version=4)  # type: ignore[no-untyped-call]
 
 
-def run(path: Path, *, data: str | None = None, limit: float = LIMIT) -> Any:
-    """Run a notebook to its end, on the real data of a folder or on what the project draws.
+def run(path: Path, *, data: str | None = None, max_seconds: float = MAX_SECONDS) -> Any:
+    """Run a notebook on the rendered data, or on the real data in a folder.
 
     Raises
     ------
     nbclient.exceptions.CellExecutionError
-        If a cell fails, an assert among them.
+        If a cell raises an exception, such as a failed assert.
     RuntimeError
         If a cell writes to standard error, such as a warning.
     TimeoutError
-        If it takes longer than `limit` seconds.
+        If it takes longer than `max_seconds`.
     """
-    # A backend or data folder of the caller's is not the reader's.
-    left_out = ("VEHICLE_DETECTION_DATA", "MPLBACKEND")
-    environment = {name: value for name, value in os.environ.items() if name not in left_out}
+    # Run as for a reader, without the settings of this shell.
+    excluded = ("VEHICLE_DETECTION_DATA", "MPLBACKEND")
+    environment = {name: value for name, value in os.environ.items() if name not in excluded}
     if data is not None:
         environment["VEHICLE_DETECTION_DATA"] = data
     notebook = read(path)
-    deadline = time.monotonic() + limit
+    deadline = time.monotonic() + max_seconds
     client = NotebookClient(
         notebook,
         timeout_func=lambda cell: max(1.0, deadline - time.monotonic()),
@@ -95,28 +92,28 @@ def _code(notebook: Any) -> list[Any]:
 
 
 def tags(cell: Any) -> list[str]:
-    """List a cell's tags."""
+    """Return a cell's tags."""
     return list(cell.metadata.get("tags", []))
 
 
 def tidy(notebook: Any, committed: Any, *, timings: bool = False) -> None:
-    """Drop from a notebook that has run what the next run would change without reason."""
+    """Remove what differs between runs from an executed notebook."""
     notebook.metadata = nbformat.from_dict(_METADATA)
     for cell in _code(notebook):
         cell.metadata = nbformat.from_dict({"tags": tags(cell)} if tags(cell) else {})
         cell.outputs = [output for output in cell.outputs if not _is_widget(output)]
         for output in cell.outputs:
             if _PNG in output.get("data", {}):
-                _shrink(output.data)
-    if timings or _steady(notebook) != _steady(committed):
+                _compress(output.data)
+    if timings or _without_times(notebook) != _without_times(committed):
         return
     for cell, old in zip(_code(notebook), _code(committed)):
         if "timing" in tags(cell) and old.outputs:
             cell.outputs = old.outputs
 
 
-def _steady(notebook: Any) -> list[Any]:
-    """List all sources, and all results but measured times."""
+def _without_times(notebook: Any) -> list[Any]:
+    """Return all sources and outputs except measured times."""
     return [
         (cell.source, None if "timing" in tags(cell) else cell.outputs) for cell in _code(notebook)
     ]
@@ -126,8 +123,8 @@ def _is_widget(output: Any) -> bool:
     return any("widget" in kind for kind in output.get("data", {}))
 
 
-def _shrink(data: Any) -> None:
-    """Keep a photograph as JPEG; charts stay as they are."""
+def _compress(data: Any) -> None:
+    """Replace a PNG by a JPEG of less than half its size: photographs, not charts."""
     png = base64.b64decode(data[_PNG])
     jpeg = _encode(_decode(png), ".jpg")
     if len(jpeg) < 0.5 * len(png):
@@ -140,18 +137,19 @@ def _decode(data: bytes) -> Any:
 
 
 def _encode(image: Any, suffix: str) -> bytes:
-    return bytes(cv2.imencode(suffix, image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1])
+    return bytes(cv2.imencode(suffix, image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1])
 
 
 def save_gallery(notebook: Any, name: str) -> None:
-    """Write the first picture of the cell with the tag ``gallery``."""
+    """Write the first image of the cell with the tag ``gallery``."""
     for cell in _code(notebook):
         if "gallery" not in tags(cell):
             continue
         for output in cell.outputs:
-            held = output.get("data", {}).get(_JPEG) or output.get("data", {}).get(_PNG)
-            if held:
-                image = _decode(base64.b64decode(held))
+            data = output.get("data", {})
+            encoded = data.get(_JPEG) or data.get(_PNG)
+            if encoded:
+                image = _decode(base64.b64decode(encoded))
                 height = round(image.shape[0] * _GALLERY_WIDTH / image.shape[1])
                 small = cv2.resize(image, (_GALLERY_WIDTH, height), interpolation=cv2.INTER_AREA)
                 GALLERY.mkdir(parents=True, exist_ok=True)
@@ -160,26 +158,24 @@ def save_gallery(notebook: Any, name: str) -> None:
 
 
 def main() -> None:
-    """Run and save the notebooks of the given numbers, or all."""
-    parser = argparse.ArgumentParser(description="Run the notebooks and save their results.")
-    parser.add_argument(
-        "numbers", nargs="*", type=int, help="numbers of the notebooks; all if none"
-    )
-    parser.add_argument("--timings", action="store_true", help="save measured times anew")
-    chosen = parser.parse_args()
+    """Run and save the selected notebooks."""
+    parser = argparse.ArgumentParser(description="Run the notebooks and save their outputs.")
+    parser.add_argument("numbers", nargs="*", type=int, help="notebooks to run; default: all")
+    parser.add_argument("--timings", action="store_true", help="replace saved measured times")
+    arguments = parser.parse_args()
     for path in notebooks():
-        if chosen.numbers and int(path.name[:2]) not in chosen.numbers:
+        if arguments.numbers and int(path.name[:2]) not in arguments.numbers:
             continue
-        began = time.perf_counter()
+        start = time.perf_counter()
         notebook = run(path)
-        tidy(notebook, read(path), timings=chosen.timings)
+        tidy(notebook, read(path), timings=arguments.timings)
         text = nbformat.writes(notebook)  # type: ignore[no-untyped-call]
         path.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
         save_gallery(notebook, path.stem)
         size = path.stat().st_size
-        print(f"{path.name}: {time.perf_counter() - began:.0f} s, {size / 1e3:,.0f} kB", flush=True)
-        if size > MOST_BYTES:
-            raise SystemExit(f"{path.name} is larger than {MOST_BYTES / 1e6} MB: draw less in it")
+        print(f"{path.name}: {time.perf_counter() - start:.0f} s, {size / 1e3:,.0f} kB", flush=True)
+        if size > MAX_BYTES:
+            raise SystemExit(f"{path.name} is larger than {MAX_BYTES / 1e6} MB: reduce its images")
 
 
 if __name__ == "__main__":

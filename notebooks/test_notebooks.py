@@ -1,4 +1,4 @@
-"""Every notebook runs to its last assert, and what is saved in it may be shown to anybody."""
+"""Every notebook runs without errors, and its saved outputs are complete and not private."""
 
 import ast
 import os
@@ -17,7 +17,7 @@ def code_of(path):
     return [cell for cell in refresh.read(path).cells if cell.cell_type == "code"]
 
 
-def words_of(path):
+def markdown_of(path):
     return [cell.source for cell in refresh.read(path).cells if cell.cell_type == "markdown"]
 
 
@@ -29,49 +29,48 @@ def texts_in(cell):
                 yield data
 
 
-def test_there_are_ten():
+def test_the_notebooks_are_numbered():
     assert [path.name[:2] for path in NOTEBOOKS] == [f"{number:02}" for number in range(1, 11)]
 
 
 @EACH
-def test_it_runs_on_what_the_project_draws(path):
+def test_it_runs_on_rendered_data(path):
     refresh.run(path)
 
 
 @pytest.mark.realdata
 @EACH
-def test_it_runs_on_the_real_data(path):
+def test_it_runs_on_real_data(path):
     folder = os.environ.get("VEHICLE_DETECTION_DATA")
     if not folder:
-        pytest.skip("VEHICLE_DETECTION_DATA is not set: the real data is not at hand")
+        pytest.skip("VEHICLE_DETECTION_DATA is not set")
     refresh.run(path, data=folder)
 
 
 @EACH
-def test_it_begins_with_what_one_learns_and_ends_with_the_next(path):
-    words = words_of(path)
-    assert words[0].startswith(f"# {int(path.name[:2])}. ")
-    assert "*What you learn:*" in words[0]
-    assert "## Things to try" in words[-1]
-    following = NOTEBOOKS[(NOTEBOOKS.index(path) + 1) % len(NOTEBOOKS)].name
-    last = words[-1].splitlines()[-1]
-    assert (following if following != NOTEBOOKS[0].name else "README.md") in last
+def test_it_starts_with_its_contents_and_ends_with_a_link_to_the_next(path):
+    cells = markdown_of(path)
+    assert cells[0].startswith(f"# {int(path.name[:2])}. ")
+    assert "*What you learn:*" in cells[0]
+    assert "## Things to try" in cells[-1]
+    targets = [*(each.name for each in NOTEBOOKS[1:]), "README.md"]
+    assert targets[NOTEBOOKS.index(path)] in cells[-1].splitlines()[-1]
     assert refresh.read(path).cells[-1].cell_type == "markdown"
 
 
 @EACH
-def test_its_last_code_checks_what_the_reader_should_have_seen(path):
+def test_its_last_code_cell_checks_the_results(path):
     body = ast.parse(code_of(path)[-1].source).body
     assert sum(isinstance(node, ast.Assert) for node in ast.walk(ast.Module(body, []))) >= 4
 
 
 @EACH
-def test_links_lead_somewhere(path):
-    for link in re.findall(r"\]\(([^)#]+)\)", "\n".join(words_of(path))):
+def test_links_have_a_target(path):
+    for link in re.findall(r"\]\(([^)#]+)\)", "\n".join(markdown_of(path))):
         assert link.startswith("https://") or (path.parent / link).exists(), link
 
 
-def test_the_gallery_shows_all():
+def test_the_gallery_shows_all_notebooks():
     page = (refresh.HERE / "README.md").read_text(encoding="utf-8")
     for link in re.findall(r'\]\(([^)]+)\)|src="([^"]+)"', page):
         assert (refresh.HERE / "".join(link)).exists(), link
@@ -81,8 +80,8 @@ def test_the_gallery_shows_all():
 
 
 @EACH
-def test_it_was_saved_after_a_whole_run(path):
-    assert path.stat().st_size <= refresh.MOST_BYTES
+def test_it_was_saved_after_a_complete_run(path):
+    assert path.stat().st_size <= refresh.MAX_BYTES
     cells = code_of(path)
     assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
     shown = [output for cell in cells for output in cell.outputs]
@@ -92,7 +91,7 @@ def test_it_was_saved_after_a_whole_run(path):
 
 
 @EACH
-def test_it_tells_nothing_of_the_machine_it_was_saved_on(path):
+def test_it_contains_no_paths_of_the_machine_that_saved_it(path):
     notebook = refresh.read(path)
     assert set(notebook.metadata) == {"kernelspec", "language_info"}
     assert all(set(cell.metadata) <= {"tags"} for cell in notebook.cells)
@@ -100,11 +99,11 @@ def test_it_tells_nothing_of_the_machine_it_was_saved_on(path):
     for cell in code_of(path):
         for text in texts_in(cell):
             assert not [word for word in private if word != "/" and word in text], text[:200]
-            # An address in memory is another one in every run.
+            # memory addresses differ between runs
             assert not re.search(r"0x[0-9a-f]{8,}", text), text[:200]
 
 
-def test_measured_times_are_kept_until_something_else_changes():
+def test_measured_times_are_kept_while_the_rest_is_unchanged():
     path = NOTEBOOKS[4]
     committed, again = refresh.read(path), refresh.read(path)
     timed = [cell for cell in again.cells if "timing" in refresh.tags(cell)]
@@ -121,7 +120,7 @@ def test_measured_times_are_kept_until_something_else_changes():
     assert not any(cell.outputs for cell in timed)
 
 
-def test_a_notebook_that_fails_or_takes_too_long_is_noticed(tmp_path):
+def test_failures_and_timeouts_are_reported(tmp_path):
     import nbformat
     from nbclient.exceptions import CellExecutionError
 
@@ -136,7 +135,7 @@ def test_a_notebook_that_fails_or_takes_too_long_is_noticed(tmp_path):
     with pytest.raises(RuntimeError, match="writes to standard error"):
         refresh.run(saved("import sys; sys.stderr.write('careful')"))
     with pytest.raises(TimeoutError):
-        refresh.run(saved("import time; time.sleep(60)"), limit=5)
+        refresh.run(saved("import time; time.sleep(60)"), max_seconds=5)
     assert "VEHICLE" not in str(
         refresh.run(saved("import os; os.environ.get('VEHICLE_DETECTION_DATA')")).cells[0].outputs
     )

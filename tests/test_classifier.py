@@ -18,8 +18,8 @@ from vehicle_detection._kernels import fit_svm
 from vehicle_detection.classifier import (
     KIND,
     Template,
+    TrainingOptions,
     VehicleClassifier,
-    copy_weights,
     load_classifier,
     patch_features,
     train_classifier,
@@ -99,12 +99,12 @@ def test_gamma_changes_the_brightness_of_mirrored_patches(patches, labels):
 
 
 def test_degraded_copies_have_their_weight(patches, labels):
-    features = patch_features(patches, SMALL, mirror=True, gamma=0.4, degraded=0.2)
+    features = patch_features(patches, SMALL, TrainingOptions(gamma=0.4, degraded=0.2))
     copies = (patches, mirror_patches(patches, gamma=0.4), blur_patches(patches), degrade_patches(patches))
     np.testing.assert_array_equal(features, np.concatenate([extract_features(c, SMALL) for c in copies]))
-    assert copy_weights(True, 0.2) == (1, 1, 0.2, 0.2)
-    assert copy_weights(False, 0.2) == (1, 0.2, 0.2)
-    assert copy_weights(False, 0.0) == (1,)
+    assert TrainingOptions(degraded=0.2).copy_weights == (1, 1, 0.2, 0.2)
+    assert TrainingOptions(mirror=False, degraded=0.2).copy_weights == (1, 0.2, 0.2)
+    assert TrainingOptions(mirror=False).copy_weights == (1,)
     found = train_classifier(patches, labels, params=SMALL, gamma=0.4, degraded=0.2)
     fitted = fit_svm(features, np.tile(labels, 4), 1e-4 * np.repeat([1, 1, 0.2, 0.2], 80), gains=SMALL.gains)
     np.testing.assert_array_equal(found.templates[0].coef, fitted.coef)
@@ -117,7 +117,7 @@ def test_degraded_copies_have_their_weight(patches, labels):
     [
         ({"degraded": 1.5}, "degraded must be a number, at least 0 and at most 1; got 1.5"),
         ({"gamma": -0.1}, "gamma must be a number, at least 0 and at most 2; got -0.1"),
-        ({"gamma": 0.4, "mirror": False}, "gamma must be 0 with mirror=False, .*; got 0.4"),
+        ({"gamma": 0.4, "mirror": False}, "gamma must be 0 without mirrored patches, .*; got 0.4"),
     ],
 )
 def test_invalid_augmentation(patches, labels, options, message):

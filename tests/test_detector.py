@@ -9,7 +9,7 @@ from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.detector import FrameResult, VehicleDetector
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.mixture import load_model
 from vehicle_detection.params import (
     FeatureParams,
@@ -401,7 +401,6 @@ GOOD = frame_with(CAR)
         (GOOD[:0], "the image is empty"),
         (GOOD[None], "pass one image"),
         (None, "read files with vehicle_detection.read_image"),
-        ("frame.png", "read files with vehicle_detection.read_image"),
     ],
 )
 @pytest.mark.parametrize("method", ["shared", "windows"])
@@ -415,6 +414,18 @@ def test_bad_frames_are_refused_and_change_nothing(frame, message, method):
     assert_same(detector.process(GOOD), plain.process(GOOD))
 
 
+def test_only_single_images_are_read_from_files():
+    detector = make()
+    for take in (detector.process, detector.search):
+        with pytest.raises(
+            InvalidInputError, match=r"^frame must be .*read files with vehicle_detection\.read_"
+        ):
+            take("frame.png")
+    for take in (detector.detect, detector):
+        with pytest.raises(InvalidInputError, match=r"frame\.png"):
+            take("frame.png")
+
+
 @pytest.mark.parametrize("method", ["shared", "windows"])
 def test_a_frame_too_small_for_a_window_is_refused(method):
     with pytest.raises(InvalidInputError, match="image of 40x40 pixels holds no search window"):
@@ -425,7 +436,6 @@ def test_a_frame_too_small_for_a_window_is_refused(method):
     ("options", "message"),
     [
         ({"method": "fast"}, "method must be one of 'shared', 'windows'; got 'fast'"),
-        ({"regions": "boxes"}, "regions must be one of 'fitted', 'heat'; got 'boxes'"),
         ({"horizon": 1.5}, "horizon must be a number, at least 0 and at most 1"),
         ({"horizon": 400}, "horizon must be a number, at least 0 and at most 1"),
         ({"n_jobs": 0}, "n_jobs must be an integer from 1"),
@@ -436,23 +446,26 @@ def test_bad_options_are_refused(options, message):
         make(**options)
 
 
-@pytest.mark.parametrize("name", ["search", "heat", "fit", "track", "camera"])
+@pytest.mark.parametrize("name", ["search_params", "region_params", "track_params", "camera"])
 @pytest.mark.parametrize("value", ["default", 5, {}])
 def test_parameters_of_another_kind_are_refused(name, value):
-    with pytest.raises(InvalidInputError, match=rf"^{name} must be a \w+, got .*; leave it out"):
+    with pytest.raises(InvalidInputError, match=rf"^{name} must be a [\w ]+, got .*; omit it"):
         make(**{name: value})
 
 
-@pytest.mark.parametrize("method", ["shared", "windows"])
-def test_what_is_no_classifier_is_refused(method):
-    with pytest.raises(InvalidInputError, match="classifier must be a VehicleClassifier, got 'model"):
-        VehicleDetector("model.safetensors", method=method)
+def test_what_is_no_model_is_refused():
+    with pytest.raises(
+        InvalidInputError, match="model must be a VehicleClassifier or TemplateMixture, got 5"
+    ):
+        VehicleDetector(5)
+    with pytest.raises(ModelFileError, match=r"model file model\.safetensors does not exist"):
+        VehicleDetector("model.safetensors")
 
 
 def test_features_that_cannot_be_shared_are_searched_window_by_window():
     params = FeatureParams(color_space="RGB", spatial_size=6, hist_feat=False, hog_feat=False)
     odd = VehicleClassifier(params, (Template(np.zeros(108), np.ones(108), np.ones(108), 0.0),))
-    with pytest.raises(InvalidInputError, match="spatial_size=6 has none; use search_windows"):
+    with pytest.raises(InvalidInputError, match="got spatial_size=6; use search_windows"):
         VehicleDetector(odd, search_params=SEARCH)
     detector = VehicleDetector(odd, method="windows", search_params=SEARCH)
     assert len(detector.search(GOOD).windows) > 0

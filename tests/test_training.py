@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from vehicle_detection import training
-from vehicle_detection.classifier import fit_features, load_classifier, patch_features, train_classifier
+from vehicle_detection.classifier import (
+    TrainingOptions,
+    fit_features,
+    load_classifier,
+    patch_features,
+    train_classifier,
+)
 from vehicle_detection.datasets import (
     PatchSet,
     load_training_patches,
@@ -129,14 +135,14 @@ def test_training_again_writes_the_same_file(patch_set, tmp_path, split):
 
 
 def test_fitting_does_not_change_the_features(patch_set):
-    features = patch_features(patch_set.patches, SMALL, mirror=True)
+    features = patch_features(patch_set.patches, SMALL, TrainingOptions())
     assert (features.shape, features.dtype) == ((320, SMALL.length), np.float32)
     np.testing.assert_array_equal(features[:160], extract_features(patch_set.patches, SMALL))
     mirrored = np.ascontiguousarray(patch_set.patches[:, :, ::-1])
     np.testing.assert_array_equal(features[160:], extract_features(mirrored, SMALL))
     before = features.copy()
     labels = patch_set.labels.astype(np.int64)
-    fitted = fit_features(features, labels, params=SMALL, C=1e-4, mirror=True, random_state=0)
+    fitted = fit_features(features, labels, SMALL, TrainingOptions())
     np.testing.assert_array_equal(features, before)
     assert fitted.metadata["training"]["vehicles"] == 80
 

@@ -18,6 +18,7 @@ from vehicle_detection._common import (
     check_integer,
     check_number,
     check_patches,
+    check_type,
     degrade_patches,
     describe,
     mirror_patches,
@@ -40,9 +41,6 @@ KIND = "patches"
 DEFAULT_C = 1e-4
 
 CLASSIFIER_REMEDY = "load_classifier, train_classifier or VehicleClassifier.from_pipeline make one"
-
-_CHUNK = 1024  # Rows converted to float64 at a time.
-_TENSORS = ("mean", "scale", "coef", "intercept")
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,11 +120,6 @@ class VehicleClassifier:
         X
             ``(N, length)`` feature vectors, or ``(N, 64, 64, 3)`` uint8 RGB patches.
 
-        Returns
-        -------
-        numpy.ndarray
-            ``(N,)`` float64.
-
         Raises
         ------
         InvalidInputError
@@ -134,13 +127,12 @@ class VehicleClassifier:
         """
         features = self._features_of(X)
         folded = [template.fold() for template in self.templates]
-        scores = np.empty((len(folded), len(features)))
-        for start in range(0, len(features), _CHUNK):
-            # Convert in chunks: a float64 copy of all features may not fit into memory.
-            rows = features[start : start + _CHUNK].astype(np.float64)
-            for row, (weights, bias) in zip(scores, folded):
-                row[start : start + _CHUNK] = rows @ weights + bias
-        return np.asarray(scores.max(axis=0), np.float64)
+        scores = np.empty(len(features))
+        # Convert in chunks: a float64 copy of all features may not fit into memory.
+        for chunk in (slice(start, start + 1024) for start in range(0, len(features), 1024)):
+            rows = features[chunk].astype(np.float64)
+            scores[chunk] = np.max([rows @ weights + bias for weights, bias in folded], axis=0)
+        return scores
 
     def predict(self, X: ArrayLike) -> NDArray[np.int64]:
         """Predict 1 for a vehicle and 0 otherwise, ``(N,)`` int64; `X` as in `decision_function`."""
@@ -148,8 +140,7 @@ class VehicleClassifier:
 
     def score(self, X: ArrayLike, y: ArrayLike) -> float:
         """Accuracy: fraction of correct predictions for the labels `y`."""
-        labels = np.asarray(y)
-        predicted = self.predict(X)
+        labels, predicted = np.asarray(y), self.predict(X)
         if labels.shape != predicted.shape or not labels.size:
             raise InvalidInputError(
                 f"y must hold one label for each of {len(predicted)} rows (at least one); "
@@ -189,7 +180,7 @@ class VehicleClassifier:
         Raises
         ------
         InvalidInputError
-            If the last two steps are different, not fitted, or fitted on features of another length.
+            If the last two steps are others, not fitted, or fitted on other features.
         """
         steps = [step for _, step in pipeline.steps]
         names = [type(step).__name__ for step in steps]
@@ -227,15 +218,12 @@ class VehicleClassifier:
                 f"only a model with one template converts; this has {len(self.templates)}"
             )
         template = self.templates[0]
-        scaler = StandardScaler()
+        scaler, svm = StandardScaler(), LinearSVC()
         scaler.mean_, scaler.scale_ = template.mean.copy(), template.scale.copy()
-        scaler.var_ = template.scale**2
-        scaler.n_features_in_ = self.params.length
-        scaler.n_samples_seen_ = 1
-        svm = LinearSVC()
+        scaler.var_, scaler.n_samples_seen_ = template.scale**2, 1
         svm.coef_, svm.intercept_ = template.coef[None].copy(), np.array([template.intercept])
         svm.classes_ = np.array([0, 1])
-        svm.n_features_in_ = self.params.length
+        scaler.n_features_in_ = svm.n_features_in_ = self.params.length
         features = PatchFeatures(**asdict(self.params))
         return Pipeline([("features", features), ("scaler", scaler), ("svm", svm)])
 
@@ -249,13 +237,12 @@ class VehicleClassifier:
         n_jobs
             Threads; the result does not depend on them.
         method
-            ``"shared"``: the fast search, features shared by all windows. ``"windows"``: the reference, one
-            patch per window.
+            ``"shared"``: the fast search; ``"windows"``: the reference, one patch per window.
 
         Raises
         ------
         InvalidInputError
-            If `method` is unknown, or the features cannot be shared by windows.
+            If `method` is unknown, or windows cannot share the features.
         """
         from vehicle_detection.search import BandSearch, ReferenceSearch
 
@@ -278,11 +265,51 @@ class VehicleClassifier:
             If the folder is missing or read-only, or `metadata` holds other values than JSON.
         """
         tensors = {
-            f"{index}.{name}": np.atleast_1d(np.asarray(getattr(template, name), np.float64))
+            f"{index}.{name}": np.array(value, np.float64, ndmin=1)
             for index, template in enumerate(self.templates)
-            for name in _TENSORS
+            for name, value in vars(template).items()
         }
         write_model(path, KIND, asdict(self.params), tensors, self.metadata)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingOptions:
+    """Options of the training, checked; `train_classifier` documents them.
+
+    A misclassified vehicle costs `positive_weight` times a misclassified non-vehicle.
+    """
+
+    C: float = DEFAULT_C
+    mirror: bool = True
+    gamma: float = 0.0
+    degraded: float = 0.0
+    positive_weight: float = 1.0
+    random_state: int = 0
+
+    def __post_init__(self) -> None:
+        checked = {
+            "C": check_number(self.C, "C", above=0, high=1e12),
+            "gamma": check_number(self.gamma, "gamma", low=0, high=2),
+            "degraded": check_number(self.degraded, "degraded", low=0, high=1),
+            "positive_weight": check_number(self.positive_weight, "positive_weight", above=0, high=1e6),
+            "random_state": check_integer(self.random_state, "random_state", low=0, high=2**32 - 1),
+        }
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+        check_type(self.mirror, "mirror", bool, "pass True or False")
+        if self.gamma and not self.mirror:
+            raise InvalidInputError(
+                f"gamma must be 0 without mirrored patches, whose brightness it changes; got {self.gamma:g}"
+            )
+
+    @property
+    def copy_weights(self) -> tuple[float, ...]:
+        """Training weight of each copy of the patches, in the order of `patch_features`."""
+        return (1.0, *(1.0,) * self.mirror, *(self.degraded, self.degraded) * (self.degraded > 0))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the options of `train_classifier` as JSON values."""
+        return {name: value for name, value in asdict(self).items() if name != "positive_weight"}
 
 
 def train_classifier(
@@ -313,22 +340,16 @@ def train_classifier(
     mirror
         Add the mirror image of each patch.
     gamma
-        Brightness jitter of the mirrored patches: gamma exponents between ``exp(-gamma)`` and
-        ``exp(gamma)``.
+        Brightness jitter of the mirrored patches, as exponents from ``exp(-gamma)`` to ``exp(gamma)``.
     degraded
-        Weight, in [0, 1], of two further copies of each patch: a blurred one, and one that is blurred,
-        desaturated and compressed. They help on images of other cameras. 0 leaves them out.
+        Weight, in [0, 1], of two more copies of each patch, one blurred, the other also desaturated and
+        compressed, which help on images of other cameras. 0 omits them.
     random_state
-        Seed of the solver.
+        Seed of the solver; the same input and seed give the same model.
     n_jobs
         Threads of the feature extraction.
     metadata
         JSON values to keep in the model file.
-
-    Returns
-    -------
-    VehicleClassifier
-        A classifier with one template. The same input and seed give the same model.
 
     Raises
     ------
@@ -345,111 +366,63 @@ def train_classifier(
     params = params or FeatureParams()
     images = check_patches(patches, PATCH_SIZE)
     targets = check_labels(labels, len(images))
-    check_number(C, "C", above=0, high=1e12)
-    check_gamma(gamma, mirror)
-    check_number(degraded, "degraded", low=0, high=1)
-    check_integer(random_state, "random_state", low=0, high=2**32 - 1)
-    features = patch_features(images, params, mirror=mirror, gamma=gamma, degraded=degraded, n_jobs=n_jobs)
-    return fit_features(
-        features,
-        targets,
-        params=params,
-        C=C,
-        mirror=mirror,
-        gamma=gamma,
-        degraded=degraded,
-        random_state=random_state,
-        metadata=metadata,
-    )
+    options = TrainingOptions(C=C, mirror=mirror, gamma=gamma, degraded=degraded, random_state=random_state)
+    features = patch_features(images, params, options, n_jobs=n_jobs)
+    return fit_features(features, targets, params, options, metadata=metadata)
 
 
 def patch_features(
-    images: NDArray[np.uint8],
-    params: FeatureParams,
-    *,
-    mirror: bool,
-    gamma: float = 0.0,
-    degraded: float = 0.0,
-    n_jobs: int | None = None,
+    images: NDArray[np.uint8], params: FeatureParams, options: TrainingOptions, *, n_jobs: int | None = None
 ) -> NDArray[np.float32]:
     """Features of all patches, followed by those of their mirrored, blurred and degraded copies."""
-    count, n_copies = len(images), len(copy_weights(mirror, degraded))
-    features = np.empty((n_copies * count, params.length), np.float32)
-    for copy, variant in enumerate(_augmented_copies(images, mirror, gamma, degraded)):
-        features[copy * count : (copy + 1) * count] = extract_features(variant, params, n_jobs=n_jobs)
-    return features
+    features = np.empty((len(options.copy_weights), len(images), params.length), np.float32)
+    for rows, variant in zip(features, _augmented_copies(images, options)):
+        rows[:] = extract_features(variant, params, n_jobs=n_jobs)
+    return features.reshape(-1, params.length)
 
 
-def _augmented_copies(
-    images: NDArray[np.uint8], mirror: bool, gamma: float, degraded: float
-) -> Iterator[NDArray[np.uint8]]:
+def _augmented_copies(images: NDArray[np.uint8], options: TrainingOptions) -> Iterator[NDArray[np.uint8]]:
     """Yield the patches and their copies one after the other, to save memory."""
     yield images
-    if mirror:
-        yield mirror_patches(images, gamma=gamma)
-    if degraded:
-        yield blur_patches(images, mirror=mirror)
-        yield degrade_patches(images, mirror=mirror)
-
-
-def copy_weights(mirror: bool, degraded: float) -> tuple[float, ...]:
-    """Training weight of each copy of the patches, in the order of `patch_features`."""
-    return (1.0, *(1.0,) * mirror, *(degraded, degraded) * (degraded > 0))
+    if options.mirror:
+        yield mirror_patches(images, gamma=options.gamma)
+    if options.degraded:
+        yield blur_patches(images, mirror=options.mirror)
+        yield degrade_patches(images, mirror=options.mirror)
 
 
 def fit_features(
     features: NDArray[np.float32],
     labels: NDArray[np.int64],
-    *,
     params: FeatureParams,
-    C: float,
-    mirror: bool,
-    gamma: float = 0.0,
-    degraded: float = 0.0,
-    positive_weight: float = 1.0,
-    random_state: int,
+    options: TrainingOptions,
+    *,
     rows: NDArray[np.intp] | None = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> VehicleClassifier:
-    """Train on features that `patch_features` computed with the same options; arguments are not checked.
+    """Train on the `patch_features` of the same options, which are not copied.
 
-    `features` is ``(copies * N, length)`` float32 and is not copied; `labels` is ``(N,)`` 0 or 1 with both
-    classes. `rows` are the patches to train on, with all their copies; None takes all. A misclassified
-    vehicle costs `positive_weight` times a misclassified non-vehicle.
+    `labels` is ``(N,)`` 0 or 1 with both classes. `rows` are the patches to train on, with all their copies.
     """
-    weights = copy_weights(mirror, degraded)
-    count = len(labels)
+    from importlib.metadata import version
+
+    weights, count = options.copy_weights, len(labels)
     chosen = np.arange(count) if rows is None else rows
     all_labels = np.tile(labels, len(weights))
     fitted = fit_svm(
         features,
         all_labels,
-        C * np.repeat(weights, count) * np.where(all_labels == 1, positive_weight, 1.0),
+        options.C * np.repeat(weights, count) * np.where(all_labels == 1, options.positive_weight, 1.0),
         rows=np.concatenate([chosen + copy * count for copy in range(len(weights))]),
         gains=params.gains,
-        random_state=random_state,
+        random_state=options.random_state,
     )
     vehicles = int(labels[chosen].sum())
-    all_metadata = {
-        "training": {
-            "C": C,
-            "mirror": mirror,
-            "gamma": gamma,
-            "degraded": degraded,
-            "random_state": random_state,
-            "vehicles": vehicles,
-            "non_vehicles": len(chosen) - vehicles,
-        },
-        "versions": {"vehicle_detection": vehicle_detection.__version__, **_library_versions()},
-        **(metadata or {}),
-    }
+    training = options.to_dict() | {"vehicles": vehicles, "non_vehicles": len(chosen) - vehicles}
+    libraries = {name: version(name) for name in ("numba", "numpy", "opencv-python-headless")}
+    versions = {"vehicle_detection": vehicle_detection.__version__, **libraries}
+    all_metadata = {"training": training, "versions": versions, **(metadata or {})}
     return VehicleClassifier(params, (Template(*fitted),), all_metadata)
-
-
-def _library_versions() -> dict[str, str]:
-    from importlib.metadata import version
-
-    return {name: version(name) for name in ("numba", "numpy", "opencv-python-headless")}
 
 
 def check_labels(labels: ArrayLike, count: int) -> NDArray[np.int64]:
@@ -464,16 +437,6 @@ def check_labels(labels: ArrayLike, count: int) -> NDArray[np.int64]:
     if count == 0 or array.min() == array.max():
         raise InvalidInputError("labels must hold both classes: vehicles (1) and non-vehicles (0)")
     return array.astype(np.int64)
-
-
-def check_gamma(gamma: object, mirror: bool) -> float:
-    """Return `gamma` if it is in range, and 0 without mirrored patches."""
-    number = check_number(gamma, "gamma", low=0, high=2)
-    if number and not mirror:
-        raise InvalidInputError(
-            f"gamma must be 0 with mirror=False, as it changes the mirrored patches; got {number:g}"
-        )
-    return number
 
 
 def load_classifier(path: str | os.PathLike[str] | None = None) -> VehicleClassifier:
@@ -499,18 +462,13 @@ def load_classifier(path: str | os.PathLike[str] | None = None) -> VehicleClassi
 
 def build_classifier(model: ModelData) -> VehicleClassifier:
     """Build a classifier from the contents of a model file."""
-    tensors = model.tensors
     try:
-        count = len({key.split(".")[0] for key in tensors})
-        templates = tuple(
-            Template(
-                tensors[f"{index}.mean"],
-                tensors[f"{index}.scale"],
-                tensors[f"{index}.coef"],
-                float(tensors[f"{index}.intercept"].reshape(())),
+        templates = []
+        for index in range(len({key.split(".")[0] for key in model.tensors})):
+            mean, scale, coef, intercept = (
+                model.tensors[f"{index}.{name}"] for name in ("mean", "scale", "coef", "intercept")
             )
-            for index in range(count)
-        )
-        return VehicleClassifier(FeatureParams(**model.params), templates, model.metadata)
+            templates.append(Template(mean, scale, coef, float(intercept.reshape(()))))
+        return VehicleClassifier(FeatureParams(**model.params), tuple(templates), model.metadata)
     except (InvalidInputError, KeyError, TypeError, ValueError) as error:
         raise ModelFileError(f"{model.name} does not fit its own parameters: {error}") from error

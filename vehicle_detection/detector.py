@@ -1,4 +1,4 @@
-"""`VehicleDetector`: search, detection and tracking combined; with `tracking`, the only state between frames."""
+"""`VehicleDetector`: search, detection and tracking combined, with the state between a video's frames."""
 
 from __future__ import annotations
 

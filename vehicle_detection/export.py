@@ -339,7 +339,7 @@ def _check_format(path: object, name: str | None, allowed: Iterable[str]) -> str
         suffixes = [suffix for suffix, meant in FORMATS.items() if meant in choices]
         raise InvalidInputError(
             f"path must end in {', '.join(suffixes)}, got {Path(path).name!r}; "
-            f"or pass format= one of {', '.join(map(repr, choices))}"
+            f"or set the format to {', '.join(map(repr, choices))}"
         )
     check_choice(kind, "format", choices)
     check_target(path, "path")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from pathlib import Path
 
@@ -16,15 +17,11 @@ from vehicle_detection.errors import InvalidInputError
 def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
     """Decode an image file's bytes to ``(H, W, 3)`` uint8 RGB; `name` is the file's name for errors.
 
-    Gray becomes three equal channels, alpha is dropped, 16-bit values are scaled to 0-255, and the EXIF
-    rotation is applied.
+    Gray becomes three equal channels, alpha is dropped, 16 bits become 8, and the EXIF rotation is applied.
     """
     image = None
-    if data:
-        try:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
-        except cv2.error:
-            image = None
+    with contextlib.suppress(cv2.error):
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
     if image is None or _is_truncated(data):
         raise InvalidInputError(
             f"{name} must be a complete image file (PNG, JPEG, ...); it cannot be decoded"

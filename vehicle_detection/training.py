@@ -15,44 +15,19 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    check_choice,
-    check_integer,
-    check_number,
-    describe,
-    progress_bar,
-    resolve_jobs,
-)
+from vehicle_detection._common import check_choice, check_integer, check_type, progress_bar, resolve_jobs
 from vehicle_detection.classifier import (
     DEFAULT_C,
+    TrainingOptions,
     VehicleClassifier,
-    check_gamma,
     check_labels,
     fit_features,
     patch_features,
 )
-from vehicle_detection.datasets import (
-    PatchSet,
-    Split,
-    make_split,
-    split_leakage,
-    split_sequences,
-)
+from vehicle_detection.datasets import PatchSet, Split, make_split, split_leakage, split_sequences
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import calibrate_scores, calibration_error
 from vehicle_detection.params import FeatureParams
-
-__all__ = [
-    "SCORE_COLUMNS",
-    "SPLITS",
-    "SplitScore",
-    "TrainingReport",
-    "markdown_table",
-    "markdown_text",
-    "model_card",
-    "score_rows",
-    "train_and_evaluate",
-]
 
 SPLITS = {
     "random": "random fifth",
@@ -85,11 +60,7 @@ class TrainingReport:
     """Options and results of `train_and_evaluate`."""
 
     params: FeatureParams
-    C: float
-    mirror: bool
-    gamma: float
-    degraded: float
-    random_state: int
+    options: TrainingOptions
     split: str  # Split whose accuracy is reported as the model's.
     sources: dict[str, int]  # Number of patches of each source folder.
     vehicles: int  # Number of patches.
@@ -118,11 +89,11 @@ class TrainingReport:
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to JSON values."""
-        plain = asdict(self) | {"accuracy": self.accuracy, "balance": self.balance, "features": self.features}
-        plain["splits"] = {
-            name: {"accuracy": score.accuracy, **asdict(score)} for name, score in self.splits.items()
-        }
-        return plain
+        derived = {"accuracy": self.accuracy, "balance": self.balance, "features": self.features}
+        plain: dict[str, Any] = asdict(self) | derived | self.options.to_dict()
+        del plain["options"]
+        splits = {name: {"accuracy": score.accuracy, **asdict(score)} for name, score in self.splits.items()}
+        return plain | {"splits": splits}
 
 
 def train_and_evaluate(
@@ -141,34 +112,30 @@ def train_and_evaluate(
 ) -> tuple[VehicleClassifier, TrainingReport]:
     """Evaluate a classifier on several splits, then train it on all patches.
 
-    On each split, scaler and SVM are fitted on the training part only, including its mirrored and degraded
-    copies, and evaluated on the unchanged test part. Features are computed once and never copied.
+    On each split, scaler and SVM are fitted on the training part and its copies, and evaluated on the
+    unchanged test part.
 
     Parameters
     ----------
     patch_set
         Patches of both classes.
-    params
-        Features; the default is ``FeatureParams()``.
-    C, mirror, gamma, degraded
+    params, C, mirror, gamma, degraded
         As in `train_classifier`.
     random_state
         Seed of the solver and of the first random split.
     split
-        Split whose accuracy is reported as the model's. The patches must allow it; other splits that they
-        do not allow are skipped.
+        Split whose accuracy is reported as the model's. Others are skipped if the patches do not allow them.
     seeds
         Number of random splits.
     n_jobs
-        Number of threads; the result does not depend on it.
+        Threads; the result does not depend on them.
     progress
         Show a progress bar if standard error is a terminal.
 
     Returns
     -------
     classifier : VehicleClassifier
-        Trained on all patches, like `train_classifier`. Its metadata also holds the metrics and the patches'
-        counts and fingerprint, and nothing that differs between runs.
+        Trained on all patches. Its metadata also holds the metrics and the patches' counts and fingerprint.
     report : TrainingReport
         All results, and the time of each step.
 
@@ -187,32 +154,24 @@ def train_and_evaluate(
     >>> sorted(report.splits), len(report.splits["random"].accuracies), report.vehicles
     (['random', 'sequences'], 2, 10)
     """
-    if not isinstance(patch_set, PatchSet):
-        raise InvalidInputError(
-            f"patch_set must be a PatchSet, got {describe(patch_set)}; read one with load_training_patches"
-        )
+    check_type(patch_set, "patch_set", PatchSet, "read one with load_training_patches")
     labels = check_labels(patch_set.labels, len(patch_set))
     params = params or FeatureParams()
-    check_number(C, "C", above=0, high=1e12)
-    check_gamma(gamma, mirror)
-    check_number(degraded, "degraded", low=0, high=1)
+    options = TrainingOptions(C=C, mirror=mirror, gamma=gamma, degraded=degraded, random_state=random_state)
     check_choice(split, "split", ("random", "sequences"))
     check_integer(seeds, "seeds", low=1, high=1000)
     check_integer(random_state, "random_state", low=0, high=2**32 - seeds)
     splits, skipped = _make_splits(patch_set, split, range(random_state, random_state + seeds))
     inner = _inner_split(patch_set, splits["sequences"][0]) if "sequences" in splits else None
-    options: dict[str, Any] = {"mirror": mirror, "gamma": gamma, "degraded": degraded}
     seconds: dict[str, float] = {}
     n_fits = sum(map(len, splits.values())) + (inner is not None) + 1
     with ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool, _timed_steps(progress, n_fits, seconds) as step:
         with step("features", fits=0):
-            features = patch_features(patch_set.patches, params, n_jobs=n_jobs, **options)
+            features = patch_features(patch_set.patches, params, options, n_jobs=n_jobs)
 
         def train(name: str, rows: NDArray[np.intp] | None = None) -> VehicleClassifier:
             with step(name):
-                return fit_features(
-                    features, labels, params=params, C=C, random_state=random_state, rows=rows, **options
-                )
+                return fit_features(features, labels, params, options, rows=rows)
 
         def test_scores(name: str, parts: Split) -> NDArray[np.float64]:
             return train(name, parts.train).decision_function(features[parts.test])
@@ -232,7 +191,15 @@ def train_and_evaluate(
                     _error_rates(future.result() > 0, labels[parts.test])
                     for future, parts in zip(running[name], listed)
                 ]
-                scores[name] = _mean_score(rates, listed[0], leakage)
+                accuracies, false_negative_rates, false_positive_rates = zip(*rates)
+                scores[name] = SplitScore(
+                    accuracies=accuracies,
+                    false_negative_rate=float(np.mean(false_negative_rates)),
+                    false_positive_rate=float(np.mean(false_positive_rates)),
+                    train=len(listed[0].train),
+                    test=len(listed[0].test),
+                    leakage=leakage,
+                )
             error = None
             if calibration is not None and inner is not None:
                 platt = calibrate_scores(calibration.result(), labels[inner.test])
@@ -243,11 +210,7 @@ def train_and_evaluate(
             pool.shutdown(cancel_futures=True)
     report = TrainingReport(
         params=params,
-        C=C,
-        mirror=mirror,
-        gamma=gamma,
-        degraded=degraded,
-        random_state=random_state,
+        options=options,
         split=split,
         sources=patch_set.counts(),
         vehicles=int(labels.sum()),
@@ -291,11 +254,10 @@ def _inner_split(patch_set: PatchSet, split: Split) -> Split | None:
     """Split the training part by sequences again, to fit the sigmoid; None if that is impossible."""
     rows = split.train
     try:
-        inner = split_sequences(patch_set[rows])
+        inner = Split(*(rows[part] for part in split_sequences(patch_set[rows])))
     except InvalidInputError:
         return None
-    result = Split(rows[inner.train], rows[inner.test])
-    return result if _has_both_classes(patch_set, result) else None
+    return inner if _has_both_classes(patch_set, inner) else None
 
 
 def _error_rates(predicted: NDArray[Any], labels: NDArray[np.int64]) -> tuple[float, float, float]:
@@ -303,18 +265,6 @@ def _error_rates(predicted: NDArray[Any], labels: NDArray[np.int64]) -> tuple[fl
     wrong = predicted != labels
     vehicle = labels == 1
     return float(1 - wrong.mean()), float(wrong[vehicle].mean()), float(wrong[~vehicle].mean())
-
-
-def _mean_score(rates: list[tuple[float, float, float]], split: Split, leakage: float) -> SplitScore:
-    accuracies, false_negative_rates, false_positive_rates = zip(*rates)
-    return SplitScore(
-        accuracies=accuracies,
-        false_negative_rate=float(np.mean(false_negative_rates)),
-        false_positive_rate=float(np.mean(false_positive_rates)),
-        train=len(split.train),
-        test=len(split.test),
-        leakage=leakage,
-    )
 
 
 def _report_metadata(report: TrainingReport) -> dict[str, Any]:
@@ -333,11 +283,8 @@ def _report_metadata(report: TrainingReport) -> dict[str, Any]:
     metrics = {"accuracy": round(report.accuracy, 5), "split": report.split, "splits": splits}
     if report.calibration_error is not None:
         metrics["calibration_error"] = round(report.calibration_error, 5)
-    data = {
-        "fingerprint": report.fingerprint,
-        "sources": report.sources,
-        "balance": round(report.balance, 5),
-    }
+    balance = round(report.balance, 5)
+    data = {"fingerprint": report.fingerprint, "sources": report.sources, "balance": balance}
     return {"metrics": metrics, "data": data}
 
 
@@ -369,8 +316,7 @@ def model_card(
 ) -> str:
     """Write the Markdown model card: data, license, accuracy on each split, limitations.
 
-    `classifier` and `report` are the results of `train_and_evaluate`, `name` is the model's name, `others`
-    are reports of other features on the same patches, and `command` is the command that trains the model.
+    `others` are reports of other features on the same patches, `command` trains the model.
     """
     parts = [
         f"# Model card: {name}" if name else "# Model card",
@@ -378,46 +324,46 @@ def model_card(
         *_card_data(report),
         *_card_accuracy(report, others),
         "## Limitations",
-        "\n".join(markdown_text(line, "- ") for line in _card_limitations(report)),
+        _markdown_list(_card_limitations(report)),
     ]
     return "\n\n".join(parts) + "\n"
 
 
 def markdown_text(text: str, mark: str = "") -> str:
     """Wrap a paragraph, or a list item that starts with `mark`, to 110 columns."""
-    return textwrap.fill(
-        text, 110, initial_indent=mark, subsequent_indent=" " * len(mark), break_on_hyphens=False
-    )
+    indent = " " * len(mark)
+    return textwrap.fill(text, 110, initial_indent=mark, subsequent_indent=indent, break_on_hyphens=False)
+
+
+def _markdown_list(items: Sequence[str]) -> str:
+    return "\n".join(markdown_text(item, "- ") for item in items)
 
 
 def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Format a table."""
+    """Format a Markdown table."""
     lines = [columns, ["---"] * len(columns), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def _card_model(classifier: VehicleClassifier, report: TrainingReport, command: str | None) -> list[str]:
-    params = report.params
+    params, options = report.params, report.options
     lengths = f"{params.spatial_length} spatial bins, {params.hist_length} histogram, {params.hog_length} HOG"
     versions = ", ".join(f"{name} {text}" for name, text in classifier.metadata["versions"].items())
-    copies = "with mirrored patches" if report.mirror else "without mirrored patches"
-    copies += f" of varied brightness (gamma {report.gamma:g})" if report.gamma else ""
-    copies += f" and degraded copies (weight {report.degraded:g})" if report.degraded else ""
+    copies = "with mirrored patches" if options.mirror else "without mirrored patches"
+    copies += f" of varied brightness (gamma {options.gamma:g})" if options.gamma else ""
+    copies += f" and degraded copies (weight {options.degraded:g})" if options.degraded else ""
     items = [
         f"Features: {report.features}, in {params.color_space}, {params.length} values ({lengths})",
-        f"Training: C = {report.C:g}, {copies}, seed {report.random_state}",
+        f"Training: C = {options.C:g}, {copies}, seed {options.random_state}",
         f"Versions: {versions}",
     ]
     text = [
         "A linear SVM that classifies 64x64 RGB patches as vehicle or non-vehicle, for searching images.",
-        "\n".join(markdown_text(item, "- ") for item in items),
+        _markdown_list(items),
     ]
     if command:
-        text += [
-            "Trained by",
-            f"```bash\n{command}\n```",
-            "The same command with the same versions writes the same file.",
-        ]
+        text += ["Trained by", f"```bash\n{command}\n```"]
+        text += ["The same command with the same versions writes the same file."]
     return text
 
 
@@ -427,14 +373,13 @@ def _card_data(report: TrainingReport) -> list[str]:
         f"({report.balance:.1%} vehicles). The model is trained on all "
         f"{report.vehicles + report.non_vehicles:,}."
     )
+    license_text = "License: the model inherits the terms of the patches that it is trained on."
     if any(source.startswith(("GTI", "KITTI")) for source in report.sources):
         license_text = (
             "License: the patches come from the GTI vehicle image database and the KITTI benchmark, both "
             "CC BY-NC-SA 3.0. The model is derived from them and has the same terms: non-commercial use, "
             "with attribution."
         )
-    else:
-        license_text = "License: the model inherits the terms of the patches that it is trained on."
     patches = [(name, f"{count:,}") for name, count in report.sources.items()]
     return [
         "## Data",
@@ -443,34 +388,6 @@ def _card_data(report: TrainingReport) -> list[str]:
         f"Fingerprint of the patches (SHA-256): `{report.fingerprint}`",
         markdown_text(license_text),
     ]
-
-
-def _card_accuracy(report: TrainingReport, others: Sequence[TrainingReport]) -> list[str]:
-    method = (
-        "Scaler and SVM are fitted on the training part of each split and evaluated on the test part. A "
-        "near duplicate is a test patch whose 16x16 gray thumbnail has a correlation of at least 0.95 with "
-        "that of a training patch."
-    )
-    if "random" in report.splits:
-        seeds = len(report.splits["random"].accuracies)
-        method += f" The random split is the mean of {seeds} seed{'s' * (seeds > 1)}."
-    text = ["## Accuracy", markdown_text(method), markdown_table(SCORE_COLUMNS, score_rows(report))]
-    if report.calibration_error is not None:
-        text.append(
-            markdown_text(
-                f"The expected calibration error of the probabilities is {report.calibration_error:.4f} on "
-                "the last fifth of each folder. Platt's sigmoid is fitted on the last fifth of the rest."
-            )
-        )
-    if others:
-        names = [name for name in SPLITS if name in report.splits]
-        accuracies = [
-            (each.features, str(each.params.length), *(f"{each.splits[name].accuracy:.4f}" for name in names))
-            for each in (report, *others)
-        ]
-        heads = ("features", "length", *(SPLITS[name] for name in names))
-        text += ["Other features, trained and evaluated in the same way:", markdown_table(heads, accuracies)]
-    return text
 
 
 SCORE_COLUMNS = (
@@ -493,6 +410,33 @@ def score_rows(report: TrainingReport) -> list[tuple[str, ...]]:
         )
         for name, score in report.splits.items()
     ]
+
+
+def _card_accuracy(report: TrainingReport, others: Sequence[TrainingReport]) -> list[str]:
+    method = (
+        "Scaler and SVM are fitted on the training part of each split and evaluated on the test part. A "
+        "near duplicate is a test patch whose 16x16 gray thumbnail has a correlation of at least 0.95 with "
+        "that of a training patch."
+    )
+    if "random" in report.splits:
+        seeds = len(report.splits["random"].accuracies)
+        method += f" The random split is the mean of {seeds} seed{'s' * (seeds > 1)}."
+    text = ["## Accuracy", markdown_text(method), markdown_table(SCORE_COLUMNS, score_rows(report))]
+    if report.calibration_error is not None:
+        calibration = (
+            f"The expected calibration error of the probabilities is {report.calibration_error:.4f} on "
+            "the last fifth of each folder. Platt's sigmoid is fitted on the last fifth of the rest."
+        )
+        text.append(markdown_text(calibration))
+    if others:
+        names = [name for name in SPLITS if name in report.splits]
+        accuracies = [
+            (each.features, str(each.params.length), *(f"{each.splits[name].accuracy:.4f}" for name in names))
+            for each in (report, *others)
+        ]
+        heads = ("features", "length", *(SPLITS[name] for name in names))
+        text += ["Other features, trained and evaluated in the same way:", markdown_table(heads, accuracies)]
+    return text
 
 
 def _card_limitations(report: TrainingReport) -> list[str]:

@@ -47,7 +47,7 @@ def test_scores_equal_the_sums_of_products(kernel, rows, columns, depth, dilatio
     weights, channels = random_inputs(rows, columns, depth, height, width, seed)
     expected = reference(weights, channels, dilation)
     scores = np.zeros(expected.shape, np.float32)
-    with mock.patch.object(correlation, "_kernel", lambda: KERNELS[kernel]):
+    with mock.patch.object(correlation, "_kernel", return_value=KERNELS[kernel]):
         Filter(weights, dilation=dilation).add_to(channels, scores)
     np.testing.assert_allclose(scores, expected, rtol=1e-4, atol=1e-4)
 

@@ -624,7 +624,7 @@ def bad_training(material, tmp):
         r"small.zip is not a zip": ["--vehicles", tmp / "small.zip", "--non-vehicles", others, *model],
         r"--non-vehicles \S+ is also --vehicles \S+;": [
             "--vehicles", vehicles, "--non-vehicles", vehicles, *model],
-        r"cannot be split at test_size=0.2: 1 vehicles": [
+        r"1 vehicles and 20 non-vehicles are too few": [
             "--vehicles", tmp / "one", "--non-vehicles", others, *model],
         r"--output needs an existing folder": [*good, "-o", tmp / "none" / "m.safetensors"],
         r"--output must be a file, got the folder": [*good, "-o", tmp],
@@ -737,86 +737,54 @@ def small_training(monkeypatch):
 def drawn_roads(tmp_path_factory):
     folder = tmp_path_factory.mktemp("roads")
     write_frame_set(folder, "town", drawn(range(6)))
-    write_frame_set(folder, "stills", drawn(range(6, 10)), place=".")
-    cars = folder / "vehicles" / "cars"
-    cars.mkdir(parents=True)
-    for number, patch in enumerate(render_patches(14, random_state=0)[0][:7]):
-        write_image(cars / f"{number}.png", patch)
+    write_frame_set(folder, "coast", drawn(range(6, 10)))
+    for number, patch in enumerate(render_patches(4, random_state=0)[0][:2]):
+        (folder / "patches" / "cars").mkdir(parents=True, exist_ok=True)
+        write_image(folder / "patches" / "cars" / f"{number}.png", patch)
     return folder
 
 
-PICTURES = ("curves", "town-missed", "town-false", "stills-missed", "stills-false")
-
-
 def test_train_frames(drawn_roads, small_training, tmp_path):
-    names = [tmp_path / f"road.{suffix}" for suffix in ("safetensors", "md", "csv")]
-    words = [
-        "train-frames",
-        drawn_roads,
-        "-o",
-        names[0],
-        "--card",
-        names[1],
-        "--curves",
-        names[2],
-        "--seed",
-        5,
-        "--no-drawn",
-        "--pictures",
-        tmp_path / "pictures",
-    ]
+    model, curves = tmp_path / "road.safetensors", tmp_path / "curves.csv"
+    words = ["train-frames", drawn_roads, "-o", model, "--curves", curves, "--seed", 5, "--no-drawn"]
+    words += ["--patches", drawn_roads / "patches"]
     out = succeed(*words)
-    pictures = [tmp_path / "pictures" / f"{name}.png" for name in PICTURES]
-    assert "town: judged by a model that does not know it" in out
+    assert "town: evaluated a model trained without this source" in out
     assert "on sources left out of training, IoU 0.5" in out
-    assert out.endswith(f"wrote {', '.join(map(str, names + pictures))}\n")
-    assert [picture.read_bytes()[:4] for picture in pictures] == 5 * [b"\x89PNG"]
-    model = load_model(names[0])
-    assert [template.box_cells for template in model.templates] == [(6, 5)]
-    assert model.metadata["training"] == {"random_state": 5}
-    assert model.metadata["data"] == {"town": 6, "course": 4, "patches": 2}
-    assert "- 2 vehicles on the course's patches" in names[1].read_text()
-    assert "KITTI (CC BY-NC-SA 3.0)" in names[1].read_text()
-    assert names[1].read_text().startswith("# Model card: road")
-    assert names[2].read_text().startswith("frames,value,precision,recall\ntown,")
-    shown = succeed("info", names[0])
-    assert re.search(r"town\W+\d\.\d{3}", shown)
-    first = names[0].read_bytes()
+    assert out.endswith(f"wrote {model}, {curves}\n")
+    trained = load_model(model)
+    assert [template.box_cells for template in trained.templates] == [(6, 5)]
+    assert trained.metadata["training"] == {"random_state": 5}
+    assert trained.metadata["data"] == {"coast": 4, "town": 6, "patches": 2}
+    assert curves.read_text().startswith("frames,margin,precision,recall\ncoast,")
+    assert re.search(r"town\W+\d\.\d{3}", succeed("info", model))
+    first = model.read_bytes()
     succeed(*words)
-    assert names[0].read_bytes() == first
+    assert model.read_bytes() == first
 
 
 def test_train_frames_adds_drawn_frames(drawn_roads, small_training, tmp_path, monkeypatch):
     few = functools.partial(mixture_training.drawn_source, drives=1, frames=1)
     monkeypatch.setattr(mixture_training, "drawn_source", few)
-    card = tmp_path / "m.md"
-    succeed("train-frames", drawn_roads, "-o", tmp_path / "m.safetensors", "--card", card)
+    succeed("train-frames", drawn_roads, "-o", tmp_path / "m.safetensors")
     data = load_model(tmp_path / "m.safetensors").metadata["data"]
-    assert data == {"town": 6, "course": 4, "drawn": 1, "patches": 2}
-    assert "- drawn: 1 frames" in card.read_text()
+    assert data == {"coast": 4, "town": 6, "drawn": 1}
 
 
 def test_train_frames_refuses_bad_input_before_it_trains(drawn_roads, tmp_path, monkeypatch):
-    monkeypatch.setattr("vehicle_detection.mixture_training.cross_validation.train_mixture", None)
+    monkeypatch.setattr(mixture_training, "cross_validate_mixture", None)
     one = tmp_path / "one"
     write_frame_set(one, "town", drawn(range(2)))
     model = tmp_path / "m.safetensors"
     (tmp_path / "empty").mkdir()
     cases = {
-        r"folder \S+none does not exist; name the folder of the labelled": [tmp_path / "none", "-o", model],
+        r"folder \S+none does not exist; pass the folder of the labelled": [tmp_path / "none", "-o", model],
         r"folder \S+empty has no labels/NAME.csv": [tmp_path / "empty", "-o", model],
-        r"DATA must be two or more, .*; got 1": [one, "-o", model],
+        r"DATA must be at least two, .*; got 1": [one, "-o", model],
         r"--output needs an existing folder": [drawn_roads, "-o", tmp_path / "none" / "m.safetensors"],
         r"--output must be a file, got the folder": [drawn_roads, "-o", tmp_path],
-        r"--card needs an existing folder": [drawn_roads, "-o", model, "--card", tmp_path / "none" / "m.md"],
         r"--curves \S+ is also --output \S+;": [drawn_roads, "-o", model, "--curves", model],
-        r"--pictures must be a folder, .* cannot be created": [
-            drawn_roads,
-            "-o",
-            model,
-            "--pictures",
-            one / "labels" / "town.csv" / "x",
-        ],
+        r"none does not exist": [drawn_roads, "-o", model, "--patches", tmp_path / "none"],
         r"--seed must be an integer from 0": [drawn_roads, "-o", model, "--seed", -1],
     }
     for message, words in cases.items():

@@ -7,8 +7,7 @@ from typer.testing import CliRunner
 from vehicle_detection.cli.app import app
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.synthetic import render_patches, render_scene, write_labels
-from vehicle_detection.tuning import read_results
-from vehicle_detection.tuning import search as tuning
+from vehicle_detection.tuning import read_results, trials
 
 SMALL = "spatial_size=8 hist_bins=8 pix_per_cell=16 hog_channel=0 mirror=no"
 
@@ -48,35 +47,35 @@ def patches(material):
 
 def test_a_grid_becomes_a_table_and_a_figure(patches, tmp_path, monkeypatch):
     out, plot = tmp_path / "table.csv", tmp_path / "plot.png"
-    words = (*patches, "--grid", f"orient=3,0,4 {SMALL}", "--out", out, "--plot", plot)
+    words = (*patches, "--grid", f"orient=3,0,4 {SMALL}", "-o", out, "--plot", plot)
     result = run(*words)
     assert result.exit_code == 0, result.output
     table = read_results(out)
-    assert table.column("orient") == [3, 0, 4]
-    assert table.column("status") == ["ok", "refused", "ok"]
-    assert table.column("split") == ["sequences", None, "sequences"]
-    assert re.search(r"2 measured; \* nothing is both more accurate and faster", result.stdout)
+    assert list(table["orient"]) == [3, 0, 4]
+    assert list(table["status"]) == ["ok", "failed", "ok"]
+    assert list(table["split"].fillna("")) == ["sequences", "", "sequences"]
+    assert re.search(r"2 measured; \* none is both more accurate and faster", result.stdout)
     assert re.search(r"(?m)^ *\* +\S.*orient=\d", result.stdout)
-    assert re.search(r"orient=0.* refused: orient must be an integer from 1 to 180", result.stdout)
+    assert re.search(r"orient=0.* failed: orient must be an integer from 1 to 180", result.stdout)
     assert result.stdout.endswith(f"wrote {out}, {plot}\n")
     assert np.ptp(read_image(plot)) == 255
-    # The same command again has nothing left to measure.
+    # The same command finds no configuration left to measure.
     text = out.read_text()
-    monkeypatch.setattr("vehicle_detection.tuning.trials.Bench.measure", None)
+    monkeypatch.setattr("vehicle_detection.tuning.trials.TrialEvaluator.evaluate", None)
     assert run(*words).exit_code == 0
     assert out.read_text() == text
 
 
 @pytest.mark.parametrize("split", ["sequences", "groups", "random"])
-def test_halving_shows_its_finalists(patches, tmp_path, split):
+def test_halving_measures_its_finalists(patches, tmp_path, split):
     out = tmp_path / "table.jsonl"
     grid = f"orient=3,4 C=1e-4,1e-2 {SMALL}"
-    result = run(*patches, "--grid", grid, "--out", out, "--halving", "--finalists", 2, "--split", split)
+    result = run(*patches, "--grid", grid, "-o", out, "--halving", "--finalists", 2, "--split", split)
     assert result.exit_code == 0, result.output
     assert "2 measured" in result.stdout
     table = read_results(out)
-    assert table.where(stage="final").column("split") == [split] * 2
-    assert len(table.where(stage="halving")) == 4 * 3
+    assert list(table[table["stage"] == "final"]["split"]) == [split] * 2
+    assert (table["stage"] == "halving").sum() == 4 * 3
 
 
 def test_frames_are_scored(patches, material, tmp_path):
@@ -89,47 +88,47 @@ def test_frames_are_scored(patches, material, tmp_path):
         "--cache",
         tmp_path / "features",
     )
-    result = run(*patches, "--grid", f"orient=3 {SMALL}", "--out", out, *words)
+    result = run(*patches, "--grid", f"orient=3 {SMALL}", "-o", out, *words)
     assert result.exit_code == 0, result.output
-    assert re.search(r"frames F1 +at best", result.stdout)
+    assert re.search(r"frames F1 +best F1", result.stdout)
     assert out.exists()
-    (row,) = read_results(tmp_path / "table.jsonl")
-    assert row["frame_f1_each"].startswith("road ")
+    (row,) = read_results(tmp_path / "table.jsonl").to_dict("records")
+    assert row["frame_f1_by_set"].startswith("road ")
     assert len(list((tmp_path / "features").glob("*.npy"))) == 1
 
 
-def test_an_interrupt_keeps_what_is_measured(patches, tmp_path, monkeypatch):
-    measure = tuning.Bench.measure
+def test_an_interrupt_keeps_the_measured_rows(patches, tmp_path, monkeypatch):
+    evaluate = trials.TrialEvaluator.evaluate
     done = []
 
     def interrupted(self, *arguments, **options):
         if done:
             raise KeyboardInterrupt
         done.append(1)
-        return measure(self, *arguments, **options)
+        return evaluate(self, *arguments, **options)
 
-    monkeypatch.setattr(tuning.Bench, "measure", interrupted)
-    result = run(*patches, "--grid", f"orient=3,4 {SMALL}", "--out", tmp_path / "table.csv")
+    monkeypatch.setattr(trials.TrialEvaluator, "evaluate", interrupted)
+    result = run(*patches, "--grid", f"orient=3,4 {SMALL}", "-o", tmp_path / "table.csv")
     assert result.exit_code == 130
-    assert read_results(tmp_path / "table.csv").column("orient") == [3]
+    assert list(read_results(tmp_path / "table.csv")["orient"]) == [3]
 
 
-def test_commands_that_make_no_sense(patches, material, tmp_path):
-    table, grid = ("--out", tmp_path / "table.csv"), ("--grid", f"orient=3 {SMALL}")
-    assert "grid knows no 'color'" in refuse(*patches, *table, "--grid", "color=LAB")
-    assert "grid must be like 'orient=8,9" in refuse(*patches, *table, "--grid", "orient")
+def test_tune_refuses_bad_input(patches, material, tmp_path):
+    table, grid = ("-o", tmp_path / "table.csv"), ("--grid", f"orient=3 {SMALL}")
+    assert "--grid has the unknown option 'color'" in refuse(*patches, *table, "--grid", "color=LAB")
+    assert "--grid must look like 'orient=8,9" in refuse(*patches, *table, "--grid", "orient")
     assert "--split must be one of 'sequences'" in refuse(*patches, *table, *grid, "--split", "half")
-    assert "--out must end in .csv or .jsonl or .parquet" in refuse(
-        *patches, *grid, "--out", tmp_path / "table.xls"
+    assert "--output must end in .csv, .jsonl, .parquet" in refuse(
+        *patches, *grid, "-o", tmp_path / "table.xls"
     )
-    assert "--out needs an existing folder" in refuse(
-        *patches, *grid, "--out", tmp_path / "none" / "table.csv"
+    assert "--output needs an existing folder" in refuse(
+        *patches, *grid, "-o", tmp_path / "none" / "table.csv"
     )
-    assert "--plot must end in .png or" in refuse(*patches, *grid, *table, "--plot", tmp_path / "plot.jpg")
+    assert "--plot must end in .png, .svg" in refuse(*patches, *grid, *table, "--plot", tmp_path / "plot.jpg")
     assert "--plot needs an existing folder" in refuse(
         *patches, *grid, *table, "--plot", tmp_path / "none" / "p.png"
     )
-    assert "--frames and --labels go together" in refuse(
+    assert "--frames and --labels belong together" in refuse(
         *patches, *grid, *table, "--frames", material / "road"
     )
     missing = ("--vehicles", tmp_path / "missing.zip", *patches[2:])
@@ -137,5 +136,5 @@ def test_commands_that_make_no_sense(patches, material, tmp_path):
     (tmp_path / "table.csv").write_text("a,b\n1,2\n")
     assert "has other columns than this release writes" in refuse(*patches, *grid, *table)
     same = ("--vehicles", tmp_path / "table.csv", *patches[2:])
-    assert "is --vehicles" in refuse(*same, *grid, *table)
+    assert "is also --vehicles" in refuse(*same, *grid, *table)
     assert (tmp_path / "table.csv").read_text() == "a,b\n1,2\n"

@@ -44,11 +44,7 @@ VEHICLES = {
     "vehicles/KITTI_extracted/1.png": png(1),
 }
 OTHERS = {"non-vehicles/Extras/extra1.png": png(20), "non-vehicles/GTI/image1.png": png(21)}
-IN_ORDER = (
-    "vehicles/GTI_Far/image9.png",
-    "vehicles/GTI_Far/image10.png",
-    "vehicles/KITTI_extracted/1.png",
-)
+IN_ORDER = ("vehicles/GTI_Far/image9.png", "vehicles/GTI_Far/image10.png", "vehicles/KITTI_extracted/1.png")
 
 FOLDERS = ("vehicles/GTI_Far", "vehicles/KITTI_extracted", "non-vehicles/GTI", "non-vehicles/Extras")
 named_patches = st.lists(

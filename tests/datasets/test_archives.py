@@ -85,7 +85,7 @@ def server(monkeypatch):
         thread.join()
 
 
-def test_both_archives_arearchivesed_once(server, tmp_path, capsys):
+def test_both_archives_are_downloaded_once(server, tmp_path, capsys):
     folder = tmp_path / "new" / "cache"
     paths = fetch_patches(folder, url=server.url, progress=False)
     assert paths == (folder / "vehicles.zip", folder / "non-vehicles.zip")
@@ -103,10 +103,10 @@ def test_both_archives_arearchivesed_once(server, tmp_path, capsys):
     assert captured.out == captured.err == ""
 
 
-def test_a_damaged_existing_archive_isarchivesed_again(server, tmp_path, caplog):
+def test_a_damaged_existing_archive_is_downloaded_again(server, tmp_path, caplog):
     (tmp_path / "vehicles.zip").write_bytes(zip_bytes(VEHICLES).replace(b"IDAT", b"iDAT"))
     fetch_patches(tmp_path, url=server.url, progress=False)
-    assert (tmp_path / "vehicles.zip").read_bytes() == zip_bytes(VEHICLES)
+    assert (tmp_path / "vehicles.zip").read_bytes() == server.answers["/data/vehicles.zip"][0]
     assert "is damaged at 'vehicles/GTI_Far/image10.png'" in caplog.text
 
 
@@ -171,7 +171,7 @@ BROKEN = {
 
 @pytest.mark.parametrize("case", BROKEN)
 @pytest.mark.parametrize("earlier", [False, True])
-def test_a_failedarchives_changes_no_file(server, tmp_path, case, earlier, caplog):
+def test_a_failed_download_changes_no_file(server, tmp_path, case, earlier, caplog):
     body, length, message = BROKEN[case]
     if earlier:
         (tmp_path / "non-vehicles.zip").write_bytes(b"an earlier file")
@@ -243,7 +243,7 @@ def test_a_full_disk(server, tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == []
 
 
-def test_partial_files_of_killedarchivess_are_removed(server, tmp_path):
+def test_partial_files_of_killed_downloads_are_removed(server, tmp_path):
     stale, running = tmp_path / ".vehicles.old.zip", tmp_path / ".vehicles.new.zip"
     for part in (stale, running):
         part.write_bytes(b"PK")

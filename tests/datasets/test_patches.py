@@ -190,7 +190,7 @@ def test_a_folder_without_a_class_name_needs_a_label(tmp_path):
 def test_patches_of_another_size_are_named(tmp_path):
     source = write_zip(tmp_path / "cars.zip", {"cars/1.png": png(1), "cars/2.png": png(2, side=32)})
     with pytest.raises(
-        DatasetError, match=r"cars/2.png of .*cars.zip is 32x32 pixels, expected 64x64; resize it with cv2"
+        DatasetError, match=r"cars/2.png of .*cars.zip is 32x32 pixels, expected 64x64; resize it to 64x64"
     ):
         load_patches(source)
     half = write_zip(tmp_path / "half.zip", {"cars/2.png": png(2, side=32)})
@@ -215,12 +215,12 @@ def test_a_source_must_be_a_path():
 
 
 def test_a_missing_source_is_named(tmp_path):
-    with pytest.raises(DatasetError, match=r"source .*nowhere does not exist; check the path or use fetch"):
+    with pytest.raises(DatasetError, match=r"source .*nowhere does not exist; check the path, or download"):
         load_patches(tmp_path / "nowhere")
 
 
 def test_a_source_without_patches(tmp_path):
-    with pytest.raises(DatasetError, match=r"source .* holds no PNG or JPEG patches; use fetch_patches"):
+    with pytest.raises(DatasetError, match=r"source .* holds no PNG or JPEG patches; download the course's"):
         load_patches(tmp_path)
     hidden = write_zip(tmp_path / "hidden.zip", {"vehicles/.DS_Store": b"", "__MACOSX/a.png": b""})
     with pytest.raises(DatasetError, match=r"hidden.zip holds no PNG or JPEG patches"):

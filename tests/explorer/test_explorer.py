@@ -374,7 +374,7 @@ def test_an_invalid_value_changes_nothing(explorer, method, arguments, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"model": 3}, r"model must be a VehicleClassifier or TemplateMixture, got 3 \(int\)"),
+        ({"model": 3}, "model must be a VehicleClassifier or TemplateMixture, got 3;"),
         ({"search_params": "default"}, "search_params must be a PyramidParams, got 'default'"),
         ({"model": "highway", "search_params": PyramidParams()}, "search_params must be a SearchParams, got"),
         ({"region_params": 1}, "region_params must be a RegionParams or HeatParams"),

@@ -12,10 +12,7 @@ from sklearn.utils.estimator_checks import check_estimator
 
 from tests.features.cases import PATCHES
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import (
-    PatchFeatures,
-    extract_features,
-)
+from vehicle_detection.features import PatchFeatures, extract_features
 from vehicle_detection.params import FeatureParams
 
 

@@ -65,7 +65,7 @@ def test_nms_removes_the_weaker_of_two_overlapping_boxes(count, seed):
     kept = boxes[rows]
     assert (np.triu(iou_matrix(kept, kept), 1) <= 0.35).all()
     for row in set(range(count)) - set(rows.tolist()):
-        iou, cover = (matrix[0] for matrix in overlap_matrices(boxes[row, None], kept))
+        (iou,), (cover,) = overlap_matrices(boxes[row, None], kept)
         better = scores[rows] >= scores[row]
         assert (((iou > 0.35) | (cover > 0.75)) & better).any()
     assert nms(kept, scores[rows]).tolist() == list(range(len(rows)))

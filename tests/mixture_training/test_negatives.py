@@ -26,9 +26,9 @@ def frames_with_ignored():
     return frames
 
 
-@pytest.mark.parametrize("facing", [False, True])
-def test_negatives_show_no_vehicle(facing):
-    params = dataclasses.replace(SMALL_MIXTURE, mirrored=(facing,))
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_negatives_show_no_vehicle(mirrored):
+    params = dataclasses.replace(SMALL_MIXTURE, mirrored=(mirrored,))
     weights = np.random.default_rng(0).normal(0, 0.05, (7, 8, N_CHANNELS))
     views = with_mirrored([MixtureTemplate(weights, 0.0, (1.0, 1.0))], params.mirrored)
     total = 0
@@ -73,14 +73,14 @@ def test_negatives_follow_from_the_labels():
     rng = np.random.default_rng(2)
     corners = rng.uniform(0, 300, (500, 2))
     boxes = np.hstack([corners, corners + rng.uniform(20, 90, (500, 2))])
-    sure = boxes[is_negative(boxes, frame)]
-    assert 0 < len(sure) < 500
-    assert (sure[:, 2] - sure[:, 0] >= 35).all()
+    negative = boxes[is_negative(boxes, frame)]
+    assert 0 < len(negative) < 500
+    assert (negative[:, 2] - negative[:, 0] >= 35).all()
     if len(frame.boxes):
-        assert iou_matrix(sure, frame.boxes).max() < 0.3
+        assert iou_matrix(negative, frame.boxes).max() < 0.3
     if len(frame.ignored):
-        areas = np.prod(sure[:, 2:] - sure[:, :2], axis=1)
-        assert (intersection_matrix(sure, frame.ignored).max(axis=1) < 0.3 * areas).all()
+        areas = np.prod(negative[:, 2:] - negative[:, :2], axis=1)
+        assert (intersection_matrix(negative, frame.ignored).max(axis=1) < 0.3 * areas).all()
     for truth in (*frame.boxes, *frame.ignored):
         assert not is_negative(truth[None], dataclasses.replace(frame, min_labelled_width=0.0))[0]
 

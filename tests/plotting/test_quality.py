@@ -186,7 +186,7 @@ def test_the_tradeoff_marks_the_pareto_front():
         plotting.plot_tradeoff(table[3:])
 
 
-def test_what_a_parameter_does():
+def test_a_parameter_is_plotted_with_the_deviation_of_its_runs():
     table = pd.DataFrame({"C": [1e-4, 1e-4, 1.0, None], "split": ["x"] * 4, "accuracy": [0.9, 1.0, 0.8, 0.1]})
     axes = plotting.plot_parameter(table, "C", by="split", ax=new_axes())
     line = axes.lines[0]
@@ -194,12 +194,12 @@ def test_what_a_parameter_does():
     (bars,) = axes.containers
     several, single = bars[2][0].get_segments()
     assert np.ptp(several[:, 1]) / 2 == pytest.approx(np.std([0.9, 1.0], ddof=1))
-    assert not len(single)  # a single run tells no deviation
+    assert not len(single)  # a single run has no deviation
     assert (axes.get_xscale(), axes.get_xlabel(), axes.get_ylabel()) == ("log", "C", "accuracy")
     assert legend(axes) == ["x"]
 
 
-def test_a_parameter_of_words_and_one_of_few_numbers():
+def test_parameters_may_be_text_or_numbers():
     table = pd.DataFrame(
         {"color_space": ["LUV", "YCrCb", "LUV"], "orient": [8, 9, 9], "frame_f1": [0.5, 0.75, 0.7]}
     )
@@ -217,13 +217,13 @@ def test_a_parameter_of_words_and_one_of_few_numbers():
         plotting.plot_parameter(pd.DataFrame({"C": [1.0], "accuracy": [None]}), "C")
 
 
-def test_a_parameter_of_numbers_and_text():
+def test_a_parameter_may_mix_numbers_and_text():
     table = pd.DataFrame({"C": [1, "ALL"], "accuracy": [0.5, 0.6]})
     assert texts(plotting.plot_parameter(table, "C", ax=new_axes()).get_xticklabels()) == ["1", "ALL"]
 
 
-def test_many_lines_stay_apart():
+def test_many_lines_differ_in_color_or_style():
     table = pd.DataFrame({"C": 1.0, "seed": range(9), "accuracy": 0.9})
     axes = plotting.plot_parameter(table, "C", by="seed", ax=new_axes())
-    looks = {(str(line[0].get_color()), line[0].get_linestyle()) for line in axes.containers}
-    assert len(looks) == 9
+    styles = {(str(line[0].get_color()), line[0].get_linestyle()) for line in axes.containers}
+    assert len(styles) == 9

@@ -29,7 +29,7 @@ def test_figures_of_several_panels_are_not_managed_by_pyplot():
     left, right = given.subfigures(1, 2)
     assert isinstance(left, SubFigure)
     assert plotting.plot_heatmap(gray_image(), Detections.empty(), figure=right) is right
-    with pytest.raises(InvalidInputError, match=r"figure must be a FigureBase, got 3 \(int\); pass a Figure"):
+    with pytest.raises(InvalidInputError, match="figure must be a FigureBase, got 3; pass a Figure"):
         plotting.show_images([gray_image()], figure=3)
 
 

@@ -87,7 +87,7 @@ def test_tracks_of_a_file_are_compared_with_the_truth_of_a_drive():
     [
         ([], {}, "results must hold at least one track to plot, got none"),
         ([result(0, track(1, 1.0, shown=False))], {}, "results must hold at least one track to plot"),
-        ([3], {}, r"results must be a FrameResult, got 3 \(int\)"),
+        ([3], {}, "results must be a FrameResult, got 3;"),
         (3, {}, "results must be the FrameResult of each frame, or FrameBoxes; got 3"),
         (
             FrameBoxes(["a"], [1], [[0, 0, 9, 9]]),

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from tests.tuning.cases import SEARCH, SMALL, UNTIMED
-from vehicle_detection.classifier import train_classifier
+from vehicle_detection.classifier import TrainingOptions, train_classifier
 from vehicle_detection.datasets import PatchSet, Split, make_split, split_sequences
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
@@ -32,7 +32,7 @@ def test_a_trial_equals_training_on_that_part(patch_set, mirror, split):
     classifier = train_classifier(
         train.patches, train.labels, params=PARAMS, C=0.01, mirror=mirror, random_state=3
     )
-    config = TrialConfig(params=PARAMS, C=0.01, mirror=mirror)
+    config = TrialConfig(PARAMS, TrainingOptions(C=0.01, mirror=mirror))
     tried = TrialEvaluator(patch_set, UNTIMED).train(config, parts.train, 3)
     for name in ("mean", "scale", "coef", "intercept"):
         expected, found = (getattr(each.templates[0], name) for each in (classifier, tried))
@@ -49,7 +49,7 @@ def test_a_weight_on_vehicles_finds_more_of_them(patch_set):
     evaluator = TrialEvaluator(noisy, UNTIMED)
     found = []
     for weight in (0.05, 1.0, 20.0):
-        config = TrialConfig(params=PARAMS, C=1e-4, mirror=False, positive_weight=weight)
+        config = TrialConfig(PARAMS, TrainingOptions(mirror=False, positive_weight=weight))
         classifier = evaluator.train(config, np.arange(len(noisy)), 0)
         found.append(classifier.predict(noisy.patches).sum())
     assert found[0] < found[1] < found[2]

@@ -13,7 +13,7 @@ from vehicle_detection.errors import InvalidInputError
 
 
 def describe(value: object) -> str:
-    """Describe a value in a message: an array's shape and dtype, or the value, with its type if not obvious."""
+    """Describe a value in a message: the shape and dtype of an array, otherwise the value itself."""
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape} and dtype {value.dtype}"
     text = " ".join(repr(value).split())

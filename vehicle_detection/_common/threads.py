@@ -22,14 +22,14 @@ JOBS_VARIABLE = "VEHICLE_DETECTION_JOBS"
 
 
 def available_cores() -> int:
-    """Number of cores that this process may use."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def resolve_jobs(n_jobs: int | None = None) -> int:
-    """Number of threads: `n_jobs`, else the variable ``VEHICLE_DETECTION_JOBS``, else all cores."""
+    """Return `n_jobs`, else the environment variable ``VEHICLE_DETECTION_JOBS``, else all cores."""
     if n_jobs is not None:
         return check_integer(n_jobs, "n_jobs", low=1, high=1024)
     text = os.environ.get(JOBS_VARIABLE, "")

@@ -37,7 +37,7 @@ def channels_from_planes(luma, blue, red, zero, gain, to_red, blue_to_green, red
 
 @jit
 def planes_from_channels(channels, luma, blue, red):
-    """Convert ``(3, H, W)`` RGB channels to BT.601 planes in the range 16-235, with factors scaled by 2**16."""
+    """Convert ``(3, H, W)`` RGB channels to BT.601 planes, 16-235; the factors are scaled by 2**16."""
     height, width = luma.shape
     shift, shift_of_four = np.int32(16), np.int32(18)
     zero = np.int32((16 << 16) + (1 << 15))

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 from typer.core import TyperArgument, TyperGroup
 
 from vehicle_detection import __version__
@@ -95,17 +96,14 @@ def _show_version(wanted: bool) -> None:
 @app.callback()
 def _global_options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
+        bool, Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
     ] = False,
 ) -> None:
     pass
 
 
 Model = Annotated[
-    str,
-    typer.Option(
-        metavar="NAME|FILE", help='"default" (any road), "highway" (fastest), or the path of a model file.'
-    ),
+    str, Option(metavar="NAME|FILE", help='"default" (any road), "highway" (fastest), or a model file.')
 ]
 HORIZON_HELP = "Height of the horizon as a fraction of the frame's height, 0 at the top."
 
@@ -113,11 +111,9 @@ HORIZON_HELP = "Height of the horizon as a fraction of the frame's height, 0 at 
 @app.command()
 @option_names(random_state="--seed")
 def demo(
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder to write.")] = Path(
-        "demo"
-    ),
-    frames: Annotated[int, typer.Option(metavar="N", help="Number of frames.")] = 120,
-    seed: Annotated[int, typer.Option(metavar="N", help="Random seed of the scene.")] = 0,
+    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder to write.")] = Path("demo"),
+    frames: Annotated[int, Option(metavar="N", help="Number of frames.")] = 120,
+    seed: Annotated[int, Option(metavar="N", help="Random seed of the scene.")] = 0,
 ) -> None:
     """Draw a drive, annotate it with the default model and score it against the ground truth."""
     from vehicle_detection.cli.demo import FILES, run_demo
@@ -140,15 +136,11 @@ def demo(
 
 @app.command()
 def detect(
-    images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="Image files.")],
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder for annotated images.")
-    ] = None,
-    boxes: Annotated[
-        Path | None, typer.Option(metavar="FILE.csv", help="Table of all boxes, by file name.")
-    ] = None,
+    images: Annotated[list[Path], Argument(metavar="IMAGE...", help="Image files.")],
+    output: Annotated[Path | None, Option("-o", "--output", metavar="DIR", help="Annotated images.")] = None,
+    boxes: Annotated[Path | None, Option(metavar="FILE.csv", help="Boxes by file name.")] = None,
     model: Model = "default",
-    horizon: Annotated[float | None, typer.Option(metavar="F", help=HORIZON_HELP)] = None,
+    horizon: Annotated[float | None, Option(metavar="F", help=HORIZON_HELP)] = None,
 ) -> None:
     """Detect the vehicles of images."""
     from vehicle_detection.detector import VehicleDetector
@@ -222,39 +214,32 @@ def _detect_each(
 @app.command()
 @option_names(target="--output")
 def video(
-    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Video to read.")],
+    source: Annotated[Path, Argument(metavar="SOURCE", help="Video to read.")],
     output: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--output", metavar="TARGET", help="Annotated video to write: .mp4, .m4v, .mov or .mkv."
-        ),
+        Path, Option("-o", "--output", metavar="TARGET", help="Video to write: .mp4, .m4v, .mov or .mkv.")
     ],
     tracks: Annotated[
-        Path | None, typer.Option(metavar="FILE.csv", help="Table of all tracks: .csv, .jsonl or .txt (MOT).")
+        Path | None, Option(metavar="FILE.csv", help="Tracks: .csv, .jsonl or .txt (MOT).")
     ] = None,
     report: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.html", help="Page with the video and its tracks over time, in one file."),
+        Path | None, Option(metavar="FILE.html", help="Page with the video and its tracks.")
     ] = None,
     diagnostics: Annotated[
-        bool,
-        typer.Option("--diagnostics", help="Show frame, positive windows, heat map and tracks side by side."),
+        bool, Option("--diagnostics", help="Show frame, positive windows, heat map and tracks side by side.")
     ] = False,
     model: Model = "default",
-    start: Annotated[float | None, typer.Option(metavar="S", help="Start time in seconds.")] = None,
-    end: Annotated[float | None, typer.Option(metavar="S", help="End time in seconds.")] = None,
-    preset: Annotated[
-        str, typer.Option(metavar="P", help="Speed of the H.264 encoder, ultrafast to placebo.")
-    ] = "veryfast",
+    start: Annotated[float | None, Option(metavar="S", help="Start time in seconds.")] = None,
+    end: Annotated[float | None, Option(metavar="S", help="End time in seconds.")] = None,
+    preset: Annotated[str, Option(metavar="P", help="Encoder speed, ultrafast to placebo.")] = "veryfast",
     horizon: Annotated[
         str | None,
-        typer.Option(
-            metavar="F|auto", help=f'{HORIZON_HELP} "auto" estimates it from vehicles in a sample of frames.'
+        Option(
+            metavar="F|auto", help=f'{HORIZON_HELP} "auto": estimated from vehicles in a sample of frames.'
         ),
     ] = None,
-    no_audio: Annotated[bool, typer.Option("--no-audio", help="Write no sound.")] = False,
-    quiet: Annotated[bool, typer.Option("-q", "--quiet", help="Print errors only.")] = False,
-    profile: Annotated[bool, typer.Option("--profile", help="Print the time of each stage.")] = False,
+    no_audio: Annotated[bool, Option("--no-audio", help="Write no sound.")] = False,
+    quiet: Annotated[bool, Option("-q", "--quiet", help="Print errors only.")] = False,
+    profile: Annotated[bool, Option("--profile", help="Print the time of each stage.")] = False,
 ) -> None:
     """Track the vehicles of a video and write an annotated copy."""
     from vehicle_detection.detector import VehicleDetector
@@ -333,14 +318,13 @@ def _estimate_horizon(
 
 @app.command()
 def evaluate(
-    predictions: Annotated[Path, typer.Argument(metavar="PREDICTIONS.csv", help="Boxes or tracks.")],
-    labels: Annotated[Path, typer.Argument(metavar="LABELS.csv", help="True boxes.")],
-    iou: Annotated[float, typer.Option(metavar="F", help="Minimum IoU of a correct box.")] = 0.5,
+    predictions: Annotated[Path, Argument(metavar="PREDICTIONS.csv", help="Boxes or tracks.")],
+    labels: Annotated[Path, Argument(metavar="LABELS.csv", help="True boxes.")],
+    iou: Annotated[float, Option(metavar="F", help="Minimum IoU of a correct box.")] = 0.5,
     ignored_as_regions: Annotated[
-        bool,
-        typer.Option("--ignored-as-regions", help="Ignore boxes of which half lies in an ignored box."),
+        bool, Option("--ignored-as-regions", help="Ignore boxes of which half lies in an ignored box.")
     ] = False,
-    json: Annotated[Path | None, typer.Option(metavar="FILE", help="File for all scores.")] = None,
+    json: Annotated[Path | None, Option(metavar="FILE", help="File for all scores.")] = None,
 ) -> None:
     """Score boxes, and tracks if there are any, against labels."""
     from json import dumps

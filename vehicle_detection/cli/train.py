@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from vehicle_detection.cli.output import (
     capture_stderr,
@@ -24,51 +25,31 @@ from vehicle_detection.cli.output import (
 if TYPE_CHECKING:
     from vehicle_detection.training import TrainingReport
 
-# Columns of the table of fold scores: titles and decimals.
-_COLUMNS = {
-    "f1": ("F1", 3),
-    "best_f1": ("best F1", 3),
-    "average_precision": ("AP", 3),
-    "precision": ("precision", 3),
-    "recall": ("recall", 3),
-    "mean_iou": ("mean IoU", 3),
-    "false_per_frame": ("false", 2),
-    "false_per_empty_frame": ("on empty", 2),
-    "region_f1": ("region F1", 3),
-    "region_average_precision": ("region AP", 3),
-}
 
-
-@option_names(random_state="--seed")
+@option_names(random_state="--seed", patches_or_labels="--vehicles and --non-vehicles")
 def train(
-    vehicles: Annotated[Path, typer.Option(metavar="PATH", help="Folder or zip of patches of vehicles.")],
-    non_vehicles: Annotated[Path, typer.Option(metavar="PATH", help="Folder or zip of other patches.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Model file to write.")],
+    vehicles: Annotated[Path, Option(metavar="PATH", help="Folder or zip of patches of vehicles.")],
+    non_vehicles: Annotated[Path, Option(metavar="PATH", help="Folder or zip of other patches.")],
+    output: Annotated[Path, Option("-o", "--output", metavar="FILE", help="Model file to write.")],
     features: Annotated[
-        str, typer.Option(metavar="PRESET", help="lab-9432, lab-8460, ycrcb-8460, ycrcb-6156 or luv-2384.")
+        str, Option(metavar="PRESET", help="lab-9432, lab-8460, ycrcb-8460, ycrcb-6156 or luv-2384.")
     ] = "lab-9432",
     split: Annotated[
-        str, typer.Option(metavar="random|sequences", help="Split whose accuracy is reported as the model's.")
+        str, Option(metavar="random|sequences", help="Split whose accuracy is reported as the model's.")
     ] = "random",
-    C: Annotated[float, typer.Option("--C", metavar="F", help="Inverse regularization strength.")] = 1e-4,
-    seed: Annotated[int, typer.Option(metavar="N", help="Random seed of solver and first split.")] = 0,
-    no_mirror: Annotated[
-        bool, typer.Option("--no-mirror", help="Train without mirrored copies of the patches.")
-    ] = False,
-    gamma: Annotated[
-        float, typer.Option(metavar="F", help="Brightness range of mirrored copies, such as 0.4.")
-    ] = 0.0,
+    C: Annotated[float, Option("--C", metavar="F", help="Inverse regularization strength.")] = 1e-4,
+    seed: Annotated[int, Option(metavar="N", help="Random seed of solver and first split.")] = 0,
+    no_mirror: Annotated[bool, Option("--no-mirror", help="Train without mirrored copies.")] = False,
+    gamma: Annotated[float, Option(metavar="F", help="Brightness range of mirrored copies.")] = 0.0,
     degraded: Annotated[
-        float,
-        typer.Option(metavar="W", help="Weight of blurred, pale and compressed copies of each patch, 0-1."),
+        float, Option(metavar="W", help="Weight of blurred, pale and compressed copies of each patch, 0-1.")
     ] = 0.0,
     report: Annotated[
-        Path | None, typer.Option(metavar="FILE.json", help="Accuracy on every split, counts, timings.")
+        Path | None, Option(metavar="FILE.json", help="Scores on every split, timings.")
     ] = None,
-    card: Annotated[Path | None, typer.Option(metavar="FILE.md", help="Model card to write.")] = None,
+    card: Annotated[Path | None, Option(metavar="FILE.md", help="Model card to write.")] = None,
     compare: Annotated[
-        list[str] | None,
-        typer.Option(metavar="PRESET", help="Also evaluate these features for the card; may be repeated."),
+        list[str] | None, Option(metavar="PRESET", help="Other features to evaluate; repeatable.")
     ] = None,
 ) -> None:
     """Train a model on patches, and evaluate it on held-out patches."""
@@ -119,34 +100,13 @@ def train(
 
 
 def _print_report(report: TrainingReport) -> None:
-    from vehicle_detection.training import SPLITS
+    from vehicle_detection.training import SCORE_COLUMNS, SPLITS, score_rows
 
-    heads = (
-        "tested on",
-        "trained",
-        "tested",
-        "accuracy",
-        "missed vehicles",
-        "false vehicles",
-        "near duplicates",
-    )
-    rows = [
-        (
-            SPLITS[name],
-            f"{score.train:,}",
-            f"{score.test:,}",
-            f"{score.accuracy:.4f}",
-            f"{score.false_negative_rate:.2%}",
-            f"{score.false_positive_rate:.2%}",
-            f"{score.leakage:.1%}",
-        )
-        for name, score in report.splits.items()
-    ]
     print_table(
         f"{report.features}: {report.vehicles:,} vehicles, {report.non_vehicles:,} others, accuracy "
         f"{report.accuracy:.4f} on the split {report.split!r}",
-        heads,
-        rows,
+        SCORE_COLUMNS,
+        score_rows(report),
     )
     if report.calibration_error is not None:
         typer.echo(f"calibration error on the split 'sequences': {report.calibration_error:.4f}")
@@ -157,8 +117,7 @@ def _print_report(report: TrainingReport) -> None:
 
 def fetch(
     output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="DIR", help="Folder to write; by default the user's cache."),
+        Path | None, Option("-o", "--output", metavar="DIR", help="Folder; default: user's cache.")
     ] = None,
 ) -> None:
     """Download the course's training patches (110 MB) once."""
@@ -172,7 +131,7 @@ def fetch(
 
 def info(
     model: Annotated[
-        str, typer.Argument(metavar="[MODEL]", help='"default", "highway" or the path of a model file.')
+        str, Argument(metavar="MODEL", help='"default", "highway" or a model file.')
     ] = "default",
 ) -> None:
     """Show a model's parameters, accuracy, training data and versions."""
@@ -210,14 +169,10 @@ def _print_metrics(metrics: object) -> bool:
 
 def print_fold_scores(scores: Mapping[str, Mapping[str, Any]]) -> None:
     """Print a table of the values of `FoldScore`, with a row per set of frames."""
-    rows = [
-        (
-            name,
-            *(f"{values[key]:.{digits}f}" if key in values else "" for key, (_, digits) in _COLUMNS.items()),
-        )
-        for name, values in scores.items()
-    ]
-    titles = (title for title, _ in _COLUMNS.values())
+    from vehicle_detection.mixture_training import FOLD_COLUMNS, format_fold
+
+    titles = (title for title, _ in FOLD_COLUMNS.values())
+    rows = [(name, *format_fold(values)) for name, values in scores.items()]
     print_table("on sources left out of training, IoU 0.5", ("frames", *titles), rows)
 
 
@@ -225,61 +180,44 @@ def print_fold_scores(scores: Mapping[str, Mapping[str, Any]]) -> None:
 def train_frames(
     data: Annotated[
         Path,
-        typer.Argument(
-            metavar="DATA",
-            help="Folder with labels/NAME.csv and frames/NAME/ or videos/NAME.mp4, and optionally the "
-            "course's patches in vehicles.zip or vehicles/.",
-        ),
+        Argument(metavar="DATA", help="Folder with labels/NAME.csv and frames/NAME/ or videos/NAME.mp4."),
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="Model file to write.")],
-    card: Annotated[
-        Path | None, typer.Option(metavar="FILE.md", help="Model card to write, from these measurements.")
+    output: Annotated[Path, Option("-o", "--output", metavar="FILE", help="Model file to write.")],
+    patches: Annotated[
+        Path | None, Option(metavar="PATH", help="Folder or zip of patches with more vehicles.")
     ] = None,
     curves: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.csv", help="Precision and recall on each source left out of training."),
+        Option(metavar="FILE.csv", help="Precision and recall on each source left out of training."),
     ] = None,
-    drawn: Annotated[bool, typer.Option("--drawn/--no-drawn", help="Also train on drawn frames.")] = True,
-    pictures: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Folder for images of the curves and the worst errors."),
-    ] = None,
-    seed: Annotated[int, typer.Option(metavar="N", help="Random seed.")] = 0,
+    drawn: Annotated[bool, Option("--drawn/--no-drawn", help="Also train on drawn frames.")] = True,
+    seed: Annotated[int, Option(metavar="N", help="Random seed.")] = 0,
 ) -> None:
     """Train a model for any road on labelled frames, and evaluate it by cross-validation over the sources."""
     from vehicle_detection._common import check_target
+    from vehicle_detection.datasets import load_patches
     from vehicle_detection.mixture_training import (
-        as_metadata,
         check_sources,
         cross_validate_mixture,
         drawn_source,
-        find_patches,
         find_sources,
-        write_card,
+        training_metadata,
         write_curves,
     )
 
-    named = {"--output": output, "--card": card, "--curves": curves}
+    named = {"--output": output, "--curves": curves}
     targets = {name: check_target(path, name) for name, path in named.items() if path is not None}
     check_distinct_paths(targets, {"DATA": data})
     sources = find_sources(data)
-    check_sources(sources, least=2)
-    patches = find_patches(data)
-    always = [drawn_source(random_state=seed)] if drawn else []
-    with output_folder(pictures, "--pictures"):
-        trained, scores, held = cross_validate_mixture(
-            sources, always=always, patches=patches, random_state=seed, on_step=typer.echo
-        )
-        sources += always
-        trained.with_metadata(as_metadata(scores, sources, seed, len(patches))).save(output)
-        if card is not None:
-            write_card(card, trained, scores, sources, seed, len(patches))
-        if curves is not None:
-            write_curves(curves, held)
-        written = [*targets.values()]
-        if pictures is not None:
-            from vehicle_detection.mixture_training import write_pictures
-
-            written += [pictures / name for name in write_pictures(pictures, scores, held)]
+    check_sources(sources, min_count=2)
+    vehicles = [] if patches is None else list(load_patches(patches, label=1).patches)
+    extra = [drawn_source(random_state=seed)] if drawn else []
+    model, scores, folds = cross_validate_mixture(
+        sources, extra_sources=extra, patches=vehicles, random_state=seed, on_step=typer.echo
+    )
+    metadata = training_metadata(scores, [*sources, *extra], seed, len(vehicles))
+    model.with_metadata(metadata).save(output)
+    if curves is not None:
+        write_curves(curves, folds)
     print_fold_scores({score.name: score.to_dict() for score in scores})
-    typer.echo(f"wrote {', '.join(map(str, written))}")
+    typer.echo(f"wrote {', '.join(map(str, targets.values()))}")

@@ -1,4 +1,4 @@
-"""The command that tries parameters: ``vehicle-detection tune``."""
+"""The command that compares parameters: ``vehicle-detection tune``."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Option
 
-from vehicle_detection.cli.output import check_distinct_paths, print_table, run_interruptible
+from vehicle_detection.cli.output import check_distinct_paths, option_names, print_table, run_interruptible
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -17,47 +18,42 @@ if TYPE_CHECKING:
 
     from vehicle_detection.evaluation import LabelledFrames
 
-_FIGURES = (".png", ".svg", ".pdf")
-_SHOWN = 15
+_TABLES, _FIGURES = (".csv", ".jsonl", ".parquet"), (".png", ".svg", ".pdf")
+_MAX_ROWS = 15
 
 
+@option_names(random_state="--seed", seeds="--seed", n_finalists="--finalists", store="--output")
 def tune(
-    vehicles: Annotated[Path, typer.Option(metavar="PATH", help="Folder or zip of patches with a vehicle.")],
-    non_vehicles: Annotated[Path, typer.Option(metavar="PATH", help="Folder or zip of patches without one.")],
+    vehicles: Annotated[Path, Option(metavar="PATH", help="Folder or zip of patches of vehicles.")],
+    non_vehicles: Annotated[Path, Option(metavar="PATH", help="Folder or zip of other patches.")],
     grid: Annotated[
-        str, typer.Option(metavar="GRID", help="Values to try: 'orient=8,9 color_space=YCrCb,LAB C=1e-4,1'.")
+        str, Option(metavar="GRID", help="Values to try: 'orient=8,9 color_space=YCrCb,LAB C=1e-4,1'.")
     ],
-    out: Annotated[
+    output: Annotated[
         Path,
-        typer.Option(
+        Option(
+            "-o",
+            "--output",
             metavar="FILE.csv",
-            help="Table (.csv, .jsonl, .parquet). Rows are kept as they come: the same command goes on.",
+            help="Table to write: .csv, .jsonl or .parquet. Results are saved one by one; the same command "
+            "resumes an interrupted run.",
         ),
     ],
-    plot: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", help="Figure of accuracy against search time.")
-    ] = None,
-    split: Annotated[
-        str, typer.Option(metavar="sequences|groups|random", help="How patches are held back.")
-    ] = "sequences",
+    plot: Annotated[Path | None, Option(metavar="FILE.png", help="Accuracy against search time.")] = None,
+    split: Annotated[str, Option(metavar="sequences|groups|random", help="Held-out patches.")] = "sequences",
     halving: Annotated[
-        bool, typer.Option("--halving", help="Drop the worse on few patches; measure the best in full.")
+        bool, Option("--halving", help="Eliminate poor configurations on few patches (successive halving).")
     ] = False,
-    finalists: Annotated[int, typer.Option(metavar="N", help="How many of --halving.")] = 3,
-    frames: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Labelled frames to score each model on.")
-    ] = None,
-    labels: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="True boxes of --frames.")] = None,
-    horizon: Annotated[
-        float | None,
-        typer.Option(metavar="F", help="Height of the frames' horizon as a share, 0 at the top."),
-    ] = None,
-    seed: Annotated[int, typer.Option(metavar="N", help="Seed of splits and training.")] = 0,
-    cache: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder that keeps features for the next run.")
-    ] = None,
+    finalists: Annotated[
+        int, Option(metavar="N", help="Configurations to measure fully after --halving.")
+    ] = 3,
+    frames: Annotated[Path | None, Option(metavar="DIR", help="Labelled frames to score models on.")] = None,
+    labels: Annotated[Path | None, Option(metavar="FILE.csv", help="True boxes of --frames.")] = None,
+    horizon: Annotated[float | None, Option(metavar="F", help="Horizon of --frames, 0 (top) to 1.")] = None,
+    seed: Annotated[int, Option(metavar="N", help="Random seed of splits and training.")] = 0,
+    cache: Annotated[Path | None, Option(metavar="DIR", help="Folder to keep features in.")] = None,
 ) -> None:
-    """Try all combinations of a grid, and show which are best."""
+    """Train and measure every combination of a grid of parameters, and show the best."""
     from vehicle_detection._common import check_choice, check_target
     from vehicle_detection.datasets import load_training_patches
     from vehicle_detection.tuning import (
@@ -71,16 +67,17 @@ def tune(
 
     values = parse_grid(grid)
     check_choice(split, "--split", ("sequences", "groups", "random"))
-    targets = {"--out": check_target(out, "--out")}
-    if plot is not None:
-        targets["--plot"] = check_target(plot, "--plot")
-    for name, path, known in (("--out", out, (".csv", ".jsonl", ".parquet")), ("--plot", plot, _FIGURES)):
-        if path is not None and path.suffix.lower() not in known:
-            raise InvalidInputError(f"{name} must end in {' or '.join(known)}; got {path.name!r}")
+    targets = {}
+    for name, path, suffixes in (("--output", output, _TABLES), ("--plot", plot, _FIGURES)):
+        if path is not None:
+            targets[name] = check_target(path, name)
+            if path.suffix.lower() not in suffixes:
+                raise InvalidInputError(f"{name} must end in {', '.join(suffixes)}; got {path.name!r}")
     check_distinct_paths(targets, {"--vehicles": vehicles, "--non-vehicles": non_vehicles})
     labelled = _read_frames(frames, labels, horizon)
-    whole = out.suffix.lower() == ".parquet"  # Parquet takes no single rows: they are kept beside it.
-    options: dict[str, Any] = {"store": out.with_suffix(".jsonl") if whole else out}
+    # Rows cannot be appended to Parquet, so they are stored in a .jsonl file beside it.
+    parquet = output.suffix.lower() == ".parquet"
+    options: dict[str, Any] = {"store": output.with_suffix(".jsonl") if parquet else output}
     options |= {"options": TrialOptions(frames=labelled, cache=cache), "progress": True}
 
     def work() -> DataFrame:
@@ -92,8 +89,8 @@ def tune(
         return compare_configurations(patches, expand_grid(values), splits=split, seeds=(seed,), **options)
 
     table = run_interruptible(work)
-    if whole:
-        write_results(table, out)
+    if parquet:
+        write_results(table, output)
     final = table[table["stage"] == ("final" if halving else "compare")]
     _show(final, table)
     if plot is not None:
@@ -105,7 +102,7 @@ def _read_frames(frames: Path | None, labels: Path | None, horizon: float | None
     if frames is None and labels is None:
         return None
     if frames is None or labels is None:
-        raise InvalidInputError("--frames and --labels go together; name both")
+        raise InvalidInputError("--frames and --labels belong together; give both")
     from vehicle_detection.datasets import load_frames
     from vehicle_detection.evaluation import LabelledFrames, read_labels
 
@@ -113,7 +110,7 @@ def _read_frames(frames: Path | None, labels: Path | None, horizon: float | None
 
 
 def _show(final: DataFrame, table: DataFrame) -> None:
-    """Print the best rows, those of the Pareto front with a star, and what could not be tried."""
+    """Print the best rows, with a star on the Pareto front, and the errors of failed configurations."""
     from vehicle_detection.tuning import pareto_front
 
     measured = final[final["accuracy"].notna()].sort_values("accuracy", ascending=False, kind="stable")
@@ -121,13 +118,13 @@ def _show(final: DataFrame, table: DataFrame) -> None:
     heads = ["", "configuration", "C", "accuracy", "training", "search ms"]
     scored = bool(measured["frame_f1"].notna().any())
     rows = []
-    for row in measured.head(_SHOWN).to_dict("records"):
+    for row in measured.head(_MAX_ROWS).to_dict("records"):
         cells = ["*" * (row["trial"] in front), row["configuration"], f"{row['C']:g}"]
         cells += [_text(row[name], 4) for name in ("accuracy", "train_accuracy")]
         cells += [_text(row["search_ms"], 1)]
         rows.append(cells + ([_text(row["frame_f1"], 3), _text(row["frame_best_f1"], 3)] if scored else []))
-    heads += ["frames F1", "at best"] if scored else []
-    title = f"{len(measured)} measured; * nothing is both more accurate and faster"
+    heads += ["frames F1", "best F1"] if scored else []
+    title = f"{len(measured)} measured; * none is both more accurate and faster"
     print_table(title, heads, rows)
     for row in table[table["message"].notna()].drop_duplicates("configuration").to_dict("records"):
         typer.echo(f"{row['configuration']} {row['status']}: {row['message']}")

@@ -2,13 +2,14 @@
 
 from vehicle_detection.datasets.archives import fetch_patches
 from vehicle_detection.datasets.frames import FrameSet, load_frames
-from vehicle_detection.datasets.near_duplicates import find_near_duplicates, make_thumbnails
 from vehicle_detection.datasets.patches import PatchSet, load_patches, load_training_patches
 from vehicle_detection.datasets.splits import (
     SEEDED_SPLITS,
     SPLIT_NAMES,
     Split,
+    find_near_duplicates,
     make_split,
+    make_thumbnails,
     split_groups,
     split_leakage,
     split_random,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import lzma
-import math
 import os
 import re
 import struct
@@ -28,47 +27,28 @@ from vehicle_detection.images import decode_image
 _LOGGER = logging.getLogger(__name__)
 
 COURSE_URL = "https://s3.amazonaws.com/udacity-sdc/Vehicle_Tracking/"
-"""Base URL of ``vehicles.zip`` and ``non-vehicles.zip``."""
-
+# Number of patches in each folder. Mirrors repack the archives, so there is no hash of the whole file.
 ARCHIVES: dict[str, dict[str, int]] = {
     "vehicles.zip": {
-        "vehicles/GTI_Far": 834,
-        "vehicles/GTI_Left": 909,
-        "vehicles/GTI_MiddleClose": 419,
-        "vehicles/GTI_Right": 664,
-        "vehicles/KITTI_extracted": 5966,
+        "vehicles/GTI_Far": 834, "vehicles/GTI_Left": 909, "vehicles/GTI_MiddleClose": 419,
+        "vehicles/GTI_Right": 664, "vehicles/KITTI_extracted": 5966,
     },
     "non-vehicles.zip": {"non-vehicles/Extras": 5068, "non-vehicles/GTI": 3900},
-}
-"""Number of patches in each folder. Mirrors repack the archives, so there is no hash of the whole file."""
-
+}  # fmt: skip
+# Labels by folder name, without hyphens and underscores.
 CLASS_FOLDERS = {"vehicles": True, "cars": True, "nonvehicles": False, "notcars": False}
-"""Labels by folder name, without hyphens and underscores."""
-
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-
+# Age from which a partial download counts as left behind by a killed process.
 STALE_SECONDS = 3600.0
-"""Age from which a partial download counts as left behind by a killed process."""
-
 # Errors of zipfile on a damaged archive; RuntimeError if it is encrypted.
 _ZIP_ERRORS = (
-    zipfile.BadZipFile,
-    zlib.error,
-    lzma.LZMAError,
-    struct.error,
-    EOFError,
-    RuntimeError,
-    ValueError,
-    OSError,
-)
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, RuntimeError, ValueError, OSError,
+)  # fmt: skip
 
 
 def natural_key(name: str) -> tuple[list[object], str]:
     """Sort key that puts ``image2`` before ``image10``."""
     parts = re.split(r"([0-9]+)", name)
-    # Compare numbers by their number of digits, then as text: leading zeros do not count.
-    numbers = [(len(digits.lstrip("0")), digits.lstrip("0")) for digits in parts[1::2]]
-    return [item for pair in zip(parts[::2], [*numbers, (0, "")]) for item in pair], name
+    return [int(part) if index % 2 else part for index, part in enumerate(parts)], name
 
 
 def parent_folder(name: str) -> str:
@@ -83,7 +63,7 @@ def is_hidden(name: str) -> bool:
 
 def is_image(name: str) -> bool:
     """Whether a file name is that of a PNG or JPEG that is not hidden."""
-    return name.lower().endswith(IMAGE_SUFFIXES) and not is_hidden(name)
+    return name.lower().endswith((".png", ".jpg", ".jpeg")) and not is_hidden(name)
 
 
 def open_archive(path: Path, shown: str | None = None) -> zipfile.ZipFile:
@@ -113,18 +93,17 @@ class Listing:
     """Images of a folder or zip file in natural order."""
 
     path: Path
-    is_zip: bool
     names: tuple[str, ...]  # Names of the patches.
     members: tuple[str, ...]  # Members of the zip, or paths relative to the folder.
 
     @contextlib.contextmanager
     def reader(self) -> Iterator[Callable[[str], bytes]]:
         """Yield a function that reads a member's bytes. It is not thread-safe: open one per thread."""
-        if self.is_zip:
+        if self.path.is_dir():
+            yield lambda member: (self.path / member).read_bytes()
+        else:
             with open_archive(self.path) as archive:
                 yield archive.read
-        else:
-            yield lambda member: (self.path / member).read_bytes()
 
 
 def list_patches(source: str | os.PathLike[str], name: str) -> Listing:
@@ -133,15 +112,14 @@ def list_patches(source: str | os.PathLike[str], name: str) -> Listing:
         raise InvalidInputError(f"{name} must be the path of a folder or zip, got {describe(source)}")
     path = Path(source)
     if not path.exists():
-        raise DatasetError(f"{name} {path} does not exist; check the path or use fetch_patches")
-    is_zip = not path.is_dir()
-    found = _list_zip(path) if is_zip else _list_folder(path)
+        raise DatasetError(f"{name} {path} does not exist; check the path, or download the course's patches")
+    found = _list_folder(path) if path.is_dir() else _list_zip(path)
     if not found:
-        zips = [] if is_zip else sorted(file.name for file in path.glob("*.zip"))
-        remedy = f"pass one of its zip files ({', '.join(zips)})" if zips else "use fetch_patches"
+        zips = sorted(file.name for file in path.glob("*.zip"))
+        remedy = f"pass one of its zip files ({', '.join(zips)})" if zips else "download the course's patches"
         raise DatasetError(f"{name} {path} holds no PNG or JPEG patches; {remedy}")
     names = tuple(sorted(found, key=natural_key))
-    return Listing(path, is_zip, names, tuple(found[each] for each in names))
+    return Listing(path, names, tuple(found[each] for each in names))
 
 
 def _list_folder(folder: Path) -> dict[str, str]:
@@ -150,14 +128,12 @@ def _list_folder(folder: Path) -> dict[str, str]:
     def stop(error: OSError) -> None:
         raise DatasetError(f"{error.filename} cannot be read: {error.strerror}; check its permissions")
 
+    walk = os.walk(folder, onerror=stop)
+    members = [
+        Path(parent, file).relative_to(folder).as_posix() for parent, _, files in walk for file in files
+    ]
     folder_name = Path(os.path.abspath(folder)).name
-    found = {}
-    for parent, _, files in os.walk(folder, onerror=stop):
-        for file in files:
-            member = (Path(parent) / file).relative_to(folder).as_posix()
-            if is_image(member):
-                found[f"{folder_name}/{member}"] = member
-    return found
+    return {f"{folder_name}/{member}": member for member in members if is_image(member)}
 
 
 def _list_zip(path: Path) -> dict[str, str]:
@@ -174,7 +150,7 @@ def infer_labels(listing: Listing) -> NDArray[np.bool_]:
     """Label patches by the innermost folder name, or else the zip's name, that stands for a class."""
     known: dict[str, bool] = {}
     for folder in dict.fromkeys(map(parent_folder, listing.names)):
-        parts = [listing.path.stem, *folder.split("/")] if listing.is_zip else folder.split("/")
+        parts = folder.split("/") if listing.path.is_dir() else [listing.path.stem, *folder.split("/")]
         classes = [CLASS_FOLDERS.get(re.sub("[-_ ]", "", part.lower())) for part in parts]
         labels = [label for label in classes if label is not None]
         if not labels:
@@ -198,19 +174,18 @@ def decode_listings(
     with progress_bar(progress, total, unit="patch") as bar, ThreadPoolExecutor(jobs) as pool:
         futures, start = [], 0
         for listing in listings:
-            count = len(listing.names)
-            out = patches[start : start + count]
-            step = math.ceil(count / jobs)
-            for first in range(0, count, step):
-                rows = range(first, min(first + step, count))
-                futures.append(pool.submit(_decode_rows, listing, rows, out, bar.update))
-            start += count
+            out = patches[start : start + len(listing.names)]
+            parts = np.array_split(np.arange(len(out)), jobs)
+            futures += [pool.submit(_decode_rows, listing, part.tolist(), out, bar.update) for part in parts]
+            start += len(out)
         for future in futures:
             future.result()
     return patches
 
 
-def _decode_rows(listing: Listing, rows: range, out: NDArray[np.uint8], update: Callable[[], object]) -> None:
+def _decode_rows(
+    listing: Listing, rows: list[int], out: NDArray[np.uint8], update: Callable[[], object]
+) -> None:
     """Decode the images of `rows` into the same rows of `out`; call `update` after each."""
     side = out.shape[1]
     with listing.reader() as read:
@@ -221,14 +196,13 @@ def _decode_rows(listing: Listing, rows: range, out: NDArray[np.uint8], update: 
             except InvalidInputError as error:
                 raise DatasetError(f"{error}; replace or remove it") from error
             except _ZIP_ERRORS as error:
-                raise DatasetError(
-                    f"{where} cannot be read ({error}); download or unpack it again"
-                ) from error
-            if image.shape != out.shape[1:]:
-                height, width = image.shape[:2]
+                message = f"{where} cannot be read ({error}); download or unpack it again"
+                raise DatasetError(message) from error
+            height, width = image.shape[:2]
+            if (height, width) != (side, side):
                 raise DatasetError(
                     f"{where} is {width}x{height} pixels, expected {side}x{side}; "
-                    f"resize it with cv2.resize(image, ({side}, {side}))"
+                    f"resize it to {side}x{side} pixels"
                 )
             out[row] = image
             update()
@@ -288,7 +262,7 @@ def fetch_patches(
     Raises
     ------
     DatasetError
-        If the server cannot be reached or lacks a file, the connection breaks, or a file is not the archive.
+        If a file cannot be downloaded completely or is not the archive.
     InvalidInputError
         If `url` is not a web address, or `folder` is not writable.
 
@@ -327,20 +301,16 @@ def _fetch(target: Path, address: str, counts: dict[str, int], progress: bool) -
         raise InvalidInputError(
             f"folder {target.parent} cannot be created: {error.strerror}; choose another"
         ) from error
-    _remove_stale_parts(target)
+    for part in target.parent.glob(f".{target.stem}.*{target.suffix}"):
+        # Partial downloads of killed processes; a running download keeps its file's time recent.
+        with contextlib.suppress(OSError):
+            if time.time() - part.stat().st_mtime > STALE_SECONDS:
+                part.unlink()
     with atomic_write(target) as part:
         _LOGGER.info("downloading %s", address)
         _download(address, part, progress)
         verify_archive(part, counts, shown=address)
     return target
-
-
-def _remove_stale_parts(target: Path) -> None:
-    """Remove partial downloads of killed processes; a running download keeps its file's time recent."""
-    for part in target.parent.glob(f".{target.stem}.*{target.suffix}"):
-        with contextlib.suppress(OSError):
-            if time.time() - part.stat().st_mtime > STALE_SECONDS:
-                part.unlink()
 
 
 def _download(address: str, part: Path, progress: bool) -> None:
@@ -367,7 +337,7 @@ def _download(address: str, part: Path, progress: bool) -> None:
     except (requests.ConnectionError, requests.Timeout) as error:
         raise DatasetError(
             f"{address} cannot be reached ({type(error).__name__}); check the network and call again, "
-            "or download the file in a browser and pass its path to load_training_patches"
+            "or download the file in a browser"
         ) from error
     except requests.RequestException as error:
         raise DatasetError(f"{address} cannot be downloaded ({type(error).__name__}); check url") from error

@@ -18,10 +18,18 @@ from vehicle_detection.images import read_image
 
 @dataclass(frozen=True)
 class FrameSet:
-    """Image files of a folder, each read on access; iterating yields ``(name, image)``."""
+    """Image files of a folder, each read on access; iterating yields ``(name, image)``.
+
+    Attributes
+    ----------
+    folder
+        The folder.
+    names
+        File names in natural order.
+    """
 
     folder: Path
-    names: tuple[str, ...]  # File names in natural order.
+    names: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.names)

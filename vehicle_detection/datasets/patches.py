@@ -50,10 +50,8 @@ class PatchSet:
     >>> patches = PatchSet(np.zeros((3, 64, 64, 3), np.uint8), [1, 1, 0], names)
     >>> patches
     PatchSet(3 patches of 64x64 pixels: 2 vehicles, 1 non-vehicles)
-    >>> patches.counts()
-    {'GTI': 1, 'KITTI': 2}
-    >>> len(patches[patches.labels])
-    2
+    >>> patches.counts(), len(patches[patches.labels])
+    ({'GTI': 1, 'KITTI': 2}, 2)
     """
 
     patches: NDArray[np.uint8]
@@ -176,8 +174,8 @@ def load_patches(
     source
         A folder, searched with its subfolders, or a zip file.
     label
-        1 for vehicles, 0 for non-vehicles. None takes the label from the folder names ``vehicles``,
-        ``cars``, ``non-vehicles`` or ``notcars``; the innermost one decides.
+        1 for vehicles, 0 for non-vehicles. None takes the label from the innermost folder named
+        ``vehicles``, ``cars``, ``non-vehicles`` or ``notcars``.
     size
         Side length in pixels that every patch must have.
     n_jobs
@@ -193,8 +191,7 @@ def load_patches(
     Raises
     ------
     DatasetError
-        If `source` is missing, is neither a folder nor a complete zip, or holds no patch, an unreadable
-        one, or one of another size.
+        If `source` is missing or damaged, or holds no patch, an unreadable one, or one of another size.
     InvalidInputError
         If an option is out of range, or `label` is None and no folder name gives the class.
 
@@ -206,8 +203,8 @@ def load_patches(
     ...     for number in (10, 9):
     ...         write_image(f"{folder}/{number}.png", np.zeros((64, 64, 3), np.uint8))
     ...     patches = load_patches(folder, label=1)
-    >>> len(patches), [name.split("/")[1] for name in patches.names]
-    (2, ['9.png', '10.png'])
+    >>> [name.split("/")[1] for name in patches.names]
+    ['9.png', '10.png']
     """
     check_choice(label, "label", (None, 0, 1))
     listing = list_patches(source, "source")
@@ -228,7 +225,7 @@ def load_training_patches(
     Parameters
     ----------
     vehicles, non_vehicles
-        A folder or zip file for each class, as in `load_patches`.
+        A folder or zip file for each class.
     n_jobs, progress
         As in `load_patches`.
 
@@ -244,10 +241,10 @@ def load_training_patches(
 
     Examples
     --------
-    >>> load_training_patches("v.zip", "n.zip")
+    >>> load_training_patches("v.zip", "n.zip")  # doctest: +ELLIPSIS
     Traceback (most recent call last):
     ...
-    vehicle_detection.errors.DatasetError: vehicles v.zip does not exist; check the path or use fetch_patches
+    vehicle_detection.errors.DatasetError: vehicles v.zip does not exist; check the path, ...
     """
     listings = [list_patches(vehicles, "vehicles"), list_patches(non_vehicles, "non_vehicles")]
     patches = decode_listings(listings, size=PATCH_SIZE, n_jobs=n_jobs, progress=progress)

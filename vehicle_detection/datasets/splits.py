@@ -1,18 +1,21 @@
-"""Splits into training and test patches, and the leakage between them."""
+"""Splits into training and test patches, near duplicates among patches, and the leakage they cause."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_integer, check_number, describe
+from vehicle_detection._common import check_integer, check_number, check_patches, describe
 from vehicle_detection.datasets.archives import natural_key, parent_folder
-from vehicle_detection.datasets.near_duplicates import find_nearest, group_near_duplicates, make_thumbnails
 from vehicle_detection.datasets.patches import PatchSet, check_labels
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.params import PATCH_SIZE
+
+_CHUNK = 512  # Rows compared with all others at a time, to limit the memory of the correlation matrix.
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -28,13 +31,6 @@ class Split:
     ------
     InvalidInputError
         If a part is empty or not a list of row numbers, or a row occurs twice.
-
-    Examples
-    --------
-    >>> split = Split([0, 1, 3], [2])
-    >>> split
-    Split(train: 3 rows, test: 1 rows)
-    >>> train, test = split
     """
 
     train: NDArray[np.intp]
@@ -86,9 +82,8 @@ def split_random(
 
     Examples
     --------
-    >>> train, test = split_random([1, 1, 1, 1, 1, 0, 0, 0, 0, 0], random_state=0)
-    >>> len(train), len(test)
-    (8, 2)
+    >>> split_random([1, 1, 1, 1, 1, 0, 0, 0, 0, 0], random_state=0)
+    Split(train: 8 rows, test: 2 rows)
     """
     from sklearn.model_selection import train_test_split
 
@@ -102,8 +97,8 @@ def split_random(
         )
     except ValueError as error:
         raise InvalidInputError(
-            f"patches_or_labels cannot be split with test_size={fraction:g}: {labels.sum()} vehicles and "
-            f"{(~labels).sum()} non-vehicles are too few; pass more patches or another test_size"
+            f"{labels.sum()} vehicles and {(~labels).sum()} non-vehicles are too few for a test part of "
+            f"{fraction:.0%}; use more patches or another test_size"
         ) from error
     return Split(np.sort(train), np.sort(test))
 
@@ -159,12 +154,9 @@ def split_groups(
     """Split groups of near duplicates at random, so that `split_leakage` at `threshold` is 0.
 
     Near duplicates, and their near duplicates in turn, form a group. In random order, each group goes to the
-    test part if it still fits into `test_size` of its folders, else to the training part. A group larger than
-    that is therefore always in the training part.
-
-    Two crops of one car may differ too much to be near duplicates. In folders whose numbers follow the drive,
-    such as those of GTI, `split_sequences` keeps more of them together; for ``KITTI_extracted``, whose
-    numbers are shuffled, this split does.
+    test part if it still fits into `test_size` of its folders, else to the training part. Two crops of one
+    car may differ too much to be near duplicates: `split_sequences` keeps more of them together in folders
+    whose numbers follow the drive (GTI), this split in those whose numbers are shuffled (KITTI).
 
     Parameters
     ----------
@@ -228,8 +220,8 @@ def split_sources(
 ) -> Split:
     """Train on some sources and test on others, which are from another camera and country.
 
-    The default trains on the vehicles and non-vehicles of GTI, and tests on the vehicles of KITTI and the
-    non-vehicles of Extras. The reverse is ``train=("KITTI", "Extras"), test=("GTI",)``.
+    The default trains on GTI, and tests on the vehicles of KITTI and the non-vehicles of Extras. The reverse
+    is ``train=("KITTI", "Extras"), test=("GTI",)``.
 
     Parameters
     ----------
@@ -260,12 +252,10 @@ def split_sources(
     masks = []
     for side, prefixes in (("train", train), ("test", test)):
         prefixes = (prefixes,) if isinstance(prefixes, str) else tuple(prefixes)
-        mask = np.zeros(len(patch_set), np.bool_)
         for prefix in prefixes:
-            matching = np.char.startswith(patch_set.sources, prefix)
-            if not prefix or not matching.any():
+            if not prefix or not np.char.startswith(patch_set.sources, prefix).any():
                 raise InvalidInputError(f"{side} must name sources of patch_set ({known}); got {prefix!r}")
-            mask |= matching
+        mask = np.array([source.startswith(prefixes) for source in patch_set.sources], np.bool_)
         if len(np.unique(patch_set.labels[mask])) < 2:
             raise InvalidInputError(
                 f"{side} must name sources of vehicles and of non-vehicles, got {prefixes}; "
@@ -281,18 +271,14 @@ def split_sources(
 
 
 SPLIT_NAMES = ("sequences", "groups", "gti_to_kitti", "kitti_to_gti", "random")
-"""Names of `make_split`."""
-
-SEEDED_SPLITS = ("groups", "random")
-"""Splits that depend on the seed."""
+SEEDED_SPLITS = ("groups", "random")  # the splits that depend on the seed
 
 
 def make_split(patch_set: PatchSet, name: str, *, test_size: float = 0.2, random_state: int = 0) -> Split:
-    """Make a split by its name."""
-    if name == "random":
-        return split_random(patch_set, test_size=test_size, random_state=random_state)
-    if name == "groups":
-        return split_groups(patch_set, test_size=test_size, random_state=random_state)
+    """Make a split by its name, one of `SPLIT_NAMES`."""
+    if name in SEEDED_SPLITS:
+        split = split_random if name == "random" else split_groups
+        return split(patch_set, test_size=test_size, random_state=random_state)
     if name == "sequences":
         return split_sequences(patch_set, test_size=test_size)
     if name == "gti_to_kitti":
@@ -300,15 +286,99 @@ def make_split(patch_set: PatchSet, name: str, *, test_size: float = 0.2, random
     return split_sources(patch_set, train=("KITTI", "Extras"), test=("GTI",))
 
 
+def find_near_duplicates(
+    patches: PatchSet | NDArray[np.uint8], *, threshold: float = 0.95
+) -> NDArray[np.intp]:
+    """Find the patches that have a near duplicate in the same set.
+
+    Patches are compared by the correlation of their 16x16 gray thumbnails, which ignores brightness and
+    contrast. A uniform patch has no near duplicate. Labels are ignored.
+
+    Parameters
+    ----------
+    patches
+        A `PatchSet`, or ``(N, 64, 64, 3)`` uint8 RGB.
+    threshold
+        Correlation, in (0, 1], from which two patches are near duplicates.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(M, 2)`` row numbers: each patch that has a near duplicate, ascending, and the most similar patch.
+
+    Raises
+    ------
+    InvalidInputError
+        If `patches` has another shape or type, or `threshold` is out of range.
+
+    Examples
+    --------
+    >>> patches = np.random.default_rng(0).integers(0, 256, (4, 64, 64, 3), np.uint8)
+    >>> patches[3] = patches[1] // 2
+    >>> find_near_duplicates(patches)
+    array([[1, 3],
+           [3, 1]])
+    """
+    limit = check_number(threshold, "threshold", above=0, high=1)
+    thumbnails = make_thumbnails(patches)
+    nearest, correlation = find_nearest(thumbnails, thumbnails, same=True)
+    rows = np.flatnonzero(correlation >= limit)
+    return np.stack([rows, nearest[rows]], axis=1)
+
+
+def make_thumbnails(patches: PatchSet | NDArray[np.uint8]) -> NDArray[np.float32]:
+    """16x16 gray thumbnails with zero mean and unit length, ``(N, 256)``; products are correlations."""
+    images = patches.patches if isinstance(patches, PatchSet) else check_patches(patches, PATCH_SIZE)
+    vectors = np.empty((len(images), 16 * 16), np.float32)
+    for row, image in enumerate(images):
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+        vectors[row] = cv2.resize(gray, (16, 16), interpolation=cv2.INTER_AREA).ravel()
+    vectors -= vectors.mean(axis=1, keepdims=True)
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    # Of a uniform patch only rounding errors remain: set them to 0.
+    return np.asarray(np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0.01))
+
+
+def find_nearest(
+    queries: NDArray[np.float32], pool: NDArray[np.float32], *, same: bool
+) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """Row of `pool` most similar to each query, and their correlation; `same` excludes the query itself."""
+    nearest = np.zeros(len(queries), np.intp)
+    correlation = np.full(len(queries), -np.inf, np.float32)
+    for start in range(0, len(queries), _CHUNK):
+        products = queries[start : start + _CHUNK] @ pool.T
+        rows = np.arange(len(products))
+        if same:
+            products[rows, start + rows] = -np.inf
+        best = products.argmax(axis=1)
+        nearest[start : start + _CHUNK] = best
+        correlation[start : start + _CHUNK] = products[rows, best]
+    return nearest, correlation
+
+
+def group_near_duplicates(thumbnails: NDArray[np.float32], limit: float) -> NDArray[np.int32]:
+    """Group number of each patch, ``(N,)``: connected components of the near-duplicate relation."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(thumbnails)
+    groups = np.arange(count, dtype=np.int32)
+    for start in range(0, count, _CHUNK):
+        similar = thumbnails[start : start + _CHUNK] @ thumbnails[start:].T >= limit
+        rows, others = groups[start + np.array(similar.nonzero())]
+        # Merge the groups chunk by chunk: all pairs at once may not fit into memory.
+        edges = coo_array((np.ones(len(rows), np.bool_), (rows, others)), shape=(count, count))
+        groups = connected_components(edges, directed=False)[1][groups]
+    return groups
+
+
 def split_leakage(patch_set: PatchSet, split: Split, *, threshold: float = 0.95) -> float:
     """Fraction of test patches that have a near duplicate among the training patches.
 
     Parameters
     ----------
-    patch_set
-        The patches.
-    split
-        A split of these patches.
+    patch_set, split
+        The patches, and a split of them.
     threshold
         As in `find_near_duplicates`.
 

@@ -8,14 +8,7 @@ from vehicle_detection.evaluation.detections import (
     precision_recall_curve,
 )
 from vehicle_detection.evaluation.frame_boxes import NO_TRACK, FrameBoxes, FrameKey
-from vehicle_detection.evaluation.labelled_frames import (
-    Frames,
-    LabelledFrames,
-    check_frame_boxes,
-    iterate_frames,
-    keyed_frames,
-    keys_of,
-)
+from vehicle_detection.evaluation.labelled_frames import Frames, LabelledFrames, keyed_frames
 from vehicle_detection.evaluation.matching import DetectionMatches, match_detections, prepare_evaluation
 from vehicle_detection.evaluation.readers import read_labels
 from vehicle_detection.evaluation.tracks import TrackScores, evaluate_tracks
@@ -33,12 +26,9 @@ __all__ = [
     "best_f1",
     "calibrate_scores",
     "calibration_error",
-    "check_frame_boxes",
     "evaluate_detections",
     "evaluate_tracks",
-    "iterate_frames",
     "keyed_frames",
-    "keys_of",
     "match_detections",
     "precision_recall_curve",
     "prepare_evaluation",

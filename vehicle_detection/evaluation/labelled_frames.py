@@ -32,31 +32,6 @@ def keyed_frames(frames: Frames) -> Mapping[FrameKey, NDArray[np.uint8]] | Frame
     )
 
 
-def iterate_frames(
-    frames: Mapping[FrameKey, NDArray[np.uint8]] | FrameSet,
-) -> Iterator[tuple[FrameKey, NDArray[np.uint8]]]:
-    """Yield each key with its checked image."""
-    for key, image in frames.items() if isinstance(frames, Mapping) else frames:
-        yield key, check_image(image, f"frame {key!r}")
-
-
-def keys_of(frames: Mapping[FrameKey, NDArray[np.uint8]] | FrameSet) -> tuple[FrameKey, ...]:
-    """List the frames' keys."""
-    return tuple(frames) if isinstance(frames, Mapping) else frames.names
-
-
-def check_frame_boxes(keys: Sequence[FrameKey], labels: FrameBoxes) -> FrameBoxes:
-    """Return `labels` if they contain at least one of the frames `keys`."""
-    check_type(labels, "labels", FrameBoxes, "read a file with read_labels")
-    if keys and not set(keys) & set(labels.frame_keys):
-        known = f"such as {labels.frame_keys[0]!r}" if labels.frame_keys else "but it is empty"
-        raise InvalidInputError(
-            f"labels contain none of the frames, such as {keys[0]!r}, {known}; "
-            "convert the keys with FrameBoxes.renamed"
-        )
-    return labels
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class LabelledFrames:
     """A named set of frames with its labels.
@@ -89,14 +64,19 @@ class LabelledFrames:
         name: object = self.name
         if not isinstance(name, str) or not name:
             raise InvalidInputError(f"name must be a non-empty string, got {describe(name)}")
-        frames = keyed_frames(self.frames)
-        keys = keys_of(frames)
+        object.__setattr__(self, "frames", keyed_frames(self.frames))
+        keys, labels = self.keys, self.labels
         if not keys:
             raise InvalidInputError("frames must hold at least one image, got none")
-        labels = check_frame_boxes(keys, self.labels)
+        check_type(labels, "labels", FrameBoxes, "read a file with read_labels")
+        if not set(keys) & set(labels.frame_keys):
+            other = f"such as {labels.frame_keys[0]!r}" if labels.frame_keys else "but it is empty"
+            raise InvalidInputError(
+                f"labels contain none of the frames, such as {keys[0]!r}, {other}; "
+                "use the same keys on both sides"
+            )
         if self.horizon is not None:
             check_number(self.horizon, "horizon", low=0, high=1)
-        object.__setattr__(self, "frames", frames)
         object.__setattr__(self, "labels", labels[sorted(row for key in keys for row in labels.rows(key))])
 
     def __repr__(self) -> str:
@@ -106,13 +86,14 @@ class LabelledFrames:
     @property
     def keys(self) -> tuple[FrameKey, ...]:
         """Keys of the frames."""
-        return keys_of(self.frames)
+        return tuple(self.frames) if isinstance(self.frames, Mapping) else self.frames.names
 
     def __len__(self) -> int:
         return len(self.keys)
 
     def __iter__(self) -> Iterator[tuple[FrameKey, NDArray[np.uint8]]]:
-        return iterate_frames(self.frames)
+        for key, image in self.frames.items() if isinstance(self.frames, Mapping) else self.frames:
+            yield key, check_image(image, f"frame {key!r}")
 
     @classmethod
     def from_video(

@@ -33,7 +33,7 @@ def prepare_evaluation(
     if len({type(key) for key in first.values()}) > 1:
         listed = ", ".join(f"{key!r} in {name}" for name, key in first.items())
         raise InvalidInputError(
-            f"frame keys must be all numbers or all names, got {listed}; convert with FrameBoxes.renamed"
+            f"frame keys must be all numbers or all names, got {listed}; use the same keys on both sides"
         )
     if given is None:
         # If no frame matches and names differ only by folder or suffix, that is a mistake, not an F1 of 0.
@@ -42,7 +42,7 @@ def prepare_evaluation(
         if not ours & theirs and stems[0] & stems[1]:
             raise InvalidInputError(
                 f"predictions and labels name their frames differently: {predictions.frames[0]!r} and "
-                f"{labels.frames[0]!r}; convert with FrameBoxes.renamed"
+                f"{labels.frames[0]!r}; use the same names on both sides"
             )
         return predictions, labels, sorted({*predictions.frame_keys, *labels.frame_keys}, key=frame_order)
     for key, count in Counter(given).items():

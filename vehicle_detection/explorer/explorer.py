@@ -45,6 +45,8 @@ METHODS: tuple[Method, ...] = ("groups", "heat")
 VIEWS: tuple[View, ...] = ("boxes", "windows", "heat")
 """What an image shows: the boxes alone, or also the positive windows or their heat map."""
 
+# Controls for models with search bands only.
+_BAND_CONTROLS = {"bands", "min_peak", "min_evidence"}
 _ALL_SCORES = -1e6
 _CACHED_SEARCHES, _CACHED_FRAMES = 64, 8
 _BOX_COLOR, _HORIZON_COLOR = TRACK_COLORS[1], (255, 255, 255)
@@ -306,18 +308,33 @@ class Explorer:
         InvalidInputError
             If ipywidgets is not installed.
         """
-        panel = build_widgets(
-            names=self.names,
-            frame=self.frame,
-            views=VIEWS,
-            view=self.view,
-            search_params=self.search_params,
-            bands=self.bands,
-            methods=METHODS,
-            method=self.method,
-            heat_params=self.heat_params,
-            group_params=self.group_params if self._all_bands else None,
-        )
+        params: Any = self.search_params
+        sizes = [tuple(map(round, band.window)) for band in self._all_bands]
+        bands = [(f"{number}: {width}x{height}", number) for number, (width, height) in enumerate(sizes)]
+        values = {
+            "frame": self.frame,
+            "view": self.view,
+            "min_score": params.min_score,
+            "horizon": 0.5 if params.horizon is None else params.horizon,
+            "bands": self.bands,
+            "method": self.method,
+            "min_peak": self.group_params.min_peak,
+            "min_evidence": self.group_params.min_evidence,
+            "threshold": self.heat_params.threshold,
+            "peak_fraction": self.heat_params.peak_fraction,
+            "weighting": self.heat_params.weighting,
+        }
+        if not bands:
+            # A mixture has no bands, and predicts the boxes itself.
+            values = {name: value for name, value in values.items() if name not in _BAND_CONTROLS}
+        options = {
+            "frame": self.names,
+            "view": VIEWS,
+            "bands": bands,
+            "method": METHODS,
+            "weighting": ("score", "count"),
+        }
+        panel = build_widgets(values, options)
         panel.watch(lambda changes: self._update(panel, changes))
         return panel.root
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,9 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.params import HeatParams, PyramidParams, RegionParams, SearchParams
 
 _JPEG_QUALITY = 88
+# Label, minimum, maximum and step of each slider.
+_SLIDERS = {
+    "min_score": ("min. score", -2.0, 4.0, 0.05),
+    "horizon": ("horizon", 0.2, 0.8, 0.01),
+    "min_peak": ("min. peak", 0.0, 4.0, 0.05),
+    "min_evidence": ("min. evidence", 0.0, 20.0, 0.1),
+    "threshold": ("min. heat", 0.0, 30.0, 0.25),
+    "peak_fraction": ("peak fraction", 0.0, 0.95, 0.05),
+}
+_LABELS = {
+    "frame": "frame",
+    "view": "show",
+    "bands": "windows (px)",
+    "method": "boxes from",
+    "weighting": "heat is",
+}
 # Controls that are enabled for one method only.
 _METHOD_CONTROLS = {
     "groups": {"min_peak", "min_evidence"},
@@ -63,20 +78,8 @@ class Panel:
         self.text.value = f"<b>{html.escape(message)}</b>"
 
 
-def build_widgets(
-    *,
-    names: Sequence[str],
-    frame: str,
-    views: Sequence[str],
-    view: str,
-    search_params: SearchParams | PyramidParams,
-    bands: Sequence[int],
-    methods: Sequence[str],
-    method: str,
-    heat_params: HeatParams,
-    group_params: RegionParams | None,
-) -> Panel:
-    """Create one control per parameter; None for `group_params` leaves out its controls."""
+def build_widgets(values: Mapping[str, Any], options: Mapping[str, Sequence[Any]]) -> Panel:
+    """Create a control for each value: a slider, or a choice of the options of the same name."""
     try:
         widgets: Any = importlib.import_module("ipywidgets")
     except ImportError:
@@ -84,41 +87,26 @@ def build_widgets(
             "the explorer's sliders need ipywidgets; pip install 'vehicle-detection[notebooks]', or use "
             "its methods without them"
         ) from None
-    style = {"description_width": "96px"}
-    wide = {"layout": widgets.Layout(width="98%"), "style": style}
-    # Buttons as wide as their labels fit in one row.
-    fitted = {"layout": widgets.Layout(width="98%"), "style": {**style, "button_width": "auto"}}
-
-    def slider(text: str, value: float, low: float, high: float, step: float) -> Any:
-        # A value outside the usual range widens the range, so that the slider does not change it.
-        ends = {"min": min(low, value), "max": max(high, value), "step": step}
-        return widgets.FloatSlider(value=value, description=text, readout_format=".2f", **ends, **wide)
-
-    def buttons(text: str, options: Sequence[str], value: str) -> Any:
-        return widgets.ToggleButtons(options=options, value=value, description=text, **fitted)
-
-    horizon = 0.5 if search_params.horizon is None else search_params.horizon
-    controls = {
-        "frame": widgets.Dropdown(options=names, value=frame, description="frame", **wide),
-        "view": buttons("show", views, view),
-        "min_score": slider("min. score", search_params.min_score, -2.0, 4.0, 0.05),
-        "horizon": slider("horizon", horizon, 0.2, 0.8, 0.01),
-    }
-    sizes = [
-        (f"{number}: {round(band.window[0])}x{round(band.window[1])}", number)
-        for number, band in enumerate(getattr(search_params, "bands", ()))
-    ]
-    if sizes:
-        controls["bands"] = widgets.SelectMultiple(
-            options=sizes, value=bands, rows=min(len(sizes), 12), description="windows (px)", **wide
-        )
-    controls["method"] = buttons("boxes from", methods, method)
-    if group_params is not None:
-        controls["min_peak"] = slider("min. peak", group_params.min_peak, 0.0, 4.0, 0.05)
-        controls["min_evidence"] = slider("min. evidence", group_params.min_evidence, 0.0, 20.0, 0.1)
-    controls["threshold"] = slider("min. heat", heat_params.threshold, 0.0, 30.0, 0.25)
-    controls["peak_fraction"] = slider("peak fraction", heat_params.peak_fraction, 0.0, 0.95, 0.05)
-    controls["weighting"] = buttons("heat is", ("score", "count"), heat_params.weighting)
+    controls = {}
+    for name, value in values.items():
+        style = {"description_width": "96px"}
+        common = {"value": value, "layout": widgets.Layout(width="98%"), "style": style}
+        if name in _SLIDERS:
+            label, low, high, step = _SLIDERS[name]
+            # A value outside the usual range widens the range, so that the slider does not change it.
+            ends = {"min": min(low, value), "max": max(high, value), "step": step}
+            control = widgets.FloatSlider(description=label, readout_format=".2f", **ends, **common)
+        else:
+            common |= {"description": _LABELS[name], "options": options[name]}
+            if name == "frame":
+                control = widgets.Dropdown(**common)
+            elif name == "bands":
+                control = widgets.SelectMultiple(rows=min(len(options[name]), 12), **common)
+            else:
+                # Buttons as wide as their labels fit in one row.
+                style["button_width"] = "auto"
+                control = widgets.ToggleButtons(**common)
+        controls[name] = control
     image = widgets.Image(format="jpeg", layout=widgets.Layout(width="100%"))
     text = widgets.HTML()
     left = widgets.VBox(list(controls.values()), layout=widgets.Layout(width="35%"))

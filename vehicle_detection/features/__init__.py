@@ -2,14 +2,16 @@
 
 from typing import TYPE_CHECKING, Any
 
-from vehicle_detection.features.color import convert_color, hog_source, pick_hog_channels
 from vehicle_detection.features.extract import (
     bin_spatial,
     color_hist,
+    convert_color,
     extract_features,
     get_hog_features,
     hog_blocks,
     hog_image,
+    hog_source,
+    pick_hog_channels,
     single_img_features,
 )
 

@@ -7,7 +7,7 @@ The course's functions are the readable reference: scikit-image's HOG, ``cv2.res
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import (
     check_channel,
+    check_choice,
     check_image,
     check_integer,
     check_patches,
@@ -29,11 +30,63 @@ from vehicle_detection._kernels import bin_of_value, degree_bounds, orientation_
 from vehicle_detection._kernels import color as _color_kernels
 from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features.color import convert_color, hog_source, pick_hog_channels
 from vehicle_detection.images import read_image
-from vehicle_detection.params import PATCH_SIZE, FeatureParams
+from vehicle_detection.params import COLOR_SPACES, PATCH_SIZE, FeatureParams
 
-_BATCH_SIZE = 256
+
+def convert_color(
+    image: NDArray[np.uint8], color_space: str = "YCrCb", *, out: NDArray[np.uint8] | None = None
+) -> NDArray[np.uint8]:
+    """Convert an RGB image to another color space, with OpenCV's 8-bit ranges.
+
+    Parameters
+    ----------
+    image
+        ``(H, W, 3)`` uint8 RGB.
+    color_space
+        ``"RGB"``, ``"HSV"`` (hue 0-179), ``"LUV"``, ``"HLS"``, ``"YUV"``, ``"YCrCb"`` or ``"LAB"``; the
+        course's spelling ``"RGB2YCrCb"`` is also accepted.
+    out
+        Output array of the image's shape; None allocates one.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(H, W, 3)`` uint8; a copy, also for ``"RGB"``.
+
+    Raises
+    ------
+    InvalidInputError
+        If the image is not uint8 RGB or the color space is unknown.
+
+    Examples
+    --------
+    >>> convert_color(np.full((1, 1, 3), 200, np.uint8), "YCrCb").tolist()
+    [[[200, 128, 128]]]
+    """
+    check_image(image)
+    space = str(color_space).removeprefix("RGB2")
+    check_choice(space, "color_space", COLOR_SPACES)
+    if space != "RGB":
+        return np.asarray(cv2.cvtColor(image, getattr(cv2, f"COLOR_RGB2{space}"), dst=out), np.uint8)
+    if out is None:
+        return image.copy()
+    out[:] = image
+    return out
+
+
+def hog_source(image: NDArray[np.uint8], params: FeatureParams) -> NDArray[np.uint8]:
+    """Channels of an RGB image that HOG is computed on: ``(H, W, hog_channels)`` uint8."""
+    if params.hog_channel == "GRAY":
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)[..., None]
+    return pick_hog_channels(convert_color(image, params.color_space), params)
+
+
+def pick_hog_channels(converted: NDArray[np.uint8], params: FeatureParams) -> NDArray[np.uint8]:
+    """Select the channels of HOG from an image that is already converted; not for ``"GRAY"``."""
+    if params.hog_channel == "ALL":
+        return converted
+    return np.ascontiguousarray(converted[..., int(params.hog_channel), None])
 
 
 def hog_blocks(
@@ -48,30 +101,20 @@ def hog_blocks(
     from skimage.feature import hog
 
     _check_hog(img, orient, pix_per_cell, cell_per_block)
-    return np.asarray(
-        hog(
-            img,
-            orientations=orient,
-            pixels_per_cell=(pix_per_cell, pix_per_cell),
-            cells_per_block=(cell_per_block, cell_per_block),
-            block_norm="L2-Hys",
-            transform_sqrt=transform_sqrt,
-            feature_vector=False,
-        ),
-        np.float64,
-    )
+    cell, block = (pix_per_cell, pix_per_cell), (cell_per_block, cell_per_block)
+    blocks = hog(img, orient, cell, block, "L2-Hys", transform_sqrt=transform_sqrt, feature_vector=False)
+    return np.asarray(blocks, np.float64)
 
 
 def _check_hog(img: NDArray[np.uint8], orient: int, pix_per_cell: int, cell_per_block: int) -> None:
     check_channel(img)
     check_integer(orient, "orient", low=1)
-    side = check_integer(pix_per_cell, "pix_per_cell", low=1) * check_integer(
-        cell_per_block, "cell_per_block", low=1
-    )
-    if min(img.shape) < side:
+    side = check_integer(pix_per_cell, "pix_per_cell", low=1)
+    side *= check_integer(cell_per_block, "cell_per_block", low=1)
+    height, width = img.shape
+    if min(height, width) < side:
         raise InvalidInputError(
-            f"img must have at least the size of a block ({side}x{side} pixels); "
-            f"got {img.shape[1]}x{img.shape[0]}"
+            f"img must have at least the size of a block ({side}x{side} pixels); got {width}x{height}"
         )
 
 
@@ -93,10 +136,8 @@ def get_hog_features(
         ``(H, W)`` uint8, one channel.
     orient
         Number of orientations over 0-180 degrees.
-    pix_per_cell
-        Side length of a cell in pixels.
-    cell_per_block
-        Side length of a block in cells.
+    pix_per_cell, cell_per_block
+        Side lengths of a cell in pixels and of a block in cells.
     transform_sqrt
         Use the square root of the pixel values.
 
@@ -119,11 +160,7 @@ def get_hog_features(
 
 
 def hog_image(
-    img: NDArray[np.uint8],
-    orient: int = 9,
-    pix_per_cell: int = 8,
-    *,
-    transform_sqrt: bool = False,
+    img: NDArray[np.uint8], orient: int = 9, pix_per_cell: int = 8, *, transform_sqrt: bool = False
 ) -> NDArray[np.float64]:
     """Visualize the orientation histogram of each cell as a star of lines.
 
@@ -141,23 +178,12 @@ def hog_image(
     ------
     InvalidInputError
         If the image is not one uint8 channel, or is smaller than a cell.
-
-    Examples
-    --------
-    >>> hog_image(np.zeros((64, 64), np.uint8)).shape
-    (64, 64)
     """
     from skimage.feature import hog
 
     _check_hog(img, orient, pix_per_cell, 1)
-    _, picture = hog(
-        img,
-        orientations=orient,
-        pixels_per_cell=(pix_per_cell, pix_per_cell),
-        cells_per_block=(1, 1),
-        transform_sqrt=transform_sqrt,
-        visualize=True,
-    )
+    cell = (pix_per_cell, pix_per_cell)
+    _, picture = hog(img, orient, cell, (1, 1), transform_sqrt=transform_sqrt, visualize=True)
     return np.asarray(picture, np.float64)
 
 
@@ -207,8 +233,8 @@ def color_hist(img: NDArray[np.uint8], nbins: int = 32) -> NDArray[np.int64]:
 
     Examples
     --------
-    >>> color_hist(np.zeros((2, 2, 3), np.uint8), 4).tolist()
-    [4, 0, 0, 0, 4, 0, 0, 0, 4, 0, 0, 0]
+    >>> color_hist(np.zeros((2, 2, 3), np.uint8), 2).tolist()
+    [4, 0, 4, 0, 4, 0]
     """
     check_image(img, "img")
     check_integer(nbins, "nbins", low=1, high=256)
@@ -252,17 +278,11 @@ def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None =
         parts.append(np.sqrt(counts) if params.hist_sqrt else counts)
     if params.hog_feat:
         source = hog_source(image, params)
-        sides = [params.pix_per_cell, 2 * params.pix_per_cell][: 2 if params.coarse_hog else 1]
+        orient, block, root = params.orient, params.cell_per_block, params.transform_sqrt
         parts += [
-            get_hog_features(
-                source[..., channel],
-                params.orient,
-                side,
-                params.cell_per_block,
-                transform_sqrt=params.transform_sqrt,
-            )
-            for side in sides
-            for channel in range(params.hog_channels)
+            get_hog_features(channel, orient, side, block, transform_sqrt=root)
+            for side in (params.pix_per_cell, 2 * params.pix_per_cell)[: 1 + params.coarse_hog]
+            for channel in np.moveaxis(source, -1, 0)
         ]
     return np.concatenate(parts).astype(np.float64)
 
@@ -283,8 +303,7 @@ def extract_features(
     params
         Features to compute; the default is ``FeatureParams()``.
     n_jobs
-        Number of threads; None uses the environment variable ``VEHICLE_DETECTION_JOBS`` or all cores. The
-        result does not depend on it.
+        Number of threads, without effect on the result; None uses ``VEHICLE_DETECTION_JOBS`` or all cores.
     progress
         Show a progress bar on standard error.
 
@@ -306,60 +325,49 @@ def extract_features(
     params = _check_params(params)
     patches = check_patches(_read_all(source), PATCH_SIZE, "source")
     features = np.empty((len(patches), params.length), np.float32)
-    extract = _batch_extractor(params)
+    batches = [slice(start, start + 256) for start in range(0, len(patches), 256)]
 
-    def run(start: int) -> int:
-        stop = min(start + _BATCH_SIZE, len(patches))
-        extract(patches[start:stop], features[start:stop])
-        return stop - start
+    def run(batch: slice) -> int:
+        _extract_batch(patches[batch], features[batch], params)
+        return len(features[batch])
 
     with (
         progress_bar(progress, len(patches), unit="patch", desc="features") as bar,
         ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool,
     ):
-        for count in pool.map(run, range(0, len(patches), _BATCH_SIZE)):
+        for count in pool.map(run, batches):
             bar.update(count)
     return features
 
 
-def _batch_extractor(params: FeatureParams) -> Callable[[NDArray[np.uint8], NDArray[np.float32]], None]:
-    """Build the function ``extract(patches, features)`` that fills the features of a batch."""
-    channels, cell, block = params.hog_channels, params.pix_per_cell, params.cell_per_block
-    coarse = params.coarse_blocks
-    cotangents = orientation_cotangents(params.orient)
-    bounds = degree_bounds(params.orient)
-    bins = bin_of_value(params.hist_bins)
-    size = params.spatial_size
-    spatial_stop = params.spatial_length
-    hist_stop = spatial_stop + params.hist_length
-
-    def extract(patches: NDArray[np.uint8], features: NDArray[np.float32]) -> None:
-        n = len(patches)
-        # Convert the colors of the whole batch as one tall image.
-        tall = np.ascontiguousarray(patches).reshape(n * PATCH_SIZE, PATCH_SIZE, 3)
-        converted = convert_color(tall, params.color_space).reshape(patches.shape)
-        if params.spatial_feat:
-            for index, patch in enumerate(converted):
-                small = cv2.resize(patch, (size, size))
-                features[index, :spatial_stop].reshape(3, size, size)[:] = small.transpose(2, 0, 1)
-        if params.hist_feat:
-            counts = features[:, spatial_stop:hist_stop]
-            _color_kernels.patch_histograms(converted, bins, params.hist_bins, counts)
-            if params.hist_sqrt:
-                np.sqrt(counts, out=counts)
-        if params.hog_feat:
-            gray = params.hog_channel == "GRAY"
-            source = hog_source(tall, params) if gray else pick_hog_channels(converted, params)
-            source = source.reshape(n, PATCH_SIZE, PATCH_SIZE, channels)
-            hog = features[:, hist_stop:]
-            if params.transform_sqrt:
-                gradients = sqrt_gradients(source)
-                _hog_kernels.patch_hog_from_angles(*gradients, bounds, channels, cell, block, coarse, hog)
-            else:
-                flat = source.reshape(n, PATCH_SIZE, PATCH_SIZE * channels)
-                _hog_kernels.patch_hog(flat, channels, cell, block, coarse, cotangents, hog)
-
-    return extract
+def _extract_batch(patches: NDArray[np.uint8], features: NDArray[np.float32], params: FeatureParams) -> None:
+    """Fill the features of a batch of patches."""
+    spatial, hist, hog = np.split(features, np.cumsum([params.spatial_length, params.hist_length]), axis=1)
+    # Convert the colors of the whole batch as one tall image.
+    tall = np.ascontiguousarray(patches).reshape(-1, PATCH_SIZE, 3)
+    converted = convert_color(tall, params.color_space).reshape(patches.shape)
+    if params.spatial_feat:
+        size = params.spatial_size
+        for row, patch in zip(spatial, converted):
+            row.reshape(3, size, size)[:] = cv2.resize(patch, (size, size)).transpose(2, 0, 1)
+    if params.hist_feat:
+        _color_kernels.patch_histograms(converted, bin_of_value(params.hist_bins), params.hist_bins, hist)
+        if params.hist_sqrt:
+            np.sqrt(hist, out=hist)
+    if params.hog_feat:
+        channels, sizes = (
+            params.hog_channels,
+            (params.pix_per_cell, params.cell_per_block, params.coarse_blocks),
+        )
+        gray = params.hog_channel == "GRAY"
+        source = hog_source(tall, params) if gray else pick_hog_channels(converted, params)
+        source = source.reshape(len(patches), PATCH_SIZE, PATCH_SIZE, channels)
+        if params.transform_sqrt:
+            bounds = degree_bounds(params.orient)
+            _hog_kernels.patch_hog_from_angles(*sqrt_gradients(source), bounds, channels, *sizes, hog)
+        else:
+            flat = source.reshape(len(patches), PATCH_SIZE, PATCH_SIZE * channels)
+            _hog_kernels.patch_hog(flat, channels, *sizes, orientation_cotangents(params.orient), hog)
 
 
 def _read_all(source: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -12,6 +13,7 @@ from vehicle_detection.features.extract import extract_features
 from vehicle_detection.params import FeatureParams
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """Turn 64x64 patches into feature vectors, for ``Pipeline`` and ``GridSearchCV``.
 
@@ -28,42 +30,22 @@ class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     (2, 5388)
     """
 
-    def __init__(
-        self,
-        *,
-        color_space: str = "YCrCb",
-        spatial_feat: bool = True,
-        hist_feat: bool = True,
-        hog_feat: bool = True,
-        spatial_size: int = 16,
-        hist_bins: int = 32,
-        orient: int = 9,
-        pix_per_cell: int = 8,
-        cell_per_block: int = 2,
-        hog_channel: int | Literal["ALL", "GRAY"] = "ALL",
-        transform_sqrt: bool = False,
-        hist_sqrt: bool = False,
-        coarse_hog: bool = False,
-        hist_gain: float = 1.0,
-        coarse_gain: float = 1.0,
-        n_jobs: int | None = None,
-    ) -> None:
-        self.color_space = color_space
-        self.spatial_feat = spatial_feat
-        self.hist_feat = hist_feat
-        self.hog_feat = hog_feat
-        self.spatial_size = spatial_size
-        self.hist_bins = hist_bins
-        self.orient = orient
-        self.pix_per_cell = pix_per_cell
-        self.cell_per_block = cell_per_block
-        self.hog_channel = hog_channel
-        self.transform_sqrt = transform_sqrt
-        self.hist_sqrt = hist_sqrt
-        self.coarse_hog = coarse_hog
-        self.hist_gain = hist_gain
-        self.coarse_gain = coarse_gain
-        self.n_jobs = n_jobs
+    color_space: str = "YCrCb"
+    spatial_feat: bool = True
+    hist_feat: bool = True
+    hog_feat: bool = True
+    spatial_size: int = 16
+    hist_bins: int = 32
+    orient: int = 9
+    pix_per_cell: int = 8
+    cell_per_block: int = 2
+    hog_channel: int | Literal["ALL", "GRAY"] = "ALL"
+    transform_sqrt: bool = False
+    hist_sqrt: bool = False
+    coarse_hog: bool = False
+    hist_gain: float = 1.0
+    coarse_gain: float = 1.0
+    n_jobs: int | None = None
 
     def to_params(self) -> FeatureParams:
         """Return the parameters as checked `FeatureParams`."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer, finite_array
-from vehicle_detection.boxes import box_areas, clip_boxes, greedy_nms, iter_nms, overlap_matrices
+from vehicle_detection.boxes import box_areas, clip_boxes, greedy_nms, iter_nms
 from vehicle_detection.mixture.crops import N_REGRESSION_FEATURES, regression_features
 
 MIN_MARGIN = -1.0
@@ -72,12 +72,6 @@ def mostly_inside(boxes: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Select the boxes whose visible fraction inside a frame of ``(height, width, ...)`` is large enough."""
     inside = box_areas(clip_boxes(boxes, shape))
     return np.asarray(inside > _MIN_VISIBLE_FRACTION * box_areas(boxes), np.bool_)
-
-
-def overlaps(box: Floats, others: Floats) -> tuple[Floats, Floats]:
-    """IoU of a box with others, and the covered fraction of the smaller of each pair."""
-    iou, coverage = overlap_matrices(box[None], others)
-    return iou[0], coverage[0]
 
 
 def vote_boxes(

@@ -1,18 +1,20 @@
 """Training and cross-validation of the mixture of templates."""
 
 from vehicle_detection.mixture_training.cross_validation import (
+    FOLD_COLUMNS,
     FoldDetections,
     FoldScore,
     cross_validate_mixture,
+    format_fold,
     training_metadata,
     write_curves,
 )
-from vehicle_detection.mixture_training.drawn_frames import DRAWN, drawn_source
+from vehicle_detection.mixture_training.drawn_frames import drawn_source
 from vehicle_detection.mixture_training.sources import FrameDataset, check_sources, find_sources
 from vehicle_detection.mixture_training.train import train_mixture
 
 __all__ = [
-    "DRAWN",
+    "FOLD_COLUMNS",
     "FoldDetections",
     "FoldScore",
     "FrameDataset",
@@ -20,6 +22,7 @@ __all__ = [
     "cross_validate_mixture",
     "drawn_source",
     "find_sources",
+    "format_fold",
     "train_mixture",
     "training_metadata",
     "write_curves",

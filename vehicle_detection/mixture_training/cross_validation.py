@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -38,43 +38,42 @@ Floats = NDArray[np.float64]
 _MIN_MARGIN = -1.0
 _THRESHOLDS = np.arange(-1.0, 1.5, 0.02)
 
+FOLD_COLUMNS = {
+    "f1": ("F1", 3),
+    "best_f1": ("best F1", 3),
+    "average_precision": ("AP", 3),
+    "precision": ("precision", 3),
+    "recall": ("recall", 3),
+    "mean_iou": ("mean IoU", 3),
+    "false_per_frame": ("false", 2),
+    "false_per_empty_frame": ("on empty", 2),
+    "region_f1": ("region F1", 3),
+    "region_average_precision": ("region AP", 3),
+}
+"""Columns of a table of `FoldScore`: titles and decimals."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class FoldScore:
     """Scores on a set of frames whose source was left out of training.
 
-    Attributes
-    ----------
-    name, source
-        Names of the set and of its source.
-    frames, vehicles
-        Number of frames, and of scored labels.
-    f1, precision, recall, mean_iou
-        At the threshold that is best for the other sources.
-    false_per_frame, false_per_empty_frame
-        False boxes per frame, and per frame without any label; NaN if there is none.
-    threshold
-        That threshold, an SVM margin.
-    average_precision, best_f1
-        Over all thresholds, and at the best threshold of this set.
-    region_f1, region_average_precision
-        `f1` and `average_precision` with ``ignored_as_regions=True``, see `evaluate_detections`: for labels
-        with one ignored box around a group of vehicles, in which the other scores count detections as false.
+    The region scores are those with ``ignored_as_regions=True``, see `evaluate_detections`: for labels with
+    one ignored box around a group of vehicles, in which the other scores count detections as false.
     """
 
     name: str
     source: str
     frames: int
-    vehicles: int
-    f1: float
+    vehicles: int  # scored labels
+    f1: float  # this and the next three at the threshold that is best for the other sources
     precision: float
     recall: float
     mean_iou: float
     false_per_frame: float
-    false_per_empty_frame: float
-    threshold: float
+    false_per_empty_frame: float  # per frame without any label; NaN if there is none
+    threshold: float  # an SVM margin
     average_precision: float
-    best_f1: float
+    best_f1: float  # at the best threshold of this set
     region_f1: float
     region_average_precision: float
 
@@ -250,6 +249,14 @@ def fit_log_odds(folds: Sequence[FoldDetections]) -> tuple[float, float]:
     platt = calibrate_scores(margins, hits, prior=False)
     # Among few boxes the better ones may be false; a negative slope would reverse their order.
     return (-platt.a, -platt.b) if platt.a < 0 else (1.0, 0.0)
+
+
+def format_fold(values: Mapping[str, Any], *, missing: str = "") -> list[str]:
+    """Format the values of ``FoldScore.to_dict()`` as the cells of `FOLD_COLUMNS`."""
+    return [
+        f"{values[name]:.{decimals}f}" if name in values else missing
+        for name, (_, decimals) in FOLD_COLUMNS.items()
+    ]
 
 
 def training_metadata(

@@ -12,9 +12,6 @@ from vehicle_detection.evaluation import FrameBoxes, FrameKey, LabelledFrames
 from vehicle_detection.mixture_training.sources import FrameDataset
 from vehicle_detection.synthetic import Drive, render_drive
 
-DRAWN = "drawn"
-"""Name of the data set of synthetic frames."""
-
 # Options of `render_drive`; "truncated" chooses frames in which the border truncates a vehicle.
 _CASES: tuple[dict[str, Any], ...] = (
     {},
@@ -42,27 +39,9 @@ _MIN_TRUNCATED, _STEP = 0.2, 5
 def drawn_source(*, drives: int = 2 * len(_CASES), frames: int = 2, random_state: int = 0) -> FrameDataset:
     """Render frames of different roads, lights and sizes, with their vehicles as labels.
 
-    Parameters
-    ----------
-    drives
-        Number of drives; the kinds of drives take turns.
-    frames
-        Number of frames of each drive, equally spaced.
-    random_state
-        Seed, from which the seed of every drive follows.
+    The kinds of drives take turns, and the frames of a drive are equally spaced. The seed of every drive
+    follows from `random_state`.
 
-    Returns
-    -------
-    FrameDataset
-        One set of frames for each drive.
-
-    Raises
-    ------
-    InvalidInputError
-        If a number is out of range.
-
-    Examples
-    --------
     >>> drawn_source(drives=1, frames=2).sets
     (LabelledFrames('drawn 1', 2 frames, 16 boxes),)
     """
@@ -78,8 +57,8 @@ def drawn_source(*, drives: int = 2 * len(_CASES), frames: int = 2, random_state
         chosen = np.linspace(0, len(drive) - 1, n_frames + 2)[1:-1].astype(int).tolist()
         if case.get("truncated", False):
             chosen = [_closest_truncation(drive, index) for index in chosen]
-        parts.append(_labelled(f"{DRAWN} {number + 1}", drive, chosen))
-    return FrameDataset(DRAWN, tuple(parts))
+        parts.append(_labelled(f"drawn {number + 1}", drive, chosen))
+    return FrameDataset("drawn", tuple(parts))
 
 
 def _labelled(name: str, drive: Drive, chosen: list[int]) -> LabelledFrames:

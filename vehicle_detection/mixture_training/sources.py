@@ -85,26 +85,9 @@ def find_sources(
 ) -> list[FrameDataset]:
     """Read a folder of labelled frames, as one data set for each file ``labels/NAME.csv``.
 
-    Parameters
-    ----------
-    folder
-        Holds the frames of each file in ``frames/NAME/``, ``NAME/`` or ``videos/NAME.mp4``.
-    min_labelled_widths
-        ``min_labelled_width`` of data sets by name; 0 for the others.
-    clip_rate
-        Frames per second to take from a video; neighboring frames show nearly the same.
-
-    Returns
-    -------
-    list of FrameDataset
-        In order of their names.
-
-    Raises
-    ------
-    DatasetError
-        If there are no labels, or the frames of a file of labels are missing.
-    InvalidInputError
-        If a file of labels is invalid, or contains none of its frames.
+    Its frames are in ``frames/NAME/``, ``NAME/`` or ``videos/NAME.mp4``, of which `clip_rate` frames per
+    second are taken, because neighboring frames show nearly the same. `min_labelled_widths` gives the
+    ``min_labelled_width`` of data sets by name; 0 for the others.
     """
     root = Path(folder)
     if not root.is_dir():

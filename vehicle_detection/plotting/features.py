@@ -206,7 +206,6 @@ def plot_hog(
     params: FeatureParams | None = None,
     *,
     pix_per_cell: Sequence[int] = (8, 16),
-    titles: Sequence[str] | None = None,
     figure: FigureLike | None = None,
 ) -> FigureLike:
     """Draw the HOG of each channel of images at several cell sizes.
@@ -223,8 +222,6 @@ def plot_hog(
         Color space, channels, orientations and block; by default ``FeatureParams()``.
     pix_per_cell
         Cell sizes in pixels, one row of panels each.
-    titles
-        One title per image.
     figure
         Where to draw; None for a new figure.
 
@@ -247,7 +244,7 @@ def plot_hog(
     """
     params = params or FeatureParams()
     single = isinstance(images, np.ndarray) and images.ndim == 3
-    listed, names = split_titles([images] if single else images, titles)
+    listed, names = split_titles([images] if single else images)
     cell_sizes = [
         check_integer(cell, "pix_per_cell", low=2)
         for cell in check_list(pix_per_cell, "pix_per_cell", "cell sizes")

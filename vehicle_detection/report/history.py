@@ -153,7 +153,7 @@ def _number(value: Any, name: str) -> float:
 
 
 def bin_means(frames: NDArray[np.int64], values: Floats, width: int) -> tuple[NDArray[np.int64], Floats]:
-    """Return the bins of `width` frames with known values, and the means of these values."""
+    """Return the bins of `width` frames that have known values, and the means of these values."""
     known = np.isfinite(values)
     bins, inverse, counts = np.unique(frames[known] // width, return_inverse=True, return_counts=True)
     return bins, np.bincount(inverse, values[known], len(bins)) / counts

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -55,7 +54,7 @@ LIGHTS = ("day", "overcast", "dusk", "night")
 
 def make_light(name: str, rain: float, rng: np.random.Generator) -> Light:
     """Return one of `LIGHTS` with a random sun; rain weakens the sun and shortens the visibility."""
-    side = float(rng.choice([-1.0, 1.0]) * rng.uniform(0.2, 0.9))
+    side = rng.choice([-1.0, 1.0]) * rng.uniform(0.2, 0.9)
     dusk = name == "dusk"
     sun = np.array([side, 0.35 if dusk else rng.uniform(0.7, 1.3), rng.uniform(-0.8, 0.3)])
     right, up, ahead = (sun / np.linalg.norm(sun)).tolist()
@@ -88,14 +87,10 @@ def make_light(name: str, rain: float, rng: np.random.Generator) -> Light:
         for sky in (light.sky_top, light.sky_low)
     )
     return replace(
-        light,
-        sky_top=top,
-        sky_low=low,
-        ambient=light.ambient + 0.25 * light.sun * rain,
-        sun=light.sun * (1 - 0.9 * rain),
-        visibility=light.visibility / (1 + 2 * rain),
+        light, sky_top=top, sky_low=low, ambient=light.ambient + 0.25 * light.sun * rain,
+        sun=light.sun * (1 - 0.9 * rain), visibility=light.visibility / (1 + 2 * rain),
         noise=light.noise + 1.5 * rain,
-    )
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -172,29 +167,26 @@ class Sensor:
             x, y = rng.uniform(0, width), rng.uniform(0, height * 2)
             length = rng.uniform(5, 20) * unit
             end = (round(x + 0.16 * length), round(y + length))
-            cv2.line(streaks, (round(x), round(y)), end, float(rng.uniform(10, 42)), 1, cv2.LINE_AA)
+            cv2.line(streaks, (round(x), round(y)), end, rng.uniform(10, 42), 1, cv2.LINE_AA)
         return np.asarray(cv2.GaussianBlur(streaks, (3, 3), 0.7), np.uint8)
 
-    def expose(self, image: Image, frame: int) -> Image:
-        """Turn a drawn ``(H, W, 3)`` image into the image that the camera delivers."""
-        rng = np.random.default_rng([self._config.seed, 2, frame])
-        height, width = self._config.shape
-        exposed = cv2.GaussianBlur(_develop(image), (0, 0), self._blur)
-        if self._streaks is not None:
-            top = int(rng.integers(height))
-            streaks = np.roll(self._streaks, int(rng.integers(width)), axis=1)[top : top + height]
-            exposed = cv2.add(exposed, cv2.merge([streaks] * 3))
-        return self._add_grain(cv2.multiply(exposed, self._gain, scale=1 / 128), rng)
+    def expose(self, image: Image, frame: int, *, crop_blur: float | None = None) -> Image:
+        """Turn a drawn ``(H, W, 3)`` image into the image that the camera delivers.
 
-    def expose_crop(self, crop: Image, frame: int, *, blur: float) -> Image:
-        """Apply lens blur (standard deviation in px) and noise to a crop, without vignette and rain."""
+        With `crop_blur`, the lens blur (standard deviation in px), it is a crop: no vignette and rain.
+        """
         rng = np.random.default_rng([self._config.seed, 2, frame])
-        return self._add_grain(cv2.GaussianBlur(_develop(crop), (0, 0), blur), rng)
-
-    def _add_grain(self, image: NDArray[Any], rng: np.random.Generator) -> Image:
-        top, left = (int(value) for value in rng.integers(_GRAIN_SIDE, size=2))
-        grain = self._grain[top : top + image.shape[0], left : left + image.shape[1]]
-        return np.asarray(cv2.add(image, grain, dtype=cv2.CV_8U), np.uint8)
+        height, width = image.shape[:2]
+        exposed = cv2.GaussianBlur(_develop(image), (0, 0), crop_blur or self._blur)
+        if crop_blur is None:
+            if self._streaks is not None:
+                top = int(rng.integers(height))
+                streaks = np.roll(self._streaks, int(rng.integers(width)), axis=1)[top : top + height]
+                exposed = cv2.add(exposed, cv2.merge([streaks] * 3))
+            exposed = cv2.multiply(exposed, self._gain, scale=1 / 128)
+        top, left = rng.integers(_GRAIN_SIDE, size=2).tolist()
+        grain = self._grain[top : top + height, left : left + width]
+        return np.asarray(cv2.add(exposed, grain, dtype=cv2.CV_8U), np.uint8)
 
 
 def _develop(image: Image) -> Image:

@@ -1,10 +1,12 @@
-"""Drives: sequences of road scenes with moving vehicles and ground truth."""
+"""Drives: traffic scenarios, rendered as sequences of road scenes with ground truth."""
 
 from __future__ import annotations
 
 import csv
+import math
 import os
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -13,33 +15,141 @@ from vehicle_detection._common import atomic_write, check_choice, check_integer,
 from vehicle_detection.synthetic.camera_light import SceneConfig
 from vehicle_detection.synthetic.render import VehiclePose, VehicleTruth
 from vehicle_detection.synthetic.scene import RandomState, Scene, SceneRenderer, make_config, make_generator
-from vehicle_detection.synthetic.scenery import Road
-from vehicle_detection.synthetic.traffic import SCENARIOS, TrafficVehicle, make_traffic
+from vehicle_detection.synthetic.scenery import LANE, Road
+from vehicle_detection.synthetic.shapes import random_appearance
 from vehicle_detection.synthetic.vehicles import VehicleBody
 
-_SPEED = 27.0  # of the camera (m/s)
+SCENARIOS = ("highway", "overtaking", "crossing", "occlusion", "empty")
 
+# Columns of a labels file; the first nine are those of manual labels.
 LABEL_COLUMNS = (
     "frame", "track", "x1", "y1", "x2", "y2", "occluded", "truncated", "ignore", "distance_m", "speed_mps",
 )  # fmt: skip
-"""Columns of a labels file; the first nine are those of manual labels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrafficVehicle:
+    """A vehicle's appearance, and its path relative to the camera as a function of time."""
+
+    track: int  # from 1 on
+    kind: str
+    color: str
+    view: str = "rear"  # the end that the camera sees
+    seed: int = 0
+    start: float  # distance at time 0 (m)
+    speed: float = 0.0  # mean speed away from the camera (m/s)
+    sway: float = 0.0  # amplitude (m), period (s) and phase of an oscillation of the distance
+    period: float = 10.0
+    phase: float = 0.0
+    lane_from: float = 0.0  # lateral position before and after a lane change (m)
+    lane_to: float | None = None
+    change_at: float = 0.0  # middle and duration of the lane change (s)
+    change_for: float = 5.0
+    oncoming: bool = False
+
+    def distance(self, time: float) -> float:
+        """Distance from the camera to the nearer tires (m)."""
+        swing = math.sin(2 * math.pi * time / self.period + self.phase) - math.sin(self.phase)
+        return self.start + self.speed * time + self.sway * swing
+
+    def relative_speed(self, time: float) -> float:
+        """Return the derivative of `distance` (m/s): positive when the vehicle pulls away."""
+        omega = 2 * math.pi / self.period
+        return self.speed + self.sway * omega * math.cos(omega * time + self.phase)
+
+    def lateral(self, time: float) -> float:
+        """Lateral position of its middle (m), positive to the right of the camera."""
+        drift = 0.12 * math.sin(2 * math.pi * time / (0.8 * self.period) + 2 * self.phase)
+        if self.lane_to is None:
+            return self.lane_from + drift
+        t = min(max((time - self.change_at) / self.change_for + 0.5, 0.0), 1.0)
+        return self.lane_from + (self.lane_to - self.lane_from) * t * t * (3 - 2 * t) + drift
+
+
+def make_traffic(
+    scenario: str, duration: float, rng: np.random.Generator
+) -> tuple[Road, list[TrafficVehicle]]:
+    """Return road and vehicles of a scenario that lasts `duration` seconds; its event is in the middle."""
+    road = Road(own=int(rng.integers(3)) if scenario in ("highway", "empty") else 1)
+    if scenario == "empty":
+        return road, []
+    if scenario == "highway":
+        ahead = _vehicles_ahead(road, duration, rng)
+        return road, ahead + _oncoming_vehicles(road, duration, rng, first_track=len(ahead) + 1)
+    side = 1 if rng.random() < 0.5 else -1
+    if scenario == "overtaking":
+        return road, [
+            TrafficVehicle(
+                track=1, start=rng.uniform(-3.0, -1.5), lane_from=side * LANE,
+                speed=min(max(45 / max(duration, 1.0), 5.0), 9.0),
+                **random_appearance(rng, ("hatchback", "estate", "sedan", "mpv", "suv")),
+            ),
+            TrafficVehicle(track=2, start=70.0, sway=1.0, lane_from=-side * LANE, **random_appearance(rng)),
+        ]  # fmt: skip
+    if scenario == "crossing":
+        near_start, far_start, change_for, kinds = 20.0, 33.0, 5.0, ("hatchback", "estate", "sedan")
+    else:
+        near_start, far_start, change_for, kinds = 15.0, 36.0, 6.5, ("suv", "mpv", "van")
+    return road, [
+        TrafficVehicle(
+            track=1, start=near_start, sway=0.6, period=9.0, phase=rng.uniform(0, 6),
+            lane_from=side * LANE, lane_to=-side * LANE, change_at=duration / 2, change_for=change_for,
+            **random_appearance(rng, kinds),
+        ),
+        TrafficVehicle(
+            track=2, start=far_start, sway=0.8, period=11.0, phase=rng.uniform(0, 6),
+            **random_appearance(rng, ("hatchback", "sedan", "estate")),
+        ),
+    ]  # fmt: skip
+
+
+def _vehicles_ahead(road: Road, duration: float, rng: np.random.Generator) -> list[TrafficVehicle]:
+    """Vehicles in every lane with gaps that their relative motion cannot close."""
+    vehicles: list[TrafficVehicle] = []
+    for lane in range(road.lanes):
+        distance = float(rng.uniform(20, 30) if lane == road.own else rng.uniform(14, 28))
+        for _ in range(int(rng.integers(1, 3))):
+            vehicles.append(
+                TrafficVehicle(
+                    track=len(vehicles) + 1, start=distance,
+                    speed=rng.uniform(-2, 2) / max(duration, 10.0),
+                    sway=rng.uniform(0.3, 1.0), period=rng.uniform(7, 14),
+                    phase=rng.uniform(0, 6), lane_from=road.lane(lane), **random_appearance(rng),
+                )
+            )  # fmt: skip
+            distance += rng.uniform(20, 36)
+    return vehicles
+
+
+def _oncoming_vehicles(
+    road: Road, duration: float, rng: np.random.Generator, first_track: int
+) -> list[TrafficVehicle]:
+    """Vehicles behind the barrier, one after the other in two lanes, visible from 220 m on."""
+    vehicles: list[TrafficVehicle] = []
+    visible_from = 220.0
+    speed = -rng.uniform(48, 58)
+    for lane in (-1, -2):
+        time = -visible_from / -speed + rng.uniform(0, 1.5)
+        while time < duration:
+            vehicles.append(
+                TrafficVehicle(
+                    track=first_track + len(vehicles), start=visible_from - speed * time, speed=speed,
+                    lane_from=road.lane(lane), view="front", oncoming=True, **random_appearance(rng),
+                )
+            )  # fmt: skip
+            time += rng.uniform(1.0, 3.5)
+    return vehicles
 
 
 class Drive:
-    """A drive whose frames are rendered on demand; `render_drive` creates one.
-
-    ``drive[i]`` and iteration give `Scene` objects. Frames do not depend on each other, and none is kept.
-    The attributes are `fps`, `shape` ``(height, width)`` and `scenario`, as given to `render_drive`.
-    """
+    """A drive made by `render_drive`; ``drive[i]`` and iteration render `Scene` objects, and none is kept."""
 
     def __init__(
-        self, config: SceneConfig, road: Road, traffic: Sequence[TrafficVehicle], *, frames: int, fps: float,
-        scenario: str,
-    ) -> None:  # fmt: skip
-        self.fps, self.shape, self.scenario = fps, config.shape, scenario
-        self._frames, self._traffic = frames, tuple(traffic)
-        self._renderer = SceneRenderer(config, road)
-        self._bodies: dict[int, VehicleBody] = {}
+        self, config: SceneConfig, road: Road, traffic: Sequence[TrafficVehicle], *, frames: int, fps: float
+    ) -> None:
+        self.fps, self.shape = fps, config.shape
+        self._frames, self._renderer = frames, SceneRenderer(config, road)
+        self._traffic = [(v, VehicleBody(v.kind, v.color, v.seed, v.view, config.light)) for v in traffic]
         self._pitch_phases = np.random.default_rng([config.seed, 8]).uniform(0, 2 * np.pi, 3)
 
     def __len__(self) -> int:
@@ -63,24 +173,13 @@ class Drive:
         """Poses of the vehicles that may be visible, distance traveled (m) and pitch offset (rows)."""
         time = frame / self.fps
         poses = [
-            VehiclePose(
-                self._body(vehicle), vehicle.track, vehicle.lateral(time), vehicle.distance(time),
-                vehicle.relative_speed(time), vehicle.oncoming,
-            )
-            for vehicle in self._traffic
-            if -12.0 < vehicle.distance(time) < 230.0
-        ]  # fmt: skip
+            VehiclePose(body, v.track, v.lateral(time), v.distance(time), v.relative_speed(time), v.oncoming)
+            for v, body in self._traffic
+            if -12.0 < v.distance(time) < 230.0
+        ]
         waves = np.sin(2 * np.pi * frame / self.fps * np.array([1.3, 2.1, 3.7]) + self._pitch_phases)
         pitch_offset = int(np.rint(self._renderer.config.margin * float(waves @ (0.5, 0.3, 0.2))))
-        return poses, _SPEED * time, pitch_offset
-
-    def _body(self, vehicle: TrafficVehicle) -> VehicleBody:
-        if vehicle.track not in self._bodies:
-            light = self._renderer.config.light
-            self._bodies[vehicle.track] = VehicleBody(
-                vehicle.kind, vehicle.color, vehicle.view, light, vehicle.seed
-            )
-        return self._bodies[vehicle.track]
+        return poses, 27.0 * time, pitch_offset  # the speed of the camera is 27 m/s
 
     def write_labels(self, path: str | os.PathLike[str]) -> None:
         """Write the ground truth of every frame as CSV; see `write_labels`."""
@@ -115,12 +214,10 @@ def render_drive(
         enters at the left or right edge of the image and pulls away. ``"crossing"``: in the middle of the
         drive a car crosses two lanes in front of another. ``"occlusion"``: the same, closer and slower, so
         that the other car is hidden for about a second. ``"empty"``: no vehicles.
-    horizon, camera_height_m, focal_px, light, rain, jpeg_quality
+    horizon, camera_height_m, focal_px, light, rain, jpeg_quality, random_state
         As for `render_scene`.
     pitch_jitter_px
         Largest number of rows by which the pitch of the camera moves the horizon up or down.
-    random_state
-        Seed or generator; the same seed and options give the same bytes.
 
     Returns
     -------
@@ -148,17 +245,13 @@ def render_drive(
     margin = check_integer(pitch_jitter_px, "pitch_jitter_px", low=0, high=50)
     config = make_config(shape, horizon, camera_height_m, focal_px, light, rain, jpeg_quality, rng, margin)
     road, traffic = make_traffic(scenario, frames / fps, rng)
-    return Drive(config, road, traffic, frames=frames, fps=fps, scenario=scenario)
+    return Drive(config, road, traffic, frames=frames, fps=fps)
 
 
 def write_labels(
     path: str | os.PathLike[str], frames: Iterable[tuple[int | str, Sequence[VehicleTruth]]]
 ) -> None:
-    """Write ground truth as CSV with the columns `LABEL_COLUMNS`, one row per vehicle.
-
-    `frames` are pairs of a frame number or file name and the ground truth of that image. The file is written
-    completely or not at all.
-    """
+    """Write the ground truth of frames, given by number or file name, as CSV, one row per vehicle."""
     with atomic_write(path, "path") as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(LABEL_COLUMNS)

@@ -15,7 +15,7 @@ from vehicle_detection.synthetic.raster import Image
 from vehicle_detection.synthetic.render import VehiclePose, draw_vehicle
 from vehicle_detection.synthetic.scene import RandomState, make_generator
 from vehicle_detection.synthetic.scenery import LANE, Canvas, Road, Scenery
-from vehicle_detection.synthetic.shapes import COLOR_WEIGHTS, KIND_WEIGHTS, weighted_choice
+from vehicle_detection.synthetic.shapes import random_appearance
 from vehicle_detection.synthetic.vehicles import VehicleBody
 
 _HEIGHT, _WIDTH = 720, 1280
@@ -78,21 +78,17 @@ class PatchScene:
     def __init__(self, rng: np.random.Generator) -> None:
         name = str(rng.choice(["day", "overcast", "dusk"], p=[0.6, 0.33, 0.07]))
         light = make_light(name, 0.0, rng)
-        height = float(rng.uniform(1.15, 1.6))
+        height = rng.uniform(1.15, 1.6)
         horizon = 403.0 + float(rng.integers(-60, 60))
         camera = Camera(focal_px=0.9 * _WIDTH, horizon_px=horizon, height_m=height)
         self.road = Road(own=int(rng.integers(3)))
         self.config = SceneConfig((_HEIGHT, _WIDTH), camera, light, seed=int(rng.integers(2**31)))
         scenery = Scenery(self.config, self.road)
-        travel = float(rng.uniform(0, 240))
+        travel = rng.uniform(0, 240)
         self.empty = scenery.render(travel)
         scenery.draw_barrier(Canvas(self.config, self.empty), travel)
         self.sensor = Sensor(replace(self.config, seed=int(rng.integers(2**31))))
-        self.bodies = [self._random_body(rng) for _ in range(10)]
-
-    def _random_body(self, rng: np.random.Generator) -> VehicleBody:
-        kind, color = weighted_choice(KIND_WEIGHTS, rng), weighted_choice(COLOR_WEIGHTS, rng)
-        return VehicleBody(kind, color, "rear", self.config.light, int(rng.integers(2**31)))
+        self.bodies = [VehicleBody(**random_appearance(rng), view="rear", light=light) for _ in range(10)]
 
     def _with_vehicle(
         self, rng: np.random.Generator, distance: float
@@ -100,9 +96,9 @@ class PatchScene:
         """Draw a vehicle into a copy of the image; return it and the box, None if the border cuts it."""
         body = self.bodies[int(rng.integers(len(self.bodies)))]
         lane = int(rng.integers(self.road.lanes))
-        lateral = self.road.lane(lane) + float(rng.uniform(-0.5, 0.5))
+        lateral = self.road.lane(lane) + rng.uniform(-0.5, 0.5)
         if rng.random() < 0.3:
-            lateral = float(rng.uniform(-0.3, 0.3)) * LANE
+            lateral = rng.uniform(-0.3, 0.3) * LANE
         image = self.empty.copy()
         box = draw_vehicle(image, self.config, VehiclePose(body, 1, lateral, distance))
         if box is None or box[0] <= 0 or box[2] >= _WIDTH or box[3] >= _HEIGHT:
@@ -112,34 +108,30 @@ class PatchScene:
     def vehicle(self, size: int, rng: np.random.Generator) -> Image:
         """Cut out a square around a vehicle, as a ``(size, size, 3)`` patch."""
         while True:
-            distance = float(np.exp(rng.uniform(np.log(7.5), np.log(60))))
-            drawn = self._with_vehicle(rng, distance)
+            drawn = self._with_vehicle(rng, float(np.exp(rng.uniform(np.log(7.5), np.log(60)))))
             if drawn is None:
                 continue
             image, box = drawn
             width, height = box[2:] - box[:2]
-            if width > 1.55 * height:
-                continue
-            side = max(width / rng.uniform(0.85, 0.98), height / 0.97)
-            center = (box[:2] + box[2:]) / 2 + rng.uniform(-0.02, 0.02, 2) * side
-            return self._cut(image, center, side, size, rng)
+            if width <= 1.55 * height:
+                side = max(width / rng.uniform(0.85, 0.98), height / 0.97)
+                center = (box[:2] + box[2:]) / 2 + rng.uniform(-0.02, 0.02, 2) * side
+                return self._cut(image, center, side, size, rng)
 
     def background(self, size: int, rng: np.random.Generator) -> Image:
         """Cut out a square without a vehicle, or with a small part of one."""
         image, horizon = self.empty, self.config.camera.horizon_px
         side = float(np.exp(rng.uniform(np.log(40), np.log(220))))
-        x = float(rng.uniform(side / 2, _WIDTH - side / 2))
+        x = rng.uniform(side / 2, _WIDTH - side / 2)
         choice = rng.random()
         if choice < 0.12:
-            y = float(rng.uniform(side / 2, max(horizon - 30, side / 2 + 1)))
+            y = rng.uniform(side / 2, max(horizon - 30, side / 2 + 1))
         else:
             # Mostly where a search looks: from above the horizon down to the near road.
             y = float(np.clip(horizon + rng.normal(60, 85), side / 2, _HEIGHT - side / 2))
-        if choice > 0.85:
-            drawn = self._with_vehicle(rng, float(rng.uniform(8, 25)))
-            square = None if drawn is None else _partial_square(drawn[1], rng)
-            if drawn is not None and square is not None:
-                image, (x, y, side) = drawn[0], square
+        drawn = self._with_vehicle(rng, rng.uniform(8, 25)) if choice > 0.85 else None
+        if drawn and (square := _partial_square(drawn[1], rng)):
+            image, (x, y, side) = drawn[0], square
         return self._cut(image, np.array([x, y]), side, size, rng)
 
     def _cut(
@@ -152,14 +144,14 @@ class PatchScene:
         columns = np.clip(np.arange(x1 - margin, x1 + span + margin), 0, image.shape[1] - 1)
         rows = np.clip(np.arange(y1 - margin, y1 + span + margin), 0, image.shape[0] - 1)
         crop = image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        crop = self.sensor.expose_crop(crop, int(rng.integers(2**31)), blur=float(rng.uniform(0.3, 0.7)))
+        crop = self.sensor.expose(crop, int(rng.integers(2**31)), crop_blur=rng.uniform(0.3, 0.7))
         # Repeat the border where the square reaches beyond the image.
         crop = crop[rows - rows[0]][:, columns - columns[0]]
         crop = np.ascontiguousarray(crop[margin:-margin, margin:-margin])
         method = cv2.INTER_AREA if span > size else cv2.INTER_CUBIC
         patch = np.asarray(cv2.resize(crop, (size, size), interpolation=method), np.float32)
         if rng.random() < 0.25:
-            sigma = float(rng.uniform(0.4, 1.3)) * size / 64
+            sigma = rng.uniform(0.4, 1.3) * size / 64
             patch = np.asarray(cv2.GaussianBlur(patch, (0, 0), sigma), np.float32)
         gain, fading = rng.uniform(0.6, 1.3), rng.uniform(-0.2, 0.25)
         patch = patch * (gain * rng.uniform(0.94, 1.06, 3)).astype(np.float32)
@@ -170,9 +162,9 @@ class PatchScene:
 def _partial_square(box: NDArray[np.int64], rng: np.random.Generator) -> tuple[float, float, float] | None:
     """Center and side of a square with up to a fifth of a vehicle; None if it leaves the image."""
     width = float(box[2] - box[0])
-    side = width * float(rng.uniform(0.7, 1.2))
-    overlap = width * float(rng.uniform(0.02, 0.19))
+    side = width * rng.uniform(0.7, 1.2)
+    overlap = width * rng.uniform(0.02, 0.19)
     x = float(box[0]) + overlap - side / 2 if rng.random() < 0.5 else float(box[2]) - overlap + side / 2
-    y = float(box[1] + box[3]) / 2 + width * float(rng.uniform(-0.2, 0.2))
+    y = float(box[1] + box[3]) / 2 + width * rng.uniform(-0.2, 0.2)
     inside = side / 2 <= x <= _WIDTH - side / 2 and side / 2 <= y <= _HEIGHT - side / 2
     return (x, y, side) if inside else None

@@ -18,9 +18,7 @@ from vehicle_detection.synthetic.shapes import profile_at
 from vehicle_detection.synthetic.surface import PIXELS_PER_METER
 from vehicle_detection.synthetic.vehicles import VehicleBody
 
-NEAR_PLANE = 1.0
-"""Distance in meters from which on anything is drawn."""
-
+NEAR_PLANE = 1.0  # distance from which on anything is drawn (m)
 _INVERSE = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
 
 
@@ -28,39 +26,21 @@ _INVERSE = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
 class VehicleTruth:
     """Ground truth of one vehicle in one image.
 
-    Attributes
-    ----------
-    track
-        Number of the vehicle, the same in every frame of a drive.
-    box
-        ``(x1, y1, x2, y2)``, half-open pixels, around the vehicle inside the image, without its shadow. It
-        includes the parts that other vehicles hide.
-    full_box
-        The same including the parts outside the image: it may be negative or exceed the size of the image.
-    distance_m
-        Distance in meters along the road from the camera to the nearer tires; negative beside and behind the
-        camera. The tires are in row ``horizon_px + focal_px * height_m / distance_m`` of the camera.
-    speed_mps
-        Rate of change of the distance, in meters per second.
-    occluded_fraction
-        Fraction of the vehicle's pixels that nearer vehicles and the barrier cover, in [0, 1].
-    occluded
-        Level of occlusion: 0 visible, 1 partly occluded (10% or more), 2 largely occluded (over 50%).
-    truncated
-        Fraction of `full_box` outside the image, in [0, 1].
-    ignore
-        1 if the vehicle is not scored: largely occluded, truncated by more than 0.7, narrower than 40
-        pixels, or oncoming behind the barrier.
+    `box` is ``(x1, y1, x2, y2)`` in half-open pixels, without the shadow, and includes parts that other
+    vehicles hide; `full_box` also includes the parts outside the image. `distance_m` is along the road to the
+    nearer tires, in row ``horizon_px + focal_px * height_m / distance_m``; it is negative behind the camera.
+    `ignore` is 1 if the vehicle is not scored: largely occluded, truncated by more than 0.7, narrower than
+    40 pixels, or oncoming behind the barrier.
     """
 
-    track: int
+    track: int  # the same in every frame of a drive
     box: tuple[int, int, int, int]
     full_box: tuple[float, float, float, float]
     distance_m: float
-    speed_mps: float
-    occluded_fraction: float
-    occluded: int
-    truncated: float
+    speed_mps: float  # rate of change of the distance
+    occluded_fraction: float  # of its pixels, covered by nearer vehicles and the barrier
+    occluded: int  # 0 visible, 1 partly occluded (10% or more), 2 largely occluded (over 50%)
+    truncated: float  # fraction of `full_box` outside the image
     ignore: int
 
 
@@ -103,9 +83,8 @@ class Sprite:
     @property
     def box(self) -> tuple[int, int, int, int]:
         """Bounding box of its solid pixels."""
-        rows, columns = np.flatnonzero(self.solid.any(1)), np.flatnonzero(self.solid.any(0))
-        x1, x2 = self.left + int(columns[0]), self.left + int(columns[-1]) + 1
-        return x1, self.top + int(rows[0]), x2, self.top + int(rows[-1]) + 1
+        x, y, width, height = cv2.boundingRect(self.solid.astype(np.uint8))
+        return self.left + x, self.top + y, self.left + x + width, self.top + y + height
 
 
 def composite(
@@ -166,10 +145,7 @@ def ground_truth(
 
 
 def projected_box(pose: VehiclePose, config: SceneConfig) -> NDArray[np.float64]:
-    """Bounding box of a vehicle's projected outline, inside the image or not.
-
-    Points nearer than `NEAR_PLANE` are moved there.
-    """
+    """Bounding box of a vehicle's outline, inside the image or not; points before `NEAR_PLANE` move there."""
     body, dims = pose.body, pose.body.dimensions
     y = np.linspace(dims.clearance, dims.height, 40)
     half, near = body.half_width(y), profile_at(body.end, y)
@@ -284,13 +260,11 @@ def _draw_flank(buffer: _SpriteBuffer, pose: VehiclePose, side: int) -> None:
     rgba, across, upwards = surface.mipmap(
         PIXELS_PER_METER * dims.length / max(width, 1.0), PIXELS_PER_METER / scale
     )
-    sample_to_ray = np.array(
-        [
-            [1 / samples, 0, buffer.left + (columns.start + 0.5) / samples - config.center_px],
-            [0, -1 / samples, camera.horizon_px - buffer.top - 0.5 / samples],
-            [0, 0, camera.focal_px],
-        ]
-    )
+    sample_to_ray = np.array([
+        [1 / samples, 0, buffer.left + (columns.start + 0.5) / samples - config.center_px],
+        [0, -1 / samples, camera.horizon_px - buffer.top - 0.5 / samples],
+        [0, 0, camera.focal_px],
+    ])  # fmt: skip
 
     def warp(offset: float, tilt: float) -> Floats:
         # The plane x = offset + tilt * y meets the ray (right * z, height + up * z, z) at
@@ -311,9 +285,8 @@ def _draw_flank(buffer: _SpriteBuffer, pose: VehiclePose, side: int) -> None:
         right, up = buffer.rays(columns)
         ahead = plane / np.where(np.abs(right) > 1e-4, right, 1e-4 * np.sign(plane))
         above = (camera.height_m + up * ahead > dims.belt)[..., None]
-        layer = np.where(
-            above, warp(pose.lateral + side * (belt_half + lean * dims.belt), -side * lean), layer
-        )
+        leaning = warp(pose.lateral + side * (belt_half + lean * dims.belt), -side * lean)
+        layer = np.where(above, leaning, layer)
     sun = light.sun * max(0.0, side * light.to_sun[0])
     layer[..., :3] = np.minimum(layer[..., :3] * (0.86 + 0.5 * sun / light.ambient), layer[..., 3:])
     buffer.composite(columns, layer)

@@ -18,13 +18,7 @@ from vehicle_detection.synthetic.camera_light import LIGHTS, SceneConfig, Sensor
 from vehicle_detection.synthetic.raster import Image
 from vehicle_detection.synthetic.render import VehiclePose, VehicleTruth, composite
 from vehicle_detection.synthetic.scenery import Road, Scenery
-from vehicle_detection.synthetic.shapes import (
-    COLOR_WEIGHTS,
-    COLORS,
-    KIND_WEIGHTS,
-    VEHICLE_SHAPES,
-    weighted_choice,
-)
+from vehicle_detection.synthetic.shapes import COLORS, VEHICLE_SHAPES, random_appearance
 from vehicle_detection.synthetic.vehicles import VehicleBody
 
 RandomState = int | np.random.Generator | None
@@ -34,29 +28,16 @@ RandomState = int | np.random.Generator | None
 class SceneVehicle:
     """A vehicle to place in a scene; `kind` and `color` are random if they are None.
 
-    Attributes
-    ----------
-    distance_m
-        Distance in meters along the road from the camera to the vehicle's nearer tires.
-    lateral_m
-        Lateral position of its middle in meters, positive to the right of the camera. A lane is 3.6 m wide.
-    kind
-        One of ``"hatchback"``, ``"estate"``, ``"sedan"``, ``"mpv"``, ``"suv"``, ``"van"``, ``"truck"``.
-    color
-        One of ``"white"``, ``"silver"``, ``"gray"``, ``"anthracite"``, ``"black"``, ``"navy"``, ``"blue"``,
-        ``"ice"``, ``"red"``, ``"wine"``, ``"green"``, ``"beige"``, ``"brown"``, ``"yellow"``.
-    view
-        The end that the camera sees: ``"rear"`` or ``"front"``.
-    speed_mps
-        Speed away from the camera in meters per second; it only appears in the ground truth.
+    `distance_m` is along the road from the camera to the nearer tires, `lateral_m` from the camera to the
+    right to the middle of the vehicle (a lane is 3.6 m wide). `view` is the end that the camera sees.
     """
 
     distance_m: float
     lateral_m: float = 0.0
-    kind: str | None = None
-    color: str | None = None
-    view: str = "rear"
-    speed_mps: float = 0.0
+    kind: str | None = None  # hatchback, estate, sedan, mpv, suv, van or truck
+    color: str | None = None  # one of `COLORS`
+    view: str = "rear"  # or front
+    speed_mps: float = 0.0  # away from the camera; only for the ground truth
 
     def __post_init__(self) -> None:
         check_number(self.distance_m, "distance_m", low=2.0, high=1000.0)
@@ -71,24 +52,12 @@ class SceneVehicle:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A rendered image and its ground truth.
+    """A rendered image and its ground truth."""
 
-    Attributes
-    ----------
-    image
-        ``(H, W, 3)`` uint8 RGB.
-    truth
-        One `VehicleTruth` for each vehicle with a pixel in the image, occluded or not, ordered by track.
-    camera
-        The camera: focal length, horizon and height are exact.
-    instance_map
-        ``(H, W)`` int32: the track of the vehicle that each pixel shows, 0 where there is none.
-    """
-
-    image: Image
-    truth: tuple[VehicleTruth, ...]
-    camera: Camera
-    instance_map: NDArray[np.int32]
+    image: Image  # (H, W, 3) RGB
+    truth: tuple[VehicleTruth, ...]  # by track; vehicles with a pixel in the image, occluded or not
+    camera: Camera  # exact
+    instance_map: NDArray[np.int32]  # (H, W) track of the vehicle that each pixel shows, 0 where none
 
     @property
     def boxes(self) -> NDArray[np.int64]:
@@ -157,7 +126,9 @@ class SceneRenderer:
         truth, instance_map = composite(poses, self.scenery, config, travel, image)
         image = self.sensor.expose(image, frame)
         if config.jpeg_quality is not None:
-            image = _compress(image, config.jpeg_quality)
+            bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+            _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality])
+            image = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR_RGB), np.uint8)
         return Scene(image, truth, config.camera, instance_map)
 
     def truth(
@@ -165,13 +136,6 @@ class SceneRenderer:
     ) -> tuple[VehicleTruth, ...]:
         """Ground truth of the same scene without the image."""
         return composite(poses, self.scenery, self.config.pitched(pitch_offset), travel, None)[0]
-
-
-def _compress(image: Image, quality: int) -> Image:
-    """Compress an image as JPEG and decompress it."""
-    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR_RGB), np.uint8)
 
 
 def render_scene(
@@ -199,10 +163,8 @@ def render_scene(
         The lane that the camera drives in: 0 left, 1 middle, 2 right; None chooses one at random.
     horizon
         Row of the horizon as a fraction of the height.
-    camera_height_m
-        Height of the camera above the road in meters.
-    focal_px
-        Focal length in pixels; None means 0.9 times the longer side.
+    camera_height_m, focal_px
+        Height of the camera above the road, and focal length; None means 0.9 times the longer side.
     light
         ``"day"``, ``"overcast"``, ``"dusk"`` or ``"night"``.
     rain
@@ -228,9 +190,8 @@ def render_scene(
     >>> scene = render_scene(shape=(360, 640), vehicles=[car], random_state=1)
     >>> scene.image.shape, scene.truth[0].track, scene.truth[0].distance_m
     ((360, 640, 3), 1, 20.0)
-    >>> x1, y1, x2, y2 = scene.truth[0].box
     >>> camera = scene.camera
-    >>> abs(camera.horizon_px + camera.focal_px * camera.height_m / 20.0 - y2) <= 1
+    >>> abs(camera.horizon_px + camera.focal_px * camera.height_m / 20.0 - scene.truth[0].box[3]) <= 1
     True
     """
     rng = make_generator(random_state)
@@ -249,31 +210,24 @@ def render_scene(
                 "make one with SceneVehicle(distance_m=20)"
             )
         # A generator for each vehicle: adding or removing a vehicle does not change the appearance of others.
-        own_rng = np.random.default_rng([config.seed, 5, track])
-        kind, color = weighted_choice(KIND_WEIGHTS, own_rng), weighted_choice(COLOR_WEIGHTS, own_rng)
-        body = VehicleBody(
-            vehicle.kind or kind,
-            vehicle.color or color,
-            vehicle.view,
-            config.light,
-            int(own_rng.integers(2**31)),
-        )
+        look = random_appearance(np.random.default_rng([config.seed, 5, track]))
+        look |= {"kind": vehicle.kind or look["kind"], "color": vehicle.color or look["color"]}
+        body = VehicleBody(**look, view=vehicle.view, light=config.light)
         lateral, distance = float(vehicle.lateral_m), float(vehicle.distance_m)
         poses.append(VehiclePose(body, track, lateral, distance, float(vehicle.speed_mps)))
-    travel = float(np.random.default_rng([config.seed, 6]).uniform(0, 200))
+    travel = np.random.default_rng([config.seed, 6]).uniform(0, 200)
     return SceneRenderer(config, road).scene(poses, travel, pitch_offset=0, frame=0)
 
 
 def _random_vehicles(road: Road, count: int, rng: np.random.Generator) -> list[SceneVehicle]:
     """Place vehicles without overlap in the lanes ahead."""
     free_from = [
-        float(rng.uniform(12, 24)) if lane != road.own else float(rng.uniform(18, 32))
-        for lane in range(road.lanes)
+        rng.uniform(18, 32) if lane == road.own else rng.uniform(12, 24) for lane in range(road.lanes)
     ]
     vehicles = []
     for _ in range(count):
         lane = int(rng.integers(road.lanes)) if rng.random() < 0.5 else int(np.argmin(free_from))
-        lateral = road.lane(lane) + float(rng.uniform(-0.3, 0.3))
+        lateral = road.lane(lane) + rng.uniform(-0.3, 0.3)
         vehicles.append(SceneVehicle(distance_m=free_from[lane], lateral_m=lateral))
-        free_from[lane] += float(rng.uniform(22, 40))
+        free_from[lane] += rng.uniform(22, 40)
     return vehicles

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -44,31 +44,20 @@ class Mask:
     """Coverage of pixels by a shape, 0-1, in the part of a canvas where the shape lies."""
 
     values: Floats
-    top: int
-    left: int
-
-    @property
-    def region(self) -> tuple[slice, slice]:
-        """Rows and columns of the part."""
-        height, width = self.values.shape
-        return slice(self.top, self.top + height), slice(self.left, self.left + width)
+    region: tuple[slice, slice]  # rows and columns of the part
+    size: tuple[int, int]  # of the canvas
 
     def _aligned(self, other: Mask) -> Floats:
         """Values of another mask in this region, 0 where the other does not reach."""
-        values = np.zeros_like(self.values)
-        y1, x1 = max(self.top, other.top), max(self.left, other.left)
-        y2 = min(self.top + self.values.shape[0], other.top + other.values.shape[0])
-        x2 = min(self.left + self.values.shape[1], other.left + other.values.shape[1])
-        if y1 < y2 and x1 < x2:
-            inside = other.values[y1 - other.top : y2 - other.top, x1 - other.left : x2 - other.left]
-            values[y1 - self.top : y2 - self.top, x1 - self.left : x2 - self.left] = inside
-        return values
+        values = np.zeros(self.size, np.float32)
+        values[other.region] = other.values
+        return values[self.region]
 
     def __and__(self, other: Mask) -> Mask:
-        return Mask(self.values * self._aligned(other), self.top, self.left)
+        return replace(self, values=self.values * self._aligned(other))
 
     def __sub__(self, other: Mask) -> Mask:
-        return Mask(np.maximum(self.values - self._aligned(other), 0), self.top, self.left)
+        return replace(self, values=np.maximum(self.values - self._aligned(other), 0))
 
 
 class SurfaceCanvas:
@@ -77,11 +66,10 @@ class SurfaceCanvas:
     def __init__(self, left: float, right: float, low: float, top: float) -> None:
         ppm = PIXELS_PER_METER
         self.left, self.top = left, top
-        self.size = (round((top - low) * ppm), round((right - left) * ppm))
-        x = left + (np.arange(self.size[1], dtype=np.float32) + 0.5) / ppm
-        y = top - (np.arange(self.size[0], dtype=np.float32) + 0.5) / ppm
-        self.x: Floats = x[None, :].astype(np.float32)
-        self.y: Floats = y[:, None].astype(np.float32)
+        height, width = self.size = round((top - low) * ppm), round((right - left) * ppm)
+        columns, rows = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)
+        self.x: Floats = np.asarray(left + (columns[None, :] + 0.5) / ppm, np.float32)
+        self.y: Floats = np.asarray(top - (rows[:, None] + 0.5) / ppm, np.float32)
         self.color: Floats = np.zeros((*self.size, 3), np.float32)
         self.alpha: Floats = np.zeros(self.size, np.float32)
 
@@ -91,14 +79,12 @@ class SurfaceCanvas:
         margin = 2 + int(3 * soften * PIXELS_PER_METER)
         x1, y1 = np.maximum(np.floor(corners.min(0)).astype(int) - margin, 0).tolist()
         x2, y2 = np.minimum(np.ceil(corners.max(0)).astype(int) + margin + 1, self.size[::-1]).tolist()
-        if x1 >= x2 or y1 >= y2:
-            return Mask(np.zeros((0, 0), np.float32), 0, 0)
         filled = np.zeros((y2 - y1, x2 - x1), np.uint8)
         cv2.fillPoly(filled, [np.rint((corners - (x1, y1)) * 16).astype(np.int32)], 255, cv2.LINE_AA, 4)
         values = filled.astype(np.float32) / 255
         if soften:
             values = cv2.GaussianBlur(values, (0, 0), soften * PIXELS_PER_METER)  # type: ignore[assignment]
-        return Mask(np.asarray(values, np.float32), y1, x1)
+        return Mask(np.asarray(values, np.float32), (slice(y1, y2), slice(x1, x2)), self.size)
 
     def box(self, x: float, y: float, width: float, height: float, *, radius: float = 0.0) -> Mask:
         """Mask of a box centered at ``(x, y)`` with rounded corners."""

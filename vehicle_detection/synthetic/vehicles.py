@@ -23,9 +23,9 @@ from vehicle_detection.synthetic.surface import PIXELS_PER_METER, Surface, Surfa
 class VehicleBody:
     """The surfaces of one vehicle in a light; `view` is the end that the camera sees, rear or front."""
 
-    def __init__(self, kind: str, color: str, view: str, light: Light, seed: int) -> None:
+    def __init__(self, kind: str, color: str, seed: int, view: str, light: Light) -> None:
         rng = np.random.default_rng([seed, 7])
-        dims = VEHICLE_SHAPES[kind].scaled(float(rng.uniform(0.96, 1.05)))
+        dims = VEHICLE_SHAPES[kind].scaled(rng.uniform(0.96, 1.05))
         self.dimensions, self.view, self.light = dims, view, light
         rear = view == "rear"
         self.end, self.far_end = (dims.rear, dims.front) if rear else (dims.front, dims.rear)

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_detection._common import check_number, describe
-from vehicle_detection.classifier import DEFAULT_C
+from vehicle_detection._common import describe
+from vehicle_detection.classifier import TrainingOptions
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import FeatureParams
 from vehicle_detection.tuning.results import number_or_text
@@ -26,25 +26,16 @@ _MAX_COMBINATIONS = 100_000
 _BOOLEANS = {"true": True, "yes": True, "false": False, "no": False}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class TrialConfig:
-    """Features and training options of one classifier, checked."""
+    """Features and training options of one classifier."""
 
     params: FeatureParams
-    C: float = DEFAULT_C
-    mirror: bool = True
-    positive_weight: float = 1.0
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "C", check_number(self.C, "C", above=0, high=1e12))
-        weight = check_number(self.positive_weight, "positive_weight", above=0, high=1e6)
-        object.__setattr__(self, "positive_weight", weight)
-        if not isinstance(self.mirror, bool):
-            raise InvalidInputError(f"mirror must be True or False; got {self.mirror!r}")
+    training: TrainingOptions
 
     def to_columns(self) -> dict[str, Any]:
         """Return the columns of a result row that describe the configuration."""
-        training = {name: getattr(self, name) for name in TRAINING_FIELDS}
+        training = {name: getattr(self.training, name) for name in TRAINING_FIELDS}
         return {**dataclasses.asdict(self.params), "n_features": self.params.length, **training}
 
 
@@ -97,7 +88,7 @@ def _read(name: str | None, configuration: object, defaults: Mapping[str, Any]) 
     features = {key: value for key, value in options.items() if key in FEATURE_FIELDS}
     training = {key: options.get(key, defaults[key]) for key in TRAINING_FIELDS}
     try:
-        config = TrialConfig(params=FeatureParams(**features), **training)
+        config = TrialConfig(FeatureParams(**features), TrainingOptions(**training))
     except InvalidInputError as error:
         return Candidate(name or _join_options(options), {**options, **training}, None, str(error))
     return Candidate(name or describe_params(config.params), options, config)

@@ -13,14 +13,7 @@ from vehicle_detection._common import check_integer, check_number
 from vehicle_detection.boxes import Detections, intersection_matrix, non_max_suppression
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.datasets import PatchSet
-from vehicle_detection.evaluation import (
-    FrameBoxes,
-    Frames,
-    check_frame_boxes,
-    iterate_frames,
-    keyed_frames,
-    keys_of,
-)
+from vehicle_detection.evaluation import FrameBoxes, Frames, LabelledFrames, keyed_frames
 from vehicle_detection.params import PATCH_SIZE, SearchParams
 
 
@@ -85,8 +78,7 @@ def mine_negatives(
     >>> len(mine_negatives([road], FrameBoxes([], None, [], frame_keys=[0]), load_classifier()))
     0
     """
-    images = keyed_frames(frames)
-    known = check_frame_boxes(keys_of(images), labels)
+    labelled = LabelledFrames(source, keyed_frames(frames), labels)
     overlap = check_number(max_overlap, "max_overlap", low=0, high=1)
     limit = None if max_per_frame is None else check_integer(max_per_frame, "max_per_frame", low=1)
     params = dataclasses.replace(
@@ -95,8 +87,8 @@ def mine_negatives(
     patches: list[NDArray[np.uint8]] = []
     names: list[str] = []
     with contextlib.closing(classifier.open_search(n_jobs)) as search:
-        for key, image in iterate_frames(images):
-            windows = _false_windows(search.find(image, params).windows, known.boxes[known.rows(key)])
+        for key, image in labelled:
+            windows = _false_windows(search.find(image, params).windows, labelled.labels.frame(key).boxes)
             kept = windows[non_max_suppression(windows.boxes, windows.scores, threshold=overlap)]
             for box in np.rint(kept.boxes[:limit]).astype(np.int64):
                 patches.append(_cut_patch(image, box))

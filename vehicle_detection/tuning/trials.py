@@ -167,20 +167,13 @@ class TrialEvaluator:
     def train(self, config: TrialConfig, rows: NDArray[np.intp], seed: int) -> VehicleClassifier:
         """Train on some of the patches; equal to `train_classifier` on them."""
         labels = check_labels(self.labels[rows], len(rows))
-        copies = (False, True) if config.mirror else (False,)
+        copies = (False, True) if config.training.mirror else (False,)
         _check_memory(config.params.length, len(self.labels), len(rows), len(copies))
         parts = [self.cache.rows(config.params, rows, mirrored=copy) for copy in copies]
         features = np.concatenate(parts) if len(parts) > 1 else parts[0]
         del parts  # As large as the joined features.
-        return fit_features(
-            features,
-            labels,
-            params=config.params,
-            C=config.C,
-            mirror=config.mirror,
-            positive_weight=config.positive_weight,
-            random_state=seed,
-        )
+        options = dataclasses.replace(config.training, random_state=seed)
+        return fit_features(features, labels, config.params, options)
 
     def accuracy(self, classifier: VehicleClassifier, rows: NDArray[np.intp]) -> float:
         """Fraction of correct predictions on some of the patches."""
@@ -259,7 +252,9 @@ class TrialRunner:
         measured = self.evaluator.evaluate(config, split, seed, on_frames=on_frames)
         row = self._append({**measured, **config.to_columns(), **labels})
         self._store.add(row)
-        _LOGGER.info("%s, C=%g, %s: %s", name, config.C, split_name, row["accuracy"] or row["message"])
+        _LOGGER.info(
+            "%s, C=%g, %s: %s", name, config.training.C, split_name, row["accuracy"] or row["message"]
+        )
         return row
 
     def add_failed(self, candidate: Candidate, *, stage: str) -> None:

@@ -197,7 +197,7 @@ class Process:
             group = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
         self.cpu_seconds = 0.0
         """Processor time, known after the process has ended, on systems that report it."""
-        self._reaping = threading.Lock()
+        self._lock = threading.Lock()
         with contextlib.ExitStack() as on_error:
             self._log = on_error.enter_context(tempfile.TemporaryFile())
             try:
@@ -214,20 +214,11 @@ class Process:
                     f"ffmpeg cannot be started ({error}); reinstall imageio-ffmpeg or unset FFMPEG_BINARY"
                 ) from error
             on_error.pop_all()
-        for pipe in (self._popen.stdin, self._popen.stdout):
+        # None unless requested.
+        self.stdin: Any = self._popen.stdin
+        self.stdout: Any = self._popen.stdout
+        for pipe in (self.stdin, self.stdout):
             _enlarge(pipe)
-
-    @property
-    def stdin(self) -> IO[bytes]:
-        """Pipe to the process."""
-        assert self._popen.stdin is not None
-        return self._popen.stdin
-
-    @property
-    def stdout(self) -> IO[bytes]:
-        """Pipe from the process."""
-        assert self._popen.stdout is not None
-        return self._popen.stdout
 
     def wait(self) -> int:
         """Wait until the process has ended and return its exit code."""
@@ -235,7 +226,7 @@ class Process:
             return self._popen.wait()
         # wait4 reports the processor time. It must not block while it holds the lock that `kill` needs.
         while True:
-            with self._reaping:
+            with self._lock:
                 if self._popen.returncode is None:
                     pid, status, usage = os.wait4(self._popen.pid, os.WNOHANG)
                     if pid:
@@ -247,7 +238,7 @@ class Process:
 
     def kill(self) -> None:
         """End the process at once; threads that read from it or write to it stop waiting."""
-        with self._reaping:
+        with self._lock:
             if self._popen.returncode is None:
                 self._popen.kill()
 
@@ -255,7 +246,7 @@ class Process:
         """End the process if it is still running, and close its pipes."""
         self.kill()
         self.wait()
-        for stream in (self._popen.stdin, self._popen.stdout, self._log):
+        for stream in (self.stdin, self.stdout, self._log):
             if stream is not None:
                 stream.close()
 

@@ -33,17 +33,8 @@ from vehicle_detection.video.pipeline import FramePipeline, VideoDetector
 from vehicle_detection.video.streams import CONTAINERS, AudioSource, FrameReader, FrameWriter
 
 PRESETS = (
-    "ultrafast",
-    "superfast",
-    "veryfast",
-    "faster",
-    "fast",
-    "medium",
-    "slow",
-    "slower",
-    "veryslow",
-    "placebo",
-)
+    "ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow", "placebo",
+)  # fmt: skip
 """Presets of the H.264 encoder, from the fastest to the one with the smallest files."""
 
 

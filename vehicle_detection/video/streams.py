@@ -103,7 +103,7 @@ class FrameReader(_FfmpegStream):
         view = self._buffer.data.cast("B")
         done = 0
         while done < len(view):
-            size = self._process.stdout.readinto(view[done:])  # type: ignore[attr-defined]
+            size = self._process.stdout.readinto(view[done:])
             if not size:
                 self._finish()
                 raise StopIteration

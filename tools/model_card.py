@@ -1,0 +1,100 @@
+"""The model card of the shipped default model, written from the measurements of its training."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from vehicle_detection._common import atomic_write
+from vehicle_detection.mixture import TemplateMixture
+from vehicle_detection.mixture_training import FOLD_COLUMNS, FoldScore, FrameDataset, format_fold
+from vehicle_detection.training import markdown_table, markdown_text
+
+_COMMAND = "python -m tools.train_default DATA -o {name}.safetensors --card {name}.md --seed {seed}"
+_METHOD = (
+    "Each source was left out of training in turn, and single frames of it were searched with the default "
+    "parameters, at an IoU of 0.5. F1, precision and recall are those at the threshold that is best for the "
+    "other sources; best F1 is that of the best threshold; AP is the average precision; false positives are "
+    'counted per frame, and per frame without any label. "Region F1" and "region AP" do not score a box of '
+    "which at least half lies in an ignored box: where labels put one ignored box around a group of "
+    "vehicles, the other columns count each vehicle detected there as false."
+)
+_LICENSES = (
+    "Licence: the frames of India, of Cambridge (CamVid) and of Indonesia were published for research and "
+    "other non-commercial use; the patches come from the GTI vehicle image database and the KITTI benchmark, "
+    "both CC BY-NC-SA 3.0. The model inherits these terms. The course's images and clips are MIT licensed."
+)
+_LIMITS = (
+    "The frames show daylight and dusk in three countries and one American highway.",
+    "Vehicles that are occluded, truncated by the frame, seen from the side at close range or narrower than "
+    "32 pixels are missed more often.",
+    "Motor scooters, signs and shop fronts cause false positives.",
+    "Use the model to explore and to annotate, not to drive.",
+)
+
+
+def write_card(
+    path: str | os.PathLike[str],
+    model: TemplateMixture,
+    scores: Sequence[FoldScore],
+    sources: Sequence[FrameDataset],
+    *,
+    seed: int,
+    patches: int = 0,
+) -> None:
+    """Write the model card as Markdown."""
+    name = Path(path).stem
+    titles = [title for title, _ in FOLD_COLUMNS.values()]
+    rows = [
+        [score.name, str(score.frames), str(score.vehicles), *format_fold(score.to_dict(), missing="-")]
+        for score in scores
+    ]
+    parts = [
+        f"# Model card: {name}",
+        markdown_text(
+            f"A mixture of {len(model.templates)} linear SVM templates over FHOG channels that detects "
+            "vehicles on any road. Created by"
+        ),
+        f"```bash\n{_COMMAND.format(name=name, seed=seed)}\n```",
+        "With the same versions, the command creates the same file again.",
+        "\n".join(markdown_text(fact, "- ") for fact in _facts(model)),
+        "## Accuracy on roads that it was not trained on",
+        markdown_text(_METHOD),
+        markdown_table(["set", "frames", "vehicles", *titles], rows),
+        "## Data",
+        "\n".join(markdown_text(line, "- ") for line in _data(sources, patches)),
+        markdown_text(_LICENSES),
+        "## Limits",
+        "\n".join(markdown_text(line, "- ") for line in _LIMITS),
+    ]
+    with atomic_write(path, "path") as part:
+        part.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+
+
+def _facts(model: TemplateMixture) -> list[str]:
+    shapes = [
+        "{:g}x{:g}".format(*template.box_cells) + " at the border" * template.border
+        for template in model.templates
+    ]
+    facts = [
+        f"Templates, in cells of the vehicle's box: {', '.join(shapes)}",
+        f"Threshold: log-odds of {model.threshold:.2f}",
+    ]
+    rescorer = model.rescorer
+    if rescorer is not None:
+        facts.insert(
+            1,
+            f"Rescoring: an RBF SVM with {len(rescorer.weights):,} support vectors on edge and color "
+            f"features, with a weight of {rescorer.blend_weight:g} in the score",
+        )
+    return facts
+
+
+def _data(sources: Sequence[FrameDataset], patches: int) -> list[str]:
+    lines = [
+        f"{source.name}: {sum(len(part) for part in source.sets)} frames, "
+        f"{sum(int((~part.labels.ignore).sum()) for part in source.sets)} vehicles"
+        for source in sources
+    ]
+    return lines + ([f"{patches} vehicles on the course's patches"] if patches else [])

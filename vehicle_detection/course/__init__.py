@@ -1,0 +1,38 @@
+"""The lesson functions of the course, for code that was written with them.
+
+The course is project 5 of Udacity's Self-Driving Car Engineer Nanodegree
+(https://github.com/udacity/CarND-Vehicle-Detection). After ``from vehicle_detection.course import *``, the
+functions of its ``lesson_functions.py`` and of its HOG sub-sampling quiz, ``find_cars``, are available with
+their argument order, defaults and return types. Options that the lesson does not have are keyword-only.
+
+Images are ``(H, W, 3)`` RGB, uint8 or float, as in the lesson; windows and boxes are lists of corner pairs
+``((x1, y1), (x2, y2))``. HOG is computed by the library's kernels. For uint8 images, the library's
+`extract_features` computes the vectors, and its fast search runs any linear classifier of scikit-learn behind
+a ``StandardScaler``. Everything else takes the lesson's own steps: features, ``scaler.transform``,
+``clf.predict``. Both ways agree within float32 precision.
+
+The page ``docs/course.md`` lists the differences from the lesson and the counterpart of each function in the
+main API.
+"""
+
+from vehicle_detection.course.features import bin_spatial, color_hist, convert_color, get_hog_features
+from vehicle_detection.course.heat import add_heat, apply_threshold, draw_boxes, draw_labeled_bboxes
+from vehicle_detection.course.vectors import extract_features, single_img_features
+from vehicle_detection.course.windows import find_car_windows, find_cars, search_windows, slide_window
+
+__all__ = [
+    "add_heat",
+    "apply_threshold",
+    "bin_spatial",
+    "color_hist",
+    "convert_color",
+    "draw_boxes",
+    "draw_labeled_bboxes",
+    "extract_features",
+    "find_car_windows",
+    "find_cars",
+    "get_hog_features",
+    "search_windows",
+    "single_img_features",
+    "slide_window",
+]

@@ -1,0 +1,60 @@
+"""Argument checks of the lesson functions, which accept more forms than the main API."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection._common import check_integer, check_number, describe
+from vehicle_detection.boxes import Detections
+from vehicle_detection.errors import InvalidInputError
+
+Image = NDArray[Any]
+
+
+def check_lesson_image(img: Any, name: str = "img") -> Image:
+    """Return an ``(H, W, 3)`` image as uint8 or float32."""
+    if not isinstance(img, np.ndarray) or img.ndim != 3 or img.shape[2] != 3 or not img.size:
+        raise InvalidInputError(f"{name} must be an (H, W, 3) RGB array; got {describe(img)}")
+    if img.dtype in (np.uint8, np.float32):
+        return img
+    if img.dtype.kind != "f":
+        raise InvalidInputError(
+            f"{name} must be uint8 or float, got {img.dtype}; convert it with {name}.astype(numpy.uint8)"
+        )
+    return img.astype(np.float32)
+
+
+def check_size(size: Any, name: str) -> tuple[int, int]:
+    """Return ``(width, height)`` of a pair or of one number."""
+    pair = (size, size) if np.ndim(size) == 0 else tuple(size)
+    if len(pair) != 2:
+        raise InvalidInputError(f"{name} must be (width, height); got {describe(size)}")
+    return check_integer(pair[0], name, low=1), check_integer(pair[1], name, low=1)
+
+
+def check_range(limits: Any, name: str) -> tuple[float, float] | None:
+    """Return the range of a histogram; None stands for the range of the values."""
+    if limits is None:
+        return None
+    if np.shape(limits) != (2,):
+        raise InvalidInputError(f"{name} must be (low, high) or None; got {describe(limits)}")
+    low = check_number(limits[0], name)
+    return low, check_number(limits[1], name, above=low)
+
+
+def corner_array(boxes: Any, name: str) -> NDArray[np.int64]:
+    """Return boxes as ``(N, 4)`` whole pixels, from corner pairs, an array or `Detections`."""
+    try:
+        array = np.asarray(boxes.boxes if isinstance(boxes, Detections) else boxes)
+    except ValueError:  # rows of different lengths
+        array = np.array(None)
+    if array.size == 0:
+        return np.empty((0, 4), np.int64)
+    if array.shape[1:] not in ((4,), (2, 2)) or array.dtype.kind not in "iuf" or not np.isfinite(array).all():
+        raise InvalidInputError(
+            f"{name} must be a list of corner pairs ((x1, y1), (x2, y2)); got {describe(boxes)}"
+        )
+    return np.asarray(np.rint(array).astype(np.int64).reshape(-1, 4))

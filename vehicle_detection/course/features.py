@@ -1,0 +1,262 @@
+"""Features of one image: color conversion, HOG, spatial bins and color histograms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection._common import check_choice, check_integer, describe
+from vehicle_detection._kernels import degree_bounds, orientation_cotangents, sqrt_gradients
+from vehicle_detection._kernels import hog as _hog_kernels
+from vehicle_detection.course.checks import Image, check_lesson_image, check_range, check_size
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.params import COLOR_SPACES
+
+Size = int | Sequence[int]
+SpatialOrder = Literal["interleaved", "channels"]
+SPATIAL_ORDERS = ("interleaved", "channels")
+
+
+def convert_color(img: Image, conv: str = "RGB2YCrCb") -> Image:
+    """Convert the color space of an image, by the name of OpenCV's conversion.
+
+    Parameters
+    ----------
+    img
+        ``(H, W, 3)`` uint8, or float as OpenCV defines it: 0-1, hue 0-360, LUV and LAB with negative values.
+    conv
+        ``"RGB2YCrCb"``, ``"BGR2YCrCb"``, ``"RGB2LUV"``, ``"RGB2HLS"``, ``"RGB2GRAY"``, ...; a color space
+        alone, such as ``"LUV"``, means from RGB.
+
+    Returns
+    -------
+    numpy.ndarray
+        A new image, uint8 or float32.
+
+    Raises
+    ------
+    InvalidInputError
+        If the image is malformed or the conversion is unknown.
+
+    Examples
+    --------
+    >>> convert_color(np.full((1, 1, 3), 200, np.uint8)).tolist()
+    [[[200, 128, 128]]]
+    """
+    image = check_lesson_image(img)
+    source, _, target = str(conv).rpartition("2")
+    source = source or "RGB"
+    if source not in ("RGB", "BGR") or target not in (*COLOR_SPACES, "BGR", "GRAY"):
+        raise InvalidInputError(
+            f"conv must be RGB2 or BGR2 and one of {', '.join(COLOR_SPACES)}, BGR, GRAY; got {describe(conv)}"
+        )
+    if source == target:
+        return image.copy()
+    return np.asarray(cv2.cvtColor(image, getattr(cv2, f"COLOR_{source}2{target}")))
+
+
+def get_hog_features(
+    img: Any,
+    orient: int,
+    pix_per_cell: int,
+    cell_per_block: int,
+    vis: bool = False,
+    feature_vec: bool = True,
+    *,
+    transform_sqrt: bool = False,
+    visualise: bool = False,
+    visualize: bool = False,
+) -> Any:
+    """HOG of one channel, with a picture of it if `vis` is set.
+
+    Parameters
+    ----------
+    img
+        ``(H, W)``, one channel, uint8 or float.
+    orient
+        Orientations over 0-180 degrees.
+    pix_per_cell, cell_per_block
+        Side of a cell in pixels and of a block in cells.
+    vis, visualise, visualize
+        Return a pair of the features and the picture.
+    feature_vec
+        Return the features as a vector; False gives the array of blocks.
+    transform_sqrt
+        Take the square root of the values first. An early quiz of the course does, its later code does not: a
+        model trained one way does not work the other way. Float channels must not be negative for it.
+
+    Returns
+    -------
+    features : numpy.ndarray
+        1-D, or ``(block rows, block columns, cell_per_block, cell_per_block, orient)``; float64, or float32
+        for a float32 image. Blocks are normalized by L2-Hys, scikit-image's default since version 0.15.
+    hog_image : numpy.ndarray
+        ``(H, W)``, only with `vis`.
+
+    Raises
+    ------
+    InvalidInputError
+        If the image is not one channel or smaller than a block.
+
+    Examples
+    --------
+    >>> channel = np.zeros((64, 64), np.uint8)
+    >>> get_hog_features(channel, 9, 8, 2).shape
+    (1764,)
+    >>> features, hog_image = get_hog_features(channel, 9, 8, 2, vis=True, feature_vec=False)
+    >>> features.shape, hog_image.shape
+    ((7, 7, 2, 2, 9), (64, 64))
+    """
+    if not isinstance(img, np.ndarray) or img.ndim != 2 or img.dtype.kind not in "uif":
+        raise InvalidInputError(
+            f"img must be one (H, W) channel of numbers, got {describe(img)}; pick one with image[..., 0]"
+        )
+    channel = img if img.dtype in (np.uint8, np.float32) else img.astype(np.float64)
+    blocks = hog_blocks(channel[..., None], orient, pix_per_cell, cell_per_block, transform_sqrt)[0]
+    blocks = np.ascontiguousarray(blocks, np.float32 if channel.dtype == np.float32 else np.float64)
+    features = blocks.ravel() if feature_vec else blocks
+    if not (vis or visualise or visualize):
+        return features
+    from skimage.feature import hog
+
+    # The picture does not depend on the size of a block.
+    cell = (pix_per_cell, pix_per_cell)
+    _, picture = hog(channel, orient, cell, (1, 1), transform_sqrt=transform_sqrt, visualize=True)
+    return features, picture
+
+
+def bin_spatial(
+    img: Image,
+    size: Size = (32, 32),
+    *,
+    color_space: str = "RGB",
+    order: SpatialOrder = "interleaved",
+) -> NDArray[Any]:
+    """Pixel values of a resized image as a vector.
+
+    Parameters
+    ----------
+    img
+        ``(H, W, 3)``, uint8 or float.
+    size
+        ``(width, height)`` to resize to, or one number for both.
+    color_space
+        Color space to convert to first, from RGB.
+    order
+        ``"interleaved"``: pixel by pixel, ``cv2.resize(img, size).ravel()``, as in the lesson.
+        ``"channels"``: one channel after the other, as in the HOG sub-sampling quiz and in the main API. A
+        model trained on one order does not work on the other.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(width * height * 3,)``, of the image's dtype.
+
+    Examples
+    --------
+    >>> image = np.full((64, 64, 3), (1, 2, 3), np.uint8)
+    >>> bin_spatial(image, (2, 1)).tolist(), bin_spatial(image, (2, 1), order="channels").tolist()
+    ([1, 2, 3, 1, 2, 3], [1, 1, 2, 2, 3, 3])
+    """
+    image = check_lesson_image(img)
+    check_choice(order, "order", SPATIAL_ORDERS)
+    if color_space != "RGB":
+        image = convert_color(image, color_space)
+    small = np.asarray(cv2.resize(image, check_size(size, "size")))
+    return small.ravel() if order == "interleaved" else small.transpose(2, 0, 1).ravel()
+
+
+def color_hist(
+    img: Image, nbins: int = 32, bins_range: tuple[float, float] | None = (0, 256)
+) -> NDArray[np.int64]:
+    """Histogram of each channel, one after the other.
+
+    Parameters
+    ----------
+    img
+        ``(H, W, 3)``, uint8 or float.
+    nbins
+        Bins of each channel.
+    bins_range
+        Values that the bins cover. With the default, all values of a 0-1 image fall into the first bin: pass
+        ``(0, 1)``. None takes each channel's own minimum and maximum, as the HOG sub-sampling quiz does.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(3 * nbins,)`` int64 counts.
+
+    Examples
+    --------
+    >>> color_hist(np.zeros((2, 2, 3), np.uint8), 4).tolist()
+    [4, 0, 0, 0, 4, 0, 0, 0, 4, 0, 0, 0]
+    """
+    image = check_lesson_image(img)
+    check_integer(nbins, "nbins", low=1)
+    limits = check_range(bins_range, "bins_range")
+    if limits is None:
+        return np.concatenate([np.histogram(image[..., channel], nbins)[0] for channel in range(3)])
+    return count_bins(bin_indices(image, nbins, limits), nbins)
+
+
+def hog_blocks(
+    image: Image, orient: int, pix_per_cell: int, cell_per_block: int, transform_sqrt: bool = False
+) -> NDArray[np.float32]:
+    """HOG of each channel: ``(channels, rows, columns, block, block, orient)`` float32, a view."""
+    check_integer(orient, "orient", low=1)
+    cell = check_integer(pix_per_cell, "pix_per_cell", low=1)
+    block = check_integer(cell_per_block, "cell_per_block", low=1)
+    height, width, channels = image.shape
+    side = cell * block
+    if min(height, width) < side:
+        raise InvalidInputError(
+            f"img must be at least one block large ({side}x{side} pixels); got {width}x{height}"
+        )
+    cells = np.empty((channels, orient, height // cell, width // cell), np.float32)
+    if image.dtype == np.uint8 and not transform_sqrt:
+        flat = np.ascontiguousarray(image).reshape(height, -1)
+        _hog_kernels.hog_cells(flat, channels, cell, orientation_cotangents(orient), cells)
+    else:
+        gradients = sqrt_gradients(image) if image.dtype == np.uint8 else _gradients(image, transform_sqrt)
+        _hog_kernels.sum_orientations(*gradients, degree_bounds(orient), channels, cell, cells)
+    blocks = np.empty((channels, block, block, *cells.shape[1:]), np.float32)
+    _hog_kernels.normalize_blocks(cells, block, 1, blocks)
+    rows, columns = (count - block + 1 for count in cells.shape[2:])
+    return blocks[..., :rows, :columns].transpose(0, 4, 5, 1, 2, 3)
+
+
+def _gradients(image: NDArray[Any], transform_sqrt: bool) -> tuple[NDArray[np.float64], ...]:
+    """Gradients of a float image and their arctangents, like `sqrt_gradients`, as scikit-image has them."""
+    if transform_sqrt:
+        if image.min() < 0:
+            raise InvalidInputError(
+                "transform_sqrt must be False for negative values, which float LUV and LAB images have; "
+                "convert a uint8 image, or switch it off"
+            )
+        image = np.sqrt(image)
+    across, down = np.zeros_like(image), np.zeros_like(image)
+    across[:, 1:-1] = image[:, 2:] - image[:, :-2]
+    down[1:-1] = image[2:] - image[:-2]
+    gx, gy = (part.reshape(len(image), -1).astype(np.float64) for part in (across, down))
+    return gx, gy, np.arctan2(gy, gx)
+
+
+def bin_indices(image: Image, bins: int, limits: tuple[float, float]) -> NDArray[np.intp]:
+    """Histogram bin of each value, as `numpy.histogram` assigns it; `bins` for values out of range."""
+    values = np.arange(256) if image.dtype == np.uint8 else image
+    edges = np.histogram_bin_edges(values, bins, limits)
+    indices = np.searchsorted(edges, values, side="right") - 1
+    indices[values == edges[-1]] = bins - 1
+    indices[indices < 0] = bins
+    return np.asarray(indices[image] if image.dtype == np.uint8 else indices)
+
+
+def count_bins(indices: NDArray[np.intp], bins: int) -> NDArray[np.int64]:
+    """Histogram of each channel of ``(h, w, 3)`` bin indices, one after the other."""
+    # One more bin holds the values out of range.
+    offset = indices + np.arange(3) * (bins + 1)
+    return np.bincount(offset.ravel(), minlength=3 * (bins + 1)).reshape(3, -1)[:, :bins].ravel()

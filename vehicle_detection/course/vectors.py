@@ -1,0 +1,293 @@
+"""Feature vectors of images, ``[spatial | histogram | HOG]``, and the options that define them."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection import features as library
+from vehicle_detection._common import check_choice, check_integer, describe
+from vehicle_detection.course.checks import Image, check_lesson_image, check_range, check_size
+from vehicle_detection.course.features import (
+    SPATIAL_ORDERS,
+    Size,
+    SpatialOrder,
+    bin_spatial,
+    color_hist,
+    convert_color,
+    hog_blocks,
+)
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.images import read_image
+from vehicle_detection.params import COLOR_SPACES, PATCH_SIZE, FeatureParams
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+CHUNK = 512
+"""Number of images whose features are computed, or kept in memory, at a time."""
+
+
+def accept_cspace(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Accept ``cspace=``, the name of ``color_space=`` in two earlier quizzes.
+
+    Each of those quizzes computes one group of features: one computes HOG, the other spatial bins and
+    histograms. With ``cspace=`` and without ``spatial_feat=``, ``hist_feat=`` and ``hog_feat=``, the group
+    follows from the options that are passed.
+    """
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Result:
+        if "cspace" in kwargs:
+            if "color_space" in kwargs:
+                raise InvalidInputError("color_space and cspace are the same option; pass one of them")
+            kwargs["color_space"] = kwargs.pop("cspace")
+            color = not kwargs.keys().isdisjoint({"spatial_size", "hist_bins", "hist_range"})
+            hog = not kwargs.keys().isdisjoint({"orient", "pix_per_cell", "cell_per_block", "hog_channel"})
+            if color != hog and kwargs.keys().isdisjoint({"spatial_feat", "hist_feat", "hog_feat"}):
+                kwargs.update(spatial_feat=color, hist_feat=color, hog_feat=hog)
+        return function(*args, **kwargs)
+
+    return call
+
+
+@accept_cspace
+def single_img_features(
+    img: Image,
+    color_space: str = "RGB",
+    spatial_size: Size = (32, 32),
+    hist_bins: int = 32,
+    orient: int = 9,
+    pix_per_cell: int = 8,
+    cell_per_block: int = 2,
+    hog_channel: int | str = 0,
+    spatial_feat: bool = True,
+    hist_feat: bool = True,
+    hog_feat: bool = True,
+    *,
+    hist_range: tuple[float, float] | None = (0, 256),
+    transform_sqrt: bool = False,
+    spatial_order: SpatialOrder = "interleaved",
+) -> NDArray[np.float64]:
+    """Feature vector of one image; the options are those of `extract_features`.
+
+    Returns
+    -------
+    numpy.ndarray
+        1-D float64, ``[spatial | histogram | HOG]``.
+
+    Examples
+    --------
+    >>> single_img_features(np.zeros((64, 64, 3), np.uint8), "YCrCb", hog_channel="ALL").shape
+    (8460,)
+    """
+    return FeatureOptions.of(locals()).compute([check_lesson_image(img)])[0]
+
+
+@accept_cspace
+def extract_features(
+    imgs: Iterable[str | os.PathLike[str] | Image],
+    color_space: str = "RGB",
+    spatial_size: Size = (32, 32),
+    hist_bins: int = 32,
+    orient: int = 9,
+    pix_per_cell: int = 8,
+    cell_per_block: int = 2,
+    hog_channel: int | str = 0,
+    spatial_feat: bool = True,
+    hist_feat: bool = True,
+    hog_feat: bool = True,
+    *,
+    hist_range: tuple[float, float] | None = (0, 256),
+    transform_sqrt: bool = False,
+    spatial_order: SpatialOrder = "interleaved",
+    imread: Callable[[str], Image] | None = None,
+) -> list[NDArray[np.float64]]:
+    """Feature vectors of a list of images.
+
+    Parameters
+    ----------
+    imgs
+        File names, or images ``(H, W, 3)`` RGB.
+    color_space
+        ``"RGB"``, ``"HSV"``, ``"LUV"``, ``"HLS"``, ``"YUV"``, ``"YCrCb"`` or ``"LAB"``. The keyword of two
+        earlier quizzes, ``cspace=``, is accepted too: with HOG options only, it selects HOG alone, and with
+        color options only, spatial bins and histograms alone, as in those quizzes.
+    spatial_size, hist_bins, hist_range, spatial_order
+        See `bin_spatial` and `color_hist`.
+    orient, pix_per_cell, cell_per_block, transform_sqrt
+        See `get_hog_features`.
+    hog_channel
+        0, 1, 2 or ``"ALL"``.
+    spatial_feat, hist_feat, hog_feat
+        Switches for the three parts.
+    imread
+        Function that reads a file as RGB. None reads like the lesson's ``mpimg.imread``: a PNG as float 0-1,
+        other files as uint8. ``vehicle_detection.read_image`` reads every file as uint8, which is faster;
+        search uint8 images then, and pass ``divide_by=1`` to `find_cars`.
+
+    Returns
+    -------
+    list of numpy.ndarray
+        A 1-D float64 vector for each image, ``[spatial | histogram | HOG]``.
+
+    Raises
+    ------
+    InvalidInputError
+        If an image is malformed, a file is missing or unreadable, or an option is out of range.
+
+    Examples
+    --------
+    >>> images = [np.zeros((64, 64, 3), np.uint8)] * 2
+    >>> [len(vector) for vector in extract_features(images, "HLS", (16, 16), 16, hog_channel=2)]
+    [2580, 2580]
+    >>> [len(vector) for vector in extract_features(images, cspace="HLS", orient=9)]
+    [1764, 1764]
+    """
+    options = FeatureOptions.of(locals())
+    if isinstance(imgs, (str, os.PathLike)) or not isinstance(imgs, Iterable):
+        raise InvalidInputError(f"imgs must be a list of file names or images; got {describe(imgs)}")
+    read = imread or _read_like_lesson
+    items: list[Any] = list(imgs)
+    vectors: list[NDArray[np.float64]] = []
+    for start in range(0, len(items), CHUNK):
+        images = [
+            read(os.fspath(item)) if isinstance(item, (str, os.PathLike)) else item
+            for item in items[start : start + CHUNK]
+        ]
+        vectors += options.compute([check_lesson_image(image, "imgs") for image in images])
+    return vectors
+
+
+def _read_like_lesson(path: str) -> Image:
+    """Read a file like matplotlib's ``imread``: a PNG as float32 0-1, others as uint8."""
+    image = read_image(path)
+    if Path(path).suffix.lower() != ".png":
+        return image
+    return np.divide(image, 255, dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class FeatureOptions:
+    """The feature options of a lesson function, checked."""
+
+    color_space: str
+    spatial_size: Any  # (width, height)
+    hist_bins: int
+    orient: int
+    pix_per_cell: int
+    cell_per_block: int
+    hog_channel: int | str
+    spatial_feat: bool
+    hist_feat: bool
+    hog_feat: bool
+    hist_range: tuple[float, float] | None
+    transform_sqrt: bool
+    spatial_order: SpatialOrder
+
+    def __post_init__(self) -> None:
+        check_choice(self.color_space, "color_space", COLOR_SPACES)
+        check_choice(self.hog_channel, "hog_channel", (0, 1, 2, "ALL"))
+        check_choice(self.spatial_order, "spatial_order", SPATIAL_ORDERS)
+        object.__setattr__(self, "spatial_size", check_size(self.spatial_size, "spatial_size"))
+        object.__setattr__(self, "hist_range", check_range(self.hist_range, "hist_range"))
+        for name in ("hist_bins", "orient", "pix_per_cell", "cell_per_block"):
+            object.__setattr__(self, name, check_integer(getattr(self, name), name, low=1))
+        for name in ("spatial_feat", "hist_feat", "hog_feat", "transform_sqrt"):
+            object.__setattr__(self, name, bool(getattr(self, name)))
+        if not (self.spatial_feat or self.hist_feat or self.hog_feat):
+            raise InvalidInputError("spatial_feat, hist_feat and hog_feat are all False; switch one on")
+
+    @classmethod
+    def of(cls, arguments: dict[str, Any]) -> FeatureOptions:
+        """Pick the options from all arguments of a lesson function, by name."""
+        return cls(**{field.name: arguments[field.name] for field in dataclasses.fields(cls)})
+
+    @property
+    def blocks(self) -> int:
+        """HOG block positions along a side of a 64x64 window."""
+        return PATCH_SIZE // self.pix_per_cell - self.cell_per_block + 1
+
+    @property
+    def length(self) -> int:
+        """Length of the feature vector of a 64x64 window."""
+        width, height = self.spatial_size
+        channels = 3 if self.hog_channel == "ALL" else 1
+        lengths = (
+            3 * width * height if self.spatial_feat else 0,
+            3 * self.hist_bins if self.hist_feat else 0,
+            self.blocks**2 * self.cell_per_block**2 * self.orient * channels if self.hog_feat else 0,
+        )
+        return sum(lengths)
+
+    def library_params(self, color_space: str) -> FeatureParams | None:
+        """Parameters of the library for the same features of uint8 patches, or None if there are none."""
+        width, height = self.spatial_size
+        if (self.spatial_feat and width != height) or (self.hist_feat and self.hist_range != (0, 256)):
+            return None
+        options = dataclasses.asdict(self) | {"color_space": color_space, "spatial_size": width}
+        del options["hist_range"], options["spatial_order"]
+        try:
+            return FeatureParams(**options)
+        except InvalidInputError:
+            return None
+
+    def compute(self, images: list[Image]) -> list[NDArray[np.float64]]:
+        """Feature vectors of images in the lesson's order, float64."""
+        params = self.library_params(self.color_space)
+        if params is None or not are_uint8_patches(images):
+            return [self._compute_one(image) for image in images]
+        features = library.extract_features(np.stack(images), params)
+        vectors = features.astype(np.float64)
+        if self.spatial_feat and self.spatial_order == "interleaved":
+            size, length = params.spatial_size, params.spatial_length
+            by_channel = features[:, :length].reshape(-1, 3, size, size)
+            vectors[:, :length] = by_channel.transpose(0, 2, 3, 1).reshape(len(features), length)
+        return list(vectors)
+
+    def _compute_one(self, image: Image) -> NDArray[np.float64]:
+        """Feature vector of one image by the lesson's steps."""
+        converted = convert_color(image, self.color_space)
+        parts: list[NDArray[Any]] = self.color_parts(converted)
+        if self.hog_feat:
+            parts.append(self.hog_blocks(converted).ravel())
+        return np.concatenate(parts).astype(np.float64)
+
+    def color_parts(self, converted: Image) -> list[NDArray[Any]]:
+        """Spatial bins and histogram of a converted image, where they are used."""
+        parts: list[NDArray[Any]] = []
+        if self.spatial_feat:
+            parts.append(bin_spatial(converted, self.spatial_size, order=self.spatial_order))
+        if self.hist_feat:
+            parts.append(color_hist(converted, self.hist_bins, self.hist_range))
+        return parts
+
+    def hog_blocks(self, converted: Image) -> NDArray[np.float32]:
+        """HOG of the selected channels of a converted image; see `hog_blocks`."""
+        channels = slice(None) if self.hog_channel == "ALL" else [int(self.hog_channel)]
+        return hog_blocks(
+            converted[..., channels], self.orient, self.pix_per_cell, self.cell_per_block, self.transform_sqrt
+        )
+
+    def library_order(self) -> NDArray[np.intp]:
+        """Position in a vector of the lesson of each feature of the library, which orders bins by channel."""
+        columns = np.arange(self.length)
+        if self.spatial_feat and self.spatial_order == "interleaved":
+            width, height = self.spatial_size
+            spatial = columns[: 3 * width * height].reshape(height, width, 3)
+            columns[: spatial.size] = spatial.transpose(2, 0, 1).ravel()
+        return columns
+
+
+def are_uint8_patches(images: list[Image]) -> bool:
+    """Whether the library's kernels can compute the features of all of some images at once."""
+    shape = (PATCH_SIZE, PATCH_SIZE, 3)
+    return bool(images) and all(image.dtype == np.uint8 and image.shape == shape for image in images)
