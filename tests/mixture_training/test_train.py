@@ -107,7 +107,7 @@ def test_invalid_training_arguments(drawn_source):
         train_mixture([drawn_source], PyramidParams())
     odd = dataclasses.replace(SMALL_MIXTURE, shapes=((6, 5), (20, 3)), mirrored=(False, False))
     with pytest.raises(
-        InvalidInputError, match="hold vehicles of every shape, got none like 20x3 that is 28"
+        InvalidInputError, match="hold vehicles of every shape, got none like 20x3 that is at least 28"
     ):
         train_mixture([drawn_source], odd, n_jobs=1)
     empty = LabelledFrames(
