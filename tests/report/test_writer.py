@@ -94,7 +94,7 @@ def test_rejects_paths_that_cannot_be_written(tmp_path):
         ((0.5, 0.0, []), "frame_index must be an integer at least 0"),
         ((0, math.nan, []), "time must be a number"),
         ((0, 0.0, None), r"tracks must be Track objects, got None; pass result.tracks"),
-        ((0, 0.0, "abc"), "tracks must be Track objects, got 'a'"),
+        ((0, 0.0, "abc"), "tracks must be Track objects, got 'abc'"),
         ((0, 0.0, [(1, 2)]), r"tracks must be Track objects, got \(1, 2\) \(tuple\)"),
         ((0, 0.0, [track(1), track(1)]), "tracks must have unique ids, got 1 twice in one frame"),
         ((0, 0.0, [track(-1)]), "track.id must be an integer at least 0; got -1"),
