@@ -50,6 +50,7 @@ def add_heat(heatmap: NDArray[Any], bbox_list: Any) -> NDArray[Any]:
     _check_heat(heatmap)
     height, width = heatmap.shape
     boxes = check_boxes(corner_array(bbox_list, "bbox_list"), "bbox_list").clip(0, (width, height) * 2)
+    boxes = boxes[(boxes[:, :2] < boxes[:, 2:]).all(axis=1)]
     if len(boxes):
         # Only the rectangle around all boxes is summed up.
         x1, y1 = boxes[:, :2].min(axis=0)

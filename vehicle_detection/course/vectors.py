@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,9 +32,10 @@ from vehicle_detection.params import COLOR_SPACES, PATCH_SIZE, FeatureParams
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
+Images = list[Image] | NDArray[Any]
 
-CHUNK = 512
-"""Number of images whose features are computed, or kept in memory, at a time."""
+# Number of images that are read and processed at a time.
+_CHUNK = 4096
 
 
 def accept_cspace(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
@@ -89,7 +91,7 @@ def single_img_features(
     >>> single_img_features(np.zeros((64, 64, 3), np.uint8), "YCrCb", hog_channel="ALL").shape
     (8460,)
     """
-    return FeatureOptions.of(locals()).compute([check_lesson_image(img)])[0]
+    return FeatureOptions.of(locals()).compute([check_lesson_image(img)])[0].astype(np.float64)
 
 
 @accept_cspace
@@ -110,7 +112,7 @@ def extract_features(
     transform_sqrt: bool = False,
     spatial_order: SpatialOrder = "interleaved",
     imread: Callable[[str], Image] | None = None,
-) -> list[NDArray[np.float64]]:
+) -> list[NDArray[Any]]:
     """Feature vectors of a list of images.
 
     Parameters
@@ -137,7 +139,9 @@ def extract_features(
     Returns
     -------
     list of numpy.ndarray
-        A 1-D float64 vector for each image, ``[spatial | histogram | HOG]``.
+        A 1-D vector for each image, ``[spatial | histogram | HOG]``: float32 for 64x64 uint8 images, which
+        the library's kernels compute, float64 for others. The lesson's code converts the stacked vectors to
+        float64 itself.
 
     Raises
     ------
@@ -156,12 +160,14 @@ def extract_features(
     if isinstance(imgs, (str, os.PathLike)) or not isinstance(imgs, Iterable):
         raise InvalidInputError(f"imgs must be a list of file names or images; got {describe(imgs)}")
     read = imread or _read_like_lesson
+    if isinstance(imgs, np.ndarray) and are_uint8_patches(imgs):
+        return options.compute(imgs)
     items: list[Any] = list(imgs)
-    vectors: list[NDArray[np.float64]] = []
-    for start in range(0, len(items), CHUNK):
+    vectors: list[NDArray[Any]] = []
+    for start in range(0, len(items), _CHUNK):
         images = [
             read(os.fspath(item)) if isinstance(item, (str, os.PathLike)) else item
-            for item in items[start : start + CHUNK]
+            for item in items[start : start + _CHUNK]
         ]
         vectors += options.compute([check_lesson_image(image, "imgs") for image in images])
     return vectors
@@ -233,25 +239,23 @@ class FeatureOptions:
         width, height = self.spatial_size
         if (self.spatial_feat and width != height) or (self.hist_feat and self.hist_range != (0, 256)):
             return None
-        options = dataclasses.asdict(self) | {"color_space": color_space, "spatial_size": width}
+        options = vars(self) | {"color_space": color_space, "spatial_size": width}
         del options["hist_range"], options["spatial_order"]
         try:
             return FeatureParams(**options)
         except InvalidInputError:
             return None
 
-    def compute(self, images: list[Image]) -> list[NDArray[np.float64]]:
-        """Feature vectors of images in the lesson's order, float64."""
+    def compute(self, images: Images) -> list[NDArray[Any]]:
+        """Feature vectors of images in the lesson's order: float32 from the kernels, else float64."""
         params = self.library_params(self.color_space)
         if params is None or not are_uint8_patches(images):
             return [self._compute_one(image) for image in images]
-        features = library.extract_features(np.stack(images), params)
-        vectors = features.astype(np.float64)
+        features = library.extract_features(np.asarray(images), params)
         if self.spatial_feat and self.spatial_order == "interleaved":
-            size, length = params.spatial_size, params.spatial_length
-            by_channel = features[:, :length].reshape(-1, 3, size, size)
-            vectors[:, :length] = by_channel.transpose(0, 2, 3, 1).reshape(len(features), length)
-        return list(vectors)
+            spatial = features[:, : params.spatial_length]
+            spatial[:] = cv2.merge(np.split(spatial, 3, axis=1)).reshape(spatial.shape)
+        return list(features)
 
     def _compute_one(self, image: Image) -> NDArray[np.float64]:
         """Feature vector of one image by the lesson's steps."""
@@ -287,7 +291,9 @@ class FeatureOptions:
         return columns
 
 
-def are_uint8_patches(images: list[Image]) -> bool:
-    """Whether the library's kernels can compute the features of all of some images at once."""
+def are_uint8_patches(images: Images) -> bool:
+    """Whether images are 64x64 uint8 RGB, whose features the library's kernels compute all at once."""
     shape = (PATCH_SIZE, PATCH_SIZE, 3)
+    if isinstance(images, np.ndarray):
+        return images.dtype == np.uint8 and images.shape[1:] == shape
     return bool(images) and all(image.dtype == np.uint8 and image.shape == shape for image in images)

@@ -24,7 +24,7 @@ from vehicle_detection.course.features import (
     count_bins,
 )
 from vehicle_detection.course.heat import draw_boxes
-from vehicle_detection.course.vectors import CHUNK, FeatureOptions, accept_cspace, are_uint8_patches
+from vehicle_detection.course.vectors import FeatureOptions, accept_cspace, are_uint8_patches
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import PATCH_SIZE, FeatureParams, PixelBand
 from vehicle_detection.search import BandSearch
@@ -34,6 +34,8 @@ Formula = Literal["old", "new"]
 ResizeOrder = Literal["after conversion", "before conversion"]
 
 _FORMULAS = ("old", "new")
+# Number of windows whose features are in memory at a time.
+_CHUNK = 512
 # Color spaces whose three channels have values 0-1 in a float image and up to 255 in a uint8 image.
 _UNIT_SPACES = ("RGB", "YUV", "YCrCb")
 
@@ -207,10 +209,10 @@ def search_windows(
         )
     rows = windows.boxes if isinstance(windows, Detections) else windows
     found: list[Any] = []
-    for start in range(0, len(corners), CHUNK):
+    for start in range(0, len(corners), _CHUNK):
         patches = [
             np.asarray(cv2.resize(image[y1:y2, x1:x2], (PATCH_SIZE, PATCH_SIZE)))
-            for x1, y1, x2, y2 in corners[start : start + CHUNK]
+            for x1, y1, x2, y2 in corners[start : start + _CHUNK]
         ]
         hits = _classify_patches(patches, options, clf, scaler)
         found += [rows[start + index] for index in np.flatnonzero(hits)]
@@ -415,8 +417,8 @@ def _search_band(
         indices = bin_indices(converted, options.hist_bins, options.hist_range)
     positions = np.indices((rows, columns)).reshape(2, -1).T
     hits = []
-    for start in range(0, len(positions), CHUNK):
-        features = np.empty((len(positions[start : start + CHUNK]), options.length))
+    for start in range(0, len(positions), _CHUNK):
+        features = np.empty((len(positions[start : start + _CHUNK]), options.length))
         for vector, (row, column) in zip(features, positions[start:].tolist()):
             y, x = row * cells_per_step * cell, column * cells_per_step * cell
             parts = _window_color(converted, indices, y, x, options)
@@ -461,8 +463,25 @@ def _fast_scores(
         return None
     height, width = converted.shape[:2]
     band = PixelBand(0, 0, width, height, (PATCH_SIZE, PATCH_SIZE), (params.pix_per_cell,) * 2)
-    with BandSearch(classifier, n_jobs=1) as search:
-        return search.score_map(converted, band)
+    return _open_search(classifier).score_map(converted, band)
+
+
+# The last model and its search: a system calls `find_cars` for each scale and frame with the same model.
+_last_search: tuple[VehicleClassifier, BandSearch] | None = None
+
+
+def _open_search(classifier: VehicleClassifier) -> BandSearch:
+    """Return a search with a one-template classifier: the last one if its model is the same."""
+    global _last_search
+    last = _last_search
+    if last is not None and last[0].params == classifier.params:
+        (old,), (new,) = last[0].templates, classifier.templates
+        names = ("mean", "scale", "coef", "intercept")
+        if all(np.array_equal(getattr(old, name), getattr(new, name)) for name in names):
+            return last[1]
+    search = BandSearch(classifier, n_jobs=1)
+    _last_search = (classifier, search)
+    return search
 
 
 def _classify_patches(

@@ -1,0 +1,716 @@
+"""The lesson functions equal their definition, and every published call form binds."""
+
+import inspect
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.ndimage import label
+from sklearn.linear_model import LogisticRegression, SGDClassifier
+from sklearn.naive_bayes import GaussianNB
+from sklearn.preprocessing import MinMaxScaler, RobustScaler, StandardScaler
+from sklearn.svm import SVC, LinearSVC
+from sklearn.tree import DecisionTreeClassifier
+
+import vehicle_detection.course as lesson
+from tests import lesson_reference as reference
+from vehicle_detection import Detections, read_image, write_image
+from vehicle_detection.course import windows as windows_module
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.synthetic import render_patches, render_scene
+
+# The kernels compute HOG in float32, scikit-image in float64: values up to 1.
+HOG_TOLERANCE = 5e-6
+
+
+def frame_of(dtype, seed=0, shape=(208, 330)):
+    """A rendered scene as uint8, float 0-1 or, for "0-255", float 0-255."""
+    image = render_scene(shape=shape, focal_px=300, vehicles=4, random_state=seed).image
+    if dtype == "uint8":
+        return image
+    return image.astype(np.float32) / (255 if dtype == "0-1" else 1)
+
+
+DTYPES = ("uint8", "0-1", "0-255")
+FRAMES = {dtype: frame_of(dtype) for dtype in DTYPES}
+PATCHES, LABELS = render_patches(60, random_state=5)
+DETECTIONS = Detections(np.array([[3.0, 4, 40, 50], [20, 10, 60, 40]]), np.array([1.0, 2.0]))
+PAIRS = [((3, 4), (40, 50)), ((20, 10), (60, 40))]
+
+
+def trained(X, y=LABELS, clf=None, scaler=None):
+    scaler = (scaler or StandardScaler()).fit(X)
+    clf = clf or LinearSVC(C=0.01, random_state=0, max_iter=10_000)
+    return clf.fit(scaler.transform(X), y), scaler
+
+
+@pytest.fixture(scope="module")
+def models():
+    """Options of `extract_features` and a classifier for them, trained on uint8 and on float 0-1 patches."""
+    found = {}
+    for name, options in {
+        "all": {"color_space": "YCrCb", "spatial_size": (16, 16), "hist_bins": 16, "hog_channel": "ALL"},
+        "hog": {
+            "color_space": "YUV",
+            "orient": 11,
+            "pix_per_cell": 16,
+            "hog_channel": "ALL",
+            "spatial_feat": False,
+            "hist_feat": False,
+        },
+        "luv": {"color_space": "LUV", "spatial_size": (16, 16), "hist_bins": 16, "orient": 8},
+        "color": {"color_space": "HSV", "spatial_size": (8, 8), "hist_bins": 8, "hog_feat": False},
+    }.items():
+        for dtype in ("uint8", "0-1"):
+            images = PATCHES if dtype == "uint8" else PATCHES.astype(np.float32) / 255
+            features = np.array(reference.extract_features(images, **options))
+            found[name, dtype] = SimpleNamespace(options=options, X=features, model=trained(features))
+    return found
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("cell", [4, 7, 8, 16])
+@pytest.mark.parametrize("transform_sqrt", [False, True])
+def test_hog_equals_scikit_image(dtype, cell, transform_sqrt):
+    channel = FRAMES[dtype][:75, :101, 1]
+    options = {"feature_vec": False, "transform_sqrt": transform_sqrt}
+    found = lesson.get_hog_features(channel, 9, cell, 2, **options)
+    expected = reference.get_hog_features(channel, 9, cell, 2, **options)
+    assert found.dtype == expected.dtype
+    assert found.flags.c_contiguous
+    np.testing.assert_allclose(found, expected, rtol=0, atol=HOG_TOLERANCE)
+
+
+def test_hog_of_other_numbers():
+    channel = FRAMES["uint8"][..., 0]
+    for dtype in (np.float64, np.int64, np.uint16):
+        found = lesson.get_hog_features(channel.astype(dtype), 8, 8, 3)
+        expected = reference.get_hog_features(channel.astype(dtype), 8, 8, 3)
+        assert found.dtype == np.float64
+        np.testing.assert_allclose(found, expected, rtol=0, atol=HOG_TOLERANCE)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_the_hog_picture_equals_scikit_image(dtype):
+    channel = FRAMES[dtype][:64, :80, 0]
+    features, picture = lesson.get_hog_features(channel, 9, 8, 2, True, False)
+    expected, expected_picture = reference.get_hog_features(channel, 9, 8, 2, True, False)
+    np.testing.assert_allclose(features, expected, rtol=0, atol=HOG_TOLERANCE)
+    np.testing.assert_allclose(picture, expected_picture, rtol=1e-6)
+    for name in ("visualise", "visualize"):
+        np.testing.assert_array_equal(lesson.get_hog_features(channel, 9, 8, 2, **{name: True})[1], picture)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("order", ["interleaved", "channels"])
+def test_spatial_bins(dtype, order):
+    for size in ((32, 32), (16, 8)):
+        found = lesson.bin_spatial(FRAMES[dtype], size, order=order)
+        expected = reference.bin_spatial(FRAMES[dtype], size, order=order)
+        assert found.dtype == expected.dtype
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+    converted = cv2.cvtColor(FRAMES[dtype], cv2.COLOR_RGB2HSV)
+    np.testing.assert_array_equal(
+        lesson.bin_spatial(FRAMES[dtype], color_space="HSV"), lesson.bin_spatial(converted)
+    )
+
+
+@given(
+    st.sampled_from(DTYPES),
+    st.integers(1, 70),
+    st.sampled_from([(0, 256), (0, 1), (0, 255), (10, 200), (-0.5, 0.7), None]),
+)
+def test_histograms_equal_numpy(dtype, bins, limits):
+    found = lesson.color_hist(FRAMES[dtype][:20, :30], bins, limits)
+    expected = reference.color_hist(FRAMES[dtype][:20, :30], bins, limits)
+    assert found.dtype == expected.dtype
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("conv", ["RGB2YCrCb", "BGR2YCrCb", "RGB2LUV", "BGR2HLS", "RGB2HSV", "RGB2YUV"])
+@pytest.mark.parametrize("dtype", ["uint8", "0-1"])
+def test_color_conversion_is_that_of_opencv(conv, dtype):
+    found, expected = (module.convert_color(FRAMES[dtype], conv) for module in (lesson, reference))
+    assert found.dtype == expected.dtype
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_color_conversion_by_the_name_of_the_space():
+    image = FRAMES["uint8"]
+    np.testing.assert_array_equal(lesson.convert_color(image, "LAB"), cv2.cvtColor(image, cv2.COLOR_RGB2LAB))
+    copy = lesson.convert_color(image, "RGB")
+    assert copy is not image
+    np.testing.assert_array_equal(copy, image)
+    assert lesson.convert_color(image / 255.0).dtype == np.float32
+
+
+FEATURE_OPTIONS = [
+    {},
+    {"color_space": "YCrCb", "hog_channel": "ALL"},
+    {"color_space": "LUV", "spatial_size": (16, 16), "hist_bins": 16, "orient": 8, "transform_sqrt": True},
+    {"color_space": "HLS", "spatial_size": (16, 8), "hog_channel": 2},
+    {"color_space": "HSV", "hist_range": (0, 180), "hog_channel": 1, "cell_per_block": 3},
+    {"color_space": "YUV", "pix_per_cell": 16, "orient": 11, "spatial_feat": False, "hist_feat": False},
+    {"color_space": "LAB", "spatial_order": "channels", "hog_channel": "ALL"},
+    {"hog_feat": False, "spatial_size": (20, 20)},
+    {"hist_range": None, "pix_per_cell": 12},
+]
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "0-1"])
+@pytest.mark.parametrize("options", FEATURE_OPTIONS)
+def test_features_equal_the_definition(dtype, options):
+    if dtype == "0-1" and options.get("transform_sqrt"):
+        options = {**options, "color_space": "YCrCb"}
+    images = PATCHES[::12] if dtype == "uint8" else PATCHES[::12].astype(np.float32) / 255
+    found = lesson.extract_features(images, **options)
+    expected = reference.extract_features(images, **options)
+    assert isinstance(found, list)
+    for vector, other in zip(found, expected, strict=True):
+        assert vector.dtype == np.float64 or (vector.dtype == np.float32 and dtype == "uint8")
+        np.testing.assert_allclose(vector, other, rtol=1e-6, atol=HOG_TOLERANCE)
+    single = lesson.single_img_features(images[0], **options)
+    assert single.dtype == np.float64
+    np.testing.assert_allclose(single, expected[0], rtol=1e-6, atol=HOG_TOLERANCE)
+
+
+def test_features_of_images_that_are_not_64x64():
+    image = FRAMES["uint8"]
+    found, expected = (module.single_img_features(image, "YCrCb") for module in (lesson, reference))
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=HOG_TOLERANCE)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("patches")
+    for index, patch in enumerate(PATCHES):
+        write_image(folder / f"{index:03d}.png", patch)
+        write_image(folder / f"{index:03d}.jpg", patch)
+    return folder
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_files_are_read_as_in_the_lesson(files, suffix):
+    names = sorted(str(path) for path in files.glob(f"*.{suffix}"))[::20]
+    found, expected = (module.extract_features(names, "YCrCb") for module in (lesson, reference))
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=HOG_TOLERANCE)
+    assert np.max(found[0][:3072]) <= (1 if suffix == "png" else 255)
+    if suffix == "png":
+        as_bytes = lesson.extract_features(names, "YCrCb", imread=read_image)
+        np.testing.assert_array_equal(as_bytes, lesson.extract_features(PATCHES[::20], "YCrCb"))
+    mixed = lesson.extract_features([names[0], reference.read(names[1])], "YCrCb")
+    np.testing.assert_array_equal(mixed, found[:2])
+
+
+def test_cspace_selects_the_features_of_the_earlier_quizzes():
+    hog = lesson.extract_features(PATCHES[:2], cspace="YUV", orient=11, pix_per_cell=16, hog_channel="ALL")
+    assert hog[0].shape == (3 * 3 * 3 * 4 * 11,)
+    color = lesson.extract_features(
+        PATCHES[:2], cspace="LUV", spatial_size=(8, 8), hist_bins=4, hist_range=(0, 256)
+    )
+    assert color[0].shape == (192 + 12,)
+    whole = lesson.extract_features(PATCHES[:2], cspace="LUV", hist_bins=4, orient=9)
+    assert whole[0].shape == (3072 + 12 + 1764,)
+    told = lesson.extract_features(PATCHES[:2], cspace="LUV", orient=9, hist_feat=True)
+    assert told[0].shape == (3072 + 96 + 1764,)
+    with pytest.raises(InvalidInputError, match="same option"):
+        lesson.extract_features(PATCHES[:2], cspace="LUV", color_space="LUV")
+
+
+@given(
+    st.integers(1, 90),
+    st.integers(0, 50),
+    st.integers(1, 200),
+    st.sampled_from([0, 0.25, 0.5, 0.6, 0.75, 0.85]),
+    st.sampled_from(["old", "new"]),
+)
+def test_windows_are_those_of_the_lesson(side, start, stop, overlap, formula):
+    if int(side * (1 - overlap)) < 1 or start > stop:
+        return
+    image = np.zeros((120, 200, 3), np.uint8)
+    arguments = ([start, stop], [None, None], (side, 40), (overlap, 0.5))
+    found, expected = (
+        module.slide_window(image, *arguments, formula=formula) for module in (lesson, reference)
+    )
+    assert found == expected
+    assert arguments[:2] == ([start, stop], [None, None])
+
+
+def test_the_first_system_has_130_windows():
+    lists = [
+        lesson.slide_window(np.zeros((720, 1280, 3)), [650, None], rows, window, overlap)
+        for rows, window, overlap in [
+            ([395, 530], (96, 96), (0.9, 0.5)),
+            ([380, 590], (110, 145), (0.7, 0.6)),
+            ([370, 590], (155, 165), (0.6, 0.5)),
+            ([400, 700], (170, 200), (0.6, 0.5)),
+        ]
+    ]
+    assert [len(windows) for windows in lists] == [69, 36, 9, 16]
+    assert max(x2 for windows in lists for _, (x2, _) in windows) > 1280
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "0-1"])
+@pytest.mark.parametrize("name", ["all", "luv", "hog", "color"])
+def test_window_hits_equal_the_definition(models, dtype, name):
+    case, image = models[name, dtype], FRAMES[dtype]
+    windows = reference.slide_window(image, [None, None], [96, 184], (64, 64), (0.875, 0.75))
+    windows += reference.slide_window(image, [40, None], [80, 200], (96, 80), (0.9, 0.5))
+    assert max(x2 for _, (x2, _) in windows) > image.shape[1]
+    found, expected = (
+        module.search_windows(image, windows, *case.model, **case.options) for module in (lesson, reference)
+    )
+    assert 0 < len(expected) < len(windows)
+    assert found == expected
+
+
+@pytest.mark.parametrize(
+    ("clf", "scaler"),
+    [
+        (GaussianNB(), StandardScaler()),
+        (DecisionTreeClassifier(random_state=0), StandardScaler()),
+        (SVC(), StandardScaler()),
+        (SVC(kernel="linear"), StandardScaler()),
+        (LogisticRegression(max_iter=1000), StandardScaler()),
+        (SGDClassifier(random_state=0, max_iter=5, tol=None), StandardScaler(with_mean=False)),
+        (LinearSVC(random_state=0), MinMaxScaler()),
+        (LinearSVC(random_state=0), RobustScaler()),
+    ],
+    ids=lambda estimator: type(estimator).__name__,
+)
+@pytest.mark.parametrize("labels", [(0, 1), (-1, 1), (1, 2)])
+def test_any_classifier_of_scikit_learn(models, clf, scaler, labels):
+    case = models["all", "uint8"]
+    model = trained(case.X, np.where(LABELS, labels[1], labels[0]), clf, scaler)
+    image = FRAMES["uint8"]
+    windows = reference.slide_window(image, [None, None], [70, 170], (64, 64), (0.6, 0.6))
+    found, expected = (
+        module.search_windows(image, windows, *model, **case.options) for module in (lesson, reference)
+    )
+    assert found == expected
+    arguments = (80, 190, 1.5, *model, 9, 8, 2, (16, 16), 16)
+    found, expected = (
+        module.find_car_windows(image, *arguments, divide_by=1) for module in (lesson, reference)
+    )
+    assert found == expected
+
+
+BAND_OPTIONS = [
+    {},
+    {"formula": "new", "cells_per_step": 1},
+    {"resize": "before conversion", "cells_per_step": 3},
+]
+
+
+def band_arguments(case):
+    """Positional and keyword options of `find_cars` for a model."""
+    options = dict(case.options)
+    positional = [
+        options.pop("orient", 9), options.pop("pix_per_cell", 8), 2, options.pop("spatial_size", (32, 32)),
+        options.pop("hist_bins", 32),
+    ]  # fmt: skip
+    return positional, {"hog_channel": 0, **options}
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "0-1"])
+@pytest.mark.parametrize("options", BAND_OPTIONS)
+@pytest.mark.parametrize("scale", [1, 1.3, 0.8])
+@pytest.mark.parametrize("name", ["all", "hog", "luv", "color"])
+def test_find_cars_equals_the_definition(models, dtype, options, scale, name):
+    # Models of float patches search the uint8 frame divided by 255, as in the quiz.
+    case, image = models[name, dtype], FRAMES["uint8"]
+    positional, keywords = band_arguments(case)
+    keywords |= options | {"divide_by": 1 if dtype == "uint8" else 255}
+    arguments = (90, 90 + round(100 * scale), scale, *case.model, *positional)
+    found, expected = (
+        module.find_car_windows(image, *arguments, **keywords) for module in (lesson, reference)
+    )
+    assert found == expected
+    drawn = lesson.find_cars(image, *arguments, **keywords)
+    np.testing.assert_array_equal(drawn, reference.draw_boxes(image, expected))
+
+
+def test_find_cars_finds_something(models):
+    for dtype, divide_by in (("uint8", 1), ("0-1", 255)):
+        case = models["all", dtype]
+        boxes = lesson.find_car_windows(
+            FRAMES["uint8"], 60, 200, 1, *case.model, 9, 8, 2, (16, 16), 16, divide_by=divide_by
+        )
+        assert 0 < len(boxes) < 100
+
+
+def test_the_fast_search_has_the_scores_of_the_lesson(models, monkeypatch):
+    case = models["all", "uint8"]
+    options = windows_module.FeatureOptions(**(
+        {"orient": 9, "pix_per_cell": 8, "cell_per_block": 2, "spatial_feat": True, "hist_feat": True}
+        | {"hog_feat": True, "hist_range": (0, 256), "transform_sqrt": False, "spatial_order": "interleaved"}
+        | case.options
+    ))  # fmt: skip
+    band = cv2.cvtColor(FRAMES["uint8"], cv2.COLOR_RGB2YCrCb)
+    fast = windows_module._fast_scores(band, options, *case.model)
+    svc, scaler = case.model
+    seen = []
+    monkeypatch.setattr(windows_module, "_fast_scores", lambda *_: None)
+    monkeypatch.setattr(
+        windows_module,
+        "_predicts_car",
+        lambda features, *_: seen.append(svc.decision_function(scaler.transform(features))) or seen[-1] > 0,
+    )
+    hits = windows_module._search_band(band, options, svc, scaler, 1, "new")
+    np.testing.assert_allclose(fast.ravel(), np.concatenate(seen), rtol=0, atol=1e-3)
+    assert hits.shape == fast.shape
+
+
+def test_the_fast_search_is_used_where_it_applies(models, monkeypatch):
+    case = models["all", "uint8"]
+    monkeypatch.setattr(windows_module, "_predicts_car", None)
+    lesson.find_car_windows(FRAMES["uint8"], 60, 200, 1.5, *case.model, 9, 8, 2, (16, 16), 16, divide_by=1)
+    lesson.search_windows(FRAMES["uint8"], PAIRS, *case.model, **case.options)
+
+
+def test_a_changed_model_is_noticed(models):
+    case = models["all", "uint8"]
+    scaler, svc = case.model[1], LinearSVC(C=0.01, random_state=0, max_iter=10_000)
+    svc.fit(scaler.transform(case.X), LABELS)
+
+    def search(scale=1):
+        arguments = (60, 200, scale, svc, scaler, 9, 8, 2, (16, 16), 16)
+        return lesson.find_car_windows(FRAMES["uint8"], *arguments, divide_by=1)
+
+    before = search()
+    assert before == search()
+    svc.intercept_ += 10
+    everything = search()
+    assert len(everything) > 10 * len(before) > 0
+    svc.intercept_ -= 10
+    svc.coef_ *= -1
+    svc.intercept_ *= -1
+    # All windows that were not found before.
+    assert sorted(search() + before) == sorted(everything)
+
+
+def test_cells_that_do_not_divide_a_window():
+    options = {"color_space": "YCrCb", "spatial_size": (16, 16), "hist_bins": 16, "pix_per_cell": 12}
+    for hist_range in ((0, 256), None):
+        features = reference.extract_features(PATCHES, **options, hist_range=hist_range)
+        model = trained(features)
+        arguments = (FRAMES["uint8"], 60, 200, 1, *model, 9, 12, 2, (16, 16), 16)
+        keywords = {"hog_channel": 0, "formula": "new", "divide_by": 1, "hist_range": hist_range}
+        found, expected = (module.find_car_windows(*arguments, **keywords) for module in (lesson, reference))
+        assert found == expected
+
+
+def test_a_float_image_from_0_to_1_is_not_divided(models):
+    case = models["all", "0-1"]
+    arguments = (60, 200, 1, *case.model, 9, 8, 2, (16, 16), 16)
+    found = [lesson.find_car_windows(FRAMES[dtype], *arguments) for dtype in DTYPES]
+    assert found[0] == found[1] == found[2] != []
+
+
+def test_a_mismatch_of_the_range_of_values_warns(models):
+    for trained_on, given_as in (("uint8", "0-1"), ("0-1", "uint8"), ("0-1", "0-255")):
+        case = models["all", trained_on]
+        with pytest.warns(UserWarning, match="the scaler was fitted on values 0-"):
+            lesson.search_windows(FRAMES[given_as], PAIRS, *case.model, **case.options)
+    case = models["all", "uint8"]
+    with pytest.warns(UserWarning, match="divide_by=1"):
+        lesson.find_cars(FRAMES["uint8"], 60, 200, 1, *case.model, 9, 8, 2, (16, 16), 16)
+    with pytest.warns(UserWarning, match="0-255"):
+        lesson.find_cars(
+            FRAMES["uint8"], 60, 200, 1, *models["all", "0-1"].model, 9, 8, 2, (16, 16), 16, divide_by=1
+        )
+
+
+@given(
+    st.lists(st.tuples(*[st.integers(0, 70)] * 4), max_size=12),
+    st.sampled_from([np.float64, np.float32, np.int64, np.uint8]),
+    st.integers(0, 4),
+)
+def test_heat_is_added_in_place(values, dtype, threshold):
+    boxes = [((min(x1, x2), min(y1, y2)), (max(x1, x2), max(y1, y2))) for x1, y1, x2, y2 in values]
+    start = np.random.default_rng(0).integers(0, 4, (40, 60)).astype(dtype)
+    heat, expected = start.copy(), start.copy()
+    assert lesson.add_heat(heat, boxes) is heat
+    reference.add_heat(expected, boxes)
+    np.testing.assert_array_equal(heat, expected)
+    assert lesson.apply_threshold(heat, threshold) is heat
+    np.testing.assert_array_equal(heat, reference.apply_threshold(expected, threshold))
+    drawn, expected = (
+        module.draw_labeled_bboxes(np.full((40, 60, 3), 9, np.uint8), label(heat))
+        for module in (lesson, reference)
+    )
+    np.testing.assert_array_equal(drawn, expected)
+
+
+def test_decayed_heat_keeps_its_fractions():
+    heat = np.full((40, 60), 0.9 / 7)
+    lesson.add_heat(heat, PAIRS)
+    np.testing.assert_array_equal(heat, reference.add_heat(np.full((40, 60), 0.9 / 7), PAIRS))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_boxes_are_drawn_on_a_copy(dtype):
+    image = FRAMES[dtype]
+    before = image.copy()
+    for arguments in ((PAIRS,), (PAIRS, (255, 0, 0), 3), (PAIRS, (0, 1, 0), -1)):
+        found, expected = (module.draw_boxes(image, *arguments) for module in (lesson, reference))
+        assert found.dtype == image.dtype
+        np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(image, before)
+    flipped = image[:, ::-1]
+    np.testing.assert_array_equal(lesson.draw_boxes(flipped, []), flipped)
+
+
+def test_boxes_in_every_form():
+    image, heat = FRAMES["uint8"], np.zeros((208, 330))
+    lesson.add_heat(heat, PAIRS)
+    expected = lesson.draw_boxes(image, PAIRS)
+    for boxes in (
+        np.array(PAIRS),
+        np.array(PAIRS).reshape(-1, 4),
+        DETECTIONS,
+        tuple(PAIRS),
+        DETECTIONS.boxes,
+    ):
+        np.testing.assert_array_equal(lesson.draw_boxes(image, boxes), expected)
+        np.testing.assert_array_equal(lesson.add_heat(np.zeros((208, 330)), boxes), heat)
+    assert not lesson.add_heat(np.zeros((4, 4)), Detections.empty()).any()
+
+
+SIGNATURES = {
+    "get_hog_features": "img, orient, pix_per_cell, cell_per_block, vis=False, feature_vec=True",
+    "bin_spatial": "img, size=(32, 32)",
+    "color_hist": "img, nbins=32, bins_range=(0, 256)",
+    "extract_features": "imgs, color_space='RGB', spatial_size=(32, 32), hist_bins=32, orient=9, "
+    "pix_per_cell=8, cell_per_block=2, hog_channel=0, spatial_feat=True, hist_feat=True, hog_feat=True",
+    "single_img_features": "img, color_space='RGB', spatial_size=(32, 32), hist_bins=32, orient=9, "
+    "pix_per_cell=8, cell_per_block=2, hog_channel=0, spatial_feat=True, hist_feat=True, hog_feat=True",
+    "slide_window": "img, x_start_stop=(None, None), y_start_stop=(None, None), xy_window=(64, 64), "
+    "xy_overlap=(0.5, 0.5)",
+    "draw_boxes": "img, bboxes, color=(0, 0, 255), thick=6",
+    "search_windows": "img, windows, clf, scaler, color_space='RGB', spatial_size=(32, 32), hist_bins=32, "
+    "hist_range=(0, 256), orient=9, pix_per_cell=8, cell_per_block=2, hog_channel=0, spatial_feat=True, "
+    "hist_feat=True, hog_feat=True",
+    "find_cars": "img, ystart, ystop, scale, svc, X_scaler, orient, pix_per_cell, cell_per_block, "
+    "spatial_size, hist_bins",
+    "convert_color": "img, conv='RGB2YCrCb'",
+    "add_heat": "heatmap, bbox_list",
+    "apply_threshold": "heatmap, threshold",
+    "draw_labeled_bboxes": "img, labels",
+}
+
+
+@pytest.mark.parametrize("name", SIGNATURES)
+def test_the_signature_is_the_lessons(name):
+    parameters = inspect.signature(getattr(lesson, name)).parameters.values()
+    positional = [
+        parameter.replace(annotation=parameter.empty)
+        for parameter in parameters
+        if parameter.kind is parameter.POSITIONAL_OR_KEYWORD
+    ]
+    assert str(inspect.Signature(positional)) == f"({SIGNATURES[name]})"
+
+
+def test_a_star_import_brings_the_lesson_functions():
+    names = {}
+    exec("from vehicle_detection.course import *", names)
+    assert set(SIGNATURES) | {"find_car_windows"} == set(names) - {"__builtins__"}
+
+
+def is_vector(length):
+    return lambda value: isinstance(value, np.ndarray) and value.shape == (length,)
+
+
+def is_list_of(count, length):
+    return lambda value: isinstance(value, list) and [len(vector) for vector in value] == [length] * count
+
+
+def is_pair_list(value):
+    return isinstance(value, list) and all(np.shape(pair) == (2, 2) for pair in value)
+
+
+def is_image(value):
+    return isinstance(value, np.ndarray) and value.shape == (208, 330, 3) and value.dtype == np.uint8
+
+
+def is_hog_pair(shape):
+    return lambda value: isinstance(value, tuple) and value[0].shape == shape and value[1].shape == (64, 64)
+
+
+# As in published systems: `d` holds an image, patches, files and a model.
+CALL_FORMS = [
+    ("get_hog_features(d.gray, 9, 8, 2)", is_vector(1764)),
+    ("get_hog_features(d.gray, 9, 8, 2, False, True)", is_vector(1764)),
+    ("get_hog_features(d.gray, 9, 8, 2, vis=False, feature_vec=True)", is_vector(1764)),
+    ("get_hog_features(d.gray, 9, 8, 2, feature_vec=False)", lambda value: value.shape == (7, 7, 2, 2, 9)),
+    ("get_hog_features(d.gray, 9, 8, 2, True)", is_hog_pair((1764,))),
+    ("get_hog_features(d.gray, 9, 8, 2, vis=True)", is_hog_pair((1764,))),
+    ("get_hog_features(d.gray, 9, 8, 2, vis=True, feature_vec=False)", is_hog_pair((7, 7, 2, 2, 9))),
+    ("get_hog_features(d.gray, 9, 8, 2, visualise=True, feature_vec=True)", is_hog_pair((1764,))),
+    ("get_hog_features(d.gray, orient=9, pix_per_cell=8, cell_per_block=2)", is_vector(1764)),
+    ("get_hog_features(img=d.gray, orient=9, pix_per_cell=8, cell_per_block=2, vis=False)", is_vector(1764)),
+    ("get_hog_features(d.patch[:, :, 0], 11, 16, 2, vis=False, feature_vec=True)", is_vector(396)),
+    ("get_hog_features(d.float_patch[:, :, 2], 9, 8, 2, vis=False, feature_vec=True)", is_vector(1764)),
+    ("get_hog_features(d.gray, 9, 8, 2, transform_sqrt=True)", is_vector(1764)),
+    ("bin_spatial(d.patch)", is_vector(3072)),
+    ("bin_spatial(d.patch, (16, 16))", is_vector(768)),
+    ("bin_spatial(d.patch, size=(16, 16))", is_vector(768)),
+    ("bin_spatial(d.patch, size=16)", is_vector(768)),
+    ("bin_spatial(d.patch, color_space='HSV', size=(32, 32))", is_vector(3072)),
+    ("color_hist(d.patch)", is_vector(96)),
+    ("color_hist(d.patch, 16)", is_vector(48)),
+    ("color_hist(d.patch, nbins=16)", is_vector(48)),
+    ("color_hist(d.patch, nbins=32, bins_range=(0, 256))", is_vector(96)),
+    ("color_hist(d.float_patch, 32, (0, 1))", is_vector(96)),
+    ("convert_color(d.image)", is_image),
+    ("convert_color(d.image, conv='RGB2YCrCb')", is_image),
+    ("convert_color(d.image, 'BGR2YCrCb')", is_image),
+    ("extract_features(d.files)", is_list_of(3, 4932)),
+    ("extract_features(d.files, 'YCrCb', (16, 16), 32, 9, 8, 2, 'ALL', True, True, True)",
+     is_list_of(3, 6156)),
+    ("extract_features(d.files, color_space='YCrCb', spatial_size=(32, 32), hist_bins=32, orient=9, "
+     "pix_per_cell=8, cell_per_block=2, hog_channel='ALL', spatial_feat=True, hist_feat=True, "
+     "hog_feat=True)", is_list_of(3, 8460)),
+    ("extract_features(d.files, cspace='YUV', orient=9, pix_per_cell=8, cell_per_block=2, "
+     "hog_channel='ALL')", is_list_of(3, 5292)),
+    ("extract_features(d.files, cspace='RGB', spatial_size=(32, 32), hist_bins=32, "
+     "hist_range=(0, 256))", is_list_of(3, 3168)),
+    ("extract_features(d.patches, spatial_feat=False, hist_feat=False)", is_list_of(3, 1764)),
+    ("extract_features(list(d.patches), color_space='HLS', hog_feat=False)", is_list_of(3, 3168)),
+    ("single_img_features(d.patch)", is_vector(4932)),
+    ("single_img_features(d.patch, color_space='YCrCb', hog_channel='ALL')", is_vector(8460)),
+    ("single_img_features(d.patch, 'YCrCb', (16, 16), 32, 9, 8, 2, 'ALL', True, True, True)",
+     is_vector(6156)),
+    ("slide_window(d.image)", is_pair_list),
+    ("slide_window(d.image, [None, None], [90, None], (64, 64), (0.75, 0.75))", is_pair_list),
+    ("slide_window(d.image, x_start_stop=[None, None], y_start_stop=[90, 200], xy_window=(96, 96), "
+     "xy_overlap=(0.5, 0.5))", is_pair_list),
+    ("slide_window(d.image, y_start_stop=(90, 200), xy_window=[48, 48])", is_pair_list),
+    ("draw_boxes(d.image, d.boxes)", is_image),
+    ("draw_boxes(d.image, d.boxes, (0, 0, 255), 6)", is_image),
+    ("draw_boxes(d.image, d.boxes, color=(255, 0, 0), thick=3)", is_image),
+    ("search_windows(d.image, d.boxes, d.svc, d.scaler, 'YCrCb', (16, 16), 16, (0, 256), 9, 8, 2, 'ALL', "
+     "True, True, True)", is_pair_list),
+    ("search_windows(d.image, d.boxes, d.svc, d.scaler, color_space='YCrCb', spatial_size=(16, 16), "
+     "hist_bins=16, orient=9, pix_per_cell=8, cell_per_block=2, hog_channel='ALL', spatial_feat=True, "
+     "hist_feat=True, hog_feat=True)", is_pair_list),
+    ("search_windows(d.image, [], clf=d.svc, scaler=d.scaler, color_space='YCrCb', spatial_size=(16, 16), "
+     "hist_bins=16, hog_channel='ALL')", lambda value: value == []),
+    ("find_cars(d.image, 90, 200, 1.5, d.svc, d.scaler, 9, 8, 2, (16, 16), 16, divide_by=1)", is_image),
+    ("find_cars(img=d.image, ystart=90, ystop=200, scale=1, svc=d.svc, X_scaler=d.scaler, orient=9, "
+     "pix_per_cell=8, cell_per_block=2, spatial_size=(16, 16), hist_bins=16, divide_by=1)", is_image),
+    ("find_car_windows(d.image, 90, 200, 1.0, d.svc, d.scaler, 9, 8, 2, (16, 16), 16, divide_by=1)",
+     is_pair_list),
+    ("find_car_windows(d.image, None, None, 1.0, d.svc, d.scaler, 9, 8, 2, (16, 16), 16, divide_by=1, "
+     "color_space='YCrCb')", is_pair_list),
+    ("add_heat(d.heat, d.boxes)", lambda value: value.shape == (208, 330)),
+    ("apply_threshold(d.heat, 1)", lambda value: value.shape == (208, 330)),
+    ("apply_threshold(heatmap=d.heat, threshold=2)", lambda value: value.shape == (208, 330)),
+    ("draw_labeled_bboxes(d.image.copy(), d.labels)", is_image),
+    ("draw_labeled_bboxes(np.copy(d.image), labels=d.labels)", is_image),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def call_data(models, files):
+    svc, scaler = models["all", "uint8"].model
+    heat = reference.add_heat(np.zeros((208, 330)), PAIRS)
+    return SimpleNamespace(
+        image=FRAMES["uint8"], patch=PATCHES[0], patches=PATCHES[:3], gray=PATCHES[0][..., 1],
+        float_patch=PATCHES[0].astype(np.float32) / 255, files=sorted(map(str, files.glob("*.jpg")))[:3],
+        svc=svc, scaler=scaler, boxes=PAIRS, heat=heat, labels=label(heat),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("form", "is_right"), CALL_FORMS, ids=[form[:60] for form, _ in CALL_FORMS])
+def test_every_call_form_binds(call_data, form, is_right):
+    assert is_right(eval(form, {**vars(lesson), "np": np, "d": call_data}))
+
+
+@pytest.mark.parametrize(
+    ("form", "message"),
+    [
+        ("get_hog_features(d.patch, 9, 8, 2)", "one .H, W. channel"),
+        ("get_hog_features(d.gray[:9], 9, 8, 2)", "at least one block large .16x16 pixels.; got 64x9"),
+        ("get_hog_features(d.gray, 9, (8, 8), 2)", "pix_per_cell must be an integer"),
+        (
+            "get_hog_features(-d.float_patch[..., 0], 9, 8, 2, transform_sqrt=True)",
+            "transform_sqrt must be False",
+        ),
+        ("bin_spatial(d.gray)", "img must be an .H, W, 3. RGB array"),
+        ("bin_spatial(d.patch, (1, 2, 3))", "size must be"),
+        ("bin_spatial(d.patch, order='rgb')", "order must be one of"),
+        ("color_hist(d.patch, 0)", "nbins must be an integer"),
+        ("color_hist(d.patch, 4, (5, 5))", "bins_range must be a number, greater than 5"),
+        ("color_hist(d.patch, 4, 256)", "bins_range must be .low, high."),
+        ("color_hist(d.patch.astype(int))", "must be uint8 or float"),
+        ("convert_color(d.patch, 'RGB2CMYK')", "conv must be"),
+        ("convert_color(d.patch, 'HSV2RGB')", "conv must be"),
+        ("extract_features('car.png')", "list of file names"),
+        ("extract_features(['missing.png'])", "does not exist"),
+        ("extract_features(d.files, 'YIQ')", "color_space must be one of"),
+        ("extract_features(d.files, hog_channel=3)", "hog_channel must be one of"),
+        ("extract_features(d.files, spatial_feat=0, hist_feat=0, hog_feat=0)", "all False"),
+        ("slide_window((720, 1280))", "img must be an image"),
+        ("slide_window(d.image, [0, 9.5])", "x_start_stop must be"),
+        ("slide_window(d.image, [9, 5])", "0 <= start <= stop"),
+        ("slide_window(d.image, xy_window=64)", "xy_window must be a pair"),
+        ("slide_window(d.image, xy_overlap=(0.5, 1))", "xy_overlap must leave a step"),
+        ("slide_window(d.image, formula='newer')", "formula must be one of"),
+        ("search_windows(d.image, [((0, 0), (0, 9))], d.svc, d.scaler, **d.options)", "non-empty"),
+        ("search_windows(d.image, [((330, 0), (340, 9))], d.svc, d.scaler, **d.options)", "330x208 image"),
+        ("search_windows(d.image, [[1, 2, 3]], d.svc, d.scaler, **d.options)", "corner pairs"),
+        ("search_windows(d.image, d.boxes, d.svc, d.scaler)", "fitted on 6108 features, but these options"),
+        (
+            "search_windows(d.image, d.boxes, d.scaler, d.svc, **d.options)",
+            "classifier must have a method predict",
+        ),
+        ("find_cars(d.image, 90, 90, 1, d.svc, d.scaler, 9, 8, 2, 16, 16)", "ystart and ystop"),
+        ("find_cars(d.image, 90, 200, 0, d.svc, d.scaler, 9, 8, 2, 16, 16)", "scale must be a number"),
+        ("find_cars(d.image, 90, 200, 1, d.svc, d.scaler, 9, 64, 2, 16, 16)", "must fit into a window"),
+        (
+            "find_cars(d.image, 90, 200, 1, d.svc, d.scaler, 9, 8, 2, 16, 16, resize='first')",
+            "resize must be",
+        ),
+        (
+            "find_cars(d.image, 90, 200, 1, d.svc, d.scaler, 9, 8, 2, 16, 16, cells_per_step=0)",
+            "cells_per_step",
+        ),
+        ("add_heat(d.patch, d.boxes)", "heatmap must be a writable"),
+        ("add_heat(d.read_only, d.boxes)", "heatmap must be a writable"),
+        ("add_heat(d.heat, [((9, 9), (5, 5))])", "x1 <= x2"),
+        ("add_heat(d.heat, [((9, np.nan), (5, 5))])", "corner pairs"),
+        ("apply_threshold(d.heat, None)", "threshold must be a number"),
+        ("draw_boxes(d.image, d.boxes, color='red')", "color must be"),
+        ("draw_boxes(d.image, d.boxes, thick=1.5)", "thick must be an integer"),
+        ("draw_labeled_bboxes(d.image[:, ::2], d.labels)", "writable and contiguous"),
+        ("draw_labeled_bboxes(d.image.copy(), d.labels[0])", "labels must be the pair"),
+        ("draw_labeled_bboxes(d.patch.copy(), d.labels)", "labels must be the pair"),
+    ],
+)
+def test_bad_input_raises_an_error_of_the_library(call_data, models, form, message):
+    data = SimpleNamespace(
+        **vars(call_data), options=models["all", "uint8"].options, read_only=np.zeros((4, 4))
+    )
+    data.read_only.setflags(write=False)
+    with pytest.raises(InvalidInputError, match=message):
+        eval(form, {**vars(lesson), "np": np, "d": data})
+
+
+def test_a_band_without_room_for_a_window(models):
+    case = models["all", "uint8"]
+    for rows, scale in ((60, 1), (200, 9.0), (200, 500.0)):
+        arguments = (FRAMES["uint8"], 0, rows, scale, *case.model, 9, 8, 2, (16, 16), 16)
+        assert lesson.find_car_windows(*arguments, divide_by=1) == []
+
+
+def test_inputs_are_left_as_they_were(models):
+    case, image = models["all", "uint8"], FRAMES["uint8"].copy()
+    image.setflags(write=False)
+    lesson.find_cars(image, 60, 200, 1.5, *case.model, 9, 8, 2, (16, 16), 16, divide_by=1)
+    lesson.search_windows(image, PAIRS, *case.model, **case.options)
+    lesson.draw_boxes(image, PAIRS)
+    np.testing.assert_array_equal(image, FRAMES["uint8"])
