@@ -246,17 +246,20 @@ def _gradients(image: NDArray[Any], transform_sqrt: bool) -> tuple[NDArray[np.fl
 
 
 def bin_indices(image: Image, bins: int, limits: tuple[float, float]) -> NDArray[np.intp]:
-    """Histogram bin of each value, as `numpy.histogram` assigns it; `bins` for values out of range."""
+    """Histogram bin of each value, as `numpy.histogram` assigns it, for `count_bins`.
+
+    A channel has ``bins + 1`` bins, the last one for values out of range.
+    """
     values = np.arange(256) if image.dtype == np.uint8 else image
     edges = np.histogram_bin_edges(values, bins, limits)
     indices = np.searchsorted(edges, values, side="right") - 1
     indices[values == edges[-1]] = bins - 1
     indices[indices < 0] = bins
-    return np.asarray(indices[image] if image.dtype == np.uint8 else indices)
+    if image.dtype == np.uint8:
+        indices = indices[image]
+    return np.asarray(indices + np.arange(3) * (bins + 1))
 
 
 def count_bins(indices: NDArray[np.intp], bins: int) -> NDArray[np.int64]:
-    """Histogram of each channel of ``(h, w, 3)`` bin indices, one after the other."""
-    # One more bin holds the values out of range.
-    offset = indices + np.arange(3) * (bins + 1)
-    return np.bincount(offset.ravel(), minlength=3 * (bins + 1)).reshape(3, -1)[:, :bins].ravel()
+    """Histogram of each channel from `bin_indices`, one after the other."""
+    return np.bincount(indices.ravel(), minlength=3 * (bins + 1)).reshape(3, -1)[:, :bins].ravel()

@@ -251,7 +251,8 @@ class FeatureOptions:
         params = self.library_params(self.color_space)
         if params is None or not are_uint8_patches(images):
             return [self._compute_one(image) for image in images]
-        features = library.extract_features(np.asarray(images), params)
+        patches = images if isinstance(images, np.ndarray) else np.stack(images)
+        features = library.extract_features(patches, params)
         if self.spatial_feat and self.spatial_order == "interleaved":
             spatial = features[:, : params.spatial_length]
             spatial[:] = cv2.merge(np.split(spatial, 3, axis=1)).reshape(spatial.shape)
