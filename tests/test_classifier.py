@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 
@@ -25,7 +24,7 @@ from vehicle_detection.classifier import (
     train_classifier,
 )
 from vehicle_detection.errors import InvalidInputError, ModelFileError
-from vehicle_detection.features import PatchFeatures, extract_features
+from vehicle_detection.features import extract_features
 from vehicle_detection.params import FeatureParams
 
 SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
@@ -328,48 +327,6 @@ def test_from_pipeline_and_back(trained, patches):
     np.testing.assert_array_equal(again.decision_function(patches), trained.decision_function(patches))
     assert again.params == trained.params
     assert again.metadata == trained.metadata
-
-
-def test_from_an_own_pipeline(patches, labels):
-    features = PatchFeatures(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
-    pipeline = make_pipeline(features, StandardScaler(), LinearSVC(C=0.01, random_state=0))
-    pipeline.fit(patches, labels.astype(bool))
-    classifier = VehicleClassifier.from_pipeline(pipeline, SMALL)
-    np.testing.assert_allclose(
-        classifier.decision_function(patches), pipeline.decision_function(patches), rtol=1e-4, atol=1e-4
-    )
-
-
-@pytest.mark.parametrize("options", [{"with_mean": False}, {"with_std": False}])
-def test_from_a_pipeline_without_mean_or_scale(patches, labels, options):
-    rows = extract_features(patches, SMALL)
-    pipeline = make_pipeline(StandardScaler(**options), LinearSVC(C=1e-3, random_state=0, max_iter=20_000))
-    pipeline.fit(rows, labels)
-    classifier = VehicleClassifier.from_pipeline(pipeline, SMALL)
-    np.testing.assert_allclose(
-        classifier.decision_function(rows), pipeline.decision_function(rows), rtol=1e-4, atol=1e-4
-    )
-
-
-def test_pipelines_that_cannot_be_converted(patches, labels):
-    rows = extract_features(patches, SMALL)
-
-    def take(pipeline):
-        return VehicleClassifier.from_pipeline(pipeline, SMALL)
-
-    with pytest.raises(InvalidInputError, match=r"must end in StandardScaler and LinearSVC; got \['LinearS"):
-        take(make_pipeline(LinearSVC()))
-    with pytest.raises(InvalidInputError, match="pipeline must be fitted; call its fit first"):
-        take(make_pipeline(StandardScaler(), LinearSVC()))
-    many = make_pipeline(StandardScaler(), LinearSVC()).fit(rows, np.arange(80) % 3)
-    with pytest.raises(InvalidInputError, match=r"fitted on the labels 0 and 1; got \[.*0.*1.*2.*\]"):
-        take(many)
-    other = make_pipeline(StandardScaler(), LinearSVC()).fit(rows, np.repeat(["car", "road"], 40))
-    with pytest.raises(InvalidInputError, match="fitted on the labels 0 and 1"):
-        take(other)
-    short = make_pipeline(StandardScaler(), LinearSVC()).fit(rows[:, :5], labels)
-    with pytest.raises(InvalidInputError, match=rf"templates must have {SMALL.length} weights"):
-        take(short)
 
 
 @pytest.mark.parametrize("templates", [1, 3])

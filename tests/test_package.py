@@ -24,7 +24,7 @@ LAYERS = [
     "_common",
     "params camera synthetic export images boxes _kernels",
     "datasets regions tracking heatmap features video",
-    "evaluation drawing classifier",
+    "evaluation drawing classifier sklearn_models",
     "windows search mixture training",
     "course detector mixture_training report",
     "tuning explorer",

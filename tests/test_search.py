@@ -124,6 +124,11 @@ def test_presets_equal_the_reference(preset, window):
         {"hist_sqrt": True, "spatial_feat": False, "hog_feat": False},
         {"hist_sqrt": True, "hist_feat": False},
         {"hist_sqrt": True, "coarse_hog": True, "color_space": "HSV", "spatial_feat": False},
+        {"spatial_order": "interleaved"},
+        {"spatial_order": "interleaved", "spatial_size": 32, "pix_per_cell": 16},
+        {"spatial_color_space": "RGB", "hist_color_space": "HSV"},
+        {"spatial_color_space": "HLS", "spatial_order": "interleaved", "hog_channel": "GRAY"},
+        {"hist_color_space": "LUV", "hist_sqrt": True, "hog_channel": 0},
     ],
     ids=str,
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
@@ -164,39 +164,63 @@ class VehicleClassifier:
 
     @classmethod
     def from_pipeline(
-        cls, pipeline: Pipeline, params: FeatureParams, *, metadata: Mapping[str, Any] | None = None
+        cls,
+        pipeline: Any,
+        params: FeatureParams | None = None,
+        *,
+        metadata: Mapping[str, Any] | None = None,
     ) -> VehicleClassifier:
-        """Convert a fitted scikit-learn pipeline that ends in ``StandardScaler`` and ``LinearSVC``.
+        """Convert fitted scikit-learn estimators: scalers and a linear classifier.
+
+        Scores equal the classifier's ``decision_function``.
 
         Parameters
         ----------
         pipeline
-            A fitted pipeline; it may start with `PatchFeatures`.
+            A fitted ``Pipeline``, a search over one such as ``GridSearchCV``, or a pair of a classifier and
+            its scaler. Scalers: ``StandardScaler``, ``RobustScaler``, ``MinMaxScaler``, ``MaxAbsScaler``.
+            Classifiers: any that computes a weighted sum, such as ``LinearSVC``, ``SGDClassifier``,
+            ``LogisticRegression`` or ``SVC(kernel="linear")``, fitted on the labels 0 (or -1) and 1.
         params
-            Parameters of the features that the scaler was fitted on.
+            Parameters of the features that it was fitted on; not needed if the first step is `PatchFeatures`.
+            The order of the spatial bins matters: for features computed with
+            ``cv2.resize(image, size).ravel()`` pass ``spatial_order="interleaved"``. The length of a vector
+            does not depend on the order, so that a wrong one cannot be detected, but the scores are wrong.
         metadata
             JSON values to keep in the model file.
 
         Raises
         ------
         InvalidInputError
-            If the last two steps are others, not fitted, or fitted on other features.
+            If a step is of another kind or not fitted, the features have another length, or `params` differ
+            from those of the pipeline's `PatchFeatures`.
+
+        Examples
+        --------
+        >>> from sklearn.pipeline import make_pipeline
+        >>> from sklearn.preprocessing import MinMaxScaler
+        >>> from sklearn.linear_model import RidgeClassifier
+        >>> from vehicle_detection import PatchFeatures, render_patches
+        >>> patches, labels = render_patches(20)
+        >>> pipeline = make_pipeline(PatchFeatures(orient=6), MinMaxScaler(), RidgeClassifier())
+        >>> VehicleClassifier.from_pipeline(pipeline.fit(patches, labels)).score(patches, labels)
+        1.0
         """
-        steps = [step for _, step in pipeline.steps]
-        names = [type(step).__name__ for step in steps]
-        if names[-2:] != ["StandardScaler", "LinearSVC"]:
-            raise InvalidInputError(f"pipeline must end in StandardScaler and LinearSVC; got {names}")
-        scaler, svm = steps[-2:]
-        if not hasattr(scaler, "scale_") or not hasattr(svm, "coef_"):
-            raise InvalidInputError("pipeline must be fitted; call its fit first")
-        if list(svm.classes_) not in ([0, 1], [False, True]):
+        from vehicle_detection.sklearn_models import check_equal_scores, fold_estimators, split_pipeline
+
+        known, steps = split_pipeline(pipeline)
+        params = params or known
+        if not isinstance(params, FeatureParams):
             raise InvalidInputError(
-                f"pipeline must be fitted on the labels 0 and 1; got {list(svm.classes_)}"
+                f"params must be the FeatureParams of the pipeline's features; got {describe(params)}"
             )
-        length = svm.coef_.shape[1]
-        mean = scaler.mean_ if scaler.with_mean else np.zeros(length)
-        scale = scaler.scale_ if scaler.with_std else np.ones(length)
-        template = Template(mean, scale, svm.coef_[0], float(np.ravel(svm.intercept_)[0]))
+        # The gains change the weights only, not the features.
+        if known and replace(params, hist_gain=known.hist_gain, coarse_gain=known.coarse_gain) != known:
+            raise InvalidInputError(
+                f"params must equal those of the pipeline, {known}, or be omitted; got {params}"
+            )
+        template = fold_estimators(steps, params.length)
+        check_equal_scores(template, steps)
         return cls(params, (template,), metadata or {})
 
     def to_pipeline(self) -> Pipeline:

@@ -341,7 +341,8 @@ class _Filters:
                     filters.append(Filter(blocks.reshape(positions, positions, -1), dilation=dilation))
         values = []
         if params.spatial_feat:
-            part = weights[: params.spatial_length].reshape(3, cells, self.per_cell, cells, self.per_cell)
+            planes = params.spatial_planes(weights[: params.spatial_length])
+            part = planes.reshape(3, cells, self.per_cell, cells, self.per_cell)
             values.append(part.transpose(1, 3, 0, 2, 4).reshape(cells, cells, -1))
         if self.hist_lookup:
             values.append(np.ones((cells, cells, 1)))
@@ -351,35 +352,38 @@ class _Filters:
         """Scores of all windows of a resized band as a new ``(rows, columns)`` float32 array."""
         params, cell = self.params, self.params.pix_per_cell
         rows, columns = band.shape[0] // cell, band.shape[1] // cell
-        converted = convert_color(
-            band, params.color_space, out=workspace.take(band.shape, np.uint8, "converted")
-        )
+        converted = {
+            space: convert_color(band, space, out=workspace.take(band.shape, np.uint8, space))
+            for space in params.used_color_spaces
+        }
         maps = self._hog_maps(band, converted, workspace) if params.hog_feat else []
         if params.spatial_feat or self.hist_lookup:
-            maps.append(self._value_map(converted, workspace))
+            maps.append(self._value_map(converted, (rows, columns), workspace))
         shape = (len(self.filters), rows - self.cells + 1, columns - self.cells + 1)
         scores = np.empty(shape, np.float32)
         for template, (filters, bias) in enumerate(zip(self.filters, self.biases)):
             scores[template] = bias
             if self.tables is not None:
-                _color_kernels.histogram_cells(converted, self.tables[template], cell, maps[-1][-1])
+                image = converted[params.hist_space]
+                _color_kernels.histogram_cells(image, self.tables[template], cell, maps[-1][-1])
             for template_filter, channels in zip(filters, maps):
                 template_filter.add_to(channels, scores[template], workspace)
         if self.root_weights is not None:
-            _color_kernels.add_root_histograms(
-                converted, self.bins, self.root_weights, cell, self.cells, scores
-            )
+            image = converted[params.hist_space]
+            _color_kernels.add_root_histograms(image, self.bins, self.root_weights, cell, self.cells, scores)
         return scores[0] if len(scores) == 1 else np.asarray(scores.max(axis=0))
 
     def _hog_maps(
-        self, band: NDArray[np.uint8], converted: NDArray[np.uint8], workspace: Workspace
+        self, band: NDArray[np.uint8], converted: dict[str, NDArray[np.uint8]], workspace: Workspace
     ) -> list[NDArray[np.float32]]:
         """Compute the blocks of HOG and, if used, of coarse HOG; each ``(channels, rows, columns)``."""
         params, channels = self.params, self.params.hog_channels
         cell = params.pix_per_cell
         rows, columns = band.shape[0] // cell, band.shape[1] // cell
         gray = params.hog_channel == "GRAY"
-        source = hog_source(band, params) if gray else pick_hog_channels(converted, params)
+        source = (
+            hog_source(band, params) if gray else pick_hog_channels(converted[params.color_space], params)
+        )
         cells = workspace.take((channels, params.orient, rows, columns), np.float32, "cells")
         if params.transform_sqrt:
             _hog_kernels.sum_orientations(*sqrt_gradients(source), self.bounds, channels, cell, cells)
@@ -398,15 +402,17 @@ class _Filters:
             maps.append(blocks.reshape(-1, rows, columns))
         return maps
 
-    def _value_map(self, converted: NDArray[np.uint8], workspace: Workspace) -> NDArray[np.float32]:
+    def _value_map(
+        self, converted: dict[str, NDArray[np.uint8]], shape: tuple[int, int], workspace: Workspace
+    ) -> NDArray[np.float32]:
         """Spatial bins of each cell ``(channels, rows, columns)`` and, last, a channel for the histogram."""
         cell, per_cell = self.params.pix_per_cell, self.per_cell
-        rows, columns = converted.shape[0] // cell, converted.shape[1] // cell
+        rows, columns = shape
         count = 3 * per_cell**2 if self.params.spatial_feat else 0
         channels = workspace.take((count + int(self.hist_lookup), rows, columns), np.float32, "values")
         if count:
             size = (columns * per_cell, rows * per_cell)
-            whole = converted[: rows * cell, : columns * cell]
+            whole = converted[self.params.spatial_space][: rows * cell, : columns * cell]
             bins = cv2.resize(whole, size, dst=workspace.take((size[1], size[0], 3), np.uint8, "bins"))
             cells = channels[:count].reshape(3, per_cell, per_cell, rows, columns)
             _color_kernels.spatial_cells(bins, per_cell, cells)

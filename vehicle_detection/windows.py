@@ -191,7 +191,8 @@ def _shared_hog_features(
             f'border="image" needs {PATCH_SIZE}x{PATCH_SIZE} windows at multiples of {cell} pixels; '
             "resize the image so that the window is 64x64"
         )
-    converted = convert_color(image, params.color_space)
+    spatial_image = convert_color(image, params.spatial_space)
+    hist_image = convert_color(image, params.hist_space)
     hog: list[NDArray[Any]] = []
     coarse: list[NDArray[Any]] = []
     if params.hog_feat:
@@ -202,10 +203,12 @@ def _shared_hog_features(
     span = 2 * params.coarse_blocks
     features = np.empty((len(boxes), params.length))
     for row, (x1, y1, x2, y2) in enumerate(boxes):
-        patch = np.ascontiguousarray(converted[y1:y2, x1:x2])
-        parts: list[NDArray[Any]] = [bin_spatial(patch, params.spatial_size)] if params.spatial_feat else []
+        parts: list[NDArray[Any]] = []
+        if params.spatial_feat:
+            patch = np.ascontiguousarray(spatial_image[y1:y2, x1:x2])
+            parts.append(bin_spatial(patch, params.spatial_size, order=params.spatial_order))
         if params.hist_feat:
-            counts = color_hist(patch, params.hist_bins)
+            counts = color_hist(np.ascontiguousarray(hist_image[y1:y2, x1:x2]), params.hist_bins)
             parts.append(np.sqrt(counts) if params.hist_sqrt else counts)
         top, left = y1 // cell, x1 // cell
         parts += [part[top : top + blocks, left : left + blocks].ravel() for part in hog]

@@ -22,7 +22,7 @@ from vehicle_detection.features import (
 )
 from vehicle_detection.features.extract import hog_blocks
 from vehicle_detection.images import decode_image, write_image
-from vehicle_detection.params import COLOR_SPACES, HOG_CHANNELS, FeatureParams
+from vehicle_detection.params import COLOR_SPACES, HOG_CHANNELS, SPATIAL_ORDERS, FeatureParams
 from vehicle_detection.synthetic import render_patches
 
 PRESETS = sorted(FeatureParams.PRESETS)
@@ -89,6 +89,10 @@ def test_the_presets_equal_the_reference(preset):
         {"coarse_hog": True, "pix_per_cell": 7, "cell_per_block": 3},
         {"coarse_hog": True, "pix_per_cell": 2, "cell_per_block": 1, "hog_channel": 1},
         {"coarse_hog": True, "hog_feat": False},
+        {"spatial_order": "interleaved"},
+        {"spatial_order": "interleaved", "spatial_size": 24, "spatial_color_space": "HLS"},
+        {"spatial_color_space": "RGB", "hist_color_space": "HSV"},
+        {"color_space": "LUV", "hist_color_space": "HLS", "hist_sqrt": True, "hog_channel": 0},
     ],
     ids=str,
 )
@@ -110,6 +114,9 @@ def feature_params(draw):
     block = draw(st.integers(1, min(4, 64 // cell)))
     return FeatureParams(
         color_space=draw(st.sampled_from(COLOR_SPACES)),
+        spatial_color_space=draw(st.sampled_from((None, *COLOR_SPACES))),
+        hist_color_space=draw(st.sampled_from((None, *COLOR_SPACES))),
+        spatial_order=draw(st.sampled_from(SPATIAL_ORDERS)),
         spatial_feat=parts[0],
         hist_feat=parts[1],
         hog_feat=True,

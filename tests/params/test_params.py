@@ -52,6 +52,8 @@ def test_parameters_are_keyword_only(params):
     ("params", "field"), [(params, field.name) for params in ALL for field in dataclasses.fields(params)]
 )
 def test_every_field_is_checked_and_named(params, field, value):
+    if value is None and field in ("spatial_color_space", "hist_color_space"):
+        return
     with pytest.raises(InvalidInputError, match=rf"^{field}\b.* must be "):
         dataclasses.replace(params, **{field: value})
 
@@ -109,7 +111,9 @@ def test_gains_apply_to_their_parts():
         ({"spatial_feat": 1}, "spatial_feat must be True or False; got 1"),
         ({"spatial_feat": False, "hist_feat": False, "hog_feat": False}, "all False; set one to True"),
         ({"spatial_size": 65}, "spatial_size must be an integer from 1 to 64; got 65"),
-        ({"spatial_size": (32, 32)}, "spatial_size must be an integer"),
+        ({"spatial_size": (32, 16)}, "spatial_size must be an integer"),
+        ({"spatial_order": "rows"}, "spatial_order must be one of 'channels', 'interleaved'"),
+        ({"hist_color_space": "BGR"}, "hist_color_space must be one of None, 'RGB'"),
         ({"hist_bins": 257}, "hist_bins must be an integer from 1 to 256"),
         ({"orient": 0}, "orient must be an integer from 1 to 180"),
         ({"pix_per_cell": 1}, "pix_per_cell must be an integer from 2 to 64"),
@@ -141,7 +145,19 @@ def test_numpy_numbers_become_python_numbers():
         hist_gain=np.float32(2),
     )
     assert params == FeatureParams(orient=9, hog_channel=0, spatial_size=8, hist_bins=4, hist_gain=2)
-    assert all(type(value) in (int, str, bool, float) for value in dataclasses.asdict(params).values())
+    plain = (int, str, bool, float, type(None))
+    assert all(type(value) in plain for value in dataclasses.asdict(params).values())
+
+
+def test_the_spatial_size_may_be_a_square_pair():
+    assert FeatureParams(spatial_size=(16, 16)) == FeatureParams(spatial_size=16)
+
+
+def test_the_color_spaces_of_the_parts():
+    params = FeatureParams(color_space="LUV", hist_color_space="HSV", spatial_feat=False)
+    assert (params.spatial_space, params.hist_space) == ("LUV", "HSV")
+    assert params.used_color_spaces == {"LUV", "HSV"}
+    assert FeatureParams(hog_channel="GRAY", spatial_color_space="HLS").used_color_spaces == {"HLS", "YCrCb"}
 
 
 @pytest.mark.parametrize("cls", [FeatureParams, SearchParams])

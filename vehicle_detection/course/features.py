@@ -14,11 +14,10 @@ from vehicle_detection._kernels import degree_bounds, orientation_cotangents, sq
 from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.course.checks import Image, check_lesson_image, check_range, check_size
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.params import COLOR_SPACES
+from vehicle_detection.params import COLOR_SPACES, SPATIAL_ORDERS
 
 Size = int | Sequence[int]
 SpatialOrder = Literal["interleaved", "channels"]
-SPATIAL_ORDERS = ("interleaved", "channels")
 
 
 def convert_color(img: Image, conv: str = "RGB2YCrCb") -> Image:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +17,6 @@ from vehicle_detection import features as library
 from vehicle_detection._common import check_choice, check_integer, describe
 from vehicle_detection.course.checks import Image, check_lesson_image, check_range, check_size
 from vehicle_detection.course.features import (
-    SPATIAL_ORDERS,
     Size,
     SpatialOrder,
     bin_spatial,
@@ -28,7 +26,7 @@ from vehicle_detection.course.features import (
 )
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import read_image
-from vehicle_detection.params import COLOR_SPACES, PATCH_SIZE, FeatureParams
+from vehicle_detection.params import COLOR_SPACES, PATCH_SIZE, SPATIAL_ORDERS, FeatureParams
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -240,7 +238,7 @@ class FeatureOptions:
         if (self.spatial_feat and width != height) or (self.hist_feat and self.hist_range != (0, 256)):
             return None
         options = vars(self) | {"color_space": color_space, "spatial_size": width}
-        del options["hist_range"], options["spatial_order"]
+        del options["hist_range"]
         try:
             return FeatureParams(**options)
         except InvalidInputError:
@@ -252,11 +250,7 @@ class FeatureOptions:
         if params is None or not are_uint8_patches(images):
             return [self._compute_one(image) for image in images]
         patches = images if isinstance(images, np.ndarray) else np.stack(images)
-        features = library.extract_features(patches, params)
-        if self.spatial_feat and self.spatial_order == "interleaved":
-            spatial = features[:, : params.spatial_length]
-            spatial[:] = cv2.merge(np.split(spatial, 3, axis=1)).reshape(spatial.shape)
-        return list(features)
+        return list(library.extract_features(patches, params))
 
     def _compute_one(self, image: Image) -> NDArray[np.float64]:
         """Feature vector of one image by the lesson's steps."""
@@ -281,15 +275,6 @@ class FeatureOptions:
         return hog_blocks(
             converted[..., channels], self.orient, self.pix_per_cell, self.cell_per_block, self.transform_sqrt
         )
-
-    def library_order(self) -> NDArray[np.intp]:
-        """Position in a vector of the lesson of each feature of the library, which orders bins by channel."""
-        columns = np.arange(self.length)
-        if self.spatial_feat and self.spatial_order == "interleaved":
-            width, height = self.spatial_size
-            spatial = columns[: 3 * width * height].reshape(height, width, 3)
-            columns[: spatial.size] = spatial.transpose(2, 0, 1).ravel()
-        return columns
 
 
 def are_uint8_patches(images: Images) -> bool:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import check_choice, check_integer, check_number, describe
 from vehicle_detection.boxes import Detections
-from vehicle_detection.classifier import Template, VehicleClassifier
+from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.course.checks import Image, check_lesson_image, corner_array
 from vehicle_detection.course.features import (
     Size,
@@ -28,6 +28,7 @@ from vehicle_detection.course.vectors import FeatureOptions, accept_cspace, are_
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import PATCH_SIZE, FeatureParams, PixelBand
 from vehicle_detection.search import BandSearch
+from vehicle_detection.sklearn_models import fold_estimators
 
 Box = tuple[tuple[int, int], tuple[int, int]]
 Formula = Literal["old", "new"]
@@ -458,7 +459,7 @@ def _fast_scores(
         return None
     if params.spatial_feat and (params.spatial_size % params.cells or PATCH_SIZE % params.spatial_size):
         return None
-    classifier = _library_classifier(clf, scaler, options, params)
+    classifier = _library_classifier(clf, scaler, params)
     if classifier is None:
         return None
     height, width = converted.shape[:2]
@@ -490,33 +491,21 @@ def _classify_patches(
     """Whether the classifier predicts 1 for each of some 64x64 patches."""
     params = options.library_params(options.color_space)
     if params is not None and are_uint8_patches(patches):
-        classifier = _library_classifier(clf, scaler, options, params)
+        classifier = _library_classifier(clf, scaler, params)
         if classifier is not None:
             return np.asarray(classifier.decision_function(np.stack(patches)) > 0)
     return _predicts_car(np.array(options.compute(patches)), clf, scaler)
 
 
-def _library_classifier(
-    clf: Any, scaler: Any, options: FeatureOptions, params: FeatureParams
-) -> VehicleClassifier | None:
-    """Return a linear classifier and its ``StandardScaler`` as the library's classifier; None for others."""
-    coef = getattr(clf, "coef_", None)
-    is_linear = (
-        isinstance(coef, np.ndarray)
-        and coef.shape == (1, params.length)
-        and hasattr(clf, "decision_function")
-        and list(clf.classes_)[1:] == [1]
-    )
+def _library_classifier(clf: Any, scaler: Any, params: FeatureParams) -> VehicleClassifier | None:
+    """Return a linear classifier and its scaler as the library's classifier; None for other estimators."""
     # Only classes of scikit-learn: others may predict in another way.
-    own = all(type(estimator).__module__.startswith("sklearn.") for estimator in (clf, scaler))
-    if not is_linear or not own or type(scaler).__name__ != "StandardScaler":
+    if not all(type(estimator).__module__.startswith("sklearn.") for estimator in (clf, scaler)):
         return None
-    columns = options.library_order()
-    mean = scaler.mean_ if scaler.with_mean else np.zeros(params.length)
-    std = scaler.scale_ if scaler.with_std else np.ones(params.length)
-    intercept = float(np.ravel(clf.intercept_)[0])
-    template = Template(mean[columns], std[columns], clf.coef_[0, columns], intercept)
-    return VehicleClassifier(params, (template,))
+    try:
+        return VehicleClassifier(params, (fold_estimators([scaler, clf], params.length),))
+    except InvalidInputError:
+        return None
 
 
 def _predicts_car(features: NDArray[np.float64], clf: Any, scaler: Any) -> NDArray[np.bool_]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -31,7 +31,7 @@ from vehicle_detection._kernels import color as _color_kernels
 from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import read_image
-from vehicle_detection.params import COLOR_SPACES, PATCH_SIZE, FeatureParams
+from vehicle_detection.params import COLOR_SPACES, PATCH_SIZE, SPATIAL_ORDERS, FeatureParams
 
 
 def convert_color(
@@ -187,8 +187,13 @@ def hog_image(
     return np.asarray(picture, np.float64)
 
 
-def bin_spatial(img: NDArray[np.uint8], size: int | tuple[int, int] = (32, 32)) -> NDArray[np.uint8]:
-    """Pixel values of a downscaled image, channel by channel.
+def bin_spatial(
+    img: NDArray[np.uint8],
+    size: int | tuple[int, int] = (32, 32),
+    *,
+    order: Literal["channels", "interleaved"] = "channels",
+) -> NDArray[np.uint8]:
+    """Pixel values of a downscaled image.
 
     Parameters
     ----------
@@ -196,6 +201,8 @@ def bin_spatial(img: NDArray[np.uint8], size: int | tuple[int, int] = (32, 32)) 
         ``(H, W, 3)`` uint8 in any color space.
     size
         Width and height to scale to, or an integer for both.
+    order
+        ``"channels"``: one channel after the other; ``"interleaved"``: pixel by pixel.
 
     Returns
     -------
@@ -212,8 +219,9 @@ def bin_spatial(img: NDArray[np.uint8], size: int | tuple[int, int] = (32, 32)) 
     if len(pair) != 2:
         raise InvalidInputError(f"size must be an integer or (width, height); got {describe(size)}")
     width, height = (check_integer(side, "size", low=1) for side in pair)
-    small = cv2.resize(img, (width, height))
-    return np.ascontiguousarray(small.transpose(2, 0, 1), np.uint8).ravel()
+    check_choice(order, "order", SPATIAL_ORDERS)
+    small = np.asarray(cv2.resize(img, (width, height)), np.uint8)
+    return (small if order == "interleaved" else small.transpose(2, 0, 1)).ravel()
 
 
 def color_hist(img: NDArray[np.uint8], nbins: int = 32) -> NDArray[np.int64]:
@@ -269,12 +277,12 @@ def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None =
     """
     params = _check_params(params)
     check_patches([image], PATCH_SIZE, "image")
-    converted = convert_color(image, params.color_space)
     parts: list[NDArray[Any]] = []
     if params.spatial_feat:
-        parts.append(bin_spatial(converted, params.spatial_size))
+        converted = convert_color(image, params.spatial_space)
+        parts.append(bin_spatial(converted, params.spatial_size, order=params.spatial_order))
     if params.hist_feat:
-        counts = color_hist(converted, params.hist_bins)
+        counts = color_hist(convert_color(image, params.hist_space), params.hist_bins)
         parts.append(np.sqrt(counts) if params.hist_sqrt else counts)
     if params.hog_feat:
         source = hog_source(image, params)
@@ -345,13 +353,16 @@ def _extract_batch(patches: NDArray[np.uint8], features: NDArray[np.float32], pa
     spatial, hist, hog = np.split(features, np.cumsum([params.spatial_length, params.hist_length]), axis=1)
     # Convert the colors of the whole batch as one tall image.
     tall = np.ascontiguousarray(patches).reshape(-1, PATCH_SIZE, 3)
-    converted = convert_color(tall, params.color_space).reshape(patches.shape)
+    converted = {
+        space: convert_color(tall, space).reshape(patches.shape) for space in params.used_color_spaces
+    }
     if params.spatial_feat:
-        size = params.spatial_size
-        for row, patch in zip(spatial, converted):
-            row.reshape(3, size, size)[:] = cv2.resize(patch, (size, size)).transpose(2, 0, 1)
+        size = (params.spatial_size,) * 2
+        for row, patch in zip(spatial, converted[params.spatial_space]):
+            params.spatial_planes(row)[:] = cv2.resize(patch, size).transpose(2, 0, 1)
     if params.hist_feat:
-        _color_kernels.patch_histograms(converted, bin_of_value(params.hist_bins), params.hist_bins, hist)
+        bins = params.hist_bins
+        _color_kernels.patch_histograms(converted[params.hist_space], bin_of_value(bins), bins, hist)
         if params.hist_sqrt:
             np.sqrt(hist, out=hist)
     if params.hog_feat:
@@ -360,7 +371,9 @@ def _extract_batch(patches: NDArray[np.uint8], features: NDArray[np.float32], pa
             (params.pix_per_cell, params.cell_per_block, params.coarse_blocks),
         )
         gray = params.hog_channel == "GRAY"
-        source = hog_source(tall, params) if gray else pick_hog_channels(converted, params)
+        source = (
+            hog_source(tall, params) if gray else pick_hog_channels(converted[params.color_space], params)
+        )
         source = source.reshape(len(patches), PATCH_SIZE, PATCH_SIZE, channels)
         if params.transform_sqrt:
             bounds = degree_bounds(params.orient)

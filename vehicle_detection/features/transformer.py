@@ -31,10 +31,13 @@ class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """
 
     color_space: str = "YCrCb"
+    spatial_color_space: str | None = None
+    hist_color_space: str | None = None
     spatial_feat: bool = True
     hist_feat: bool = True
     hog_feat: bool = True
     spatial_size: int = 16
+    spatial_order: Literal["channels", "interleaved"] = "channels"
     hist_bins: int = 32
     orient: int = 9
     pix_per_cell: int = 8

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from vehicle_detection.params.features import COLOR_SPACES, HOG_CHANNELS, PATCH_SIZE, FeatureParams
+from vehicle_detection.params.features import (
+    COLOR_SPACES,
+    HOG_CHANNELS,
+    PATCH_SIZE,
+    SPATIAL_ORDERS,
+    FeatureParams,
+)
 from vehicle_detection.params.mixture import MixtureParams, entries
 from vehicle_detection.params.regions import HeatParams, RegionParams
 from vehicle_detection.params.search import (
@@ -19,6 +25,7 @@ __all__ = [
     "HOG_CHANNELS",
     "PATCH_SIZE",
     "REFERENCE_WIDTH",
+    "SPATIAL_ORDERS",
     "FeatureParams",
     "HeatParams",
     "MixtureParams",

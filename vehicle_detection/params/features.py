@@ -15,6 +15,7 @@ PATCH_SIZE = 64
 """Side length in pixels of a training patch and of a resized window."""
 
 COLOR_SPACES = ("RGB", "HSV", "LUV", "HLS", "YUV", "YCrCb", "LAB")
+SPATIAL_ORDERS = ("channels", "interleaved")
 HOG_CHANNELS: tuple[int | str, ...] = (0, 1, 2, "ALL", "GRAY")
 _LAB = {"color_space": "LAB", "spatial_size": 32}
 
@@ -28,12 +29,18 @@ class FeatureParams:
     Attributes
     ----------
     color_space
-        Color space of all parts: ``"RGB"``, ``"HSV"``, ``"LUV"``, ``"HLS"``, ``"YUV"``, ``"YCrCb"`` or
-        ``"LAB"``.
+        Color space: ``"RGB"``, ``"HSV"``, ``"LUV"``, ``"HLS"``, ``"YUV"``, ``"YCrCb"`` or ``"LAB"``.
+    spatial_color_space, hist_color_space
+        Color space of the spatial bins and of the histogram; None means `color_space`.
     spatial_feat, hist_feat, hog_feat
         Which of the three parts to compute.
     spatial_size
-        Side length of the grid of spatial bins, which gives ``spatial_size**2 * 3`` values.
+        Side length of the grid of spatial bins, which gives ``spatial_size**2 * 3`` values; a pair of equal
+        numbers is accepted too.
+    spatial_order
+        ``"channels"``: the spatial bins of one channel after the other; ``"interleaved"``: pixel by pixel,
+        as ``cv2.resize(image, size).ravel()`` orders them. A model that was trained on the other order loads
+        without an error, but its scores are wrong.
     hist_bins, hist_sqrt
         Number of bins of each channel's histogram over 0-255, and whether to use the square roots of the
         counts, so that a full bin dominates less.
@@ -62,10 +69,13 @@ class FeatureParams:
     """
 
     color_space: str = "YCrCb"
+    spatial_color_space: str | None = None
+    hist_color_space: str | None = None
     spatial_feat: bool = True
     hist_feat: bool = True
     hog_feat: bool = True
     spatial_size: int = 16
+    spatial_order: Literal["channels", "interleaved"] = "channels"
     hist_bins: int = 32
     orient: int = 9
     pix_per_cell: int = 8
@@ -93,12 +103,18 @@ class FeatureParams:
 
     def __post_init__(self) -> None:
         check_choice(self.color_space, "color_space", COLOR_SPACES)
+        check_choice(self.spatial_color_space, "spatial_color_space", (None, *COLOR_SPACES))
+        check_choice(self.hist_color_space, "hist_color_space", (None, *COLOR_SPACES))
+        check_choice(self.spatial_order, "spatial_order", SPATIAL_ORDERS)
         switches = ("spatial_feat", "hist_feat", "hog_feat", "transform_sqrt", "hist_sqrt", "coarse_hog")
         for name in switches:
             if not isinstance(getattr(self, name), bool):
                 raise InvalidInputError(f"{name} must be True or False; got {describe(getattr(self, name))}")
         if not (self.spatial_feat or self.hist_feat or self.hog_feat):
             raise InvalidInputError("spatial_feat, hist_feat and hog_feat are all False; set one to True")
+        size: Any = self.spatial_size
+        if isinstance(size, (tuple, list)) and len(size) == 2 and size[0] == size[1]:
+            object.__setattr__(self, "spatial_size", size[0])
         self._check_integer("spatial_size", 1, PATCH_SIZE)
         self._check_integer("hist_bins", 1, 256)
         self._check_integer("orient", 1, 180)
@@ -124,6 +140,33 @@ class FeatureParams:
         """Parameters by name: of three course projects, or ``"lab-9432"`` of the shipped model "highway"."""
         check_choice(name, "preset", cls.PRESETS)
         return cls(**cls.PRESETS[name])
+
+    def spatial_planes(self, values: NDArray[Any]) -> NDArray[Any]:
+        """View spatial features ``(..., spatial_length)`` as ``(..., 3, spatial_size, spatial_size)``."""
+        size = self.spatial_size
+        if self.spatial_order == "interleaved":
+            return np.moveaxis(values.reshape(*values.shape[:-1], size, size, 3), -1, -3)
+        return values.reshape(*values.shape[:-1], 3, size, size)
+
+    @property
+    def spatial_space(self) -> str:
+        """Color space of the spatial bins."""
+        return self.spatial_color_space or self.color_space
+
+    @property
+    def hist_space(self) -> str:
+        """Color space of the histogram."""
+        return self.hist_color_space or self.color_space
+
+    @property
+    def used_color_spaces(self) -> set[str]:
+        """Color spaces that an image is converted to; not the gray image of ``hog_channel="GRAY"``."""
+        parts = (
+            (self.spatial_space, self.spatial_feat),
+            (self.hist_space, self.hist_feat),
+            (self.color_space, self.hog_feat and self.hog_channel != "GRAY"),
+        )
+        return {space for space, is_used in parts if is_used}
 
     @property
     def hog_channels(self) -> int:

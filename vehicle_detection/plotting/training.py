@@ -129,7 +129,7 @@ def _add_hog_weights(
 def _add_spatial_weights(
     column: NDArray[Any], weights: NDArray[np.float64], params: FeatureParams, names: tuple[str, ...]
 ) -> None:
-    maps = weights.reshape(3, params.spatial_size, params.spatial_size)
+    maps = params.spatial_planes(weights)
     top = float(np.abs(maps).max()) or 1.0
     for panel, values, name in zip(column, maps, names):
         add_image(panel, values, cmap="PuOr_r", vmin=-top, vmax=top)
@@ -153,16 +153,16 @@ def _add_histogram_weights(
 
 def _add_shifted_patches(column: NDArray[Any], template: Template, params: FeatureParams) -> None:
     """Show the mean patch, and the mean patch shifted along the weights of the spatial bins."""
-    stop, size = params.spatial_length, params.spatial_size
+    stop = params.spatial_length
     direction = template.coef[:stop] * template.scale[:stop]
     step = _MAX_SHIFT / (float(np.abs(direction).max()) or 1.0)
     for panel, name, sign in zip(column, ("mean + weights", "mean patch", "mean - weights"), (1, 0, -1)):
         values = template.mean[:stop] + sign * step * direction
-        patch = values.reshape(3, size, size).transpose(1, 2, 0)
-        limits = [179 if params.color_space in ("HSV", "HLS") else 255, 255, 255]
+        patch = params.spatial_planes(values).transpose(1, 2, 0)
+        limits = [179 if params.spatial_space in ("HSV", "HLS") else 255, 255, 255]
         patch = np.ascontiguousarray(patch.clip(0, limits).round().astype(np.uint8))
-        if params.color_space in _TO_RGB:
-            patch = np.asarray(cv2.cvtColor(patch, _TO_RGB[params.color_space]), np.uint8)
+        if params.spatial_space in _TO_RGB:
+            patch = np.asarray(cv2.cvtColor(patch, _TO_RGB[params.spatial_space]), np.uint8)
         add_image(panel, patch)
         panel.set_xlabel(name, fontsize=9)
 

@@ -1,0 +1,170 @@
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+from sklearn.decomposition import PCA
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+from sklearn.linear_model import LogisticRegression, RidgeClassifier, SGDClassifier
+from sklearn.model_selection import GridSearchCV
+from sklearn.naive_bayes import GaussianNB
+from sklearn.pipeline import Pipeline, make_pipeline
+from sklearn.preprocessing import MaxAbsScaler, MinMaxScaler, RobustScaler, StandardScaler
+from sklearn.svm import SVC, LinearSVC
+
+from vehicle_detection.classifier import VehicleClassifier
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.features import PatchFeatures, extract_features
+from vehicle_detection.params import FeatureParams, PixelBand
+from vehicle_detection.search import BandSearch
+from vehicle_detection.synthetic import render_patches
+
+SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
+
+
+@pytest.fixture(scope="module")
+def patches():
+    return render_patches(80, random_state=1)[0]
+
+
+@pytest.fixture(scope="module")
+def labels():
+    return render_patches(80, random_state=1)[1]
+
+
+def test_from_an_own_pipeline(patches, labels):
+    features = PatchFeatures(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
+    pipeline = make_pipeline(features, StandardScaler(), LinearSVC(C=0.01, random_state=0))
+    pipeline.fit(patches, labels.astype(bool))
+    classifier = VehicleClassifier.from_pipeline(pipeline, SMALL)
+    np.testing.assert_allclose(
+        classifier.decision_function(patches), pipeline.decision_function(patches), rtol=1e-4, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("options", [{"with_mean": False}, {"with_std": False}])
+def test_from_a_pipeline_without_mean_or_scale(patches, labels, options):
+    rows = extract_features(patches, SMALL)
+    pipeline = make_pipeline(StandardScaler(**options), LinearSVC(C=1e-3, random_state=0, max_iter=20_000))
+    pipeline.fit(rows, labels)
+    classifier = VehicleClassifier.from_pipeline(pipeline, SMALL)
+    np.testing.assert_allclose(
+        classifier.decision_function(rows), pipeline.decision_function(rows), rtol=1e-4, atol=1e-4
+    )
+
+
+def published_features(patches, size=8):
+    """Features of patches with the spatial bins in the order of ``cv2.resize(image, size).ravel()``."""
+    params = dataclasses.replace(SMALL, spatial_feat=False)
+    converted = [cv2.cvtColor(patch, cv2.COLOR_RGB2YCrCb) for patch in patches]
+    spatial = np.array([cv2.resize(image, (size, size)).ravel() for image in converted])
+    return np.hstack([spatial, extract_features(patches, params)])
+
+
+def test_a_published_model_with_interleaved_spatial_bins(patches, labels):
+    rows = published_features(patches)
+    pipeline = make_pipeline(StandardScaler(), LinearSVC(C=1e-3, random_state=0)).fit(rows, labels)
+    params = dataclasses.replace(SMALL, spatial_order="interleaved")
+    classifier = VehicleClassifier.from_pipeline(pipeline, params)
+    expected = pipeline.decision_function(rows)
+    np.testing.assert_allclose(classifier.decision_function(patches), expected, rtol=1e-4, atol=1e-4)
+    # The shared search computes the same score for a frame of one window.
+    scores = BandSearch(classifier).score_map(patches[0], PixelBand(0, 0, 64, 64, (64, 64), (16, 16)))
+    assert scores[0, 0] == pytest.approx(expected[0], abs=1e-4)
+    wrong = VehicleClassifier.from_pipeline(pipeline, SMALL)
+    assert np.abs(wrong.decision_function(patches) - expected).max() > 0.1
+
+
+LINEAR_CLASSIFIERS = [
+    LinearSVC(C=1e-3, random_state=0),
+    SGDClassifier(alpha=1.0, random_state=0),
+    LogisticRegression(C=1e-3),
+    SVC(kernel="linear", C=1e-3),
+    RidgeClassifier(alpha=1000.0),
+    LinearDiscriminantAnalysis(solver="lsqr", shrinkage=0.5),
+]
+
+
+@pytest.mark.parametrize("scaler", [StandardScaler(), RobustScaler(), MinMaxScaler((-1, 1)), MaxAbsScaler()])
+@pytest.mark.parametrize("classifier", LINEAR_CLASSIFIERS, ids=lambda each: type(each).__name__)
+def test_any_scaler_and_linear_classifier(patches, labels, scaler, classifier):
+    rows = extract_features(patches, SMALL)
+    pipeline = make_pipeline(scaler, classifier).fit(rows, 2 * labels - 1)
+    expected = pipeline.decision_function(rows)
+    tolerance = 1e-4 * np.abs(expected).max()
+    for model in (pipeline, (classifier, scaler), [scaler, classifier]):
+        converted = VehicleClassifier.from_pipeline(model, SMALL)
+        np.testing.assert_allclose(converted.decision_function(rows), expected, rtol=0, atol=tolerance)
+    np.testing.assert_array_equal(converted.predict(patches), pipeline.predict(rows) > 0)
+
+
+def test_a_grid_search_over_the_features(patches, labels):
+    steps = (PatchFeatures(**dataclasses.asdict(SMALL), n_jobs=1), StandardScaler(), LinearSVC(C=1e-3))
+    grid = {"patchfeatures__orient": [5], "patchfeatures__spatial_order": ["interleaved"]}
+    search = GridSearchCV(make_pipeline(*steps), grid, cv=2).fit(patches, labels)
+    classifier = VehicleClassifier.from_pipeline(search)
+    assert classifier.params == dataclasses.replace(SMALL, orient=5, spatial_order="interleaved")
+    np.testing.assert_allclose(
+        classifier.decision_function(patches), search.decision_function(patches), rtol=1e-4, atol=1e-4
+    )
+    gained = dataclasses.replace(classifier.params, hist_gain=2)
+    assert VehicleClassifier.from_pipeline(search, gained).params == gained
+    with pytest.raises(InvalidInputError, match="params must equal those of the pipeline"):
+        VehicleClassifier.from_pipeline(search, SMALL)
+
+
+def test_a_search_over_the_classifier_alone(patches, labels):
+    rows = extract_features(patches, SMALL)
+    search = GridSearchCV(LinearSVC(), {"C": [1e-3, 1e-2]}, cv=2)
+    pipeline = Pipeline([("none", "passthrough"), ("scale", StandardScaler()), ("svm", search)])
+    pipeline.fit(rows, labels)
+    classifier = VehicleClassifier.from_pipeline(pipeline, SMALL)
+    expected = pipeline.decision_function(rows)
+    np.testing.assert_allclose(classifier.decision_function(rows), expected, rtol=1e-4, atol=1e-4)
+
+
+class Squared(LinearSVC):
+    """Looks linear and is not."""
+
+    def decision_function(self, X):
+        return super().decision_function(X) ** 2
+
+
+def test_pipelines_that_cannot_be_converted(patches, labels):
+    rows = extract_features(patches, SMALL)
+
+    def take(pipeline):
+        return VehicleClassifier.from_pipeline(pipeline, SMALL)
+
+    with pytest.raises(InvalidInputError, match="pipeline must be fitted; its LinearSVC is not"):
+        take(make_pipeline(LinearSVC()))
+    with pytest.raises(InvalidInputError, match="pipeline must be fitted; its StandardScaler is not"):
+        take(make_pipeline(StandardScaler(), LinearSVC()))
+    with pytest.raises(InvalidInputError, match="with refit=True; its GridSearchCV is not"):
+        take(GridSearchCV(LinearSVC(), {"C": [1]}))
+    with pytest.raises(InvalidInputError, match="must end in a linear classifier; got no step"):
+        take([])
+    with pytest.raises(InvalidInputError, match="must end in a linear classifier; got 3"):
+        take(3)
+    with pytest.raises(InvalidInputError, match="such as LinearSVC; got GaussianNB"):
+        take(make_pipeline(StandardScaler(), GaussianNB()).fit(rows, labels))
+    with pytest.raises(InvalidInputError, match="before the classifier; got PCA"):
+        take(make_pipeline(PCA(4), LinearSVC()).fit(rows, labels))
+    with pytest.raises(InvalidInputError, match=r"train with MinMaxScaler\(clip=False\)"):
+        take(make_pipeline(MinMaxScaler(clip=True), LinearSVC()).fit(rows, labels))
+    with pytest.raises(InvalidInputError, match="weighted sum of the features; StandardScaler and Squared"):
+        take(make_pipeline(StandardScaler(), Squared()).fit(rows, labels))
+    with pytest.raises(InvalidInputError, match=r"must be the FeatureParams of .*; got None"):
+        VehicleClassifier.from_pipeline(make_pipeline(StandardScaler(), LinearSVC()).fit(rows, labels))
+    many = make_pipeline(StandardScaler(), LinearSVC(C=1e-5)).fit(rows, np.arange(80) % 3)
+    with pytest.raises(InvalidInputError, match=r"labels 0 or -1 for others and 1 for vehicles; got .*2"):
+        take(many)
+    other = make_pipeline(StandardScaler(), LinearSVC()).fit(rows, np.repeat(["car", "road"], 40))
+    with pytest.raises(InvalidInputError, match="must be fitted on the labels 0 or -1"):
+        take(other)
+    short = make_pipeline(StandardScaler(), LinearSVC()).fit(rows[:, :5], labels)
+    with pytest.raises(
+        InvalidInputError,
+        match=rf"on the {SMALL.length} features .*; its StandardScaler .* 5",
+    ):
+        take(short)

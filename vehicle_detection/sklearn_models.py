@@ -1,0 +1,138 @@
+"""Fold fitted scikit-learn estimators, scalers and a linear classifier, into one `Template`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection._common import describe
+from vehicle_detection.classifier import Template
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.params import FeatureParams
+
+_SCALERS = "StandardScaler, RobustScaler, MinMaxScaler or MaxAbsScaler"
+
+
+def split_pipeline(model: Any) -> tuple[FeatureParams | None, list[Any]]:
+    """Split a fitted pipeline, search or ``(classifier, scaler)`` pair: parameters of its features, steps.
+
+    The parameters are those of a first step `PatchFeatures`, None without it. The classifier is the last
+    step.
+    """
+    from vehicle_detection.features import PatchFeatures
+
+    steps = _flatten(model)
+    if isinstance(model, (tuple, list)) and len(steps) == 2 and hasattr(steps[0], "predict"):
+        steps.reverse()
+    if steps and isinstance(steps[0], PatchFeatures):
+        return steps[0].to_params(), steps[1:]
+    return None, steps
+
+
+def _flatten(model: Any) -> list[Any]:
+    """List the fitted estimators of nested pipelines and searches, in order."""
+    if isinstance(model, (tuple, list)):
+        return [step for part in model for step in _flatten(part)]
+    if hasattr(model, "steps"):
+        return [step for _, part in model.steps for step in _flatten(part)]
+    if model is None or isinstance(model, str):  # "passthrough"
+        return []
+    if hasattr(model, "cv") and hasattr(model, "refit"):
+        if not hasattr(model, "best_estimator_"):
+            name = type(model).__name__
+            raise InvalidInputError(f"pipeline must be fitted, with refit=True; its {name} is not")
+        return _flatten(model.best_estimator_)
+    return [model]
+
+
+def fold_estimators(steps: Sequence[Any], length: int) -> Template:
+    """Fold fitted scalers and, last, a linear classifier of vectors of `length` into a template.
+
+    Raises
+    ------
+    InvalidInputError
+        If a step is of another kind, not fitted, or fitted on vectors of another length or other labels.
+    """
+    if not steps:
+        raise InvalidInputError("pipeline must end in a linear classifier; got no step")
+    *scalers, classifier = steps
+    mean, scale = np.zeros(length), np.ones(length)
+    for scaler in scalers:
+        offset, factor = _scaling(scaler, length)
+        mean, scale = mean + scale * offset, scale * factor
+    return Template(mean, scale, *_weights(classifier, length))
+
+
+def _scaling(scaler: Any, length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Offset and factor of a fitted scaler, which computes ``(x - offset) / factor``."""
+    name = type(scaler).__name__
+    if name not in _SCALERS or hasattr(scaler, "predict"):
+        raise InvalidInputError(
+            f"pipeline must hold {_SCALERS} before the classifier; got {name}, which does not scale each "
+            "feature by itself. Train with one of these, or search with vehicle_detection.course, which "
+            "accepts any scikit-learn estimator"
+        )
+    if getattr(scaler, "n_features_in_", None) is None:
+        raise InvalidInputError(f"pipeline must be fitted; its {name} is not: call fit first")
+    _check_length(int(scaler.n_features_in_), length, name)
+    offset, factor = np.zeros(length), np.ones(length)
+    if getattr(scaler, "clip", False):
+        raise InvalidInputError(f"pipeline must not clip; train with {name}(clip=False)")
+    if name == "MinMaxScaler":
+        return -scaler.min_ / scaler.scale_, 1 / scaler.scale_
+    center = getattr(scaler, "mean_" if name == "StandardScaler" else "center_", None)
+    if center is not None and getattr(scaler, "with_mean", True):
+        offset = np.asarray(center, np.float64)
+    if getattr(scaler, "scale_", None) is not None:
+        factor = np.asarray(scaler.scale_, np.float64)
+    return offset, factor
+
+
+def _weights(classifier: Any, length: int) -> tuple[NDArray[np.float64], float]:
+    """Weights and intercept of a fitted linear classifier of two classes."""
+    name = type(classifier).__name__
+    if not hasattr(classifier, "decision_function") and not hasattr(classifier, "predict"):
+        raise InvalidInputError(f"pipeline must end in a linear classifier; got {describe(classifier)}")
+    if not hasattr(classifier, "classes_"):
+        raise InvalidInputError(f"pipeline must be fitted; its {name} is not: call fit first")
+    if not hasattr(classifier, "coef_"):
+        raise InvalidInputError(
+            f"pipeline must end in a linear classifier, such as LinearSVC; got {name}. Search with "
+            "vehicle_detection.course, which accepts any scikit-learn estimator"
+        )
+    labels = list(classifier.classes_)
+    if labels not in ([0, 1], [-1, 1]):
+        raise InvalidInputError(
+            f"pipeline must be fitted on the labels 0 or -1 for others and 1 for vehicles; got {labels}"
+        )
+    coef = classifier.coef_
+    coef = np.asarray(coef.toarray() if hasattr(coef, "toarray") else coef, np.float64).ravel()
+    _check_length(len(coef), length, name)
+    return coef, float(np.ravel(classifier.intercept_)[0])
+
+
+def _check_length(fitted: int, length: int, name: str) -> None:
+    if fitted != length:
+        raise InvalidInputError(
+            f"pipeline must be fitted on the {length} features of its parameters; its {name} was fitted on "
+            f"{fitted}. Pass the parameters that the features were computed with"
+        )
+
+
+def check_equal_scores(template: Template, steps: Sequence[Any]) -> None:
+    """Compare the template with the estimators on random vectors: those of other libraries may differ."""
+    *scalers, classifier = steps
+    rng = np.random.default_rng(0)
+    vectors = template.mean + template.scale * rng.normal(scale=3, size=(16, len(template.mean)))
+    weights, bias = template.fold()
+    expected = vectors @ weights + bias
+    scaled = vectors
+    for scaler in scalers:
+        scaled = scaler.transform(scaled)
+    scores = np.ravel(classifier.decision_function(scaled))
+    if not np.allclose(scores, expected, rtol=1e-3, atol=1e-3 * float(np.abs(expected).max())):
+        names = " and ".join(type(step).__name__ for step in steps)
+        raise InvalidInputError(f"pipeline must score by a weighted sum of the features; {names} does not")
