@@ -7,6 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+from sklearn.linear_model import LogisticRegression
+from sklearn.naive_bayes import GaussianNB
+from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 
@@ -23,8 +27,10 @@ from vehicle_detection.classifier import (
     patch_features,
     train_classifier,
 )
+from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.features import extract_features
+from vehicle_detection.images import write_image
 from vehicle_detection.params import FeatureParams
 
 SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
@@ -104,11 +110,80 @@ def test_degraded_copies_have_their_weight(patches, labels):
     assert TrainingOptions(degraded=0.2).copy_weights == (1, 1, 0.2, 0.2)
     assert TrainingOptions(mirror=False, degraded=0.2).copy_weights == (1, 0.2, 0.2)
     assert TrainingOptions(mirror=False).copy_weights == (1,)
-    found = train_classifier(patches, labels, params=SMALL, gamma=0.4, degraded=0.2)
+    found = train_classifier(patches, labels, params=SMALL, gamma=0.4, degraded=0.2, solver="dual")
     fitted = fit_svm(features, np.tile(labels, 4), 1e-4 * np.repeat([1, 1, 0.2, 0.2], 80), gains=SMALL.gains)
     np.testing.assert_array_equal(found.templates[0].coef, fitted.coef)
     training = found.metadata["training"]
     assert (training["degraded"], training["vehicles"], training["non_vehicles"]) == (0.2, 40, 40)
+
+
+def test_the_default_is_linear_svc_behind_a_scaler(patches, labels):
+    found = train_classifier(patches, labels, params=SMALL, C=0.01, mirror=False)
+    pipeline = make_pipeline(StandardScaler(), LinearSVC(C=0.01, random_state=0, max_iter=10_000))
+    features = extract_features(patches, SMALL)
+    expected = pipeline.fit(features, labels).decision_function(features)
+    np.testing.assert_allclose(found.decision_function(features), expected, rtol=1e-5, atol=1e-5)
+    dual = train_classifier(patches, labels, params=SMALL, C=0.01, mirror=False, solver="dual")
+    np.testing.assert_allclose(dual.decision_function(features), expected, atol=3e-3)
+    assert found.metadata["training"]["solver"] == "liblinear"
+    assert found.metadata["training"] | {"solver": "dual"} == dual.metadata["training"]
+
+
+@pytest.mark.parametrize("options", [{}, {"gamma": 0.4, "degraded": 0.2}], ids=str)
+def test_any_linear_estimator(patches, labels, options):
+    estimator = LogisticRegression(C=1e-3)
+    found = train_classifier(patches, labels, params=SMALL, estimator=estimator, **options)
+    training = TrainingOptions(**options)
+    features = patch_features(patches, SMALL, training)
+    scaled = StandardScaler().fit_transform(features)
+    copies = len(training.copy_weights)
+    weights = np.repeat(training.copy_weights, len(patches))
+    fitted = LogisticRegression(C=1e-3).fit(scaled, np.tile(labels, copies), weights)
+    np.testing.assert_allclose(
+        found.decision_function(features), fitted.decision_function(scaled), rtol=1e-4, atol=1e-4
+    )
+    assert not hasattr(estimator, "coef_")
+    assert found.metadata["training"]["estimator"] == "LogisticRegression(C=0.001)"
+
+
+def test_estimators_that_cannot_be_used(patches, labels):
+    def train(estimator, **options):
+        train_classifier(patches, labels, params=SMALL, estimator=estimator, **options)
+
+    with pytest.raises(InvalidInputError, match="such as LinearSVC; got GaussianNB"):
+        train(GaussianNB())
+    with pytest.raises(InvalidInputError, match="estimator must be a scikit-learn classifier without its"):
+        train(make_pipeline(StandardScaler(), LinearSVC()))
+    with pytest.raises(InvalidInputError, match=r"must be a scikit-learn classifier .*; got 'svm'"):
+        train("svm")
+    with pytest.raises(InvalidInputError, match=r"must accept sample_weight .*; LinearDis.* does not"):
+        train(LinearDiscriminantAnalysis(), degraded=0.1)
+    with pytest.raises(InvalidInputError, match="solver must be one of 'liblinear', 'dual'; got 'fast'"):
+        train(None, solver="fast")
+
+
+def test_the_forms_of_training_patches(patches, labels, tmp_path):
+    some = np.r_[0:6, 40:46]
+    patches, labels = patches[some], labels[some]
+    files = [tmp_path / f"{index}.png" for index in range(len(patches))]
+    for file, patch in zip(files, patches):
+        write_image(file, patch)
+    expected = train_classifier(patches, labels, params=SMALL).templates[0].coef
+    names = [f"vehicles/drawn/{index}.png" for index in range(len(patches))]
+    forms = (
+        (PatchSet(patches, labels, names),),
+        ((patches[:6], patches[6:]),),
+        ((list(patches[:6]), [str(file) for file in files[6:]]),),
+        ([PatchSet(patches[:6], labels[:6], names[:6]), files[6:]],),
+        (files, labels),
+        (PatchSet(patches, labels, names), labels.tolist()),
+    )
+    for form in forms:
+        np.testing.assert_array_equal(train_classifier(*form, params=SMALL).templates[0].coef, expected)
+    with pytest.raises(InvalidInputError, match="labels must hold both classes"):
+        train_classifier((patches, []), params=SMALL)
+    with pytest.raises(InvalidInputError, match="cars must be patches or a list of paths, got 'vehicles'"):
+        train_classifier(("vehicles", "non-vehicles"), params=SMALL)
 
 
 @pytest.mark.parametrize(
@@ -143,7 +218,7 @@ def test_metadata_of_training(trained):
     training = trained.metadata["training"]
     assert (training["vehicles"], training["non_vehicles"]) == (40, 40)
     assert training["random_state"] == 0
-    assert {"vehicle_detection", "numpy", "numba"} <= trained.metadata["versions"].keys()
+    assert {"vehicle_detection", "numpy", "scikit-learn"} <= trained.metadata["versions"].keys()
     assert trained.metadata["accuracy"] == 1.0
     json.dumps(trained.metadata)
 
@@ -187,7 +262,7 @@ def test_labels_of_any_number_type(patches, labels, trained, kind):
         (np.repeat([1, 0], 39), "labels must hold one number for each of 80 patches; got an array of shape"),
         (np.repeat([1, 0], 40)[:, None], "labels must hold one number for each of 80 patches"),
         (np.repeat(["car", "road"], 40), "labels must hold one number for each of 80 patches"),
-        (None, "labels must hold one number for each of 80 patches"),
+        (None, r"labels must be given, unless patches is a PatchSet or a pair \(cars, notcars\)"),
     ],
 )
 def test_bad_labels(patches, bad, message):
@@ -309,6 +384,8 @@ def test_invalid_templates(columns, message):
 def test_templates_that_do_not_match_the_params():
     with pytest.raises(InvalidInputError, match="templates must hold at least one template; got none"):
         VehicleClassifier(SMALL, ())
+    with pytest.raises(InvalidInputError, match="templates must be a Template, got 'abc'; load_classifier"):
+        VehicleClassifier(SMALL, ("abc",))
     with pytest.raises(InvalidInputError, match=rf"templates must have {SMALL.length} weights, .* got 4"):
         VehicleClassifier(SMALL, (Template(np.zeros(4), np.ones(4), np.ones(4), 0.0),))
 

@@ -90,6 +90,7 @@ def test_the_scores_equal_training_on_the_training_part_only(patch_set, mirror, 
                 mirror=mirror,
                 gamma=gamma,
                 random_state=3,
+                solver="dual",
             )
             assert alone.score(patch_set.patches[test], patch_set.labels[test]) == accuracy
         assert score.leakage == split_leakage(patch_set, each[0])
@@ -103,7 +104,7 @@ def test_error_rates():
 
 def test_the_model_is_trained_on_all_patches(trained, patch_set):
     classifier, report = trained
-    plain = train_classifier(patch_set.patches, patch_set.labels, params=SMALL, random_state=3)
+    plain = train_classifier(patch_set.patches, patch_set.labels, params=SMALL, random_state=3, solver="dual")
     for name in ("mean", "scale", "coef", "intercept"):
         np.testing.assert_array_equal(
             getattr(classifier.templates[0], name), getattr(plain.templates[0], name)

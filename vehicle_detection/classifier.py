@@ -26,8 +26,9 @@ from vehicle_detection._common import (
     write_model,
 )
 from vehicle_detection._kernels import fit_svm
+from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError, ModelFileError
-from vehicle_detection.features import extract_features
+from vehicle_detection.features import extract_features, read_patches
 from vehicle_detection.params import PATCH_SIZE, FeatureParams, SearchParams
 
 if TYPE_CHECKING:
@@ -106,6 +107,7 @@ class VehicleClassifier:
         if not self.templates:
             raise InvalidInputError("templates must hold at least one template; got none")
         for template in self.templates:
+            check_type(template, "templates", Template, CLASSIFIER_REMEDY)
             if template.coef.shape != (self.params.length,):
                 raise InvalidInputError(
                     f"templates must have {self.params.length} weights, the length of the features; "
@@ -304,6 +306,7 @@ class TrainingOptions:
     """
 
     C: float = DEFAULT_C
+    solver: Literal["liblinear", "dual"] = "dual"
     mirror: bool = True
     gamma: float = 0.0
     degraded: float = 0.0
@@ -320,6 +323,7 @@ class TrainingOptions:
         }
         for name, value in checked.items():
             object.__setattr__(self, name, value)
+        check_choice(self.solver, "solver", ("liblinear", "dual"))
         check_type(self.mirror, "mirror", bool, "pass True or False")
         if self.gamma and not self.mirror:
             raise InvalidInputError(
@@ -337,11 +341,13 @@ class TrainingOptions:
 
 
 def train_classifier(
-    patches: NDArray[np.uint8],
-    labels: ArrayLike,
+    patches: Any,
+    labels: ArrayLike | None = None,
     *,
     params: FeatureParams | None = None,
     C: float = DEFAULT_C,
+    solver: Literal["liblinear", "dual"] = "liblinear",
+    estimator: Any = None,
     mirror: bool = True,
     gamma: float = 0.0,
     degraded: float = 0.0,
@@ -349,18 +355,26 @@ def train_classifier(
     n_jobs: int | None = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> VehicleClassifier:
-    """Train a linear SVM behind a feature scaler on patches.
+    """Train a linear SVM behind a feature scaler on patches: scikit-learn's ``LinearSVC``, or another model.
 
     Parameters
     ----------
     patches
-        ``(N, 64, 64, 3)`` uint8 RGB training patches.
+        ``(N, 64, 64, 3)`` uint8 RGB training patches, or a list of patches or of image files. Without
+        `labels`: a `PatchSet`, or a pair ``(cars, notcars)`` of such arrays or lists.
     labels
         ``(N,)``, 1 (or True) for a vehicle, 0 otherwise.
     params
         Features; the default is ``FeatureParams()``.
     C
         Inverse regularization strength. Small values generalize better to other sequences.
+    solver
+        ``"liblinear"``: ``LinearSVC`` of scikit-learn. ``"dual"``: the library's solver of the same problem,
+        for large sets: on 17,760 patches with 8,460 features it needs a fifth of the time and a thirteenth of
+        the memory, and its scores differ by up to 3e-4.
+    estimator
+        An unfitted scikit-learn classifier with linear scores, such as ``LogisticRegression(C=0.01)``, that
+        replaces ``LinearSVC``, `C` and `solver`.
     mirror
         Add the mirror image of each patch.
     gamma
@@ -378,7 +392,8 @@ def train_classifier(
     Raises
     ------
     InvalidInputError
-        If a patch is malformed, the labels do not match the patches, or a class is missing.
+        If a patch is malformed, the labels do not match the patches, a class is missing, or the estimator is
+        not linear.
 
     Examples
     --------
@@ -388,11 +403,28 @@ def train_classifier(
     1.0
     """
     params = params or FeatureParams()
-    images = check_patches(patches, PATCH_SIZE)
-    targets = check_labels(labels, len(images))
-    options = TrainingOptions(C=C, mirror=mirror, gamma=gamma, degraded=degraded, random_state=random_state)
+    options = TrainingOptions(
+        C=C, solver=solver, mirror=mirror, gamma=gamma, degraded=degraded, random_state=random_state
+    )
+    images, targets = _read_training_set(patches, labels)
     features = patch_features(images, params, options, n_jobs=n_jobs)
-    return fit_features(features, targets, params, options, metadata=metadata)
+    return fit_features(features, targets, params, options, estimator=estimator, metadata=metadata)
+
+
+def _read_training_set(patches: Any, labels: ArrayLike | None) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Patches and labels of the forms that `train_classifier` accepts."""
+    if labels is None and isinstance(patches, PatchSet):
+        labels = patches.labels
+    if labels is None:
+        if not isinstance(patches, (tuple, list)) or len(patches) != 2:
+            raise InvalidInputError(
+                "labels must be given, unless patches is a PatchSet or a pair (cars, notcars); "
+                f"patches is {describe(patches)}"
+            )
+        cars, others = (read_patches(part, name) for part, name in zip(patches, ("cars", "notcars")))
+        patches, labels = np.concatenate([cars, others]), np.repeat([1, 0], [len(cars), len(others)])
+    images = read_patches(patches, "patches")
+    return images, check_labels(labels, len(images))
 
 
 def patch_features(
@@ -422,6 +454,7 @@ def fit_features(
     options: TrainingOptions,
     *,
     rows: NDArray[np.intp] | None = None,
+    estimator: Any = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> VehicleClassifier:
     """Train on the `patch_features` of the same options, which are not copied.
@@ -433,20 +466,28 @@ def fit_features(
     weights, count = options.copy_weights, len(labels)
     chosen = np.arange(count) if rows is None else rows
     all_labels = np.tile(labels, len(weights))
-    fitted = fit_svm(
-        features,
-        all_labels,
-        options.C * np.repeat(weights, count) * np.where(all_labels == 1, options.positive_weight, 1.0),
-        rows=np.concatenate([chosen + copy * count for copy in range(len(weights))]),
-        gains=params.gains,
-        random_state=options.random_state,
-    )
+    all_weights = np.repeat(weights, count) * np.where(all_labels == 1, options.positive_weight, 1.0)
+    all_rows = np.concatenate([chosen + copy * count for copy in range(len(weights))])
+    training, seed = options.to_dict(), options.random_state
+    if estimator is None and options.solver == "dual":
+        costs = options.C * all_weights
+        fitted = fit_svm(features, all_labels, costs, rows=all_rows, gains=params.gains, random_state=seed)
+        template, learner = Template(*fitted), "numba"
+    else:
+        from vehicle_detection.sklearn_models import fit_estimator, linear_svc
+
+        if estimator is not None:
+            training |= {"estimator": " ".join(repr(estimator).split()), "C": None, "solver": None}
+        model = linear_svc(options.C, seed) if estimator is None else estimator
+        rows_labels, rows_weights = all_labels[all_rows], all_weights[all_rows]
+        template = fit_estimator(model, features[all_rows], rows_labels, rows_weights, params.gains)
+        learner = "scikit-learn"
     vehicles = int(labels[chosen].sum())
-    training = options.to_dict() | {"vehicles": vehicles, "non_vehicles": len(chosen) - vehicles}
-    libraries = {name: version(name) for name in ("numba", "numpy", "opencv-python-headless")}
+    training |= {"vehicles": vehicles, "non_vehicles": len(chosen) - vehicles}
+    libraries = {name: version(name) for name in (learner, "numpy", "opencv-python-headless")}
     versions = {"vehicle_detection": vehicle_detection.__version__, **libraries}
     all_metadata = {"training": training, "versions": versions, **(metadata or {})}
-    return VehicleClassifier(params, (Template(*fitted),), all_metadata)
+    return VehicleClassifier(params, (template,), all_metadata)
 
 
 def check_labels(labels: ArrayLike, count: int) -> NDArray[np.int64]:

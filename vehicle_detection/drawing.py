@@ -77,7 +77,7 @@ def draw_boxes(image: Image, boxes: ArrayLike, *, color: Color = (0, 0, 255), th
         raise InvalidInputError(f"color must be (red, green, blue), 0-255 each; got {describe(color)}")
     red, green, blue = (check_integer(value, "color", low=0, high=255) for value in color)
     width = check_integer(thickness, "thickness", low=1, high=10_000)
-    for box in _corner_array(boxes):
+    for box in check_boxes(boxes):
         _draw_outline(result, _round_box(box), (red, green, blue), width)
     return result
 
@@ -204,7 +204,7 @@ def draw_diagnostics(
     # Draw at the panels' size, so that lines and text stay sharp.
     small = np.asarray(cv2.resize(checked, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
     scale = np.array([width, height, width, height]) / np.array(checked.shape[:2] * 2)[[1, 0, 1, 0]]
-    boxes = check_boxes(windows.boxes) if isinstance(windows, Detections) else _corner_array(windows)
+    boxes = check_boxes(windows)
     scaled = [dataclasses.replace(track, box=track.box * scale) for track in _check_tracks(tracks)]
     panels = [
         ("frame", small),
@@ -351,11 +351,3 @@ def _check_tracks(tracks: object) -> list[Track]:
             f"tracks must be Track objects, got {describe(tracks)}; pass what update returns"
         )
     return listed
-
-
-def _corner_array(boxes: ArrayLike) -> NDArray[Any]:
-    """Boxes as ``(N, 4)``; the course's pairs of corners may be in any order."""
-    if isinstance(boxes, Sequence) and len(boxes) and np.shape(boxes)[1:] == (2, 2):
-        corners = np.asarray(boxes)
-        return check_boxes(np.concatenate((corners.min(axis=1), corners.max(axis=1)), axis=1))
-    return check_boxes(boxes)

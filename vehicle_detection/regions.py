@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection._common import check_type
 from vehicle_detection.boxes import (
     Detections,
     Floats,
@@ -61,6 +62,9 @@ def find_vehicles(
     array([[608, 385, 676, 448]])
     """
     params = params or RegionParams()
+    check_type(windows, "windows", Detections, "pass Detections(boxes, scores)")
+    check_type(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
+    check_type(params, "params", RegionParams, "omit it for the default")
     return fit_boxes(group_windows(windows, params), camera, shape, params)
 
 

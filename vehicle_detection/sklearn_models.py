@@ -48,6 +48,42 @@ def _flatten(model: Any) -> list[Any]:
     return [model]
 
 
+def linear_svc(C: float, random_state: int) -> Any:
+    """Return the unfitted ``LinearSVC`` of `train_classifier`."""
+    from sklearn.svm import LinearSVC
+
+    return LinearSVC(C=C, random_state=random_state, max_iter=10_000)
+
+
+def fit_estimator(
+    estimator: Any,
+    features: NDArray[np.float32],
+    labels: NDArray[np.int64],
+    weights: NDArray[np.float64],
+    gains: NDArray[np.float64],
+) -> Template:
+    """Fit a scaler and a copy of a linear classifier; `weights` are those of the rows of `features`."""
+    from sklearn.base import clone
+    from sklearn.preprocessing import StandardScaler
+    from sklearn.utils.validation import has_fit_parameter
+
+    if not hasattr(estimator, "fit") or not hasattr(estimator, "get_params") or hasattr(estimator, "steps"):
+        raise InvalidInputError(
+            f"estimator must be a scikit-learn classifier without its scaler; got {describe(estimator)}"
+        )
+    weighted = bool((weights != 1).any())
+    if weighted and not has_fit_parameter(estimator, "sample_weight"):
+        raise InvalidInputError(
+            f"estimator must accept sample_weight for degraded copies; {type(estimator).__name__} does not"
+        )
+    scaler = StandardScaler(copy=False).fit(features)
+    scaled = scaler.transform(features)
+    scaled *= gains.astype(np.float32)
+    fitted = clone(estimator).fit(scaled, labels, **({"sample_weight": weights} if weighted else {}))
+    template = fold_estimators([scaler, fitted], len(gains))
+    return Template(template.mean, template.scale / gains, template.coef, template.intercept)
+
+
 def fold_estimators(steps: Sequence[Any], length: int) -> Template:
     """Fold fitted scalers and, last, a linear classifier of vectors of `length` into a template.
 

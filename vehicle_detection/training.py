@@ -104,6 +104,7 @@ def train_and_evaluate(
     mirror: bool = True,
     gamma: float = 0.0,
     degraded: float = 0.0,
+    solver: Literal["liblinear", "dual"] = "dual",
     random_state: int = 0,
     split: Literal["random", "sequences"] = "random",
     seeds: int = 5,
@@ -121,6 +122,9 @@ def train_and_evaluate(
         Patches of both classes.
     params, C, mirror, gamma, degraded
         As in `train_classifier`.
+    solver
+        As in `train_classifier`; ``"dual"`` is the default because the models of all splits are trained at
+        the same time, without copies of the features.
     random_state
         Seed of the solver and of the first random split.
     split
@@ -157,7 +161,9 @@ def train_and_evaluate(
     check_type(patch_set, "patch_set", PatchSet, "read one with load_training_patches")
     labels = check_labels(patch_set.labels, len(patch_set))
     params = params or FeatureParams()
-    options = TrainingOptions(C=C, mirror=mirror, gamma=gamma, degraded=degraded, random_state=random_state)
+    options = TrainingOptions(
+        C=C, solver=solver, mirror=mirror, gamma=gamma, degraded=degraded, random_state=random_state
+    )
     check_choice(split, "split", ("random", "sequences"))
     check_integer(seeds, "seeds", low=1, high=1000)
     check_integer(random_state, "random_state", low=0, high=2**32 - seeds)

@@ -15,6 +15,8 @@ from vehicle_detection._common import (
     check_type,
     describe,
 )
+from vehicle_detection.boxes import Detections
+from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
 
 IMAGE = np.zeros((4, 6, 3), np.uint8)
@@ -69,6 +71,7 @@ def test_check_image_returns_the_same_array():
         (np.zeros((4, 0, 3), np.uint8), "the image is empty"),
         (IMAGE / 255, r"\(image \* 255\)"),
         (IMAGE.astype(np.float32), r"\(image \* 255\)"),
+        (IMAGE + 255.0, r"convert its values 0-255 with image.round\(\).astype\(numpy.uint8\)"),
         (IMAGE.astype(np.uint16), "image // 257"),
         (IMAGE.astype(np.int64), "0-255"),
         (IMAGE.astype(bool), "0-255"),
@@ -123,6 +126,17 @@ def test_check_boxes_keeps_dtype_and_values():
     boxes = np.array([[0, 1, 2, 3], [5, 5, 5, 5]], np.int16)
     assert check_boxes(boxes) is boxes
     assert check_boxes([[0.5, 1, 2, 3]]).dtype == np.float64
+
+
+def test_check_boxes_accepts_corner_pairs_and_detections():
+    boxes = [[1, 2, 3, 4], [0, 0, 5, 6]]
+    np.testing.assert_array_equal(check_boxes([((1, 2), (3, 4)), ((5, 6), (0, 0))]), boxes)
+    np.testing.assert_array_equal(check_boxes(Detections(boxes, [1, 2])), boxes)
+
+
+def test_check_patches_accepts_a_patch_set():
+    patches = np.zeros((2, 64, 64, 3), np.uint8)
+    assert check_patches(PatchSet(patches, [0, 1], ["a/b/c.png"] * 2), 64) is patches
 
 
 @pytest.mark.parametrize(

@@ -589,7 +589,8 @@ def test_train_writes_model_report_and_card(material, tmp_path):
     text = card.read_text()
     assert (
         "vehicle-detection train --vehicles vehicles.zip --non-vehicles non-vehicles --features luv-2384 "
-        "--split sequences --C 0.0001 --seed 2 --compare ycrcb-6156 -o m.safetensors --card c.md\n"
+        "--split sequences --C 0.0001 --seed 2 --gamma 0.4 --degraded 0.05 --compare ycrcb-6156 "
+        "-o m.safetensors --card c.md\n"
     ) in text
     assert str(tmp_path) not in text
     again = tmp_path / "again.safetensors"

@@ -30,7 +30,7 @@ def test_a_trial_equals_training_on_that_part(patch_set, mirror, split):
     (row,) = table.to_dict("records")
     train, test = patch_set[parts.train], patch_set[parts.test]
     classifier = train_classifier(
-        train.patches, train.labels, params=PARAMS, C=0.01, mirror=mirror, random_state=3
+        train.patches, train.labels, params=PARAMS, C=0.01, mirror=mirror, random_state=3, solver="dual"
     )
     config = TrialConfig(PARAMS, TrainingOptions(C=0.01, mirror=mirror))
     tried = TrialEvaluator(patch_set, UNTIMED).train(config, parts.train, 3)

@@ -7,7 +7,7 @@ from collections.abc import Collection
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from vehicle_detection.errors import InvalidInputError
 
@@ -44,8 +44,10 @@ def check_image(image: object, name: str = "image") -> NDArray[np.uint8]:
         remedy = "pass one image with three color channels"
     elif image.shape[0] == 0 or image.shape[1] == 0:
         remedy = "the image is empty"
+    elif image.dtype.kind == "f" and image.max() > 1:
+        remedy = "convert its values 0-255 with image.round().astype(numpy.uint8)"
     elif image.dtype.kind == "f":
-        remedy = "scale a 0-1 float image with (image * 255).round().astype(numpy.uint8)"
+        remedy = "scale its values 0-1 with (image * 255).round().astype(numpy.uint8)"
     elif image.dtype == np.uint16:
         remedy = "scale a 16-bit image with (image // 257).astype(numpy.uint8)"
     elif image.dtype != np.uint8:
@@ -66,6 +68,7 @@ def check_channel(channel: object, name: str = "img") -> NDArray[np.uint8]:
 
 def check_patches(patches: object, size: int, name: str = "patches") -> NDArray[np.uint8]:
     """Return `patches` as an ``(N, size, size, 3)`` uint8 array; a list of such images is stacked."""
+    patches = getattr(patches, "patches", patches)  # of a PatchSet
     if isinstance(patches, (list, tuple)):
         images = [check_image(patch, f"{name}[{index}]") for index, patch in enumerate(patches)]
         for index, image in enumerate(images):
@@ -88,18 +91,24 @@ def check_patches(patches: object, size: int, name: str = "patches") -> NDArray[
     return patches
 
 
-def check_boxes(boxes: ArrayLike, name: str = "boxes") -> NDArray[Any]:
-    """Return `boxes` as an ``(N, 4)`` array of finite boxes with ``x1 <= x2`` and ``y1 <= y2``."""
+def check_boxes(boxes: Any, name: str = "boxes") -> NDArray[Any]:
+    """Return `boxes` as an ``(N, 4)`` array of finite boxes with ``x1 <= x2`` and ``y1 <= y2``.
+
+    `boxes` may also be `Detections`, or pairs ``((x1, y1), (x2, y2))`` of opposite corners.
+    """
+    boxes = getattr(boxes, "boxes", boxes)  # of Detections
     try:
         array = np.asarray(boxes)
     except ValueError:  # rows of different lengths
         array = np.array(None)
     if array.size == 0:
         return np.empty((0, 4), array.dtype if array.dtype.kind in "iuf" else np.float64)
+    if array.shape[1:] == (2, 2) and array.dtype.kind in "iuf":
+        array = np.concatenate((array.min(axis=1), array.max(axis=1)), axis=1)
     if array.ndim != 2 or array.shape[1] != 4 or array.dtype.kind not in "iuf":
         raise InvalidInputError(
-            f"{name} must be an (N, 4) number array of [x1, y1, x2, y2], got {describe(boxes)}; "
-            "wrap a single box in a list"
+            f"{name} must be an (N, 4) number array of [x1, y1, x2, y2] or corner pairs "
+            f"((x1, y1), (x2, y2)), got {describe(boxes)}; wrap a single box in a list"
         )
     if not np.isfinite(array).all():
         raise InvalidInputError(f"{name} must be finite, got NaN or infinity; drop those rows")

@@ -40,10 +40,17 @@ def train(
     C: Annotated[float, Option("--C", metavar="F", help="Inverse regularization strength.")] = 1e-4,
     seed: Annotated[int, Option(metavar="N", help="Random seed of solver and first split.")] = 0,
     no_mirror: Annotated[bool, Option("--no-mirror", help="Train without mirrored copies.")] = False,
-    gamma: Annotated[float, Option(metavar="F", help="Brightness range of mirrored copies.")] = 0.0,
+    gamma: Annotated[
+        float | None,
+        Option(metavar="F", help="Brightness range of mirrored copies; default: 0.4, without mirroring 0."),
+    ] = None,
     degraded: Annotated[
         float, Option(metavar="W", help="Weight of blurred, pale and compressed copies of each patch, 0-1.")
-    ] = 0.0,
+    ] = 0.05,
+    solver: Annotated[
+        str,
+        Option(metavar="dual|liblinear", help="liblinear is LinearSVC: same model, slower."),
+    ] = "dual",
     report: Annotated[
         Path | None, Option(metavar="FILE.json", help="Scores on every split, timings.")
     ] = None,
@@ -52,7 +59,7 @@ def train(
         list[str] | None, Option(metavar="PRESET", help="Other features to evaluate; repeatable.")
     ] = None,
 ) -> None:
-    """Train a model on patches, and evaluate it on held-out patches."""
+    """Train a model on patches, and evaluate it on held-out patches; by default like the model "highway"."""
     from vehicle_detection._common import atomic_write, check_target
     from vehicle_detection.datasets import load_training_patches
     from vehicle_detection.params import FeatureParams
@@ -65,8 +72,10 @@ def train(
         presets = [FeatureParams.preset(features)]
     with option_names(preset="--compare"):
         presets += [FeatureParams.preset(name) for name in compare or ()]
+    if gamma is None:
+        gamma = 0.0 if no_mirror else 0.4
     options: dict[str, Any] = {"C": C, "mirror": not no_mirror, "gamma": gamma, "degraded": degraded}
-    options |= {"random_state": seed, "split": split}
+    options |= {"solver": solver, "random_state": seed, "split": split}
 
     with capture_stderr():
         patches = load_training_patches(vehicles, non_vehicles)
@@ -86,8 +95,8 @@ def train(
     if card is not None:
         words = ["--vehicles", vehicles.name, "--non-vehicles", non_vehicles.name, "--features", features]
         words += ["--split", split, "--C", f"{C:g}", "--seed", str(seed)] + ["--no-mirror"] * no_mirror
-        words += ["--gamma", f"{gamma:g}"] if gamma else []
-        words += ["--degraded", f"{degraded:g}"] if degraded else []
+        words += ["--gamma", f"{gamma:g}", "--degraded", f"{degraded:g}"]
+        words += ["--solver", solver] if solver != "dual" else []
         words += [word for name in compare or () for word in ("--compare", name)]
         words += ["-o", output.name, "--card", card.name]
         command = shlex.join(["vehicle-detection", "train", *words])

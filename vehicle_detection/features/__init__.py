@@ -12,6 +12,7 @@ from vehicle_detection.features.extract import (
     hog_image,
     hog_source,
     pick_hog_channels,
+    read_patches,
     single_img_features,
 )
 
@@ -29,6 +30,7 @@ __all__ = [
     "hog_image",
     "hog_source",
     "pick_hog_channels",
+    "read_patches",
     "single_img_features",
 ]
 

@@ -7,7 +7,7 @@ The course's functions are the readable reference: scikit-image's HOG, ``cv2.res
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal
 
@@ -296,7 +296,7 @@ def single_img_features(image: NDArray[np.uint8], params: FeatureParams | None =
 
 
 def extract_features(
-    source: NDArray[np.uint8] | Sequence[NDArray[np.uint8]] | Iterable[str | os.PathLike[str]],
+    source: Any,
     params: FeatureParams | None = None,
     *,
     n_jobs: int | None = None,
@@ -307,7 +307,7 @@ def extract_features(
     Parameters
     ----------
     source
-        ``(N, 64, 64, 3)`` uint8 RGB, a list of such patches, or paths of image files.
+        ``(N, 64, 64, 3)`` uint8 RGB, a `PatchSet`, or a list of patches or of paths of image files.
     params
         Features to compute; the default is ``FeatureParams()``.
     n_jobs
@@ -331,7 +331,7 @@ def extract_features(
     (5, 6156)
     """
     params = _check_params(params)
-    patches = check_patches(_read_all(source), PATCH_SIZE, "source")
+    patches = read_patches(source, "source")
     features = np.empty((len(patches), params.length), np.float32)
     batches = [slice(start, start + 256) for start in range(0, len(patches), 256)]
 
@@ -383,17 +383,17 @@ def _extract_batch(patches: NDArray[np.uint8], features: NDArray[np.float32], pa
             _hog_kernels.patch_hog(flat, channels, *sizes, orientation_cotangents(params.orient), hog)
 
 
-def _read_all(source: Any) -> Any:
-    """Read the files of a list of paths; return patches unchanged."""
+def read_patches(source: Any, name: str) -> NDArray[np.uint8]:
+    """Return patches as ``(N, 64, 64, 3)`` uint8; the files of a list of paths are read."""
+    source = getattr(source, "patches", source)  # of a PatchSet
     if isinstance(source, (str, os.PathLike)) or not isinstance(source, Iterable):
         raise InvalidInputError(
-            f"source must be patches or a list of paths, got {describe(source)}; "
+            f"{name} must be patches or a list of paths, got {describe(source)}; "
             "read a folder or zip with vehicle_detection.load_patches"
         )
-    if isinstance(source, np.ndarray):
-        return source
-    items = list(source)
-    return [read_image(item) if isinstance(item, (str, os.PathLike)) else item for item in items]
+    if not isinstance(source, np.ndarray):
+        source = [read_image(item) if isinstance(item, (str, os.PathLike)) else item for item in source]
+    return check_patches(source, PATCH_SIZE, name)
 
 
 def _check_params(params: FeatureParams | None) -> FeatureParams:

@@ -84,7 +84,7 @@ def describe_image(image: NDArray[Any]) -> ImageDescription:
     >>> print(describe_image(np.full((2, 3, 3), 7, np.uint8)))
     uint8 array of shape (2, 3, 3), values 7 to 7, mean 7, 7, 7
     >>> describe_image(np.full((2, 3, 3), 0.5)).problem.partition("; ")[2]
-    'scale a 0-1 float image with (image * 255).round().astype(numpy.uint8)'
+    'scale its values 0-1 with (image * 255).round().astype(numpy.uint8)'
     """
     given: object = image
     if not isinstance(given, np.ndarray) or not image.size or image.dtype.kind not in "iufb":
