@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import random_classifier
+from vehicle_detection import course
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import extract_features, single_img_features
 from vehicle_detection.params import FeatureParams, PixelBand, SearchParams
@@ -117,7 +118,10 @@ def test_windows_of_a_placed_band():
 def test_the_window_list_of_the_first_system():
     image = np.zeros((720, 1280, 3), np.uint8)
     lists = [
-        slide_window(image, x_start_stop=(650, None), y_start_stop=rows, xy_window=window, xy_overlap=overlap)
+        [
+            function(image, x_start_stop=(650, None), y_start_stop=rows, xy_window=window, xy_overlap=overlap)
+            for function in (slide_window, course.slide_window)
+        ]
         for rows, window, overlap in [
             ((395, 530), (96, 96), (0.9, 0.5)),
             ((380, 590), (110, 145), (0.7, 0.6)),
@@ -126,9 +130,12 @@ def test_the_window_list_of_the_first_system():
         ]
     ]
     bands = SearchParams.preset("130-windows").place(image.shape)
-    for found, band in zip(lists, bands, strict=True):
+    for (found, published), band in zip(lists, bands, strict=True):
         np.testing.assert_array_equal(found, band_windows(band))
-    assert sum(map(len, lists)) == 114
+        fits = [(x1, y1, x2, y2) for (x1, y1), (x2, y2) in published if x2 <= band.x2 and y2 <= band.y2]
+        assert fits == [tuple(window) for window in found.tolist()]
+    assert [len(published) for _, published in lists] == [69, 36, 9, 16]
+    assert sum(len(found) for found, _ in lists) == 114
 
 
 def test_scores_are_those_of_the_cropped_patches():

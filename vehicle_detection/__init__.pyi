@@ -1,4 +1,4 @@
-from . import plotting
+from . import course, plotting
 from .boxes import Detections, clip_boxes, iou_matrix, non_max_suppression
 from .camera import Camera, HorizonEstimate, estimate_horizon
 from .classifier import VehicleClassifier, load_classifier, train_classifier
@@ -132,6 +132,7 @@ __all__ = [
     "color_hist",
     "compare_configurations",
     "convert_color",
+    "course",
     "cross_validate_mixture",
     "draw_boxes",
     "draw_diagnostics",

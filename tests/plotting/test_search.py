@@ -62,7 +62,7 @@ def test_bands_are_drawn_where_they_are_searched(preset):
         assert f"{len(windows):,} windows" in axes.get_title()
         assert axes.lines[0].get_ydata() == [search.horizon * 720] * 2
     if preset == "130-windows":
-        assert total == 114  # as the course's slide_window
+        assert total == 114  # of 130, those that fit into the regions
     assert texts(figure.legends[0].get_texts())[:2] == ["band", "first window"]
     colors = [lines.get_colors()[0][:3] for lines in figure.axes[0].collections]
     assert colors == [pytest.approx(color) for color in (YELLOW, SKY, VERMILION)]
