@@ -1,19 +1,20 @@
 import dataclasses
+import pickle
 
 import numpy as np
 import pytest
 from sklearn.base import clone
-from sklearn.model_selection import GridSearchCV
+from sklearn.model_selection import GridSearchCV, cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
-from sklearn.utils import estimator_checks
-from sklearn.utils.estimator_checks import check_estimator
+from sklearn.utils.estimator_checks import estimator_checks_generator
 
 from tests.features.cases import PATCHES
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PatchFeatures, extract_features
 from vehicle_detection.params import FeatureParams
+from vehicle_detection.synthetic import render_patches
 
 
 def test_the_transformer_equals_extract_features():
@@ -57,17 +58,83 @@ def test_the_transformer_names_its_features():
     assert names[-1] == "hog15"
 
 
-@pytest.mark.filterwarnings("ignore:Can't test estimator:sklearn.exceptions.SkipTestWarning")
-def test_the_transformer_is_an_estimator():
-    # Most checks of scikit-learn need 2-D input; run those that do not.
-    check_estimator(PatchFeatures())
-    for check in (
-        estimator_checks.check_parameters_default_constructible,
-        estimator_checks.check_no_attributes_set_in_init,
-        estimator_checks.check_get_params_invariance,
-        estimator_checks.check_set_params,
-    ):
-        check("PatchFeatures", PatchFeatures())
+class OfTables(PatchFeatures):
+    """`PatchFeatures` that claims to accept tables of numbers, so that scikit-learn runs all its checks."""
+
+    def __sklearn_tags__(self):
+        tags = super().__sklearn_tags__()
+        tags.input_tags.two_d_array, tags.no_validation = True, False
+        return tags
+
+
+# Checks of scikit-learn that do not apply: they pass tables of numbers to `transform`, which needs images
+# (the tests below check the same with images), or expect `fit` to check its input, which it does not use.
+DO_NOT_APPLY = {
+    "check_fit_score_takes_y",
+    "check_estimators_dtypes",
+    "check_dtype_object",
+    "check_pipeline_consistency",
+    "check_estimators_pickle",
+    "check_f_contiguous_array_estimator",
+    "check_transformer_data_not_an_array",
+    "check_transformer_general",
+    "check_transformers_unfitted_stateless",
+    "check_methods_sample_order_invariance",
+    "check_methods_subset_invariance",
+    "check_dict_unchanged",
+    "check_fit_idempotent",
+    "check_fit2d_predict1d",
+    # Checks of the input of `fit`.
+    "check_n_features_in_after_fitting",
+    "check_n_features_in",
+    "check_complex_data",
+    "check_estimators_empty_data_messages",
+    "check_estimators_nan_inf",
+    "check_estimator_sparse_tag",
+    "check_fit1d",
+}
+
+
+def test_the_transformer_passes_the_estimator_checks_that_apply():
+    passed = set()
+    for estimator, check in estimator_checks_generator(OfTables(), legacy=True):
+        name = check.func.__name__
+        if name not in DO_NOT_APPLY and name != "check_array_api_input":
+            check(estimator)
+            passed.add(name)
+    assert {"check_parameters_default_constructible", "check_set_params", "check_fit2d_1sample"} <= passed
+    assert len(passed) >= 20
+
+
+def test_the_transformer_depends_on_each_patch_alone():
+    transformer = PatchFeatures(n_jobs=1)
+    expected = transformer.fit_transform(PATCHES)
+    order = np.random.default_rng(0).permutation(len(PATCHES))
+    np.testing.assert_array_equal(transformer.transform(PATCHES[order]), expected[order])
+    for row in range(len(PATCHES)):
+        np.testing.assert_array_equal(transformer.transform(PATCHES[row : row + 1])[0], expected[row])
+    np.testing.assert_array_equal(transformer.fit(PATCHES[:2]).fit(PATCHES).transform(PATCHES), expected)
+
+
+def test_the_transformer_leaves_its_input_alone_and_can_be_pickled():
+    before = PATCHES.copy()
+    frozen = np.asfortranarray(PATCHES)
+    frozen.setflags(write=False)
+    transformer = PatchFeatures(n_jobs=1)
+    expected = transformer.transform(PATCHES)
+    np.testing.assert_array_equal(transformer.transform(frozen), expected)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(transformer)).transform(frozen), expected)
+    np.testing.assert_array_equal(PATCHES, before)
+    assert vars(transformer) == vars(PatchFeatures(n_jobs=1))
+
+
+def test_the_transformer_in_cross_validation():
+    patches, labels = render_patches(40, random_state=5)
+    features = PatchFeatures(spatial_size=8, orient=6, hog_channel=0, n_jobs=1)
+    pipeline = make_pipeline(features, StandardScaler(), LinearSVC(C=1e-3, random_state=0))
+    assert cross_val_score(pipeline, patches, labels, cv=4, error_score="raise").mean() >= 0.9
+    named = make_pipeline(features).set_output(transform="pandas").fit_transform(patches[:2])
+    assert list(named.columns[:2]) == ["spatial0", "spatial1"]
 
 
 def test_the_transformer_in_a_grid_search():

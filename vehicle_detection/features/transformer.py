@@ -19,7 +19,8 @@ class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 
     The parameters are the fields of `FeatureParams`, checked by `fit`, and `n_jobs` of `extract_features`.
     The transformer has no state and works without `fit`. It ignores the gains, which only `train_classifier`
-    uses.
+    uses. It passes scikit-learn's estimator checks that do not need tables of numbers as input; images have
+    four dimensions, and ``n_features_in_`` is not set.
 
     Examples
     --------
