@@ -37,6 +37,7 @@ from .evaluation import (
     evaluate_tracks,
     precision_recall_curve,
     read_labels,
+    write_labels,
 )
 from .explorer import Explorer
 from .export import TrackWriter, write_boxes, write_tracks
@@ -182,5 +183,6 @@ __all__ = [
     "train_mixture",
     "write_boxes",
     "write_image",
+    "write_labels",
     "write_tracks",
 ]
