@@ -73,6 +73,7 @@ from .tracking import Track, Tracker
 from .training import train_and_evaluate
 from .tuning import (
     TrialOptions,
+    compare_classifiers,
     compare_configurations,
     mine_negatives,
     pareto_front,
@@ -131,6 +132,7 @@ __all__ = [
     "calibration_error",
     "clip_boxes",
     "color_hist",
+    "compare_classifiers",
     "compare_configurations",
     "convert_color",
     "cross_validate_mixture",

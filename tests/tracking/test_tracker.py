@@ -653,7 +653,7 @@ class TestDistance:
 
 class TestPrediction:
     def drive(self, tracker, frames, *, speed=150.0, start=300.0):
-        """Track a vehicle that moves right by `speed` pixels per second; its true box as a function of time."""
+        """Track a vehicle that moves right by `speed` pixels per second; returns its box at a time."""
 
         def truth(time):
             left = start + speed * time
