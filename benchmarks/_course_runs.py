@@ -23,6 +23,7 @@ from vehicle_detection.tuning import (
     FeatureCache,
     RowStore,
     TrialOptions,
+    compare_classifiers,
     compare_configurations,
     digest_of,
     make_table,
@@ -158,20 +159,20 @@ class Runs:
 
     def bayes(self) -> pd.DataFrame:
         """Gaussian naive Bayes on the second system's features."""
+        from sklearn.naive_bayes import GaussianNB
+
+        models = {"naive Bayes": GaussianNB()}
         rows = []
         for name, seed, split in self.parts(SPLITS[:3]):
             trial = digest_of(self.cache.digest, "bayes", split.train, split.test)
             if trial not in self._extra:
-                accuracy = self._bayes_accuracy(split)
+                table = compare_classifiers(
+                    self.patch_set, models, params=SECOND, splits={name: split}, cache=self.cache
+                )
+                accuracy = float(table["accuracy"][0])
                 self._add(trial, "bayes", "naive Bayes", split=name, seed=seed, accuracy=accuracy)
             rows.append({"configuration": "naive Bayes", "C": None, **self._extra[trial]})
         return make_table(rows)
-
-    def _bayes_accuracy(self, split: Split) -> float:
-        bayes = GaussianBayes()
-        bayes.fit(*self._side(SECOND, split.train))
-        features, labels = self._side(SECOND, split.test)
-        return float((bayes.predict(features) == labels).mean())
 
     def first_predictions(self, count: int = 15) -> pd.DataFrame:
         """Labels and predictions of both classifiers for some test samples of the first random split."""
@@ -180,9 +181,13 @@ class Runs:
         trial = digest_of(self.cache.digest, "answers", split.train, chosen)
         models = ("truth", "naive Bayes", "linear SVM")
         if f"{trial} {models[-1]}" not in self._extra:
+            from sklearn.naive_bayes import GaussianNB
+            from sklearn.pipeline import make_pipeline
+            from sklearn.preprocessing import StandardScaler
+
             features, labels = self._side(SECOND, split.train)
             tested = self._side(SECOND, chosen)[0]
-            bayes = GaussianBayes()
+            bayes = make_pipeline(StandardScaler(copy=False), GaussianNB())
             bayes.fit(features.copy(), labels)
             svm = _fit_svm(SECOND, features, labels)
             answers = (self._labels(chosen), bayes.predict(tested.copy()), svm.predict(tested))
@@ -276,25 +281,6 @@ def _zero_classifier(params: FeatureParams) -> VehicleClassifier:
     """A classifier without detections: the time of a search does not depend on the weights."""
     ones = np.ones(params.length)
     return VehicleClassifier(params, (Template(0 * ones, ones, 0 * ones, -1.0),))
-
-
-class GaussianBayes:
-    """Scaler and Gaussian naive Bayes, like in the second system."""
-
-    def __init__(self) -> None:
-        from sklearn.naive_bayes import GaussianNB
-        from sklearn.preprocessing import StandardScaler
-
-        self._scaler = StandardScaler(copy=False)
-        self._bayes = GaussianNB()
-
-    def fit(self, features: NDArray[np.float32], labels: NDArray[np.int64]) -> None:
-        """Fit both, scaling the features in place."""
-        self._bayes.fit(self._scaler.fit_transform(features), labels)
-
-    def predict(self, features: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Predict 0 or 1 for each row, scaling the features in place."""
-        return np.asarray(self._bayes.predict(self._scaler.transform(features)), np.int64)
 
 
 def _seconds(function: Callable[[], object]) -> float:

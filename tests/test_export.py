@@ -166,7 +166,7 @@ def test_jsonl_has_an_object_a_line(tmp_path):
 def test_mot_counts_from_one(tmp_path):
     write_tracks(RESULTS, tmp_path / "t.txt")
     lines = (tmp_path / "t.txt").read_text().splitlines()
-    assert lines[0] == "1,1,11.00,21.00,40.25,40.50,1.5000,-1,-1,-1"
+    assert lines[0] == "1,1,11.0,21.0,40.25,40.5,1.5,-1,-1,-1"
     assert [line.split(",")[0] for line in lines] == ["1", "1", "3"]
 
 
@@ -200,6 +200,14 @@ def test_coco_is_a_data_set(tmp_path):
         "speed_mps": -0.5,
     }
     assert "distance_m" not in second
+    # The ids of the images do not depend on which frames have rows.
+    write_tracks(ROWS[2:], tmp_path / "t.json")
+    data = json.loads((tmp_path / "t.json").read_text())
+    assert (
+        [entry["image_id"] for entry in data["annotations"]]
+        == [image["id"] for image in data["images"]]
+        == [3]
+    )
     assert (third["id"], third["image_id"], third["speed_mps"]) == (3, 3, 0.0)
 
 
@@ -304,6 +312,9 @@ def test_boxes_of_stills(tmp_path):
     assert {image["file_name"] for image in data["images"]} == {name for name, _ in found}
     names = {image["id"]: image["file_name"] for image in data["images"]}
     assert [names[a["image_id"]] for a in data["annotations"]] == [row["frame"] for row in read]
+    write_boxes(found[2:], tmp_path / "b.json")
+    (alone,) = json.loads((tmp_path / "b.json").read_text(encoding="utf-8"))["images"]
+    assert names[alone["id"]] == alone["file_name"]
 
 
 def test_rows_of_stills(tmp_path):

@@ -37,6 +37,7 @@ from .evaluation import (
     evaluate_tracks,
     precision_recall_curve,
     read_labels,
+    write_labels,
 )
 from .explorer import Explorer
 from .export import TrackWriter, write_boxes, write_tracks
@@ -72,6 +73,7 @@ from .tracking import Track, Tracker
 from .training import train_and_evaluate
 from .tuning import (
     TrialOptions,
+    compare_classifiers,
     compare_configurations,
     mine_negatives,
     pareto_front,
@@ -130,6 +132,7 @@ __all__ = [
     "calibration_error",
     "clip_boxes",
     "color_hist",
+    "compare_classifiers",
     "compare_configurations",
     "convert_color",
     "course",
@@ -183,5 +186,6 @@ __all__ = [
     "train_mixture",
     "write_boxes",
     "write_image",
+    "write_labels",
     "write_tracks",
 ]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import hashlib
 import json
 import math
 import os
@@ -35,7 +36,7 @@ DIGITS = dict(zip(TRACK_COLUMNS[2:], (2, 2, 2, 2, 4, 2, 2)))
 
 
 class Row(NamedTuple):
-    """One box of one frame, with rounded values."""
+    """One box of one frame. Without a score it is a label, which may be marked `ignore`."""
 
     frame: int | str
     track_id: int | None
@@ -43,9 +44,11 @@ class Row(NamedTuple):
     y1: float
     x2: float
     y2: float
-    score: float
+    score: float | None
     distance_m: float | None = None
     speed_mps: float | None = None
+    ignore: bool = False
+    visible: float = 1.0
 
 
 def check_items(items: object) -> Iterator[Any]:
@@ -184,7 +187,9 @@ def write_tracks(
     -----
     ``frame`` counts from 0, the first processed frame; boxes are half-open pixels with two decimals.
     Unknown distances and speeds are empty in CSV and null elsewhere. MOT files count frames and pixels from
-    1, as the MOTChallenge tools do, and hold width and height.
+    1, as the MOTChallenge tools do, and hold width and height. A COCO file is a data set whose image ids
+    are the frame numbers plus 1, whichever frames have tracks; for ``COCO.loadRes`` of pycocotools, write
+    ``FrameBoxes.from_results(results)`` with `write_labels`.
 
     Examples
     --------
@@ -197,7 +202,7 @@ def write_tracks(
     0,1,10.00,20.00,50.13,60.00,1.5000,,
     1,1,12.00,20.00,52.00,60.00,1.2500,31.40,-0.50
     """
-    kind = _check_format(path, format, FORMATS.values())
+    kind = check_format(path, format, FORMATS.values())
     if kind in ("csv", "jsonl", "mot"):
         with TrackWriter(path, format=kind) as write:
             for item in check_items(results):
@@ -226,7 +231,8 @@ def write_boxes(
         ``frame, track_id, x1, y1, x2, y2, score`` with the file name as ``frame``, and None as ``track_id``
         unless the boxes are numbered.
     path, format
-        As in `write_tracks`, without ``"mot"``.
+        As in `write_tracks`, without ``"mot"``. The image ids of a COCO file depend on the file names alone;
+        `write_labels` writes boxes with the ids of a ground truth.
 
     Returns
     -------
@@ -249,7 +255,7 @@ def write_boxes(
     frame,track_id,x1,y1,x2,y2,score
     road.jpg,,10.00,20.00,50.00,60.00,1.5000
     """
-    kind = _check_format(path, format, ("csv", "jsonl", "parquet", "coco"))
+    kind = check_format(path, format, ("csv", "jsonl", "parquet", "coco"))
     names: list[int | str] = []
     rows: list[Row] = []
     for item in check_items(boxes):
@@ -297,7 +303,7 @@ class TrackWriter:
     """
 
     def __init__(self, path: str | os.PathLike[str], *, format: str | None = None) -> None:  # noqa: A002
-        self._kind = _check_format(path, format, ("csv", "jsonl", "mot"))
+        self._kind = check_format(path, format, ("csv", "jsonl", "mot"))
         self._path = path
         self._stack = contextlib.ExitStack()
         self._write_row: Callable[[Row], object] | None = None
@@ -327,7 +333,7 @@ class TrackWriter:
         self._stack.__exit__(*error)
 
 
-def _check_format(path: object, name: str | None, allowed: Iterable[str]) -> str:
+def check_format(path: object, name: str | None, allowed: Iterable[str]) -> str:
     """Choose the format by its name or the suffix, and check the target before any work is done."""
     if not isinstance(path, (str, os.PathLike)):
         raise InvalidInputError(
@@ -354,7 +360,7 @@ def _row_writer(file: IO[str], kind: str, columns: Sequence[str]) -> Callable[[R
         return lambda row: table.writerow(_csv_cells(row)[: len(columns)])
     if kind == "jsonl":
         return lambda row: file.write(json.dumps(dict(zip(columns, row)), ensure_ascii=False) + "\n")
-    return lambda row: file.write(_mot_line(row) + "\n")
+    return lambda row: file.write(mot_line(row) + "\n")
 
 
 def _csv_cells(row: Row) -> list[Any]:
@@ -362,11 +368,21 @@ def _csv_cells(row: Row) -> list[Any]:
     return [*row[:2], *("" if value is None else f"{value:.{digits}f}" for value, digits in numbers)]
 
 
-def _mot_line(row: Row) -> str:
-    """MOTChallenge text of a row: frame, id, left, top, width, height, score and no world position."""
-    frame = int(row.frame) + 1
-    size = f"{row.x2 - row.x1:.2f},{row.y2 - row.y1:.2f}"
-    return f"{frame},{row.track_id},{row.x1 + 1:.2f},{row.y1 + 1:.2f},{size},{row.score:.4f},-1,-1,-1"
+def mot_line(row: Row) -> str:
+    """MOTChallenge text of a row, whose frames and pixels count from 1: a result, or without score a label.
+
+    Both start with frame, id, left, top, width and height. A result goes on with its score and no world
+    position, a label with its flag (0 if ignored), the class 3 (car) and its visible fraction.
+    """
+    numbers = row.x1 + 1, row.y1 + 1, row.x2 - row.x1, row.y2 - row.y1
+    box = ",".join(str(_without_noise(number)) for number in numbers)
+    end = f"{int(not row.ignore)},3,{row.visible}" if row.score is None else f"{row.score},-1,-1,-1"
+    return f"{int(row.frame) + 1},{-1 if row.track_id is None else row.track_id},{box},{end}"
+
+
+def _without_noise(value: float) -> float:
+    """Drop the rounding error of a sum or difference of coordinates: 50.25 - 10.1 becomes 40.15."""
+    return round(value, 9)
 
 
 def _write_rows(
@@ -385,7 +401,8 @@ def _write_rows(
         return len(rows)
     with atomic_write(path, "path") as part, part.open("w", encoding="utf-8", newline="") as file:
         if kind == "coco":
-            json.dump(_coco_document(rows, frames, shape), file, ensure_ascii=False)
+            images = coco_images([*frames, *(row.frame for row in rows)], shape)
+            json.dump(coco_document(rows, images), file, ensure_ascii=False)
         else:
             write_row = _row_writer(file, kind, columns)
             for row in rows:
@@ -393,38 +410,56 @@ def _write_rows(
     return len(rows)
 
 
-def _coco_document(
-    rows: Sequence[Row], frames: Sequence[int | str], shape: tuple[int, ...] | None
-) -> dict[str, Any]:
-    """COCO data set: every frame is an image, every row an annotation with its score."""
-    keys = list(dict.fromkeys([*frames, *(row.frame for row in rows)]))
-    keys.sort(key=lambda key: (isinstance(key, str), key))
+CocoImages = Mapping[int | str, Mapping[str, Any]]
+"""Entry of each frame in the list of images of a COCO file."""
+
+
+def coco_images(frames: Iterable[int | str], shape: tuple[int, ...] | None) -> CocoImages:
+    """Describe frames as COCO images. Their ids depend on nothing else, so that files agree about them."""
+    keys = sorted(set(frames), key=lambda key: (isinstance(key, str), key))
     size = {} if shape is None else {"height": int(shape[0]), "width": int(shape[1])}
-    numbers = {key: place for place, key in enumerate(keys, start=1)}
-    # Video frames have no file, so their number serves as the file name.
-    images = [
-        {"id": numbers[key], "file_name": key if isinstance(key, str) else f"{key:06d}", **size}
-        | ({} if isinstance(key, str) else {"frame": key})
-        for key in keys
-    ]
+    return {key: {"id": _image_id(key), **_image_name(key), **size} for key in keys}
+
+
+def _image_id(key: int | str) -> int:
+    """Frame number plus 1; for a file name 52 bits of its hash, which every JSON reader holds exactly."""
+    if isinstance(key, str):
+        return int(hashlib.sha256(key.encode()).hexdigest()[:13], 16)
+    return key + 1
+
+
+def _image_name(key: int | str) -> dict[str, Any]:
+    """Name of an image; a video frame has no file, so that its number serves as the file name."""
+    return {"file_name": key} if isinstance(key, str) else {"file_name": f"{key:06d}", "frame": key}
+
+
+def coco_result(row: Row, image_id: int, category_id: int) -> dict[str, Any]:
+    """COCO result: box, score and, if known, track, distance and speed of one detection."""
+    optional = {"track_id": row.track_id, "distance_m": row.distance_m, "speed_mps": row.speed_mps}
+    return {
+        "image_id": image_id,
+        "category_id": category_id,
+        "bbox": [row.x1, row.y1, _without_noise(row.x2 - row.x1), _without_noise(row.y2 - row.y1)],
+        **({} if row.score is None else {"score": row.score}),
+        **{name: value for name, value in optional.items() if value is not None},
+    }
+
+
+def coco_document(rows: Iterable[Row], images: CocoImages) -> dict[str, Any]:
+    """COCO data set: every frame is an image, every row an annotation, with its score if it has one.
+
+    Ignored rows are crowds, because pycocotools overwrites ``ignore`` with ``iscrowd``.
+    """
     annotations = []
     for number, row in enumerate(rows, start=1):
-        width, height = round(row.x2 - row.x1, 2), round(row.y2 - row.y1, 2)
-        annotation = {
-            "id": number,
-            "image_id": numbers[row.frame],
-            "category_id": 1,
-            "bbox": [row.x1, row.y1, width, height],
-            "area": round(width * height, 2),
-            "iscrowd": 0,
-            "score": row.score,
-        }
-        optional = {"track_id": row.track_id, "distance_m": row.distance_m, "speed_mps": row.speed_mps}
-        annotations.append(
-            annotation | {name: value for name, value in optional.items() if value is not None}
-        )
+        result = coco_result(row, images[row.frame]["id"], 1)
+        width, height = result["bbox"][2:]
+        flags = {"area": round(width * height, 2), "iscrowd": int(row.ignore)}
+        flags |= {"ignore": 1} if row.ignore else {}
+        # An explicit null: readers number labels that name no track.
+        annotations.append({"id": number, "track_id": None} | result | flags)
     return {
-        "images": images,
+        "images": list(images.values()),
         "annotations": annotations,
         "categories": [{"id": 1, "name": "vehicle", "supercategory": "vehicle"}],
     }

@@ -546,6 +546,17 @@ def test_evaluate_scores_boxes_and_tracks(tmp_path):
     )
 
 
+def test_evaluate_reads_coco_results_with_their_truth(tmp_path):
+    from vehicle_detection.evaluation import FrameBoxes, write_labels
+
+    boxes = [[0, 0, 100, 60], [5, 0, 105, 60]]
+    write_labels(FrameBoxes([0, 2], [1, 1], boxes), tmp_path / "truth.json")
+    found = FrameBoxes([0, 2], [1, 1], boxes, scores=[2.0, 1.0])
+    write_labels(found, tmp_path / "found.json", format="coco_results", truth=tmp_path / "truth.json")
+    out = succeed("evaluate", tmp_path / "found.json", tmp_path / "truth.json")
+    assert "HOTA               1.000 (DetA 1.000, AssA 1.000, LocA 1.000)" in out
+
+
 def test_evaluate_refuses_bad_input(material, tmp_path):
     labels = material / "labels.csv"
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")

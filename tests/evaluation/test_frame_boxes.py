@@ -2,6 +2,7 @@ import math
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from tests.evaluation.cases import CAR, boxes_of, moved
@@ -125,10 +126,10 @@ def test_from_results_rejects_other_objects(results):
 
 def test_frame_boxes_are_shown_as_a_table():
     found = boxes_of((2, 1, CAR, 0.5), (0, 3, moved(5), 1.5))
-    table = found.to_dataframe()
+    table = found.to_pandas()
     assert list(table) == [
         "frame",
-        "track",
+        "track_id",
         "x1",
         "y1",
         "x2",
@@ -136,9 +137,46 @@ def test_frame_boxes_are_shown_as_a_table():
         "occluded",
         "truncated",
         "ignore",
-        "scores",
+        "score",
     ]
     assert table["frame"].tolist() == [2, 0]
     np.testing.assert_array_equal(table[["x1", "y1", "x2", "y2"]], found.boxes)
     assert "<table" in found._repr_html_()
     assert "FrameBoxes(2 boxes in 2 frames)" in found._repr_html_()
+
+
+def test_a_table_is_taken_back_whole(tmp_path):
+    found = boxes_of(
+        (2, 1, CAR, 0.5),
+        (0, -1, moved(5), 1.5),
+        occluded=[2, 0],
+        truncated=[0.25, 0],
+        ignore=[True, False],
+        distance_m=[31.5, math.nan],
+    )
+    pd.testing.assert_frame_equal(FrameBoxes.from_pandas(found.to_pandas()).to_pandas(), found.to_pandas())
+    labels = boxes_of(("a", 1, CAR), ("b", -1, CAR))
+    assert FrameBoxes.from_pandas(labels.to_pandas()).scores is None
+    # Files that pandas reads, with unknown tracks and speeds, are such tables as well.
+    write_tracks([(0, 7, *CAR, 0.5), (4, 8, *CAR, 1.5, 20.0)], tmp_path / "tracks.csv")
+    for table in (
+        pd.read_csv(tmp_path / "tracks.csv"),
+        pd.read_csv(tmp_path / "tracks.csv").convert_dtypes(),
+    ):
+        read = FrameBoxes.from_pandas(table)
+        assert (read.frames, read.tracks.tolist(), read.scores.tolist()) == ((0, 4), [7, 8], [0.5, 1.5])
+        np.testing.assert_array_equal(read.distance_m, [math.nan, 20])
+    table = pd.DataFrame({"frame": ["a"], "x1": [1], "y1": [2], "x2": [3], "y2": [4], "track_id": [None]})
+    assert FrameBoxes.from_pandas(table).tracks.tolist() == [-1]
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        (5, "table must be a pandas.DataFrame with the columns frame, x1, y1, x2, y2; got 5"),
+        (pd.DataFrame({"frame": [0], "x1": [0]}), "it lacks y1, x2, y2"),
+    ],
+)
+def test_from_pandas_rejects_other_tables(table, message):
+    with pytest.raises(InvalidInputError, match=message):
+        FrameBoxes.from_pandas(table)

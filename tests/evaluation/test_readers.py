@@ -156,7 +156,7 @@ def test_kitti_folder(tmp_path):
 def test_mot_file(tmp_path):
     truth = read_labels(written(tmp_path, "1,3,10,20,30,40,1,1,1\n2,3,11,20,30,40,0,1,0.5\n", "gt.txt"))
     assert truth.frames == (0, 1)
-    assert truth.boxes[0].tolist() == [10, 20, 40, 60]
+    assert truth.boxes[0].tolist() == [9, 19, 39, 59]  # MOTChallenge counts pixels from 1
     assert truth.ignore.tolist() == [False, True]
     assert truth.scores is None
     found = read_labels(written(tmp_path, "1, 3, 10, 20, 30, 40, 0.75, -1, -1, -1,\r\n", "mot.txt"))
@@ -196,7 +196,8 @@ def test_coco_file(tmp_path):
     ("name", "text", "message"),
     [
         ("a.json", "{", "line 1: not JSON text"),
-        ("a.json", "[]", "is not a COCO file: it lacks the lists images, annotations, categories"),
+        ("a.json", "[]", "is a list of COCO results, .* name that file with truth="),
+        ("a.json", "[1]", "is not a COCO file: it lacks the lists images, annotations, categories"),
         ("a.json", coco(images=[{"file_name": "x"}]), "every image and category needs an id"),
         ("a.json", coco(images=[{"id": 5}, {"id": 6, "file_name": "a"}]), "give every image a file_name"),
         ("a.json", coco(images=[{"id": 5}, {"id": 5}]), "two images share an id"),
@@ -212,6 +213,10 @@ def test_coco_file(tmp_path):
             "annotation 0: a box needs x1 < x2",
         ),
         ("a.json", coco(categories=[{"id": 1, "name": "boat"}]), "no category among car, .* found 'boat'"),
+        ("a.jsonl", '{"frame": 0}\n', "lacks the columns track, x1, .*; found frame"),
+        ("a.jsonl", "{", "line 1: not a JSON object"),
+        ("a.jsonl", "\n[]", "line 2: expected a JSON object, found"),
+        ("a.parquet", "frame", "is not a Parquet file"),
         ("a.txt", "Car 0 0 0 1 2 3", "lacks the columns"),
         ("a.txt", KITTI.replace("69.44 ", ""), "lacks the columns"),
         ("a.txt", KITTI + "Car 0 0", "line 8: a KITTI object has 15 values .* found 3"),
@@ -235,7 +240,7 @@ def test_invalid_paths(tmp_path):
     with pytest.raises(DatasetError, match="is a folder, and csv labels are one file"):
         read_labels(tmp_path, format="csv")
     with pytest.raises(
-        InvalidInputError, match="format must be one of 'csv', 'kitti', 'mot', 'coco'; got 'voc'"
+        InvalidInputError, match=r"format must be one of 'csv', 'jsonl', 'parquet', 'kitti', .*; got 'voc'"
     ):
         read_labels(written(tmp_path, CSV), format="voc")
 

@@ -3,6 +3,7 @@ import math
 import motmetrics
 import numpy as np
 import pytest
+import trackeval
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -141,3 +142,86 @@ def test_track_scores_equal_those_of_motmetrics(trial):
     assert scores.idf1 == pytest.approx(row["idf1"], nan_ok=True)
     assert (scores.id_switches, scores.fragmentations) == (row["num_switches"], row["num_fragmentations"])
     assert (scores.fn, scores.fp) == (row["num_misses"], row["num_false_positives"])
+
+
+def trackeval_hota(found, labels):
+    """Scores of TrackEval for the same boxes; it numbers ids from 0."""
+
+    def numbered(side):
+        order = {track: number for number, track in enumerate(np.unique(side.tracks).tolist())}
+        frames = [side.tracks[side.rows(key)].tolist() for key in labels.frame_keys]
+        return [np.array([order[track] for track in each], int) for each in frames], len(order)
+
+    (gt_ids, num_gt_ids), (tracker_ids, num_tracker_ids) = numbered(labels), numbered(found)
+    scores = trackeval.metrics.HOTA().eval_sequence(
+        {
+            "num_gt_dets": len(labels),
+            "num_tracker_dets": len(found),
+            "num_gt_ids": num_gt_ids,
+            "num_tracker_ids": num_tracker_ids,
+            "gt_ids": gt_ids,
+            "tracker_ids": tracker_ids,
+            "similarity_scores": [
+                iou_matrix(labels.frame(key).boxes, found.frame(key).boxes) for key in labels.frame_keys
+            ],
+        }
+    )
+    return [float(np.mean(scores[name])) for name in ("HOTA", "DetA", "AssA", "LocA")]
+
+
+@given(trial=trials() | crowds())
+@settings(max_examples=60)
+def test_hota_equals_that_of_trackeval(trial):
+    found, labels = trial
+    labels = FrameBoxes(
+        labels.frames, labels.tracks, labels.boxes, frame_keys={*found.frame_keys, *labels.frame_keys}
+    )
+    scores = evaluate_tracks(found, labels)
+    if len(found) or len(labels):
+        ours = [scores.hota, scores.deta, scores.assa, scores.loca]
+        np.testing.assert_allclose(ours, trackeval_hota(found, labels), rtol=0, atol=1e-9)
+    else:
+        assert math.isnan(scores.hota)
+
+
+def random_clip(seed, frames, cars):
+    """Vehicles that cross each other, and noisy tracks that break off, are missing, or are false."""
+    rng = np.random.default_rng(seed)
+    sides = [[], []]
+    starts, speeds, sizes = rng.uniform(0, 1000, (cars, 2)), rng.normal(0, 3, (cars, 2)), (90, 60)
+    for frame in range(frames):
+        corners = starts + frame * speeds % 300
+        for car, corner in enumerate(corners):
+            sides[0].append((frame, car, (*corner, *(corner + sizes))))
+            if rng.random() < 0.85:
+                noisy = corner + rng.normal(0, 9, 2)
+                sides[1].append((frame, car + 100 * (frame // 80), (*noisy, *(noisy + sizes))))
+        false = rng.uniform(0, 900, 2)
+        sides[1].append((frame, 10_000 + frame // 20, (*false, *(false + sizes))))
+    return boxes_of(*sides[1]), boxes_of(*sides[0])
+
+
+@pytest.mark.parametrize(("seed", "frames", "cars"), [(0, 40, 3), (1, 200, 8), (2, 100, 20)])
+def test_hota_of_longer_clips_equals_that_of_trackeval(seed, frames, cars):
+    found, labels = random_clip(seed, frames, cars)
+    scores = evaluate_tracks(found, labels)
+    ours = [scores.hota, scores.deta, scores.assa, scores.loca]
+    assert 0.2 < scores.hota < 0.9
+    np.testing.assert_allclose(ours, trackeval_hota(found, labels), rtol=0, atol=1e-9)
+
+
+def test_hota_by_hand():
+    # Perfect boxes under two tracks of 2 frames each: every match shares 2 of its 4 frames.
+    scores = evaluate_tracks(*clip([5, 5, 6, 6]))
+    assert (scores.deta, scores.assa, scores.loca) == (1, 0.5, 1)
+    assert scores.hota == pytest.approx(math.sqrt(0.5))
+    assert "HOTA" in scores.summary()
+    missed = evaluate_tracks(*clip([None, None]))
+    assert (missed.hota, missed.deta, missed.assa, missed.loca) == (0, 0, 0, 1)  # as in TrackEval
+    assert math.isnan(evaluate_tracks(FrameBoxes([], [], []), FrameBoxes([], [], [])).hota)
+
+
+def test_hota_leaves_ignored_boxes_out():
+    labels = boxes_of((0, 1, CAR), (0, -1, (700, 0, 900, 90)), ignore=[False, True])
+    found = boxes_of((0, 5, CAR), (0, 6, moved(740)))
+    assert evaluate_tracks(found, labels).hota == 1

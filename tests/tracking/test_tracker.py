@@ -651,6 +651,88 @@ class TestDistance:
         assert distances[1] > distances[0] * 1.2
 
 
+class TestPrediction:
+    def drive(self, tracker, frames, *, speed=150.0, start=300.0):
+        """Track a vehicle that moves right by `speed` pixels per second; returns its box at a time."""
+
+        def truth(time):
+            left = start + speed * time
+            return np.array([left, 400.0, left + 100, 490.0])
+
+        for index in range(frames):
+            tracker.update(found(truth(index / 25)), SHAPE)
+        return truth
+
+    @pytest.mark.parametrize("ahead", [1 / 25, 0.2, 1.0])
+    def test_a_vehicle_at_constant_velocity_is_predicted(self, ahead):
+        tracker = Tracker()
+        truth = self.drive(tracker, 75)
+        now = 74 / 25
+        (track,) = tracker.predict(time=now + ahead)
+        np.testing.assert_allclose(track.box, truth(now + ahead), atol=1 + ahead)
+        np.testing.assert_allclose(track.velocity, (150, 0), atol=2)
+        if ahead == 1 / 25:
+            np.testing.assert_allclose(tracker.predict()[0].box, track.box, atol=1e-9)
+
+    def test_the_distance_is_predicted(self):
+        tracker = Tracker(camera=CAMERA)
+        for index in range(75):
+            (last,) = tracker.update(found(on_road(15 + 5 * index / 25)), SHAPE)
+        (track,) = tracker.predict(time=74 / 25 + 0.4)
+        assert track.distance_m == pytest.approx(last.distance_m + 0.4 * last.speed_mps)
+        assert track.distance_m == pytest.approx(15 + 5 * (74 / 25 + 0.4), rel=0.1)
+        assert track.distance_std_m > last.distance_std_m
+        assert tracker.predict(time=74 / 25 + 0.6)[0].distance_m is None  # as after coasting long
+
+    @pytest.mark.parametrize("smoother", ["kalman", "history", "nearest"])
+    def test_prediction_changes_nothing(self, smoother):
+        one, other = (Tracker(TrackParams(smoother=smoother)) for _ in range(2))
+        rng = np.random.default_rng(3)
+        for index in range(60):
+            boxes = [np.array(CAR) + 2 * index, np.array([300.0, 410, 380, 480]) - index]
+            detections = found(*(box + rng.normal(0, 2, 4) for box in boxes if rng.random() < 0.8))
+            first, second = one.update(detections, SHAPE), other.update(detections, SHAPE)
+            for predicted in (other.predict(), other.predict(time=index / 25 + 0.7)):
+                assert [track.id for track in predicted] == [track.id for track in second if track.id]
+                for track in predicted:
+                    assert_valid(track)
+            assert [(t.id, t.age, t.misses, t.score, t.distance_m) for t in first] == [
+                (t.id, t.age, t.misses, t.score, t.distance_m) for t in second
+            ]
+            for left, right in zip(first, second, strict=True):
+                np.testing.assert_array_equal(left.box, right.box)
+
+    def test_a_prediction_is_what_the_next_frame_without_detection_returns(self):
+        tracker = Tracker()
+        self.drive(tracker, 50)
+        (predicted,), (track,) = tracker.predict(), tracker.update(Detections.empty(), SHAPE)
+        np.testing.assert_allclose(predicted.box, track.box)
+        for name in ("id", "state", "misses"):
+            assert getattr(predicted, name) == getattr(track, name), name
+        for name in ("age", "time_since_update", "velocity", "distance_m"):
+            assert getattr(predicted, name) == pytest.approx(getattr(track, name)), name
+
+    def test_only_confirmed_tracks_inside_the_frame_are_predicted(self):
+        tracker = Tracker()
+        assert tracker.predict() == tracker.predict(time=3.0) == ()
+        tracker.update(found(CAR, score=0.1), SHAPE)
+        assert tracker.predict() == ()  # tentative
+        self.drive(tracker, 75)
+        assert tracker.predict(time=30.0) == ()  # beyond the right edge of the frame
+        tracker.end_tracks()
+        assert tracker.predict() == ()
+
+    def test_the_time_of_the_last_frame_returns_its_tracks(self):
+        tracker = Tracker()
+        for index in range(20):
+            tracks = tracker.update(found(CAR), SHAPE, time=5 + index / 25)
+        assert tracker.predict(time=5 + 19 / 25) == tracks
+        with pytest.raises(InvalidInputError, match=r"time must be a number, at least 5\.76"):
+            tracker.predict(time=5.5)
+        with pytest.raises(InvalidInputError, match="time must be a number"):
+            tracker.predict(time="now")
+
+
 class TestDeterminism:
     def drive(self, order):
         rng, shuffler = np.random.default_rng(5), np.random.default_rng(order)

@@ -318,8 +318,16 @@ def _estimate_horizon(
 
 @app.command()
 def evaluate(
-    predictions: Annotated[Path, Argument(metavar="PREDICTIONS.csv", help="Boxes or tracks.")],
-    labels: Annotated[Path, Argument(metavar="LABELS.csv", help="True boxes.")],
+    predictions: Annotated[
+        Path,
+        Argument(
+            metavar="PREDICTIONS.csv",
+            help="Boxes or tracks: .csv, .jsonl, .parquet, .txt (MOT) or .json (COCO data set or results).",
+        ),
+    ],
+    labels: Annotated[
+        Path, Argument(metavar="LABELS.csv", help="True boxes, in one of these formats or KITTI's folder.")
+    ],
     iou: Annotated[float, Option(metavar="F", help="Minimum IoU of a correct box.")] = 0.5,
     ignored_as_regions: Annotated[
         bool, Option("--ignored-as-regions", help="Ignore boxes of which half lies in an ignored box.")
@@ -335,7 +343,7 @@ def evaluate(
     if json is not None:
         check_target(json, "--json")
         check_distinct_paths({"--json": json}, {"PREDICTIONS": predictions, "LABELS": labels})
-    found, true = read_labels(predictions), read_labels(labels)
+    found, true = read_labels(predictions, truth=labels), read_labels(labels)
     scores: dict[str, Any] = {
         "detections": evaluate_detections(found, true, iou=iou, ignored_as_regions=ignored_as_regions)
     }

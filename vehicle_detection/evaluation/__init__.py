@@ -12,6 +12,7 @@ from vehicle_detection.evaluation.labelled_frames import Frames, LabelledFrames,
 from vehicle_detection.evaluation.matching import DetectionMatches, match_detections, prepare_evaluation
 from vehicle_detection.evaluation.readers import read_labels
 from vehicle_detection.evaluation.tracks import TrackScores, evaluate_tracks
+from vehicle_detection.evaluation.writers import write_labels
 
 __all__ = [
     "NO_TRACK",
@@ -33,4 +34,5 @@ __all__ = [
     "precision_recall_curve",
     "prepare_evaluation",
     "read_labels",
+    "write_labels",
 ]

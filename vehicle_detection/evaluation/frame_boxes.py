@@ -25,6 +25,17 @@ FrameKey = int | str
 NO_TRACK = -1
 """Track of a box without identity. A row with `ignore` and this track is a region, not a vehicle."""
 
+_CORNERS = ("x1", "y1", "x2", "y2")
+# Attribute and type of each optional column of a table.
+_TABLE_COLUMNS: dict[str, tuple[str, type]] = {
+    "occluded": ("occluded", int),
+    "truncated": ("truncated", float),
+    "ignore": ("ignore", bool),
+    "score": ("scores", float),
+    "distance_m": ("distance_m", float),
+    "speed_mps": ("speed_mps", float),
+}
+
 _ROW_COLUMNS = ("tracks", "boxes", "occluded", "truncated", "ignore", "scores", "distance_m", "speed_mps")
 
 
@@ -215,7 +226,7 @@ class FrameBoxes:
         return f"FrameBoxes({boxes} in {frames})"
 
     def _repr_html_(self) -> str:
-        return f"<p>{self!r}</p>{self.to_dataframe().to_html(max_rows=20)}"
+        return f"<p>{self!r}</p>{self.to_pandas().to_html(max_rows=20)}"
 
     def __getitem__(self, rows: slice | NDArray[Any] | list[int]) -> FrameBoxes:
         """Select rows by a slice, a mask or a list of indices; `frame_keys` stay the same."""
@@ -234,14 +245,46 @@ class FrameBoxes:
         frames, keys = ([rename(key) for key in each] for each in (self.frames, self.frame_keys))
         return dataclasses.replace(self, frames=frames, frame_keys=keys)
 
-    def to_dataframe(self) -> pandas.DataFrame:
-        """Return the boxes as a table, one row per box."""
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return a table with one row per box, like a file of `write_labels`; scores only where known.
+
+        >>> FrameBoxes([0, 3], [7, 8], [[0, 0, 50, 40], [5, 0, 55, 40]]).to_pandas().iloc[1].to_dict()
+        {'frame': 3, 'track_id': 8, 'x1': 5.0, 'y1': 0.0, 'x2': 55.0, 'y2': 40.0, 'occluded': 0, \
+'truncated': 0.0, 'ignore': False}
+        """
         import pandas
 
-        columns = {"frame": self.frames, "track": self.tracks}
-        columns |= dict(zip(("x1", "y1", "x2", "y2"), self.boxes.T))
-        rest = {name: getattr(self, name) for name in _ROW_COLUMNS[2:]}
-        return pandas.DataFrame(columns | {name: each for name, each in rest.items() if each is not None})
+        columns: dict[str, Any] = {"frame": self.frames, "track_id": self.tracks}
+        columns |= dict(zip(_CORNERS, self.boxes.T))
+        columns |= {name: getattr(self, column) for name, (column, _) in _TABLE_COLUMNS.items()}
+        return pandas.DataFrame({name: each for name, each in columns.items() if each is not None})
+
+    @classmethod
+    def from_pandas(cls, table: pandas.DataFrame) -> FrameBoxes:
+        """Take the boxes of a table with the columns of `to_pandas`; only frame and corners are required.
+
+        So ``pandas.read_csv`` of a file that `write_tracks` wrote is such a table. A missing track is -1.
+        """
+        given: object = table
+        names = set(getattr(given, "columns", ()))
+        missing = [name for name in ("frame", *_CORNERS) if name not in names]
+        if missing or not hasattr(given, "to_dict"):
+            raise InvalidInputError(
+                f"table must be a pandas.DataFrame with the columns frame, {', '.join(_CORNERS)}; "
+                + (f"it lacks {', '.join(missing)}" if names else f"got {describe(given)}")
+            )
+        columns = {
+            column: table[name].astype(kind).to_numpy()
+            for name, (column, kind) in _TABLE_COLUMNS.items()
+            if name in names
+        }
+        tracks = next((table[name] for name in ("track_id", "track") if name in names), None)
+        return cls(
+            table["frame"].tolist(),
+            None if tracks is None else tracks.fillna(NO_TRACK).to_numpy(np.int64),  # type: ignore[arg-type]
+            table[list(_CORNERS)].to_numpy(np.float64),
+            **columns,
+        )
 
     def _take(self, rows: NDArray[np.intp], keys: Sequence[FrameKey]) -> FrameBoxes:
         frames = [self.frames[row] for row in rows.tolist()]

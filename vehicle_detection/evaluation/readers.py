@@ -1,4 +1,4 @@
-"""Read label and prediction files: CSV, KITTI, MOTChallenge and COCO."""
+"""Read label and prediction files: CSV, JSON Lines, Parquet, KITTI, MOTChallenge and COCO."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from vehicle_detection._common import check_choice
 from vehicle_detection.boxes import clip_boxes
-from vehicle_detection.errors import DatasetError
+from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation.frame_boxes import (
     NO_TRACK,
     FrameBoxes,
@@ -24,9 +24,12 @@ from vehicle_detection.evaluation.frame_boxes import (
     frame_order,
     none_if_unknown,
 )
-from vehicle_detection.export import BOX_COLUMNS
+from vehicle_detection.export import BOX_COLUMNS, FORMATS
 
 LABEL_COLUMNS = ("frame", "track", "x1", "y1", "x2", "y2", "occluded", "truncated", "ignore")
+
+FRAME_NUMBER = re.compile(r"-?(0|[1-9][0-9]*)(\.0*)?")
+"""Frame of a CSV file that is a number. One with leading zeros is a file name."""
 
 VEHICLE_CLASSES = ("car", "van", "truck", "bus", "vehicle")
 LOOKALIKE_CLASSES = ("tram", "train", "misc", "trailer", "caravan", "autorickshaw", "vehicle fallback")
@@ -98,8 +101,7 @@ def _integer(text: str, name: str, where: str, *, low: int) -> int:
     return int(value)
 
 
-def _read_csv(source: Path, classes: Collection[str] | None) -> Rows:
-    del classes  # these files hold vehicles only
+def _read_csv(source: Path) -> Rows:
     text = _read_text(source)
     separator = max(",;\t", key=text.split("\n", 1)[0].count)
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
@@ -108,14 +110,8 @@ def _read_csv(source: Path, classes: Collection[str] | None) -> Rows:
     except csv.Error as error:
         raise DatasetError(f"{source} line {reader.line_num}: not CSV text ({error})") from None
     names = [" ".join(name.split()).lower() for name in lines[0][1]] if lines else []
-    predicted = "track_id" in names or ("score" in names and "track" not in names)
+    predicted = _check_columns(source, names)
     expected = BOX_COLUMNS if predicted else LABEL_COLUMNS
-    missing = [name for name in expected if name not in names]
-    if missing:
-        raise DatasetError(
-            f"{source} lacks the columns {', '.join(missing)}; found {', '.join(names) or 'an empty file'}; "
-            f"labels have {','.join(LABEL_COLUMNS)}, predictions {','.join(BOX_COLUMNS)}"
-        )
     twice = sorted({name for name in expected if names.count(name) > 1})
     if twice:
         raise DatasetError(f"{source} has the column {', '.join(twice)} more than once; keep one of each")
@@ -127,32 +123,99 @@ def _read_csv(source: Path, classes: Collection[str] | None) -> Rows:
         if len(line) != len(names):
             raise DatasetError(f"{where}: expected {len(names)} columns, found {len(line)}")
         records.append((where, dict(zip(names, (cell.strip() for cell in line)))))
-    # A number with leading zeros is a file name; signs and decimal points are checked below.
-    counted = all(re.fullmatch(r"-?(0|[1-9][0-9]*)(\.0*)?", record["frame"]) for _, record in records)
-    return [_csv_row(where, record, predicted, counted) for where, record in records], []
+    counted = all(FRAME_NUMBER.fullmatch(record["frame"]) for _, record in records)
+    return [_table_row(where, record, predicted, counted) for where, record in records], []
 
 
-def _csv_row(where: str, record: dict[str, str], predicted: bool, counted: bool) -> Row:
-    if not record["frame"]:
+def _read_json_lines(source: Path) -> Rows:
+    records: list[tuple[str, Any]] = []
+    # Not splitlines, which also splits at other characters that a name may hold.
+    for number, line in enumerate(_read_text(source).split("\n"), 1):
+        where = f"{source} line {number}"
+        if line.strip():
+            try:
+                records.append((where, json.loads(line)))
+            except json.JSONDecodeError as error:
+                raise DatasetError(f"{where}: not a JSON object ({error.msg})") from None
+            if not isinstance(records[-1][1], dict):
+                raise DatasetError(f"{where}: expected a JSON object, found {line.strip()[:40]!r}")
+    return _typed_rows(source, records)
+
+
+def _read_parquet(source: Path) -> Rows:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise InvalidInputError(
+            "a .parquet file needs pyarrow; pip install 'vehicle-detection[parquet]', or convert it to .csv"
+        ) from None
+    try:
+        table = pyarrow.parquet.read_table(source)
+    except (pyarrow.ArrowException, OSError) as error:
+        raise DatasetError(f"{source} is not a Parquet file: {' '.join(str(error).split())}") from None
+    rows = [(f"{source} row {number}", record) for number, record in enumerate(table.to_pylist())]
+    if not rows:
+        _check_columns(source, table.column_names)
+    return _typed_rows(source, rows)
+
+
+def _typed_rows(source: Path, records: Sequence[tuple[str, Mapping[str, Any]]]) -> Rows:
+    """Rows of a table with types: frames are numbers or names as they are stored there."""
+    predicted = _check_columns(source, list(records[0][1])) if records else False
+    frames = [record.get("frame") for _, record in records]
+    named = {isinstance(frame, str) for frame in frames}
+    if len(named) > 1:
+        raise DatasetError(f"{source}: frame must be a number in every row, or a name in every row")
+    texts = [
+        (where, {name: "" if value is None else str(value) for name, value in record.items()})
+        for where, record in records
+    ]
+    return [_table_row(where, record, predicted, named == {False}) for where, record in texts], []
+
+
+def _check_columns(source: Path, names: Sequence[str]) -> bool:
+    """Check that all columns are there; return whether they are those of predictions."""
+    predicted = "track" not in names and ("score" in names or ("track_id" in names and "ignore" not in names))
+    expected = BOX_COLUMNS if predicted else LABEL_COLUMNS
+    given = {*names} | ({"track"} if "track_id" in names else set())
+    missing = [name for name in expected if name not in given]
+    if missing:
+        raise DatasetError(
+            f"{source} lacks the columns {', '.join(missing)}; found {', '.join(names) or 'an empty file'}; "
+            f"labels have {','.join(LABEL_COLUMNS)}, predictions {','.join(BOX_COLUMNS)}"
+        )
+    return predicted
+
+
+def _table_row(where: str, record: dict[str, str], predicted: bool, counted: bool) -> Row:
+    """Row of a table; `record` holds the text of each cell by the name of its column."""
+
+    def text(name: str, default: str = "") -> str:
+        return record.get(name, "") or default
+
+    if not text("frame"):
         raise DatasetError(f"{where}: frame is empty; enter its number from 0 or its file name")
-    frame: FrameKey = _integer(record["frame"], "frame", where, low=0) if counted else record["frame"]
-    x1, y1, x2, y2 = (_number(record[name], name, where) for name in ("x1", "y1", "x2", "y2"))
-    if predicted:
-        track = _integer(record["track_id"] or str(NO_TRACK), "track_id", where, low=NO_TRACK)
-        score = _number(record["score"], "score", where)
-        optional: dict[str, Any] = {
-            name: _number(record[name], name, where)
-            for name in ("distance_m", "speed_mps")
-            if record.get(name, "").lower() not in ("", "nan")
-        }
-        return Row(where, frame, track, (x1, y1, x2, y2), score=score, **optional)
-    track = _integer(record["track"], "track", where, low=NO_TRACK)
-    occluded = _integer(record["occluded"], "occluded", where, low=0)
-    truncated = _number(record["truncated"], "truncated", where, low=0, high=1)
-    flag = {"0": False, "1": True, "false": False, "true": True}.get(record["ignore"].lower())
+    frame: FrameKey = _integer(text("frame"), "frame", where, low=0) if counted else text("frame")
+    x1, y1, x2, y2 = (_number(text(name), name, where) for name in ("x1", "y1", "x2", "y2"))
+    name = "track_id" if "track_id" in record else "track"
+    track = _integer(text(name, str(NO_TRACK) if predicted else ""), name, where, low=NO_TRACK)
+    # Predictions may lack these columns, labels may not have empty cells in them.
+    zero = "0" if predicted else ""
+    occluded = _integer(text("occluded", zero), "occluded", where, low=0)
+    truncated = _number(text("truncated", zero), "truncated", where, low=0, high=1)
+    ignored = text("ignore", zero)
+    flag = {"0": False, "1": True, "false": False, "true": True}.get(ignored.lower())
     if flag is None:
-        raise DatasetError(f"{where}: ignore must be 0 or 1, got {record['ignore']!r}")
-    return Row(where, frame, track, (x1, y1, x2, y2), occluded, truncated, flag)
+        raise DatasetError(f"{where}: ignore must be 0 or 1, got {ignored!r}")
+    optional: dict[str, Any] = {
+        name: _number(text(name), name, where)
+        for name in ("distance_m", "speed_mps")
+        if text(name).lower() not in ("", "nan")
+    }
+    if predicted:
+        optional["score"] = _number(text("score"), "score", where)
+    return Row(where, frame, track, (x1, y1, x2, y2), occluded, truncated, flag, **optional)
 
 
 def _read_kitti(source: Path, classes: Collection[str] | None) -> Rows:
@@ -198,7 +261,7 @@ def _read_mot(source: Path, classes: Collection[str] | None) -> Rows:
         frame = _integer(words[0], "frame (counted from 1)", where, low=1) - 1
         track = _integer(words[1], "id", where, low=NO_TRACK)
         x, y, width, height = (_number(word, "side of the box", where) for word in words[2:6])
-        box = (x, y, x + width, y + height)
+        box = (x - 1, y - 1, x - 1 + width, y - 1 + height)  # the first pixel is number 1
         # Ground truth has nine columns, the last ones flag, class, visibility. Results have class -1 or ten.
         if len(words) == 9 and words[7] != "-1":
             if classes is None or words[7] in classes:
@@ -209,18 +272,35 @@ def _read_mot(source: Path, classes: Collection[str] | None) -> Rows:
     return rows, []
 
 
-def _read_coco(source: Path, classes: Collection[str] | None) -> Rows:
+class CocoFile(NamedTuple):
+    """A COCO data set, or a list of results, whose images and categories are those of another file."""
+
+    images: dict[Any, FrameKey]  # frame of each image id, in the order of the file
+    entries: list[dict[str, Any]]  # of the images
+    categories: dict[Any, str]  # lower-case name of each category id
+    annotations: list[Any]
+
+
+def read_coco_file(source: Path, truth: Path | None = None) -> CocoFile:
+    """Read a COCO file; `truth` names the data set that a list of results belongs to."""
     try:
         data = json.loads(_read_text(source))
     except json.JSONDecodeError as error:
         raise DatasetError(f"{source} line {error.lineno}: not JSON text ({error.msg})") from None
+    if isinstance(data, list) and all(isinstance(entry, dict) and "image_id" in entry for entry in data):
+        if truth is None:
+            raise DatasetError(
+                f"{source} is a list of COCO results, which names images by their ids in the ground truth; "
+                "name that file with truth="
+            )
+        return read_coco_file(truth)._replace(annotations=data)
     parts = data if isinstance(data, dict) else {}
     needed = ("images", "annotations", "categories")
     missing = [name for name in needed if not isinstance(parts.get(name), list)]
     if missing:
         raise DatasetError(f"{source} is not a COCO file: it lacks the lists {', '.join(missing)}")
     try:
-        images = {image["id"]: image.get("file_name", image["id"]) for image in data["images"]}
+        images = {image["id"]: _coco_frame(image) for image in data["images"]}
         names = {entry["id"]: str(entry["name"]).lower() for entry in data["categories"]}
     except (KeyError, TypeError, AttributeError):
         raise DatasetError(
@@ -230,34 +310,60 @@ def _read_coco(source: Path, classes: Collection[str] | None) -> Rows:
         raise DatasetError(f"{source}: give every image a file_name, or none of them and integer ids")
     if len(set(images.values())) < len(data["images"]):
         raise DatasetError(f"{source}: two images share an id or a file_name; make them unique")
+    return CocoFile(images, data["images"], names, data["annotations"])
+
+
+def _coco_frame(image: dict[str, Any]) -> FrameKey:
+    """Frame of an image: its file name; the frame's number where `write_labels` put it into the name."""
+    name, frame = image.get("file_name", image["id"]), image.get("frame")
+    return frame if isinstance(frame, int) and name == f"{frame:06d}" else name
+
+
+def vehicle_categories(file: CocoFile, source: Path, classes: Collection[str] | None) -> set[Any]:
+    """Ids of the categories that are vehicles; raise if there are annotations but no such category."""
     wanted = VEHICLE_CLASSES if classes is None else classes
-    if data["annotations"] and not set(names.values()) & set(wanted):
+    found = {number for number, name in file.categories.items() if name in wanted}
+    if file.annotations and not found:
+        listed = ", ".join(map(repr, file.categories.values())) or "none"
         raise DatasetError(
-            f"{source} has no category among {', '.join(wanted)}; found "
-            f"{', '.join(map(repr, names.values())) or 'none'}; name those of vehicles with classes="
+            f"{source} has no category among {', '.join(wanted)}; found {listed}; "
+            "name those of vehicles with classes="
         )
+    return found
+
+
+def _read_coco(source: Path, classes: Collection[str] | None, truth: Path | None) -> Rows:
+    file = read_coco_file(source, truth)
+    vehicles = vehicle_categories(file, source, classes)
     rows: list[Row] = []
-    for number, entry in enumerate(data["annotations"]):
+    for number, entry in enumerate(file.annotations):
         where = f"{source} annotation {number}"
         try:
             x, y, width, height = (_number(str(side), "bbox", where) for side in entry["bbox"])
-            frame, name = images[entry["image_id"]], names[entry["category_id"]]
+            category = entry["category_id"]
+            frame, name = file.images[entry["image_id"]], file.categories[category]
         except (KeyError, TypeError, ValueError) as error:
             raise DatasetError(
                 f"{where}: expected bbox [x, y, width, height] and the image_id and category_id of an image "
                 f"and a category in the file ({error})"
             ) from None
-        if name not in wanted and name not in LOOKALIKE_CLASSES:
+        if category not in vehicles and name not in LOOKALIKE_CLASSES:
             continue
         score = math.nan if entry.get("score") is None else _number(str(entry["score"]), "score", where)
         track = entry.get("track_id", number if math.isnan(score) else NO_TRACK)
-        if entry.get("iscrowd") or track is None:
+        # A crowd is a region, except for the ignored vehicles of write_labels, which marks them twice.
+        if track is None or (entry.get("iscrowd") and not (entry.get("ignore") and "track_id" in entry)):
             track = NO_TRACK
         track = _integer(str(track), "track_id", where, low=NO_TRACK)
-        ignore = bool(entry.get("iscrowd") or entry.get("ignore") or name not in wanted)
+        ignore = bool(entry.get("iscrowd") or entry.get("ignore") or category not in vehicles)
         box = (x, y, x + width, y + height)
-        rows.append(Row(where, frame, track, box, ignore=ignore, score=score))
-    return rows, list(images.values())
+        optional: dict[str, Any] = {
+            name: _number(str(entry[name]), name, where)
+            for name in ("distance_m", "speed_mps")
+            if entry.get(name) is not None
+        }
+        rows.append(Row(where, frame, track, box, ignore=ignore, score=score, **optional))
+    return rows, list(file.images.values())
 
 
 def read_labels(
@@ -266,28 +372,34 @@ def read_labels(
     format: str | None = None,  # noqa: A002
     classes: Collection[str] | None = None,
     shape: tuple[int, ...] | None = None,
+    truth: str | os.PathLike[str] | None = None,
 ) -> FrameBoxes:
-    """Read labelled or predicted boxes from a file or folder.
+    """Read labelled or predicted boxes from a file or folder; `write_labels` writes them.
 
     Parameters
     ----------
     path
         A CSV file (``frame,track,x1,y1,x2,y2,occluded,truncated,ignore`` or, for predictions,
         ``frame,track_id,x1,y1,x2,y2,score[,distance_m,speed_mps]``, separated by commas, semicolons or tabs),
-        a KITTI ``label_2`` folder, a MOTChallenge text file or a COCO JSON file.
+        a JSON Lines or Parquet (needs pyarrow) file with these columns, a KITTI ``label_2`` folder, a
+        MOTChallenge text file, a COCO JSON file, or a list of COCO results.
     format
-        ``"csv"``, ``"kitti"``, ``"mot"`` or ``"coco"``; None chooses by suffix and content.
+        ``"csv"``, ``"jsonl"``, ``"parquet"``, ``"kitti"``, ``"mot"`` or ``"coco"``; None chooses by suffix
+        and content.
     classes
         KITTI types, COCO category names or MOT class numbers that are vehicles, in upper or lower case.
         None takes car, van, truck, bus and vehicle, and every row of a MOT file.
     shape
         ``(height, width, ...)`` of the frames, to which boxes are clipped. None does not clip them.
+    truth
+        The COCO data set whose image and category ids a list of COCO results has; not read otherwise.
 
     Returns
     -------
     FrameBoxes
         CSV frames are int if all of them are whole numbers, else str. KITTI frames are the files' names
-        without ``.txt``, COCO frames the images' ``file_name``; MOT frames count from 0, in the file from 1.
+        without ``.txt``, COCO frames the images' ``file_name``. Frames and pixels of MOT files count from 1
+        and are returned from 0.
 
     Raises
     ------
@@ -295,7 +407,7 @@ def read_labels(
         If the file is missing, has none of these formats, or holds an invalid row; the message names the
         line.
     InvalidInputError
-        If `format` or `shape` is none of the values above.
+        If `format` or `shape` is none of the values above, or pyarrow is missing.
 
     Notes
     -----
@@ -311,10 +423,9 @@ def read_labels(
     ...
     vehicle_detection.errors.DatasetError: labels/missing.csv does not exist; check the path
     """
-    readers = {"csv": _read_csv, "kitti": _read_kitti, "mot": _read_mot, "coco": _read_coco}
     source = Path(path)
     if format is not None:
-        check_choice(format, "format", readers)
+        check_choice(format, "format", ("csv", "jsonl", "parquet", "kitti", "mot", "coco"))
     if not source.exists():
         raise DatasetError(f"{source} does not exist; check the path")
     kind = format or _guess_format(source)
@@ -323,7 +434,13 @@ def read_labels(
             f"{source} is a folder, and {kind} labels are one file; pass the path of that file"
         )
     chosen = None if classes is None else frozenset(str(name).lower() for name in classes)
-    return _assemble(*readers[kind](source, chosen), shape)
+    if kind in ("csv", "jsonl", "parquet"):  # these files hold vehicles only
+        found = {"csv": _read_csv, "jsonl": _read_json_lines, "parquet": _read_parquet}[kind](source)
+    elif kind == "coco":
+        found = _read_coco(source, chosen, None if truth is None else Path(truth))
+    else:
+        found = {"kitti": _read_kitti, "mot": _read_mot}[kind](source, chosen)
+    return _assemble(*found, shape)
 
 
 def _assemble(rows: list[Row], keys: list[FrameKey], shape: tuple[int, ...] | None) -> FrameBoxes:
@@ -373,9 +490,9 @@ def _guess_format(source: Path) -> str:
     """Choose the format by the suffix or else by the first line."""
     if source.is_dir():
         return "kitti"
-    by_suffix = {".json": "coco", ".csv": "csv", ".tsv": "csv"}.get(source.suffix.lower())
-    if by_suffix:
-        return by_suffix
+    suffix = source.suffix.lower()
+    if suffix == ".tsv" or (suffix in FORMATS and suffix != ".txt"):
+        return FORMATS.get(suffix, "csv")
     start = _read_text(source).lstrip()[:4096]
     words = _split_words(start.splitlines()[0]) if start else [""]
     if start.startswith(("{", "[")):

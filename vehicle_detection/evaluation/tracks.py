@@ -1,4 +1,4 @@
-"""Score tracks against labelled vehicles: CLEAR MOT metrics, IDF1 and jitter."""
+"""Score tracks against labelled vehicles: HOTA, CLEAR MOT metrics, IDF1 and jitter."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.detections import Scores, format_number, format_summary, mean, rates, ratio
 from vehicle_detection.evaluation.frame_boxes import NO_TRACK, FrameBoxes, FrameKey
+from vehicle_detection.evaluation.hota import Overlaps, hota_scores
 from vehicle_detection.evaluation.matching import find_ignored, prepare_evaluation
 
 
@@ -33,6 +34,9 @@ class TrackScores(Scores):
         the frames.
     jitter
         Mean change of the four edge errors of a matched box from one frame to the next, in pixels.
+    hota, deta, assa, loca
+        Higher order tracking accuracy, with its parts for detection, association and localization: means
+        over the IoU thresholds 0.05, 0.1, ..., 0.95, whatever `iou` is. NaN without any box.
     mota
         ``1 - (fn + fp + id_switches) / (tp + fn)``; at most 1, and below 0 if errors outnumber vehicles.
     idf1
@@ -56,6 +60,10 @@ class TrackScores(Scores):
     f1: float
     mean_iou: float
     jitter: float
+    hota: float
+    deta: float
+    assa: float
+    loca: float
     mota: float
     idf1: float
     id_switches: int
@@ -65,7 +73,9 @@ class TrackScores(Scores):
     def summary(self) -> str:
         """Return the scores as a few aligned lines."""
         precision, recall = format_number(self.precision), format_number(self.recall)
+        parts = (format_number(part) for part in (self.deta, self.assa, self.loca))
         rows = {
+            "HOTA": "{} (DetA {}, AssA {}, LocA {})".format(format_number(self.hota), *parts),
             "MOTA": format_number(self.mota),
             "IDF1": format_number(self.idf1),
             "F1": f"{format_number(self.f1)} (precision {precision}, recall {recall})",
@@ -83,11 +93,11 @@ class TrackScores(Scores):
 def evaluate_tracks(
     predictions: FrameBoxes, labels: FrameBoxes, *, iou: float = 0.5, frames: Sequence[FrameKey] | None = None
 ) -> TrackScores:
-    """Score tracks against labels: CLEAR MOT metrics, IDF1 and jitter.
+    """Score tracks against labels: HOTA, CLEAR MOT metrics, IDF1 and jitter.
 
     A vehicle keeps the track that matched it last as long as their IoU is large enough; the rest are assigned
     for the largest number of matches and, among those, the largest total IoU. The counts equal those of the
-    package motmetrics.
+    package motmetrics, and HOTA equals that of TrackEval.
 
     Parameters
     ----------
@@ -111,15 +121,16 @@ def evaluate_tracks(
     -----
     MOTA, switches and fragmentations: Bernardin and Stiefelhagen, "Evaluating multiple object tracking
     performance: the CLEAR MOT metrics", 2008. IDF1: Ristani et al., "Performance measures and a data set
-    for multi-target, multi-camera tracking", 2016. Ignored boxes are removed before anything is counted.
+    for multi-target, multi-camera tracking", 2016. HOTA: Luiten et al., "HOTA: a higher order metric for
+    evaluating multi-object tracking", 2021. Ignored boxes are removed before anything is counted.
 
     Examples
     --------
     >>> labels = FrameBoxes([0, 1, 2], [1, 1, 1], [[0, 0, 50, 40], [4, 0, 54, 40], [8, 0, 58, 40]])
     >>> found = FrameBoxes([0, 1, 2], [7, 7, 8], [[0, 0, 50, 40], [5, 0, 55, 40], [9, 0, 59, 40]])
     >>> scores = evaluate_tracks(found, labels)
-    >>> scores.id_switches, round(scores.mota, 3), scores.jitter
-    (1, 0.667, 0.25)
+    >>> scores.id_switches, round(scores.mota, 3), round(scores.hota, 3), scores.jitter
+    (1, 0.667, 0.745, 0.25)
     """
     predictions, labels, keys = prepare_evaluation(predictions, labels, frames)
     min_iou = check_number(iou, "iou", above=0, high=1)
@@ -153,6 +164,7 @@ def evaluate_tracks(
         mean_iou=mean(overlaps),
         jitter=_jitter(predictions, labels, matched),
         mota=1 - ratio(fn + fp + switches, tp + fn),
+        **hota_scores([_overlaps(predictions, labels, frame) for frame in matched]),
         idf1=ratio(2 * _identity_true_positives(matched), 2 * tp + fp + fn),
         id_switches=switches,
         fragmentations=fragmentations,
@@ -171,6 +183,14 @@ class _MatchedFrame:
     false: list[int]  # prediction rows
     ignored: int
     overlapping: list[tuple[int, int]]  # vehicle and track of every pair that overlaps enough, matched or not
+
+
+def _overlaps(predictions: FrameBoxes, labels: FrameBoxes, frame: _MatchedFrame) -> Overlaps:
+    """Collect the boxes of a frame that count."""
+    targets = np.array(sorted([*(target for target, *_ in frame.pairs), *frame.missed]), np.intp)
+    rows = np.array(sorted([*(row for _, row, _ in frame.pairs), *frame.false]), np.intp)
+    iou = iou_matrix(labels.boxes[targets], predictions.boxes[rows])
+    return Overlaps(labels.tracks[targets], predictions.tracks[rows], iou)
 
 
 def _check_tracks(side: FrameBoxes, name: str, keys: list[FrameKey]) -> None:

@@ -10,6 +10,7 @@ frame.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -145,8 +146,64 @@ class Tracker:
         self._start(boxes[unassigned], scores[unassigned], frame, dt)
         self._confirm(frame)
         self._update_horizon(frame, dt)
-        self._tracks, self._at_start = self._snapshot(frame), False
+        self._tracks, self._at_start = self._snapshot(frame, self._states), False
         return self._tracks
+
+    def predict(self, *, time: float | None = None) -> tuple[Track, ...]:
+        """Estimate where the confirmed tracks will be, without changing the state of the tracker.
+
+        Parameters
+        ----------
+        time
+            Time in seconds, not before the last frame; by default one frame after it.
+
+        Returns
+        -------
+        tuple of Track
+            The tracks by id, as `update` would return them if nothing was detected: the state is
+            ``"coasting"``, and ages and misses have grown; score and ``shown`` are those of the last frame.
+            A track that has left the frame by then is left out. At the time of the last frame, its tracks.
+
+        Raises
+        ------
+        InvalidInputError
+            If `time` is not a number, or lies before the last frame.
+
+        Notes
+        -----
+        The Kalman filter predicts at constant speed on the road; the smoothers ``"history"`` and
+        ``"nearest"`` have no motion model and leave each box where it is.
+
+        Examples
+        --------
+        >>> tracker = Tracker(fps=25)
+        >>> for frame in range(50):
+        ...     found = Detections([[600 + 4 * frame, 400, 700 + 4 * frame, 490]], [1.0])
+        ...     tracks = tracker.update(found, (720, 1280, 3))
+        >>> tracks[0].box.round(), tracker.predict()[0].box.round()
+        (array([796., 400., 896., 490.]), array([800., 400., 900., 490.]))
+        """
+        last = 0.0 if self._time is None else self._time
+        dt = self._frame_seconds if time is None else check_number(time, "time", low=last, high=1e12) - last
+        confirmed = [row for row, track in enumerate(self._live) if track.id]
+        if self._shape is None or not confirmed:
+            return ()
+        if dt == 0:
+            return self._tracks[: len(confirmed)]
+        coasting = np.array([self._live[row].misses > 0 for row in confirmed])
+        states = self._smoother.predict(self._states.take(confirmed), coasting, dt)
+        tracks = self._snapshot(self._shape, predict_ranges(states, dt, self.camera), dt)
+        return tuple(
+            dataclasses.replace(
+                track,
+                state="coasting",
+                age=track.age + dt,
+                misses=track.misses + 1,
+                time_since_update=track.time_since_update + dt,
+            )
+            for track, area in zip(tracks, box_areas(_clip(states.boxes(), self._shape)))
+            if area >= 1
+        )
 
     def _advance(self, frame: FrameShape, time: float | None) -> float:
         """Set the time of this frame and return the seconds since the last; end all tracks at a jump."""
@@ -285,13 +342,13 @@ class Tracker:
         visible &= ~truncated_edges(boxes, frame).any(axis=1)
         self._horizon.update(ids[visible], boxes[visible], frame, dt)
 
-    def _snapshot(self, frame: FrameShape) -> tuple[Track, ...]:
-        """Return the current tracks."""
-        boxes = _clip(self._states.boxes(), frame)
+    def _snapshot(self, frame: FrameShape, states: KalmanStates, dt: float = 0.0) -> tuple[Track, ...]:
+        """Return the first tracks, whose states have been predicted by `dt` seconds."""
+        boxes = _clip(states.boxes(), frame)
         boxes.setflags(write=False)
-        gap = np.array([track.time_since_update for track in self._live])
-        ranges = estimate_ranges(self._states, gap, self.camera)
-        velocities = self._states.mean[:, 4:6].tolist()
+        gap = np.array([track.time_since_update + dt for track in self._live[: len(boxes)]])
+        ranges = estimate_ranges(states, gap, self.camera)
+        velocities = states.mean[:, 4:6].tolist()
         fields = ("id", "score", "state", "shown", "age", "misses", "time_since_update")
         return tuple(
             Track(

@@ -1,6 +1,7 @@
 """Parameter search: configurations, trials, tables of results, and hard negative mining."""
 
 from vehicle_detection.tuning.cache import FeatureCache, digest_of
+from vehicle_detection.tuning.classifiers import compare_classifiers
 from vehicle_detection.tuning.grid import TrialConfig, expand_grid, parse_grid
 from vehicle_detection.tuning.mining import mine_negatives
 from vehicle_detection.tuning.results import (
@@ -21,6 +22,7 @@ __all__ = [
     "TrialConfig",
     "TrialOptions",
     "check_column",
+    "compare_classifiers",
     "compare_configurations",
     "digest_of",
     "expand_grid",

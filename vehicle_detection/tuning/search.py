@@ -115,7 +115,7 @@ def compare_configurations(
     values = [C] if isinstance(C, (int, float)) else list(C)
     if not values:
         raise InvalidInputError("C must be a number or several; got none")
-    checked_seeds = _check_seeds(seeds)
+    checked_seeds = check_seeds(seeds)
     # A configuration that sets C itself is tried with that value only.
     candidates = [
         candidate
@@ -126,7 +126,7 @@ def compare_configurations(
         if number == 0 or "C" not in candidate.options
     ]
     evaluator = TrialEvaluator(patch_set, options or TrialOptions())
-    trials = list(_make_splits(patch_set, splits, checked_seeds))
+    trials = list(make_splits(patch_set, splits, checked_seeds))
     rows = RowStore(store, COLUMNS)
     # Candidates with the same features follow each other, so that a small cache computes them once.
     order = {name: place for place, name in enumerate(dict.fromkeys(each.name for each in candidates))}
@@ -243,7 +243,7 @@ def search_parameters(
             runner, list(names), fold_of, split=split, n_candidates=n_candidates, factor=factor, seed=seed
         )
         if n_finalists:
-            ((name, _, parts),) = _make_splits(patch_set, split, (seed,))
+            ((name, _, parts),) = make_splits(patch_set, split, (seed,))
             for config in ranked[:n_finalists]:
                 runner.run(config, parts, seed, name=names[config], split_name=name, stage="final")
     return runner.table()
@@ -351,7 +351,7 @@ def _make_estimator(runner: TrialRunner, fold_of: NDArray[np.intp], split: str, 
     return Trial()
 
 
-def _make_splits(
+def make_splits(
     patch_set: PatchSet, splits: str | Sequence[str] | Mapping[str, Split], seeds: tuple[int, ...]
 ) -> Iterator[tuple[str, int, Split]]:
     """Name, seed and rows of each split."""
@@ -376,7 +376,8 @@ def _make_splits(
             yield name, seed, make_split(patch_set, name, random_state=seed)
 
 
-def _check_seeds(seeds: Sequence[int]) -> tuple[int, ...]:
+def check_seeds(seeds: Sequence[int]) -> tuple[int, ...]:
+    """Return the seeds if they are different integers."""
     given: object = seeds
     if isinstance(given, (str, bytes)) or not isinstance(given, Iterable):
         raise InvalidInputError(f"seeds must be a list of integers, such as range(5); got {describe(given)}")
