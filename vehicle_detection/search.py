@@ -43,7 +43,7 @@ from vehicle_detection._kernels import (
     orientation_cotangents,
     sqrt_gradients,
 )
-from vehicle_detection._kernels import color as _color_kernels
+from vehicle_detection._kernels import histogram as _histogram_kernels
 from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier
@@ -365,12 +365,14 @@ class _Filters:
             scores[template] = bias
             if self.tables is not None:
                 image = converted[params.hist_space]
-                _color_kernels.histogram_cells(image, self.tables[template], cell, maps[-1][-1])
+                _histogram_kernels.histogram_cells(image, self.tables[template], cell, maps[-1][-1])
             for template_filter, channels in zip(filters, maps):
                 template_filter.add_to(channels, scores[template], workspace)
         if self.root_weights is not None:
             image = converted[params.hist_space]
-            _color_kernels.add_root_histograms(image, self.bins, self.root_weights, cell, self.cells, scores)
+            _histogram_kernels.add_root_histograms(
+                image, self.bins, self.root_weights, cell, self.cells, scores
+            )
         return scores[0] if len(scores) == 1 else np.asarray(scores.max(axis=0))
 
     def _hog_maps(
@@ -415,7 +417,7 @@ class _Filters:
             whole = converted[self.params.spatial_space][: rows * cell, : columns * cell]
             bins = cv2.resize(whole, size, dst=workspace.take((size[1], size[0], 3), np.uint8, "bins"))
             cells = channels[:count].reshape(3, per_cell, per_cell, rows, columns)
-            _color_kernels.spatial_cells(bins, per_cell, cells)
+            _histogram_kernels.spatial_cells(bins, per_cell, cells)
         return channels
 
 

@@ -11,7 +11,7 @@ from vehicle_detection.tracking.kalman_filter import (
     initiate_states,
     predict,
     update,
-    update_ranges,
+    update_distances,
 )
 
 SHAPE = (720, 1280)
@@ -86,7 +86,7 @@ def first_range(box, *, camera=CAMERA):
     """Distance, and its standard error, after the first measurement of a vehicle."""
     boxes = np.array([box])
     states = initiate_states(*initiate(boxes, np.ones((1, 4))), camera)
-    states = update_ranges(states, Measurements.from_boxes(boxes, SHAPE), camera, 0.04, 0.04)
+    states = update_distances(states, Measurements.from_boxes(boxes, SHAPE), camera, 0.04, 0.04)
     return states.range_mean[0, 0], np.sqrt(states.range_cov[0, 0, 0])
 
 
@@ -130,7 +130,7 @@ def test_inputs_are_not_modified():
     corrected(mean, cov, boxes_from_states(mean) + 90.0, density, innovation_mean=np.full((2, 4), 5.0))
     states = initiate_states(mean, cov, CAMERA)
     before = [column.copy() for column in states]
-    update_ranges(states, Measurements.from_boxes(BOXES, SHAPE), CAMERA, 0.04, 0.04)
+    update_distances(states, Measurements.from_boxes(BOXES, SHAPE), CAMERA, 0.04, 0.04)
     np.testing.assert_array_equal(mean, copies[0])
     np.testing.assert_array_equal(cov, copies[1])
     for column, copy in zip(states, before, strict=True):

@@ -27,7 +27,7 @@ from vehicle_detection._common import (
     resolve_jobs,
 )
 from vehicle_detection._kernels import bin_of_value, degree_bounds, orientation_cotangents, sqrt_gradients
-from vehicle_detection._kernels import color as _color_kernels
+from vehicle_detection._kernels import histogram as _histogram_kernels
 from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import read_image
@@ -362,7 +362,7 @@ def _extract_batch(patches: NDArray[np.uint8], features: NDArray[np.float32], pa
             params.spatial_planes(row)[:] = cv2.resize(patch, size).transpose(2, 0, 1)
     if params.hist_feat:
         bins = params.hist_bins
-        _color_kernels.patch_histograms(converted[params.hist_space], bin_of_value(bins), bins, hist)
+        _histogram_kernels.patch_histograms(converted[params.hist_space], bin_of_value(bins), bins, hist)
         if params.hist_sqrt:
             np.sqrt(hist, out=hist)
     if params.hog_feat:

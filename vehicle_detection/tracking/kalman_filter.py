@@ -261,7 +261,7 @@ def initiate_states(mean: Floats, cov: Floats, camera: Camera) -> KalmanStates:
     return KalmanStates(mean, cov, np.zeros((count, 4)), range_mean, range_cov)
 
 
-def predict_ranges(states: KalmanStates, dt: float, camera: Camera) -> KalmanStates:
+def predict_distances(states: KalmanStates, dt: float, camera: Camera) -> KalmanStates:
     """Predict distances by `dt` seconds."""
     transition = np.eye(3)
     transition[0, 1] = dt
@@ -272,7 +272,7 @@ def predict_ranges(states: KalmanStates, dt: float, camera: Camera) -> KalmanSta
     return states._replace(range_mean=mean, range_cov=transition @ states.range_cov @ transition.T + noise)
 
 
-def update_ranges(
+def update_distances(
     states: KalmanStates, measured: Measurements, camera: Camera, dt: float, correlation_time: float
 ) -> KalmanStates:
     """Correct distances by the bottom edge and the width of boxes (extended Kalman filter).
@@ -337,7 +337,9 @@ def _scalar_update(
     return mean + gain * innovation[:, None], cov - gain[:, :, None] * cross[:, None, :]
 
 
-def estimate_ranges(states: KalmanStates, time_since_update: Floats, camera: Camera) -> list[dict[str, Any]]:
+def estimate_distances(
+    states: KalmanStates, time_since_update: Floats, camera: Camera
+) -> list[dict[str, Any]]:
     """Distance and speed of each track with standard errors, as fields of `Track`; None where unknown."""
     distance, speed = states.range_mean[:, 0], states.range_mean[:, 1]
     distance_std, speed_std = np.sqrt(np.maximum(states.range_cov[:, [0, 1], [0, 1]], 0)).T

@@ -27,10 +27,10 @@ from vehicle_detection.tracking.kalman_filter import (
     KalmanStates,
     Measurements,
     coasted_distance,
-    estimate_ranges,
+    estimate_distances,
     initiate_states,
-    predict_ranges,
-    update_ranges,
+    predict_distances,
+    update_distances,
 )
 from vehicle_detection.tracking.simple import make_smoother
 from vehicle_detection.tracking.track import TIME_TOLERANCE, Track, TrackState
@@ -140,9 +140,9 @@ class Tracker:
         if self._live:
             coasting = np.array([track.misses > 0 for track in self._live])
             states = self._smoother.predict(self._states, coasting, dt)
-            self._states = predict_ranges(states, dt, self.camera)
+            self._states = predict_distances(states, dt, self.camera)
             unassigned = self._correct(boxes, scores, frame, dt)
-            self._end_expired(frame, dt)
+            self._end_lost_tracks(frame, dt)
         self._start(boxes[unassigned], scores[unassigned], frame, dt)
         self._confirm(frame)
         self._update_horizon(frame, dt)
@@ -192,7 +192,7 @@ class Tracker:
             return self._tracks[: len(confirmed)]
         coasting = np.array([self._live[row].misses > 0 for row in confirmed])
         states = self._smoother.predict(self._states.take(confirmed), coasting, dt)
-        tracks = self._snapshot(self._shape, predict_ranges(states, dt, self.camera), dt)
+        tracks = self._snapshot(self._shape, predict_distances(states, dt, self.camera), dt)
         return tuple(
             dataclasses.replace(
                 track,
@@ -235,12 +235,12 @@ class Tracker:
         tracks, boxes = [self._live[row] for row in rows], boxes[[source[row] for row in rows]]
         measured = Measurements.from_boxes(boxes, frame, [row in shared or row in merged for row in rows])
         states = self._smoother.correct(self._states.take(rows), tracks, measured, dt)
-        self._states = self._states.put(rows, self._update_ranges(states, measured, dt))
+        self._states = self._states.put(rows, self._update_distances(states, measured, dt))
         return unassigned
 
-    def _update_ranges(self, states: KalmanStates, measured: Measurements, dt: float) -> KalmanStates:
+    def _update_distances(self, states: KalmanStates, measured: Measurements, dt: float) -> KalmanStates:
         """Correct the distances of tracks by a measurement each."""
-        return update_ranges(states, measured, self.camera, dt, self.params.measurement_correlation_time)
+        return update_distances(states, measured, self.camera, dt, self.params.measurement_correlation_time)
 
     def _assign(
         self, boxes: Floats, scores: Floats, frame: FrameShape
@@ -272,7 +272,7 @@ class Tracker:
             own[confirmed + row] = columns[column]
         return own, shared, merged
 
-    def _end_expired(self, frame: FrameShape, dt: float) -> None:
+    def _end_lost_tracks(self, frame: FrameShape, dt: float) -> None:
         """End tracks that have no visible part, or that have no detection and expired or left the frame."""
         whole = self._states.boxes()
         inside = _clip(whole, frame)
@@ -316,7 +316,7 @@ class Tracker:
             return
         measured = Measurements.from_boxes(boxes[rows], frame)
         states = initiate_states(*self._smoother.initiate(measured), self.camera)
-        self._states = self._states.join(self._update_ranges(states, measured, dt))
+        self._states = self._states.join(self._update_distances(states, measured, dt))
         weight = 1 - math.exp(-dt / self.params.score_time_constant)
         for score in scores[rows].tolist():
             confirm_at_birth = self._at_start and score >= self.params.instant_confirm_score
@@ -347,7 +347,7 @@ class Tracker:
         boxes = _clip(states.boxes(), frame)
         boxes.setflags(write=False)
         gap = np.array([track.time_since_update + dt for track in self._live[: len(boxes)]])
-        ranges = estimate_ranges(states, gap, self.camera)
+        ranges = estimate_distances(states, gap, self.camera)
         velocities = states.mean[:, 4:6].tolist()
         fields = ("id", "score", "state", "shown", "age", "misses", "time_since_update")
         return tuple(

@@ -1,4 +1,4 @@
-"""Numba kernels of color: histograms of patches and of all windows of a band, and spatial bins."""
+"""Numba kernels of color histograms, of patches and of all windows of a band, and of spatial bins."""
 
 from __future__ import annotations
 
