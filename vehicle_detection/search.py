@@ -199,7 +199,7 @@ class BandSearch(FrameSearch):
     def __init__(self, classifier: VehicleClassifier, *, n_jobs: int | None = None) -> None:
         check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
         super().__init__(n_jobs)
-        self._filters = _Filters(classifier)
+        self.filters = _Filters(classifier)
 
     def _search(
         self, frame: NDArray[np.uint8], params: SearchParams, min_vehicle_score: float
@@ -211,7 +211,7 @@ class BandSearch(FrameSearch):
         check_image(image)
         check_type(params, "params", SearchParams, 'pass SearchParams.preset("default")')
         bands = params.place(image.shape)
-        cell, min_score = self._filters.params.pix_per_cell, float(params.min_score)
+        cell, min_score = self.filters.params.pix_per_cell, float(params.min_score)
         with single_threaded_opencv():
             parts = self._team.map(
                 lambda band: _hits(self.score_map(image, band), band, cell, min_score), bands, cost=_cost
@@ -226,7 +226,7 @@ class BandSearch(FrameSearch):
         several templates, it is the maximum of their scores.
         """
         workspace = self.workspace
-        return self._filters.score_map(resize_band(image, band, workspace), workspace)
+        return self.filters.score_map(resize_band(image, band, workspace), workspace)
 
 
 class ReferenceSearch(FrameSearch):
@@ -323,8 +323,8 @@ class _Filters:
         hist = slice(params.spatial_length, params.spatial_length + params.hist_length)
         # Every template has its own table of weights by pixel value, and so its own histogram channel.
         by_bin = np.array([weights[hist] for weights, _ in folded], np.float32).reshape(len(folded), 3, -1)
+        self.weights_by_bin = by_bin
         self.tables = by_bin[:, :, self.bins] if self.hist_lookup else None
-        self.root_weights = by_bin if self.hist_roots else None
 
     def _build_filters(self, weights: NDArray[np.float64]) -> list[Filter]:
         """Build the filters of one template: over HOG, over coarse HOG, over spatial bins and histogram."""
@@ -350,29 +350,43 @@ class _Filters:
 
     def score_map(self, band: NDArray[np.uint8], workspace: Workspace) -> NDArray[np.float32]:
         """Scores of all windows of a resized band as a new ``(rows, columns)`` float32 array."""
-        params, cell = self.params, self.params.pix_per_cell
-        rows, columns = band.shape[0] // cell, band.shape[1] // cell
+        params = self.params
         converted = {
             space: convert_color(band, space, out=workspace.take(band.shape, np.uint8, space))
             for space in params.used_color_spaces
         }
-        maps = self._hog_maps(band, converted, workspace) if params.hog_feat else []
-        if params.spatial_feat or self.hist_lookup:
-            maps.append(self._value_map(converted, (rows, columns), workspace))
+        hog = self._hog_maps(band, converted, workspace) if params.hog_feat else []
+        spatial, hist = (converted.get(space, band) for space in (params.spatial_space, params.hist_space))
+        return self.score_maps(hog, spatial, hist, self.tables, workspace)
+
+    def score_maps(
+        self,
+        hog: list[NDArray[np.float32]],
+        spatial: NDArray[Any],
+        hist: NDArray[Any],
+        tables: NDArray[np.float32] | None,
+        workspace: Workspace,
+    ) -> NDArray[np.float32]:
+        """Scores of all windows from the HOG of a band and the images of spatial bins and histogram.
+
+        `hog` are ``(channels, rows, columns)`` for each filter over HOG. `tables` is
+        ``(templates, 3, values)``, the histogram's weight of each value of the integer image `hist`.
+        """
+        cell, maps = self.params.pix_per_cell, list(hog)
+        rows, columns = spatial.shape[0] // cell, spatial.shape[1] // cell
+        if self.params.spatial_feat or self.hist_lookup:
+            maps.append(self._value_map(spatial, workspace))
         shape = (len(self.filters), rows - self.cells + 1, columns - self.cells + 1)
         scores = np.empty(shape, np.float32)
         for template, (filters, bias) in enumerate(zip(self.filters, self.biases)):
             scores[template] = bias
-            if self.tables is not None:
-                image = converted[params.hist_space]
-                _histogram_kernels.histogram_cells(image, self.tables[template], cell, maps[-1][-1])
+            if tables is not None:
+                _histogram_kernels.histogram_cells(hist, tables[template], cell, maps[-1][-1])
             for template_filter, channels in zip(filters, maps):
                 template_filter.add_to(channels, scores[template], workspace)
-        if self.root_weights is not None:
-            image = converted[params.hist_space]
-            _histogram_kernels.add_root_histograms(
-                image, self.bins, self.root_weights, cell, self.cells, scores
-            )
+        if self.hist_roots:
+            weights = self.weights_by_bin
+            _histogram_kernels.add_root_histograms(hist, self.bins, weights, cell, self.cells, scores)
         return scores[0] if len(scores) == 1 else np.asarray(scores.max(axis=0))
 
     def _hog_maps(
@@ -404,18 +418,16 @@ class _Filters:
             maps.append(blocks.reshape(-1, rows, columns))
         return maps
 
-    def _value_map(
-        self, converted: dict[str, NDArray[np.uint8]], shape: tuple[int, int], workspace: Workspace
-    ) -> NDArray[np.float32]:
+    def _value_map(self, image: NDArray[Any], workspace: Workspace) -> NDArray[np.float32]:
         """Spatial bins of each cell ``(channels, rows, columns)`` and, last, a channel for the histogram."""
         cell, per_cell = self.params.pix_per_cell, self.per_cell
-        rows, columns = shape
+        rows, columns = image.shape[0] // cell, image.shape[1] // cell
         count = 3 * per_cell**2 if self.params.spatial_feat else 0
         channels = workspace.take((count + int(self.hist_lookup), rows, columns), np.float32, "values")
         if count:
             size = (columns * per_cell, rows * per_cell)
-            whole = converted[self.params.spatial_space][: rows * cell, : columns * cell]
-            bins = cv2.resize(whole, size, dst=workspace.take((size[1], size[0], 3), np.uint8, "bins"))
+            memory = workspace.take((size[1], size[0], 3), image.dtype, "bins")
+            bins = cv2.resize(image[: rows * cell, : columns * cell], size, dst=memory)
             cells = channels[:count].reshape(3, per_cell, per_cell, rows, columns)
             _histogram_kernels.spatial_cells(bins, per_cell, cells)
         return channels

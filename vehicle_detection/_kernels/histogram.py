@@ -35,11 +35,35 @@ def patch_histograms(patches, bin_of_value, bins, features):
 
 
 @jit
+def find_bins(image, edges, indices):
+    """Find the bin of each value between equally spaced `edges`, as `numpy.histogram` does.
+
+    `image` and the output `indices` are ``(H, W, C)``, numbers and intp, and `edges` ``(bins + 1,)`` float64.
+    Values out of range get the index `bins`.
+    """
+    bins = len(edges) - 1
+    factor = bins / (edges[bins] - edges[0])
+    for y in range(image.shape[0]):
+        for x in range(image.shape[1]):
+            for c in range(image.shape[2]):
+                value = np.float64(image[y, x, c])
+                index = bins
+                if edges[0] <= value <= edges[bins]:
+                    index = min(int((value - edges[0]) * factor), bins - 1)
+                    # Rounding may miss the bin by one.
+                    if value < edges[index]:
+                        index -= 1
+                    elif index < bins - 1 and value >= edges[index + 1]:
+                        index += 1
+                indices[y, x, c] = index
+
+
+@jit
 def histogram_cells(image, table, cell, cells):
     """Sum, over each cell, the weights of the pixel values of all channels.
 
-    `image` is ``(H, W, 3)`` uint8, `table` ``(3, 256)`` float32 the weight of each value, `cell` the side of
-    a cell in pixels, and `cells` the output ``(cell rows, cell columns)`` float32.
+    `image` is ``(H, W, 3)`` integer, `table` ``(3, values)`` float32 the weight of each value, `cell` the
+    side of a cell in pixels, and `cells` the output ``(cell rows, cell columns)`` float32.
     """
     rows, columns = cells.shape
     for row in range(rows):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import check_choice, check_integer, describe
 from vehicle_detection._kernels import degree_bounds, orientation_cotangents, sqrt_gradients
+from vehicle_detection._kernels import histogram as _histogram_kernels
 from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.course.checks import Image, check_lesson_image, check_range, check_size
 from vehicle_detection.errors import InvalidInputError
@@ -206,6 +207,18 @@ def hog_blocks(
     image: Image, orient: int, pix_per_cell: int, cell_per_block: int, transform_sqrt: bool = False
 ) -> NDArray[np.float32]:
     """HOG of each channel: ``(channels, rows, columns, block, block, orient)`` float32, a view."""
+    maps = hog_maps(image, orient, pix_per_cell, cell_per_block, transform_sqrt)
+    rows, columns = (count - cell_per_block + 1 for count in maps.shape[4:])
+    return maps[..., :rows, :columns].transpose(0, 4, 5, 1, 2, 3)
+
+
+def hog_maps(
+    image: Image, orient: int, pix_per_cell: int, cell_per_block: int, transform_sqrt: bool = False
+) -> NDArray[np.float32]:
+    """HOG of each channel: ``(channels, block, block, orient, cell rows, cell columns)`` float32.
+
+    The last ``cell_per_block - 1`` rows and columns hold no whole block.
+    """
     check_integer(orient, "orient", low=1)
     cell = check_integer(pix_per_cell, "pix_per_cell", low=1)
     block = check_integer(cell_per_block, "cell_per_block", low=1)
@@ -216,27 +229,25 @@ def hog_blocks(
             f"img must be at least one block large ({side}x{side} pixels); got {width}x{height}"
         )
     cells = np.empty((channels, orient, height // cell, width // cell), np.float32)
-    if image.dtype == np.uint8 and not transform_sqrt:
+    if transform_sqrt:
+        gradients = sqrt_gradients(image) if image.dtype == np.uint8 else _sqrt_gradients(image)
+        _hog_kernels.sum_orientations(*gradients, degree_bounds(orient), channels, cell, cells)
+    else:
         flat = np.ascontiguousarray(image).reshape(height, -1)
         _hog_kernels.hog_cells(flat, channels, cell, orientation_cotangents(orient), cells)
-    else:
-        gradients = sqrt_gradients(image) if image.dtype == np.uint8 else _gradients(image, transform_sqrt)
-        _hog_kernels.sum_orientations(*gradients, degree_bounds(orient), channels, cell, cells)
     blocks = np.empty((channels, block, block, *cells.shape[1:]), np.float32)
     _hog_kernels.normalize_blocks(cells, block, 1, blocks)
-    rows, columns = (count - block + 1 for count in cells.shape[2:])
-    return blocks[..., :rows, :columns].transpose(0, 4, 5, 1, 2, 3)
+    return blocks
 
 
-def _gradients(image: NDArray[Any], transform_sqrt: bool) -> tuple[NDArray[np.float64], ...]:
-    """Gradients of a float image and their arctangents, like `sqrt_gradients`, as scikit-image has them."""
-    if transform_sqrt:
-        if image.min() < 0:
-            raise InvalidInputError(
-                "transform_sqrt must be False for negative values, which float LUV and LAB images have; "
-                "convert a uint8 image, or switch it off"
-            )
-        image = np.sqrt(image)
+def _sqrt_gradients(image: NDArray[Any]) -> tuple[NDArray[np.float64], ...]:
+    """Gradients of the square root of a float image and their arctangents, like `sqrt_gradients`."""
+    if image.min() < 0:
+        raise InvalidInputError(
+            "transform_sqrt must be False for negative values, which float LUV and LAB images have; "
+            "convert a uint8 image, or switch it off"
+        )
+    image = np.sqrt(image)
     across, down = np.zeros_like(image), np.zeros_like(image)
     across[:, 1:-1] = image[:, 2:] - image[:, :-2]
     down[1:-1] = image[2:] - image[:-2]
@@ -245,20 +256,15 @@ def _gradients(image: NDArray[Any], transform_sqrt: bool) -> tuple[NDArray[np.fl
 
 
 def bin_indices(image: Image, bins: int, limits: tuple[float, float]) -> NDArray[np.intp]:
-    """Histogram bin of each value, as `numpy.histogram` assigns it, for `count_bins`.
-
-    A channel has ``bins + 1`` bins, the last one for values out of range.
-    """
-    values = np.arange(256) if image.dtype == np.uint8 else image
-    edges = np.histogram_bin_edges(values, bins, limits)
-    indices = np.searchsorted(edges, values, side="right") - 1
-    indices[values == edges[-1]] = bins - 1
-    indices[indices < 0] = bins
-    if image.dtype == np.uint8:
-        indices = indices[image]
-    return np.asarray(indices + np.arange(3) * (bins + 1))
+    """Histogram bin of each value, as `numpy.histogram` assigns it; `bins` for values out of range."""
+    values = np.arange(256).reshape(1, -1, 1) if image.dtype == np.uint8 else image
+    edges = np.histogram_bin_edges(values, bins, limits).astype(np.float64)
+    indices = np.empty(values.shape, np.intp)
+    _histogram_kernels.find_bins(values, edges, indices)
+    return indices.ravel()[image] if image.dtype == np.uint8 else indices
 
 
 def count_bins(indices: NDArray[np.intp], bins: int) -> NDArray[np.int64]:
     """Histogram of each channel from `bin_indices`, one after the other."""
-    return np.bincount(indices.ravel(), minlength=3 * (bins + 1)).reshape(3, -1)[:, :bins].ravel()
+    separate = (indices + np.arange(3) * (bins + 1)).ravel()
+    return np.bincount(separate, minlength=3 * (bins + 1)).reshape(3, -1)[:, :bins].ravel()

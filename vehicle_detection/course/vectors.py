@@ -23,6 +23,7 @@ from vehicle_detection.course.features import (
     color_hist,
     convert_color,
     hog_blocks,
+    hog_maps,
 )
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import read_image
@@ -232,10 +233,15 @@ class FeatureOptions:
         )
         return sum(lengths)
 
+    @property
+    def has_library_range(self) -> bool:
+        """Whether the histogram covers the range of the library's."""
+        return not self.hist_feat or self.hist_range == (0, 256)
+
     def library_params(self, color_space: str) -> FeatureParams | None:
-        """Parameters of the library for the same features of uint8 patches, or None if there are none."""
+        """Parameters of the library for the same vector, but for `hist_range`; None if there are none."""
         width, height = self.spatial_size
-        if (self.spatial_feat and width != height) or (self.hist_feat and self.hist_range != (0, 256)):
+        if self.spatial_feat and width != height:
             return None
         options = vars(self) | {"color_space": color_space, "spatial_size": width}
         del options["hist_range"]
@@ -246,7 +252,7 @@ class FeatureOptions:
 
     def compute(self, images: Images) -> list[NDArray[Any]]:
         """Feature vectors of images in the lesson's order: float32 from the kernels, else float64."""
-        params = self.library_params(self.color_space)
+        params = self.library_params(self.color_space) if self.has_library_range else None
         if params is None or not are_uint8_patches(images):
             return [self._compute_one(image) for image in images]
         patches = images if isinstance(images, np.ndarray) else np.stack(images)
@@ -271,10 +277,16 @@ class FeatureOptions:
 
     def hog_blocks(self, converted: Image) -> NDArray[np.float32]:
         """HOG of the selected channels of a converted image; see `hog_blocks`."""
+        return hog_blocks(*self._hog_arguments(converted))
+
+    def hog_maps(self, converted: Image) -> NDArray[np.float32]:
+        """HOG of the selected channels of a converted image; see `hog_maps`."""
+        return hog_maps(*self._hog_arguments(converted))
+
+    def _hog_arguments(self, converted: Image) -> tuple[Any, ...]:
         channels = slice(None) if self.hog_channel == "ALL" else [int(self.hog_channel)]
-        return hog_blocks(
-            converted[..., channels], self.orient, self.pix_per_cell, self.cell_per_block, self.transform_sqrt
-        )
+        sizes = (self.orient, self.pix_per_cell, self.cell_per_block)
+        return converted[..., channels], *sizes, self.transform_sqrt
 
 
 def are_uint8_patches(images: Images) -> bool:

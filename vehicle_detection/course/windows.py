@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -26,7 +27,7 @@ from vehicle_detection.course.features import (
 from vehicle_detection.course.heat import draw_boxes
 from vehicle_detection.course.vectors import FeatureOptions, accept_cspace, are_uint8_patches
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.params import PATCH_SIZE, FeatureParams, PixelBand
+from vehicle_detection.params import PATCH_SIZE, FeatureParams
 from vehicle_detection.search import BandSearch
 from vehicle_detection.sklearn_models import fold_estimators
 
@@ -452,44 +453,57 @@ def _window_color(
 def _fast_scores(
     converted: Image, options: FeatureOptions, clf: Any, scaler: Any
 ) -> NDArray[np.float32] | None:
-    """Scores of the windows at every cell by the library's search, or None where it does not apply."""
-    # The band is already converted: the library takes its channels as RGB and converts nothing.
-    params = options.library_params("RGB") if converted.dtype == np.uint8 else None
-    if params is None or PATCH_SIZE % params.pix_per_cell:
+    """Scores of the windows at every cell by the library's filters, or None where they do not apply."""
+    params = options.library_params(options.color_space)
+    if params is None or PATCH_SIZE % params.pix_per_cell or (options.hist_feat and not options.hist_range):
         return None
     if params.spatial_feat and (params.spatial_size % params.cells or PATCH_SIZE % params.spatial_size):
         return None
-    classifier = _library_classifier(clf, scaler, params)
-    if classifier is None:
+    search = _open_search(clf, scaler, params)
+    if search is None:
         return None
-    height, width = converted.shape[:2]
-    band = PixelBand(0, 0, width, height, (PATCH_SIZE, PATCH_SIZE), (params.pix_per_cell,) * 2)
-    return _open_search(classifier).score_map(converted, band)
+    filters = search.filters
+    hog = options.hog_maps(converted)
+    hist, tables = converted, filters.tables
+    if options.hist_feat and (converted.dtype != np.uint8 or not options.has_library_range):
+        assert options.hist_range is not None
+        hist = bin_indices(converted, options.hist_bins, options.hist_range)
+        # The last bin, of values out of range, has no weight.
+        tables = np.pad(filters.weights_by_bin, ((0, 0), (0, 0), (0, 1)))
+    maps = [hog.reshape(-1, *hog.shape[4:])] if options.hog_feat else []
+    return filters.score_maps(maps, converted, hist, tables, search.workspace)
 
 
 # The last model and its search: a system calls `find_cars` for each scale and frame with the same model.
-_last_search: tuple[VehicleClassifier, BandSearch] | None = None
+_last_search: tuple[list[Any], FeatureParams, BandSearch] | None = None
 
 
-def _open_search(classifier: VehicleClassifier) -> BandSearch:
-    """Return a search with a one-template classifier: the last one if its model is the same."""
+def _open_search(clf: Any, scaler: Any, params: FeatureParams) -> BandSearch | None:
+    """Return a search with a linear classifier, the last one if its model is the same; None for others."""
     global _last_search
+    names = ("coef_", "intercept_", "mean_", "center_", "min_", "scale_")
+    state = [type(clf), type(scaler), scaler.get_params() if hasattr(scaler, "get_params") else None]
+    state += [getattr(each, name, None) for each in (clf, scaler) for name in names]
     last = _last_search
-    if last is not None and last[0].params == classifier.params:
-        (old,), (new,) = last[0].templates, classifier.templates
-        names = ("mean", "scale", "coef", "intercept")
-        if all(np.array_equal(getattr(old, name), getattr(new, name)) for name in names):
-            return last[1]
+    if last is not None and last[1] == params and all(map(_equal, last[0], state)):
+        return last[2]
+    classifier = _library_classifier(clf, scaler, params)
+    if classifier is None:
+        return None
     search = BandSearch(classifier, n_jobs=1)
-    _last_search = (classifier, search)
+    _last_search = (copy.deepcopy(state), params, search)
     return search
+
+
+def _equal(first: Any, second: Any) -> bool:
+    return np.array_equal(first, second) if isinstance(first, np.ndarray) else bool(first == second)
 
 
 def _classify_patches(
     patches: list[Image], options: FeatureOptions, clf: Any, scaler: Any
 ) -> NDArray[np.bool_]:
     """Whether the classifier predicts 1 for each of some 64x64 patches."""
-    params = options.library_params(options.color_space)
+    params = options.library_params(options.color_space) if options.has_library_range else None
     if params is not None and are_uint8_patches(patches):
         classifier = _library_classifier(clf, scaler, params)
         if classifier is not None:
