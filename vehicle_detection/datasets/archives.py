@@ -68,24 +68,21 @@ def is_image(name: str) -> bool:
 
 def open_archive(path: Path, shown: str | None = None) -> zipfile.ZipFile:
     """Open a zip for reading, or raise a DatasetError that says what the file is instead."""
-    shown = shown or str(path)
     try:
         return zipfile.ZipFile(path)
     except _ZIP_ERRORS as error:
+        reason = "is not a zip; pass a folder of patches or a .zip file"
         try:
             with path.open("rb") as file:
                 head = file.read(512).lstrip()
         except OSError as unreadable:
-            raise DatasetError(
-                f"{shown} cannot be read: {unreadable.strerror}; check the path and its permissions"
-            ) from unreadable
-        if head.startswith(b"PK"):
-            reason = "is a damaged or incomplete zip; download it again"
-        elif head.startswith(b"<"):
-            reason = "is a web page, not a zip (perhaps a login page); open the address in a browser"
+            reason = f"cannot be read: {unreadable.strerror}; check the path and its permissions"
         else:
-            reason = "is not a zip; pass a folder of patches or a .zip file"
-        raise DatasetError(f"{shown} {reason}") from error
+            if head.startswith(b"PK"):
+                reason = "is a damaged or incomplete zip; download it again"
+            elif head.startswith(b"<"):
+                reason = "is a web page, not a zip (perhaps a login page); open the address in a browser"
+        raise DatasetError(f"{shown or path} {reason}") from error
 
 
 @dataclass(frozen=True)
@@ -129,9 +126,8 @@ def _list_folder(folder: Path) -> dict[str, str]:
         raise DatasetError(f"{error.filename} cannot be read: {error.strerror}; check its permissions")
 
     walk = os.walk(folder, onerror=stop)
-    members = [
-        Path(parent, file).relative_to(folder).as_posix() for parent, _, files in walk for file in files
-    ]
+    paths = [Path(parent, file) for parent, _, files in walk for file in files]
+    members = [path.relative_to(folder).as_posix() for path in paths]
     folder_name = Path(os.path.abspath(folder)).name
     return {f"{folder_name}/{member}": member for member in members if is_image(member)}
 
@@ -187,7 +183,6 @@ def _decode_rows(
     listing: Listing, rows: list[int], out: NDArray[np.uint8], update: Callable[[], object]
 ) -> None:
     """Decode the images of `rows` into the same rows of `out`; call `update` after each."""
-    side = out.shape[1]
     with listing.reader() as read:
         for row in rows:
             where = f"{listing.names[row]} of {listing.path}"
@@ -196,13 +191,12 @@ def _decode_rows(
             except InvalidInputError as error:
                 raise DatasetError(f"{error}; replace or remove it") from error
             except _ZIP_ERRORS as error:
-                message = f"{where} cannot be read ({error}); download or unpack it again"
-                raise DatasetError(message) from error
-            height, width = image.shape[:2]
-            if (height, width) != (side, side):
+                raise DatasetError(f"{where} cannot be read ({error}); download it again") from error
+            if image.shape != out.shape[1:]:
+                height, width = image.shape[:2]
+                expected = f"{out.shape[1]}x{out.shape[1]}"
                 raise DatasetError(
-                    f"{where} is {width}x{height} pixels, expected {side}x{side}; "
-                    f"resize it to {side}x{side} pixels"
+                    f"{where} is {width}x{height} pixels, expected {expected}; resize it to {expected} pixels"
                 )
             out[row] = image
             update()
@@ -247,10 +241,9 @@ def fetch_patches(
 
     Parameters
     ----------
-    folder
-        Folder for the two files, created if missing; None is the user's cache folder.
-    url
-        Base URL (``http://`` or ``https://``) of the two files.
+    folder, url
+        Folder for the two files, created if missing, None for the user's cache folder; and the base URL
+        (``http://`` or ``https://``) that they are at.
     progress
         Show a progress bar on standard error.
 
@@ -319,34 +312,31 @@ def _download(address: str, part: Path, progress: bool) -> None:
     import requests
 
     responses: list[requests.Response] = []
-
-    def keep(response: requests.Response, **_: object) -> None:
-        responses.append(response)
-
+    hooks = {"response": lambda response, **_: responses.append(response)}
     # Not pooch.retrieve, which asks to pin the hash of the file.
-    download = pooch.HTTPDownloader(progressbar=progress, chunk_size=1 << 16, hooks={"response": keep})
+    download = pooch.HTTPDownloader(progressbar=progress, chunk_size=1 << 16, hooks=hooks)
     try:
         download(address, str(part), None)
-    except requests.HTTPError as error:
-        status = error.response.status_code if error.response is not None else "an error"
-        raise DatasetError(
-            f"{address} returns {status}; pass the url of a folder with {' and '.join(ARCHIVES)}"
-        ) from error
-    except requests.exceptions.ChunkedEncodingError as error:
-        raise DatasetError(f"{address} was cut off during the download; call again to restart it") from error
-    except (requests.ConnectionError, requests.Timeout) as error:
-        raise DatasetError(
-            f"{address} cannot be reached ({type(error).__name__}); check the network and call again, "
-            "or download the file in a browser"
-        ) from error
-    except requests.RequestException as error:
-        raise DatasetError(f"{address} cannot be downloaded ({type(error).__name__}); check url") from error
-    except OSError as error:
-        raise DatasetError(
-            f"{address} cannot be stored in {part.parent}: {error.strerror}; free some space or choose "
-            "another folder"
-        ) from error
+    except OSError as error:  # also the base class of the errors of requests
+        raise DatasetError(f"{address} {_download_problem(error, part.parent)}") from error
     finally:
         # pooch leaves the connection open when it raises.
         for response in responses:
             response.close()
+
+
+def _download_problem(error: OSError, folder: Path) -> str:
+    """Say why a download failed, and what to do."""
+    import requests
+
+    match error:
+        case requests.HTTPError(response=requests.Response(status_code=status)):
+            return f"returns {status}; pass the url of a folder with {' and '.join(ARCHIVES)}"
+        case requests.exceptions.ChunkedEncodingError():
+            return "was cut off during the download; call again to restart it"
+        case requests.ConnectionError() | requests.Timeout():
+            remedy = "check the network and call again, or download the file in a browser"
+            return f"cannot be reached ({type(error).__name__}); {remedy}"
+        case requests.RequestException():
+            return f"cannot be downloaded ({type(error).__name__}); check url"
+    return f"cannot be stored in {folder}: {error.strerror}; free some space or choose another folder"

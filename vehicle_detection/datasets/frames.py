@@ -18,18 +18,10 @@ from vehicle_detection.images import read_image
 
 @dataclass(frozen=True)
 class FrameSet:
-    """Image files of a folder, each read on access; iterating yields ``(name, image)``.
-
-    Attributes
-    ----------
-    folder
-        The folder.
-    names
-        File names in natural order.
-    """
+    """Image files of a folder, each read on access; iterating yields ``(name, image)``."""
 
     folder: Path
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # in natural order
 
     def __len__(self) -> int:
         return len(self.names)
@@ -45,8 +37,7 @@ class FrameSet:
             raise DatasetError(f"{error}; replace or remove it") from error
 
     def __iter__(self) -> Iterator[tuple[str, NDArray[np.uint8]]]:
-        for index, name in enumerate(self.names):
-            yield name, self[index]
+        return ((name, self[index]) for index, name in enumerate(self.names))
 
 
 def load_frames(folder: str | os.PathLike[str]) -> FrameSet:

@@ -34,10 +34,9 @@ class PatchSet:
     ----------
     patches
         ``(N, 64, 64, 3)`` uint8 RGB; another side length is allowed, but features cannot be extracted then.
-    labels
-        ``(N,)`` bool, True for a vehicle; may be given as 0 and 1.
-    names
-        N strings ``set/folder/file``, such as ``vehicles/GTI_Far/image0000.png``.
+    labels, names
+        ``(N,)`` bool, True for a vehicle (may be given as 0 and 1); and N strings ``set/folder/file``, such
+        as ``vehicles/GTI_Far/image0000.png``.
 
     Raises
     ------
@@ -48,10 +47,8 @@ class PatchSet:
     --------
     >>> names = ["vehicles/KITTI/1.png", "vehicles/KITTI/2.png", "non-vehicles/GTI/1.png"]
     >>> patches = PatchSet(np.zeros((3, 64, 64, 3), np.uint8), [1, 1, 0], names)
-    >>> patches
-    PatchSet(3 patches of 64x64 pixels: 2 vehicles, 1 non-vehicles)
-    >>> patches.counts(), len(patches[patches.labels])
-    ({'GTI': 1, 'KITTI': 2}, 2)
+    >>> patches[patches.labels], patches.counts()
+    (PatchSet(2 patches of 64x64 pixels: 2 vehicles, 0 non-vehicles), {'GTI': 1, 'KITTI': 2})
     """
 
     patches: NDArray[np.uint8]
@@ -65,20 +62,19 @@ class PatchSet:
         labels, names = check_labels(self.labels, "labels"), tuple(self.names)
         if not all(isinstance(name, str) for name in names):
             raise InvalidInputError("names must be strings like 'vehicles/GTI_Far/image0000.png'")
-        for column, length in (("labels", len(labels)), ("names", len(names))):
-            if length != len(patches):
+        columns: dict[str, Any] = {"patches": patches, "labels": labels, "names": names}
+        for column, values in columns.items():
+            if len(values) != len(patches):
                 raise InvalidInputError(
-                    f"{column} must hold one entry for each of the {len(patches)} patches, got {length}"
+                    f"{column} must hold one entry for each of the {len(patches)} patches, got {len(values)}"
                 )
-        object.__setattr__(self, "patches", patches)
-        object.__setattr__(self, "labels", labels)
-        object.__setattr__(self, "names", names)
+            object.__setattr__(self, column, values)
 
     @classmethod
     def concatenate(cls, sets: Sequence[PatchSet]) -> PatchSet:
         """Join several sets of the same patch size, in the given order."""
-        if not sets or len({each.patches.shape[1:] for each in sets}) > 1:
-            shapes = [each.patches.shape[1:] for each in sets]
+        shapes = [each.patches.shape[1:] for each in sets]
+        if len(set(shapes)) != 1:
             raise InvalidInputError(f"sets must be one or more sets of the same patch size; got {shapes}")
         return cls(
             np.concatenate([each.patches for each in sets]),
@@ -99,11 +95,8 @@ class PatchSet:
         import pandas as pd
 
         total, vehicles = self.counts(), Counter(self.sources[self.labels].tolist())
-        table = pd.DataFrame(
-            [(vehicles[source], count - vehicles[source], count) for source, count in total.items()],
-            index=list(total),
-            columns=["vehicles", "non-vehicles", "total"],
-        )
+        rows = [(vehicles[source], count - vehicles[source], count) for source, count in total.items()]
+        table = pd.DataFrame(rows, index=list(total), columns=["vehicles", "non-vehicles", "total"])
         table.loc["total"] = table.sum()
         return str(table.to_html(max_rows=60))
 
@@ -176,12 +169,9 @@ def load_patches(
     label
         1 for vehicles, 0 for non-vehicles. None takes the label from the innermost folder named
         ``vehicles``, ``cars``, ``non-vehicles`` or ``notcars``.
-    size
-        Side length in pixels that every patch must have.
-    n_jobs
-        Number of decoding threads; None uses one per core, at most 8.
-    progress
-        Show a progress bar on standard error.
+    size, n_jobs, progress
+        Side in pixels that every patch must have; threads, None for one per core, at most 8; and whether to
+        show a progress bar on standard error.
 
     Returns
     -------
@@ -224,15 +214,8 @@ def load_training_patches(
 
     Parameters
     ----------
-    vehicles, non_vehicles
-        A folder or zip file for each class.
-    n_jobs, progress
-        As in `load_patches`.
-
-    Returns
-    -------
-    PatchSet
-        The patches, with their labels and names.
+    vehicles, non_vehicles, n_jobs, progress
+        A folder or zip file for each class; the others as in `load_patches`.
 
     Raises
     ------
@@ -248,5 +231,5 @@ def load_training_patches(
     """
     listings = [list_patches(vehicles, "vehicles"), list_patches(non_vehicles, "non_vehicles")]
     patches = decode_listings(listings, size=PATCH_SIZE, n_jobs=n_jobs, progress=progress)
-    names = listings[0].names + listings[1].names
-    return PatchSet(patches, np.arange(len(names)) < len(listings[0].names), names)
+    names, others = (listing.names for listing in listings)
+    return PatchSet(patches, np.arange(len(patches)) < len(names), names + others)

@@ -22,15 +22,7 @@ _CHUNK = 512  # Rows compared with all others at a time, to limit the memory of 
 class Split:
     """Row numbers of training and test patches; unpacks as ``train, test = split``.
 
-    Attributes
-    ----------
-    train, test
-        ``(N,)`` and ``(M,)`` intp row numbers, without a common one, neither empty.
-
-    Raises
-    ------
-    InvalidInputError
-        If a part is empty or not a list of row numbers, or a row occurs twice.
+    Both parts are ``(N,)`` intp, not empty, and share no row; anything else raises an `InvalidInputError`.
     """
 
     train: NDArray[np.intp]
@@ -65,15 +57,13 @@ def split_random(
     ----------
     patches_or_labels
         The set, or its ``(N,)`` labels.
-    test_size
-        Fraction of test patches, in (0, 1); rounded up to whole patches.
-    random_state
-        Seed; the same seed gives the same split.
+    test_size, random_state
+        Fraction of test patches, in (0, 1), rounded up to whole patches; and the seed.
 
     Returns
     -------
     Split
-        Ascending row numbers, which together are all rows.
+        All rows, in ascending order within each part.
 
     Raises
     ------
@@ -91,16 +81,15 @@ def split_random(
     labels = given.labels if isinstance(given, PatchSet) else check_labels(given, "patches_or_labels")
     fraction = _check_test_size(test_size)
     seed = check_integer(random_state, "random_state", low=0, high=2**32 - 1)
+    rows = np.arange(len(labels))
     try:
-        train, test = train_test_split(
-            np.arange(len(labels)), test_size=fraction, random_state=seed, stratify=labels
-        )
+        parts = train_test_split(rows, test_size=fraction, random_state=seed, stratify=labels)
     except ValueError as error:
         raise InvalidInputError(
             f"{labels.sum()} vehicles and {(~labels).sum()} non-vehicles are too few for a test part of "
             f"{fraction:.0%}; use more patches or another test_size"
         ) from error
-    return Split(np.sort(train), np.sort(test))
+    return Split(*map(np.sort, parts))
 
 
 def split_sequences(patch_set: PatchSet, *, test_size: float = 0.2) -> Split:
@@ -121,7 +110,7 @@ def split_sequences(patch_set: PatchSet, *, test_size: float = 0.2) -> Split:
     Returns
     -------
     Split
-        Ascending row numbers, which together are all rows.
+        As of `split_random`.
 
     Raises
     ------
@@ -160,22 +149,19 @@ def split_groups(
 
     Parameters
     ----------
-    patch_set
-        The patches; a folder is identified by its whole path.
-    test_size
-        Fraction of each folder, and of each class in it, to test on, in (0, 1), rounded. Large groups may
-        make the test part smaller.
+    patch_set, test_size
+        As for `split_sequences`, but of each class in a folder; large groups may make the test part smaller.
     threshold
         Correlation, in (0, 1], from which two patches are near duplicates, as in `find_near_duplicates`. On
         the course's vehicles, most pairs at 0.9 show the same car; at 0.85 a quarter of all patches fall into
         one group by chance.
     random_state
-        Seed; the same seed gives the same split.
+        Seed.
 
     Returns
     -------
     Split
-        Ascending row numbers, which together are all rows.
+        As of `split_random`.
 
     Raises
     ------
@@ -225,16 +211,9 @@ def split_sources(
 
     Parameters
     ----------
-    patch_set
-        The patches.
-    train, test
-        Prefixes of the sources of each part: ``"GTI"`` selects ``GTI``, ``GTI_Far`` and so on. Other sources
-        are left out.
-
-    Returns
-    -------
-    Split
-        Ascending row numbers.
+    patch_set, train, test
+        The patches, and prefixes of the sources of each part: ``"GTI"`` selects ``GTI``, ``GTI_Far`` and so
+        on. Other sources are left out.
 
     Raises
     ------
@@ -244,8 +223,7 @@ def split_sources(
     Examples
     --------
     >>> names = ["v/GTI_Far/1.png", "n/GTI/1.png", "v/KITTI_extracted/1.png", "n/Extras/1.png"]
-    >>> patches = PatchSet(np.zeros((4, 64, 64, 3), np.uint8), [1, 0, 1, 0], names)
-    >>> split_sources(patches).test
+    >>> split_sources(PatchSet(np.zeros((4, 64, 64, 3), np.uint8), [1, 0, 1, 0], names)).test
     array([2, 3])
     """
     known = ", ".join(patch_set.counts()) or "none"
@@ -262,8 +240,8 @@ def split_sources(
                 f"patch_set has {known}"
             )
         masks.append(mask)
-    if (masks[0] & masks[1]).any():
-        shared = sorted(set(patch_set.sources[masks[0] & masks[1]].tolist()))
+    shared = sorted(set(patch_set.sources[masks[0] & masks[1]].tolist()))
+    if shared:
         raise InvalidInputError(
             f"train and test must not share sources, both match {shared}; use longer prefixes"
         )
@@ -296,10 +274,9 @@ def find_near_duplicates(
 
     Parameters
     ----------
-    patches
-        A `PatchSet`, or ``(N, 64, 64, 3)`` uint8 RGB.
-    threshold
-        Correlation, in (0, 1], from which two patches are near duplicates.
+    patches, threshold
+        A `PatchSet`, or ``(N, 64, 64, 3)`` uint8 RGB; and the smallest correlation of near duplicates, in
+        (0, 1].
 
     Returns
     -------
@@ -347,12 +324,10 @@ def find_nearest(
     correlation = np.full(len(queries), -np.inf, np.float32)
     for start in range(0, len(queries), _CHUNK):
         products = queries[start : start + _CHUNK] @ pool.T
-        rows = np.arange(len(products))
+        rows = np.arange(start, start + len(products))
         if same:
-            products[rows, start + rows] = -np.inf
-        best = products.argmax(axis=1)
-        nearest[start : start + _CHUNK] = best
-        correlation[start : start + _CHUNK] = products[rows, best]
+            products[rows - start, rows] = -np.inf
+        nearest[rows], correlation[rows] = products.argmax(axis=1), products.max(axis=1)
     return nearest, correlation
 
 
@@ -377,15 +352,8 @@ def split_leakage(patch_set: PatchSet, split: Split, *, threshold: float = 0.95)
 
     Parameters
     ----------
-    patch_set, split
-        The patches, and a split of them.
-    threshold
-        As in `find_near_duplicates`.
-
-    Returns
-    -------
-    float
-        In [0, 1].
+    patch_set, split, threshold
+        The patches, a split of them, and the threshold of `find_near_duplicates`.
 
     Raises
     ------

@@ -2,6 +2,4 @@
 
 from vehicle_detection.explorer.explorer import Explorer
 
-__all__ = [
-    "Explorer",
-]
+__all__ = ["Explorer"]

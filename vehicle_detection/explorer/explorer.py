@@ -12,7 +12,7 @@ import functools
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar, get_args
 
 import cv2
 import numpy as np
@@ -26,7 +26,7 @@ from vehicle_detection.datasets import FrameSet
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drawing import TRACK_COLORS, blend, draw_boxes, heat_image
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
-from vehicle_detection.explorer.widgets import Panel, build_widgets
+from vehicle_detection.explorer.widgets import METHOD_CONTROLS, Panel, build_widgets
 from vehicle_detection.heatmap import frame_heat, label_boxes
 from vehicle_detection.images import read_image
 from vehicle_detection.mixture import TemplateMixture
@@ -38,15 +38,14 @@ PathLike = str | os.PathLike[str]
 Frames = Sequence[Image | PathLike] | Mapping[str, Image | PathLike] | FrameSet
 Method = Literal["groups", "heat"]
 View = Literal["boxes", "windows", "heat"]
+Weighting = Literal["score", "count"]
 
-METHODS: tuple[Method, ...] = ("groups", "heat")
+METHODS: tuple[Method, ...] = get_args(Method)
 """How windows become boxes: groups of agreeing windows (or the model's own boxes), or a heat map."""
 
-VIEWS: tuple[View, ...] = ("boxes", "windows", "heat")
+VIEWS: tuple[View, ...] = get_args(View)
 """What an image shows: the boxes alone, or also the positive windows or their heat map."""
 
-# Controls for models with search bands only.
-_BAND_CONTROLS = {"bands", "min_peak", "min_evidence"}
 _ALL_SCORES = -1e6
 _CACHED_SEARCHES, _CACHED_FRAMES = 64, 8
 _BOX_COLOR, _HORIZON_COLOR = TRACK_COLORS[1], (255, 255, 255)
@@ -88,16 +87,13 @@ class Explorer:
 
     Attributes
     ----------
-    names
-        Names of the frames.
-    model
-        The model.
+    names, model
+        Names of the frames, and the model.
     frame, view
         Name of the current frame, and what images show.
-    search_params
-        Current search parameters; for a classifier of patches with all bands, searched or not.
-    bands
-        Numbers of the bands that are searched; empty for a model without bands.
+    search_params, bands
+        Current search parameters; for a classifier of patches with all bands, of which those numbered in
+        `bands` are searched.
     method
         ``"groups"``: boxes from groups of agreeing windows, or those that the model predicts. ``"heat"``:
         boxes from the heat map.
@@ -106,10 +102,8 @@ class Explorer:
 
     Raises
     ------
-    ModelFileError
-        If the model file is missing or damaged.
-    InvalidInputError
-        If an argument is malformed.
+    ModelFileError, InvalidInputError
+        If the model file is missing or damaged, or an argument is malformed.
 
     Examples
     --------
@@ -140,8 +134,7 @@ class Explorer:
         self._search = detector.model.open_search()
         self._read_frame = functools.lru_cache(_CACHED_FRAMES)(self._read_frame_uncached)
         self._search_frame = functools.lru_cache(_CACHED_SEARCHES)(self._search_frame_uncached)
-        self._state: tuple[Any, ...] = ()
-        self._results: dict[str, Any] = {}
+        self._compute = functools.lru_cache(3)(lambda function, state: function())
         self.model = detector.model
         self.names = tuple(self._readers)
         self.frame = self.names[0]
@@ -183,14 +176,9 @@ class Explorer:
     ) -> None:
         """Change search parameters; None keeps a value.
 
-        Parameters
-        ----------
-        min_score
-            Minimum score of positive windows. The boxes that a mixture predicts do not depend on it.
-        horizon
-            Height of the horizon as a fraction of the frame's height; the frame is searched again.
-        bands
-            Numbers of the bands of ``search_params.bands`` to search, from 0; an empty list finds nothing.
+        `min_score` is the minimum score of positive windows, on which the boxes that a mixture predicts do
+        not depend; `horizon` a fraction of the frame's height; `bands` numbers the bands of
+        ``search_params.bands`` to search, from 0. An empty list finds nothing.
         """
         params = self.search_params.with_horizon(horizon)
         if min_score is not None:
@@ -208,28 +196,22 @@ class Explorer:
         *,
         threshold: float | None = None,
         peak_fraction: float | None = None,
-        weighting: Literal["score", "count"] | None = None,
+        weighting: Weighting | None = None,
         min_peak: float | None = None,
         min_evidence: float | None = None,
     ) -> None:
         """Change how windows become boxes; None keeps a value.
 
-        Parameters
-        ----------
-        method
-            ``"groups"`` or ``"heat"``.
-        threshold, peak_fraction, weighting
-            Fields of `HeatParams`, for ``"heat"``.
-        min_peak, min_evidence
-            Fields of `RegionParams`, for ``"groups"``; no effect if the model predicts boxes.
+        `threshold`, `peak_fraction` and `weighting` are fields of `HeatParams`, for the method ``"heat"``;
+        `min_peak` and `min_evidence` are fields of `RegionParams`, for ``"groups"``, and have no effect if
+        the model predicts boxes.
         """
-        if method is not None:
-            check_choice(method, "method", METHODS)
-        heat = _replace(
-            self.heat_params, threshold=threshold, peak_fraction=peak_fraction, weighting=weighting
-        )
+        method = self.method if method is None else method
+        check_choice(method, "method", METHODS)
+        changes = {"threshold": threshold, "peak_fraction": peak_fraction, "weighting": weighting}
+        heat = _replace(self.heat_params, **changes)
         groups = _replace(self.group_params, min_peak=min_peak, min_evidence=min_evidence)
-        self.method, self.heat_params, self.group_params = method or self.method, heat, groups
+        self.method, self.heat_params, self.group_params = method, heat, groups
 
     def windows(self) -> Detections:
         """Positive windows of the current frame."""
@@ -246,35 +228,21 @@ class Explorer:
     def detector(self, **options: Any) -> VehicleDetector:
         """Create a detector with the current parameters, for a script or a video.
 
-        Parameters
-        ----------
-        **options
-            Further arguments of `VehicleDetector`, such as ``track_params``.
-
-        Raises
-        ------
-        InvalidInputError
-            If no band is selected.
+        `options` are further arguments of `VehicleDetector`, such as ``track_params``. An `InvalidInputError`
+        is raised if no band is selected.
         """
         params: Any = self.search_params
         if self._all_bands:
-            selected = tuple(self._all_bands[number] for number in self.bands)
-            params = dataclasses.replace(params, bands=selected)
-        return VehicleDetector(
-            self.model,
-            search_params=params,
-            region_params=self.region_params,
-            camera=self._camera,
-            **options,
-        )
+            params = dataclasses.replace(
+                params, bands=tuple(self._all_bands[number] for number in self.bands)
+            )
+        options |= {"region_params": self.region_params, "camera": self._camera}
+        return VehicleDetector(self.model, search_params=params, **options)
 
     def render(self) -> Image:
         """Draw the current frame with its boxes, the horizon, and the windows or heat map of the view.
 
-        Returns
-        -------
-        numpy.ndarray
-            ``(h, w, 3)`` uint8 RGB, not wider than `width`.
+        The image is ``(h, w, 3)`` uint8 RGB, not wider than `width`.
         """
         full, small = self._read_frame(self.frame)
         scale = small.shape[1] / full.shape[1]
@@ -301,39 +269,20 @@ class Explorer:
         )
 
     def widget(self) -> Any:
-        """Create the sliders and the image, an ``ipywidgets.HBox``.
-
-        Raises
-        ------
-        InvalidInputError
-            If ipywidgets is not installed.
-        """
-        params: Any = self.search_params
+        """Create the sliders and the image, an ``ipywidgets.HBox``; ipywidgets must be installed."""
+        horizon = self.search_params.horizon
+        values: dict[str, Any] = {"frame": self.frame, "view": self.view}
+        values |= {"min_score": self.search_params.min_score, "horizon": 0.5 if horizon is None else horizon}
         sizes = [tuple(map(round, band.window)) for band in self._all_bands]
         bands = [(f"{number}: {width}x{height}", number) for number, (width, height) in enumerate(sizes)]
-        values = {
-            "frame": self.frame,
-            "view": self.view,
-            "min_score": params.min_score,
-            "horizon": 0.5 if params.horizon is None else params.horizon,
-            "bands": self.bands,
-            "method": self.method,
-            "min_peak": self.group_params.min_peak,
-            "min_evidence": self.group_params.min_evidence,
-            "threshold": self.heat_params.threshold,
-            "peak_fraction": self.heat_params.peak_fraction,
-            "weighting": self.heat_params.weighting,
-        }
-        if not bands:
-            # A mixture has no bands, and predicts the boxes itself.
-            values = {name: value for name, value in values.items() if name not in _BAND_CONTROLS}
-        options = {
-            "frame": self.names,
-            "view": VIEWS,
-            "bands": bands,
-            "method": METHODS,
-            "weighting": ("score", "count"),
-        }
+        if bands:
+            values["bands"] = self.bands
+        values["method"] = self.method
+        if bands:  # a mixture has none, and predicts the boxes itself
+            values |= {name: getattr(self.group_params, name) for name in METHOD_CONTROLS["groups"]}
+        values |= {name: getattr(self.heat_params, name) for name in METHOD_CONTROLS["heat"]}
+        options = {"frame": self.names, "view": VIEWS, "method": METHODS, "weighting": get_args(Weighting)}
+        options["bands"] = tuple(bands)
         panel = build_widgets(values, options)
         panel.watch(lambda changes: self._update(panel, changes))
         return panel.root
@@ -353,9 +302,7 @@ class Explorer:
             self.set_frame(changes.get("frame", self.frame))
             self.set_view(changes.get("view", self.view))
             self.set_search(**changed("min_score", "horizon", "bands"))
-            self.set_regions(
-                **changed("method", "threshold", "peak_fraction", "weighting", "min_peak", "min_evidence")
-            )
+            self.set_regions(**changed("method", *METHOD_CONTROLS["groups"], *METHOD_CONTROLS["heat"]))
             panel.show(self.render(), self.summary())
         except VehicleDetectionError as error:
             # ipywidgets does not display exceptions of callbacks.
@@ -364,11 +311,7 @@ class Explorer:
     def _cached(self, compute: Callable[[], Value]) -> Value:
         """Return the result of `compute` for the current parameters, computed once."""
         state = (self.frame, self.search_params, self.bands, self.region_params)
-        if state != self._state:
-            self._state, self._results = state, {}
-        if compute.__name__ not in self._results:
-            self._results[compute.__name__] = compute()
-        result: Value = self._results[compute.__name__]
+        result: Value = self._compute(compute, state)
         return result
 
     def _select_windows(self) -> Detections:
@@ -383,16 +326,14 @@ class Explorer:
 
     def _find_boxes(self) -> Detections:
         if self.method == "heat":
-            params = self.heat_params
-            return label_boxes(
-                self.heat_map(), threshold=params.threshold, peak_fraction=params.peak_fraction
-            )
+            heat = self.heat_params
+            return label_boxes(self.heat_map(), threshold=heat.threshold, peak_fraction=heat.peak_fraction)
         found = self._find()
         if found.vehicles is not None:
             return found.vehicles
         shape = self._read_frame(self.frame).full.shape[:2]
-        search_params: Any = self.search_params
-        camera = self._camera or Camera.for_frame(shape, horizon=search_params.horizon)
+        params: Any = self.search_params
+        camera = self._camera or Camera.for_frame(shape, horizon=params.horizon)
         return find_vehicles(self.windows(), camera, shape, self.group_params)
 
     def _read_frame_uncached(self, name: str) -> _FrameImage:
@@ -426,9 +367,8 @@ class Explorer:
 
 def _replace(params: Params, **changes: Any) -> Params:
     """Replace the fields whose new value is not None."""
-    return dataclasses.replace(
-        params, **{name: value for name, value in changes.items() if value is not None}
-    )
+    given = {name: value for name, value in changes.items() if value is not None}
+    return dataclasses.replace(params, **given)
 
 
 def _draw_windows(image: Image, windows: Detections, scale: float) -> None:
@@ -445,32 +385,27 @@ def _draw_windows(image: Image, windows: Detections, scale: float) -> None:
 def _frame_readers(frames: object) -> dict[str, Callable[[], Image]]:
     """Name each frame and return a function that reads it; arrays are checked now, files when read."""
     if isinstance(frames, FrameSet):
-        return {name: functools.partial(read_image, frames.folder / name) for name in frames.names}
-    if isinstance(frames, Mapping):
-        named = [(str(name), frame) for name, frame in frames.items()]
+        frames = {name: frames.folder / name for name in frames.names}
     elif isinstance(frames, (list, tuple)):
-        default_names = [f"frame {number}" for number in range(len(frames))]
-        named = [(_path_name(frame) or name, frame) for frame, name in zip(frames, default_names)]
-        if len({name for name, _ in named}) < len(named):
-            # Two files of the same name: use their paths.
-            named = [(str(frame) if _path_name(frame) else name, frame) for name, frame in named]
-    else:
+        paths = [
+            str(frame) if isinstance(frame, (str, os.PathLike)) else f"frame {number}"
+            for number, frame in enumerate(frames)
+        ]
+        names = [Path(path).name for path in paths]
+        # Two files of the same name are named by their paths.
+        frames = dict(zip(names if len(set(names)) == len(names) else paths, frames))
+    if not isinstance(frames, Mapping):
         raise InvalidInputError(
             f"frames must be a list of images or paths, or a mapping from names to them; "
             f"got {describe(frames)}; wrap a single one in a list"
         )
-    if not named:
+    if not frames:
         raise InvalidInputError("frames must hold at least one image; got none")
-    return {name: _frame_reader(frame, name) for name, frame in named}
-
-
-def _path_name(frame: object) -> str:
-    """File name of a path; empty for anything else."""
-    return Path(frame).name if isinstance(frame, (str, os.PathLike)) else ""
+    return {str(name): _frame_reader(frame, f"frames[{str(name)!r}]") for name, frame in frames.items()}
 
 
 def _frame_reader(frame: Any, name: str) -> Callable[[], Image]:
     if isinstance(frame, (str, os.PathLike)):
         return functools.partial(read_image, frame)
-    checked = check_image(frame, f"frames[{name!r}]")
+    checked = check_image(frame, name)
     return lambda: checked

@@ -24,18 +24,13 @@ _SLIDERS = {
     "threshold": ("min. heat", 0.0, 30.0, 0.25),
     "peak_fraction": ("peak fraction", 0.0, 0.95, 0.05),
 }
-_LABELS = {
-    "frame": "frame",
-    "view": "show",
-    "bands": "windows (px)",
-    "method": "boxes from",
-    "weighting": "heat is",
+_LABELS = {"view": "show", "bands": "windows (px)", "method": "boxes from", "weighting": "heat is"}
+
+METHOD_CONTROLS = {
+    "groups": ("min_peak", "min_evidence"),
+    "heat": ("threshold", "peak_fraction", "weighting"),
 }
-# Controls that are enabled for one method only.
-_METHOD_CONTROLS = {
-    "groups": {"min_peak", "min_evidence"},
-    "heat": {"threshold", "peak_fraction", "weighting"},
-}
+"""Controls that are enabled for one method only."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +49,7 @@ class Panel:
         def on_change(_: object = None) -> None:
             nonlocal values
             previous, values = values, self._values()
-            for method, names in _METHOD_CONTROLS.items():
+            for method, names in METHOD_CONTROLS.items():
                 for name in self.controls.keys() & names:
                     self.controls[name].disabled = values["method"] != method
             update({name: value for name, value in values.items() if value != previous[name]})
@@ -97,7 +92,7 @@ def build_widgets(values: Mapping[str, Any], options: Mapping[str, Sequence[Any]
             ends = {"min": min(low, value), "max": max(high, value), "step": step}
             control = widgets.FloatSlider(description=label, readout_format=".2f", **ends, **common)
         else:
-            common |= {"description": _LABELS[name], "options": options[name]}
+            common |= {"description": _LABELS.get(name, name), "options": options[name]}
             if name == "frame":
                 control = widgets.Dropdown(**common)
             elif name == "bands":

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 import vehicle_detection
 from vehicle_detection._common import atomic_write, check_integer, resolve_jobs
-from vehicle_detection.boxes import Detections
 from vehicle_detection.evaluation import (
     DetectionMatches,
     FrameBoxes,
@@ -135,10 +134,9 @@ def cross_validate_mixture(
 
     Parameters
     ----------
-    sources
-        Labelled frames of at least two sources.
-    extra_sources
-        Further sources that every model is trained on and none is evaluated on.
+    sources, extra_sources
+        Labelled frames of at least two sources; and sources that every model is trained on and none is
+        evaluated on.
     params, patches, random_state, n_jobs, on_step
         As in `train_mixture`.
 
@@ -186,16 +184,12 @@ def detect_in_source(
     """Detect vehicles in all frames of a source, including weak ones; scores are margins."""
     with mixture.open_search(n_jobs=1) as search, ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
 
-        def detect(pair: tuple[Any, NDArray[np.uint8]]) -> tuple[Any, Detections]:
+        def detect(pair: tuple[Any, NDArray[np.uint8]]) -> tuple[Any, Any]:
             # An uncalibrated mixture has slope 1 and offset 0, so its scores are margins.
-            found = search.find(pair[1], min_vehicle_score=_MIN_MARGIN).vehicles
-            assert found is not None
-            return pair[0], found
+            return pair[0], search.find(pair[1], min_vehicle_score=_MIN_MARGIN).vehicles
 
-        return [
-            FoldDetections(source.name, part, FrameBoxes.from_detections(dict(pool.map(detect, part))))
-            for part in source.sets
-        ]
+        found = [FrameBoxes.from_detections(dict(pool.map(detect, part))) for part in source.sets]
+    return [FoldDetections(source.name, part, boxes) for part, boxes in zip(source.sets, found)]
 
 
 def score_fold(fold: FoldDetections, threshold: float) -> FoldScore:
@@ -207,15 +201,13 @@ def score_fold(fold: FoldDetections, threshold: float) -> FoldScore:
     every_region = evaluate_detections(fold.predictions, labels, ignored_as_regions=True)
     empty = [key for key in fold.frames.keys if not len(labels.rows(key))]
     false_on_empty = sum(len(kept.rows(key)) for key in empty)
+    at_threshold = {name: getattr(scores, name) for name in ("f1", "precision", "recall", "mean_iou")}
     return FoldScore(
         name=fold.frames.name,
         source=fold.source,
         frames=len(fold.frames),
         vehicles=int((~labels.ignore).sum()),
-        f1=scores.f1,
-        precision=scores.precision,
-        recall=scores.recall,
-        mean_iou=scores.mean_iou,
+        **at_threshold,
         false_per_frame=scores.false_positives_per_frame,
         false_per_empty_frame=false_on_empty / len(empty) if empty else math.nan,
         threshold=threshold,
@@ -231,19 +223,22 @@ def best_threshold(folds: Sequence[FoldDetections]) -> float:
 
     The mean of their F1 would give a fold with a few dozen vehicles the same weight as one with hundreds.
     """
-    right, shown, vehicles = np.zeros(len(_THRESHOLDS)), np.zeros(len(_THRESHOLDS)), 0
-    for fold in folds:
-        margins, hit = fold.hits
-        above = margins[:, None] >= _THRESHOLDS
-        right += above[hit].sum(axis=0)
-        shown += above.sum(axis=0)
-        vehicles += len(fold.matches.usable)
+    margins, hits = _joined_hits(folds)
+    above = margins[:, None] >= _THRESHOLDS
+    right, shown = above[hits].sum(axis=0), above.sum(axis=0)
+    vehicles = sum(len(fold.matches.usable) for fold in folds)
     return best_f1(right / np.maximum(shown, 1), right / max(vehicles, 1), _THRESHOLDS)[1]
+
+
+def _joined_hits(folds: Sequence[FoldDetections]) -> tuple[Floats, NDArray[np.bool_]]:
+    """`FoldDetections.hits` of all folds."""
+    margins, hits = zip(*(fold.hits for fold in folds))
+    return np.concatenate(margins), np.concatenate(hits)
 
 
 def fit_log_odds(folds: Sequence[FoldDetections]) -> tuple[float, float]:
     """Slope and offset that turn margins into log-odds, fitted to the detections of all folds."""
-    margins, hits = (np.concatenate(side) for side in zip(*(fold.hits for fold in folds)))
+    margins, hits = _joined_hits(folds)
     if len(set(hits.tolist())) < 2:
         return 1.0, 0.0
     platt = calibrate_scores(margins, hits, prior=False)

@@ -75,8 +75,7 @@ def is_negative(boxes: Floats, frame: TrainingFrame) -> NDArray[np.bool_]:
         negative &= iou_matrix(boxes, frame.boxes).max(axis=1) < _MAX_OVERLAP
     if len(frame.ignored):
         centers = ((boxes[:, :2] + boxes[:, 2:]) / 2)[:, None]
-        low, high = frame.ignored[None, :, :2], frame.ignored[None, :, 2:]
-        inside = np.asarray((centers > low) & (centers < high)).all(axis=2)
+        inside = np.asarray((centers > frame.ignored[:, :2]) & (centers < frame.ignored[:, 2:])).all(axis=2)
         negative &= ~np.asarray(inside).any(axis=1)
         shared = intersection_matrix(boxes, frame.ignored)
         negative &= (shared / box_areas(boxes)[:, None]).max(axis=1) < _MAX_OVERLAP
@@ -87,10 +86,12 @@ def random_windows(
     frame: TrainingFrame, seed: int, views: Sequence[View], params: MixtureParams
 ) -> list[HardNegative]:
     """Draw a few random negatives."""
-    rng = np.random.default_rng(int(seed))
-    return _negatives(
-        frame, views, params, lambda margins: rng.permutation(margins.size)[: rng.poisson(_RANDOM_PER_LEVEL)]
-    )
+    rng = np.random.default_rng(seed)
+
+    def choose(margins: NDArray[np.float32]) -> NDArray[np.intp]:
+        return rng.permutation(margins.size)[: rng.poisson(_RANDOM_PER_LEVEL)]
+
+    return _negatives(frame, views, params, choose)
 
 
 def mine_windows(frame: TrainingFrame, views: Sequence[View], params: MixtureParams) -> list[HardNegative]:
@@ -111,20 +112,17 @@ def _negatives(
     """Negatives of a frame among the windows that `choose` takes, for each view."""
     shape = frame.image.shape[:2]
     sizes = params.search.sizes(*smallest_box([view.template for view in views]), shape)
+    maps: list[FeatureMap] = []
     with single_threaded_opencv():
         images = image_pyramid(frame.image)
-        maps = [
-            features
-            for level in pyramid_levels(sizes)
-            for _, features in feature_maps(images, level, (0, shape[0]))
-        ]
-    return [
-        HardNegative(view.index, (number, *place), block.transpose(1, 2, 0).ravel())
-        for number, view in enumerate(views)
-        for place, block in (_border_blocks if view.template.border else _inner_blocks)(
-            frame, maps, view, params, choose
-        )
-    ]
+        for level in pyramid_levels(sizes):
+            maps += [features for _, features in feature_maps(images, level, (0, shape[0]))]
+    found = []
+    for number, view in enumerate(views):
+        blocks = _border_blocks if view.template.border else _inner_blocks
+        for place, block in blocks(frame, maps, view, params, choose):
+            found.append(HardNegative(view.index, (number, *place), block.transpose(1, 2, 0).ravel()))
+    return found
 
 
 def _inner_blocks(

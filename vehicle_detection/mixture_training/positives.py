@@ -21,6 +21,7 @@ from vehicle_detection.params import MixtureParams
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
+Rows = NDArray[np.float32]
 VehicleSamples = Iterator[tuple[Image, Floats]]
 """Images, each with the box of one vehicle."""
 
@@ -92,44 +93,46 @@ def mirror_boxes(boxes: Floats, width: float) -> Floats:
 
 
 def vehicle_features(
-    samples: VehicleSamples, templates: Sequence[MixtureTemplate], params: MixtureParams
-) -> list[NDArray[np.float32]]:
-    """Features of the samples of each template, ``(N, length)``; whole vehicles are mirrored, too."""
-    found: list[list[NDArray[np.float32]]] = [[] for _ in templates]
+    samples: VehicleSamples,
+    templates: Sequence[MixtureTemplate],
+    params: MixtureParams,
+    means: Sequence[Rows] | None = None,
+) -> list[Rows]:
+    """Features of the samples of each template, ``(N, length)``; whole vehicles are mirrored, too.
+
+    Cells outside the image take the features in `means`, ``(28, rows, columns)`` for each template.
+    """
+    found: list[list[Rows]] = [[] for _ in templates]
     for image, box in samples if templates else ():
         for index in _matching_templates(box, templates, params.aspect_tolerance):
-            channels = window_features(image, box, templates[index])
+            template = templates[index]
+            channels = window_features(image, box, template)
+            if means is not None:
+                channels = np.where(_outside_cells(image, box, template), means[index], channels)
             # The samples of border templates already come from both sides.
-            views = (channels,) if templates[index].border else (channels, mirror_channels(channels))
-            found[index] += _flatten(*views)
-    return _stack(found, templates)
+            views = (channels,) if template.border else (channels, mirror_channels(channels))
+            found[index] += [view.transpose(1, 2, 0).ravel() for view in views]
+    return [np.array(rows, np.float32).reshape(-1, t.weights.size) for rows, t in zip(found, templates)]
 
 
 def patch_features(
     patches: Sequence[Image],
     regressor: BoxRegressor,
     templates: Sequence[MixtureTemplate],
-    known: Sequence[NDArray[np.float32]],
+    known: Sequence[Rows],
     params: MixtureParams,
-) -> list[NDArray[np.float32]]:
+) -> list[Rows]:
     """Features of the vehicles on patches for templates of whole vehicles, as in `vehicle_features`.
 
     A patch does not show the surroundings of its vehicle, so cells outside it take the mean over the features
     of vehicles in frames, `known`. The regressor locates the vehicle on its patch.
     """
-    found: list[list[NDArray[np.float32]]] = [[] for _ in templates]
     means = [
         rows.mean(axis=0).reshape(template.weights.shape).transpose(2, 0, 1)
         for template, rows in zip(templates, known)
     ]
-    for image in patches:
-        box = locate_on_patch(image, regressor)
-        for index in _matching_templates(box, templates, params.aspect_tolerance):
-            channels = window_features(image, box, templates[index]).copy()
-            outside = _outside_cells(image, box, templates[index])
-            channels[:, outside] = means[index][:, outside]
-            found[index] += _flatten(channels, mirror_channels(channels))
-    return _stack(found, templates)
+    samples = ((image, locate_on_patch(image, regressor)) for image in patches)
+    return vehicle_features(samples, templates, params, means)
 
 
 def locate_on_patch(image: Image, regressor: BoxRegressor) -> Floats:
@@ -160,19 +163,7 @@ def _matching_templates(box: Floats, templates: Sequence[MixtureTemplate], toler
     return [int(index) for index in np.flatnonzero((distance == distance.min()) | (distance < tolerance))]
 
 
-def _flatten(*views: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-    return [view.transpose(1, 2, 0).ravel() for view in views]
-
-
-def _stack(
-    found: Sequence[Sequence[NDArray[np.float32]]], templates: Sequence[MixtureTemplate]
-) -> list[NDArray[np.float32]]:
-    return [np.array(rows, np.float32).reshape(-1, t.weights.size) for rows, t in zip(found, templates)]
-
-
-def align_mirrored(
-    rows: NDArray[np.float32], rng: np.random.Generator, tries: int = 5
-) -> NDArray[np.float32]:
+def align_mirrored(rows: Rows, rng: np.random.Generator, tries: int = 5) -> Rows:
     """Keep one of each two neighboring rows, a sample and its mirror image, so that all show the same side.
 
     k-means with two clusters that are each other's mirror image, from a few random starts.

@@ -53,6 +53,8 @@ def train_rescorer(
     Positives are the labelled boxes, also slightly shifted, and the proposals on them. Negatives are the
     proposals where no vehicle is, and boxes that show only a part of one.
     """
+    from sklearn.svm import SVC
+
     seeds = rng.integers(2**32, size=len(frames)).tolist()
 
     def crops(frame: TrainingFrame, seed: int) -> tuple[Crops, Crops]:
@@ -65,25 +67,25 @@ def train_rescorer(
     # Negatives are plentiful, so each is taken either as it is or mirrored; positives are taken both ways.
     positives = _join([positives, _mirror(positives)])
     flipped = rng.random((len(negatives[0]), 1)) < 0.5
-    mirrored = _mirror(negatives)
-    negatives = (
-        np.where(flipped, mirrored[0], negatives[0]),
-        np.where(flipped, mirrored[1], negatives[1]),
-    )
+    edges, colors = (np.where(flipped, *pair) for pair in zip(_mirror(negatives), negatives))
+    negatives = edges, colors
     is_vehicle = np.repeat([True, False], [len(positives[0]), len(negatives[0])])
     edges, colors = _join([positives, negatives])
     seed = int(rng.integers(2**31))
     to_edges = _fit_projection(edges, _EDGE_COMPONENTS, 1.0, seed)
     to_colors = _fit_projection(colors, _COLOR_COMPONENTS, _COLOR_STD, seed)
     points = np.hstack([to_edges(edges), to_colors(colors)])
-    return _fit_svm(to_edges, to_colors, points, is_vehicle, params.blend_weight)
+    svm = SVC(C=_C, gamma=_GAMMA, cache_size=2000).fit(points, is_vehicle)
+    vectors, coefficients, bias = svm.support_vectors_, svm.dual_coef_[0], float(svm.intercept_[0])
+    return Rescorer(to_edges, to_colors, vectors, coefficients, bias, _GAMMA, params.blend_weight)
 
 
 def _sample_boxes(
     frame: TrainingFrame, search: MixtureSearch, params: MixtureParams, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
     """Positive and negative boxes of a frame."""
-    proposals = _propose_boxes(search, frame.image)
+    windows = search.score_windows(frame.image, PyramidParams())
+    proposals = search.model.propose_boxes(frame.image, windows, min_margin=_MIN_MARGIN)[0]
     negatives = proposals[is_negative(proposals, frame)]
     positives = proposals[iou_matrix(proposals, frame.boxes).max(axis=1, initial=0) >= _MIN_POSITIVE_IOU]
     wide = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.min_width]
@@ -94,12 +96,6 @@ def _sample_boxes(
     overlap = iou_matrix(beside, frame.boxes).max(axis=1, initial=0)
     beside = beside[(overlap > _NEGATIVE_IOU[0]) & (overlap < _NEGATIVE_IOU[1])][: _BESIDE * len(wide)]
     return np.concatenate([copies + shifts, positives]), np.concatenate([negatives, beside])
-
-
-def _propose_boxes(search: MixtureSearch, image: NDArray[np.uint8]) -> Floats:
-    """Boxes that the search proposes in a denoised frame, before rescoring."""
-    windows = search.score_windows(image, PyramidParams())
-    return search.model.propose_boxes(image, windows, min_margin=_MIN_MARGIN)[0]
 
 
 def _join(parts: Sequence[Crops]) -> Crops:
@@ -125,18 +121,3 @@ def _fit_projection(rows: NDArray[np.float32], count: int, std: float, seed: int
     pca = PCA(min(count, *rows.shape), svd_solver="randomized", random_state=seed).fit(rows)
     scale = std / max(np.sqrt(pca.explained_variance_.sum()), 1e-9)
     return Projection(pca.mean_, pca.components_ * scale)
-
-
-def _fit_svm(
-    edges: Projection,
-    colors: Projection,
-    points: NDArray[np.float32],
-    is_vehicle: NDArray[np.bool_],
-    blend_weight: float,
-) -> Rescorer:
-    """Train the RBF SVM on projected samples, ``(N, components)``."""
-    from sklearn.svm import SVC
-
-    svm = SVC(C=_C, gamma=_GAMMA, cache_size=2000).fit(points, is_vehicle)
-    bias = float(svm.intercept_[0])
-    return Rescorer(edges, colors, svm.support_vectors_, svm.dual_coef_[0], bias, _GAMMA, blend_weight)

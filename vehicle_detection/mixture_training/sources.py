@@ -23,10 +23,8 @@ class FrameDataset:
 
     Attributes
     ----------
-    name
-        Name of the data set.
-    sets
-        Its sets of labelled frames.
+    name, sets
+        Name of the data set, and its sets of labelled frames.
     min_labelled_width
         Width in pixels from which on every vehicle is labelled; narrower windows are never negatives.
 
@@ -69,10 +67,10 @@ def check_sources(sources: object, *, min_count: int = 1) -> tuple[FrameDataset,
     if len(names) < min_count:
         expected = "at least two, so that one can be left out" if min_count > 1 else "at least one"
         raise InvalidInputError(f"sources must be {expected}; got {len(names)}: add labelled frames")
-    twice = {name for name in names if names.count(name) > 1}
+    twice = min((name for name in names if names.count(name) > 1), default=None)
     if twice:
         raise InvalidInputError(
-            f"sources must have different names, got {min(twice)!r} twice; merge them into one"
+            f"sources must have different names, got {twice!r} twice; merge them into one"
         )
     return tuple(sources)
 
@@ -113,9 +111,9 @@ def _read_frames(root: Path, file: Path, clip_rate: float) -> LabelledFrames:
     name, labels = file.stem, read_labels(file)
     video = root / "videos" / f"{name}.mp4"
     folders = root / "frames" / name, root / name
-    images = next((place for place in folders if place.is_dir()), None)
-    if images is not None:
-        return LabelledFrames(name, load_frames(images), labels)
+    for folder in folders:
+        if folder.is_dir():
+            return LabelledFrames(name, load_frames(folder), labels)
     if video.is_file():
         every = max(1, round(float(probe_video(video).fps) / clip_rate))
         return LabelledFrames.from_video(video, labels, every=every)

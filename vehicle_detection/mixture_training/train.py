@@ -6,7 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -71,17 +71,13 @@ def train_mixture(
 
     Parameters
     ----------
-    sources
-        Labelled frames.
-    params
-        Shapes of the templates, and how they are trained.
+    sources, params
+        Labelled frames; and the shapes of the templates and how they are trained.
     patches
         Additional vehicles: ``(H, W, 3)`` uint8 RGB images of any size, each mostly filled by one vehicle,
         such as the course's patches. A box regressor locates the vehicle on its patch.
-    random_state
-        Seed of the jitter and of the first negatives.
-    n_jobs
-        Threads; the model does not depend on them.
+    random_state, n_jobs
+        Seed of the jitter and of the first negatives; threads, on which the model does not depend.
     on_step
         Called with one line of text after each step.
 
@@ -110,99 +106,135 @@ def train_mixture(
         raise InvalidInputError(f"patches must be a list of images, got {describe(given)}")
     for image in patches:
         check_image(image, "patches")
-    report = on_step or log.info
-    frames = load_training_frames(sources)
-    rng = np.random.default_rng(random_state)
     with ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
+        rng, frames = np.random.default_rng(random_state), load_training_frames(sources)
+        return _Training(frames, params, rng, pool, on_step or log.info).run(patches)
+
+
+@dataclass(frozen=True, eq=False)
+class _Training:
+    """The steps of a training, and what they share."""
+
+    frames: Sequence[TrainingFrame]
+    params: MixtureParams
+    rng: np.random.Generator
+    pool: ThreadPoolExecutor
+    report: Callable[[str], object]
+
+    def run(self, patches: Sequence[Image]) -> TemplateMixture:
+        """Train the templates, then the box regressor and the rescorer on what these find."""
+        params = self.params
         inner = [_blank(shape, params.padding) for shape in params.shapes]
         border = [_blank(shape, params.padding, border=True) for shape in params.border_shapes]
-        positives = _positives(frames, patches, inner, border, params, rng, pool)
-        report(f"vehicles per template: {', '.join(str(len(rows)) for rows in positives)}")
-        templates = _train_templates([*inner, *border], frames, positives, params, rng, pool, report)
+        positives = self.positives(patches, inner, border)
+        self.report(f"vehicles per template: {', '.join(str(len(rows)) for rows in positives)}")
         mixture = TemplateMixture(
-            tuple(templates),
+            tuple(self.train_templates([*inner, *border], positives)),
             BoxRegressor.none(),
             size_prior_weight=params.size_prior_weight,
             vote_weight=params.vote_weight,
         )
         with mixture.open_search(n_jobs=1) as search:
-            regressor = _fit_box_regressor(frames, rng, params, pool, search)
-        mixture = replace(mixture, box_regressor=regressor)
+            mixture = replace(mixture, box_regressor=self.fit_box_regressor(search))
         if params.blend_weight:
             with mixture.open_search(n_jobs=1) as search:
-                mixture = replace(mixture, rescorer=train_rescorer(frames, search, params, rng, pool))
-    return mixture
+                rescorer = train_rescorer(self.frames, search, params, self.rng, self.pool)
+            mixture = replace(mixture, rescorer=rescorer)
+        return mixture
 
+    def positives(
+        self, patches: Sequence[Image], inner: Sequence[MixtureTemplate], border: Sequence[MixtureTemplate]
+    ) -> list[Rows]:
+        """Features of the positive samples of each template."""
+        params, rng = self.params, self.rng
+        whole = vehicle_features(whole_vehicles(self.frames, params, rng), inner, params)
+        truncated = vehicle_features(truncated_vehicles(self.frames, params, rng), border, params)
+        for (width, height), rows in zip(params.shapes + params.border_shapes, whole + truncated):
+            if not len(rows):
+                raise InvalidInputError(
+                    f"sources must hold vehicles of every shape, got none like {width:g}x{height:g} that is "
+                    f"at least {params.min_width:g} pixels wide; remove that shape from MixtureParams"
+                )
+        if len(patches):
+            more = patch_features(patches, self.fit_box_regressor(), inner, whole, params)
+            whole = [np.concatenate(both) for both in zip(whole, more)]
+        for index in np.flatnonzero(params.mirrored).tolist():
+            whole[index] = align_mirrored(whole[index], rng)
+        return whole + truncated
 
-def _positives(
-    frames: Sequence[TrainingFrame],
-    patches: Sequence[Image],
-    inner: Sequence[MixtureTemplate],
-    border: Sequence[MixtureTemplate],
-    params: MixtureParams,
-    rng: np.random.Generator,
-    pool: ThreadPoolExecutor,
-) -> list[Rows]:
-    """Features of the positive samples of each template."""
-    whole = vehicle_features(whole_vehicles(frames, params, rng), inner, params)
-    truncated = vehicle_features(truncated_vehicles(frames, params, rng), border, params)
-    for shape, rows in zip(params.shapes + params.border_shapes, whole + truncated):
-        if not len(rows):
-            raise InvalidInputError(
-                f"sources must hold vehicles of every shape, got none like {shape[0]:g}x{shape[1]:g} that is "
-                f"at least {params.min_width:g} pixels wide; remove that shape from MixtureParams"
-            )
-    if len(patches):
-        regressor = _fit_box_regressor(frames, rng, params, pool)
-        more = patch_features(patches, regressor, inner, whole, params)
-        whole = [np.concatenate(both) for both in zip(whole, more)]
-    for index in np.flatnonzero(params.mirrored).tolist():
-        whole[index] = align_mirrored(whole[index], rng)
-    return whole + truncated
+    def train_templates(
+        self, templates: list[MixtureTemplate], positives: Sequence[Rows]
+    ) -> list[MixtureTemplate]:
+        """Train the templates, mining hard negatives in rounds; mirrored templates are added at the end."""
+        params, frames = self.params, self.frames
+        mirrored = params.mirrored + (False,) * len(params.border_shapes)
+        negatives = NegativePool([rows.shape[1] for rows in positives])
 
+        def solve(
+            templates: list[MixtureTemplate], vectors: list[Floats], iterations: int
+        ) -> tuple[list[MixtureTemplate], list[Floats]]:
+            def fit(template: MixtureTemplate, start: Floats, rows: Rows, others: Rows) -> Floats:
+                C = params.border_C if template.border else params.C
+                return _fit_svm(rows, others, C, params.positive_weight, start=start, iterations=iterations)
 
-def _train_templates(
-    templates: list[MixtureTemplate],
-    frames: Sequence[TrainingFrame],
-    positives: Sequence[Rows],
-    params: MixtureParams,
-    rng: np.random.Generator,
-    pool: ThreadPoolExecutor,
-    report: Callable[[str], object],
-) -> list[MixtureTemplate]:
-    """Train the templates, mining hard negatives in rounds; mirrored templates are added at the end."""
-    mirrored = params.mirrored + (False,) * len(params.border_shapes)
-    negatives = NegativePool([rows.shape[1] for rows in positives])
+            vectors = list(self.pool.map(fit, templates, vectors, positives, negatives.rows))
+            return [_with_vector(each, vector) for each, vector in zip(templates, vectors)], vectors
 
-    def solve(start: list[Floats], iterations: int) -> list[Floats]:
-        def fit(index: int) -> Floats:
-            C = params.border_C if templates[index].border else params.C
-            rows = positives[index], negatives.rows[index]
-            return _fit_svm(*rows, C, params.positive_weight, start=start[index], iterations=iterations)
+        seeds = self.rng.integers(2**32, size=len(frames)).tolist()
+        draw = partial(random_windows, views=with_mirrored(templates, mirrored), params=params)
+        negatives.add(enumerate(self.pool.map(draw, frames, seeds)))
+        vectors = [np.zeros(rows.shape[1] + 1) for rows in positives]
+        for step, fraction in enumerate(params.mining_schedule, 1):
+            templates, vectors = solve(templates, vectors, _MINING_ITERATIONS)
+            chosen = self.rng.permutation(len(frames))[: math.ceil(fraction * len(frames))].tolist()
+            negatives.trim(templates, params.max_negatives)
+            mine = partial(mine_windows, views=with_mirrored(templates, mirrored), params=params)
+            new = negatives.add(zip(chosen, self.pool.map(mine, [frames[number] for number in chosen])))
+            total = sum(map(len, negatives.rows))
+            self.report(f"round {step}: {new} new of {total} negatives")
+            if fraction == 1 and new < 0.01 * total:
+                break
+        templates, _ = solve(templates, vectors, _FINAL_ITERATIONS)
+        biased = [replace(each, bias=each.bias + params.border_bias * each.border) for each in templates]
+        return [view.template for view in with_mirrored(biased, mirrored)]
 
-        return list(pool.map(fit, range(len(templates))))
+    def fit_box_regressor(self, search: MixtureSearch | None = None) -> BoxRegressor:
+        """Fit the shifts from found and from jittered boxes to the labels, by ridge regression.
 
-    seeds = rng.integers(2**32, size=len(frames)).tolist()
-    draw = partial(random_windows, views=with_mirrored(templates, mirrored), params=params)
-    negatives.add(enumerate(pool.map(draw, frames, seeds)))
-    vectors = [np.zeros(rows.shape[1] + 1) for rows in positives]
-    for step, fraction in enumerate(params.mining_schedule, 1):
-        vectors = solve(vectors, _MINING_ITERATIONS)
-        templates = [_with_vector(template, vector) for template, vector in zip(templates, vectors)]
-        chosen = rng.permutation(len(frames))[: math.ceil(fraction * len(frames))].tolist()
-        negatives.trim(templates, params.max_negatives)
-        mine = partial(mine_windows, views=with_mirrored(templates, mirrored), params=params)
-        new = negatives.add(zip(chosen, pool.map(mine, [frames[number] for number in chosen])))
-        total = sum(map(len, negatives.rows))
-        report(f"round {step}: {new} new of {total} negatives")
-        if fraction == 1 and new < 0.01 * total:
-            break
-    vectors = solve(vectors, _FINAL_ITERATIONS)
-    templates = [_with_vector(template, vector) for template, vector in zip(templates, vectors)]
-    biased = [
-        replace(each, bias=each.bias + params.border_bias) if each.border else each for each in templates
-    ]
-    return [view.template for view in with_mirrored(biased, mirrored)]
+        Without a search, from the jittered boxes alone.
+        """
+        from sklearn.linear_model import Ridge
+
+        params = self.params
+
+        def samples(frame: TrainingFrame, seed: int) -> tuple[Rows, Floats]:
+            """Features and shifts of some boxes of a frame and of its mirror image."""
+            if not len(frame.boxes):
+                return np.empty((0, N_REGRESSION_FEATURES), np.float32), np.empty((0, 4))
+            found = np.empty((0, 4))
+            if search is not None:
+                windows = search.score_windows(frame.image, params.search)
+                found = vote_boxes(windows, min_margin=-1.0)[0].boxes
+            overlap = iou_matrix(found, frame.boxes)
+            near = overlap.max(axis=1) >= 0.4
+            wide = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.min_width]
+            copies = np.tile(wide, (params.copies, 1))
+            boxes = np.concatenate([found[near], jitter_boxes(copies, np.random.default_rng(seed))])
+            labels = np.concatenate([frame.boxes[overlap.argmax(axis=1)[near]], copies])
+            shifts = (labels - boxes) / np.tile(boxes[:, 2:] - boxes[:, :2], 2)
+            mirrored = np.ascontiguousarray(frame.image[:, ::-1])
+            mirrored_boxes = mirror_boxes(boxes, frame.image.shape[1])
+            features = regression_features(frame.image, boxes), regression_features(mirrored, mirrored_boxes)
+            return np.concatenate(features), np.concatenate([shifts, mirror_boxes(shifts, 0)])
+
+        seeds = self.rng.integers(2**32, size=len(self.frames)).tolist()
+        found = self.pool.map(samples, self.frames, seeds)
+        features, shifts = (np.concatenate(side) for side in zip(*found))
+        if not len(features):
+            return BoxRegressor.none()
+        ridge = Ridge(alpha=30.0).fit(features.astype(np.float64), np.clip(shifts, -0.5, 0.5))
+        weights, bias = ridge.coef_.T.astype(np.float32), ridge.intercept_.astype(np.float32)
+        return BoxRegressor(weights, bias, params.n_iterations)
 
 
 def _blank(shape: tuple[float, float], padding: float, *, border: bool = False) -> MixtureTemplate:
@@ -241,48 +273,3 @@ def _fit_svm(
 
     found = minimize(loss, start, jac=True, method="L-BFGS-B", options={"maxiter": iterations})
     return np.asarray(found.x, np.float64)
-
-
-def _fit_box_regressor(
-    frames: Sequence[TrainingFrame],
-    rng: np.random.Generator,
-    params: MixtureParams,
-    pool: ThreadPoolExecutor,
-    search: MixtureSearch | None = None,
-) -> BoxRegressor:
-    """Fit the shifts from found and from jittered boxes to the labels, by ridge regression.
-
-    Without a search, from the jittered boxes alone.
-    """
-    from sklearn.linear_model import Ridge
-
-    seeds = rng.integers(2**32, size=len(frames)).tolist()
-
-    def samples(frame: TrainingFrame, seed: int) -> tuple[Rows, Floats]:
-        """Features and shifts of some boxes of a frame and of its mirror image."""
-        if not len(frame.boxes):
-            return np.empty((0, N_REGRESSION_FEATURES), np.float32), np.empty((0, 4))
-        found = np.empty((0, 4)) if search is None else _voted_boxes(search, frame.image, params)
-        overlap = iou_matrix(found, frame.boxes)
-        near = overlap.max(axis=1) >= 0.4
-        wide = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.min_width]
-        copies = np.tile(wide, (params.copies, 1))
-        boxes = np.concatenate([found[near], jitter_boxes(copies, np.random.default_rng(seed))])
-        labels = np.concatenate([frame.boxes[overlap.argmax(axis=1)[near]], copies])
-        shifts = (labels - boxes) / np.tile(boxes[:, 2:] - boxes[:, :2], 2)
-        mirrored = np.ascontiguousarray(frame.image[:, ::-1])
-        mirrored_boxes = mirror_boxes(boxes, frame.image.shape[1])
-        features = regression_features(frame.image, boxes), regression_features(mirrored, mirrored_boxes)
-        return np.concatenate(features), np.concatenate([shifts, mirror_boxes(shifts, 0)])
-
-    features, shifts = (np.concatenate(side) for side in zip(*pool.map(samples, frames, seeds)))
-    if not len(features):
-        return BoxRegressor.none()
-    ridge = Ridge(alpha=30.0).fit(features.astype(np.float64), np.clip(shifts, -0.5, 0.5))
-    weights, bias = ridge.coef_.T.astype(np.float32), ridge.intercept_.astype(np.float32)
-    return BoxRegressor(weights, bias, params.n_iterations)
-
-
-def _voted_boxes(search: MixtureSearch, image: Image, params: MixtureParams) -> Floats:
-    """Boxes that the windows of a denoised frame vote for, before regression."""
-    return vote_boxes(search.score_windows(image, params.search), min_margin=-1.0)[0].boxes

@@ -138,23 +138,17 @@ def gantt(tracks: Sequence[TrackHistory], axis: TimeAxis, *, label: str) -> str:
             x = axis.percent(track.first)
             names.append(svg_element("text", name, class_="track-name", x=x, dx=3, y=y))
         times = f"{format_time(track.first / axis.fps)} to {format_time((track.last + 1) / axis.fps)}"
+        parts = [svg_element("title", f"{name}, {times}")]
         bar = {"y": _decimal(middle - _BAR_HEIGHT / 2), "height": _BAR_HEIGHT, "rx": 3}
-        bars.append(
-            svg_element(
-                "g",
-                svg_element("title", f"{name}, {times}"),
-                *(
-                    svg_element("rect", x=axis.percent(start), width=axis.percent(stop - start), **bar)
-                    for start, stop in track.spans(max(1, axis.frames // _CURVE_WIDTH))
-                ),
-                class_=f"bar c{track.color}",
-                role="button",
-                tabindex=0,
-                aria_label=f"Track {track.id}, {times}: show in the video",
-                data_frame=track.first,
-                data_track=track.id,
-            )
-        )
+        for start, stop in track.spans(max(1, axis.frames // _CURVE_WIDTH)):
+            parts.append(svg_element("rect", x=axis.percent(start), width=axis.percent(stop - start), **bar))
+        button = {
+            "role": "button",
+            "tabindex": 0,
+            "aria_label": f"Track {track.id}, {times}: show in the video",
+        }
+        seek = {"data_frame": track.first, "data_track": track.id}
+        bars.append(svg_element("g", *parts, class_=f"bar c{track.color}", **button, **seek))
     height = _ROW_HEIGHT * (max(rows, default=-1) + 1)
     return _graph(row_names, [*bars, *names], axis, height, role="group", label=label)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -62,10 +63,8 @@ class TrackHistory:
 
     def spans(self, max_step: int = 1) -> list[tuple[int, int]]:
         """Half-open ranges of frames that show the track; frames up to `max_step` apart share a range."""
-        return [
-            (int(self.frames[run.start]), int(self.frames[run.stop - 1]) + 1)
-            for run in split_runs(self.frames, max_step)
-        ]
+        runs = [self.frames[run] for run in split_runs(self.frames, max_step)]
+        return [(int(run[0]), int(run[-1]) + 1) for run in runs]
 
     def closest_approach(self, fps: float) -> ClosestApproach | None:
         """Minimum of the running median of the distance; None if no distance is known."""
@@ -81,8 +80,8 @@ class TrackHistory:
         # The frame to seek to: the one whose distance is closest to the median.
         best = window[int(np.argmin(np.abs(distances[window] - medians[start])))]
         std = float(np.median(stds[window]))
-        known_std = std if math.isfinite(std) else None
-        return ClosestApproach(int(self.frames[best]), float(medians[start]), known_std)
+        frame, distance = int(self.frames[best]), float(medians[start])
+        return ClosestApproach(frame, distance, std if math.isfinite(std) else None)
 
 
 class TrackLog:
@@ -91,7 +90,10 @@ class TrackLog:
     def __init__(self) -> None:
         self.first_time: float | None = None  # of the first frame in the source, in seconds
         self.counts = array("q")  # shown tracks in each frame
-        self._columns: dict[int, tuple[array[int], dict[str, array[float]]]] = {}
+        # Frames and columns of each track.
+        self._tracks: dict[int, list[array[Any]]] = defaultdict(
+            lambda: [array("q"), *(array("d") for _ in COLUMNS)]
+        )
 
     def add(self, index: int, time: float | None, tracks: Iterable[Any]) -> None:
         """Add the tracks of the next frame."""
@@ -108,19 +110,15 @@ class TrackLog:
             self.first_time = time
         self.counts.append(len(rows))
         for track_id, values in rows:
-            if track_id not in self._columns:
-                self._columns[track_id] = (array("q"), {name: array("d") for name in COLUMNS})
-            frames, columns = self._columns[track_id]
-            frames.append(expected)
-            for name, value in zip(COLUMNS, values):
-                columns[name].append(value)
+            for column, value in zip(self._tracks[track_id], (expected, *values)):
+                column.append(value)
 
     def histories(self) -> list[TrackHistory]:
         """Return the tracks in the order of their first frames."""
-        histories = []
-        for track_id, (frames, columns) in self._columns.items():
-            arrays = {name: np.array(column, np.float64) for name, column in columns.items()}
-            histories.append(TrackHistory(track_id, np.array(frames, np.int64), arrays))
+        histories = [
+            TrackHistory(track_id, np.array(frames), dict(zip(COLUMNS, map(np.array, columns))))
+            for track_id, (frames, *columns) in self._tracks.items()
+        ]
         return sorted(histories, key=lambda track: (track.first, track.id))
 
 

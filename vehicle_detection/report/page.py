@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -54,8 +54,7 @@ class VideoEmbed:
                 yield base64.b64encode(chunk).decode("ascii")
 
 
-@dataclass(frozen=True)
-class Figure:
+class Figure(NamedTuple):
     """A chart with its caption; without a chart, the note is shown alone."""
 
     title: str
@@ -63,8 +62,7 @@ class Figure:
     svg: str = ""
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """A table of text cells; the first cell of a row is its header."""
 
     label: str
@@ -73,23 +71,12 @@ class Table:
     rows: list[list[str]]
 
 
-@dataclass(frozen=True)
-class Group:
+class Group(NamedTuple):
     """Named values that the reader can unfold, below an optional table."""
 
     title: str
     values: Mapping[str, Any]
     table: Table | None = None
-
-
-@dataclass(frozen=True)
-class ModelSummary:
-    """What is known of a model."""
-
-    title: str
-    license: str
-    tables: list[Table]
-    groups: list[Group]
 
 
 def render_page(
@@ -100,13 +87,13 @@ def render_page(
 
     axis = TimeAxis(max(report.frames, len(log.counts), 1), float(report.fps))
     tracks = [_without_imprecise_speeds(track) for track in log.histories()]
-    css, script = _read("report.css"), _read("report.js")
+    css, script, template = map(_read, ("report.css", "report.js", "report.html.j2"))
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters |= {"time": format_time, "plural": pluralize, "value": format_value}
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
-    return environment.from_string(_read("report.html.j2")).generate(
+    return environment.from_string(template).generate(
         css=css,
         script=script,
         css_hash=_csp_hash(css),
@@ -138,29 +125,23 @@ def _csp_hash(code: str) -> str:
 
 def _counts(tracks: Sequence[TrackHistory], log: TrackLog, report: VideoReport) -> dict[str, str]:
     fps = float(report.fps)
-    counts = {
-        "Vehicles": f"{len(tracks):,}",
-        "Frames": f"{report.frames:,}",
-        "Length": format_time(report.frames / fps),
-        "Most at once": str(max(log.counts, default=0)),
-    }
+    counts = {"Vehicles": f"{len(tracks):,}", "Frames": f"{report.frames:,}"}
+    counts |= {"Length": format_time(report.frames / fps), "Most at once": str(max(log.counts, default=0))}
     if tracks:
         longest = max(tracks, key=lambda track: len(track.frames))
         counts["Longest track"] = f"#{longest.id}, {len(longest.frames) / fps:.1f} s"
-    approaches = [(track.closest_approach(fps), track.id) for track in tracks]
-    near = [(approach.distance_m, track_id) for approach, track_id in approaches if approach is not None]
-    if near:
-        counts["Nearest"] = "{:.0f} m, #{}".format(*min(near))
+    nearest = [(found.distance_m, track.id) for track in tracks if (found := track.closest_approach(fps))]
+    if nearest:
+        counts["Nearest"] = "{:.0f} m, #{}".format(*min(nearest))
     return counts
 
 
 def _figures(tracks: Sequence[TrackHistory], log: TrackLog, axis: TimeAxis) -> list[Figure]:
     label = f"Bars of {pluralize(len(tracks), 'track')}: when each was shown, as in the table of tracks."
-    gantt_figure = Figure("Tracks", "When each vehicle was shown", gantt(tracks, axis, label=label))
     distances = [track.columns["distance_m"] for track in tracks]
     speeds = [bin_means(track.frames, track.columns["speed_mps"], axis.bin_width)[1] for track in tracks]
     return [
-        gantt_figure,
+        Figure("Tracks", "When each vehicle was shown", gantt(tracks, axis, label=label)),
         _count_figure(log, axis),
         _curve_figure("distance", np.concatenate(distances), tracks, axis),
         _curve_figure("relative speed", np.concatenate(speeds), tracks, axis),
@@ -196,10 +177,8 @@ def _curve_figure(quantity: str, values: Floats, tracks: Sequence[TrackHistory],
         note = f"Meters per second, above 0 when moving away; standard error at most {MAX_SPEED_STD:g} m/s"
     value_axis = ValueAxis.covering(min(low, 0.0), max(high, 0.0), 150)
     curves = "".join(curve(track, name, axis, value_axis, std=std) for track in tracks)
-    label, ends = (
-        f"Lines: {quantity} of each track, from {extent}",
-        end_labels(tracks, name, axis, value_axis),
-    )
+    ends = end_labels(tracks, name, axis, value_axis)
+    label = f"Lines: {quantity} of each track, from {extent}"
     svg = chart(curves, axis, value_axis, label=label, track_labels=ends)
     return Figure(quantity.capitalize(), note, svg)
 
@@ -220,33 +199,27 @@ def _script_data(tracks: Sequence[TrackHistory], axis: TimeAxis) -> dict[str, An
         for key, name in (("distance", "distance_m"), ("speed", "speed_mps")):
             means = dict(zip(*bin_means(track.frames, track.columns[name], axis.bin_width)))
             points[key] = [round(float(means[n]), 1) if n in means else None for n in range(first, last + 1)]
-        listed.append(
-            {"id": track.id, "color": track.color, "spans": track.spans(), "first": first, **points}
-        )
+        values = {"id": track.id, "color": track.color, "spans": track.spans(), "first": first}
+        listed.append(values | points)
     return {"fps": axis.fps, "frames": axis.frames, "step": axis.bin_width, "tracks": listed}
 
 
 def _settings(detector: Any, shape: tuple[int, ...]) -> list[Group]:
     """Parameters of a detector, a group for each dataclass of them."""
-    search = getattr(detector, "search_params", None)
-    regions = getattr(detector, "region_params", None)
-    camera, camera_title = getattr(detector, "camera", None), "Camera"
+    search, regions, tracks, camera = (
+        getattr(detector, name, None) for name in ("search_params", "region_params", "track_params", "camera")
+    )
+    bands = getattr(search, "bands", ())
+    groups = {"Search": search}
+    if isinstance(regions, HeatParams):
+        groups["Regions (heat map)"] = regions
+    elif bands:  # without bands, the model itself predicts boxes
+        groups["Regions (fitted boxes)"] = regions
+    groups |= {"Tracks": tracks, "Camera": camera}
     if camera is None and dataclasses.is_dataclass(search):
         horizon = getattr(search, "horizon", None)
         known = {} if horizon is None else {"horizon": horizon}
-        camera, camera_title = Camera.for_frame(shape, **known), "Camera (assumed)"
-    bands = getattr(search, "bands", ())
-    if isinstance(regions, HeatParams):
-        regions_title = "Regions (heat map)"
-    else:
-        regions_title = "Regions (fitted boxes)"
-        regions = regions if bands else None  # without bands, the model itself predicts boxes
-    groups = {
-        "Search": search,
-        regions_title: regions,
-        "Tracks": getattr(detector, "track_params", None),
-        camera_title: camera,
-    }
+        groups["Camera (assumed)"] = Camera.for_frame(shape, **known)
     found = []
     for title, params in groups.items():
         if dataclasses.is_dataclass(params):
@@ -272,7 +245,7 @@ def _band_table(bands: Sequence[Any]) -> Table:
     return Table("Search bands", note, ("Window", "Rows", "Columns", "Overlap"), rows)
 
 
-def _model_summary(model: Any) -> ModelSummary | None:
+def _model_summary(model: Any) -> dict[str, Any] | None:
     """Describe a model by its summary and metadata; None for a model of another library."""
     if not hasattr(model, "open_search"):
         return None
@@ -285,12 +258,12 @@ def _model_summary(model: Any) -> ModelSummary | None:
             shown = {key: value for key, value in shown.items() if key not in ("splits", "left_out")}
         groups.append(Group(name.capitalize(), shown))
     tables = [_split_table(_scores(metadata, "splits")), _left_out_table(_scores(metadata, "left_out"))]
-    return ModelSummary(
-        title,
-        _license(metadata),
-        [table for table in tables if table.rows],
-        [group for group in groups if group.values],
-    )
+    return {
+        "title": title,
+        "license": _license(metadata),
+        "tables": [table for table in tables if table.rows],
+        "groups": [group for group in groups if group.values],
+    }
 
 
 def _scores(metadata: Mapping[str, Any], name: str) -> dict[str, Mapping[str, Any]]:
@@ -311,11 +284,8 @@ def _split_table(scores: Mapping[str, Mapping[str, Any]]) -> Table:
             return f"{value:.4f}" if name == "accuracy" else f"{value:.2%}"
         return f"{value:,}" if isinstance(value, int) else str(value)
 
-    rows = [
-        [title, *(cell(scores[split], name) for name in columns)]
-        for split, title in SPLITS.items()
-        if split in scores
-    ]
+    tested = {title: scores[split] for split, title in SPLITS.items() if split in scores}
+    rows = [[title, *(cell(values, name) for name in columns)] for title, values in tested.items()]
     note = "Accuracy on patches that were not used for training; vehicles in whole frames are another task."
     return Table("Accuracy of the model", note, ("Tested on", *map(_heading, columns)), rows)
 
@@ -324,8 +294,7 @@ def _left_out_table(scores: Mapping[str, Mapping[str, Any]]) -> Table:
     """Scores on frames of sources that were left out of training."""
     columns = ("f1", "average_precision", "precision", "recall", "mean_iou")
     rows = [
-        [name, *(format_value(values.get(column, "")) for column in columns)]
-        for name, values in scores.items()
+        [name, *(format_value(values.get(key, "")) for key in columns)] for name, values in scores.items()
     ]
     note = "Single frames of sources that were left out of training, IoU 0.5."
     return Table("Quality of the model", note, ("Frames", *map(_heading, columns)), rows)

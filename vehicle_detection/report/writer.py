@@ -19,8 +19,7 @@ class ReportWriter:
     """Collect the tracks of a video while it is processed, and write a page that shows them.
 
     The page is one HTML file that loads nothing from elsewhere: the video and charts of its tracks over time
-    that seek in it, the times of the run, the settings and the model. The writer keeps a few numbers per
-    track and frame, and no images.
+    that seek in it, the times of the run, the settings and the model.
 
     Parameters
     ----------
@@ -87,9 +86,8 @@ class ReportWriter:
     def finish(self, report: VideoReport) -> None:
         """Write the page, completely or not at all, with the `report` that `process_video` returned."""
         check_type(report, "report", VideoReport, "pass what process_video returned")
-        pieces = render_page(
-            self._log, report, video=self._embed(), source=self._source, detector=self._detector
-        )
+        options = {"video": self._embed(), "source": self._source, "detector": self._detector}
+        pieces = render_page(self._log, report, **options)
         with (
             atomic_write(self._path, "path") as part,
             # A file name may hold bytes that are not UTF-8; they become question marks.

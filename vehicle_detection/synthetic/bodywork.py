@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from vehicle_detection.synthetic.raster import Color, Floats
+from vehicle_detection.synthetic.raster import Color, Doubles, Floats
 from vehicle_detection.synthetic.shapes import profile_at
 from vehicle_detection.synthetic.surface import Mask, Outline, SurfaceCanvas, round_corners
 
@@ -31,8 +31,7 @@ class BodyPainter:
         """Mask of a band across the body, `ratio` of its width less `inset` meters at each side."""
         y = np.linspace(low, high, 12)
         x = self.body.half_width(y) * ratio - inset
-        outline = np.concatenate([np.column_stack([x, y]), np.column_stack([-x, y])[::-1]])
-        return self.canvas.polygon(outline, soften=soften)
+        return self.canvas.between(x, -x, y, soften=soften)
 
     def paint_box(
         self, x: float, y: float, width: float, height: float, color: ArrayLike, opacity: float,
@@ -44,9 +43,8 @@ class BodyPainter:
     def paint_window(self, low: float, high: float, ratio: float, inset: float, radius: float) -> Mask:
         """Paint a window across the body."""
         bottom, top = (float(self.body.half_width(y)) * ratio - inset for y in (low, high))
-        return self.paint_glass(
-            round_corners([(-bottom, low), (bottom, low), (top, high), (-top, high)], radius), seats=True
-        )
+        corners = [(-bottom, low), (bottom, low), (top, high), (-top, high)]
+        return self.paint_glass(round_corners(corners, radius), seats=True)
 
     def paint_glass(self, outline: Outline, *, seats: bool) -> Mask:
         """Paint a pane: a dark cabin behind it, the reflected sky on it, a dark seal around it."""
@@ -63,10 +61,8 @@ class BodyPainter:
             canvas.paint(seat & pane, np.array([22, 24, 26]) * gain, 0.55)
         ripple = 0.75 + 0.25 * np.sin(canvas.x * 5.0 + look.seed % 7) * np.cos(canvas.y * 9.0 + look.seed % 5)
         strength = (0.16 + 0.42 * look.glass_reflection) * (0.45 + 0.55 * rise) * ripple
-        color = canvas.color[pane.region]
-        color += (pane.values * strength[pane.region])[..., None] * (
-            self.reflection[pane.region] - 0.4 * color
-        )
+        color, strength = canvas.color[pane.region], pane.values * strength[pane.region]
+        color += strength[..., None] * (self.reflection[pane.region] - 0.4 * color)
         return pane
 
     def paint_plate(self, y: float) -> None:
@@ -169,9 +165,8 @@ class BodyPainter:
         canvas, dims, look, light = self.canvas, self.dims, self.look, self.light
         heights = np.linspace(0.6, dims.belt, 40)
         nose = float(np.interp(0.22, profile_at(dims.front, heights), heights))
-        low = float(
-            np.interp(0.1 if dims.is_box else 1.05, [z for _, z in dims.front], [y for y, _ in dims.front])
-        )
+        front_heights, front_depths = zip(*dims.front)
+        low = float(np.interp(0.1 if dims.is_box else 1.05, front_depths, front_heights))
         low = min(max(low, dims.belt), dims.height - 0.5)
         high = 2.4 if dims.is_box else dims.height - 0.1
         pane = self.paint_window(low, high, 0.92, 0.02, 0.09)
@@ -226,9 +221,8 @@ class BodyPainter:
         """Paint a flank: outline, windows with pillars, wheels in their arches, doors, sill."""
         canvas, dims, look, light, body = self.canvas, self.dims, self.look, self.light, self.body
         y = np.linspace(dims.clearance, dims.height, 50)
-        near = np.column_stack([profile_at(body.end, y) - 0.06, y])
-        far = np.column_stack([dims.length - profile_at(body.far_end, y), y])
-        canvas.make_opaque(canvas.polygon(np.concatenate([near, far[::-1]])))
+        near, far = profile_at(body.end, y) - 0.06, dims.length - profile_at(body.far_end, y)
+        canvas.make_opaque(canvas.between(near, far, y))
         dark = np.array([20, 20, 21]) * self.by_light(0.5, 1.0)
         if dims.is_box:
             start, stop = (1.6, dims.length) if body.view == "front" else (0.0, dims.length - 1.7)
@@ -273,7 +267,7 @@ class BodyPainter:
             canvas.multiply(gap, 0.55)
             self.paint_box(x + 0.2, dims.belt - 0.11, 0.17, 0.03, body.color * 0.7, 0.6)
 
-    def _paint_wheels(self, dark: NDArray[np.float64], gain: float) -> None:
+    def _paint_wheels(self, dark: Doubles, gain: float) -> None:
         canvas, dims, body = self.canvas, self.dims, self.body
         angles = np.linspace(0, 2 * np.pi, 40)
         circle = np.column_stack([np.cos(angles), np.sin(angles)])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection.camera import Camera
-from vehicle_detection.synthetic.raster import Color, Floats, Image, tile_to, wrapped_noise
+from vehicle_detection.synthetic.raster import Color, Doubles, Floats, Image, Rng, tile_to, wrapped_noise
 
 _GRAIN_SIDE = 512  # side of the noise tile (px)
 
@@ -42,7 +42,7 @@ class Light:
         """Gain of an upright surface at a distance (m): 1 by day, the camera car's headlights at night."""
         return min(1.0, 0.26 + 0.9 * float(np.exp(-max(distance, 0.0) / 40.0))) if self.dark else 1.0
 
-    def shade(self, color: ArrayLike, distance: float = 0.0) -> NDArray[np.float64]:
+    def shade(self, color: ArrayLike, distance: float = 0.0) -> Doubles:
         """Color of a surface in this light, seen through `distance` meters of haze."""
         gain = (self.ambient + 0.6 * self.sun) * (0.5 if self.dark else 1.0) * self.headlight_gain(distance)
         clear = self.transmission(distance)
@@ -52,7 +52,7 @@ class Light:
 LIGHTS = ("day", "overcast", "dusk", "night")
 
 
-def make_light(name: str, rain: float, rng: np.random.Generator) -> Light:
+def make_light(name: str, rain: float, rng: Rng) -> Light:
     """Return one of `LIGHTS` with a random sun; rain weakens the sun and shortens the visibility."""
     side = rng.choice([-1.0, 1.0]) * rng.uniform(0.2, 0.9)
     dusk = name == "dusk"
@@ -110,7 +110,7 @@ class SceneConfig:
         """Column of the optical axis, the middle of the frame."""
         return self.shape[1] / 2
 
-    def project(self, x: ArrayLike, y: ArrayLike, z: ArrayLike) -> NDArray[np.float64]:
+    def project(self, x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Doubles:
         """Columns and rows ``(..., 2)`` of points `x` m right, `y` m above the road and `z` > 0 m ahead."""
         right, up, ahead = np.broadcast_arrays(*(np.asarray(value, np.float64) for value in (x, y, z)))
         camera = self.camera
@@ -158,7 +158,7 @@ class Sensor:
         self._grain = tile_to(tile, height + _GRAIN_SIDE, width + _GRAIN_SIDE)
         self._streaks = self._draw_streaks(rng) if rain > 0 else None
 
-    def _draw_streaks(self, rng: np.random.Generator) -> Image:
+    def _draw_streaks(self, rng: Rng) -> Image:
         """Rain streaks, ``(2 * H, W)``."""
         height, width = self._config.shape
         streaks = np.zeros((height * 2, width), np.uint8)

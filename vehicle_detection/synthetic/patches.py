@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from vehicle_detection._common import check_integer
 from vehicle_detection.camera import Camera
 from vehicle_detection.synthetic.camera_light import SceneConfig, Sensor, make_light
-from vehicle_detection.synthetic.raster import Image
+from vehicle_detection.synthetic.raster import Doubles, Image, Rng
 from vehicle_detection.synthetic.render import VehiclePose, draw_vehicle
 from vehicle_detection.synthetic.scene import RandomState, make_generator
 from vehicle_detection.synthetic.scenery import LANE, Canvas, Road, Scenery
@@ -32,19 +32,15 @@ def render_patches(
 
     Parameters
     ----------
-    n
-        Number of patches; the first half, rounded up, shows vehicles.
-    size
-        Side in pixels.
+    n, size
+        Number of patches, and their side in pixels.
     random_state
         Seed or generator; the same seed and options give the same bytes.
 
     Returns
     -------
-    patches : numpy.ndarray
-        ``(n, size, size, 3)`` uint8 RGB.
-    labels : numpy.ndarray
-        ``(n,)`` bool: True for a vehicle.
+    patches, labels : numpy.ndarray
+        ``(n, size, size, 3)`` uint8 RGB, and ``(n,)`` bool: True for the vehicles, which come first.
 
     Raises
     ------
@@ -75,7 +71,7 @@ def render_patches(
 class PatchScene:
     """An empty road and several vehicles to draw on it."""
 
-    def __init__(self, rng: np.random.Generator) -> None:
+    def __init__(self, rng: Rng) -> None:
         name = str(rng.choice(["day", "overcast", "dusk"], p=[0.6, 0.33, 0.07]))
         light = make_light(name, 0.0, rng)
         height = rng.uniform(1.15, 1.6)
@@ -90,9 +86,7 @@ class PatchScene:
         self.sensor = Sensor(replace(self.config, seed=int(rng.integers(2**31))))
         self.bodies = [VehicleBody(**random_appearance(rng), view="rear", light=light) for _ in range(10)]
 
-    def _with_vehicle(
-        self, rng: np.random.Generator, distance: float
-    ) -> tuple[Image, NDArray[np.int64]] | None:
+    def _with_vehicle(self, rng: Rng, distance: float) -> tuple[Image, NDArray[np.int64]] | None:
         """Draw a vehicle into a copy of the image; return it and the box, None if the border cuts it."""
         body = self.bodies[int(rng.integers(len(self.bodies)))]
         lane = int(rng.integers(self.road.lanes))
@@ -105,7 +99,7 @@ class PatchScene:
             return None
         return image, box
 
-    def vehicle(self, size: int, rng: np.random.Generator) -> Image:
+    def vehicle(self, size: int, rng: Rng) -> Image:
         """Cut out a square around a vehicle, as a ``(size, size, 3)`` patch."""
         while True:
             drawn = self._with_vehicle(rng, float(np.exp(rng.uniform(np.log(7.5), np.log(60)))))
@@ -118,7 +112,7 @@ class PatchScene:
                 center = (box[:2] + box[2:]) / 2 + rng.uniform(-0.02, 0.02, 2) * side
                 return self._cut(image, center, side, size, rng)
 
-    def background(self, size: int, rng: np.random.Generator) -> Image:
+    def background(self, size: int, rng: Rng) -> Image:
         """Cut out a square without a vehicle, or with a small part of one."""
         image, horizon = self.empty, self.config.camera.horizon_px
         side = float(np.exp(rng.uniform(np.log(40), np.log(220))))
@@ -134,9 +128,7 @@ class PatchScene:
             image, (x, y, side) = drawn[0], square
         return self._cut(image, np.array([x, y]), side, size, rng)
 
-    def _cut(
-        self, image: Image, center: NDArray[np.float64], side: float, size: int, rng: np.random.Generator
-    ) -> Image:
+    def _cut(self, image: Image, center: Doubles, side: float, size: int, rng: Rng) -> Image:
         """Cut out a square, apply lens and sensor, resize it, and vary blur, exposure and color."""
         margin = 4
         x1, y1 = (int(np.floor(v)) for v in center - side / 2)
@@ -159,7 +151,7 @@ class PatchScene:
         return np.asarray(np.clip(np.rint(patch), 0, 255), np.uint8)
 
 
-def _partial_square(box: NDArray[np.int64], rng: np.random.Generator) -> tuple[float, float, float] | None:
+def _partial_square(box: NDArray[np.int64], rng: Rng) -> tuple[float, float, float] | None:
     """Center and side of a square with up to a fifth of a vehicle; None if it leaves the image."""
     width = float(box[2] - box[0])
     side = width * rng.uniform(0.7, 1.2)

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
+Rng = np.random.Generator
 Color = tuple[float, float, float]
 Dtype = TypeVar("Dtype", bound=np.generic)
 
 
-def wrapped_noise(
-    rng: np.random.Generator, shape: tuple[int, int], *, falloff: float, stretch: float = 1.0
-) -> Floats:
+def wrapped_noise(rng: Rng, shape: tuple[int, int], *, falloff: float, stretch: float = 1.0) -> Floats:
     """Return noise with zero mean and unit variance that repeats seamlessly along both axes.
 
     Its amplitude falls with frequency to the power `falloff` (0: white noise, 2: smooth clouds); a `stretch`

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection.synthetic.camera_light import SceneConfig
-from vehicle_detection.synthetic.raster import Floats, Image, alpha_over
+from vehicle_detection.synthetic.raster import Doubles, Floats, Image, alpha_over
 from vehicle_detection.synthetic.scenery import Canvas, Scenery, draw_layer
 from vehicle_detection.synthetic.shapes import profile_at
 from vehicle_detection.synthetic.surface import PIXELS_PER_METER
@@ -144,7 +144,7 @@ def ground_truth(
     )  # fmt: skip
 
 
-def projected_box(pose: VehiclePose, config: SceneConfig) -> NDArray[np.float64]:
+def projected_box(pose: VehiclePose, config: SceneConfig) -> Doubles:
     """Bounding box of a vehicle's outline, inside the image or not; points before `NEAR_PLANE` move there."""
     body, dims = pose.body, pose.body.dimensions
     y = np.linspace(dims.clearance, dims.height, 40)
@@ -197,7 +197,7 @@ class _SpriteBuffer:
         self.config, self.left, self.top, self.samples = config, left, top, samples
         self.rgba: Floats = np.zeros(((bottom - top) * samples, (right - left) * samples, 4), np.float32)
 
-    def columns(self, x: NDArray[np.float64], z: NDArray[np.float64]) -> slice:
+    def columns(self, x: Doubles, z: Doubles) -> slice:
         """Columns of samples between the outermost of some points in meters, with a margin."""
         columns = (self.config.project(x, 0.0, z)[..., 0] - self.left) * self.samples
         first, last = np.clip([columns.min() - 3, columns.max() + 4], 0, self.rgba.shape[1])

@@ -6,7 +6,6 @@ What does not change along a drive is drawn once; the rest is shifted by the dis
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -15,7 +14,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection.synthetic.camera_light import Light, SceneConfig
-from vehicle_detection.synthetic.raster import Floats, Image, alpha_over, blend, tile_to, wrapped_noise
+from vehicle_detection.synthetic.raster import (
+    Doubles,
+    Floats,
+    Image,
+    Rng,
+    alpha_over,
+    blend,
+    tile_to,
+    wrapped_noise,
+)
 
 LANE = 3.6  # width of a lane (m)
 _PERIOD = 96.0  # length after which ground and hedges repeat (m)
@@ -38,7 +46,7 @@ class Road:
         return self.barrier - 1.4 + (number + 0.5) * LANE if number < 0 else (number - self.own) * LANE
 
 
-def draw_backdrop(config: SceneConfig, dryness: float, rng: np.random.Generator) -> Image:
+def draw_backdrop(config: SceneConfig, dryness: float, rng: Rng) -> Image:
     """Draw everything above the horizon into an ``(H, W, 3)`` image that is black below it."""
     # One row below the horizon is included, so that no gap opens above the ground.
     rows = min(config.shape[0], int(config.camera.horizon_px) + 2)
@@ -53,7 +61,7 @@ def draw_backdrop(config: SceneConfig, dryness: float, rng: np.random.Generator)
     return image
 
 
-def _draw_sky(height: int, config: SceneConfig, rng: np.random.Generator) -> Floats:
+def _draw_sky(height: int, config: SceneConfig, rng: Rng) -> Floats:
     """Draw a vertical color gradient with clouds, ``(height, W, 3)``."""
     light, width = config.light, config.shape[1]
     elevation = np.clip(1 - (np.arange(height) + 0.5) / max(config.camera.horizon_px, 1), 0, 1) ** 0.8
@@ -66,9 +74,7 @@ def _draw_sky(height: int, config: SceneConfig, rng: np.random.Generator) -> Flo
     return sky
 
 
-def _draw_hills(
-    sky: Floats, config: SceneConfig, dryness: float, layer: int, rng: np.random.Generator
-) -> None:
+def _draw_hills(sky: Floats, config: SceneConfig, dryness: float, layer: int, rng: Rng) -> None:
     """Draw one range of hills in place; layer 0 is the farthest and haziest."""
     light = config.light
     max_height = rng.uniform(0.02, 0.06) / (1 + 0.5 * layer) * config.camera.focal_px
@@ -79,44 +85,35 @@ def _draw_hills(
     clear = 0.9 if light.dark else 0.35 + 0.25 * layer
     ground = light.shade((70, 82, 62) if dryness < 0.5 else (112, 100, 74))
     color = ground * clear + light.haze * np.array([0.73, 0.79, 0.85]) * (1 - clear)
-    first = max(int(edge.min()) - 1, 0)
-    part = sky[first:]
-    hills = color.astype(np.float32) * (1 + 0.09 * _texture(rng, part.shape, 0.9))
-    blend(part, hills, _mask_below(edge - first, len(part)))
+    _paint_below(sky, edge, color.astype(np.float32), 0.09, wrapped_noise(rng, (256, 256), falloff=0.9))
 
 
-def _draw_tree_line(sky: Floats, config: SceneConfig, rng: np.random.Generator) -> None:
+def _draw_tree_line(sky: Floats, config: SceneConfig, rng: Rng) -> None:
     """Draw distant trees in place, lower towards the vanishing point of the road."""
     width, camera = sky.shape[1], config.camera
     slopes = (np.arange(width) + 0.5 - config.center_px) / camera.focal_px
-    noise = np.interp(
-        np.linspace(0, 700, width), np.arange(1024), wrapped_noise(rng, (1, 1024), falloff=1.0)[0]
-    )
+    noise = wrapped_noise(rng, (1, 1024), falloff=1.0)[0]
+    noise = np.interp(np.linspace(0, 700, width), np.arange(1024), noise)
     distance = 170.0 + 160.0 * np.exp(-((slopes / 0.08) ** 2))
     height = np.clip(6.0 + 2.6 * noise, 1.5, 14) * camera.focal_px / distance
     edge = camera.horizon_px - height
+    depth = np.clip((np.arange(len(sky))[:, None] - edge) / np.maximum(height, 1), 0, 1)[..., None]
+    green = config.light.shade((66, 78, 50), 60.0).astype(np.float32)
+    green = green * (1.1 - 0.45 * depth.astype(np.float32))
+    _paint_below(sky, edge, green, 0.28, wrapped_noise(rng, (256, 256), falloff=0.75))
+
+
+def _paint_below(sky: Floats, edge: Doubles, color: Floats, contrast: float, noise: Floats) -> None:
+    """Paint a color with a texture of noise below a line, given by its row in each column, in place."""
     first = max(int(edge.min()) - 1, 0)
     part = sky[first:]
-    below = np.arange(first, len(sky))[:, None] - edge[None, :]
-    depth = np.clip(below / np.maximum(height, 1), 0, 1)[..., None].astype(np.float32)
-    leaves = _texture(rng, part.shape, 0.75)
-    green = config.light.shade((66, 78, 50), 60.0).astype(np.float32)
-    blend(part, green * (1.1 - 0.45 * depth) * (1 + 0.28 * leaves), _mask_below(edge - first, len(part)))
-
-
-def _mask_below(edge: NDArray[np.float64], rows: int) -> Floats:
-    """Antialiased mask ``(rows, W, 1)`` of what lies below a line given by its row in each column."""
-    mask = np.clip(np.arange(rows)[:, None] + 0.5 - edge[None, :], 0, 1)
-    return np.asarray(mask[..., None], np.float32)
-
-
-def _texture(rng: np.random.Generator, shape: tuple[int, ...], falloff: float) -> Floats:
-    """Noise ``(H, W, 1)`` for an image of a shape."""
-    return tile_to(wrapped_noise(rng, (256, 256), falloff=falloff), shape[0], shape[1])[..., None]
+    texture = 1 + contrast * tile_to(noise, *part.shape[:2])[..., None]
+    mask = np.clip(np.arange(len(part))[:, None] + 0.5 - (edge - first), 0, 1)[..., None]
+    blend(part, np.broadcast_to(color, sky.shape)[first:] * texture, mask.astype(np.float32))
 
 
 def _mipmap_parts(
-    footprint: NDArray[np.float64], n_levels: int, shown: NDArray[np.bool_] | bool = True
+    footprint: Doubles, n_levels: int, shown: NDArray[np.bool_] | bool = True
 ) -> Iterator[tuple[int, slice]]:
     """Yield the mipmap levels in use and the rows (or columns) that take their texture from each.
 
@@ -145,7 +142,7 @@ _TILE_HALF_WIDTH = 28.0  # meters to each side of the camera
 class Ground:
     """Asphalt and grass below the horizon, without the lane markings."""
 
-    def __init__(self, config: SceneConfig, road: Road, dryness: float, rng: np.random.Generator) -> None:
+    def __init__(self, config: SceneConfig, road: Road, dryness: float, rng: Rng) -> None:
         camera, (height, width) = config.camera, config.shape
         self.first = int(np.clip(np.ceil(camera.horizon_px + 0.5), 0, height))
         rows = np.arange(self.first, height) + 0.5
@@ -157,7 +154,7 @@ class Ground:
         row_length = ahead**2 / (camera.focal_px * camera.height_m)
         self._parts = self._make_parts(row_length, _draw_road_texture(config.light, road, rng))
 
-    def _paint(self, config: SceneConfig, road: Road, dryness: float, rng: np.random.Generator) -> Image:
+    def _paint(self, config: SceneConfig, road: Road, dryness: float, rng: Rng) -> Image:
         """Asphalt, shoulder and grass in daylight and haze, or illuminated by the headlights."""
         light, across, ahead = config.light, self._across, self._ahead
         tone = rng.uniform(70, 118)
@@ -182,7 +179,7 @@ class Ground:
             color *= (0.13 + 0.95 * beam)[..., None]
         return np.asarray(np.clip(color, 0, 255), np.uint8)
 
-    def _make_parts(self, row_length: NDArray[np.float64], texture: Floats) -> list[_TexturedPart]:
+    def _make_parts(self, row_length: Doubles, texture: Floats) -> list[_TexturedPart]:
         """Choose for each row, which covers `row_length` meters of road, the mipmap level of that length."""
         levels = [np.clip(texture * 128, 0, 255).astype(np.uint8)]
         while len(levels) < 7:
@@ -190,12 +187,10 @@ class Ground:
             levels.append(cv2.resize(levels[-1], size, interpolation=cv2.INTER_AREA))  # type: ignore[arg-type]
         parts = []
         for level, rows in _mipmap_parts(row_length / _TILE_ALONG, len(levels)):
-            map_x = (self._across[rows] + _TILE_HALF_WIDTH) / _TILE_ACROSS - 0.5
-            map_y = np.broadcast_to(self._ahead[rows] / (_TILE_ALONG * 2**level) - 0.5, map_x.shape)
-            region = (rows, slice(None))
-            parts.append(
-                _TexturedPart(region, levels[level], map_x.astype(np.float32), map_y.astype(np.float32))
-            )
+            map_x = ((self._across[rows] + _TILE_HALF_WIDTH) / _TILE_ACROSS - 0.5).astype(np.float32)
+            map_y = (self._ahead[rows] / (_TILE_ALONG * 2**level) - 0.5).astype(np.float32)
+            map_y = np.broadcast_to(map_y, map_x.shape)
+            parts.append(_TexturedPart((rows, slice(None)), levels[level], map_x, map_y))
         return parts
 
     def apply_texture(self, ground: Image, travel: float) -> None:
@@ -212,14 +207,12 @@ def _ramp(values: Floats, edge: float, width: ArrayLike) -> Floats:
     return np.asarray(np.clip((values - np.float32(edge)) / np.maximum(width, 1e-3) + 0.5, 0, 1), np.float32)
 
 
-def _draw_road_texture(light: Light, road: Road, rng: np.random.Generator) -> Floats:
+def _draw_road_texture(light: Light, road: Road, rng: Rng) -> Floats:
     """Gain of the road's brightness over one period, seamless along the road (rows)."""
     size = (round(_PERIOD / _TILE_ALONG), round(2 * _TILE_HALF_WIDTH / _TILE_ACROSS))
     coarse, fine = wrapped_noise(rng, size, falloff=1.1, stretch=0.5), wrapped_noise(rng, size, falloff=0.2)
-    outer, barrier, verge = (
-        int((x + _TILE_HALF_WIDTH) / _TILE_ACROSS)
-        for x in (road.barrier - 2.2 - 3 * LANE, road.barrier, road.verge)
-    )
+    edges = np.array([road.barrier - 2.2 - 3 * LANE, road.barrier, road.verge])
+    outer, barrier, verge = ((edges + _TILE_HALF_WIDTH) / _TILE_ACROSS).astype(int).tolist()
     # Grass is far less even than asphalt.
     contrast = np.full(size[1], 0.16, np.float32)
     contrast[max(outer, 0) : verge] = 0.035
@@ -242,7 +235,7 @@ def _draw_road_texture(light: Light, road: Road, rng: np.random.Generator) -> Fl
     return np.asarray(texture, np.float32)
 
 
-def _tree_shadows(light: Light, size: tuple[int, int], rng: np.random.Generator) -> Floats:
+def _tree_shadows(light: Light, size: tuple[int, int], rng: Rng) -> Floats:
     """Gain of the shadows that trees cast across the road."""
     leaves = wrapped_noise(rng, size, falloff=1.0)
     y = np.arange(size[0], dtype=np.float32)[:, None] * _TILE_ALONG
@@ -265,9 +258,8 @@ class Hedge:
     """Shrubs `lateral` meters beside the camera, `low` to `high` meters tall."""
 
     def __init__(
-        self, config: SceneConfig, lateral: float, low: float, high: float, dryness: float,
-        rng: np.random.Generator,
-    ) -> None:  # fmt: skip
+        self, config: SceneConfig, lateral: float, low: float, high: float, dryness: float, rng: Rng
+    ) -> None:
         self._config, focal = config, config.camera.focal_px
         columns = np.arange(config.shape[1]) + 0.5 - config.center_px
         ahead = focal * lateral / np.where(np.abs(columns) < 0.25, 0.25, columns)
@@ -279,9 +271,7 @@ class Hedge:
         parts = _mipmap_parts(column_length / _HEDGE_ALONG, len(levels), (ahead > 6.0) & (ahead < 320.0))
         self._parts = [self._make_part(part, ahead[part], levels[level]) for level, part in parts]
 
-    def _make_part(
-        self, columns: slice, ahead: NDArray[np.float64], texture: Floats
-    ) -> tuple[_TexturedPart, Floats]:
+    def _make_part(self, columns: slice, ahead: Doubles, texture: Floats) -> tuple[_TexturedPart, Floats]:
         """Columns of the image that show one mipmap level, and the gain of each."""
         camera, light = self._config.camera, self._config.light
         scale = camera.focal_px / ahead.min()
@@ -308,7 +298,7 @@ class Hedge:
             image[region] = np.clip(alpha_over(image[region], color, alpha), 0, 255)
 
 
-def _draw_foliage(low: float, high: float, dryness: float, light: Light, rng: np.random.Generator) -> Floats:
+def _draw_foliage(low: float, high: float, dryness: float, light: Light, rng: Rng) -> Floats:
     """Paint a hedge as premultiplied RGBA: a ragged top, lit clumps, gaps."""
     size = (round(_HEDGE_TOP / _HEDGE_UP), round(_PERIOD / _HEDGE_ALONG))
     y = _HEDGE_TOP - (np.arange(size[0]) + 0.5)[:, None] * _HEDGE_UP
@@ -327,7 +317,7 @@ def _draw_foliage(low: float, high: float, dryness: float, light: Light, rng: np
     return np.dstack([color, alpha * 255]).astype(np.float32)
 
 
-def _draw_tree(rng: np.random.Generator, dryness: float, light: Light) -> tuple[Floats, float]:
+def _draw_tree(rng: Rng, dryness: float, light: Light) -> tuple[Floats, float]:
     """Paint a tree as ``(192, W, 4)`` premultiplied RGBA, 0-255; also return its width over its height."""
     aspect_ratio = rng.uniform(0.55, 1.0)
     height, width = 192, round(192 * aspect_ratio)
@@ -350,7 +340,7 @@ def _draw_tree(rng: np.random.Generator, dryness: float, light: Light) -> tuple[
     return np.dstack([np.clip(color, 0, 255), (alpha + trunk) * 255]).astype(np.float32), aspect_ratio
 
 
-def _draw_crown(rng: np.random.Generator, x: Floats, y: Floats, light: Light) -> tuple[Floats, Floats]:
+def _draw_crown(rng: Rng, x: Floats, y: Floats, light: Light) -> tuple[Floats, Floats]:
     """Clusters of leaves: a map that is above 0 inside them, and one of the light on them."""
     crown = np.full((y.size, x.size), -3.0, np.float32)
     shade = np.zeros_like(crown)
@@ -367,7 +357,7 @@ def _draw_crown(rng: np.random.Generator, x: Floats, y: Floats, light: Light) ->
     return np.asarray(crown, np.float32), np.asarray(shade, np.float32)
 
 
-def _draw_sign(rng: np.random.Generator, light: Light) -> Floats:
+def _draw_sign(rng: Rng, light: Light) -> Floats:
     """Paint a road sign on its post as ``(128, 64, 4)`` premultiplied RGBA, 0-255."""
     sign = np.zeros((128, 64, 4), np.float32)
 
@@ -409,7 +399,7 @@ class Canvas:
     ) -> None:
         self.config, self.image, self.instance_map = config, image, instance_map
 
-    def fill(self, corners: NDArray[np.float64], color: NDArray[np.float64]) -> None:
+    def fill(self, corners: Doubles, color: Doubles) -> None:
         """Fill a polygon of ``(column, row)`` corners; it hides the vehicles behind it."""
         points = [np.rint((corners - 0.5) * 16).astype(np.int32)]
         if self.image is not None:
@@ -418,8 +408,7 @@ class Canvas:
             cv2.fillPoly(self.instance_map, points, 0, cv2.LINE_8, 4)
 
 
-@dataclass(frozen=True, eq=False)
-class _Prop:
+class _Prop(NamedTuple):
     """An upright object beside the road: premultiplied RGBA, position and size in meters."""
 
     rgba: Floats
@@ -495,9 +484,7 @@ class Scenery:
             for start in np.arange(-(travel % period), 160, period):
                 self._draw_line(canvas, x, float(start), float(start) + 3.6, self._white)
 
-    def _draw_line(
-        self, canvas: Canvas, x: float, start: float, stop: float, color: NDArray[np.float64]
-    ) -> None:
+    def _draw_line(self, canvas: Canvas, x: float, start: float, stop: float, color: Doubles) -> None:
         """Draw a line along the road in pieces, because haze and headlights change along it."""
         camera, light = self.config.camera, self.config.light
         nearest = camera.focal_px * camera.height_m / (self.config.shape[0] - camera.horizon_px) * 0.9
@@ -537,13 +524,13 @@ class Scenery:
         for low, high, tone in _RAIL_BANDS:
             self._draw_wall(canvas, x, low, high, (tone, tone, tone + 2))
 
-    def _make_hedges(self, dryness: float, rng: np.random.Generator) -> list[Hedge]:
+    def _make_hedges(self, dryness: float, rng: Rng) -> list[Hedge]:
         """Rows of shrubs on both sides, tall ones behind low ones."""
         right, left = self.road.verge, self.road.barrier - 3 * LANE - 5.0
         rows = [(right + 11.0, 1.5, 6.5), (left - 7.0, 1.5, 6.5), (right + rng.uniform(4, 7), -1.2, 1.8)]
         return [Hedge(self.config, *row, dryness, rng) for row in rows if rng.random() < 0.65]
 
-    def _make_props(self, dryness: float, rng: np.random.Generator) -> list[_Prop]:
+    def _make_props(self, dryness: float, rng: Rng) -> list[_Prop]:
         """Trees and bushes on both sides, signs on the right."""
         trees = [_draw_tree(rng, dryness, self.config.light) for _ in range(5)]
         density = rng.uniform(0.35, 1.0)

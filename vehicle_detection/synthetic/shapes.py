@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from vehicle_detection.synthetic.raster import Color
+from vehicle_detection.synthetic.raster import Color, Doubles, Rng
 
 Profile = Sequence[tuple[float, float]]  # contour of one end of a vehicle: height and depth (m)
 
@@ -111,7 +111,7 @@ COLOR_WEIGHTS = {
 }  # fmt: skip
 
 
-def random_appearance(rng: np.random.Generator, kinds: Sequence[str] = tuple(KIND_WEIGHTS)) -> dict[str, Any]:
+def random_appearance(rng: Rng, kinds: Sequence[str] = tuple(KIND_WEIGHTS)) -> dict[str, Any]:
     """Draw the kind, color and seed of a `VehicleBody`."""
 
     def draw(weights: dict[str, int]) -> str:
@@ -122,7 +122,7 @@ def random_appearance(rng: np.random.Generator, kinds: Sequence[str] = tuple(KIN
     return {"kind": draw(weights), "color": draw(COLOR_WEIGHTS), "seed": int(rng.integers(2**31))}
 
 
-def profile_at(profile: Profile, y: ArrayLike) -> NDArray[np.float64]:
+def profile_at(profile: Profile, y: ArrayLike) -> Doubles:
     """Depth of an end at heights `y`."""
     heights, depths = zip(*profile)
     return np.asarray(np.interp(np.asarray(y), heights, depths), np.float64)
@@ -131,7 +131,7 @@ def profile_at(profile: Profile, y: ArrayLike) -> NDArray[np.float64]:
 class VehicleAppearance:
     """Random details that differ between vehicles of one kind."""
 
-    def __init__(self, kind: str, rng: np.random.Generator) -> None:
+    def __init__(self, kind: str, rng: Rng) -> None:
         tall = kind in ("hatchback", "estate", "mpv", "suv", "van")
         self.tall_lamps = tall and rng.random() < 0.75
         self.lamp_width = rng.uniform(0.14, 0.19) if self.tall_lamps else rng.uniform(0.26, 0.42)

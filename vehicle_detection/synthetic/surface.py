@@ -6,13 +6,13 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from vehicle_detection.synthetic.raster import Floats, blend
+from vehicle_detection.synthetic.raster import Doubles, Floats, blend
 
 PIXELS_PER_METER = 112
 
-Outline = NDArray[np.float64]
+Outline = Doubles
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,12 +86,16 @@ class SurfaceCanvas:
             values = cv2.GaussianBlur(values, (0, 0), soften * PIXELS_PER_METER)  # type: ignore[assignment]
         return Mask(np.asarray(values, np.float32), (slice(y1, y2), slice(x1, x2)), self.size)
 
+    def between(self, left: Doubles, right: Doubles, y: Doubles, *, soften: float = 0.0) -> Mask:
+        """Mask of the area between two curves, given by their `x` at ascending heights `y`."""
+        outline = np.column_stack([np.append(left, right[::-1]), np.append(y, y[::-1])])
+        return self.polygon(outline, soften=soften)
+
     def box(self, x: float, y: float, width: float, height: float, *, radius: float = 0.0) -> Mask:
         """Mask of a box centered at ``(x, y)`` with rounded corners."""
         w, h = width / 2, height / 2
-        return self.polygon(
-            round_corners([(x - w, y - h), (x + w, y - h), (x + w, y + h), (x - w, y + h)], radius)
-        )
+        corners = [(x - w, y - h), (x + w, y - h), (x + w, y + h), (x - w, y + h)]
+        return self.polygon(round_corners(corners, radius))
 
     def paint(self, mask: Mask, color: ArrayLike, opacity: float = 1.0) -> None:
         """Composite a color, or an ``(H, W, 3)`` image of colors, under a mask."""

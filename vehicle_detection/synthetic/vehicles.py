@@ -11,11 +11,11 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vehicle_detection.synthetic.bodywork import BodyPainter
 from vehicle_detection.synthetic.camera_light import Light
-from vehicle_detection.synthetic.raster import Floats, blend, tile_to, wrapped_noise
+from vehicle_detection.synthetic.raster import Doubles, Floats, blend, tile_to, wrapped_noise
 from vehicle_detection.synthetic.shapes import COLORS, VEHICLE_SHAPES, VehicleAppearance, profile_at
 from vehicle_detection.synthetic.surface import PIXELS_PER_METER, Surface, SurfaceCanvas
 
@@ -34,7 +34,7 @@ class VehicleBody:
         self._seed = seed
         self.appearance = VehicleAppearance(kind, rng)
 
-    def half_width(self, y: ArrayLike) -> NDArray[np.float64]:
+    def half_width(self, y: ArrayLike) -> Doubles:
         """Half of the body's width at heights `y`, in meters."""
         dims = self.dimensions
         if dims.is_box:
@@ -66,8 +66,7 @@ class VehicleBody:
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         y = np.linspace(dims.clearance, dims.height, 60)
         x = self.half_width(y) * 0.975
-        outline = np.concatenate([np.column_stack([x, y]), np.column_stack([-x, y])[::-1]])
-        canvas.make_opaque(canvas.polygon(outline))
+        canvas.make_opaque(canvas.between(x, -x, y))
         reflection = self._reflect(normal)
         canvas.color[:] = self._shade(normal, reflection)
         painter = BodyPainter(self, canvas, reflection)
