@@ -27,7 +27,7 @@ from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drawing import TRACK_COLORS, blend, draw_boxes, heat_image
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
 from vehicle_detection.explorer.widgets import Panel, build_widgets
-from vehicle_detection.heatmap import frame_heat, label_boxes
+from vehicle_detection.heatmap import frame_heat, label_heat
 from vehicle_detection.images import read_image
 from vehicle_detection.mixture import TemplateMixture
 from vehicle_detection.params import HeatParams, PyramidParams, RegionParams, SearchParams
@@ -150,7 +150,8 @@ class Explorer:
         self.bands = tuple(range(len(self._all_bands)))
         given = detector.region_params
         self.method: Method = "heat" if isinstance(given, HeatParams) else "groups"
-        self.heat_params = given if isinstance(given, HeatParams) else HeatParams()
+        heat = given if isinstance(given, HeatParams) else HeatParams()
+        self.heat_params = heat.for_search(self.search_params)
         self.group_params = given if isinstance(given, RegionParams) else RegionParams()
 
     @property
@@ -383,10 +384,7 @@ class Explorer:
 
     def _find_boxes(self) -> Detections:
         if self.method == "heat":
-            params = self.heat_params
-            return label_boxes(
-                self.heat_map(), threshold=params.threshold, peak_fraction=params.peak_fraction
-            )
+            return label_heat(self.heat_map(), self.heat_params)
         found = self._find()
         if found.vehicles is not None:
             return found.vehicles

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from vehicle_detection.params.features import COLOR_SPACES, HOG_CHANNELS, PATCH_SIZE, FeatureParams
 from vehicle_detection.params.mixture import MixtureParams, entries
-from vehicle_detection.params.regions import HeatParams, RegionParams
+from vehicle_detection.params.regions import HeatParams, HeatRange, RegionParams
 from vehicle_detection.params.search import (
     REFERENCE_WIDTH,
+    FunctionParams,
     PixelBand,
     PyramidParams,
     SearchBand,
@@ -20,7 +21,9 @@ __all__ = [
     "PATCH_SIZE",
     "REFERENCE_WIDTH",
     "FeatureParams",
+    "FunctionParams",
     "HeatParams",
+    "HeatRange",
     "MixtureParams",
     "PixelBand",
     "PyramidParams",
