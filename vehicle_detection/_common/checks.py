@@ -89,9 +89,12 @@ def check_patches(patches: object, size: int, name: str = "patches") -> NDArray[
 
 
 def check_boxes(boxes: ArrayLike, name: str = "boxes") -> NDArray[Any]:
-    """Return `boxes` as an ``(N, 4)`` array of finite boxes with ``x1 <= x2`` and ``y1 <= y2``."""
+    """Return `boxes` as an ``(N, 4)`` array of finite boxes with ``x1 <= x2`` and ``y1 <= y2``.
+
+    Objects with an attribute ``xyxy``, such as ``supervision.Detections``, are accepted.
+    """
     try:
-        array = np.asarray(boxes)
+        array = np.asarray(getattr(boxes, "xyxy", boxes))
     except ValueError:  # rows of different lengths
         array = np.array(None)
     if array.size == 0:
