@@ -67,8 +67,8 @@ class HeatmapDetector(VehicleDetector):
     --------
     >>> detector = HeatmapDetector(threshold=2)
     >>> frame = np.full((720, 1280, 3), 90, np.uint8)
-    >>> np.array_equal(detector(frame), frame), detector.heatmap.max(), detector.labels[1]
-    (True, np.float32(0.0), 0)
+    >>> np.array_equal(detector(frame), frame), float(detector.heatmap.max()), detector.labels[1]
+    (True, 0.0, 0)
     """
 
     def __init__(
