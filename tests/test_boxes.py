@@ -1,3 +1,6 @@
+import sys
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -243,3 +246,93 @@ def test_empty_detections():
 def test_detections_reject_invalid_columns(boxes, scores, message):
     with pytest.raises(InvalidInputError, match=message):
         Detections(boxes, scores)
+
+
+class StandIn:
+    """What the library uses of supervision.Detections."""
+
+    def __init__(self, xyxy, confidence=None, class_id=None, tracker_id=None):
+        self.xyxy, self.confidence, self.class_id, self.tracker_id = xyxy, confidence, class_id, tracker_id
+
+
+TWO = [[0, 0, 10, 10], [5, 5, 9, 9]]
+
+
+def test_detections_are_joined():
+    first, second = Detections(TWO, [1.0, 2.0]), Detections([[1.5, 0, 3, 3]], [3.0])
+    joined = first + second
+    np.testing.assert_array_equal(joined.boxes, [*TWO, [1.5, 0, 3, 3]])
+    assert joined.scores.tolist() == [1, 2, 3]
+    assert len(Detections.empty() + first) == 2
+    with pytest.raises(TypeError, match="unsupported operand"):
+        first + 1
+
+
+def test_detections_of_supervision_are_converted():
+    given_ = StandIn(np.array(TWO, np.float32), np.array([0.5, 0.9], np.float32), np.array([2, 7]))
+    found = Detections.from_supervision(given_)
+    np.testing.assert_array_equal(found.boxes, TWO)
+    np.testing.assert_allclose(found.scores, [0, np.log(9)], atol=1e-6)
+    lower = Detections.from_supervision(given_, threshold=0.25)
+    np.testing.assert_allclose(lower.scores, [np.log(3), np.log(27)], atol=1e-6)
+    assert Detections.from_supervision(given_, class_ids={7}).boxes.tolist() == [TWO[1]]
+    assert Detections.from_supervision(given_, score="logit").scores[0] == 0.5
+    assert Detections.from_supervision(given_, score=(0.1, 0.9)).scores.tolist() == pytest.approx([1.5, 3])
+    assert Detections.from_supervision(StandIn(TWO)).scores.tolist() == [3, 3]
+    assert len(Detections.from_supervision(StandIn(np.empty((0, 4)), np.empty(0)))) == 0
+
+
+def test_boxes_of_supervision_are_boxes():
+    np.testing.assert_array_equal(iou_matrix(StandIn(TWO), TWO), iou_matrix(TWO, TWO))
+
+
+def test_probabilities_of_0_and_1_are_finite():
+    scores = Detections.from_supervision(StandIn(TWO, [0.0, 1.0])).scores
+    np.testing.assert_allclose(scores, [-np.log(999), np.log(999)])
+
+
+@pytest.mark.parametrize(
+    ("given_", "options", "message"),
+    [
+        ([TWO], {}, "detections must have an attribute xyxy"),
+        (StandIn(TWO, [0.5, 3.0]), {}, r'0 to 1 with score="probability", got 0.5 to 3; pass score="logit"'),
+        (StandIn(TWO, [0.5, np.nan]), {}, "scores must be finite"),
+        (StandIn(TWO, [0.5]), {}, "scores must be one number for each of the 2 boxes"),
+        (StandIn(TWO, [[0.5, 0.5]]), {}, "scores must be one number for each box"),
+        (StandIn([[9, 9, 5, 5]], [0.5]), {}, "x1 <= x2"),
+        (
+            StandIn(TWO, [0.5, 0.5]),
+            {"class_ids": [1]},
+            "class_ids needs one class_id for each of the 2 boxes",
+        ),
+        (StandIn(TWO), {"score": "percent"}, "score must be one of 'probability', 'logit'"),
+        (StandIn(TWO), {"score": (1, 1)}, r"score\[1\] must be a number, greater than 1"),
+        (StandIn(TWO), {"score": (0, 1), "threshold": 0.5}, "threshold must be omitted"),
+        (StandIn(TWO), {"threshold": 1.0}, "threshold must be a number, greater than 0 and at most 0.999"),
+        (StandIn(TWO), {"score": "logit", "threshold": "0"}, "threshold must be a number"),
+    ],
+)
+def test_invalid_detections_of_supervision_are_rejected(given_, options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        Detections.from_supervision(given_, **options)
+
+
+def test_detections_become_those_of_supervision(monkeypatch):
+    monkeypatch.setitem(sys.modules, "supervision", SimpleNamespace(Detections=StandIn))
+    found = Detections(TWO, [0.0, np.log(9)])
+    converted = found.to_supervision(tracker_id=[4, 7])
+    np.testing.assert_array_equal(converted.xyxy, TWO)
+    np.testing.assert_allclose(converted.confidence, [0.5, 0.9], rtol=1e-6)
+    assert converted.class_id.tolist() == [0, 0]
+    assert converted.tracker_id.tolist() == [4, 7]
+    assert found.to_supervision().tracker_id is None
+    assert converted.xyxy.dtype == converted.confidence.dtype == np.float32
+    back = Detections.from_supervision(converted)
+    np.testing.assert_allclose(back.scores, found.scores, atol=1e-5)
+    assert Detections.empty().to_supervision().xyxy.shape == (0, 4)
+
+
+def test_the_remedy_without_supervision(monkeypatch):
+    monkeypatch.setitem(sys.modules, "supervision", None)
+    with pytest.raises(InvalidInputError, match="which is not installed; run pip install supervision"):
+        Detections(TWO, [1, 2]).to_supervision()

@@ -1,6 +1,8 @@
 import dataclasses
 import random
+import sys
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,8 +10,10 @@ import pytest
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import Template, VehicleClassifier
+from vehicle_detection.datasets import load_frames
 from vehicle_detection.detector import FrameResult, VehicleDetector
 from vehicle_detection.errors import InvalidInputError, ModelFileError
+from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, evaluate_detections, read_labels
 from vehicle_detection.mixture import load_model
 from vehicle_detection.params import (
     FeatureParams,
@@ -20,6 +24,7 @@ from vehicle_detection.params import (
     TrackParams,
 )
 from vehicle_detection.synthetic import render_scene
+from vehicle_detection.tracking import Tracker
 
 HEIGHT, WIDTH = 180, 320
 SIDES = (160, 200, 250)  # of windows in a 1280 wide frame: 40, 50 and 62 pixels in these
@@ -219,7 +224,7 @@ def test_reset_takes_the_frame_rate():
     for detector, frames in ((slow, 4), (fast, 4)):
         results = [detector.process(frame_with(CAR)) for _ in range(frames)]
         assert results[-1].tracks[0].age == pytest.approx(3 / (5 if detector is slow else 25))
-    for fps in (0, -25, np.nan, None, "25"):
+    for fps in (0, -25, np.nan, "25"):
         with pytest.raises(InvalidInputError, match="fps must be a number, greater than 0"):
             slow.reset(fps=fps)
 
@@ -344,6 +349,7 @@ def test_frames_are_left_as_they_were():
 
 def test_calling_it_processes_and_annotates():
     one, other = make(), make()
+    other.reset(fps=25)
     for frame in drive(8):
         result = one.process(frame)
         np.testing.assert_array_equal(other(frame), one.annotate(frame, result))
@@ -396,7 +402,7 @@ GOOD = frame_with(CAR)
     [
         (GOOD[..., 0], "COLOR_GRAY2RGB"),
         (np.dstack([GOOD, GOOD[..., 0]]), "drop the alpha channel"),
-        (GOOD / 255, r"scale a 0-1 float image"),
+        (GOOD / 255, r"scale its values 0-1"),
         (GOOD.astype(np.uint16) * 257, "scale a 16-bit image"),
         (GOOD[:0], "the image is empty"),
         (GOOD[None], "pass one image"),
@@ -485,3 +491,46 @@ def test_the_default_takes_frames_of_other_cameras(shape):
     found = VehicleDetector(horizon=0.45).detect(noise)
     height, width = shape
     assert ((found.boxes >= 0) & (found.boxes <= (width, height, width, height))).all()
+
+
+def test_heat_thresholds_depend_on_the_model():
+    thresholds = {
+        model: VehicleDetector(model, region_params=HeatParams()).region_params.threshold
+        for model in ("default", "highway")
+    }
+    assert thresholds == {"default": 0.25, "highway": 2.0}
+    assert make(region_params=HeatParams(threshold=7.0)).region_params.threshold == 7
+    with pytest.warns(UserWarning, match="the heat threshold 20 does not fit the density") as caught:
+        VehicleDetector(region_params=HeatParams(threshold=20.0))
+    assert caught[0].filename == __file__
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("model", ["default", "highway"])
+@pytest.mark.parametrize("weighting", ["score", "count"])
+def test_heat_finds_all_vehicles_of_the_courses_images(real_data, model, weighting):
+    labels = read_labels(real_data / "labels" / "test_images.csv")
+    images = LabelledFrames("test images", load_frames(real_data / "test_images"), labels)
+    with VehicleDetector(model, region_params=HeatParams(weighting=weighting)) as detector:
+        found = FrameBoxes.from_detections({key: detector.detect(image) for key, image in images})
+    scores = evaluate_detections(found, images.labels, frames=images.keys)
+    assert (scores.tp, scores.fn, scores.fp) == (9, 0, 0)
+
+
+def test_tracks_become_detections_of_supervision(monkeypatch):
+    monkeypatch.setitem(sys.modules, "supervision", SimpleNamespace(Detections=SimpleNamespace))
+    detector = make()
+    for frame in drive(8):
+        result = detector.process(frame)
+    converted = result.to_supervision()
+    assert converted.tracker_id.tolist() == [track.id for track in result.shown]
+    np.testing.assert_allclose(converted.xyxy, [track.box for track in result.shown], rtol=1e-6)
+
+
+def test_a_tracker_accepts_detections_of_supervision():
+    tracker = Tracker()
+    for _ in range(8):
+        found = SimpleNamespace(xyxy=np.array([CAR]), confidence=np.array([0.9]))
+        tracks = tracker.update(found, (HEIGHT, WIDTH))
+    assert [track.id for track in tracks] == [1]
+    assert 1 < tracks[0].score < np.log(9)  # rising from 0

@@ -249,3 +249,45 @@ def test_windows_have_the_features_of_patches():
     found = search_windows(image, [[64, 0, 128, 64]], CLASSIFIER, min_score=None)
     features = extract_features([image[:, 64:]], SMALL)
     np.testing.assert_array_equal(found.scores, CLASSIFIER.decision_function(features))
+
+
+def test_plus_joins_lists_of_windows():
+    small, large = (slide_window(IMAGE, xy_window=(side, side)) for side in (32, 40))
+    assert len(small) != len(large)
+    for first, second in [(small, large), (small, small[::-1]), (large, large[:0]), (small, np.array(large))]:
+        joined = first + second
+        assert joined.tolist() == first.tolist() + second.tolist()
+        # As often as needed, from either side, and in place.
+        assert (joined + first).tolist() == first.tolist() + second.tolist() + first.tolist()
+    assert ([] + small).tolist() == (small + []).tolist() == small.tolist()  # noqa: RUF005
+    pairs = [((x1, y1), (x2, y2)) for x1, y1, x2, y2 in large.tolist()]
+    assert (small + pairs).tolist() == small.tolist() + large.tolist()
+    assert (pairs + small).tolist() == large.tolist() + small.tolist()
+    joined = sum([small, large, small], [])  # noqa: RUF017
+    assert joined.tolist() == small.tolist() + large.tolist() + small.tolist()
+    windows = small
+    windows += large
+    assert len(windows) == len(small) + len(large)
+    assert len(small) == len(slide_window(IMAGE, xy_window=(32, 32)))
+
+
+def test_windows_are_an_array_otherwise():
+    windows = slide_window(IMAGE)
+    plain = np.asarray(windows)
+    assert type(plain) is np.ndarray
+    for shift in (5, np.int64(5), [1, 2, 1, 2], np.array([1, 2, 1, 2])):
+        np.testing.assert_array_equal(windows + shift, plain + shift)
+        np.testing.assert_array_equal(shift + windows, plain + shift)
+    np.testing.assert_array_equal(np.add(windows, windows), 2 * plain)
+    assert type(2 * windows) is type(windows.sum(axis=0)) is type(windows == windows) is np.ndarray
+    np.testing.assert_array_equal(windows[:, :2] + windows[:, 2:], plain[:, :2] + plain[:, 2:])
+    moved = windows.copy()
+    moved += 3
+    moved *= 2
+    np.add(moved, 1, out=moved)
+    np.testing.assert_array_equal(moved, 2 * (plain + 3) + 1)
+    assert windows.min() == 0
+    assert (windows[windows[:, 0] > 0] + windows[:1]).shape[1] == 4
+    with pytest.raises(InvalidInputError, match=r"windows must be .* x1 <= x2"):
+        _ = windows + [[5, 5, 0, 0]]  # noqa: RUF005
+    assert search_windows(IMAGE, windows + windows, CLASSIFIER, min_score=None).boxes.dtype == np.int64

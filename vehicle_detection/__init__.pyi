@@ -2,6 +2,7 @@ from . import course, plotting
 from .boxes import Detections, clip_boxes, iou_matrix, non_max_suppression
 from .camera import Camera, HorizonEstimate, estimate_horizon
 from .classifier import VehicleClassifier, load_classifier, train_classifier
+from .course import HeatmapDetector
 from .datasets import (
     FrameSet,
     PatchSet,
@@ -17,10 +18,11 @@ from .datasets import (
     split_sequences,
     split_sources,
 )
-from .detector import FrameResult, VehicleDetector
+from .detector import FrameResult, VehicleDetector, detector_from
 from .drawing import draw_boxes, draw_diagnostics, draw_labeled_bboxes, draw_tracks
 from .errors import (
     DatasetError,
+    DetectorError,
     InvalidInputError,
     ModelFileError,
     VehicleDetectionError,
@@ -57,6 +59,7 @@ from .mixture import TemplateMixture, load_model
 from .mixture_training import FrameDataset, cross_validate_mixture, train_mixture
 from .params import (
     FeatureParams,
+    FunctionParams,
     HeatParams,
     MixtureParams,
     PyramidParams,
@@ -89,14 +92,17 @@ __all__ = [
     "DatasetError",
     "DetectionScores",
     "Detections",
+    "DetectorError",
     "Explorer",
     "FeatureParams",
     "FrameBoxes",
     "FrameDataset",
     "FrameResult",
     "FrameSet",
+    "FunctionParams",
     "HeatHistory",
     "HeatParams",
+    "HeatmapDetector",
     "HorizonEstimate",
     "InvalidInputError",
     "LabelledFrames",
@@ -137,6 +143,7 @@ __all__ = [
     "convert_color",
     "course",
     "cross_validate_mixture",
+    "detector_from",
     "draw_boxes",
     "draw_diagnostics",
     "draw_labeled_bboxes",

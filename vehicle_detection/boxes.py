@@ -5,15 +5,16 @@ Boxes are ``(N, 4)`` arrays ``[x1, y1, x2, y2]`` in half-open pixels: the width 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_boxes, check_number, describe
+from vehicle_detection._common import check_boxes, check_choice, check_number, describe
 from vehicle_detection.errors import InvalidInputError
 
 Floats = NDArray[np.float64]
@@ -175,6 +176,64 @@ def non_max_suppression(boxes: ArrayLike, scores: ArrayLike, *, threshold: float
     return greedy_nms(detections.boxes.astype(np.float64), detections.scores, max_iou=max_iou)
 
 
+ScoreScale = Literal["probability", "logit"] | tuple[float, float]
+"""What the scores of another detector are: see `log_odds`."""
+
+CERTAIN_SCORE = 3.0
+"""Log-odds of a certain detection: 95%."""
+
+
+def log_odds(scores: ArrayLike, score: ScoreScale, threshold: float | None = None) -> Floats:
+    """Convert the scores of another detector to log-odds above its threshold, ``(N,)`` float64.
+
+    Probabilities become ``log(p / (1 - p))`` minus that of the threshold, 0.5 by default; log-odds are
+    reduced by the threshold, 0 by default; ``(low, high)`` maps low to 0 and high to `CERTAIN_SCORE`.
+    """
+    values = _score_column(scores)
+    if isinstance(score, tuple):
+        low, high = score
+        return (values - low) / (high - low) * CERTAIN_SCORE
+    if score == "logit":
+        return values - (0.0 if threshold is None else threshold)
+    if values.size and (values.min() < 0 or values.max() > 1):
+        raise InvalidInputError(
+            f'scores must be 0 to 1 with score="probability", got {values.min():g} to {values.max():g}; pass '
+            'score="logit" for log-odds, or score=(low, high)'
+        )
+    limit = 0.5 if threshold is None else threshold
+    # Probabilities of exactly 0 and 1 have no finite log-odds.
+    p = values.clip(1e-3, 1 - 1e-3)
+    return np.asarray(np.log(p / (1 - p)) - math.log(limit / (1 - limit)))
+
+
+def check_score_scale(score: object, threshold: float | None) -> ScoreScale:
+    """Return the scale of `log_odds` if it and the threshold are valid."""
+    if isinstance(score, (tuple, list)) and len(score) == 2:
+        low = check_number(score[0], "score[0]")
+        if threshold is not None:
+            raise InvalidInputError(
+                f"threshold must be omitted with score=(low, high): low is the threshold; got {threshold}"
+            )
+        return low, check_number(score[1], "score[1]", above=low)
+    check_choice(score, "score", ("probability", "logit"))
+    if threshold is not None and score == "probability":
+        check_number(threshold, "threshold", above=0, high=0.999)
+    elif threshold is not None:
+        check_number(threshold, "threshold")
+    return score  # type: ignore[return-value]
+
+
+def _score_column(scores: ArrayLike) -> Floats:
+    array = np.asarray(scores)
+    if array.size == 0:
+        return np.empty(0)
+    if array.ndim != 1 or array.dtype.kind not in "iuf":
+        raise InvalidInputError(f"scores must be one number for each box, got {describe(scores)}")
+    if not np.isfinite(array).all():
+        raise InvalidInputError("scores must be finite, got NaN or infinity; drop those rows")
+    return array.astype(np.float64)
+
+
 @dataclass(frozen=True, eq=False)
 class Detections:
     """Boxes and their scores as two columns, checked on construction.
@@ -196,6 +255,8 @@ class Detections:
     Detections(2 boxes, scores 0.50 to 2.00)
     >>> found[found.scores > 1].boxes
     array([[5, 5, 9, 9]])
+    >>> found + found[:1]
+    Detections(3 boxes, scores 0.50 to 2.00)
     """
 
     boxes: NDArray[Any]
@@ -219,6 +280,105 @@ class Detections:
     def empty(cls) -> Detections:
         """Return detections without any box."""
         return cls(np.empty((0, 4)), np.empty(0))
+
+    @classmethod
+    def from_supervision(
+        cls,
+        detections: Any,
+        *,
+        score: ScoreScale = "probability",
+        threshold: float | None = None,
+        class_ids: Collection[int] | None = None,
+    ) -> Detections:
+        """Convert the detections of another library, such as ``supervision.Detections``.
+
+        Parameters
+        ----------
+        detections
+            An object with ``xyxy``, ``(N, 4)``, and, if known, ``confidence`` and ``class_id``, ``(N,)``.
+        score, threshold
+            What the confidences are, as in `detector_from`.
+        class_ids
+            Keep only boxes of these classes, such as ``(2, 5, 7)`` for the cars, buses and trucks of COCO.
+
+        Returns
+        -------
+        Detections
+            Boxes with scores in log-odds above the threshold. Without confidences, the score is 3.
+
+        Raises
+        ------
+        InvalidInputError
+            If the object has no ``xyxy``, its columns are malformed, or classes are asked for but unknown.
+
+        Examples
+        --------
+        >>> from types import SimpleNamespace
+        >>> found = SimpleNamespace(xyxy=[[0, 0, 9, 9], [5, 5, 9, 9]], confidence=[0.5, 0.9], class_id=[2, 0])
+        >>> Detections.from_supervision(found), Detections.from_supervision(found, class_ids=[0])
+        (Detections(2 boxes, scores 0.00 to 2.20), Detections(1 box, scores 2.20 to 2.20))
+        """
+        if not hasattr(detections, "xyxy"):
+            raise InvalidInputError(
+                f"detections must have an attribute xyxy, got {describe(detections)}; pass a "
+                "supervision.Detections"
+            )
+        scale = check_score_scale(score, threshold)
+        boxes = check_boxes(detections.xyxy)
+        confidence: Any = getattr(detections, "confidence", None)
+        classes: Any = getattr(detections, "class_id", None)
+        if confidence is None:
+            scores = np.full(len(boxes), CERTAIN_SCORE)
+        else:
+            scores = log_odds(confidence, scale, threshold)
+        found = cls(boxes, scores)
+        if class_ids is None:
+            return found
+        if np.shape(classes) != (len(found),):
+            raise InvalidInputError(
+                f"class_ids needs one class_id for each of the {len(found)} boxes, got {describe(classes)}; "
+                "omit class_ids"
+            )
+        return found[np.isin(classes, list(class_ids))]
+
+    def to_supervision(self, *, tracker_id: ArrayLike | None = None) -> Any:
+        """Convert to ``supervision.Detections``, for the drawing, counting and tracking of that library.
+
+        The confidence is the probability of the score, ``1 / (1 + exp(-score))``; a score of 0, the
+        threshold of a vehicle, becomes 0.5. The class is 0.
+
+        Parameters
+        ----------
+        tracker_id
+            ``(N,)`` numbers of the tracks, if known.
+
+        Raises
+        ------
+        InvalidInputError
+            If supervision is not installed.
+        """
+        try:
+            from supervision import Detections as SupervisionDetections
+        except ImportError as error:
+            raise InvalidInputError(
+                "to_supervision needs the package supervision, which is not installed; run "
+                "pip install supervision"
+            ) from error
+        ids = None if tracker_id is None else np.asarray(tracker_id, np.int64).reshape(-1)
+        return SupervisionDetections(
+            xyxy=self.boxes.astype(np.float32),
+            confidence=(1 / (1 + np.exp(-self.scores.clip(-500, 500)))).astype(np.float32),
+            class_id=np.zeros(len(self), np.int64),
+            tracker_id=ids,
+        )
+
+    def __add__(self, other: Detections) -> Detections:
+        """Join two sets of boxes, such as the windows of two searches."""
+        if not isinstance(other, Detections):
+            return NotImplemented
+        return Detections(
+            np.concatenate([self.boxes, other.boxes]), np.concatenate([self.scores, other.scores])
+        )
 
     def __repr__(self) -> str:
         if not len(self):

@@ -2,35 +2,53 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import time as clock
+import warnings
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_image, check_number, check_type
-from vehicle_detection.boxes import Detections
+from vehicle_detection._common import check_image, check_number, check_type, describe
+from vehicle_detection.boxes import Detections, ScoreScale
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.drawing import draw_boxes, draw_diagnostics, draw_tracks
-from vehicle_detection.heatmap import HeatHistory, frame_heat, label_boxes
+from vehicle_detection.errors import DetectorError, InvalidInputError
+from vehicle_detection.function_model import DetectorFunction, FunctionModel
+from vehicle_detection.heatmap import HeatHistory, frame_heat, label_heat
 from vehicle_detection.images import read_image
 from vehicle_detection.mixture import TemplateMixture, load_model
-from vehicle_detection.params import HeatParams, PyramidParams, RegionParams, SearchParams, TrackParams
+from vehicle_detection.params import (
+    FunctionParams,
+    HeatParams,
+    PyramidParams,
+    RegionParams,
+    SearchParams,
+    TrackParams,
+)
 from vehicle_detection.regions import find_vehicles
 from vehicle_detection.search import FrameSearch, SearchResult
 from vehicle_detection.tracking import Track, Tracker
 
 Path = str | os.PathLike[str]
+Model = VehicleClassifier | TemplateMixture | FunctionModel
+Clip = TypeVar("Clip")
 
 CUT_DIFFERENCE = 40.0
 """Mean absolute difference of consecutive thumbnails, 0-255, above which the scene has been cut."""
 
 # Standard error of the horizon as a fraction of the search's horizon tolerance.
 _HORIZON_STD = 0.4
+# Frame rate that is assumed where it is unknown.
+_USUAL_FPS = 25.0
+# Frames: rounding error of a time times the frame rate, as in moviepy.
+_FRAME_TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +83,12 @@ class FrameResult:
         """The tracks to draw."""
         return tuple(track for track in self.tracks if track.shown)
 
+    def to_supervision(self) -> Any:
+        """Convert the shown tracks to ``supervision.Detections`` with their ids as ``tracker_id``."""
+        boxes = np.array([track.box for track in self.shown]).reshape(-1, 4)
+        found = Detections(boxes, np.array([track.score for track in self.shown]))
+        return found.to_supervision(tracker_id=[track.id for track in self.shown])
+
 
 class VehicleDetector:
     """Detect the vehicles of images, and track those of a video.
@@ -72,15 +96,18 @@ class VehicleDetector:
     Parameters
     ----------
     model
-        A name (``"default"`` for any road, ``"highway"``), the path of a model file, or a model.
+        A name (``"default"`` for any road, ``"highway"``), the path of a model file, or a model. For a
+        detector of your own see `detector_from`.
     method
         ``"shared"``: the fast search, features shared by all windows. ``"windows"``: the reference, one patch
         per window; for classifiers of patches.
     search_params
-        Where windows are searched: `PyramidParams` for a mixture, `SearchParams` for a classifier of patches.
+        Where windows are searched: `PyramidParams` for a mixture, `SearchParams` for a classifier of patches,
+        `FunctionParams` for a function.
     region_params
         How windows become boxes, unless the model predicts boxes: `RegionParams` for one box per group of
-        agreeing windows; `HeatParams` for the course's heat map over the last frames (any model).
+        agreeing windows; `HeatParams` for the course's heat map over the last frames (any model). Without a
+        threshold in it, the threshold fits the model and its search.
     track_params
         Parameters of the tracker.
     camera
@@ -100,6 +127,11 @@ class VehicleDetector:
     InvalidInputError
         If an argument is malformed, or `search_params` or `method` do not fit the model.
 
+    Warns
+    -----
+    UserWarning
+        If the heat threshold cannot fit the density of the search.
+
     Examples
     --------
     >>> detector = VehicleDetector()
@@ -110,10 +142,10 @@ class VehicleDetector:
 
     def __init__(
         self,
-        model: Path | VehicleClassifier | TemplateMixture = "default",
+        model: Path | Model = "default",
         *,
         method: Literal["shared", "windows"] = "shared",
-        search_params: SearchParams | PyramidParams | None = None,
+        search_params: SearchParams | PyramidParams | FunctionParams | None = None,
         region_params: RegionParams | HeatParams | None = None,
         track_params: TrackParams | None = None,
         camera: Camera | None = None,
@@ -131,33 +163,37 @@ class VehicleDetector:
             if value is not None:
                 check_type(value, name, kind, "omit it for the default")
         chosen = search_params or self.model.search_params_type.default()
-        self.search_params: SearchParams | PyramidParams = chosen.with_horizon(horizon)
+        self.search_params: SearchParams | PyramidParams | FunctionParams = chosen.with_horizon(horizon)
+        if isinstance(region_params, HeatParams):
+            region_params = region_params.for_search(self.search_params)
         self.region_params = region_params or RegionParams()
         self.track_params = track_params or TrackParams()
         self.camera = camera
         self.diagnostics = diagnostics
         self._search: FrameSearch = self.model.open_search(n_jobs, method)
         self._heat_params = region_params if isinstance(region_params, HeatParams) else None
-        self._heat_history = HeatHistory((self._heat_params or HeatParams()).frames)
+        self._speed_warning = True
         self.reset()
 
-    def reset(self, *, fps: float = 25.0) -> None:
+    def reset(self, *, fps: float | None = None) -> None:
         """Forget all frames, before the first frame of another video.
 
         Parameters
         ----------
         fps
-            Frame rate, for frames without a time.
+            Frame rate, for frames without a time. None: unknown; 25 is assumed.
 
         Raises
         ------
         InvalidInputError
             If the frame rate is not a positive number.
         """
-        self._fps = check_number(fps, "fps", above=0, high=1e6)
+        self._fps = None if fps is None else check_number(fps, "fps", above=0, high=1e6)
         self._index = 0
+        self._first: tuple[NDArray[np.uint8], FrameResult] | None = None
         self._thumbnail: NDArray[np.float32] | None = None
-        self._heat_history.clear()
+        self._heat_history = HeatHistory((self._heat_params or HeatParams()).frames)
+        self._heat: NDArray[np.float32] | None = None
         self._tracker: Tracker | None = None
 
     def search(self, frame: NDArray[np.uint8]) -> SearchResult:
@@ -195,7 +231,7 @@ class VehicleDetector:
         frame = read_image(image) if isinstance(image, (str, os.PathLike)) else image
         found = self.search(frame)
         if self._heat_params is not None:
-            return self._label(frame_heat(found.shape, found.windows, self._heat_params), self._heat_params)
+            return label_heat(frame_heat(found.shape, found.windows, self._heat_params), self._heat_params)
         return _positive(self._fit_boxes(found))
 
     def _fit_boxes(self, found: SearchResult) -> Detections:
@@ -203,10 +239,6 @@ class VehicleDetector:
             return found.vehicles
         assert isinstance(self.region_params, RegionParams)
         return find_vehicles(found.windows, self._camera_of(found.shape), found.shape, self.region_params)
-
-    @staticmethod
-    def _label(heat: NDArray[np.float32], params: HeatParams) -> Detections:
-        return label_boxes(heat, threshold=params.threshold, peak_fraction=params.peak_fraction)
 
     def _camera_of(self, shape: tuple[int, int]) -> Camera:
         if self.camera is not None:
@@ -227,8 +259,19 @@ class VehicleDetector:
             ``(H, W, 3)`` uint8 RGB.
         time
             Time of the frame in seconds; None: one frame after the last one.
+
+        Raises
+        ------
+        InvalidInputError
+            If the frame is not an ``(H, W, 3)`` uint8 RGB image, or is too small for a window.
+        DetectorError
+            If the detector is a function that fails; the message names the frame.
         """
-        return self.track(self.search(frame), time=time)
+        try:
+            found = self.search(frame)
+        except DetectorError as error:
+            raise DetectorError(f"frame {self._index}: {error}") from error
+        return self.track(found, time=time)
 
     def track(self, found: SearchResult, *, time: float | None = None) -> FrameResult:
         """Update the tracks with the search result of the next frame, in frame order.
@@ -246,15 +289,15 @@ class VehicleDetector:
         """
         start = clock.perf_counter()
         if self._tracker is None:
-            self._tracker = Tracker(self.track_params, fps=self._fps)
+            self._tracker = Tracker(self.track_params, fps=self._fps or _USUAL_FPS)
         self._tracker.set_camera(self._camera_of(found.shape))
         if self._is_cut(found):
             self._heat_history.clear()
             self._tracker.end_tracks()
         self._thumbnail = found.thumbnail
         if self._heat_params is not None:
-            heat = self._heat_history.add(frame_heat(found.shape, found.windows, self._heat_params))
-            detections = self._label(heat, self._heat_params)
+            self._heat = self._heat_history.add(frame_heat(found.shape, found.windows, self._heat_params))
+            detections = label_heat(self._heat, self._heat_params)
         else:
             detections = self._fit_boxes(found)
         detected = clock.perf_counter()
@@ -282,14 +325,84 @@ class VehicleDetector:
         return draw_tracks(frame, result.tracks)
 
     def __call__(self, frame: NDArray[np.uint8] | Path) -> NDArray[np.uint8]:
-        """Return the next frame annotated: ``clip.image_transform(detector)`` in moviepy.
+        """Return the next frame annotated.
 
         The path of an image file gives that image with the vehicles of `detect` drawn; tracks are unchanged.
+
+        Warns
+        -----
+        UserWarning
+            Once, if speeds are shown although the frame rate is unknown.
+
+        Notes
+        -----
+        In moviepy use `annotate_clip`. With ``clip.image_transform(detector)`` only images arrive here: times
+        are those of the frame rate that `reset` was given (25 if none), a second clip continues the tracks of
+        the first one unless `reset` is called, and so does a clip that is rewound. The first frame, which
+        moviepy reads twice, counts once.
         """
         if isinstance(frame, (str, os.PathLike)):
             image = read_image(frame)
             return draw_boxes(image, self.detect(image).boxes)
-        return self.annotate(frame, self.process(frame))
+        if self._first is not None and self._index == 1 and np.array_equal(frame, self._first[0]):
+            return self.annotate(frame, self._first[1])
+        result = self.process(frame)
+        if result.index == 0:
+            self._first = frame.copy(), result
+        has_speed = any(track.speed_mps is not None for track in result.shown)
+        if has_speed and self._fps is None and self._speed_warning:
+            self._speed_warning = False
+            warnings.warn(
+                f"the speeds assume {_USUAL_FPS:g} frames per second, because the frames came without times; "
+                "use detector.annotate_clip(clip) in moviepy, or call detector.reset(fps=...) first",
+                stacklevel=2,
+            )
+        return self.annotate(frame, result)
+
+    def annotate_clip(self, clip: Clip, *, on_result: Callable[[FrameResult], object] | None = None) -> Clip:
+        """Annotate a moviepy clip: a new clip with the same duration, frame rate and audio.
+
+        The new clip has tracks of its own, numbered from 1; those of the detector and of other clips are
+        neither used nor changed. Frames are processed when they are read, with their times in `clip`. Before
+        and after, every method and effect of moviepy applies, such as ``subclipped``, ``resized`` and
+        ``concatenate_videoclips``. Change the speed afterwards: the estimated speeds are those of `clip`.
+
+        Parameters
+        ----------
+        clip
+            A video clip of moviepy 2.
+        on_result
+            Function that is called with the result of each processed frame.
+
+        Returns
+        -------
+        moviepy.VideoClip
+            Reading frames in ascending order tracks the vehicles. A frame that is read again is not processed
+            again. Going back in time, as a second rendering does, forgets all frames and starts anew; its
+            result equals that of the first. Skipping more than ``track_params.max_gap`` seconds ends all
+            tracks.
+
+        Raises
+        ------
+        InvalidInputError
+            If `clip` is not a video clip of moviepy 2.
+
+        Examples
+        --------
+        >>> from moviepy import VideoFileClip  # doctest: +SKIP
+        >>> clip = VideoFileClip("drive.mp4").subclipped(2, 12)  # doctest: +SKIP
+        >>> VehicleDetector().annotate_clip(clip).write_videofile("found.mp4")  # doctest: +SKIP
+        """
+        given: Any = clip
+        if not all(hasattr(given, name) for name in ("transform", "get_frame", "size")):
+            raise InvalidInputError(
+                f"clip must be a video clip of moviepy 2, got {describe(clip)}; pass VideoFileClip(path), or "
+                "use process_video for a file"
+            )
+        if on_result is not None and not callable(on_result):
+            raise InvalidInputError(f"on_result must be a function of a result, got {describe(on_result)}")
+        annotated: Clip = given.transform(_ClipAnnotator(self, getattr(given, "fps", None), on_result))
+        return annotated
 
     def warm_up(self, shape: tuple[int, int] = (720, 1280)) -> None:
         """Compile the kernels and allocate the buffers for frames of `shape`, before the first frame.
@@ -309,14 +422,123 @@ class VehicleDetector:
         self.close()
 
 
+class _ClipAnnotator:
+    """The function of a moviepy clip that annotates its frames, with tracks of its own."""
+
+    def __init__(
+        self, detector: VehicleDetector, fps: float | None, on_result: Callable[[FrameResult], object] | None
+    ) -> None:
+        # The copy shares the model and its threads; `reset` gives it a state of its own.
+        self._detector = copy.copy(detector)
+        self._fps, self._on_result = fps, on_result
+        self._time: float | None = None
+
+    def __call__(self, get_frame: Callable[[float], NDArray[np.uint8]], t: float) -> NDArray[np.uint8]:
+        """Return the annotated frame at `t` seconds."""
+        # Times within one frame, as in slow motion, show the same frame.
+        time = float(t) if not self._fps else int(t * self._fps + _FRAME_TOLERANCE) / self._fps
+        if time != self._time:
+            if self._time is None or time < self._time:
+                self._detector.reset(fps=self._fps or _USUAL_FPS)
+            frame = get_frame(time)
+            result = self._detector.process(frame, time)
+            self._picture, self._time = self._detector.annotate(frame, result), time
+            if self._on_result is not None:
+                self._on_result(result)
+        return self._picture.copy()
+
+
+def detector_from(
+    function: DetectorFunction,
+    *,
+    score: ScoreScale = "probability",
+    threshold: float | None = None,
+    class_ids: Collection[int] | None = None,
+    thread_safe: bool = False,
+    name: str | None = None,
+    **options: Any,
+) -> VehicleDetector:
+    """Make a detector of any function that finds boxes: to track, draw, evaluate and render with it.
+
+    Parameters
+    ----------
+    function
+        Called with an ``(H, W, 3)`` uint8 RGB image of its own. It returns the pair ``(boxes, scores)``,
+        ``(N, 4)`` ``[x1, y1, x2, y2]`` in pixels and ``(N,)``; or `Detections`, or an object with ``xyxy``
+        and ``confidence`` such as ``supervision.Detections``. Boxes are clipped to the image. It should
+        return weak boxes as well: the tracker uses them, images show only those above the threshold.
+    score
+        What the scores are. They are converted to log-odds above the threshold, the unit of `TrackParams`:
+        ``"probability"``, 0 to 1; ``"logit"``, log-odds; ``(low, high)``, any scale, of which `low` is the
+        threshold and becomes 0, and `high`, a certain vehicle, becomes 3 (95%).
+    threshold
+        Score from which a box is a vehicle in a single image: by default 0.5 for probabilities and 0 for
+        log-odds. Pass 0.25 if that is the usual threshold of your detector.
+    class_ids
+        Keep only boxes of these classes, where the function returns an object with ``class_id``.
+    thread_safe
+        Whether the function may be called from several threads. `process_video` searches several frames at
+        once; with False the calls wait for each other. Sessions of ONNX Runtime and the ``predict`` of
+        scikit-learn are thread-safe.
+    name
+        Name in messages; by default that of the function.
+    **options
+        Further arguments of `VehicleDetector`, such as ``track_params``, ``camera`` and ``horizon``.
+
+    Returns
+    -------
+    VehicleDetector
+        Its `detect`, `process`, `annotate_clip` and so on work as with the shipped models.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is malformed.
+    DetectorError
+        In the methods of the detector, if the function fails or returns something else; the message names
+        the function and the frame.
+
+    Notes
+    -----
+    With the defaults of `TrackParams`, scores from 0 on are vehicles in a single image; tracks start from
+    -0.3 on (a probability of 0.43), are confirmed at an average of 0.2 (0.55), and are continued by boxes
+    down to -1.5 (0.18). The probabilities hold for a threshold of 0.5.
+
+    Examples
+    --------
+    >>> def bright_spot(image):
+    ...     y, x = np.unravel_index(image.sum(axis=2).argmax(), image.shape[:2])
+    ...     return [[x - 20, y - 20, x + 20, y + 20]], [0.9]
+    >>> detector = detector_from(bright_spot)
+    >>> image = np.zeros((90, 160, 3), np.uint8)
+    >>> image[50, 100] = 255
+    >>> detector.detect(image).boxes.tolist()
+    [[80.0, 30.0, 120.0, 70.0]]
+    """
+    model = FunctionModel(
+        function=function,
+        score=score,
+        threshold=threshold,
+        class_ids=class_ids,
+        thread_safe=thread_safe,
+        name=name,
+    )
+    return VehicleDetector(model, **options)
+
+
 def _positive(vehicles: Detections) -> Detections:
     """Keep the vehicles to show: negative scores are for the tracker only."""
     return vehicles[vehicles.scores >= 0]
 
 
-def _load(model: object) -> VehicleClassifier | TemplateMixture:
+def _load(model: object) -> Model:
     if isinstance(model, (str, os.PathLike)):
         return load_model(model)
-    kinds = VehicleClassifier, TemplateMixture
-    check_type(model, "model", kinds, "pass a name, the path of a model file, or what load_model returns")
+    if callable(model) and not isinstance(model, type):
+        raise InvalidInputError(
+            f"model must not be a function, got {describe(model)}; pass it to detector_from"
+        )
+    if not isinstance(model, FunctionModel):
+        kinds = VehicleClassifier, TemplateMixture
+        check_type(model, "model", kinds, "pass a name, the path of a model file, or what load_model returns")
     return model  # type: ignore[return-value]

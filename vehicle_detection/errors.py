@@ -19,5 +19,9 @@ class DatasetError(VehicleDetectionError):
     """Training patches, frames or labels are missing, incomplete or malformed."""
 
 
+class DetectorError(VehicleDetectionError):
+    """A function passed to `detector_from` failed, or did not return boxes and scores."""
+
+
 class VideoError(VehicleDetectionError):
     """A video cannot be read or written."""

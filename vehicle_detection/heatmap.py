@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from vehicle_detection._common import check_boxes, check_integer, check_number, describe
 from vehicle_detection.boxes import Detections, clip_boxes
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.params import HeatParams
+from vehicle_detection.params import HeatParams, SearchParams
+
+Heat = TypeVar("Heat", bound=NDArray[Any])
 
 
 def _check_heat(heatmap: object) -> NDArray[Any]:
@@ -24,78 +26,111 @@ def _check_heat(heatmap: object) -> NDArray[Any]:
     return heatmap
 
 
-def add_heat(
-    heatmap: NDArray[Any], boxes: ArrayLike, *, scores: ArrayLike | None = None
-) -> NDArray[np.float32]:
-    """Add each window's heat to the pixels that it covers.
+def _check_writable_heat(heatmap: object) -> NDArray[Any]:
+    heat = _check_heat(heatmap)
+    if not heat.flags.writeable:
+        raise InvalidInputError(
+            "heatmap must be writable, because it is changed in place; got a read-only array, pass a copy"
+        )
+    return heat
 
-    A window is added as four corner differences, and one cumulative sum over the map follows, so the cost
-    does not depend on the area of the windows.
+
+def add_heat(heatmap: Heat, boxes: ArrayLike, *, scores: ArrayLike | None = None) -> Heat:
+    """Add each window's heat to the pixels that it covers, in place.
+
+    A window is added as four corner differences, and one cumulative sum follows, so the cost does not depend
+    on the area of the windows.
 
     Parameters
     ----------
-    heatmap, boxes
-        ``(H, W)`` map, and ``(N, 4)`` windows, which are rounded to whole pixels and clipped to the map.
+    heatmap
+        ``(H, W)`` map of any number type; changed. Pass ``heatmap.copy()`` to keep it.
+    boxes
+        ``(N, 4)`` windows, which are rounded to whole pixels and clipped to the map.
     scores
         ``(N,)`` heat that each window adds; by default 1 each, as in the course.
 
     Returns
     -------
     numpy.ndarray
-        A new ``(H, W)`` float32 map.
+        The same array, `heatmap`.
 
     Raises
     ------
     InvalidInputError
-        If the map is not two-dimensional, or boxes and scores differ in number.
+        If the map is not two-dimensional, is read-only, or is of an integer type that cannot hold the new
+        heat; or if boxes and scores differ in number. The map is unchanged then.
 
     Examples
     --------
-    >>> add_heat(np.zeros((2, 4)), [[0, 0, 2, 2], [1, 0, 3, 1]])
+    >>> heat = np.zeros((2, 4))
+    >>> add_heat(heat, [[0, 0, 2, 2], [1, 0, 3, 1]]) is heat
+    True
+    >>> heat
     array([[1., 2., 1., 0.],
-           [1., 1., 0., 0.]], dtype=float32)
+           [1., 1., 0., 0.]])
     """
-    heat = _check_heat(heatmap)
-    height, width = heat.shape
+    heat = _check_writable_heat(heatmap)
     windows = check_boxes(boxes)
     weights = np.ones(len(windows)) if scores is None else Detections(windows, np.asarray(scores)).scores
-    x1, y1, x2, y2 = clip_boxes(np.rint(windows), heat.shape).astype(np.int64).T
-    corners = np.zeros((height + 1, width + 1))
+    windows = clip_boxes(np.rint(windows), heat.shape).astype(np.int64)
+    if not len(windows):
+        return heatmap
+    # Only the rectangle around all windows is summed.
+    (left, top), (right, bottom) = windows[:, :2].min(axis=0), windows[:, 2:].max(axis=0)
+    x1, y1, x2, y2 = (windows - (left, top, left, top)).T
+    corners = np.zeros((bottom - top + 1, right - left + 1))
     for rows, columns, sign in ((y1, x1, 1), (y1, x2, -1), (y2, x1, -1), (y2, x2, 1)):
         np.add.at(corners, (rows, columns), sign * weights)
-    # Only the part of the map that windows touch is summed.
-    result = heat.astype(np.float32)
-    if len(windows):
-        top, bottom, left, right = y1.min(), y2.max(), x1.min(), x2.max()
-        part = corners[top:bottom, left:right].cumsum(axis=0).cumsum(axis=1)
-        # Set rounding errors of the sums to zero.
-        part[np.abs(part) < 1e-9 * max(1.0, np.abs(weights).sum())] = 0
-        result[top:bottom, left:right] += part.astype(np.float32)
-    return result
+    added = corners[:-1, :-1].cumsum(axis=0).cumsum(axis=1)
+    # Set rounding errors of the sums to zero.
+    added[np.abs(added) < 1e-9 * max(1.0, np.abs(weights).sum())] = 0
+    part = heat[top:bottom, left:right]
+    total = part + added
+    if heat.dtype.kind != "f" and part.size:
+        _check_holds(total, heat.dtype)
+    part[:] = total
+    return heatmap
 
 
-def apply_threshold(heatmap: NDArray[Any], threshold: float) -> NDArray[np.float32]:
-    """Set heat at or below the threshold to zero.
+def _check_holds(values: NDArray[np.float64], dtype: np.dtype[Any]) -> None:
+    """Raise unless an integer type holds the values exactly."""
+    limits = np.iinfo(dtype)
+    if (values != np.rint(values)).any() or values.min() < limits.min or values.max() > limits.max:
+        raise InvalidInputError(
+            f"heatmap of dtype {dtype} holds whole numbers from {limits.min} to {limits.max} only; the new "
+            f"heat is {values.min():g} to {values.max():g}; start with "
+            "numpy.zeros(image.shape[:2], numpy.float32)"
+        )
+
+
+def apply_threshold(heatmap: Heat, threshold: float) -> Heat:
+    """Set heat at or below the threshold to zero, in place.
 
     Parameters
     ----------
     heatmap, threshold
-        ``(H, W)`` map, and the highest heat that is removed.
+        ``(H, W)`` map, which is changed, and the highest heat that is removed.
 
     Returns
     -------
     numpy.ndarray
-        A new ``(H, W)`` float32 map.
+        The same array, `heatmap`.
+
+    Raises
+    ------
+    InvalidInputError
+        If the map is not two-dimensional or is read-only, or the threshold is not a number.
 
     Examples
     --------
-    >>> apply_threshold(np.array([[1.0, 2.0, 3.0]]), 2)
-    array([[0., 0., 3.]], dtype=float32)
+    >>> heat = np.array([[1.0, 2.0, 3.0]])
+    >>> apply_threshold(heat, 2) is heat, heat.tolist()
+    (True, [[0.0, 0.0, 3.0]])
     """
-    heat = _check_heat(heatmap).astype(np.float32)
-    check_number(threshold, "threshold")
-    heat[heat <= threshold] = 0
-    return heat
+    heat = _check_writable_heat(heatmap)
+    heat[heat <= check_number(threshold, "threshold")] = 0
+    return heatmap
 
 
 def label_boxes(heatmap: NDArray[Any], *, threshold: float = 0.0, peak_fraction: float = 0.0) -> Detections:
@@ -161,7 +196,7 @@ def bounding_boxes(
     shape, windows
         ``(height, width, ...)`` of the frame, and its positive windows.
     params
-        By default ``HeatParams()``.
+        By default ``HeatParams()``. Without a threshold in it, that for the windows of `find_cars`.
 
     Returns
     -------
@@ -175,9 +210,19 @@ def bounding_boxes(
     [[0, 0, 12, 8]]
     """
     params = params or HeatParams()
-    return label_boxes(
-        frame_heat(shape, windows, params), threshold=params.threshold, peak_fraction=params.peak_fraction
-    )
+    return label_heat(frame_heat(shape, windows, params), params)
+
+
+def heat_threshold(params: HeatParams) -> float:
+    """Threshold of the parameters; None means that for the windows of a classifier's default search."""
+    if params.threshold is None:
+        return SearchParams.default().heat_range(params).default
+    return params.threshold
+
+
+def label_heat(heatmap: NDArray[Any], params: HeatParams) -> Detections:
+    """Boxes of a heat map, see `label_boxes`, with the threshold and peak fraction of `params`."""
+    return label_boxes(heatmap, threshold=heat_threshold(params), peak_fraction=params.peak_fraction)
 
 
 def frame_heat(shape: tuple[int, ...], windows: Detections, params: HeatParams) -> NDArray[np.float32]:

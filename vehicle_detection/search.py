@@ -49,7 +49,14 @@ from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import convert_color, hog_source, pick_hog_channels
-from vehicle_detection.params import PATCH_SIZE, FeatureParams, PixelBand, PyramidParams, SearchParams
+from vehicle_detection.params import (
+    PATCH_SIZE,
+    FeatureParams,
+    FunctionParams,
+    PixelBand,
+    PyramidParams,
+    SearchParams,
+)
 from vehicle_detection.windows import band_windows, search_windows
 
 _THUMBNAIL_SHAPE = (18, 32)
@@ -82,12 +89,12 @@ class SearchResult:
 
 
 class FrameSearch(ABC):
-    """What ``model.open_search()`` returns for either kind of model: threads and memory kept between frames.
+    """What ``model.open_search()`` returns for every kind of model: threads and memory kept between frames.
 
     Searches are thread-safe context managers.
     """
 
-    params_type: ClassVar[type[SearchParams] | type[PyramidParams]]
+    params_type: ClassVar[type[SearchParams] | type[PyramidParams] | type[FunctionParams]]
 
     def __init__(self, n_jobs: int | None) -> None:
         self._team = ThreadTeam(n_jobs, name="search")
@@ -103,7 +110,8 @@ class FrameSearch(ABC):
         frame
             ``(H, W, 3)`` uint8 RGB.
         params
-            `SearchParams` or `PyramidParams`, depending on the model; the default suits any dash-cam.
+            `SearchParams`, `PyramidParams` or `FunctionParams`, depending on the model; the default suits any
+            dash-cam.
         min_vehicle_score
             Minimum score of a vehicle. It has no effect if vehicles are derived from the windows.
 

@@ -90,7 +90,7 @@ def test_the_given_parameters_are_used(scenes):
     np.testing.assert_array_equal(heated.heat_map(), frame_heat(SHAPE, heated.windows(), counted))
     detector = heated.detector(n_jobs=1)
     assert detector.camera is camera
-    assert detector.region_params == counted
+    assert detector.region_params == counted.for_search(params)
     assert detector.search_params == params
     heated.set_regions(
         "groups", threshold=4.0, peak_fraction=0.1, weighting="score", min_peak=0.2, min_evidence=0.3
@@ -411,7 +411,7 @@ def decode(picture):
 
 def test_the_controls_start_with_the_parameters(explorer, panel):
     controls, text, image = panel
-    groups, heat = RegionParams(), HeatParams()
+    groups, heat = RegionParams(), HeatParams().for_search(SearchParams.preset())
     assert {name: control.value for name, control in controls.items()} == {
         "frame": "frame 0", "show": "windows", "min. score": 0.0, "horizon": 0.56,
         "windows (px)": tuple(range(8)), "boxes from": "groups", "min. peak": groups.min_peak,
@@ -491,9 +491,9 @@ def test_an_error_is_shown_and_the_image_stays(scenes, tmp_path):
 
 def test_values_outside_the_usual_range_widen_the_slider(scenes):
     search = SearchParams(bands=SearchParams.preset().bands, min_score=-7.0)
-    controls, *_ = open_panel(explore(scenes, search_params=search, region_params=HeatParams(threshold=99.0)))
+    controls, *_ = open_panel(explore(scenes, search_params=search, region_params=HeatParams(threshold=39.0)))
     assert (controls["min. score"].value, controls["min. score"].min) == (-7.0, -7.0)
-    assert (controls["min. heat"].value, controls["min. heat"].max) == (99.0, 99.0)
+    assert (controls["min. heat"].value, controls["min. heat"].max) == (39.0, 39.0)
 
 
 def test_only_the_sliders_need_ipywidgets(explorer, monkeypatch):

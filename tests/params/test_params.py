@@ -11,6 +11,7 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import (
     PATCH_SIZE,
     FeatureParams,
+    FunctionParams,
     HeatParams,
     PixelBand,
     PyramidParams,
@@ -52,7 +53,7 @@ def test_parameters_are_keyword_only(params):
     ("params", "field"), [(params, field.name) for params in ALL for field in dataclasses.fields(params)]
 )
 def test_every_field_is_checked_and_named(params, field, value):
-    if value is None and field in ("spatial_color_space", "hist_color_space"):
+    if value is None and field in ("spatial_color_space", "hist_color_space", "threshold"):
         return
     with pytest.raises(InvalidInputError, match=rf"^{field}\b.* must be "):
         dataclasses.replace(params, **{field: value})
@@ -371,3 +372,63 @@ def test_rows_of_a_flat_road():
     # 90 px are 1.8 m: the bottom of a vehicle is 50 to 100 px below the horizon, with a tolerance of 36 px.
     assert known.rows(90, 80, (720, 1280)) == (360 + 50 - 36 - 80, 360 + 100 + 36)
     assert everywhere.with_horizon(0.4).horizon == 0.4
+
+
+WHOLE = HeatParams(weighting="count", peak_fraction=0)
+
+
+def test_heat_thresholds_scale_with_the_density_of_the_windows():
+    dense = SearchParams.preset()
+    half = dataclasses.replace(
+        dense, bands=tuple(dataclasses.replace(band, overlap=(0.75, 0.75)) for band in dense.bands)
+    )
+    assert half.window_density == pytest.approx(dense.window_density / 4)
+    for heat in (WHOLE, HeatParams(), HeatParams(weighting="count"), HeatParams(peak_fraction=0)):
+        assert half.heat_range(heat) == pytest.approx([value / 4 for value in dense.heat_range(heat)])
+        for search in (dense, half, SearchParams.preset("three-scales"), SearchParams.preset("130-windows")):
+            low, high = search.heat_range(heat)[1:]
+            assert low <= heat.for_search(search).threshold <= high
+    # The fast search steps by a cell or more.
+    denser = dataclasses.replace(
+        dense, bands=tuple(dataclasses.replace(band, overlap=(0.95, 0.95)) for band in dense.bands)
+    )
+    assert denser.window_density == dense.window_density
+    assert HeatParams().for_search(PyramidParams()).threshold == 0.25
+    assert HeatParams().for_search(PyramidParams(per_octave=10)).threshold == 0.5
+
+
+def test_a_given_heat_threshold_is_kept_and_checked_against_the_density():
+    dense = SearchParams.preset()
+    given_ = dataclasses.replace(WHOLE, threshold=20.0)
+    assert given_.for_search(dense) is given_
+    cases = [
+        (dataclasses.replace(WHOLE, threshold=2.0), dense, "too many windows are hot.* expect 10 to 56;"),
+        (dataclasses.replace(WHOLE, threshold=80.0), dense, "threshold 80 does not fit .*too few windows"),
+        (
+            HeatParams(threshold=5.0),
+            PyramidParams(),
+            "expect 0 to 3; omit the threshold for the default of 0.25",
+        ),
+        (
+            HeatParams(threshold=5.0, weighting="count"),
+            PyramidParams(),
+            "weighting='count' and peak_fraction=0.35",
+        ),
+    ]
+    for params, search, message in cases:
+        with pytest.warns(UserWarning, match=message):
+            assert params.for_search(search) is params
+    assert FunctionParams().heat_range(WHOLE).high == np.inf
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"horizon": 2}, "horizon must be a number"),
+        ({"horizon_tolerance": -1}, "horizon_tolerance must be a number"),
+        ({"min_score": None}, "min_score must be a number"),
+    ],
+)
+def test_invalid_function_params_are_rejected(options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        FunctionParams(**options)

@@ -135,7 +135,7 @@ def test_a_given_heat_map_is_used():
     heat = np.zeros((90, 160), np.float32)
     heat[10:20, 30:60] = 5
     figure = plotting.plot_heatmap(
-        gray_image(), Detections.empty(), params=HeatParams(weighting="count"), heat=heat
+        gray_image(), Detections.empty(), params=HeatParams(weighting="count", threshold=2), heat=heat
     )
     assert drawn_boxes(figure.axes[2].collections[0]).tolist() == [[30, 10, 60, 20]]
     assert titles(figure)[:3] == ["0 windows", "heat, peak 5.0", "1 region above 2"]

@@ -94,11 +94,12 @@ def check_patches(patches: object, size: int, name: str = "patches") -> NDArray[
 def check_boxes(boxes: Any, name: str = "boxes") -> NDArray[Any]:
     """Return `boxes` as an ``(N, 4)`` array of finite boxes with ``x1 <= x2`` and ``y1 <= y2``.
 
-    `boxes` may also be `Detections`, or pairs ``((x1, y1), (x2, y2))`` of opposite corners.
+    `boxes` may also be `Detections`, pairs ``((x1, y1), (x2, y2))`` of opposite corners, or an object with an
+    attribute ``xyxy``, such as ``supervision.Detections``.
     """
     boxes = getattr(boxes, "boxes", boxes)  # of Detections
     try:
-        array = np.asarray(boxes)
+        array = np.asarray(getattr(boxes, "xyxy", boxes))
     except ValueError:  # rows of different lengths
         array = np.array(None)
     if array.size == 0:

@@ -15,12 +15,14 @@ The page ``docs/course.md`` lists the differences from the lesson and the counte
 main API.
 """
 
+from vehicle_detection.course.detector import HeatmapDetector
 from vehicle_detection.course.features import bin_spatial, color_hist, convert_color, get_hog_features
 from vehicle_detection.course.heat import add_heat, apply_threshold, draw_boxes, draw_labeled_bboxes
 from vehicle_detection.course.vectors import extract_features, single_img_features
 from vehicle_detection.course.windows import find_car_windows, find_cars, search_windows, slide_window
 
 __all__ = [
+    "HeatmapDetector",
     "add_heat",
     "apply_threshold",
     "bin_spatial",

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection import heatmap as library
-from vehicle_detection._common import check_boxes, check_integer, check_number, describe
+from vehicle_detection._common import check_integer, describe
 from vehicle_detection.course.checks import Image, check_lesson_image, corner_array
 from vehicle_detection.errors import InvalidInputError
 
@@ -19,7 +19,7 @@ _THICKNESS = 6
 
 
 def add_heat(heatmap: NDArray[Any], bbox_list: Any) -> NDArray[Any]:
-    """Add 1 to the pixels of each box, in place.
+    """Add 1 to the pixels of each box, in place: `add_heat` of the main API for corner pairs.
 
     Parameters
     ----------
@@ -47,42 +47,10 @@ def add_heat(heatmap: NDArray[Any], bbox_list: Any) -> NDArray[Any]:
     array([[1., 2., 1., 0.],
            [1., 1., 0., 0.]])
     """
-    _check_heat(heatmap)
-    height, width = heatmap.shape
-    boxes = check_boxes(corner_array(bbox_list, "bbox_list"), "bbox_list").clip(0, (width, height) * 2)
-    boxes = boxes[(boxes[:, :2] < boxes[:, 2:]).all(axis=1)]
-    if len(boxes):
-        # Only the rectangle around all boxes is summed up.
-        x1, y1 = boxes[:, :2].min(axis=0)
-        x2, y2 = boxes[:, 2:].max(axis=0)
-        counts = library.add_heat(np.zeros((y2 - y1, x2 - x1), np.float32), boxes - (x1, y1, x1, y1))
-        heatmap[y1:y2, x1:x2] += counts.astype(heatmap.dtype)
-    return heatmap
+    return library.add_heat(heatmap, corner_array(bbox_list, "bbox_list"))
 
 
-def apply_threshold(heatmap: NDArray[Any], threshold: float) -> NDArray[Any]:
-    """Set heat at or below the threshold to zero, in place, and return the same array.
-
-    Examples
-    --------
-    >>> heat = np.array([[1.0, 2.0, 3.0]])
-    >>> apply_threshold(heat, 2) is heat
-    True
-    >>> heat
-    array([[0., 0., 3.]])
-    """
-    _check_heat(heatmap)
-    heatmap[heatmap <= check_number(threshold, "threshold")] = 0
-    return heatmap
-
-
-def _check_heat(heatmap: Any) -> None:
-    is_map = isinstance(heatmap, np.ndarray) and heatmap.ndim == 2 and heatmap.dtype.kind in "iuf"
-    if not is_map or not heatmap.flags.writeable:
-        raise InvalidInputError(
-            f"heatmap must be a writable (H, W) number array, since it is changed in place; got "
-            f"{describe(heatmap)}; start with numpy.zeros(image.shape[:2])"
-        )
+apply_threshold = library.apply_threshold
 
 
 def draw_boxes(img: Image, bboxes: Any, color: Sequence[float] = _BLUE, thick: int = _THICKNESS) -> Image:

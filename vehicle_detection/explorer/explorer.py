@@ -27,7 +27,7 @@ from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drawing import TRACK_COLORS, blend, draw_boxes, heat_image
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
 from vehicle_detection.explorer.widgets import METHOD_CONTROLS, Panel, build_widgets
-from vehicle_detection.heatmap import frame_heat, label_boxes
+from vehicle_detection.heatmap import frame_heat, label_heat
 from vehicle_detection.images import read_image
 from vehicle_detection.mixture import TemplateMixture
 from vehicle_detection.params import HeatParams, PyramidParams, RegionParams, SearchParams
@@ -143,7 +143,8 @@ class Explorer:
         self.bands = tuple(range(len(self._all_bands)))
         given = detector.region_params
         self.method: Method = "heat" if isinstance(given, HeatParams) else "groups"
-        self.heat_params = given if isinstance(given, HeatParams) else HeatParams()
+        heat = given if isinstance(given, HeatParams) else HeatParams()
+        self.heat_params = heat.for_search(self.search_params)
         self.group_params = given if isinstance(given, RegionParams) else RegionParams()
 
     @property
@@ -326,8 +327,7 @@ class Explorer:
 
     def _find_boxes(self) -> Detections:
         if self.method == "heat":
-            heat = self.heat_params
-            return label_boxes(self.heat_map(), threshold=heat.threshold, peak_fraction=heat.peak_fraction)
+            return label_heat(self.heat_map(), self.heat_params)
         found = self._find()
         if found.vehicles is not None:
             return found.vehicles

@@ -10,9 +10,10 @@ from vehicle_detection.params.features import (
     FeatureParams,
 )
 from vehicle_detection.params.mixture import MixtureParams, entries
-from vehicle_detection.params.regions import HeatParams, RegionParams
+from vehicle_detection.params.regions import HeatParams, HeatRange, RegionParams
 from vehicle_detection.params.search import (
     REFERENCE_WIDTH,
+    FunctionParams,
     PixelBand,
     PyramidParams,
     SearchBand,
@@ -27,7 +28,9 @@ __all__ = [
     "REFERENCE_WIDTH",
     "SPATIAL_ORDERS",
     "FeatureParams",
+    "FunctionParams",
     "HeatParams",
+    "HeatRange",
     "MixtureParams",
     "PixelBand",
     "PyramidParams",

@@ -9,9 +9,27 @@ from typing import ClassVar
 
 from vehicle_detection._common import check_choice, check_integer, check_number, describe
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.params.regions import HeatParams, HeatRange
 
 REFERENCE_WIDTH = 1280
 """Search windows are given in pixels of a frame whose longer side has this length."""
+
+# Heat thresholds by weighting, and whether regions are reduced to their peak, chosen on single frames of the
+# labelled clips: the default has the best F1, or close to it, and beyond the limits F1 is
+# about 0.5 and lower. First for the classifier's default search, then for the mixture's.
+_BAND_HEAT = {
+    ("score", True): HeatRange(2.0, 0.0, 40.0),
+    ("count", True): HeatRange(8.0, 0.0, 56.0),
+    ("score", False): HeatRange(12.0, 4.0, 40.0),
+    ("count", False): HeatRange(16.0, 10.0, 56.0),
+}
+_PYRAMID_HEAT = {"score": HeatRange(0.25, 0.0, 3.0), "count": HeatRange(0.5, 0.0, 4.0)}
+# Factor of the default thresholds of whole regions if all windows are of similar size.
+_SIMILAR_SIZES_FACTOR = 0.6
+# Windows of sides that differ by at most this factor fire on the same vehicle.
+_SIMILAR_SIDES = 1.5
+# The fast search steps by one cell, an eighth of a window, or more.
+_MIN_STEP = 1 / 8
 
 Pair = tuple[float, float]
 
@@ -137,6 +155,37 @@ class SearchParams:
         """Return the same parameters with another horizon; None keeps it."""
         return self if horizon is None else dataclasses.replace(self, horizon=horizon)
 
+    @property
+    def window_density(self) -> float:
+        """Number of windows of similar size that cover a point, as the mean over the bands."""
+        sides = [math.sqrt(band.window[0] * band.window[1]) for band in self.bands]
+        covers = [
+            math.prod(1 / max(1 - overlap, _MIN_STEP) for overlap in band.overlap) for band in self.bands
+        ]
+        similar = [
+            cover
+            for side in sides
+            for other, cover in zip(sides, covers)
+            if max(side, other) <= _SIMILAR_SIDES * min(side, other)
+        ]
+        return sum(similar) / len(self.bands)
+
+    def heat_range(self, heat: HeatParams) -> HeatRange:
+        """Heat thresholds for the windows of this search: those of the default search, scaled by density.
+
+        Examples
+        --------
+        >>> SearchParams.preset().heat_range(HeatParams(weighting="count", peak_fraction=0))
+        HeatRange(default=16.0, low=10.0, high=56.0)
+        """
+        factor = self.window_density / SearchParams.default().window_density
+        default, low, high = (factor * value for value in _BAND_HEAT[heat.weighting, heat.peak_fraction > 0])
+        # Only windows much larger than a vehicle join it to others, which takes a higher threshold.
+        sides = [side for band in self.bands for side in band.window]
+        if heat.peak_fraction == 0 and max(sides) <= 4 * min(sides):
+            default, low = _SIMILAR_SIZES_FACTOR * default, 0.0
+        return HeatRange(default, low, high)
+
     def place(self, shape: tuple[int, ...]) -> tuple[PixelBand, ...]:
         """Bands in pixels of a frame of `shape` (height, width, ...), in which some window must fit."""
         placed = [band.place(shape, self.horizon, self.horizontal_padding) for band in self.bands]
@@ -184,6 +233,51 @@ def _default_bands() -> SearchParams:
     sides = [64.0 * 1.25**step for step in range(8)]
     bands = tuple(SearchBand(window=(side, side), y=(-0.35 * side - 16, 0.95 * side + 16)) for side in sides)
     return SearchParams(bands=bands, horizontal_padding=0.5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FunctionParams:
+    """Parameters of a detector that is a function: it searches the whole frame by itself.
+
+    Attributes
+    ----------
+    horizon
+        Row of the horizon as a fraction of the frame's height, for distances; None: estimated.
+    horizon_tolerance
+        Error of the horizon as a fraction of the frame's height.
+    min_score
+        Minimum score, in log-odds, of the boxes that count as positive windows.
+
+    Examples
+    --------
+    >>> FunctionParams().with_horizon(0.55).horizon
+    0.55
+    """
+
+    horizon: float | None = None
+    horizon_tolerance: float = 0.15
+    min_score: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.horizon is not None:
+            check_number(self.horizon, "horizon", low=0, high=1)
+        check_number(self.horizon_tolerance, "horizon_tolerance", low=0, high=1)
+        check_number(self.min_score, "min_score")
+
+    @classmethod
+    def default(cls) -> FunctionParams:
+        """Return the default parameters."""
+        return cls()
+
+    def with_horizon(self, horizon: float | None) -> FunctionParams:
+        """Return the same parameters with a known horizon and a lower tolerance; None changes nothing."""
+        if horizon is None:
+            return self
+        return dataclasses.replace(self, horizon=horizon, horizon_tolerance=0.06)
+
+    def heat_range(self, heat: HeatParams) -> HeatRange:
+        """Heat thresholds for boxes of unknown density: any."""
+        return HeatRange(0.0, 0.0, math.inf)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,6 +342,10 @@ class PyramidParams:
         if horizon is None:
             return self
         return dataclasses.replace(self, horizon=horizon, horizon_tolerance=0.06)
+
+    def heat_range(self, heat: HeatParams) -> HeatRange:
+        """Heat thresholds for the windows of this search, which are few: two to six on a vehicle."""
+        return HeatRange(*(self.per_octave / 5 * value for value in _PYRAMID_HEAT[heat.weighting]))
 
     def sizes(self, columns: float, rows: float, shape: tuple[int, ...]) -> list[float]:
         """Cell sizes in pixels of the frame, for boxes of `columns` by `rows` cells in a frame of `shape`."""

@@ -13,7 +13,7 @@ from scipy import ndimage
 from vehicle_detection._common import check_image, check_number, check_type, describe
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.heatmap import apply_threshold, frame_heat, label_boxes
+from vehicle_detection.heatmap import frame_heat, heat_threshold, label_heat
 from vehicle_detection.params import HeatParams, PixelBand, SearchParams
 from vehicle_detection.plotting.style import (
     BLUE,
@@ -313,7 +313,7 @@ def plot_heatmap(
     windows
         Its positive windows.
     params
-        Weighting, threshold and fraction of the peak; by default ``HeatParams()``.
+        Weighting, threshold and fraction of the peak; by default as in `bounding_boxes`.
     heat
         ``(H, W)`` heat map, such as the mean over the last frames; None computes that of `windows`.
     figure
@@ -348,7 +348,7 @@ def plot_heatmap(
             f"heat must be an array of the frame's size {(height, width)}, got {describe(given)}; "
             "compute it with add_heat"
         )
-    found = label_boxes(given, threshold=params.threshold, peak_fraction=params.peak_fraction)
+    found, threshold = label_heat(given, params), heat_threshold(params)
     figure = new_figure(figure, 15, 5 * height / width + 0.5, layout="compressed")
     first, second, third = subplot_grid(figure, 1, 3)[0]
     add_image(first, image)
@@ -358,18 +358,18 @@ def plot_heatmap(
     add_image(second, given, cmap="inferno", vmin=0, vmax=max(peak, 1e-6))
     bar = second.figure.colorbar(second.images[0], ax=second, shrink=0.8, pad=0.02)
     bar.set_label("sum of scores" if params.weighting == "score" else "windows")
-    if params.threshold <= peak:
-        bar.ax.axhline(params.threshold, color=SKY, linewidth=2)
+    if threshold <= peak:
+        bar.ax.axhline(threshold, color=SKY, linewidth=2)
     second.set_title(f"heat, peak {peak:.1f}", fontsize=10)
-    add_image(third, _color_regions(image, given, params.threshold))
+    add_image(third, _color_regions(image, given, threshold))
     add_boxes(third, found.boxes, YELLOW, linewidths=2.0)
-    third.set_title(f"{_count(len(found), 'region')} above {params.threshold:g}", fontsize=10)
+    third.set_title(f"{_count(len(found), 'region')} above {threshold:g}", fontsize=10)
     return figure
 
 
 def _color_regions(image: Image, heat: NDArray[Any], threshold: float) -> Image:
     """Blend a color over each connected region above the threshold, on a gray copy of the frame."""
-    labels, _ = ndimage.label(apply_threshold(heat, threshold) > 0, structure=np.ones((3, 3)))
+    labels, _ = ndimage.label(heat > threshold, structure=np.ones((3, 3)))
     gray = np.repeat(image.mean(axis=2, keepdims=True) * 0.8, 3, axis=2)
     colors = 255 * np.array(COLORS)[(labels - 1) % len(COLORS)]
     blended = np.where(labels[..., None] > 0, 0.45 * gray + 0.55 * colors, gray)

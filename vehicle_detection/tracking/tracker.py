@@ -117,7 +117,8 @@ class Tracker:
         Parameters
         ----------
         detections, shape
-            Boxes and scores of this frame, and its ``(height, width, ...)``.
+            Boxes and scores (log-odds) of this frame, and its ``(height, width, ...)``. The confidences of a
+            ``supervision.Detections`` are taken as probabilities.
         time
             Time of the frame in seconds; by default one frame after the last. A frame with the same time as
             the last one changes nothing. An earlier time, a gap of more than ``params.max_gap`` and another
@@ -128,6 +129,8 @@ class Tracker:
         tuple of Track
             Confirmed tracks by id, then tentative ones.
         """
+        if hasattr(detections, "xyxy"):
+            detections = Detections.from_supervision(detections)
         check_type(detections, "detections", Detections, "pass Detections(boxes, scores)")
         frame = check_shape(shape)
         dt = self._advance(frame, time)

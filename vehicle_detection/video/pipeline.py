@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import describe
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.video.streams import FrameReader, FrameWriter
 
 Item = TypeVar("Item")
@@ -187,7 +187,10 @@ class FramePipeline:
             for thread in threads:
                 thread.start()
             for moment, frame, search in self._searched:
-                found, seconds = search.result()
+                try:
+                    found, seconds = search.result()
+                except DetectorError as error:
+                    raise DetectorError(f"at {moment:.2f} s: {error}") from error
                 result = self._detector.track(found, time=moment)
                 self._add_times(result, seconds)
                 if writer is not None:

@@ -1,0 +1,238 @@
+import threading
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tests.video.clips import write_clip
+from vehicle_detection.boxes import Detections
+from vehicle_detection.detector import VehicleDetector, detector_from
+from vehicle_detection.errors import DetectorError, InvalidInputError
+from vehicle_detection.evaluation import FrameBoxes, evaluate_tracks
+from vehicle_detection.explorer import Explorer
+from vehicle_detection.function_model import FunctionModel
+from vehicle_detection.params import FunctionParams, HeatParams, TrackParams
+from vehicle_detection.video import process_video
+
+SHAPE = (120, 200)
+BOX = [40, 50, 80, 80]
+
+
+def frame_with(*boxes, shape=SHAPE):
+    frame = np.full((*shape, 3), 90, np.uint8)
+    for x1, y1, x2, y2 in boxes:
+        frame[y1:y2, x1:x2] = (240, 15, 15)
+    return frame
+
+
+def find_red(image):
+    """The box of all red pixels, with the probability 0.9."""
+    rows, columns = np.nonzero(image[..., 0] > 180)
+    if not len(rows):
+        return [], []
+    return [[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]], [0.9]
+
+
+def moved(step):
+    return [BOX[0] + 2 * step, BOX[1], BOX[2] + 2 * step, BOX[3]]
+
+
+def returning(boxes, scores=None):
+    result = boxes if scores is None else (boxes, scores)
+    return lambda image: result
+
+
+def test_a_function_detects_tracks_and_draws():
+    detector = detector_from(find_red)
+    frame = frame_with(BOX)
+    found = detector.detect(frame)
+    assert found.boxes.tolist() == [BOX]
+    assert found.scores.tolist() == pytest.approx([np.log(9)])
+    assert len(detector.detect(frame_with())) == 0
+    results = [detector.process(frame_with(moved(step)), step / 25) for step in range(12)]
+    truth = FrameBoxes(range(12), [1] * 12, [moved(step) for step in range(12)])
+    scores = evaluate_tracks(FrameBoxes.from_results(results), truth)
+    assert (scores.tp, scores.id_switches) == (12, 0)
+    assert (detector.annotate(frame, results[-1]) != frame).any()
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_a_function_annotates_a_video(tmp_path, workers):
+    clip = write_clip(tmp_path / "clip.mp4", [frame_with(moved(step)) for step in range(15)], fps="25")
+    results = []
+    report = process_video(
+        clip, tmp_path / "out.mp4", detector_from(find_red), workers=workers, on_result=results.append
+    )
+    assert (report.frames, report.tracks) == (15, 1)
+    assert [track.id for track in results[-1].shown] == [1]
+
+
+@pytest.mark.parametrize(
+    ("options", "scores", "expected"),
+    [
+        ({}, [0.5, 0.75, 0.18], [0, np.log(3), np.log(0.18 / 0.82)]),
+        ({"threshold": 0.25}, [0.25, 0.5], [0, np.log(3)]),
+        ({"score": "logit"}, [-1, 0, 7.5], [-1, 0, 7.5]),
+        ({"score": "logit", "threshold": 1}, [1, 3], [0, 2]),
+        ({"score": (10, 20)}, [10, 20, 5, 30], [0, 3, -1.5, 6]),
+        ({"score": [0.3, 0.9]}, [0.3, 0.9], [0, 3]),
+    ],
+)
+def test_scores_become_log_odds_above_the_threshold(options, scores, expected):
+    boxes = [[10 * row, 0, 10 * row + 10, 10] for row in range(len(scores))]
+    detector = detector_from(returning(boxes, scores), **options)
+    found = detector.model.find(frame_with())
+    np.testing.assert_allclose(found.scores, expected, atol=1e-9)
+    # Still images show vehicles from 0 on; the tracker gets weaker boxes too.
+    shown = np.array(expected) >= -1e-9
+    assert len(detector.detect(frame_with())) == shown.sum()
+    assert len(detector.search(frame_with()).vehicles) == (np.array(expected) >= -1.5).sum()
+
+
+def test_the_documented_probabilities_confirm_and_continue_tracks():
+    tracks = TrackParams()
+    assert [round(1 / (1 + np.exp(-score)), 2) for score in (
+        tracks.high_threshold, tracks.confirm_score, tracks.low_threshold
+    )] == [0.43, 0.55, 0.18]  # fmt: skip
+    for probability, shown in ((0.53, 0), (0.6, 1)):
+        detector = detector_from(returning([BOX], [probability]))
+        results = [detector.process(frame_with()) for _ in range(40)]
+        assert len(results[-1].shown) == shown
+
+
+def test_other_results_are_accepted():
+    columns = SimpleNamespace(xyxy=[BOX, [0, 0, 9, 9]], confidence=[0.9, 0.8], class_id=[2, 0])
+    for result in (columns, Detections([BOX], [0.9]), ([BOX], [0.9]), [np.array([BOX]), np.array([0.9])]):
+        found = detector_from(returning(result), class_ids=[2]).detect(frame_with())
+        assert found.boxes.tolist() == [BOX]
+        assert found.scores[0] == pytest.approx(np.log(9))
+    assert len(detector_from(returning(columns)).detect(frame_with())) == 2
+
+
+def test_boxes_are_clipped_and_those_outside_dropped():
+    boxes = [[-20, -5, 30, 40], [190, 100, 260, 150], [300, 10, 340, 40], [-9, -9, 0, 0]]
+    found = detector_from(returning(boxes, [0.9, 0.8, 0.7, 0.6])).detect(frame_with())
+    assert found.boxes.tolist() == [[0, 0, 30, 40], [190, 100, 200, 120]]
+
+
+@pytest.mark.parametrize(
+    ("result", "message"),
+    [
+        (None, r"expected the pair \(boxes, scores\), got None; for an image without vehicles return"),
+        (np.zeros((3, 4)), r"expected the pair \(boxes, scores\), got an array of shape \(3, 4\)"),
+        (([BOX], [0.9, 0.8]), "scores must be one number for each of the 1 boxes"),
+        (([BOX], [np.nan]), "scores must be finite"),
+        (([[0, 0, np.nan, 4]], [0.5]), "boxes must be finite"),
+        (([[50, 50, 20, 20]], [0.5]), "boxes given as .x, y, width, height. need x"),
+        (([BOX[:3]], [0.5]), r"boxes must be an \(N, 4\) number array"),
+        (([BOX], [7.2]), 'got 7.2 to 7.2; pass score="logit"'),
+    ],
+)
+def test_invalid_results_name_the_function_and_the_frame(result, message):
+    detector = detector_from(returning(result), name="my_detector")
+    start = "the function my_detector returned an invalid result for a frame of 200x120 pixels: "
+    with pytest.raises(DetectorError, match=start + ".*" + message):
+        detector.detect(frame_with())
+    with pytest.raises(DetectorError, match=r"^frame 0: the function my_detector"):
+        detector.process(frame_with())
+
+
+def test_a_failing_function_is_named_with_its_frame(tmp_path):
+    calls = []
+
+    def failing(image):
+        calls.append(None)
+        if len(calls) > 4:
+            raise RuntimeError("out of memory")
+        return [], []
+
+    detector = detector_from(failing)
+    for _ in range(4):
+        detector.process(frame_with())
+    message = (
+        "^frame 4: the function failing failed on a frame of 200x120 pixels: RuntimeError: out of memory"
+    )
+    with pytest.raises(DetectorError, match=message) as caught:
+        detector.process(frame_with())
+    assert isinstance(caught.value.__cause__.__cause__, RuntimeError)
+    clip = write_clip(tmp_path / "clip.mp4", [frame_with()] * 10, fps="25")
+    calls.clear()
+    with pytest.raises(DetectorError, match=r"^at 0.16 s: the function failing failed"):
+        process_video(clip, tmp_path / "out.mp4", detector, workers=1)
+    assert not (tmp_path / "out.mp4").exists()
+
+
+def test_the_function_gets_an_image_of_its_own():
+    def draws(image):
+        image[:] = 0
+        return [], []
+
+    frame = frame_with(BOX)
+    before = frame.copy()
+    detector_from(draws).process(frame)
+    np.testing.assert_array_equal(frame, before)
+
+
+@pytest.mark.parametrize("thread_safe", [False, True])
+def test_calls_wait_for_each_other_unless_the_function_is_thread_safe(thread_safe):
+    running, most, lock = 0, 0, threading.Lock()
+
+    def slow(image):
+        nonlocal running, most
+        with lock:
+            running += 1
+            most = max(most, running)
+        time.sleep(0.05)
+        with lock:
+            running -= 1
+        return [], []
+
+    detector = detector_from(slow, thread_safe=thread_safe)
+    threads = [threading.Thread(target=detector.search, args=(frame_with(),)) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most > 1 if thread_safe else most == 1
+
+
+def test_a_function_has_the_interface_of_a_model():
+    model = FunctionModel(function=find_red, score=(0, 8))
+    assert model.summary() == ("function find_red", {"scores": "0 to 8", "threshold": "default"})
+    detector = VehicleDetector(model, horizon=0.5)
+    assert detector.search_params == FunctionParams(horizon=0.5, horizon_tolerance=0.06)
+    with pytest.raises(InvalidInputError, match="method must be 'shared' for a function, got 'windows'"):
+        VehicleDetector(model, method="windows")
+    detector.warm_up()
+    detector.close()
+    heat = detector_from(find_red, region_params=HeatParams(weighting="count", peak_fraction=0))
+    assert heat.detect(frame_with(BOX)).boxes.tolist() == [BOX]
+    explorer = Explorer([frame_with(BOX)], FunctionModel(function=find_red))
+    assert explorer.boxes().boxes.tolist() == [BOX]
+    explorer.set_search(min_score=5.0)
+    assert len(explorer.windows()) == 0
+    assert explorer.render().shape == (*SHAPE, 3)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"function": 5}, "function must be a function of an image, got 5"),
+        ({"score": "percent"}, "score must be one of 'probability', 'logit'"),
+        ({"score": (2, 1)}, r"score\[1\] must be a number, greater than 2"),
+        ({"score": (0, 1), "threshold": 0.5}, "threshold must be omitted with"),
+        ({"threshold": 0}, "threshold must be a number, greater than 0"),
+        ({"thread_safe": "yes"}, "thread_safe must be a bool"),
+        ({"search_params": HeatParams()}, "search_params must be a FunctionParams"),
+    ],
+)
+def test_invalid_arguments_are_rejected(options, message):
+    options = {"function": find_red, **options}
+    with pytest.raises(InvalidInputError, match=message):
+        detector_from(options.pop("function"), **options)
+
+
+def test_a_function_as_the_model_names_the_remedy():
+    with pytest.raises(InvalidInputError, match=r"model must not be a function, .*; pass it"):
+        VehicleDetector(find_red)

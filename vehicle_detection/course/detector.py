@@ -1,0 +1,172 @@
+"""The course's detector: hits of the window search, their heat over several frames, threshold, labels."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection._common import check_integer, check_number, describe
+from vehicle_detection.classifier import VehicleClassifier
+from vehicle_detection.course.heat import draw_boxes
+from vehicle_detection.course.windows import find_car_windows
+from vehicle_detection.detector import FrameResult, VehicleDetector
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.function_model import FunctionModel
+from vehicle_detection.heatmap import heat_threshold
+from vehicle_detection.params import PATCH_SIZE, REFERENCE_WIDTH, HeatParams, SearchBand, SearchParams
+
+_HORIZON = 400 / 720
+
+
+class HeatmapDetector(VehicleDetector):
+    """Detect vehicles as in the course: search windows, add up the heat of the hits, threshold, label.
+
+    A `VehicleDetector` with the course's parameters: calling it with a frame draws the boxes, and
+    `process_video`, `annotate_clip`, `detect` and the evaluation work as usual.
+
+    Parameters
+    ----------
+    clf
+        ``"highway"``, the path of a model file, a `VehicleClassifier`, or any fitted classifier with
+        ``predict``, which needs `scaler`.
+    scaler
+        The fitted scaler with ``transform`` of such a classifier.
+    ystart, ystop
+        Rows to search in a 1280x720 frame; they scale with the frame.
+    scales
+        Sides of the windows divided by 64 pixels, in a frame 1280 wide.
+    cells_per_step
+        Step between windows in cells of 8 pixels.
+    threshold
+        A pixel is hot if more than this number of windows hit it, as the mean over the frames. None: chosen
+        for the density of the windows.
+    n_frames
+        Number of frames over which the heat is averaged.
+    **options
+        For a classifier with `scaler`, the features that it was trained on: arguments of `find_car_windows`
+        such as ``orient`` (default 9), ``pix_per_cell`` (8), ``cell_per_block`` (2), ``spatial_size``
+        ((32, 32)), ``hist_bins`` (32), ``color_space`` and ``divide_by``.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is malformed.
+    ModelFileError
+        If the model file is missing or damaged, or is not a classifier of patches.
+
+    Warns
+    -----
+    UserWarning
+        If the threshold cannot fit the density of the windows.
+
+    Examples
+    --------
+    >>> detector = HeatmapDetector(threshold=2)
+    >>> frame = np.full((720, 1280, 3), 90, np.uint8)
+    >>> np.array_equal(detector(frame), frame), float(detector.heatmap.max()), detector.labels[1]
+    (True, 0.0, 0)
+    """
+
+    def __init__(
+        self,
+        clf: Any = "highway",
+        scaler: Any = None,
+        *,
+        ystart: int = 400,
+        ystop: int = 656,
+        scales: Sequence[float] = (0.8, 1.0, 1.5),
+        cells_per_step: int = 2,
+        threshold: float | None = None,
+        n_frames: int = 5,
+        **options: Any,
+    ) -> None:
+        search = _search_params(ystart, ystop, scales, cells_per_step)
+        heat = HeatParams(weighting="count", frames=n_frames, threshold=threshold, peak_fraction=0)
+        if isinstance(clf, (str, os.PathLike, VehicleClassifier)):
+            if scaler is not None or options:
+                raise InvalidInputError(
+                    "scaler and options of the features must be omitted with a model of the library, which "
+                    f"contains them; got {describe(scaler)} and {sorted(options)}"
+                )
+            super().__init__(clf, search_params=search, region_params=heat)
+        else:
+            if not hasattr(clf, "predict") or not hasattr(scaler, "transform"):
+                raise InvalidInputError(
+                    "clf must be a model of the library, or a fitted classifier with a scaler; got "
+                    f"{describe(clf)} and {describe(scaler)}"
+                )
+            search_hits = _WindowSearch(clf, scaler, (ystart, ystop), tuple(scales), cells_per_step, options)
+            model = FunctionModel(
+                function=search_hits, score="logit", thread_safe=True, name="the window search"
+            )
+            super().__init__(model, region_params=heat.for_search(search), horizon=_HORIZON)
+        self._speed_warning = False
+
+    @property
+    def heatmap(self) -> NDArray[np.float32] | None:
+        """Mean number of hits per pixel over the last frames, ``(H, W)``; None before the first frame."""
+        return None if self._heat is None else self._heat.copy()
+
+    @property
+    def labels(self) -> tuple[NDArray[np.int32], int]:
+        """Label array ``(H, W)`` of the regions above the threshold, and their number."""
+        from scipy.ndimage import label
+
+        if self._heat is None or self._heat_params is None:
+            raise InvalidInputError("labels need a frame; call the detector with one first")
+        array, count = label(self._heat > heat_threshold(self._heat_params), structure=np.ones((3, 3)))
+        return array, count
+
+    def annotate(self, frame: NDArray[np.uint8], result: FrameResult) -> NDArray[np.uint8]:
+        """Draw the boxes of the hot regions on a copy of the frame, in the course's style."""
+        if self.diagnostics:
+            return super().annotate(frame, result)
+        return draw_boxes(frame, result.detections)
+
+
+def _search_params(ystart: int, ystop: int, scales: Sequence[float], cells_per_step: int) -> SearchParams:
+    """Bands with the windows of the lesson's ``find_cars`` at each scale."""
+    top = check_integer(ystart, "ystart", low=0)
+    bottom = check_integer(ystop, "ystop", low=top + 1)
+    overlap = 1 - check_integer(cells_per_step, "cells_per_step", low=1, high=8) / 8
+    given: object = scales
+    if not isinstance(given, (tuple, list, np.ndarray)) or not len(given):
+        raise InvalidInputError(
+            f"scales must be a list of numbers such as (1.0, 1.5), got {describe(scales)}"
+        )
+    sides = [PATCH_SIZE * check_number(scale, "scales", low=0.25, high=20) for scale in given]
+    y = (top - 400.0, bottom - 400.0)
+    bands = tuple(SearchBand(window=(side, side), y=y, overlap=(overlap, overlap)) for side in sides)
+    return SearchParams(bands=bands, horizon=_HORIZON)
+
+
+class _WindowSearch:
+    """The hits of ``find_cars`` at several scales: boxes, and scores of 1."""
+
+    def __init__(
+        self,
+        clf: Any,
+        scaler: Any,
+        rows: tuple[int, int],
+        scales: tuple[float, ...],
+        cells_per_step: int,
+        options: dict[str, Any],
+    ) -> None:
+        self._rows, self._scales = rows, scales
+        defaults = {"orient": 9, "pix_per_cell": 8, "cell_per_block": 2, "spatial_size": (32, 32)}
+        self._arguments = {"svc": clf, "X_scaler": scaler, "cells_per_step": cells_per_step}
+        self._arguments |= defaults | {"hist_bins": 32} | options
+
+    def __call__(self, image: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[np.float64]]:
+        factor = max(image.shape) / REFERENCE_WIDTH
+        ystart, ystop = (round(row * factor) for row in self._rows)
+        hits = [
+            box
+            for scale in self._scales
+            for box in find_car_windows(image, ystart, ystop, scale * factor, **self._arguments)
+        ]
+        return np.array(hits, np.float64).reshape(-1, 4), np.ones(len(hits))

@@ -1,0 +1,127 @@
+"""Detectors from elsewhere: any function that finds boxes in an image, as a model of `VehicleDetector`."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection._common import check_type, describe
+from vehicle_detection.boxes import (
+    Detections,
+    ScoreScale,
+    box_areas,
+    check_score_scale,
+    clip_boxes,
+    log_odds,
+)
+from vehicle_detection.errors import DetectorError, InvalidInputError
+from vehicle_detection.params import FunctionParams
+from vehicle_detection.search import FrameSearch
+
+DetectorFunction = Callable[[NDArray[np.uint8]], Any]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FunctionModel:
+    """A function as a model; `detector_from` documents the arguments and creates one."""
+
+    search_params_type: ClassVar[type[FunctionParams]] = FunctionParams
+
+    function: DetectorFunction
+    score: ScoreScale = "probability"
+    threshold: float | None = None
+    class_ids: Collection[int] | None = None
+    thread_safe: bool = False
+    name: str | None = None
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    _lock: contextlib.AbstractContextManager[Any] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not callable(self.function):
+            raise InvalidInputError(
+                f"function must be a function of an image, got {describe(self.function)}; it returns boxes "
+                "and scores"
+            )
+        check_type(self.thread_safe, "thread_safe", bool, "pass True or False")
+        name = self.name or getattr(self.function, "__name__", type(self.function).__name__)
+        object.__setattr__(self, "score", check_score_scale(self.score, self.threshold))
+        object.__setattr__(self, "name", name)
+        object.__setattr__(self, "_lock", contextlib.nullcontext() if self.thread_safe else threading.Lock())
+
+    def open_search(
+        self, n_jobs: int | None = None, method: Literal["shared", "windows"] = "shared"
+    ) -> FunctionSearch:
+        """Open a search of frames that calls the function; `n_jobs` has no effect.
+
+        Raises
+        ------
+        InvalidInputError
+            If `method` is ``"windows"``.
+        """
+        if method != "shared":
+            raise InvalidInputError(f"method must be 'shared' for a function, got {method!r}; omit it")
+        return FunctionSearch(self, n_jobs)
+
+    def summary(self) -> tuple[str, dict[str, str]]:
+        """Describe the model for display: a title, and named facts."""
+        scale = self.score if isinstance(self.score, str) else "{:g} to {:g}".format(*self.score)
+        threshold = "default" if self.threshold is None else f"{self.threshold:g}"
+        return f"function {self.name}", {"scores": scale, "threshold": threshold}
+
+    def find(self, frame: NDArray[np.uint8]) -> Detections:
+        """Call the function on a copy of a frame: boxes clipped to it, with log-odds."""
+        height, width = frame.shape[:2]
+        try:
+            with self._lock:
+                returned = self.function(frame.copy())
+        except Exception as error:
+            raise DetectorError(
+                f"the function {self.name} failed on a frame of {width}x{height} pixels: "
+                f"{type(error).__name__}: {error}"
+            ) from error
+        try:
+            found = self._convert(returned)
+        except InvalidInputError as error:
+            raise DetectorError(
+                f"the function {self.name} returned an invalid result for a frame of {width}x{height} "
+                f"pixels: {error}"
+            ) from error
+        boxes = clip_boxes(found.boxes.astype(np.float64), frame.shape)
+        inside = box_areas(boxes) > 0
+        return Detections(boxes[inside], found.scores[inside])
+
+    def _convert(self, returned: Any) -> Detections:
+        if hasattr(returned, "xyxy"):
+            return Detections.from_supervision(
+                returned, score=self.score, threshold=self.threshold, class_ids=self.class_ids
+            )
+        if isinstance(returned, Detections):
+            returned = (returned.boxes, returned.scores)
+        if not isinstance(returned, (tuple, list)) or len(returned) != 2:
+            raise InvalidInputError(
+                f"expected the pair (boxes, scores), got {describe(returned)}; for an image without vehicles "
+                "return ([], [])"
+            )
+        return Detections(returned[0], log_odds(returned[1], self.score, self.threshold))
+
+
+class FunctionSearch(FrameSearch):
+    """The search that calls a function for each frame."""
+
+    params_type = FunctionParams
+
+    def __init__(self, model: FunctionModel, n_jobs: int | None = None) -> None:
+        super().__init__(n_jobs)
+        self._model = model
+
+    def _search(
+        self, frame: NDArray[np.uint8], params: FunctionParams, min_vehicle_score: float
+    ) -> tuple[Detections, Detections]:
+        found = self._model.find(frame)
+        return found[found.scores >= params.min_score], found[found.scores >= min_vehicle_score]
