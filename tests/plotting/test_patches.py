@@ -65,9 +65,11 @@ def test_the_balance_counts_the_patches_of_each_source(patch_set):
 
 
 def test_the_balance_needs_a_set_with_patches(patch_set):
-    with pytest.raises(InvalidInputError, match="patch_set must be a PatchSet, got an array"):
+    with pytest.raises(InvalidInputError, match="patch_set must be a PatchSet with patches, got an array"):
         plotting.plot_balance(patch_set.patches)
-    with pytest.raises(InvalidInputError, match="patch_set must hold patches, got none"):
+    with pytest.raises(
+        InvalidInputError, match=r"patch_set must be a PatchSet with patches, got PatchSet\(0 "
+    ):
         plotting.plot_balance(patch_set[:0])
 
 
@@ -89,8 +91,7 @@ def test_near_duplicates_are_shown_below_each_other(duplicates):
     assert all(0.95 <= float(text.removeprefix("r = ")) <= 1 for text in texts(axes.texts)[4:])
     # the second row of pairs is not full
     wide = plotting.plot_near_duplicates(duplicates, pairs, count=13, ax=new_axes())
-    assert len(wide.images) == 40
-    assert len(wide.texts) == 26
+    assert len(wide.images) == len(wide.texts) == 26
 
 
 def test_near_duplicates_in_both_parts_of_a_split(duplicates):

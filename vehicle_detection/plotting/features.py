@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -14,21 +15,8 @@ from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import convert_color, extract_features, hog_blocks, hog_source
 from vehicle_detection.params import COLOR_SPACES, PATCH_SIZE, FeatureParams
-from vehicle_detection.plotting.style import (
-    COLORS,
-    LINE_COLORS,
-    OTHER,
-    VEHICLE,
-    FigureLike,
-    Image,
-    add_image,
-    check_length,
-    check_list,
-    check_numbers,
-    new_figure,
-    split_titles,
-    subplot_grid,
-)
+from vehicle_detection.plotting import style
+from vehicle_detection.plotting.style import COLORS, LINE_COLORS, OTHER, VEHICLE, FigureLike, Image
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -82,20 +70,20 @@ def add_glyphs(
 
     rows, columns, orient = cells.shape
     angles = np.pi * (np.arange(orient) + 0.5) / orient
-    row, column, bin_ = np.nonzero(cells > 0)
-    values = cells[row, column, bin_]
-    order = np.argsort(values, kind="stable")  # strong lines on top
-    row, column, bin_, values = row[order], column[order], bin_[order], values[order]
-    center = np.stack([column + 0.5, row + 0.5], axis=1) * size
     # An edge is perpendicular to its gradient, as drawn by skimage.feature.hog.
-    offset = np.stack([np.sin(angles), -np.cos(angles)], axis=1)[bin_] * (0.47 * size)
+    offsets = np.stack([np.sin(angles), -np.cos(angles)], axis=1) * (0.47 * size)
+    places = np.argwhere(cells > 0)
+    values = cells[cells > 0]
+    order = np.argsort(values, kind="stable")  # strong lines on top
+    row, column, bin_ = places[order].T
+    center = np.stack([column + 0.5, row + 0.5], axis=1) * size
     lines = LineCollection(
-        list(np.stack([center - offset, center + offset], axis=1)),
-        array=values,
+        list(np.stack([center - offsets[bin_], center + offsets[bin_]], axis=1)),
+        array=values[order],
         cmap="gray",
         linewidths=1.1 if columns <= _MANY_CELLS else 0.5,
     )
-    lines.set_clim(0, float(values.max()) if peak is None and len(values) else peak or 1.0)
+    lines.set_clim(0, peak or values.max(initial=0) or 1.0)
     ax.add_collection(lines, autolim=False)
     ax.set_facecolor("black")
     ax.set(xlim=(0, columns * size), ylim=(rows * size, 0), aspect="equal", xticks=[], yticks=[])
@@ -121,19 +109,15 @@ def plot_channels(
         One of ``COLOR_SPACES``.
     labels
         ``(N,)`` 1 for a vehicle, 0 for anything else: one curve per class. None takes those of a set.
-    points
-        Number of randomly chosen pixels per class in the lower panels; without labels each point has the
-        color of its pixel.
-    random_state
-        Seed of that choice.
-    figure
-        Where to draw; None for a new figure.
+    points, random_state
+        Number of randomly chosen pixels per class in the lower panels, and seed of the choice; without
+        labels each point has the color of its pixel.
+    figure : matplotlib.figure.Figure or SubFigure, optional
 
     Returns
     -------
     matplotlib.figure.Figure or SubFigure
-        Three panels with the histograms of the channels over all pixels; below, three scatter plots of
-        pairs of channels.
+        Three histograms of the channels over all pixels; below, three scatter plots of pairs of channels.
 
     Raises
     ------
@@ -151,8 +135,7 @@ def plot_channels(
     max_points = check_integer(points, "points", low=1, high=1_000_000)
     groups = _pixels_by_class(images, labels)
     names = channel_names(color_space)
-    figure = new_figure(figure, 11, 6)
-    upper, lower = subplot_grid(figure, 2, 3)
+    figure, (upper, lower) = style.new_panels(figure, (11, 6), 2, 3)
     converted = [convert_color(pixels[None], color_space)[0] for _, _, pixels in groups]
     for (label, color, pixels), values in zip(groups, converted):
         for channel, panel in enumerate(upper):
@@ -188,17 +171,16 @@ def _pixels_by_class(images: object, labels: ArrayLike | None) -> list[tuple[str
     elif isinstance(images, PatchSet):
         labels = images.labels if labels is None else labels
         images = images.patches
-    listed = check_list(images, "images", "images")
+    listed = style.check_list(images, "images", "images")
     flat = [check_image(image, f"images[{index}]").reshape(-1, 3) for index, image in enumerate(listed)]
-    known = check_numbers(labels, "labels", len(flat), "images")
+    known = style.check_numbers(labels, "labels", len(flat), "images")
     if known is None:
         return [(None, "0.35", np.concatenate(flat))]
-    groups = (("vehicle", VEHICLE, known > 0), ("other", OTHER, known <= 0))
-    return [
-        (name, color, np.concatenate([flat[row] for row in np.flatnonzero(mask)]))
-        for name, color, mask in groups
-        if mask.any()
-    ]
+    groups: list[tuple[str | None, Any, Image]] = []
+    for name, color, mask in (("vehicle", VEHICLE, known > 0), ("other", OTHER, known <= 0)):
+        if mask.any():
+            groups.append((name, color, np.concatenate(list(itertools.compress(flat, mask)))))
+    return groups
 
 
 def plot_hog(
@@ -218,18 +200,15 @@ def plot_hog(
     images
         One ``(H, W, 3)`` uint8 RGB image or several, such as a vehicle and a non-vehicle; the keys of a
         mapping are the titles.
-    params
-        Color space, channels, orientations and block; by default ``FeatureParams()``.
-    pix_per_cell
-        Cell sizes in pixels, one row of panels each.
-    figure
-        Where to draw; None for a new figure.
+    params, pix_per_cell
+        Color space, channels, orientations and block, by default ``FeatureParams()``; and cell sizes in
+        pixels, one row of panels each.
+    figure : matplotlib.figure.Figure or SubFigure, optional
 
     Returns
     -------
     matplotlib.figure.Figure or SubFigure
-        One column per image and channel: the channel in gray, and below it its HOG as one line collection per
-        cell size.
+        One column per image and channel: the channel in gray, and its HOG as a line collection per cell size.
 
     Raises
     ------
@@ -244,11 +223,9 @@ def plot_hog(
     """
     params = params or FeatureParams()
     single = isinstance(images, np.ndarray) and images.ndim == 3
-    listed, names = split_titles([images] if single else images)
-    cell_sizes = [
-        check_integer(cell, "pix_per_cell", low=2)
-        for cell in check_list(pix_per_cell, "pix_per_cell", "cell sizes")
-    ]
+    listed, names = style.split_titles([images] if single else images)
+    sizes = style.check_list(pix_per_cell, "pix_per_cell", "cell sizes")
+    cell_sizes = [check_integer(cell, "pix_per_cell", low=2) for cell in sizes]
     columns = []
     for index, (image, name) in enumerate(zip(listed, names)):
         source = hog_source(check_image(image, f"images[{index}]"), params)
@@ -257,21 +234,15 @@ def plot_hog(
     width = min(2.2, 12.5 / len(columns)) if len(columns) > 1 else 6.0
     height = width * columns[0][0].shape[0] / columns[0][0].shape[1]
     rows = 1 + len(cell_sizes)
-    figure = new_figure(figure, width * len(columns), height * rows + 0.4, layout="compressed")
-    grid = subplot_grid(figure, rows, len(columns))
-    for column, (channel_image, title) in zip(grid.T, columns):
-        add_image(column[0], channel_image, title, vmin=0, vmax=255)
-        for panel, cell in zip(column[1:], cell_sizes):
-            blocks = hog_blocks(
-                channel_image,
-                params.orient,
-                cell,
-                params.cell_per_block,
-                transform_sqrt=params.transform_sqrt,
-            )
-            sums, counts = sum_blocks(blocks)
+    size = width * len(columns), height * rows + 0.4
+    figure, grid = style.new_panels(figure, size, rows, len(columns), layout="compressed")
+    block, sqrt = params.cell_per_block, params.transform_sqrt
+    for (first, *others), (gray, title) in zip(grid.T, columns):
+        style.add_image(first, gray, title, vmin=0, vmax=255)
+        for panel, cell in zip(others, cell_sizes):
+            sums, counts = sum_blocks(hog_blocks(gray, params.orient, cell, block, transform_sqrt=sqrt))
             add_glyphs(panel, sums / counts, size=cell)
-            panel.set(xlim=(0, channel_image.shape[1]), ylim=(channel_image.shape[0], 0))
+            panel.set(xlim=(0, gray.shape[1]), ylim=(gray.shape[0], 0))
     for panel, cell in zip(grid[1:, 0], cell_sizes):
         panel.set_ylabel(f"{cell} px cells", fontsize=9)
     return figure
@@ -295,16 +266,12 @@ def plot_features(
     ----------
     patches
         ``(N, 64, 64, 3)`` uint8 RGB, or a set.
-    model
-        A classifier, whose scaler is used; or parameters, with the scaler fitted to all of `patches`.
-    rows
-        Row numbers of the patches to plot.
-    names
-        One name per row.
-    template
-        Number of the classifier's template whose scaler is used.
-    figure
-        Where to draw; None for a new figure.
+    model, template
+        A classifier and the number of the template whose scaler is used; or parameters, with the scaler
+        fitted to all of `patches`.
+    rows, names
+        Row numbers of the patches to plot, and one name per row.
+    figure : matplotlib.figure.Figure or SubFigure, optional
 
     Returns
     -------
@@ -324,15 +291,13 @@ def plot_features(
     2628
     """
     images = check_patches(patches.patches if isinstance(patches, PatchSet) else patches, PATCH_SIZE)
-    chosen = [
-        check_integer(row, "rows", low=0, high=len(images) - 1)
-        for row in check_list(rows, "rows", "row numbers")
-    ]
-    labels = check_length(names, "names", len(chosen), "rows")
+    numbers = style.check_list(rows, "rows", "row numbers")
+    chosen = [check_integer(row, "rows", low=0, high=len(images) - 1) for row in numbers]
+    labels = style.check_length(names, "names", len(chosen), "rows")
     params, mean, scale = _scaler(images, model, template)
     raw = extract_features(images[chosen], params)
-    figure = new_figure(figure, 11, 5.5)
-    above, below = subplot_grid(figure, 2, 1, sharex=True)[:, 0]
+    figure, grid = style.new_panels(figure, (11, 5.5), 2, 1, sharex=True)
+    above, below = grid.flat
     for panel, values in ((above, raw), (below, (raw - mean) / scale)):
         for line, label, color in zip(values, labels, LINE_COLORS * len(chosen)):
             panel.plot(line, linewidth=0.6, color=color, label=label)
@@ -366,32 +331,22 @@ def _scaler(
     return model, features.mean(axis=0), scale
 
 
-def part_bounds(params: FeatureParams) -> dict[str, tuple[int, int]]:
-    """Half-open range of feature numbers of each part of the vector."""
+def part_slices(params: FeatureParams) -> dict[str, slice]:
+    """Position of each part in the feature vector, if the vector has it."""
     lengths = {
         "spatial bins": params.spatial_length,
         "color histogram": params.hist_length,
         "HOG": params.hog_length - params.coarse_length,
         "coarse HOG": params.coarse_length,
     }
-    bounds, start = {}, 0
-    for name, length in lengths.items():
-        if length:
-            bounds[name] = (start, start + length)
-        start += length
-    return bounds
+    stops = itertools.accumulate(lengths.values())
+    return {name: slice(stop - lengths[name], stop) for name, stop in zip(lengths, stops) if lengths[name]}
 
 
 def _shade_parts(panel: Axes, params: FeatureParams) -> None:
     colors = (COLORS[1], COLORS[3], "0.6", COLORS[2])
-    for color, (name, (start, stop)) in zip(colors, part_bounds(params).items()):
-        panel.axvspan(start, stop, color=color, alpha=0.18, linewidth=0)
-        panel.annotate(
-            f"{name} ({stop - start:,})",
-            ((start + stop) / 2, 1.0),
-            xycoords=("data", "axes fraction"),
-            xytext=(0, 3),
-            textcoords="offset points",
-            ha="center",
-            fontsize=8,
-        )
+    for color, (name, part) in zip(colors, part_slices(params).items()):
+        panel.axvspan(part.start, part.stop, color=color, alpha=0.18, linewidth=0)
+        label, middle = f"{name} ({part.stop - part.start:,})", (part.start + part.stop) / 2
+        above = panel.get_xaxis_transform()
+        panel.annotate(label, (middle, 1.0), (0, 3), above, "offset points", ha="center", fontsize=8)

@@ -13,21 +13,8 @@ from numpy.typing import NDArray
 from vehicle_detection._common import check_image, check_integer, describe
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.plotting.style import (
-    SKY,
-    TRUTH,
-    Boxes,
-    FigureLike,
-    Image,
-    add_boxes,
-    add_image,
-    box_array,
-    check_displayable,
-    check_length,
-    filled_axes,
-    new_figure,
-    split_titles,
-)
+from vehicle_detection.plotting import style
+from vehicle_detection.plotting.style import SKY, TRUTH, Boxes, FigureLike, Image
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,18 +107,15 @@ def show_images(
 
     Parameters
     ----------
-    images
-        ``(H, W, 3)`` uint8 RGB, or ``(H, W)`` numbers, shown in gray; the keys of a mapping are the titles.
-    titles
-        One title per image.
-    boxes
-        Boxes to draw on each image, or None: `Detections`, `FrameBoxes` or ``(N, 4)``.
-    truth
-        Labelled boxes in the same form, drawn with dashed lines.
+    images, titles
+        ``(H, W, 3)`` uint8 RGB, or ``(H, W)`` numbers, shown in gray; and one title per image, by default the
+        keys if `images` is a mapping.
+    boxes, truth
+        Boxes to draw on each image, or None: `Detections`, `FrameBoxes` or ``(N, 4)``; and labelled boxes in
+        the same form, drawn with dashed lines.
     columns
         Images per row; None for up to three.
-    figure
-        Where to draw; None for a new figure.
+    figure : matplotlib.figure.Figure or SubFigure, optional
 
     Returns
     -------
@@ -150,22 +134,23 @@ def show_images(
     >>> [panel.get_title() for panel in figure.axes]
     ['first', 'second']
     """
-    listed, names = split_titles(images, titles)
-    shown = [check_displayable(image, f"images[{index}]") for index, image in enumerate(listed)]
+    listed, names = style.split_titles(images, titles)
+    shown = [style.check_displayable(image, f"images[{index}]") for index, image in enumerate(listed)]
     count = len(shown)
-    found = check_length(boxes, "boxes", count, "images")
-    true = check_length(truth, "truth", count, "images")
+    found = style.check_length(boxes, "boxes", count, "images")
+    true = style.check_length(truth, "truth", count, "images")
     per_row = min(3, count) if columns is None else check_integer(columns, "columns", low=1, high=100)
     rows = math.ceil(count / per_row)
     width = max(2.0, min(12.5 / per_row, 6.5))
     height = width * float(np.median([image.shape[0] / image.shape[1] for image in shown]))
-    figure = new_figure(figure, per_row * width, rows * (height + 0.3 * any(names)), layout="compressed")
-    for index, panel in enumerate(filled_axes(figure, rows, per_row, count)):
-        add_image(panel, shown[index], "" if names[index] is None else str(names[index]))
+    size = per_row * width, rows * (height + 0.3 * any(names))
+    figure, grid = style.new_panels(figure, size, rows, per_row, count=count, layout="compressed")
+    for index, (panel, image, name) in enumerate(zip(grid.flat, shown, names)):
+        style.add_image(panel, image, "" if name is None else str(name))
         if true[index] is not None:
-            add_boxes(panel, box_array(true[index], f"truth[{index}]"), TRUTH, linestyles="--")
+            style.add_boxes(panel, style.box_array(true[index], f"truth[{index}]"), TRUTH, linestyles="--")
         if found[index] is not None:
-            add_boxes(panel, box_array(found[index], f"boxes[{index}]"), SKY)
+            style.add_boxes(panel, style.box_array(found[index], f"boxes[{index}]"), SKY)
     return figure
 
 
@@ -180,14 +165,12 @@ def plot_methods(
 
     Parameters
     ----------
-    images
-        ``(H, W, 3)`` uint8 RGB; the keys of a mapping name the rows.
+    images, truth
+        ``(H, W, 3)`` uint8 RGB, with the keys of a mapping as names of the rows; and labelled boxes of each
+        image, drawn with dashed lines.
     methods
         For each method, its detections in each image.
-    truth
-        Labelled boxes of each image, drawn with dashed lines.
-    figure
-        Where to draw; None for a new figure.
+    figure : matplotlib.figure.Figure or SubFigure, optional
 
     Returns
     -------
@@ -213,15 +196,15 @@ def plot_methods(
             f"methods must map names to a list of Detections, got {describe(given)}; "
             'pass {"default": [detector.detect(image) for image in images]}'
         )
-    listed, rows = split_titles(images)
-    true = check_length(truth, "truth", len(listed), "images")
+    listed, rows = style.split_titles(images)
+    true = style.check_length(truth, "truth", len(listed), "images")
     for name, found in methods.items():
-        check_length(found, f"methods[{name!r}]", len(listed), "images")
+        style.check_length(found, f"methods[{name!r}]", len(listed), "images")
     shown, titles, boxes = [], [], []
     for index, (image, row) in enumerate(zip(listed, rows)):
         check_image(image, f"images[{index}]")
         for name, found in methods.items():
-            count = len(box_array(found[index], f"methods[{name!r}][{index}]"))
+            count = len(style.box_array(found[index], f"methods[{name!r}][{index}]"))
             prefix = "" if row is None else f"{row}, "
             shown.append(image)
             titles.append(f"{prefix}{name}: {count} box{'es' * (count != 1)}")

@@ -12,24 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from vehicle_detection._common import check_integer, check_type, describe
 from vehicle_detection.datasets import PatchSet, Split, make_thumbnails
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.plotting.style import (
-    OTHER,
-    VEHICLE,
-    Image,
-    add_tiles,
-    check_displayable,
-    check_length,
-    check_list,
-    check_numbers,
-    evenly_spaced,
-    hide_spines,
-    new_axes,
-)
+from vehicle_detection.plotting import style
+from vehicle_detection.plotting.style import OTHER, VEHICLE, Image
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-_REMEDY = "read one with load_training_patches, or build PatchSet(patches, labels, names)"
 
 
 def plot_patches(
@@ -48,18 +35,14 @@ def plot_patches(
     ----------
     patches
         A set, or ``(H, W, 3)`` images.
-    count
-        Maximum number of patches; of more, this many are chosen at even distances.
-    columns
-        Patches per row.
+    count, columns
+        Maximum number of patches, chosen at even distances if there are more, and patches per row.
     labels
         ``(N,)`` 1 for a vehicle, 0 for anything else. None takes those of a set, or draws no edges.
-    captions
-        One caption per patch; by default the source of a set's patches.
-    scores
-        ``(N,)`` numbers to add to the captions, such as decision values.
-    ax
-        Where to draw; None for a new figure.
+    captions, scores
+        One caption per patch, by default the source of a set's patches; and ``(N,)`` numbers to add to the
+        captions, such as decision values.
+    ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
@@ -84,26 +67,24 @@ def plot_patches(
         labels = patches.labels if labels is None else labels
         captions = captions or patches.sources.tolist()
     else:
-        images = check_list(patches, "patches", "images")
-    classes = check_numbers(labels, "labels", len(images), "patches")
-    texts = check_length(captions, "captions", len(images), "patches")
-    values = check_numbers(scores, "scores", len(images), "patches")
-    rows = evenly_spaced(len(images), check_integer(count, "count", low=1, high=1000)).tolist()
+        images = style.check_list(patches, "patches", "images")
+    classes = style.check_numbers(labels, "labels", len(images), "patches")
+    texts = style.check_length(captions, "captions", len(images), "patches")
+    values = style.check_numbers(scores, "scores", len(images), "patches")
+    rows = style.evenly_spaced(len(images), check_integer(count, "count", low=1, high=1000)).tolist()
     if not rows:
         raise InvalidInputError("patches must hold at least one patch; got none")
-    lines = [[texts[row]] if texts[row] else [] for row in rows]
-    if values is not None:
-        lines = [[*line, f"score {values[row]:+.2f}"] for line, row in zip(lines, rows)]
-    axes, _ = add_tiles(
-        ax,
-        [check_displayable(images[row], f"patches[{row}]") for row in rows],
-        ["\n".join(line) for line in lines],
-        columns=min(check_integer(columns, "columns", low=1, high=100), len(rows)),
-        inches=1.25,
-        caption_lines=max(map(len, lines)),
-        colors=None if classes is None else [VEHICLE if classes[row] else OTHER for row in rows],
+    tiles = []
+    for row in rows:
+        lines = [texts[row]] if texts[row] else []
+        lines += [] if values is None else [f"score {values[row]:+.2f}"]
+        tiles.append((style.check_displayable(images[row], f"patches[{row}]"), "\n".join(lines)))
+    caption_lines = any(texts[row] for row in rows) + (values is not None)
+    colors = None if classes is None else [VEHICLE if classes[row] else OTHER for row in rows]
+    axes, _ = style.add_tiles(
+        ax, tiles, columns=columns, inches=1.25, caption_lines=caption_lines, colors=colors
     )
-    if classes is not None:
+    if colors:
         _add_class_legend(axes)
     return axes
 
@@ -125,8 +106,7 @@ def plot_balance(patch_set: PatchSet, *, ax: Axes | None = None) -> Axes:
     ----------
     patch_set
         The patches.
-    ax
-        Where to draw; None for a new figure.
+    ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
@@ -148,28 +128,28 @@ def plot_balance(patch_set: PatchSet, *, ax: Axes | None = None) -> Axes:
     _check_patch_set(patch_set)
     counts = Counter(zip((~patch_set.labels).tolist(), patch_set.sources.tolist()))
     keys = sorted(counts)
-    axes = new_axes(ax, 7, 1.2 + 0.35 * len(keys))
+    axes = style.new_axes(ax, 7, 1.2 + 0.35 * len(keys))
     for other, name, color in ((False, "vehicles", VEHICLE), (True, "other", OTHER)):
         rows = [row for row, key in enumerate(keys) if key[0] == other]
         lengths = [counts[keys[row]] for row in rows]
         if rows:
             label = f"{name}: {sum(lengths):,} ({sum(lengths) / len(patch_set):.1%})"
-            axes.bar_label(
-                axes.barh(rows, lengths, color=color, label=label), fmt="{:,.0f}", padding=3, fontsize=9
-            )
+            bars = axes.barh(rows, lengths, color=color, label=label)
+            axes.bar_label(bars, fmt="{:,.0f}", padding=3, fontsize=9)
     axes.set_yticks(range(len(keys)), [source for _, source in keys])
-    axes.set_xlabel("patches")
     axes.margins(x=0.14)
     axes.legend(loc="upper left", bbox_to_anchor=(0, 1.0), ncols=2, frameon=False, fontsize=9)
-    axes.set_ylim(len(keys) - 0.4, -1.2)
-    hide_spines(axes)
+    axes.set(xlabel="patches", ylim=(len(keys) - 0.4, -1.2))
+    style.hide_spines(axes)
     return axes
 
 
-def _check_patch_set(patch_set: PatchSet) -> None:
-    check_type(patch_set, "patch_set", PatchSet, _REMEDY)
-    if not len(patch_set):
-        raise InvalidInputError(f"patch_set must hold patches, got none; {_REMEDY}")
+def _check_patch_set(patch_set: object) -> None:
+    if not isinstance(patch_set, PatchSet) or not len(patch_set):
+        raise InvalidInputError(
+            f"patch_set must be a PatchSet with patches, got {describe(patch_set)}; "
+            "read one with load_training_patches, or build PatchSet(patches, labels, names)"
+        )
 
 
 def plot_near_duplicates(
@@ -184,23 +164,19 @@ def plot_near_duplicates(
 
     Parameters
     ----------
-    patch_set
-        The patches.
-    pairs
-        ``(M, 2)`` row numbers, as `find_near_duplicates` returns.
+    patch_set, pairs
+        The patches, and ``(M, 2)`` of their row numbers, as `find_near_duplicates` returns.
     split
         A split of the patches: only pairs of a test patch (above) and a training patch are shown.
     count
-        Maximum number of pairs; of more, this many are chosen at even distances.
-    ax
-        Where to draw; None for a new figure.
+        Maximum number of pairs, chosen at even distances if there are more.
+    ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
     matplotlib.axes.Axes
-        Contains two images and two texts per pair: the source, and the correlation of the two patches. The
-        title states the percentage of patches that have a near duplicate, or of test patches that have
-        one in the training part.
+        Two images and two texts per pair: the source, and the correlation of the two patches. The title
+        states the percentage of (test) patches that have a near duplicate (in the training part).
 
     Raises
     ------
@@ -233,20 +209,17 @@ def plot_near_duplicates(
         total, title = len(split.test), "test patches have their nearest duplicate in the training part"
     if not len(rows):
         raise InvalidInputError("pairs must hold at least one pair to show; got none")
-    chosen = rows[evenly_spaced(len(rows), check_integer(count, "count", low=1, high=200))]
+    chosen = rows[style.evenly_spaced(len(rows), check_integer(count, "count", low=1, high=200))]
+    first, second = chosen.T
+    correlations = (make_thumbnails(patch_set[first]) * make_thumbnails(patch_set[second])).sum(axis=1)
+    above = [(patch_set.patches[row], patch_set.sources[row]) for row in first]
+    below = [(patch_set.patches[row], f"r = {value:.3f}") for row, value in zip(second, correlations)]
     columns = min(len(chosen), 10)
-    images: list[NDArray[Any]] = []
-    captions: list[str] = []
+    blank = [(None, "")] * (-len(chosen) % columns)
+    tiles: list[tuple[NDArray[Any] | None, str]] = []
     for start in range(0, len(chosen), columns):
-        first, second = chosen[start : start + columns].T
-        correlations = (make_thumbnails(patch_set[first]) * make_thumbnails(patch_set[second])).sum(axis=1)
-        blank = columns - len(first)
-        for side, texts in (
-            (first, patch_set.sources[first].tolist()),
-            (second, [f"r = {value:.3f}" for value in correlations]),
-        ):
-            images += [*patch_set.patches[side], *[np.full((1, 1, 3), 255, np.uint8)] * blank]
-            captions += [*texts, *[""] * blank]
-    axes, _ = add_tiles(ax, images, captions, columns=columns, inches=1.2, caption_lines=1)
+        for side in (above + blank, below + blank):
+            tiles += side[start : start + columns]
+    axes, _ = style.add_tiles(ax, tiles, columns=columns, inches=1.2)
     axes.set_title(f"{len(rows):,} of {total:,} {title} ({len(rows) / total:.1%})", fontsize=10)
     return axes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -21,21 +22,8 @@ from vehicle_detection.evaluation import (
     match_detections,
     prepare_evaluation,
 )
-from vehicle_detection.plotting.style import (
-    LINE_COLORS,
-    SKY,
-    TRUTH,
-    VERMILION,
-    Color,
-    Image,
-    add_boxes,
-    add_tiles,
-    hide_spines,
-    legend_above,
-    legend_lines,
-    line_styles,
-    new_axes,
-)
+from vehicle_detection.plotting import style
+from vehicle_detection.plotting.style import LINE_COLORS, SKY, TRUTH, VERMILION, Image
 from vehicle_detection.tuning import check_column, numeric_column, pareto_front
 
 if TYPE_CHECKING:
@@ -59,8 +47,7 @@ def plot_precision_recall(
         A result of `precision_recall_curve`, or a mapping from names to several.
     threshold
         Threshold to mark with a square; a dot marks the best F1.
-    ax
-        Where to draw; None for a new figure.
+    ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
@@ -83,23 +70,26 @@ def plot_precision_recall(
     if not named:
         raise InvalidInputError("curves must hold at least one curve; got none")
     checked = {str(name): _check_curve(curve, str(name)) for name, curve in named.items()}
-    limit = None if threshold is None else check_number(threshold, "threshold")
-    axes = new_axes(ax, 6.5, 6)
-    _add_f1_lines(axes)
-    for (name, (precision, recall, thresholds)), (color, dash) in zip(checked.items(), line_styles()):
+    limit = math.inf if threshold is None else check_number(threshold, "threshold")
+    axes = style.new_axes(ax, 6.5, 6)
+    for level in (0.2, 0.4, 0.6, 0.8, 0.9):
+        x = np.linspace(level / (2 - level), 1, 100)
+        axes.plot(x, level * x / (2 * x - level), color="0.85", linewidth=0.8, zorder=1)
+        axes.annotate(f"F1 {level:g}", (1, x[0]), fontsize=7, color="0.5", ha="right", va="bottom")
+    for (name, (precision, recall, thresholds)), (color, dash) in zip(checked.items(), style.line_styles()):
         f1, best_threshold = best_f1(precision, recall, thresholds)
         best = int(np.argmax(thresholds == best_threshold))
         text = f"best F1 {f1:.2f} at {best_threshold:.2f}"
         label = f"{name}: {text}" if name else text
         axes.plot(recall, precision, color=color, linestyle=dash, linewidth=1.8, label=label, zorder=3)
         axes.plot(recall[best], precision[best], "o", color=color, zorder=4)
-        used = np.flatnonzero(thresholds > limit) if limit is not None else np.empty(0, np.intp)
+        used = np.flatnonzero(thresholds > limit)
         if len(used):
             axes.plot(recall[used[-1]], precision[used[-1]], "s", color=color, mfc="white", zorder=4)
     axes.set(xlim=(0, 1.01), ylim=(0, 1.01), aspect="equal")
-    axes.set_xlabel("recall (fraction of vehicles found)")
-    axes.set_ylabel("precision (fraction of boxes that are correct)")
-    legend_above(axes, fontsize=8)
+    axes.set(xlabel="recall (fraction of vehicles found)")
+    axes.set(ylabel="precision (fraction of boxes that are correct)")
+    style.legend_above(axes, fontsize=8)
     return axes
 
 
@@ -116,13 +106,6 @@ def _check_curve(curve: object, name: str) -> Curve:
     return precision, recall, thresholds
 
 
-def _add_f1_lines(axes: Axes) -> None:
-    for f1 in (0.2, 0.4, 0.6, 0.8, 0.9):
-        recall = np.linspace(f1 / (2 - f1), 1, 100)
-        axes.plot(recall, f1 * recall / (2 * recall - f1), color="0.85", linewidth=0.8, zorder=1)
-        axes.annotate(f"F1 {f1:g}", (1, f1 / (2 - f1)), fontsize=7, color="0.5", ha="right", va="bottom")
-
-
 def plot_f1(
     scores: Mapping[str, DetectionScores] | Mapping[str, Mapping[str, DetectionScores]],
     *,
@@ -137,8 +120,7 @@ def plot_f1(
         Results of `evaluate_detections` by source; or by detector, then by source.
     metric
         ``"f1"``, ``"precision"``, ``"recall"``, ``"average_precision"`` or ``"mean_iou"``.
-    ax
-        Where to draw; None for a new figure.
+    ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
@@ -170,19 +152,19 @@ def plot_f1(
     sources = list(dict.fromkeys(source for by_source in detectors.values() for source in by_source))
     if not sources:
         raise InvalidInputError("scores must hold at least one source; got none")
-    axes = new_axes(ax, 2.5 + 1.3 * len(sources), 4)
+    axes = style.new_axes(ax, 2.5 + 1.3 * len(sources), 4)
     width = 0.8 / len(detectors)
     for number, (name, by_source) in enumerate(detectors.items()):
-        values = [getattr(by_source[source], metric) if source in by_source else np.nan for source in sources]
+        values = [getattr(by_source.get(source), metric, np.nan) for source in sources]
         positions = np.arange(len(sources)) + (number - (len(detectors) - 1) / 2) * width
         color = LINE_COLORS[number % len(LINE_COLORS)]
         bars = axes.bar(positions, values, width * 0.94, color=color, label=name)
         axes.bar_label(bars, ["" if np.isnan(v) else f"{v:.2f}" for v in values], padding=2, fontsize=8)
     axes.set_xticks(range(len(sources)), [str(source) for source in sources])
     axes.set(ylim=(0, 1.1), ylabel=_METRIC_NAMES.get(metric, metric))
-    hide_spines(axes)
+    style.hide_spines(axes)
     if nested:
-        legend_above(axes, 3)
+        style.legend_above(axes, 3)
     return axes
 
 
@@ -200,27 +182,22 @@ def plot_errors(
 
     Parameters
     ----------
-    frames
-        Frames with their true boxes.
-    predictions
-        Predicted boxes with scores, such as those of `FrameBoxes.from_detections`.
+    frames, predictions
+        Frames with their true boxes; and predicted boxes with scores, as `FrameBoxes.from_detections` makes.
     kind
         ``"missed"``: labelled vehicles without a detection, largest first, with the largest IoU of any
         detection. ``"false"``: detections without a labelled vehicle, highest score first.
     iou
         Minimum IoU of a detection and its vehicle, as in `evaluate_detections`.
-    count
-        Maximum number of errors to show.
-    columns
-        Crops per row.
-    ax
-        Where to draw; None for a new figure.
+    count, columns
+        Maximum number of errors to show, and crops per row.
+    ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
     matplotlib.axes.Axes
-        Contains one image per error, with dashed labelled boxes and solid detections. The title states the
-        total number of errors.
+        One image per error, with dashed labelled boxes and solid detections. The title states the total
+        number of errors.
 
     Raises
     ------
@@ -234,16 +211,14 @@ def plot_errors(
     >>> plot_errors(frames, FrameBoxes([], None, [], scores=[])).get_title()
     '1 of 1 vehicles missed'
     """
-    check_type(
-        frames, "frames", LabelledFrames, "pair frames and labels with LabelledFrames(name, frames, labels)"
-    )
+    check_type(frames, "frames", LabelledFrames, "pass LabelledFrames(name, frames, labels)")
     check_choice(kind, "kind", ("missed", "false"))
     min_iou = check_number(iou, "iou", above=0, high=1)
     max_count = check_integer(count, "count", low=1, high=1000)
     predictions, labels, keys = prepare_evaluation(predictions, frames.labels, frames.keys)
     matches = match_detections(predictions, labels, keys, min_iou)
     if kind == "missed":
-        side, rows = labels, np.setdiff1d(matches.usable, matches.match)
+        side, rows = labels, matches.missed
         title = f"{len(rows):,} of {len(matches.usable):,} vehicles missed"
         order = np.argsort(-box_areas(side.boxes[rows]), kind="stable")
     else:
@@ -252,33 +227,24 @@ def plot_errors(
         order = np.arange(len(rows)) if side.scores is None else np.argsort(-side.scores[rows], kind="stable")
     shown = rows[order[:max_count]].tolist()
     crops = [_crop(_read_frame(frames, side.frames[row]), side.boxes[row]) for row in shown]
-    axes, tiles = add_tiles(
-        ax,
-        [crop for crop, _ in crops],
-        [_caption(side, row, predictions, kind) for row in shown],
-        columns=min(check_integer(columns, "columns", low=1, high=100), max(len(shown), 1)),
-        inches=1.9,
-        caption_lines=2,
-    )
+    captions = [_caption(side, row, predictions, kind) for row in shown]
+    tiles = [(image, caption) for (image, _), caption in zip(crops, captions)]
+    axes, places = style.add_tiles(ax, tiles, columns=columns, inches=1.9, caption_lines=2)
     axes.set_title(title, fontsize=10)
-    for row, crop, tile in zip(shown, crops, tiles):
-        key = side.frames[row]
-        true = labels.frame(key)
-        _add_cropped_boxes(axes, true.boxes[~true.ignore], crop, tile, TRUTH, "--")
-        _add_cropped_boxes(axes, predictions.frame(key).boxes, crop, tile, SKY, "-")
-        if kind == "false":
-            _add_cropped_boxes(axes, side.boxes[[row]], crop, tile, VERMILION, "-")
+    entries = [("labelled", "0.6", "--"), ("detected", SKY, "-"), ("false positive", VERMILION, "-")]
+    entries = entries[: 2 if kind == "missed" else 3]
+    for row, (image, corner), (left, top, pixel) in zip(shown, crops, places):
+        true, found = labels.frame(side.frames[row]), predictions.frame(side.frames[row])
+        layers = (true.boxes[~true.ignore], found.boxes, side.boxes[[row]])
+        for boxes, color, (_, _, linestyle) in zip(layers, (TRUTH, SKY, VERMILION), entries):
+            clipped = clip_boxes(boxes - np.tile(corner, 2), image.shape)
+            clipped = clipped[(clipped[:, 2:] - clipped[:, :2] >= 2).all(axis=1)]
+            if len(clipped):
+                placed = clipped * pixel + np.array([left, top, left, top])
+                style.add_boxes(axes, placed, color, linewidths=1.3, linestyles=linestyle)
     if shown:
-        entries: list[tuple[str, Any, Any]] = [("labelled", "0.6", "--"), ("detected", SKY, "-")]
-        entries += [("false positive", VERMILION, "-")] if kind == "false" else []
-        axes.legend(
-            handles=legend_lines(*entries),
-            loc="upper right",
-            bbox_to_anchor=(1, 0),
-            ncols=3,
-            fontsize=8,
-            frameon=False,
-        )
+        options: dict[str, Any] = {"bbox_to_anchor": (1, 0), "ncols": 3, "fontsize": 8, "frameon": False}
+        axes.legend(handles=style.legend_lines(*entries), loc="upper right", **options)
     return axes
 
 
@@ -287,12 +253,8 @@ def _read_frame(frames: LabelledFrames, key: FrameKey) -> Image:
     return images[images.names.index(str(key))] if isinstance(images, FrameSet) else images[key]
 
 
-Crop = tuple[Image, tuple[int, int]]
-"""An image cut out of a frame, and the frame's pixel at its upper left corner."""
-
-
-def _crop(image: Image, box: NDArray[Any]) -> Crop:
-    """Cut out a square around the center of a box, 1.8 times its longer side."""
+def _crop(image: Image, box: NDArray[Any]) -> tuple[Image, tuple[int, int]]:
+    """Cut out a square around the center of a box, 1.8 times its longer side; and its upper left corner."""
     height, width = image.shape[:2]
     x, y = (box[:2] + box[2:]) / 2
     half = max(24.0, 0.9 * float((box[2:] - box[:2]).max()))
@@ -315,23 +277,6 @@ def _caption(side: FrameBoxes, row: int, predictions: FrameBoxes, kind: str) -> 
     return f"{name if len(name) <= 24 else '...' + name[-21:]}\n{text}"
 
 
-def _add_cropped_boxes(
-    axes: Axes,
-    boxes: NDArray[Any],
-    crop: Crop,
-    tile: tuple[float, float, float],
-    color: Color,
-    linestyle: str,
-) -> None:
-    """Draw the parts of boxes that lie inside a crop onto its tile (left, top, pixel size)."""
-    (image, corner), (left, top, pixel) = crop, tile
-    clipped = clip_boxes(boxes - np.tile(corner, 2), image.shape)
-    clipped = clipped[(clipped[:, 2:] - clipped[:, :2] >= 2).all(axis=1)]
-    if len(clipped):
-        placed = clipped * pixel + np.array([left, top, left, top])
-        add_boxes(axes, placed, color, linewidths=1.3, linestyles=linestyle)
-
-
 # Ratio of the largest to the smallest value above which the x axis is logarithmic.
 _LOG_RATIO = 20
 # Number of characters of tick labels that fit under the x axis without rotation.
@@ -352,14 +297,11 @@ def plot_tradeoff(
     ----------
     table
         Results of `compare_configurations` or `search_parameters`; rows without either value are left out.
-    quality
-        Column of the y axis; higher is better.
-    cost
-        Column of the x axis; lower is better.
+    quality, cost
+        Columns of the y axis, where higher is better, and of the x axis, where lower is better.
     label
         Column of the text beside the points of the front; None for no text.
-    ax
-        Where to draw; None for a new figure.
+    ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
@@ -383,7 +325,7 @@ def plot_tradeoff(
         raise InvalidInputError(f"table has no row with both {quality} and {cost}; measure them first")
     if label is not None:
         check_column(table, label)
-    axes = new_axes(ax)
+    axes = style.new_axes(ax)
     x, y = numeric_column(table, cost), numeric_column(table, quality)
     shown = ~np.isnan(x) & ~np.isnan(y)
     axes.scatter(x[shown], y[shown], s=24, color="0.6", label="measured", zorder=2)
@@ -391,12 +333,16 @@ def plot_tradeoff(
     if label is not None:
         for x, y, text in zip(front[cost], front[quality], front[label]):
             axes.annotate(str(text), (x, y), (4, 6), textcoords="offset points", fontsize=8)
-    axes.set_xlabel(cost.replace("_", " "))
-    axes.set_ylabel(quality.replace("_", " "))
+    _label_axes(axes, cost, quality)
     axes.margins(0.12)
-    axes.grid(alpha=0.3)
     axes.legend(loc="lower right")
     return axes
+
+
+def _label_axes(axes: Axes, x: str, y: str) -> None:
+    """Name the axes after columns, and draw a grid."""
+    axes.set(xlabel=x.replace("_", " "), ylabel=y.replace("_", " "))
+    axes.grid(alpha=0.3)
 
 
 def plot_parameter(
@@ -413,21 +359,18 @@ def plot_parameter(
     ----------
     table
         Results of `compare_configurations` or `search_parameters`; rows without the measurement are left out.
-    parameter
-        Column of the x axis, such as ``"C"`` or ``"orient"``.
-    quality
-        Column of the y axis, a measurement.
+    parameter, quality
+        Columns of the x axis, such as ``"C"`` or ``"orient"``, and of the y axis, a measurement.
     by
         Column that groups the rows into lines, such as ``"split"``; None for one line.
-    ax
-        Where to draw; None for a new figure.
+    ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
     matplotlib.axes.Axes
-        One line for each value of `by`. Error bars show the standard deviation over rows with the same
-        `parameter` and `by`. The x axis is logarithmic if its numbers span more than a factor of 20, and
-        evenly spaced if it holds text.
+        One line for each value of `by`, with the standard deviation over rows with the same `parameter` and
+        `by` as error bars. The x axis is logarithmic if its numbers span more than a factor of 20, and evenly
+        spaced if it holds text.
 
     Raises
     ------
@@ -444,42 +387,36 @@ def plot_parameter(
     columns = [parameter] if by is None else [parameter, by]
     for name in columns:
         check_column(table, name)
-    measured = table[~np.isnan(numeric_column(table, quality))].dropna(subset=columns)
+    measured = table[~np.isnan(numeric_column(table, quality))].dropna(subset=columns).reset_index(drop=True)
     if measured.empty:
         raise InvalidInputError(f"table has no row with both {parameter} and {quality}; measure them first")
-    axes = new_axes(ax)
-    values = measured[parameter].unique().tolist()
+    axes = style.new_axes(ax)
+    values = measured[parameter].tolist()
     numeric = all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
-    values = sorted(values) if numeric else values
-    x_of = {value: value if numeric else index for index, value in enumerate(values)}
+    x, names = (np.array(values), ()) if numeric else measured[parameter].factorize()
     groups = [(None, measured)] if by is None else measured.groupby(by, sort=False)
-    for (name, rows), (color, dash) in zip(groups, line_styles()):
-        runs = rows.groupby(parameter, sort=False)[quality].agg(["mean", "std"])
-        runs.index = runs.index.map(x_of)
-        runs = runs.sort_index()
-        axes.errorbar(
+    for (name, rows), (color, dash) in zip(groups, style.line_styles()):
+        runs = rows[quality].groupby(x[rows.index]).agg(["mean", "std"])
+        lines = axes.errorbar(
             runs.index,
             runs["mean"],
-            yerr=runs["std"],
+            runs["std"],
             fmt="o",
             linestyle=dash,
             color=color,
             capsize=3,
             markersize=4,
-            label=None if by is None else str(name),
         )
+        lines.set_label(None if by is None else str(name))
     if not numeric:
-        texts = [str(value) for value in values]
-        axes.set_xticks(range(len(values)), texts)
-        if max(map(len, texts)) * len(texts) > _MAX_TICK_CHARACTERS:
+        axes.set_xticks(range(len(names)), [str(name) for name in names])
+        if max(len(str(name)) for name in names) * len(names) > _MAX_TICK_CHARACTERS:
             axes.tick_params(axis="x", rotation=30)
             for label in axes.get_xticklabels():
                 label.set_horizontalalignment("right")
-    elif values[0] > 0 and values[-1] > _LOG_RATIO * values[0]:
+    elif x.min() > 0 and x.max() > _LOG_RATIO * x.min():
         axes.set_xscale("log")
-    axes.set_xlabel(parameter.replace("_", " "))
-    axes.set_ylabel(quality.replace("_", " "))
-    axes.grid(alpha=0.3)
+    _label_axes(axes, parameter, quality)
     if by is not None:
         axes.legend(title=by.replace("_", " "), fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
     return axes

@@ -5,27 +5,17 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check_number, check_type, describe
 from vehicle_detection.detector import FrameResult
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import NO_TRACK, FrameBoxes
-from vehicle_detection.plotting.style import (
-    COLORS,
-    LINESTYLES,
-    YELLOW,
-    Color,
-    FigureLike,
-    hide_spines,
-    legend_above,
-    new_axes,
-    new_figure,
-    subplot_grid,
-)
+from vehicle_detection.plotting import style
+from vehicle_detection.plotting.style import COLORS, LINESTYLES, YELLOW, Color, FigureLike
 from vehicle_detection.synthetic import VehicleTruth
 from vehicle_detection.video import VideoReport
 
@@ -34,12 +24,12 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-_QUANTITIES = {
-    "center": "center of the box, x (px)",
-    "width": "width of the box (px)",
-    "distance": "distance (m)",
-    "speed": "speed relative to\nthe camera (m/s)",
-}
+_LABELS = (
+    "center of the box, x (px)",
+    "width of the box (px)",
+    "distance (m)",
+    "speed relative to\nthe camera (m/s)",
+)
 # A line is interrupted where consecutive rows are more than this many frames apart.
 _MAX_GAP = 1.5
 # Replaces the yellow of the video, which is hard to see on white.
@@ -48,12 +38,8 @@ _DARK_YELLOW = (0.80, 0.73, 0.1)
 _STAGES = ("decode", "search", "regions", "track", "draw", "encode")
 
 
-class _TrackSeries(NamedTuple):
-    """One track over time: columns of equal length, NaN where a value is unknown."""
-
-    time: Floats
-    values: dict[str, Floats]
-    stds: dict[str, Floats]
+Tracks = dict[int, Floats]
+"""``(N, 9)`` rows of each track by its number: time, the values of the panels, and their standard errors."""
 
 
 def plot_tracks(
@@ -74,12 +60,9 @@ def plot_tracks(
     truth
         True boxes, drawn as black dots: labels, or the ``truth`` of a rendered drive, which includes
         distances and speeds. Ignored boxes are left out.
-    fps
-        Frame rate, for frames without a time.
-    min_frames
-        Tracks with fewer frames are left out.
-    figure
-        Where to draw; None for a new figure.
+    fps, min_frames
+        Frame rate, for frames without a time; and number of frames below which a track is left out.
+    figure : matplotlib.figure.Figure or SubFigure, optional
 
     Returns
     -------
@@ -102,37 +85,33 @@ def plot_tracks(
     rate = check_number(fps, "fps", above=0, high=1e6)
     shortest = check_number(min_frames, "min_frames", low=1)
     if isinstance(results, FrameBoxes):
-        tracks = _series_of_boxes(results, rate, "results")
+        tracks = _tracks_of_boxes(results, rate, "results")
     else:
-        tracks = _series_of_results(results, rate)
-    tracks = {number: series for number, series in tracks.items() if len(series.time) >= shortest}
+        tracks = _tracks_of_results(results, rate)
+    tracks = {number: rows for number, rows in tracks.items() if len(rows) >= shortest}
     if not tracks:
         raise InvalidInputError(
             "results must hold at least one track to plot, got none; pass results with shown tracks"
         )
-    figure = new_figure(figure, 10, 9)
-    axes = dict(zip(_QUANTITIES, subplot_grid(figure, len(_QUANTITIES), 1, sharex=True)[:, 0]))
-    for number, series in sorted(tracks.items()):
-        color, style = _track_style(number)
-        time, values, stds = _insert_gaps(series, rate)
-        for name, panel in axes.items():
-            value = values[name]
-            panel.plot(time, value, color=color, linestyle=style, linewidth=1.8, label=f"#{number}")
-            if name in stds:
-                low, high = value - stds[name], value + stds[name]
-                panel.fill_between(time, low, high, color=color, alpha=0.25, linewidth=0)
+    figure, grid = style.new_panels(figure, (10, 9), 4, 1, sharex=True)
+    for number, rows in tracks.items():
+        color, dash = _track_style(number)
+        time, *columns = _insert_gaps(rows, rate).T
+        for panel, values, stds in zip(grid.flat, columns[:4], columns[4:]):
+            panel.plot(time, values, color=color, linestyle=dash, linewidth=1.8, label=f"#{number}")
+            if not np.isnan(stds).all():
+                panel.fill_between(time, values - stds, values + stds, color=color, alpha=0.25, linewidth=0)
     if truth is not None:
-        true_tracks = _series_of_boxes(_truth_boxes(truth), rate, "truth").values()
-        for index, series in enumerate(true_tracks):
-            for name, panel in axes.items():
-                label = None if index else "truth"
-                panel.plot(series.time, series.values[name], "k.", markersize=2, label=label)
-    for name, panel in axes.items():
-        panel.set_ylabel(_QUANTITIES[name])
+        true_tracks = _tracks_of_boxes(_truth_boxes(truth), rate, "truth").values()
+        for index, (time, *columns) in enumerate(rows.T for rows in true_tracks):
+            for panel, values in zip(grid.flat, columns):
+                panel.plot(time, values, "k.", markersize=2, label=None if index else "truth")
+    for panel, label in zip(grid.flat, _LABELS):
+        panel.set_ylabel(label)
         panel.grid(alpha=0.3)
-    axes["speed"].axhline(0, color="black", linewidth=0.6)
-    axes["speed"].set_xlabel("time (s)")
-    handles, labels = axes["center"].get_legend_handles_labels()
+    panel.axhline(0, color="black", linewidth=0.6)
+    panel.set_xlabel("time (s)")
+    handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", fontsize=9, title="track")
     return figure
 
@@ -165,69 +144,57 @@ def _truth_boxes(truth: object) -> FrameBoxes:
     )
 
 
-def _series_of_results(results: object, rate: float) -> dict[int, _TrackSeries]:
+def _tracks_of_results(results: object, rate: float) -> Tracks:
     if not isinstance(results, Iterable):
         raise InvalidInputError(
             f"results must be the FrameResult of each frame, or FrameBoxes; got {describe(results)}; "
             "collect what detector.process returns"
         )
-    rows: dict[int, list[tuple[float | None, ...]]] = {}
+    numbers, rows = [], []
     for result in results:
         check_type(result, "results", FrameResult, "collect what detector.process returns")
         time = result.index / rate if result.time is None else result.time
         for track in result.shown:
             x1, _, x2, _ = track.box.tolist()
-            estimates = (track.distance_m, track.distance_std_m, track.speed_mps, track.speed_std_mps)
-            rows.setdefault(track.id, []).append((time, (x1 + x2) / 2, x2 - x1, *estimates))
-    tracks = {}
-    for number, listed in rows.items():
-        # None becomes NaN.
-        time, center, width, distance, distance_std, speed, speed_std = np.array(listed, np.float64).T
-        tracks[number] = _TrackSeries(
-            time,
-            {"center": center, "width": width, "distance": distance, "speed": speed},
-            {"distance": distance_std, "speed": speed_std},
-        )
-    return tracks
+            numbers.append(track.id)
+            rows.append((
+                time, (x1 + x2) / 2, x2 - x1, track.distance_m, track.speed_mps,
+                None, None, track.distance_std_m, track.speed_std_mps,
+            ))  # fmt: skip
+    return _split_tracks(numbers, np.array(rows, np.float64))  # None becomes NaN
 
 
-def _series_of_boxes(labels: FrameBoxes, rate: float, name: str) -> dict[int, _TrackSeries]:
+def _tracks_of_boxes(labels: FrameBoxes, rate: float, name: str) -> Tracks:
     if any(isinstance(key, str) for key in labels.frame_keys):
         raise InvalidInputError(
             f"{name} must have numbered frames, got names such as {labels.frame_keys[0]!r}; "
             "convert them with FrameBoxes.renamed"
         )
-    times = np.array([int(key) for key in labels.frames], np.float64) / rate
-    unknown = np.full(len(labels), math.nan)
+    rows = np.full((len(labels), 9), math.nan)
     x1, _, x2, _ = labels.boxes.T
-    columns = {
-        "center": (x1 + x2) / 2,
-        "width": x2 - x1,
-        "distance": unknown if labels.distance_m is None else labels.distance_m,
-        "speed": unknown if labels.speed_mps is None else labels.speed_mps,
-    }
-    tracks = {}
-    for number in np.unique(labels.tracks[labels.tracks != NO_TRACK]).tolist():
-        rows = np.flatnonzero(labels.tracks == number)
-        rows = rows[np.argsort(times[rows], kind="stable")]
-        values = {name: column[rows] for name, column in columns.items()}
-        tracks[number] = _TrackSeries(times[rows], values, {})
-    return tracks
+    rows[:, 0] = np.array(labels.frames, np.float64) / rate
+    rows[:, 1], rows[:, 2] = (x1 + x2) / 2, x2 - x1
+    # None becomes NaN.
+    rows[:, 3], rows[:, 4] = labels.distance_m, labels.speed_mps
+    order = np.argsort(rows[:, 0], kind="stable")
+    return _split_tracks(labels.tracks[order], rows[order])
 
 
-def _insert_gaps(series: _TrackSeries, rate: float) -> _TrackSeries:
+def _split_tracks(numbers: ArrayLike, rows: Floats) -> Tracks:
+    """Rows of each track, in ascending order of their numbers."""
+    known = np.asarray(numbers, np.int64)
+    return {number: rows[known == number] for number in np.unique(known[known != NO_TRACK]).tolist()}
+
+
+def _insert_gaps(rows: Floats, rate: float) -> Floats:
     """Insert a row of NaN where frames are missing, so that the line is interrupted."""
-    steps = np.diff(series.time)
-    usual = max(1 / rate, float(steps.min(initial=math.inf)) if len(steps) else 0.0)
+    time = rows[:, 0]
+    steps = np.diff(time)
+    usual = max(1 / rate, steps.min(initial=math.inf))
     after = np.flatnonzero(steps > _MAX_GAP * usual) + 1
-
-    def insert_nan(columns: dict[str, Floats]) -> dict[str, Floats]:
-        return {name: np.insert(values, after, math.nan) for name, values in columns.items()}
-
-    middle = (series.time[after - 1] + series.time[after]) / 2
-    return _TrackSeries(
-        np.insert(series.time, after, middle), insert_nan(series.values), insert_nan(series.stds)
-    )
+    gaps = np.full((len(after), rows.shape[1]), math.nan)
+    gaps[:, 0] = (time[after - 1] + time[after]) / 2
+    return np.insert(rows, after, gaps, axis=0)
 
 
 Run = VideoReport | Sequence[FrameResult]
@@ -239,16 +206,14 @@ def plot_stage_times(runs: Run | Mapping[str, Run], *, ax: Axes | None = None) -
     Parameters
     ----------
     runs
-        The report of `process_video`, or the detector's result of each frame; or a mapping from names to
-        several of them.
-    ax
-        Where to draw; None for a new figure.
+        The report of `process_video`, or the detector's result of each frame; or several of them by name.
+    ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
     matplotlib.axes.Axes
-        Contains a stacked bar per run, in milliseconds per frame. Stages of a video run in parallel, so the
-        bar may be longer than the time between two frames.
+        A stacked bar per run, in milliseconds per frame. Stages of a video run in parallel, so the bar may
+        be longer than the time between two frames.
 
     Raises
     ------
@@ -266,11 +231,11 @@ def plot_stage_times(runs: Run | Mapping[str, Run], *, ax: Axes | None = None) -
     if not named:
         raise InvalidInputError("runs must hold at least one run; got none")
     times = {str(name): _stage_milliseconds(run) for name, run in named.items()}
-    known = dict.fromkeys(stage for stages in times.values() for stage in stages)
-    stages = sorted(known, key=lambda stage: _STAGES.index(stage) if stage in _STAGES else len(_STAGES))
-    axes = new_axes(ax, 9, 1.3 + 0.55 * len(times))
+    stages = list(dict.fromkeys([*_STAGES, *(stage for run in times.values() for stage in run)]))
+    stages = [stage for stage in stages if any(stage in run for run in times.values())]
+    axes = style.new_axes(ax, 9, 1.3 + 0.55 * len(times))
     left = np.zeros(len(times))
-    longest = max(sum(stages.values()) for stages in times.values())
+    longest = max(sum(run.values()) for run in times.values())
     for number, stage in enumerate(stages):
         values = np.array([run.get(stage, 0.0) for run in times.values()])
         color = COLORS[number % len(COLORS)]
@@ -285,8 +250,8 @@ def plot_stage_times(runs: Run | Mapping[str, Run], *, ax: Axes | None = None) -
     axes.invert_yaxis()
     axes.margins(x=0.12)
     axes.set_xlabel("work (ms per frame)")
-    legend_above(axes, max(len(stages), 1))
-    hide_spines(axes)
+    style.legend_above(axes, max(len(stages), 1))
+    style.hide_spines(axes)
     return axes
 
 

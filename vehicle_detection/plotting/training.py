@@ -12,36 +12,12 @@ from vehicle_detection._common import check_integer, check_number, check_type, d
 from vehicle_detection.classifier import CLASSIFIER_REMEDY, Template, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import PATCH_SIZE, FeatureParams
-from vehicle_detection.plotting.features import (
-    add_glyphs,
-    channel_names,
-    hog_channel_names,
-    part_bounds,
-    sum_blocks,
-)
-from vehicle_detection.plotting.style import (
-    OTHER,
-    VEHICLE,
-    FigureLike,
-    add_image,
-    check_scores,
-    legend_above,
-    new_axes,
-    new_figure,
-    subplot_grid,
-)
+from vehicle_detection.plotting import features, style
+from vehicle_detection.plotting.style import OTHER, VEHICLE, FigureLike
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_TO_RGB = {
-    "HSV": cv2.COLOR_HSV2RGB,
-    "LUV": cv2.COLOR_LUV2RGB,
-    "HLS": cv2.COLOR_HLS2RGB,
-    "YUV": cv2.COLOR_YUV2RGB,
-    "YCrCb": cv2.COLOR_YCrCb2RGB,
-    "LAB": cv2.COLOR_LAB2RGB,
-}
 # Largest difference, in gray levels, between the mean patch and the patch shifted along the weights.
 _MAX_SHIFT = 110.0
 
@@ -57,12 +33,9 @@ def plot_weights(
 
     Parameters
     ----------
-    classifier
-        The trained model.
-    template
-        Number of the template.
-    figure
-        Where to draw; None for a new figure.
+    classifier, template
+        The trained model, and the number of its template.
+    figure : matplotlib.figure.Figure or SubFigure, optional
 
     Returns
     -------
@@ -86,22 +59,21 @@ def plot_weights(
     number = check_integer(template, "template", low=0, high=len(classifier.templates) - 1)
     chosen = classifier.templates[number]
     params = classifier.params
-    names = channel_names(params.color_space)
-    titles = ["HOG, positive", "HOG, negative"] if params.hog_feat else []
-    titles += ["coarse HOG, positive", "coarse HOG, negative"] if params.coarse_length else []
+    names = features.channel_names(params.color_space)
+    weights = {part: chosen.coef[rows] for part, rows in features.part_slices(params).items()}
+    hogs = {"HOG": params.blocks, "coarse HOG": params.coarse_blocks}
+    titles = [f"{part}, {sign}" for part in hogs if part in weights for sign in ("positive", "negative")]
     titles += ["spatial bins"] if params.spatial_feat else []
     titles += ["histogram"] if params.hist_feat else []
     titles += ["in color"] if params.spatial_feat else []
-    figure = new_figure(figure, min(2.6 * len(titles), 15), 7.2)
-    grid = subplot_grid(figure, 3, len(titles))
+    figure, grid = style.new_panels(figure, (min(2.6 * len(titles), 15), 7.2), 3, len(titles))
     columns = dict(zip(titles, grid.T))
     for title, column in columns.items():
         column[0].set_title(title, fontsize=10)
-    weights = {name: chosen.coef[start:stop] for name, (start, stop) in part_bounds(params).items()}
-    if params.hog_feat:
-        _add_hog_weights(grid[:, :2], weights["HOG"], params, params.blocks)
-    if params.coarse_length:
-        _add_hog_weights(grid[:, 2:4], weights["coarse HOG"], params, params.coarse_blocks)
+    for part, blocks in hogs.items():
+        if part in weights:
+            pair = columns[f"{part}, positive"], columns[f"{part}, negative"]
+            _add_hog_weights(np.stack(pair, axis=1), weights[part], params, blocks)
     if params.spatial_feat:
         _add_spatial_weights(columns["spatial bins"], weights["spatial bins"], params, names)
         _add_shifted_patches(columns["in color"], chosen, params)
@@ -116,11 +88,11 @@ def _add_hog_weights(
     """Draw the HOG weights of all channels; the patch has ``(blocks, blocks)`` blocks."""
     block = params.cell_per_block
     shape = (params.hog_channels, blocks, blocks, block, block, params.orient)
-    cells = [sum_blocks(channel)[0] for channel in weights.reshape(shape)]
+    cells = [features.sum_blocks(channel)[0] for channel in weights.reshape(shape)]
     peak = float(np.abs(cells).max()) or 1.0
-    for row, channel, name in zip(grid, cells, hog_channel_names(params)):
+    for row, channel, name in zip(grid, cells, features.hog_channel_names(params)):
         for panel, signed in zip(row, (channel, -channel)):
-            add_glyphs(panel, signed.clip(0), size=PATCH_SIZE / len(signed), peak=peak)
+            features.add_glyphs(panel, signed.clip(0), size=PATCH_SIZE / len(signed), peak=peak)
         row[0].set_ylabel(f"channel {name}", fontsize=9)
     for panel in grid[len(cells) :].flat:
         panel.remove()
@@ -132,7 +104,7 @@ def _add_spatial_weights(
     maps = weights.reshape(3, params.spatial_size, params.spatial_size)
     top = float(np.abs(maps).max()) or 1.0
     for panel, values, name in zip(column, maps, names):
-        add_image(panel, values, cmap="PuOr_r", vmin=-top, vmax=top)
+        style.add_image(panel, values, cmap="PuOr_r", vmin=-top, vmax=top)
         panel.set_ylabel(name, fontsize=9)
         bar = panel.figure.colorbar(panel.images[0], ax=panel, shrink=0.8)
         bar.ax.tick_params(labelsize=6)
@@ -161,34 +133,24 @@ def _add_shifted_patches(column: NDArray[Any], template: Template, params: Featu
         patch = values.reshape(3, size, size).transpose(1, 2, 0)
         limits = [179 if params.color_space in ("HSV", "HLS") else 255, 255, 255]
         patch = np.ascontiguousarray(patch.clip(0, limits).round().astype(np.uint8))
-        if params.color_space in _TO_RGB:
-            patch = np.asarray(cv2.cvtColor(patch, _TO_RGB[params.color_space]), np.uint8)
-        add_image(panel, patch)
+        if params.color_space != "RGB":
+            patch = np.asarray(cv2.cvtColor(patch, getattr(cv2, f"COLOR_{params.color_space}2RGB")), np.uint8)
+        style.add_image(panel, patch)
         panel.set_xlabel(name, fontsize=9)
 
 
 def plot_scores(
-    scores: ArrayLike,
-    labels: ArrayLike,
-    *,
-    threshold: float = 0.0,
-    bins: int = 60,
-    ax: Axes | None = None,
+    scores: ArrayLike, labels: ArrayLike, *, threshold: float = 0.0, bins: int = 60, ax: Axes | None = None
 ) -> Axes:
     """Plot histograms of the scores of both classes, on a logarithmic scale that makes errors visible.
 
     Parameters
     ----------
-    scores
-        ``(N,)`` decision values.
-    labels
-        ``(N,)`` 1 for a vehicle, 0 for anything else.
-    threshold
-        Score above which a patch is classified as a vehicle.
-    bins
-        Number of bins over the range of the scores.
-    ax
-        Where to draw; None for a new figure.
+    scores, labels
+        ``(N,)`` decision values, and ``(N,)`` 1 for a vehicle, 0 for anything else.
+    threshold, bins
+        Score above which a patch is classified as a vehicle, and number of bins over the range of the scores.
+    ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
@@ -208,18 +170,16 @@ def plot_scores(
     """
     from matplotlib.ticker import LogFormatter
 
-    values, known = check_scores(scores, "scores"), np.asarray(labels)
+    values, known = style.check_scores(scores, "scores"), np.asarray(labels)
     if known.shape != values.shape or not np.isin(known, (0, 1)).all():
         raise InvalidInputError(
             f"labels must be 0 or 1 for each of the {len(values)} scores; got {describe(known)}"
         )
     limit = check_number(threshold, "threshold")
     edges = _bin_edges(values, limit, check_integer(bins, "bins", low=1, high=10_000))
-    axes = new_axes(ax)
-    for vehicle, color, name, error in (
-        (True, VEHICLE, "vehicles", "missed"),
-        (False, OTHER, "other", "classified as vehicles"),
-    ):
+    axes = style.new_axes(ax)
+    classes = ((1, VEHICLE, "vehicles", "missed"), (0, OTHER, "other", "classified as vehicles"))
+    for vehicle, color, name, error in classes:
         own = values[known == vehicle]
         errors = int(((own > limit) != vehicle).sum())
         counts = np.histogram(own, edges)[0]
@@ -227,13 +187,12 @@ def plot_scores(
         label = f"{name}: {errors:,} of {len(own):,} {error}"
         axes.stairs(counts, edges, color=color, linewidth=1.4, label=label)
     axes.axvline(limit, color="black", linestyle="--", linewidth=1, label=f"threshold {limit:g}")
-    axes.set_yscale("log")
+    axes.set(yscale="log", xlabel="score (decision value)", ylabel="patches")
     axes.set_ylim(bottom=0.7)
     # The default formatter writes 4x10^0 on an axis of less than a decade.
     axes.yaxis.set_major_formatter("{x:,.0f}")
     axes.yaxis.set_minor_formatter(LogFormatter())
-    axes.set(xlabel="score (decision value)", ylabel="patches")
-    legend_above(axes, 3)
+    style.legend_above(axes, 3)
     return axes
 
 
