@@ -16,20 +16,7 @@ from vehicle_detection.tuning.search import compare_configurations, search_param
 from vehicle_detection.tuning.trials import TrialOptions
 
 __all__ = [
-    "FeatureCache",
-    "RowStore",
-    "TrialConfig",
-    "TrialOptions",
-    "check_column",
-    "compare_configurations",
-    "digest_of",
-    "expand_grid",
-    "make_table",
-    "mine_negatives",
-    "numeric_column",
-    "pareto_front",
-    "parse_grid",
-    "read_results",
-    "search_parameters",
-    "write_results",
-]
+    "FeatureCache", "RowStore", "TrialConfig", "TrialOptions", "check_column", "compare_configurations",
+    "digest_of", "expand_grid", "make_table", "mine_negatives", "numeric_column", "pareto_front",
+    "parse_grid", "read_results", "search_parameters", "write_results",
+]  # fmt: skip

@@ -74,12 +74,10 @@ class FeatureCache:
     def rows(
         self, params: FeatureParams, rows: NDArray[np.intp], *, mirrored: bool = False
     ) -> NDArray[np.float32]:
-        """Features of some patches as a new array ``(len(rows), length)`` float32.
-
-        If the set is not cached, few rows are computed without the others.
-        """
+        """Features of some patches as a new ``(len(rows), length)`` float32 array."""
         path = self._path(params, mirrored)
         cached = (params, mirrored) in self._in_memory or (path is not None and path.exists())
+        # Few rows of an uncached set are computed without the others.
         if not cached and len(rows) < len(self.patches) / 4:
             return self._compute(params, mirrored, rows)
         return self.all(params, mirrored=mirrored)[rows]

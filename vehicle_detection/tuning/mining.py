@@ -32,7 +32,8 @@ def mine_negatives(
     """Cut the false positive windows of labelled frames out as training patches.
 
     A window is a false positive if it touches no labelled box, whether that box is scored or ignored. Every
-    vehicle in the frames must therefore be labelled, at least coarsely. Do not evaluate on mined frames.
+    vehicle in the frames must therefore be labelled, at least coarsely. Do not evaluate on mined frames. The
+    detector is then trained again with its false positives (Dalal and Triggs, CVPR 2005, section 4).
 
     Parameters
     ----------
@@ -61,10 +62,6 @@ def mine_negatives(
     ------
     InvalidInputError
         If an argument is malformed, or `labels` holds none of the frames.
-
-    Notes
-    -----
-    Dalal and Triggs (CVPR 2005), section 4: the detector is retrained with its own false positives.
 
     Examples
     --------

@@ -66,11 +66,9 @@ def pareto_front(table: DataFrame, quality: str = "accuracy", cost: str = "searc
 
     Parameters
     ----------
-    table
-        Results, such as those of `compare_configurations`.
-    quality, cost
-        Numeric columns: a higher quality and a lower cost are better. Rows without either value are
-        left out. Of equal rows the first one is kept.
+    table, quality, cost
+        Results, such as those of `compare_configurations`, and numeric columns: a higher quality and a lower
+        cost are better. Rows without either value are left out. Of equal rows the first one is kept.
 
     Returns
     -------
@@ -154,15 +152,15 @@ def read_results(path: str | os.PathLike[str]) -> DataFrame:
     return make_table(rows, columns)
 
 
-class RowStore:
+class RowStore(dict[str, Mapping[str, Any]]):
     """Rows by their ``trial``; each new one is appended to a file and synced to disk at once.
 
     `path` is a ``.csv`` or ``.jsonl`` file, read first if it exists; None keeps the rows in memory only.
     """
 
     def __init__(self, path: str | os.PathLike[str] | None, columns: Sequence[str]) -> None:
+        super().__init__()
         self._columns = tuple(columns)
-        self._rows: dict[str, Mapping[str, Any]] = {}
         self._suffix = "" if path is None else _check_suffix(path, (".csv", ".jsonl"), "store")
         self._path = None if path is None else check_target(path, "store")
         if self._path is None or not self._path.exists():
@@ -175,17 +173,11 @@ class RowStore:
             )
         # Remove an incomplete last line: the next row would be appended to it.
         os.truncate(self._path, len(text.encode("utf-8")))
-        self._rows = {str(row["trial"]): row for row in rows if row.get("trial")}
-
-    def __contains__(self, trial: str) -> bool:
-        return trial in self._rows
-
-    def __getitem__(self, trial: str) -> Mapping[str, Any]:
-        return self._rows[trial]
+        self.update({str(row["trial"]): row for row in rows if row.get("trial")})
 
     def add(self, row: Mapping[str, Any]) -> None:
         """Store a finished row."""
-        self._rows[row["trial"]] = row
+        self[row["trial"]] = row
         if self._path is None:
             return
         line = _format_row(row, self._columns, self._suffix)
