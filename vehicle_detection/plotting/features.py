@@ -1,4 +1,4 @@
-"""Figures of the features: color channels, HOG, and the feature vector before and after scaling."""
+"""Figures of the features: color channels, HOG, the feature vector, and the weights of a classifier."""
 
 from __future__ import annotations
 
@@ -6,11 +6,19 @@ import itertools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_choice, check_image, check_integer, check_patches, describe
-from vehicle_detection.classifier import VehicleClassifier
+from vehicle_detection._common import (
+    check_choice,
+    check_image,
+    check_integer,
+    check_patches,
+    check_type,
+    describe,
+)
+from vehicle_detection.classifier import CLASSIFIER_REMEDY, Template, VehicleClassifier
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import convert_color, extract_features, hog_blocks, hog_source
@@ -42,20 +50,17 @@ def hog_channel_names(params: FeatureParams) -> tuple[str, ...]:
     return names if params.hog_channel == "ALL" else (names[int(params.hog_channel)],)
 
 
-def sum_blocks(blocks: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sum the values of each cell over the blocks that contain it.
+def sum_blocks(blocks: NDArray[Any]) -> NDArray[np.float64]:
+    """Sum each cell of ``(block rows, block columns, b, b, orient)`` over the blocks that contain it.
 
-    ``(block rows, block columns, b, b, orient)``, as `hog_blocks` returns, to ``(rows, columns, orient)``
-    sums and ``(rows, columns, 1)`` numbers of blocks.
+    Returns ``(rows, columns, orient)``; ``sum_blocks(np.ones_like(blocks))`` counts the blocks.
     """
     down, across, side, _, orient = blocks.shape
     sums = np.zeros((down + side - 1, across + side - 1, orient))
-    counts = np.zeros((*sums.shape[:2], 1))
     for row in range(side):
         for column in range(side):
             sums[row : row + down, column : column + across] += blocks[:, :, row, column]
-            counts[row : row + down, column : column + across] += 1
-    return sums, counts
+    return sums
 
 
 def add_glyphs(
@@ -103,10 +108,8 @@ def plot_channels(
 
     Parameters
     ----------
-    images
-        One ``(H, W, 3)`` uint8 RGB image, several images, or a set of patches.
-    color_space
-        One of ``COLOR_SPACES``.
+    images, color_space
+        One ``(H, W, 3)`` uint8 RGB image, several images, or a set of patches; and one of ``COLOR_SPACES``.
     labels
         ``(N,)`` 1 for a vehicle, 0 for anything else: one curve per class. None takes those of a set.
     points, random_state
@@ -240,8 +243,8 @@ def plot_hog(
     for (first, *others), (gray, title) in zip(grid.T, columns):
         style.add_image(first, gray, title, vmin=0, vmax=255)
         for panel, cell in zip(others, cell_sizes):
-            sums, counts = sum_blocks(hog_blocks(gray, params.orient, cell, block, transform_sqrt=sqrt))
-            add_glyphs(panel, sums / counts, size=cell)
+            blocks = hog_blocks(gray, params.orient, cell, block, transform_sqrt=sqrt)
+            add_glyphs(panel, sum_blocks(blocks) / sum_blocks(np.ones_like(blocks)), size=cell)
             panel.set(xlim=(0, gray.shape[1]), ylim=(gray.shape[0], 0))
     for panel, cell in zip(grid[1:, 0], cell_sizes):
         panel.set_ylabel(f"{cell} px cells", fontsize=9)
@@ -264,13 +267,11 @@ def plot_features(
 
     Parameters
     ----------
-    patches
-        ``(N, 64, 64, 3)`` uint8 RGB, or a set.
+    patches, rows, names
+        ``(N, 64, 64, 3)`` uint8 RGB, or a set; row numbers of the patches to plot; and one name per row.
     model, template
         A classifier and the number of the template whose scaler is used; or parameters, with the scaler
         fitted to all of `patches`.
-    rows, names
-        Row numbers of the patches to plot, and one name per row.
     figure : matplotlib.figure.Figure or SubFigure, optional
 
     Returns
@@ -298,10 +299,15 @@ def plot_features(
     raw = extract_features(images[chosen], params)
     figure, grid = style.new_panels(figure, (11, 5.5), 2, 1, sharex=True)
     above, below = grid.flat
+    shades = (COLORS[1], COLORS[3], "0.6", COLORS[2])
     for panel, values in ((above, raw), (below, (raw - mean) / scale)):
         for line, label, color in zip(values, labels, LINE_COLORS * len(chosen)):
             panel.plot(line, linewidth=0.6, color=color, label=label)
-        _shade_parts(panel, params)
+        for shade, (name, part) in zip(shades, part_slices(params).items()):
+            label, middle = f"{name} ({part.stop - part.start:,})", (part.start + part.stop) / 2
+            top = panel.get_xaxis_transform()
+            panel.axvspan(part.start, part.stop, color=shade, alpha=0.18, linewidth=0)
+            panel.annotate(label, (middle, 1.0), (0, 3), top, "offset points", ha="center", fontsize=8)
     above.set(ylabel="value", xlim=(0, params.length))
     below.set(ylabel="value (standard deviations)", xlabel="feature")
     above.set_title("before scaling", loc="left", fontsize=10)
@@ -343,10 +349,117 @@ def part_slices(params: FeatureParams) -> dict[str, slice]:
     return {name: slice(stop - lengths[name], stop) for name, stop in zip(lengths, stops) if lengths[name]}
 
 
-def _shade_parts(panel: Axes, params: FeatureParams) -> None:
-    colors = (COLORS[1], COLORS[3], "0.6", COLORS[2])
-    for color, (name, part) in zip(colors, part_slices(params).items()):
-        panel.axvspan(part.start, part.stop, color=color, alpha=0.18, linewidth=0)
-        label, middle = f"{name} ({part.stop - part.start:,})", (part.start + part.stop) / 2
-        above = panel.get_xaxis_transform()
-        panel.annotate(label, (middle, 1.0), (0, 3), above, "offset points", ha="center", fontsize=8)
+# Largest difference, in gray levels, between the mean patch and the patch shifted along the weights.
+_MAX_SHIFT = 110.0
+
+
+def plot_weights(
+    classifier: VehicleClassifier, *, template: int = 0, figure: FigureLike | None = None
+) -> FigureLike:
+    """Draw the weights of a linear SVM template, arranged as in the window.
+
+    The weights belong to the scaled features, so they are comparable. HOG weights are summed over the blocks
+    of each cell and drawn as edges, positive and negative ones separately (Dalal and Triggs, CVPR 2005,
+    figure 6).
+
+    Parameters
+    ----------
+    classifier, template
+        The trained model, and the number of its template.
+    figure : matplotlib.figure.Figure or SubFigure, optional
+
+    Returns
+    -------
+    matplotlib.figure.Figure or SubFigure
+        One row per channel. Columns: positive and negative weights of HOG and of coarse HOG, weights of the
+        spatial bins and of the histogram, as far as the model uses them. With spatial bins, the last column
+        shows the mean patch, and the mean patch shifted along the weights in both directions.
+
+    Raises
+    ------
+    InvalidInputError
+        If `classifier` is not a classifier, or does not have the template.
+
+    Examples
+    --------
+    >>> from vehicle_detection import load_classifier
+    >>> [panel.get_title() for panel in plot_weights(load_classifier()).axes[:2]]
+    ['HOG, positive', 'HOG, negative']
+    """
+    check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
+    number = check_integer(template, "template", low=0, high=len(classifier.templates) - 1)
+    chosen = classifier.templates[number]
+    params = classifier.params
+    weights = {part: chosen.coef[rows] for part, rows in part_slices(params).items()}
+    hogs = {"HOG": params.blocks, "coarse HOG": params.coarse_blocks}
+    titles = [f"{part}, {sign}" for part in hogs if part in weights for sign in ("positive", "negative")]
+    titles += ["spatial bins"] if params.spatial_feat else []
+    titles += ["histogram"] if params.hist_feat else []
+    titles += ["in color"] if params.spatial_feat else []
+    figure, grid = style.new_panels(figure, (min(2.6 * len(titles), 15), 7.2), 3, len(titles))
+    columns = dict(zip(titles, grid.T))
+    for title, column in columns.items():
+        column[0].set_title(title, fontsize=10)
+    for part, blocks in hogs.items():
+        if part in weights:
+            pair = columns[f"{part}, positive"], columns[f"{part}, negative"]
+            _add_hog_weights(np.stack(pair, axis=1), weights[part], params, blocks)
+    if params.spatial_feat:
+        _add_spatial_weights(columns["spatial bins"], weights["spatial bins"], params)
+        _add_shifted_patches(columns["in color"], chosen, params)
+    if params.hist_feat:
+        _add_histogram_weights(columns["histogram"], weights["color histogram"], params)
+    return figure
+
+
+def _add_hog_weights(
+    grid: NDArray[Any], weights: NDArray[np.float64], params: FeatureParams, blocks: int
+) -> None:
+    """Draw the HOG weights of all channels; the patch has ``(blocks, blocks)`` blocks."""
+    block = params.cell_per_block
+    shape = (params.hog_channels, blocks, blocks, block, block, params.orient)
+    cells = [sum_blocks(channel) for channel in weights.reshape(shape)]
+    peak = float(np.abs(cells).max()) or 1.0
+    for row, channel, name in zip(grid, cells, hog_channel_names(params)):
+        for panel, signed in zip(row, (channel, -channel)):
+            add_glyphs(panel, signed.clip(0), size=PATCH_SIZE / len(signed), peak=peak)
+        row[0].set_ylabel(f"channel {name}", fontsize=9)
+    for panel in grid[len(cells) :].flat:
+        panel.remove()
+
+
+def _add_spatial_weights(column: NDArray[Any], weights: NDArray[np.float64], params: FeatureParams) -> None:
+    maps = weights.reshape(3, params.spatial_size, params.spatial_size)
+    top = float(np.abs(maps).max()) or 1.0
+    for panel, values, name in zip(column, maps, channel_names(params.color_space)):
+        style.add_image(panel, values, cmap="PuOr_r", vmin=-top, vmax=top)
+        panel.set_ylabel(name, fontsize=9)
+        bar = panel.figure.colorbar(panel.images[0], ax=panel, shrink=0.8)
+        bar.ax.tick_params(labelsize=6)
+
+
+def _add_histogram_weights(column: NDArray[Any], weights: NDArray[np.float64], params: FeatureParams) -> None:
+    top = 1.1 * float(np.abs(weights).max()) or 1.0
+    for panel, values, name in zip(column, weights.reshape(3, -1), channel_names(params.color_space)):
+        panel.stairs(values, np.linspace(0, 256, len(values) + 1), fill=True, color="0.45")
+        panel.axhline(0, color="black", linewidth=0.6)
+        panel.set(xlim=(0, 256), ylim=(-top, top))
+        panel.set_xlabel(f"{name} (0-255)", fontsize=8)
+        panel.set_ylabel("weight", fontsize=8)
+        panel.tick_params(labelsize=7)
+
+
+def _add_shifted_patches(column: NDArray[Any], template: Template, params: FeatureParams) -> None:
+    """Show the mean patch, and the mean patch shifted along the weights of the spatial bins."""
+    stop, size = params.spatial_length, params.spatial_size
+    direction = template.coef[:stop] * template.scale[:stop]
+    step = _MAX_SHIFT / (float(np.abs(direction).max()) or 1.0)
+    for panel, name, sign in zip(column, ("mean + weights", "mean patch", "mean - weights"), (1, 0, -1)):
+        values = template.mean[:stop] + sign * step * direction
+        patch = values.reshape(3, size, size).transpose(1, 2, 0)
+        limits = [179 if params.color_space in ("HSV", "HLS") else 255, 255, 255]
+        patch = np.ascontiguousarray(patch.clip(0, limits).round().astype(np.uint8))
+        if params.color_space != "RGB":
+            patch = np.asarray(cv2.cvtColor(patch, getattr(cv2, f"COLOR_{params.color_space}2RGB")), np.uint8)
+        style.add_image(panel, patch)
+        panel.set_xlabel(name, fontsize=9)

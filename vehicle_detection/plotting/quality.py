@@ -1,4 +1,4 @@
-"""Figures of detection quality on labelled frames: curves, bars, the worst errors, parameter studies."""
+"""Figures of quality: scores of patches, curves and errors on labelled frames, parameter studies."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check_choice, check_integer, check_number, check_type, describe
 from vehicle_detection.boxes import box_areas, clip_boxes, iou_matrix
@@ -23,7 +23,7 @@ from vehicle_detection.evaluation import (
     prepare_evaluation,
 )
 from vehicle_detection.plotting import style
-from vehicle_detection.plotting.style import LINE_COLORS, SKY, TRUTH, VERMILION, Image
+from vehicle_detection.plotting.style import LINE_COLORS, OTHER, SKY, TRUTH, VEHICLE, VERMILION, Image
 from vehicle_detection.tuning import check_column, numeric_column, pareto_front
 
 if TYPE_CHECKING:
@@ -36,6 +36,72 @@ _METRICS = ("f1", "precision", "recall", "average_precision", "mean_iou")
 _METRIC_NAMES = {"f1": "F1", "average_precision": "average precision", "mean_iou": "mean IoU"}
 
 
+def plot_scores(
+    scores: ArrayLike, labels: ArrayLike, *, threshold: float = 0.0, bins: int = 60, ax: Axes | None = None
+) -> Axes:
+    """Plot histograms of the scores of both classes, on a logarithmic scale that makes errors visible.
+
+    Parameters
+    ----------
+    scores, labels
+        ``(N,)`` decision values, and ``(N,)`` 1 for a vehicle, 0 for anything else.
+    threshold, bins
+        Score above which a patch is classified as a vehicle, and number of bins over the range of the scores.
+    ax : matplotlib.axes.Axes, optional
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        The legend counts the errors at the threshold; the vertical line is the threshold.
+
+    Raises
+    ------
+    InvalidInputError
+        If scores and labels differ in number, are empty or contain NaN.
+
+    Examples
+    --------
+    >>> axes = plot_scores([1.0, 2.0, -0.5, -2.0], [1, 1, 1, 0])
+    >>> [text.get_text() for text in axes.get_legend().get_texts()]
+    ['vehicles: 1 of 3 missed', 'other: 0 of 1 classified as vehicles', 'threshold 0']
+    """
+    from matplotlib.ticker import LogFormatter
+
+    values, known = style.check_scores(scores, "scores"), np.asarray(labels)
+    if known.shape != values.shape or not np.isin(known, (0, 1)).all():
+        raise InvalidInputError(
+            f"labels must be 0 or 1 for each of the {len(values)} scores; got {describe(known)}"
+        )
+    limit = check_number(threshold, "threshold")
+    edges = _bin_edges(values, limit, check_integer(bins, "bins", low=1, high=10_000))
+    axes = style.new_axes(ax)
+    classes = ((1, VEHICLE, "vehicles", "missed"), (0, OTHER, "other", "classified as vehicles"))
+    for vehicle, color, name, error in classes:
+        own = values[known == vehicle]
+        errors = int(((own > limit) != vehicle).sum())
+        counts = np.histogram(own, edges)[0]
+        axes.stairs(counts, edges, fill=True, color=color, alpha=0.35)
+        label = f"{name}: {errors:,} of {len(own):,} {error}"
+        axes.stairs(counts, edges, color=color, linewidth=1.4, label=label)
+    axes.axvline(limit, color="black", linestyle="--", linewidth=1, label=f"threshold {limit:g}")
+    axes.set(yscale="log", xlabel="score (decision value)", ylabel="patches")
+    axes.set_ylim(bottom=0.7)
+    # The default formatter writes 4x10^0 on an axis of less than a decade.
+    axes.yaxis.set_major_formatter("{x:,.0f}")
+    axes.yaxis.set_minor_formatter(LogFormatter())
+    style.legend_above(axes, 3)
+    return axes
+
+
+def _bin_edges(values: NDArray[np.float64], threshold: float, count: int) -> NDArray[np.float64]:
+    """Edges of about `count` bins, one of them at the threshold, so that no bin mixes both decisions."""
+    low, high = min(float(values.min()), threshold), max(float(values.max()), threshold)
+    width = (high - low) / count or 1.0
+    before = np.ceil((threshold - low) / width)
+    after = np.floor((high - threshold) / width) + 1
+    return np.asarray(threshold + width * np.arange(-before, after + 1), np.float64)
+
+
 def plot_precision_recall(
     curves: Mapping[str, Curve] | Curve, *, threshold: float | None = None, ax: Axes | None = None
 ) -> Axes:
@@ -43,10 +109,9 @@ def plot_precision_recall(
 
     Parameters
     ----------
-    curves
-        A result of `precision_recall_curve`, or a mapping from names to several.
-    threshold
-        Threshold to mark with a square; a dot marks the best F1.
+    curves, threshold
+        A result of `precision_recall_curve`, or a mapping from names to several; and a threshold to mark with
+        a square. A dot marks the best F1.
     ax : matplotlib.axes.Axes, optional
 
     Returns
@@ -162,7 +227,7 @@ def plot_f1(
         axes.bar_label(bars, ["" if np.isnan(v) else f"{v:.2f}" for v in values], padding=2, fontsize=8)
     axes.set_xticks(range(len(sources)), [str(source) for source in sources])
     axes.set(ylim=(0, 1.1), ylabel=_METRIC_NAMES.get(metric, metric))
-    style.hide_spines(axes)
+    axes.spines[["top", "right"]].set_visible(False)
     if nested:
         style.legend_above(axes, 3)
     return axes
@@ -187,17 +252,14 @@ def plot_errors(
     kind
         ``"missed"``: labelled vehicles without a detection, largest first, with the largest IoU of any
         detection. ``"false"``: detections without a labelled vehicle, highest score first.
-    iou
-        Minimum IoU of a detection and its vehicle, as in `evaluate_detections`.
-    count, columns
-        Maximum number of errors to show, and crops per row.
+    iou, count, columns
+        Minimum IoU of a detection and its vehicle; maximum number of errors to show; and crops per row.
     ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
     matplotlib.axes.Axes
-        One image per error, with dashed labelled boxes and solid detections. The title states the total
-        number of errors.
+        One image per error, with dashed labelled boxes and solid detections; the title counts all errors.
 
     Raises
     ------
@@ -218,15 +280,14 @@ def plot_errors(
     predictions, labels, keys = prepare_evaluation(predictions, frames.labels, frames.keys)
     matches = match_detections(predictions, labels, keys, min_iou)
     if kind == "missed":
-        side, rows = labels, matches.missed
+        side, rows, importance = labels, matches.missed, box_areas(labels.boxes)
         title = f"{len(rows):,} of {len(matches.usable):,} vehicles missed"
-        order = np.argsort(-box_areas(side.boxes[rows]), kind="stable")
     else:
         side, rows = predictions, np.flatnonzero((matches.match < 0) & ~matches.ignored)
+        importance = np.zeros(len(side)) if side.scores is None else side.scores
         title = f"{len(rows):,} of {len(predictions):,} detections are false positives"
-        order = np.arange(len(rows)) if side.scores is None else np.argsort(-side.scores[rows], kind="stable")
-    shown = rows[order[:max_count]].tolist()
-    crops = [_crop(_read_frame(frames, side.frames[row]), side.boxes[row]) for row in shown]
+    shown = rows[np.argsort(-importance[rows], kind="stable")[:max_count]].tolist()
+    crops = [_crop(frames, side.frames[row], side.boxes[row]) for row in shown]
     captions = [_caption(side, row, predictions, kind) for row in shown]
     tiles = [(image, caption) for (image, _), caption in zip(crops, captions)]
     axes, places = style.add_tiles(ax, tiles, columns=columns, inches=1.9, caption_lines=2)
@@ -248,13 +309,10 @@ def plot_errors(
     return axes
 
 
-def _read_frame(frames: LabelledFrames, key: FrameKey) -> Image:
-    images = frames.frames
-    return images[images.names.index(str(key))] if isinstance(images, FrameSet) else images[key]
-
-
-def _crop(image: Image, box: NDArray[Any]) -> tuple[Image, tuple[int, int]]:
+def _crop(frames: LabelledFrames, key: FrameKey, box: NDArray[Any]) -> tuple[Image, tuple[int, int]]:
     """Cut out a square around the center of a box, 1.8 times its longer side; and its upper left corner."""
+    images = frames.frames
+    image = images[images.names.index(str(key))] if isinstance(images, FrameSet) else images[key]
     height, width = image.shape[:2]
     x, y = (box[:2] + box[2:]) / 2
     half = max(24.0, 0.9 * float((box[2:] - box[:2]).max()))
@@ -297,10 +355,9 @@ def plot_tradeoff(
     ----------
     table
         Results of `compare_configurations` or `search_parameters`; rows without either value are left out.
-    quality, cost
-        Columns of the y axis, where higher is better, and of the x axis, where lower is better.
-    label
-        Column of the text beside the points of the front; None for no text.
+    quality, cost, label
+        Columns of the y axis, where higher is better, of the x axis, where lower is better, and of the text
+        beside the points of the front, None for no text.
     ax : matplotlib.axes.Axes, optional
 
     Returns
@@ -333,16 +390,11 @@ def plot_tradeoff(
     if label is not None:
         for x, y, text in zip(front[cost], front[quality], front[label]):
             axes.annotate(str(text), (x, y), (4, 6), textcoords="offset points", fontsize=8)
-    _label_axes(axes, cost, quality)
+    axes.set(xlabel=cost.replace("_", " "), ylabel=quality.replace("_", " "))
+    axes.grid(alpha=0.3)
     axes.margins(0.12)
     axes.legend(loc="lower right")
     return axes
-
-
-def _label_axes(axes: Axes, x: str, y: str) -> None:
-    """Name the axes after columns, and draw a grid."""
-    axes.set(xlabel=x.replace("_", " "), ylabel=y.replace("_", " "))
-    axes.grid(alpha=0.3)
 
 
 def plot_parameter(
@@ -359,10 +411,9 @@ def plot_parameter(
     ----------
     table
         Results of `compare_configurations` or `search_parameters`; rows without the measurement are left out.
-    parameter, quality
-        Columns of the x axis, such as ``"C"`` or ``"orient"``, and of the y axis, a measurement.
-    by
-        Column that groups the rows into lines, such as ``"split"``; None for one line.
+    parameter, quality, by
+        Columns of the x axis, such as ``"C"``, of the y axis, a measurement, and of the groups of rows that
+        form lines, such as ``"split"``, None for one line.
     ax : matplotlib.axes.Axes, optional
 
     Returns
@@ -409,14 +460,14 @@ def plot_parameter(
         )
         lines.set_label(None if by is None else str(name))
     if not numeric:
-        axes.set_xticks(range(len(names)), [str(name) for name in names])
-        if max(len(str(name)) for name in names) * len(names) > _MAX_TICK_CHARACTERS:
-            axes.tick_params(axis="x", rotation=30)
-            for label in axes.get_xticklabels():
-                label.set_horizontalalignment("right")
+        texts = [str(name) for name in names]
+        turned = max(map(len, texts)) * len(texts) > _MAX_TICK_CHARACTERS
+        align = "right" if turned else "center"
+        axes.set_xticks(range(len(texts)), texts, rotation=30 if turned else 0, horizontalalignment=align)
     elif x.min() > 0 and x.max() > _LOG_RATIO * x.min():
         axes.set_xscale("log")
-    _label_axes(axes, parameter, quality)
+    axes.set(xlabel=parameter.replace("_", " "), ylabel=quality.replace("_", " "))
+    axes.grid(alpha=0.3)
     if by is not None:
         axes.legend(title=by.replace("_", " "), fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
     return axes

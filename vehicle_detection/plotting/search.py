@@ -14,7 +14,7 @@ from vehicle_detection._common import check_image, check_number, check_type, des
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import apply_threshold, frame_heat, label_boxes
-from vehicle_detection.params import HeatParams, PixelBand, SearchParams
+from vehicle_detection.params import HeatParams, SearchParams
 from vehicle_detection.plotting import style
 from vehicle_detection.plotting.style import BLUE, SKY, TRUTH, VERMILION, YELLOW, Boxes, FigureLike, Image
 from vehicle_detection.windows import band_windows
@@ -45,8 +45,7 @@ def plot_windows(
     Returns
     -------
     matplotlib.axes.Axes
-        The first collection contains the windows in ascending order of score, so that the best are on top;
-        its array contains the scores.
+        The first collection contains the windows in ascending order of score; its array contains the scores.
 
     Raises
     ------
@@ -77,6 +76,7 @@ def plot_windows(
     if true is not None:
         style.add_boxes(axes, true, TRUTH, linestyles="--", linewidths=2.0)
     _expand_limits(axes, boxes, width, height)
+    axes.set(xlabel="x (px)", ylabel="y (px)")
     axes.set_title(_count(len(boxes), "window") if title is None else title, fontsize=10)
     return axes
 
@@ -136,10 +136,16 @@ def plot_bands(
     for panel, band, bound in zip(grid.flat, bands, bounds):
         style.add_image(panel, image)
         panel.axhline(search.horizon * height, color="white", linestyle="--", linewidth=0.8)
-        windows = _add_band(panel, band, bound[None])
+        windows = band_windows(band)
+        shift = np.array([[band.step[0], 0] * 2, [0, band.step[1]] * 2])
+        # A low or narrow band may not have a second window in that direction.
+        neighbors = [row for row in windows[:1] + shift if (windows == row).all(axis=1).any()]
+        style.add_boxes(panel, bound[None], YELLOW)
+        style.add_boxes(panel, np.array(neighbors).reshape(-1, 4), SKY, linewidths=1.0)
+        style.add_boxes(panel, windows[:1], VERMILION, linewidths=1.4)
         _expand_limits(panel, bounds, width, height)
         side, step = (f"{x}x{y}" for x, y in (band.window, band.step))
-        panel.set_title(f"{side} px, step {step}, {_count(windows, 'window')}", fontsize=9)
+        panel.set_title(f"{side} px, step {step}, {_count(len(windows), 'window')}", fontsize=9)
     handles = style.legend_lines(
         ("band", YELLOW, "-"),
         ("first window", VERMILION, "-"),
@@ -148,19 +154,6 @@ def plot_bands(
     )
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
     return figure
-
-
-def _add_band(panel: Axes, band: PixelBand, bound: NDArray[Any]) -> int:
-    """Draw a band and return its number of windows."""
-    windows = band_windows(band)
-    first = windows[:1]
-    shift = np.array([[band.step[0], 0] * 2, [0, band.step[1]] * 2])
-    # A low or narrow band may not have a second window in that direction.
-    neighbors = [row for row in first + shift if (windows == row).all(axis=1).any()]
-    style.add_boxes(panel, bound, YELLOW)
-    style.add_boxes(panel, np.array(neighbors).reshape(-1, 4), SKY, linewidths=1.0)
-    style.add_boxes(panel, first, VERMILION, linewidths=1.4)
-    return len(windows)
 
 
 def plot_comparison(fast: ArrayLike, reference: ArrayLike, *, figure: FigureLike | None = None) -> FigureLike:
@@ -249,7 +242,7 @@ def plot_speedups(
     axes.bar_label(bars, texts, padding=3, fontsize=9)
     axes.set(xscale="log", xlim=(min(values) / 3, max(values) * 12), xlabel="time (ms)")
     axes.invert_yaxis()
-    style.hide_spines(axes)
+    axes.spines[["top", "right"]].set_visible(False)
     return axes
 
 
@@ -278,10 +271,9 @@ def plot_heatmap(
     ----------
     image, windows
         ``(H, W, 3)`` uint8 RGB frame, and its positive windows.
-    params
-        Weighting, threshold and fraction of the peak; by default ``HeatParams()``.
-    heat
-        ``(H, W)`` heat map, such as the mean over the last frames; None computes that of `windows`.
+    params, heat
+        Weighting, threshold and fraction of the peak, by default ``HeatParams()``; and ``(H, W)`` heat map,
+        such as the mean over the last frames, by default that of `windows`.
     figure : matplotlib.figure.Figure or SubFigure, optional
 
     Returns

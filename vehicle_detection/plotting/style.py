@@ -6,7 +6,7 @@ import functools
 import io
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Union
 
 import numpy as np
@@ -75,10 +75,7 @@ def new_panels(
     layout: Literal["constrained", "compressed"] = "constrained",
     sharex: bool = False,
 ) -> tuple[FigureLike, NDArray[Any]]:
-    """Create a grid of Axes in `figure`, or in a new one (`size` in inches) that pyplot does not manage.
-
-    Returns the figure and its ``(rows, columns)`` Axes, of which only the first `count` are visible.
-    """
+    """Create ``(rows, columns)`` Axes, the first `count` visible, in `figure` or a new one (inches)."""
     from matplotlib.figure import FigureBase
 
     if figure is None:
@@ -92,20 +89,14 @@ def new_panels(
 
 def new_axes(ax: Axes | None, width: float = 7.0, height: float = 4.5) -> Axes:
     """Return `ax`, or the Axes of a new pyplot figure (size in inches)."""
+    from matplotlib.axes import Axes as AxesClass
+
     if ax is None:
         import matplotlib.pyplot as plt
 
-        axes: Axes = plt.subplots(figsize=(width, height), layout="constrained")[1]
-        return axes
-    from matplotlib.axes import Axes as AxesClass
-
+        ax = plt.subplots(figsize=(width, height), layout="constrained")[1]
     check_type(ax, "ax", AxesClass, "pass matplotlib Axes, or None for a new figure")
     return ax
-
-
-def hide_spines(axes: Axes) -> None:
-    """Hide the upper and the right border of a chart."""
-    axes.spines[["top", "right"]].set_visible(False)
 
 
 def legend_above(axes: Axes, columns: int = 1, *, fontsize: int = 9) -> Legend:
@@ -131,14 +122,13 @@ def check_displayable(image: object, name: str) -> NDArray[Any]:
 
 def check_list(values: object, name: str, kind: str) -> list[Any]:
     """Return `values` as a list with at least one entry; `kind` names the entries in the message."""
-    single = isinstance(values, np.ndarray) and values.ndim < 4
-    if single or isinstance(values, (str, bytes)) or not hasattr(values, "__iter__"):
-        raise InvalidInputError(
-            f"{name} must be a list of {kind}, got {describe(values)}; wrap a single one in a list"
-        )
-    listed = list(values)
+    single = isinstance(values, (str, bytes)) or (isinstance(values, np.ndarray) and values.ndim < 4)
+    listed = list(values) if isinstance(values, Iterable) and not single else []
     if not listed:
-        raise InvalidInputError(f"{name} must be a list of {kind}, at least one; got an empty list")
+        raise InvalidInputError(
+            f"{name} must be a list of {kind}, at least one; got {describe(values)}; "
+            "wrap a single one in a list"
+        )
     return listed
 
 
@@ -192,27 +182,18 @@ def box_array(boxes: Boxes, name: str = "boxes") -> NDArray[Any]:
     return check_boxes(boxes, name)
 
 
-def add_image(
-    ax: Axes,
-    image: NDArray[Any],
-    title: str = "",
-    *,
-    ticks: bool = False,
-    extent: tuple[float, float, float, float] | None = None,
-    **options: Any,
-) -> None:
-    """Show an image at `extent`, by default with half-open pixels as coordinates; `ticks` labels the axes."""
+def add_image(ax: Axes, image: NDArray[Any], title: str = "", *, ticks: bool = False, **options: Any) -> None:
+    """Show an image, by default with half-open pixels as coordinates; `options` are those of ``imshow``."""
     height, width = image.shape[:2]
+    options.setdefault("extent", (0, width, height, 0))
     if image.ndim == 2:
         options.setdefault("cmap", "gray")
     if max(height, width) <= _MAX_PIXELATED:
         options.setdefault("interpolation", "nearest")
-    ax.imshow(image, extent=extent or (0, width, height, 0), **options)
+    ax.imshow(image, **options)
     if title:
         ax.set_title(title, fontsize=9)
-    if ticks:
-        ax.set(xlabel="x (px)", ylabel="y (px)")
-    else:
+    if not ticks:
         ax.set(xticks=[], yticks=[])
 
 
@@ -234,9 +215,7 @@ def add_boxes(
 
 def evenly_spaced(count: int, max_rows: int) -> NDArray[np.intp]:
     """At most `max_rows` evenly spaced row numbers out of `count`."""
-    if count <= max_rows:
-        return np.arange(count)
-    return np.linspace(0, count - 1, max_rows).round().astype(np.intp)
+    return np.linspace(0, count - 1, min(count, max_rows)).round().astype(np.intp)
 
 
 def add_tiles(

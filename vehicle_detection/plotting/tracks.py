@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from vehicle_detection._common import check_number, check_type, describe
 from vehicle_detection.detector import FrameResult
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import NO_TRACK, FrameBoxes
 from vehicle_detection.plotting import style
-from vehicle_detection.plotting.style import COLORS, LINESTYLES, YELLOW, Color, FigureLike
+from vehicle_detection.plotting.style import COLORS, LINESTYLES, YELLOW, FigureLike
 from vehicle_detection.synthetic import VehicleTruth
 from vehicle_detection.video import VideoReport
 
@@ -38,8 +38,8 @@ _DARK_YELLOW = (0.80, 0.73, 0.1)
 _STAGES = ("decode", "search", "regions", "track", "draw", "encode")
 
 
-Tracks = dict[int, Floats]
-"""``(N, 9)`` rows of each track by its number: time, the values of the panels, and their standard errors."""
+# Number and time of a track in a frame, its box, distance and speed, and their standard errors.
+Row = tuple[int, float, Any, float | None, float | None, float | None, float | None]
 
 
 def plot_tracks(
@@ -67,8 +67,7 @@ def plot_tracks(
     Returns
     -------
     matplotlib.figure.Figure or SubFigure
-        Four panels with a common time axis. Distances and speeds of results have bands of one standard
-        error.
+        Four panels over time; distances and speeds of results have bands of one standard error.
 
     Raises
     ------
@@ -85,116 +84,104 @@ def plot_tracks(
     rate = check_number(fps, "fps", above=0, high=1e6)
     shortest = check_number(min_frames, "min_frames", low=1)
     if isinstance(results, FrameBoxes):
-        tracks = _tracks_of_boxes(results, rate, "results")
+        tracks = _split_tracks(_rows_of_boxes(results, rate, "results"))
     else:
-        tracks = _tracks_of_results(results, rate)
-    tracks = {number: rows for number, rows in tracks.items() if len(rows) >= shortest}
+        tracks = _split_tracks(_rows_of_results(results, rate))
+    tracks = {number: columns for number, columns in tracks.items() if columns.shape[1] >= shortest}
     if not tracks:
         raise InvalidInputError(
             "results must hold at least one track to plot, got none; pass results with shown tracks"
         )
     figure, grid = style.new_panels(figure, (10, 9), 4, 1, sharex=True)
-    for number, rows in tracks.items():
-        color, dash = _track_style(number)
-        time, *columns = _insert_gaps(rows, rate).T
+    for number, known in tracks.items():
+        # Color of the track as in the video; the line style differs between tracks of one color.
+        cycle, index = divmod(number - 1, len(COLORS))
+        color = _DARK_YELLOW if COLORS[index] == YELLOW else COLORS[index]
+        dash = LINESTYLES[cycle % len(LINESTYLES)]
+        time, *columns = _insert_gaps(known, rate)
         for panel, values, stds in zip(grid.flat, columns[:4], columns[4:]):
             panel.plot(time, values, color=color, linestyle=dash, linewidth=1.8, label=f"#{number}")
             if not np.isnan(stds).all():
                 panel.fill_between(time, values - stds, values + stds, color=color, alpha=0.25, linewidth=0)
     if truth is not None:
-        true_tracks = _tracks_of_boxes(_truth_boxes(truth), rate, "truth").values()
-        for index, (time, *columns) in enumerate(rows.T for rows in true_tracks):
+        for index, (time, *columns) in enumerate(_split_tracks(_rows_of_truth(truth, rate)).values()):
             for panel, values in zip(grid.flat, columns):
                 panel.plot(time, values, "k.", markersize=2, label=None if index else "truth")
     for panel, label in zip(grid.flat, _LABELS):
         panel.set_ylabel(label)
         panel.grid(alpha=0.3)
-    panel.axhline(0, color="black", linewidth=0.6)
-    panel.set_xlabel("time (s)")
+    grid[-1, 0].axhline(0, color="black", linewidth=0.6)
+    grid[-1, 0].set_xlabel("time (s)")
     handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", fontsize=9, title="track")
     return figure
 
 
-def _track_style(number: int) -> tuple[Color, str]:
-    """Color of a track as in the video, and a line style that differs between tracks of one color."""
-    cycle, index = divmod(number - 1, len(COLORS))
-    color = _DARK_YELLOW if COLORS[index] == YELLOW else COLORS[index]
-    return color, LINESTYLES[cycle % len(LINESTYLES)]
-
-
-def _truth_boxes(truth: object) -> FrameBoxes:
-    """Return the true boxes that are not ignored, from labels or the truth of a rendered drive."""
-    if isinstance(truth, FrameBoxes):
-        return truth[~truth.ignore]
-    if not isinstance(truth, Sequence) or not all(
-        isinstance(row, VehicleTruth) for rows in truth for row in rows
-    ):
-        raise InvalidInputError(
-            f"truth must be FrameBoxes or the truth of a rendered drive, got {describe(truth)}; "
-            "read a file with read_labels or pass drive.truth"
-        )
-    listed = [(frame, row) for frame, rows in enumerate(truth) for row in rows if not row.ignore]
-    return FrameBoxes(
-        [frame for frame, _ in listed],
-        np.array([row.track for _, row in listed], np.int64),
-        np.array([row.box for _, row in listed], np.float64).reshape(-1, 4),
-        distance_m=np.array([row.distance_m for _, row in listed]),
-        speed_mps=np.array([row.speed_mps for _, row in listed]),
-    )
-
-
-def _tracks_of_results(results: object, rate: float) -> Tracks:
+def _rows_of_results(results: object, rate: float) -> Iterator[Row]:
     if not isinstance(results, Iterable):
         raise InvalidInputError(
             f"results must be the FrameResult of each frame, or FrameBoxes; got {describe(results)}; "
             "collect what detector.process returns"
         )
-    numbers, rows = [], []
     for result in results:
         check_type(result, "results", FrameResult, "collect what detector.process returns")
         time = result.index / rate if result.time is None else result.time
         for track in result.shown:
-            x1, _, x2, _ = track.box.tolist()
-            numbers.append(track.id)
-            rows.append((
-                time, (x1 + x2) / 2, x2 - x1, track.distance_m, track.speed_mps,
-                None, None, track.distance_std_m, track.speed_std_mps,
-            ))  # fmt: skip
-    return _split_tracks(numbers, np.array(rows, np.float64))  # None becomes NaN
+            stds = track.distance_std_m, track.speed_std_mps
+            yield track.id, time, track.box, track.distance_m, track.speed_mps, *stds
 
 
-def _tracks_of_boxes(labels: FrameBoxes, rate: float, name: str) -> Tracks:
+def _rows_of_boxes(labels: FrameBoxes, rate: float, name: str) -> Iterator[Row]:
     if any(isinstance(key, str) for key in labels.frame_keys):
         raise InvalidInputError(
             f"{name} must have numbered frames, got names such as {labels.frame_keys[0]!r}; "
             "convert them with FrameBoxes.renamed"
         )
-    rows = np.full((len(labels), 9), math.nan)
-    x1, _, x2, _ = labels.boxes.T
-    rows[:, 0] = np.array(labels.frames, np.float64) / rate
-    rows[:, 1], rows[:, 2] = (x1 + x2) / 2, x2 - x1
-    # None becomes NaN.
-    rows[:, 3], rows[:, 4] = labels.distance_m, labels.speed_mps
-    order = np.argsort(rows[:, 0], kind="stable")
-    return _split_tracks(labels.tracks[order], rows[order])
+    unknown = [None] * len(labels)
+    distances = unknown if labels.distance_m is None else labels.distance_m
+    speeds = unknown if labels.speed_mps is None else labels.speed_mps
+    times = np.array(labels.frames, np.float64) / rate
+    for row in np.argsort(times, kind="stable"):
+        if labels.tracks[row] != NO_TRACK:
+            yield labels.tracks[row], times[row], labels.boxes[row], distances[row], speeds[row], None, None
 
 
-def _split_tracks(numbers: ArrayLike, rows: Floats) -> Tracks:
-    """Rows of each track, in ascending order of their numbers."""
-    known = np.asarray(numbers, np.int64)
-    return {number: rows[known == number] for number in np.unique(known[known != NO_TRACK]).tolist()}
+def _rows_of_truth(truth: object, rate: float) -> Iterator[Row]:
+    """Rows of the true boxes that are not ignored, from labels or the truth of a rendered drive."""
+    if isinstance(truth, FrameBoxes):
+        yield from _rows_of_boxes(truth[~truth.ignore], rate, "truth")
+        return
+    frames = truth if isinstance(truth, Sequence) else [[truth]]
+    for frame, rows in enumerate(frames):
+        for row in rows:
+            if not isinstance(row, VehicleTruth):
+                raise InvalidInputError(
+                    f"truth must be FrameBoxes or the truth of a rendered drive, got {describe(truth)}; "
+                    "read a file with read_labels or pass drive.truth"
+                )
+            if not row.ignore:
+                yield row.track, frame / rate, row.box, row.distance_m, row.speed_mps, None, None
 
 
-def _insert_gaps(rows: Floats, rate: float) -> Floats:
-    """Insert a row of NaN where frames are missing, so that the line is interrupted."""
-    time = rows[:, 0]
+def _split_tracks(rows: Iterable[Row]) -> dict[int, Floats]:
+    """``(9, N)`` columns of each track: time, the values of the panels, and their standard errors."""
+    table = [
+        (number, time, (box[0] + box[2]) / 2, box[2] - box[0], distance, speed, None, None, *stds)
+        for number, time, box, distance, speed, *stds in rows
+    ]
+    columns = np.array(table, np.float64).reshape(-1, 10).T  # None becomes NaN
+    return {int(number): columns[1:, columns[0] == number] for number in np.unique(columns[0])}
+
+
+def _insert_gaps(columns: Floats, rate: float) -> Floats:
+    """Insert NaN where frames are missing, so that the line is interrupted."""
+    time = columns[0]
     steps = np.diff(time)
     usual = max(1 / rate, steps.min(initial=math.inf))
     after = np.flatnonzero(steps > _MAX_GAP * usual) + 1
-    gaps = np.full((len(after), rows.shape[1]), math.nan)
-    gaps[:, 0] = (time[after - 1] + time[after]) / 2
-    return np.insert(rows, after, gaps, axis=0)
+    result = np.insert(columns, after, math.nan, axis=1)
+    result[0] = np.insert(time, after, (time[after - 1] + time[after]) / 2)
+    return result
 
 
 Run = VideoReport | Sequence[FrameResult]
@@ -251,23 +238,24 @@ def plot_stage_times(runs: Run | Mapping[str, Run], *, ax: Axes | None = None) -
     axes.margins(x=0.12)
     axes.set_xlabel("work (ms per frame)")
     style.legend_above(axes, max(len(stages), 1))
-    style.hide_spines(axes)
+    axes.spines[["top", "right"]].set_visible(False)
     return axes
 
 
 def _stage_milliseconds(run: object) -> dict[str, float]:
     """Milliseconds per frame of each stage."""
     if isinstance(run, VideoReport):
-        frames, seconds = run.frames, Counter(run.stages)
+        frames, parts = run.frames, [run.stages]
     elif isinstance(run, (list, tuple)) and all(isinstance(result, FrameResult) for result in run):
-        frames, seconds = len(run), Counter()
-        for result in run:
-            seconds.update(result.seconds)
+        frames, parts = len(run), [result.seconds for result in run]
     else:
         raise InvalidInputError(
-            f"runs must be a VideoReport or a list of FrameResult, or a mapping from names to them; "
+            "runs must be a VideoReport or a list of FrameResult, or a mapping from names to them; "
             f"got {describe(run)}"
         )
     if not frames:
         raise InvalidInputError("runs must have at least one frame each; got a run without any")
+    seconds: Counter[str] = Counter()
+    for part in parts:
+        seconds.update(part)
     return {stage: 1000 * value / frames for stage, value in seconds.items()}
