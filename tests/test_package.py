@@ -73,7 +73,11 @@ def imports(name, *, at_import=False):
             if isinstance(child, ast.Import):
                 yield from (alias.name for alias in child.names)
             elif isinstance(child, ast.ImportFrom):
-                yield child.module
+                # Inside plotting, `from vehicle_detection.plotting import style` imports another file.
+                own_package = child.module == f"vehicle_detection.{package_of(name)}"
+                for alias in child.names:
+                    is_file = own_package and f"{package_of(name)}.{alias.name}" in FILES
+                    yield f"{child.module}.{alias.name}" if is_file else child.module
             elif not at_import or not (
                 isinstance(child, ast.FunctionDef)
                 or (isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test))

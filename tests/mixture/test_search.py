@@ -127,7 +127,7 @@ def test_invalid_frames_and_parameters_are_rejected():
     search = MixtureSearch(random_mixture(), n_jobs=1)
     with pytest.raises(InvalidInputError, match=r"convert a grayscale image with cv2\.cvtColor"):
         search.find(ROAD[..., 0])
-    with pytest.raises(InvalidInputError, match="scale a 0-1 float image"):
+    with pytest.raises(InvalidInputError, match="scale its values 0-1"):
         search.find(ROAD / 255)
     with pytest.raises(InvalidInputError, match="params must be a PyramidParams, got SearchParams"):
         search.find(ROAD, SearchParams.preset())

@@ -7,6 +7,7 @@ from hypothesis.extra import numpy as hnp
 from tests.helpers import random_classifier
 from tests.plotting.helpers import SMALL, gray_image, legend, new_axes, texts, titles
 from vehicle_detection import plotting
+from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import extract_features, hog_image
 from vehicle_detection.params import FeatureParams
@@ -117,7 +118,7 @@ def test_malformed_options_of_hog_are_rejected():
     )
 )
 def test_sums_over_blocks_keep_the_total(blocks):
-    sums, counts = sum_blocks(blocks)
+    sums, counts = sum_blocks(blocks), sum_blocks(np.ones_like(blocks))[..., 0]
     side = blocks.shape[2]
     assert sums.shape == (blocks.shape[0] + side - 1, blocks.shape[1] + side - 1, blocks.shape[4])
     assert sums.sum() == pytest.approx(blocks.sum(), abs=1e-9)
@@ -178,3 +179,60 @@ def test_features_need_a_classifier_or_parameters(patch_set):
         InvalidInputError, match="model must be a VehicleClassifier or FeatureParams, got 'm'"
     ):
         plotting.plot_features(patch_set, "m")
+
+
+def classifier_with_mean(params):
+    """A classifier whose mean patch is random too."""
+    rng = np.random.default_rng(0)
+    mean, scale = rng.uniform(50, 150, params.length), rng.uniform(1, 9, params.length)
+    return VehicleClassifier(params, (Template(mean, scale, rng.normal(size=params.length), 0.1),))
+
+
+def test_weights_are_arranged_as_in_the_window():
+    classifier = classifier_with_mean(SMALL)
+    coef = classifier.templates[0].coef
+    figure = plotting.plot_weights(classifier)
+    grid = np.array(figure.axes[:15]).reshape(3, 5)
+    assert [axes.get_title() for axes in grid[0]] == [
+        "HOG, positive", "HOG, negative", "spatial bins", "histogram", "in color",
+    ]  # fmt: skip
+    for channel, row in enumerate(grid):
+        np.testing.assert_array_equal(
+            row[2].images[0].get_array().ravel(), coef[channel * 64 : (channel + 1) * 64]
+        )
+        start = 192 + 8 * channel
+        np.testing.assert_array_equal(row[3].patches[0].get_data().values, coef[start : start + 8])
+        # each orientation of each cell is either positive or negative
+        lines = [len(axes.collections[0].get_segments()) for axes in row[:2]]
+        assert sum(lines) == 4 * 4 * 6
+    mean = classifier.templates[0].mean[:192].reshape(3, 8, 8).transpose(1, 2, 0).round().astype(np.uint8)
+    shown = grid[1, 4].images[0].get_array()
+    assert shown.shape == (8, 8, 3)
+    assert (shown != grid[0, 4].images[0].get_array()).any()
+    rgb = FeatureParams(**{**SMALL.__dict__, "color_space": "RGB"})
+    plain = plotting.plot_weights(classifier_with_mean(rgb))
+    np.testing.assert_array_equal(np.array(plain.axes[:15]).reshape(3, 5)[1, 4].images[0].get_array(), mean)
+
+
+def test_hog_weights_are_the_sums_over_the_blocks():
+    params = FeatureParams(spatial_feat=False, hist_feat=False, orient=4, pix_per_cell=32, hog_channel=0)
+    weights = np.arange(16.0) - 7.5
+    template = Template(np.zeros(16), np.ones(16), weights, 0.0)
+    figure = plotting.plot_weights(VehicleClassifier(params, (template,)))
+    assert len(figure.axes) == 2  # one channel, no other parts
+    found = [sorted(axes.collections[0].get_array().tolist()) for axes in figure.axes]
+    assert found == [sorted(weights[weights > 0].tolist()), sorted((-weights[weights < 0]).tolist())]
+    assert {axes.collections[0].get_clim() for axes in figure.axes} == {(0, 7.5)}
+
+
+@pytest.mark.parametrize("space", ["RGB", "HSV", "LUV", "HLS", "YUV", "YCrCb", "LAB"])
+def test_weights_in_every_color_space(space):
+    params = FeatureParams(hog_feat=False, spatial_size=4, hist_bins=4, color_space=space)
+    assert len(plotting.plot_weights(classifier_with_mean(params)).axes) == 3 * 3 + 3
+
+
+def test_malformed_options_of_the_weights_are_rejected():
+    with pytest.raises(InvalidInputError, match="classifier must be a VehicleClassifier, got 'm'"):
+        plotting.plot_weights("m")
+    with pytest.raises(InvalidInputError, match="template must be an integer from 0 to 0; got 1"):
+        plotting.plot_weights(classifier_with_mean(SMALL), template=1)

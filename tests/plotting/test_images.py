@@ -1,12 +1,14 @@
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 
-from tests.plotting.helpers import drawn_boxes, gray_image, titles
+from tests.plotting.helpers import drawn_boxes, gray_image, legend, new_axes, texts, titles
 from vehicle_detection import plotting
 from vehicle_detection.boxes import Detections
+from vehicle_detection.datasets import PatchSet, Split, find_near_duplicates
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import FrameBoxes
-from vehicle_detection.plotting.style import SKY, TRUTH
+from vehicle_detection.plotting.style import OTHER, SKY, TRUTH, VEHICLE, evenly_spaced
 
 
 def test_an_image_is_described():
@@ -22,7 +24,7 @@ def test_an_image_is_described():
 @pytest.mark.parametrize(
     ("array", "mean", "problem"),
     [
-        (np.full((2, 2, 3), 0.5, np.float32), (0.5, 0.5, 0.5), "scale a 0-1 float image"),
+        (np.full((2, 2, 3), 0.5, np.float32), (0.5, 0.5, 0.5), "scale its values 0-1"),
         (np.zeros((2, 2), np.uint8), (0,), "convert a grayscale image"),
         (np.full((5, 2, 2, 3), 9, np.uint8), (9,), "pass one image with three color channels"),
     ],
@@ -69,9 +71,12 @@ def test_the_grid_has_no_empty_panels():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (([],), "images must be a list of images, at least one; got an empty list"),
-        ((gray_image(),), r"images must be a list of images, got an array of shape \(90, 160, 3\)"),
-        (([gray_image() / 255],), r"images\[0\] must be an \(H, W, 3\) uint8 RGB array.*scale a 0-1 float"),
+        (([],), r"images must be a list of images, at least one; got \[\]"),
+        (
+            (gray_image(),),
+            r"images must be a list of images, at least one; got an array of shape \(90, 160, 3\)",
+        ),
+        (([gray_image() / 255],), r"images\[0\] must be an \(H, W, 3\) uint8 RGB array.*scale its values 0-1"),
         (([gray_image()], ["a", "b"]), "titles must have one value for each of the 1 images, got 2"),
     ],
 )
@@ -107,3 +112,109 @@ def test_methods_are_shown_side_by_side():
         plotting.plot_methods([gray_image()], {"count": found})
     with pytest.raises(InvalidInputError, match="methods must map names to a list of Detections, got"):
         plotting.plot_methods([gray_image()], [found])
+
+
+def test_patches_of_a_set_show_class_and_source(patch_set):
+    axes = plotting.plot_patches(patch_set, count=8, columns=4, scores=np.arange(40.0), ax=new_axes())
+    rows = evenly_spaced(40, 8)
+    np.testing.assert_array_equal(axes.images[7].get_array(), patch_set.patches[39])
+    assert texts(axes.texts)[0] == "Far\nscore +0.00"
+    assert texts(axes.texts)[-1] == "Road\nscore +39.00"
+    colors = [tuple(lines.get_colors()[0][:3]) for lines in axes.collections]
+    assert colors == [pytest.approx(VEHICLE if label else OTHER) for label in patch_set.labels[rows]]
+    left, right, bottom, top = np.array([image.get_extent() for image in axes.images]).T
+    assert (right <= axes.get_xlim()[1]).all()
+    assert (bottom <= axes.get_ylim()[0]).all()
+    assert (np.diff(left[:4]) > 0).all()
+    assert top[4] > bottom[0]
+
+
+def test_patches_from_a_list_have_no_edges_without_labels(patch_set):
+    axes = plotting.plot_patches(list(patch_set.patches[:3]), captions=["a", "", "c"], ax=new_axes())
+    assert texts(axes.texts) == ["a", "c"]
+    assert not axes.collections
+    assert axes.get_legend() is None
+    labelled = plotting.plot_patches(patch_set.patches[:3], labels=[1, 0, 1], ax=new_axes())
+    assert len(labelled.collections) == 3
+    assert legend(labelled) == ["vehicle", "other"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"labels": [1]}, "labels must be one number for each of 40 patches"),
+        ({"scores": ["a"] * 40}, "scores must be one number for each of 40 patches"),
+        ({"captions": ["a"]}, "captions must have one value for each of the 40 patches, got 1"),
+        ({"count": 0}, "count must be an integer from 1 to 1000"),
+        ({"columns": 0}, "columns must be an integer from 1 to 100"),
+    ],
+)
+def test_malformed_options_of_the_patches_are_rejected(patch_set, options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        plotting.plot_patches(patch_set, **options)
+    with pytest.raises(InvalidInputError, match="patches must hold at least one patch; got none"):
+        plotting.plot_patches(patch_set[:0])
+
+
+def test_the_balance_counts_the_patches_of_each_source(patch_set):
+    some = patch_set[:30]
+    axes = plotting.plot_balance(some, ax=new_axes())
+    assert texts(axes.get_yticklabels()) == ["Far", "Road"]
+    widths = [patch.get_width() for patch in axes.patches]
+    assert widths == [int(some.labels.sum()), int((~some.labels).sum())]
+    assert [to_rgb(patch.get_facecolor()) for patch in axes.patches] == [VEHICLE, OTHER]
+    assert legend(axes) == ["vehicles: 20 (66.7%)", "other: 10 (33.3%)"]
+    assert axes.get_xlabel() == "patches"
+    # a single class
+    assert legend(plotting.plot_balance(some[some.labels], ax=new_axes())) == ["vehicles: 20 (100.0%)"]
+
+
+def test_the_balance_needs_a_set_with_patches(patch_set):
+    with pytest.raises(InvalidInputError, match="patch_set must be a PatchSet with patches, got an array"):
+        plotting.plot_balance(patch_set.patches)
+    with pytest.raises(
+        InvalidInputError, match=r"patch_set must be a PatchSet with patches, got PatchSet\(0 "
+    ):
+        plotting.plot_balance(patch_set[:0])
+
+
+@pytest.fixture(scope="module")
+def duplicates():
+    patches = np.random.default_rng(0).integers(0, 256, (30, 64, 64, 3), np.uint8)
+    patches[20:] = patches[:10] // 2
+    return PatchSet(patches, [1] * 30, [f"vehicles/drawn/{row}.png" for row in range(30)])
+
+
+def test_near_duplicates_are_shown_below_each_other(duplicates):
+    pairs = find_near_duplicates(duplicates)
+    axes = plotting.plot_near_duplicates(duplicates, pairs, count=4, ax=new_axes())
+    assert axes.get_title() == "20 of 30 patches have a near duplicate (66.7%)"
+    chosen = pairs[evenly_spaced(20, 4)]
+    for place, row in enumerate([*chosen[:, 0], *chosen[:, 1]]):
+        np.testing.assert_array_equal(axes.images[place].get_array(), duplicates.patches[row])
+    assert texts(axes.texts)[:4] == ["drawn"] * 4
+    assert all(0.95 <= float(text.removeprefix("r = ")) <= 1 for text in texts(axes.texts)[4:])
+    # the second row of pairs is not full
+    wide = plotting.plot_near_duplicates(duplicates, pairs, count=13, ax=new_axes())
+    assert len(wide.images) == len(wide.texts) == 26
+
+
+def test_near_duplicates_in_both_parts_of_a_split(duplicates):
+    pairs = find_near_duplicates(duplicates)
+    split = Split(np.arange(20), np.arange(20, 30))
+    axes = plotting.plot_near_duplicates(duplicates, pairs, split=split, ax=new_axes())
+    assert axes.get_title().startswith(
+        "10 of 10 test patches have their nearest duplicate in the training part"
+    )
+    np.testing.assert_array_equal(axes.images[0].get_array(), duplicates.patches[20])
+    apart = Split(np.arange(10, 20), np.r_[:10, 20:30])
+    with pytest.raises(InvalidInputError, match="pairs must hold at least one pair to show; got none"):
+        plotting.plot_near_duplicates(duplicates, pairs, split=apart)
+    with pytest.raises(InvalidInputError, match="split must be a Split, got"):
+        plotting.plot_near_duplicates(duplicates, pairs, split=(1, 2))
+
+
+@pytest.mark.parametrize("pairs", [[1, 2], [[0, 30]], [[-1, 2]], [[0.5, 1.0]]])
+def test_malformed_pairs_are_rejected(duplicates, pairs):
+    with pytest.raises(InvalidInputError, match=r"pairs must be \(M, 2\) row numbers of the 30 patches"):
+        plotting.plot_near_duplicates(duplicates, pairs)

@@ -1,6 +1,8 @@
 import numpy as np
 import pandas as pd
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tests.plotting.helpers import drawn_boxes, gray_image, legend, new_axes, texts
 from vehicle_detection import plotting
@@ -227,3 +229,45 @@ def test_many_lines_differ_in_color_or_style():
     axes = plotting.plot_parameter(table, "C", by="seed", ax=new_axes())
     styles = {(str(line[0].get_color()), line[0].get_linestyle()) for line in axes.containers}
     assert len(styles) == 9
+
+
+def test_the_legend_counts_the_errors_of_both_classes():
+    scores, labels = [2.0, 1.0, -0.25, 0.0, -1.0, 0.5], [1, 1, 1, 1, 0, 0]
+    axes = plotting.plot_scores(scores, labels, bins=12, ax=new_axes())
+    assert legend(axes) == [
+        "vehicles: 2 of 4 missed", "other: 1 of 2 classified as vehicles", "threshold 0",
+    ]  # fmt: skip
+    assert axes.get_yscale() == "log"
+    assert axes.get_xlabel() == "score (decision value)"
+    assert axes.lines[0].get_xdata() == [0, 0]
+    strict = plotting.plot_scores(scores, labels, threshold=1.5, ax=new_axes())
+    assert legend(strict)[:2] == ["vehicles: 3 of 4 missed", "other: 0 of 2 classified as vehicles"]
+
+
+@settings(max_examples=30)
+@given(
+    scores=st.lists(st.floats(-50, 50), min_size=1, max_size=30),
+    threshold=st.floats(-60, 60),
+    bins=st.integers(1, 80),
+)
+def test_every_score_is_in_a_bin_and_the_threshold_is_an_edge(scores, threshold, bins):
+    axes = plotting.plot_scores(
+        scores, [index % 2 for index in range(len(scores))], threshold=threshold, bins=bins, ax=new_axes()
+    )
+    data = [patch.get_data() for patch in axes.patches[::2]]
+    assert sum(part.values.sum() for part in data) == len(scores)
+    assert np.abs(data[0].edges - threshold).min() == 0
+
+
+@pytest.mark.parametrize(
+    ("scores", "labels", "message"),
+    [
+        ([], [], "scores must be a list of finite numbers, at least one"),
+        ([np.nan], [1], "scores must be a list of finite numbers"),
+        ([1.0], [1, 0], "labels must be 0 or 1 for each of the 1 scores"),
+        ([1.0, 2.0], [1, -1], "labels must be 0 or 1"),
+    ],
+)
+def test_malformed_scores_are_rejected(scores, labels, message):
+    with pytest.raises(InvalidInputError, match=message):
+        plotting.plot_scores(scores, labels)

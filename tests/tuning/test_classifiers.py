@@ -80,7 +80,7 @@ def test_a_test_part_of_one_class_has_one_error_rate(patch_set):
         ),
         ({"params": "luv-2384"}, r"params must be a FeatureParams"),
         ({"splits": "half"}, r"splits must be one of"),
-        ({"seeds": 5}, r"seeds must be a list of integers"),
+        ({"seeds": 5}, r"seeds must be a list of different integers"),
     ],
 )
 def test_invalid_arguments(patch_set, arguments, message):

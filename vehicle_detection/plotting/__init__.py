@@ -11,14 +11,22 @@ uniform colormaps.
 
 from __future__ import annotations
 
-from vehicle_detection.plotting.features import plot_channels, plot_features, plot_hog
-from vehicle_detection.plotting.images import ImageDescription, describe_image, plot_methods, show_images
-from vehicle_detection.plotting.patches import plot_balance, plot_near_duplicates, plot_patches
+from vehicle_detection.plotting.features import plot_channels, plot_features, plot_hog, plot_weights
+from vehicle_detection.plotting.images import (
+    ImageDescription,
+    describe_image,
+    plot_balance,
+    plot_methods,
+    plot_near_duplicates,
+    plot_patches,
+    show_images,
+)
 from vehicle_detection.plotting.quality import (
     plot_errors,
     plot_f1,
     plot_parameter,
     plot_precision_recall,
+    plot_scores,
     plot_tradeoff,
 )
 from vehicle_detection.plotting.search import (
@@ -29,7 +37,6 @@ from vehicle_detection.plotting.search import (
     plot_windows,
 )
 from vehicle_detection.plotting.tracks import plot_stage_times, plot_tracks
-from vehicle_detection.plotting.training import plot_scores, plot_weights
 
 __all__ = [
     "ImageDescription",

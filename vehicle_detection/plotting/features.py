@@ -1,34 +1,30 @@
-"""Figures of the features: color channels, HOG, and the feature vector before and after scaling."""
+"""Figures of the features: color channels, HOG, the feature vector, and the weights of a classifier."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_choice, check_image, check_integer, check_patches, describe
-from vehicle_detection.classifier import VehicleClassifier
+from vehicle_detection._common import (
+    check_choice,
+    check_image,
+    check_integer,
+    check_patches,
+    check_type,
+    describe,
+)
+from vehicle_detection.classifier import CLASSIFIER_REMEDY, Template, VehicleClassifier
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import convert_color, extract_features, hog_blocks, hog_source
 from vehicle_detection.params import COLOR_SPACES, PATCH_SIZE, FeatureParams
-from vehicle_detection.plotting.style import (
-    COLORS,
-    LINE_COLORS,
-    OTHER,
-    VEHICLE,
-    FigureLike,
-    Image,
-    add_image,
-    check_length,
-    check_list,
-    check_numbers,
-    new_figure,
-    split_titles,
-    subplot_grid,
-)
+from vehicle_detection.plotting import style
+from vehicle_detection.plotting.style import COLORS, LINE_COLORS, OTHER, VEHICLE, FigureLike, Image
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,20 +50,17 @@ def hog_channel_names(params: FeatureParams) -> tuple[str, ...]:
     return names if params.hog_channel == "ALL" else (names[int(params.hog_channel)],)
 
 
-def sum_blocks(blocks: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sum the values of each cell over the blocks that contain it.
+def sum_blocks(blocks: NDArray[Any]) -> NDArray[np.float64]:
+    """Sum each cell of ``(block rows, block columns, b, b, orient)`` over the blocks that contain it.
 
-    ``(block rows, block columns, b, b, orient)``, as `hog_blocks` returns, to ``(rows, columns, orient)``
-    sums and ``(rows, columns, 1)`` numbers of blocks.
+    Returns ``(rows, columns, orient)``; ``sum_blocks(np.ones_like(blocks))`` counts the blocks.
     """
     down, across, side, _, orient = blocks.shape
     sums = np.zeros((down + side - 1, across + side - 1, orient))
-    counts = np.zeros((*sums.shape[:2], 1))
     for row in range(side):
         for column in range(side):
             sums[row : row + down, column : column + across] += blocks[:, :, row, column]
-            counts[row : row + down, column : column + across] += 1
-    return sums, counts
+    return sums
 
 
 def add_glyphs(
@@ -82,20 +75,20 @@ def add_glyphs(
 
     rows, columns, orient = cells.shape
     angles = np.pi * (np.arange(orient) + 0.5) / orient
-    row, column, bin_ = np.nonzero(cells > 0)
-    values = cells[row, column, bin_]
-    order = np.argsort(values, kind="stable")  # strong lines on top
-    row, column, bin_, values = row[order], column[order], bin_[order], values[order]
-    center = np.stack([column + 0.5, row + 0.5], axis=1) * size
     # An edge is perpendicular to its gradient, as drawn by skimage.feature.hog.
-    offset = np.stack([np.sin(angles), -np.cos(angles)], axis=1)[bin_] * (0.47 * size)
+    offsets = np.stack([np.sin(angles), -np.cos(angles)], axis=1) * (0.47 * size)
+    places = np.argwhere(cells > 0)
+    values = cells[cells > 0]
+    order = np.argsort(values, kind="stable")  # strong lines on top
+    row, column, bin_ = places[order].T
+    center = np.stack([column + 0.5, row + 0.5], axis=1) * size
     lines = LineCollection(
-        list(np.stack([center - offset, center + offset], axis=1)),
-        array=values,
+        list(np.stack([center - offsets[bin_], center + offsets[bin_]], axis=1)),
+        array=values[order],
         cmap="gray",
         linewidths=1.1 if columns <= _MANY_CELLS else 0.5,
     )
-    lines.set_clim(0, float(values.max()) if peak is None and len(values) else peak or 1.0)
+    lines.set_clim(0, peak or values.max(initial=0) or 1.0)
     ax.add_collection(lines, autolim=False)
     ax.set_facecolor("black")
     ax.set(xlim=(0, columns * size), ylim=(rows * size, 0), aspect="equal", xticks=[], yticks=[])
@@ -115,25 +108,19 @@ def plot_channels(
 
     Parameters
     ----------
-    images
-        One ``(H, W, 3)`` uint8 RGB image, several images, or a set of patches.
-    color_space
-        One of ``COLOR_SPACES``.
+    images, color_space
+        One ``(H, W, 3)`` uint8 RGB image, several images, or a set of patches; and one of ``COLOR_SPACES``.
     labels
         ``(N,)`` 1 for a vehicle, 0 for anything else: one curve per class. None takes those of a set.
-    points
-        Number of randomly chosen pixels per class in the lower panels; without labels each point has the
-        color of its pixel.
-    random_state
-        Seed of that choice.
-    figure
-        Where to draw; None for a new figure.
+    points, random_state
+        Number of randomly chosen pixels per class in the lower panels, and seed of the choice; without
+        labels each point has the color of its pixel.
+    figure : matplotlib.figure.Figure or SubFigure, optional
 
     Returns
     -------
     matplotlib.figure.Figure or SubFigure
-        Three panels with the histograms of the channels over all pixels; below, three scatter plots of
-        pairs of channels.
+        Three histograms of the channels over all pixels; below, three scatter plots of pairs of channels.
 
     Raises
     ------
@@ -151,8 +138,7 @@ def plot_channels(
     max_points = check_integer(points, "points", low=1, high=1_000_000)
     groups = _pixels_by_class(images, labels)
     names = channel_names(color_space)
-    figure = new_figure(figure, 11, 6)
-    upper, lower = subplot_grid(figure, 2, 3)
+    figure, (upper, lower) = style.new_panels(figure, (11, 6), 2, 3)
     converted = [convert_color(pixels[None], color_space)[0] for _, _, pixels in groups]
     for (label, color, pixels), values in zip(groups, converted):
         for channel, panel in enumerate(upper):
@@ -188,17 +174,16 @@ def _pixels_by_class(images: object, labels: ArrayLike | None) -> list[tuple[str
     elif isinstance(images, PatchSet):
         labels = images.labels if labels is None else labels
         images = images.patches
-    listed = check_list(images, "images", "images")
+    listed = style.check_list(images, "images", "images")
     flat = [check_image(image, f"images[{index}]").reshape(-1, 3) for index, image in enumerate(listed)]
-    known = check_numbers(labels, "labels", len(flat), "images")
+    known = style.check_numbers(labels, "labels", len(flat), "images")
     if known is None:
         return [(None, "0.35", np.concatenate(flat))]
-    groups = (("vehicle", VEHICLE, known > 0), ("other", OTHER, known <= 0))
-    return [
-        (name, color, np.concatenate([flat[row] for row in np.flatnonzero(mask)]))
-        for name, color, mask in groups
-        if mask.any()
-    ]
+    groups: list[tuple[str | None, Any, Image]] = []
+    for name, color, mask in (("vehicle", VEHICLE, known > 0), ("other", OTHER, known <= 0)):
+        if mask.any():
+            groups.append((name, color, np.concatenate(list(itertools.compress(flat, mask)))))
+    return groups
 
 
 def plot_hog(
@@ -218,18 +203,15 @@ def plot_hog(
     images
         One ``(H, W, 3)`` uint8 RGB image or several, such as a vehicle and a non-vehicle; the keys of a
         mapping are the titles.
-    params
-        Color space, channels, orientations and block; by default ``FeatureParams()``.
-    pix_per_cell
-        Cell sizes in pixels, one row of panels each.
-    figure
-        Where to draw; None for a new figure.
+    params, pix_per_cell
+        Color space, channels, orientations and block, by default ``FeatureParams()``; and cell sizes in
+        pixels, one row of panels each.
+    figure : matplotlib.figure.Figure or SubFigure, optional
 
     Returns
     -------
     matplotlib.figure.Figure or SubFigure
-        One column per image and channel: the channel in gray, and below it its HOG as one line collection per
-        cell size.
+        One column per image and channel: the channel in gray, and its HOG as a line collection per cell size.
 
     Raises
     ------
@@ -244,11 +226,9 @@ def plot_hog(
     """
     params = params or FeatureParams()
     single = isinstance(images, np.ndarray) and images.ndim == 3
-    listed, names = split_titles([images] if single else images)
-    cell_sizes = [
-        check_integer(cell, "pix_per_cell", low=2)
-        for cell in check_list(pix_per_cell, "pix_per_cell", "cell sizes")
-    ]
+    listed, names = style.split_titles([images] if single else images)
+    sizes = style.check_list(pix_per_cell, "pix_per_cell", "cell sizes")
+    cell_sizes = [check_integer(cell, "pix_per_cell", low=2) for cell in sizes]
     columns = []
     for index, (image, name) in enumerate(zip(listed, names)):
         source = hog_source(check_image(image, f"images[{index}]"), params)
@@ -257,21 +237,15 @@ def plot_hog(
     width = min(2.2, 12.5 / len(columns)) if len(columns) > 1 else 6.0
     height = width * columns[0][0].shape[0] / columns[0][0].shape[1]
     rows = 1 + len(cell_sizes)
-    figure = new_figure(figure, width * len(columns), height * rows + 0.4, layout="compressed")
-    grid = subplot_grid(figure, rows, len(columns))
-    for column, (channel_image, title) in zip(grid.T, columns):
-        add_image(column[0], channel_image, title, vmin=0, vmax=255)
-        for panel, cell in zip(column[1:], cell_sizes):
-            blocks = hog_blocks(
-                channel_image,
-                params.orient,
-                cell,
-                params.cell_per_block,
-                transform_sqrt=params.transform_sqrt,
-            )
-            sums, counts = sum_blocks(blocks)
-            add_glyphs(panel, sums / counts, size=cell)
-            panel.set(xlim=(0, channel_image.shape[1]), ylim=(channel_image.shape[0], 0))
+    size = width * len(columns), height * rows + 0.4
+    figure, grid = style.new_panels(figure, size, rows, len(columns), layout="compressed")
+    block, sqrt = params.cell_per_block, params.transform_sqrt
+    for (first, *others), (gray, title) in zip(grid.T, columns):
+        style.add_image(first, gray, title, vmin=0, vmax=255)
+        for panel, cell in zip(others, cell_sizes):
+            blocks = hog_blocks(gray, params.orient, cell, block, transform_sqrt=sqrt)
+            add_glyphs(panel, sum_blocks(blocks) / sum_blocks(np.ones_like(blocks)), size=cell)
+            panel.set(xlim=(0, gray.shape[1]), ylim=(gray.shape[0], 0))
     for panel, cell in zip(grid[1:, 0], cell_sizes):
         panel.set_ylabel(f"{cell} px cells", fontsize=9)
     return figure
@@ -293,18 +267,12 @@ def plot_features(
 
     Parameters
     ----------
-    patches
-        ``(N, 64, 64, 3)`` uint8 RGB, or a set.
-    model
-        A classifier, whose scaler is used; or parameters, with the scaler fitted to all of `patches`.
-    rows
-        Row numbers of the patches to plot.
-    names
-        One name per row.
-    template
-        Number of the classifier's template whose scaler is used.
-    figure
-        Where to draw; None for a new figure.
+    patches, rows, names
+        ``(N, 64, 64, 3)`` uint8 RGB, or a set; row numbers of the patches to plot; and one name per row.
+    model, template
+        A classifier and the number of the template whose scaler is used; or parameters, with the scaler
+        fitted to all of `patches`.
+    figure : matplotlib.figure.Figure or SubFigure, optional
 
     Returns
     -------
@@ -324,19 +292,22 @@ def plot_features(
     2628
     """
     images = check_patches(patches.patches if isinstance(patches, PatchSet) else patches, PATCH_SIZE)
-    chosen = [
-        check_integer(row, "rows", low=0, high=len(images) - 1)
-        for row in check_list(rows, "rows", "row numbers")
-    ]
-    labels = check_length(names, "names", len(chosen), "rows")
+    numbers = style.check_list(rows, "rows", "row numbers")
+    chosen = [check_integer(row, "rows", low=0, high=len(images) - 1) for row in numbers]
+    labels = style.check_length(names, "names", len(chosen), "rows")
     params, mean, scale = _scaler(images, model, template)
     raw = extract_features(images[chosen], params)
-    figure = new_figure(figure, 11, 5.5)
-    above, below = subplot_grid(figure, 2, 1, sharex=True)[:, 0]
+    figure, grid = style.new_panels(figure, (11, 5.5), 2, 1, sharex=True)
+    above, below = grid.flat
+    shades = (COLORS[1], COLORS[3], "0.6", COLORS[2])
     for panel, values in ((above, raw), (below, (raw - mean) / scale)):
         for line, label, color in zip(values, labels, LINE_COLORS * len(chosen)):
             panel.plot(line, linewidth=0.6, color=color, label=label)
-        _shade_parts(panel, params)
+        for shade, (name, part) in zip(shades, part_slices(params).items()):
+            label, middle = f"{name} ({part.stop - part.start:,})", (part.start + part.stop) / 2
+            top = panel.get_xaxis_transform()
+            panel.axvspan(part.start, part.stop, color=shade, alpha=0.18, linewidth=0)
+            panel.annotate(label, (middle, 1.0), (0, 3), top, "offset points", ha="center", fontsize=8)
     above.set(ylabel="value", xlim=(0, params.length))
     below.set(ylabel="value (standard deviations)", xlabel="feature")
     above.set_title("before scaling", loc="left", fontsize=10)
@@ -366,32 +337,130 @@ def _scaler(
     return model, features.mean(axis=0), scale
 
 
-def part_bounds(params: FeatureParams) -> dict[str, tuple[int, int]]:
-    """Half-open range of feature numbers of each part of the vector."""
+def part_slices(params: FeatureParams) -> dict[str, slice]:
+    """Position of each part in the feature vector, if the vector has it."""
     lengths = {
         "spatial bins": params.spatial_length,
         "color histogram": params.hist_length,
         "HOG": params.hog_length - params.coarse_length,
         "coarse HOG": params.coarse_length,
     }
-    bounds, start = {}, 0
-    for name, length in lengths.items():
-        if length:
-            bounds[name] = (start, start + length)
-        start += length
-    return bounds
+    stops = itertools.accumulate(lengths.values())
+    return {name: slice(stop - lengths[name], stop) for name, stop in zip(lengths, stops) if lengths[name]}
 
 
-def _shade_parts(panel: Axes, params: FeatureParams) -> None:
-    colors = (COLORS[1], COLORS[3], "0.6", COLORS[2])
-    for color, (name, (start, stop)) in zip(colors, part_bounds(params).items()):
-        panel.axvspan(start, stop, color=color, alpha=0.18, linewidth=0)
-        panel.annotate(
-            f"{name} ({stop - start:,})",
-            ((start + stop) / 2, 1.0),
-            xycoords=("data", "axes fraction"),
-            xytext=(0, 3),
-            textcoords="offset points",
-            ha="center",
-            fontsize=8,
-        )
+# Largest difference, in gray levels, between the mean patch and the patch shifted along the weights.
+_MAX_SHIFT = 110.0
+
+
+def plot_weights(
+    classifier: VehicleClassifier, *, template: int = 0, figure: FigureLike | None = None
+) -> FigureLike:
+    """Draw the weights of a linear SVM template, arranged as in the window.
+
+    The weights belong to the scaled features, so they are comparable. HOG weights are summed over the blocks
+    of each cell and drawn as edges, positive and negative ones separately (Dalal and Triggs, CVPR 2005,
+    figure 6).
+
+    Parameters
+    ----------
+    classifier, template
+        The trained model, and the number of its template.
+    figure : matplotlib.figure.Figure or SubFigure, optional
+
+    Returns
+    -------
+    matplotlib.figure.Figure or SubFigure
+        One row per channel. Columns: positive and negative weights of HOG and of coarse HOG, weights of the
+        spatial bins and of the histogram, as far as the model uses them. With spatial bins, the last column
+        shows the mean patch, and the mean patch shifted along the weights in both directions.
+
+    Raises
+    ------
+    InvalidInputError
+        If `classifier` is not a classifier, or does not have the template.
+
+    Examples
+    --------
+    >>> from vehicle_detection import load_classifier
+    >>> [panel.get_title() for panel in plot_weights(load_classifier()).axes[:2]]
+    ['HOG, positive', 'HOG, negative']
+    """
+    check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
+    number = check_integer(template, "template", low=0, high=len(classifier.templates) - 1)
+    chosen = classifier.templates[number]
+    params = classifier.params
+    weights = {part: chosen.coef[rows] for part, rows in part_slices(params).items()}
+    hogs = {"HOG": params.blocks, "coarse HOG": params.coarse_blocks}
+    titles = [f"{part}, {sign}" for part in hogs if part in weights for sign in ("positive", "negative")]
+    titles += ["spatial bins"] if params.spatial_feat else []
+    titles += ["histogram"] if params.hist_feat else []
+    titles += ["in color"] if params.spatial_feat else []
+    figure, grid = style.new_panels(figure, (min(2.6 * len(titles), 15), 7.2), 3, len(titles))
+    columns = dict(zip(titles, grid.T))
+    for title, column in columns.items():
+        column[0].set_title(title, fontsize=10)
+    for part, blocks in hogs.items():
+        if part in weights:
+            pair = columns[f"{part}, positive"], columns[f"{part}, negative"]
+            _add_hog_weights(np.stack(pair, axis=1), weights[part], params, blocks)
+    if params.spatial_feat:
+        _add_spatial_weights(columns["spatial bins"], weights["spatial bins"], params)
+        _add_shifted_patches(columns["in color"], chosen, params)
+    if params.hist_feat:
+        _add_histogram_weights(columns["histogram"], weights["color histogram"], params)
+    return figure
+
+
+def _add_hog_weights(
+    grid: NDArray[Any], weights: NDArray[np.float64], params: FeatureParams, blocks: int
+) -> None:
+    """Draw the HOG weights of all channels; the patch has ``(blocks, blocks)`` blocks."""
+    block = params.cell_per_block
+    shape = (params.hog_channels, blocks, blocks, block, block, params.orient)
+    cells = [sum_blocks(channel) for channel in weights.reshape(shape)]
+    peak = float(np.abs(cells).max()) or 1.0
+    for row, channel, name in zip(grid, cells, hog_channel_names(params)):
+        for panel, signed in zip(row, (channel, -channel)):
+            add_glyphs(panel, signed.clip(0), size=PATCH_SIZE / len(signed), peak=peak)
+        row[0].set_ylabel(f"channel {name}", fontsize=9)
+    for panel in grid[len(cells) :].flat:
+        panel.remove()
+
+
+def _add_spatial_weights(column: NDArray[Any], weights: NDArray[np.float64], params: FeatureParams) -> None:
+    maps = params.spatial_planes(weights)
+    top = float(np.abs(maps).max()) or 1.0
+    for panel, values, name in zip(column, maps, channel_names(params.color_space)):
+        style.add_image(panel, values, cmap="PuOr_r", vmin=-top, vmax=top)
+        panel.set_ylabel(name, fontsize=9)
+        bar = panel.figure.colorbar(panel.images[0], ax=panel, shrink=0.8)
+        bar.ax.tick_params(labelsize=6)
+
+
+def _add_histogram_weights(column: NDArray[Any], weights: NDArray[np.float64], params: FeatureParams) -> None:
+    top = 1.1 * float(np.abs(weights).max()) or 1.0
+    for panel, values, name in zip(column, weights.reshape(3, -1), channel_names(params.color_space)):
+        panel.stairs(values, np.linspace(0, 256, len(values) + 1), fill=True, color="0.45")
+        panel.axhline(0, color="black", linewidth=0.6)
+        panel.set(xlim=(0, 256), ylim=(-top, top))
+        panel.set_xlabel(f"{name} (0-255)", fontsize=8)
+        panel.set_ylabel("weight", fontsize=8)
+        panel.tick_params(labelsize=7)
+
+
+def _add_shifted_patches(column: NDArray[Any], template: Template, params: FeatureParams) -> None:
+    """Show the mean patch, and the mean patch shifted along the weights of the spatial bins."""
+    stop = params.spatial_length
+    direction = template.coef[:stop] * template.scale[:stop]
+    step = _MAX_SHIFT / (float(np.abs(direction).max()) or 1.0)
+    for panel, name, sign in zip(column, ("mean + weights", "mean patch", "mean - weights"), (1, 0, -1)):
+        values = template.mean[:stop] + sign * step * direction
+        patch = params.spatial_planes(values).transpose(1, 2, 0)
+        limits = [179 if params.spatial_space in ("HSV", "HLS") else 255, 255, 255]
+        patch = np.ascontiguousarray(patch.clip(0, limits).round().astype(np.uint8))
+        if params.spatial_space != "RGB":
+            conversion = getattr(cv2, f"COLOR_{params.spatial_space}2RGB")
+            patch = np.asarray(cv2.cvtColor(patch, conversion), np.uint8)
+        style.add_image(panel, patch)
+        panel.set_xlabel(name, fontsize=9)

@@ -1,12 +1,13 @@
-"""Figures of detection quality on labelled frames: curves, bars, the worst errors, parameter studies."""
+"""Figures of quality: scores of patches, curves and errors on labelled frames, parameter studies."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check_choice, check_integer, check_number, check_type, describe
 from vehicle_detection.boxes import box_areas, clip_boxes, iou_matrix
@@ -21,21 +22,8 @@ from vehicle_detection.evaluation import (
     match_detections,
     prepare_evaluation,
 )
-from vehicle_detection.plotting.style import (
-    LINE_COLORS,
-    SKY,
-    TRUTH,
-    VERMILION,
-    Color,
-    Image,
-    add_boxes,
-    add_tiles,
-    hide_spines,
-    legend_above,
-    legend_lines,
-    line_styles,
-    new_axes,
-)
+from vehicle_detection.plotting import style
+from vehicle_detection.plotting.style import LINE_COLORS, OTHER, SKY, TRUTH, VEHICLE, VERMILION, Image
 from vehicle_detection.tuning import check_column, numeric_column, pareto_front
 
 if TYPE_CHECKING:
@@ -48,6 +36,72 @@ _METRICS = ("f1", "precision", "recall", "average_precision", "mean_iou")
 _METRIC_NAMES = {"f1": "F1", "average_precision": "average precision", "mean_iou": "mean IoU"}
 
 
+def plot_scores(
+    scores: ArrayLike, labels: ArrayLike, *, threshold: float = 0.0, bins: int = 60, ax: Axes | None = None
+) -> Axes:
+    """Plot histograms of the scores of both classes, on a logarithmic scale that makes errors visible.
+
+    Parameters
+    ----------
+    scores, labels
+        ``(N,)`` decision values, and ``(N,)`` 1 for a vehicle, 0 for anything else.
+    threshold, bins
+        Score above which a patch is classified as a vehicle, and number of bins over the range of the scores.
+    ax : matplotlib.axes.Axes, optional
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        The legend counts the errors at the threshold; the vertical line is the threshold.
+
+    Raises
+    ------
+    InvalidInputError
+        If scores and labels differ in number, are empty or contain NaN.
+
+    Examples
+    --------
+    >>> axes = plot_scores([1.0, 2.0, -0.5, -2.0], [1, 1, 1, 0])
+    >>> [text.get_text() for text in axes.get_legend().get_texts()]
+    ['vehicles: 1 of 3 missed', 'other: 0 of 1 classified as vehicles', 'threshold 0']
+    """
+    from matplotlib.ticker import LogFormatter
+
+    values, known = style.check_scores(scores, "scores"), np.asarray(labels)
+    if known.shape != values.shape or not np.isin(known, (0, 1)).all():
+        raise InvalidInputError(
+            f"labels must be 0 or 1 for each of the {len(values)} scores; got {describe(known)}"
+        )
+    limit = check_number(threshold, "threshold")
+    edges = _bin_edges(values, limit, check_integer(bins, "bins", low=1, high=10_000))
+    axes = style.new_axes(ax)
+    classes = ((1, VEHICLE, "vehicles", "missed"), (0, OTHER, "other", "classified as vehicles"))
+    for vehicle, color, name, error in classes:
+        own = values[known == vehicle]
+        errors = int(((own > limit) != vehicle).sum())
+        counts = np.histogram(own, edges)[0]
+        axes.stairs(counts, edges, fill=True, color=color, alpha=0.35)
+        label = f"{name}: {errors:,} of {len(own):,} {error}"
+        axes.stairs(counts, edges, color=color, linewidth=1.4, label=label)
+    axes.axvline(limit, color="black", linestyle="--", linewidth=1, label=f"threshold {limit:g}")
+    axes.set(yscale="log", xlabel="score (decision value)", ylabel="patches")
+    axes.set_ylim(bottom=0.7)
+    # The default formatter writes 4x10^0 on an axis of less than a decade.
+    axes.yaxis.set_major_formatter("{x:,.0f}")
+    axes.yaxis.set_minor_formatter(LogFormatter())
+    style.legend_above(axes, 3)
+    return axes
+
+
+def _bin_edges(values: NDArray[np.float64], threshold: float, count: int) -> NDArray[np.float64]:
+    """Edges of about `count` bins, one of them at the threshold, so that no bin mixes both decisions."""
+    low, high = min(float(values.min()), threshold), max(float(values.max()), threshold)
+    width = (high - low) / count or 1.0
+    before = np.ceil((threshold - low) / width)
+    after = np.floor((high - threshold) / width) + 1
+    return np.asarray(threshold + width * np.arange(-before, after + 1), np.float64)
+
+
 def plot_precision_recall(
     curves: Mapping[str, Curve] | Curve, *, threshold: float | None = None, ax: Axes | None = None
 ) -> Axes:
@@ -55,12 +109,10 @@ def plot_precision_recall(
 
     Parameters
     ----------
-    curves
-        A result of `precision_recall_curve`, or a mapping from names to several.
-    threshold
-        Threshold to mark with a square; a dot marks the best F1.
-    ax
-        Where to draw; None for a new figure.
+    curves, threshold
+        A result of `precision_recall_curve`, or a mapping from names to several; and a threshold to mark with
+        a square. A dot marks the best F1.
+    ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
@@ -83,23 +135,26 @@ def plot_precision_recall(
     if not named:
         raise InvalidInputError("curves must hold at least one curve; got none")
     checked = {str(name): _check_curve(curve, str(name)) for name, curve in named.items()}
-    limit = None if threshold is None else check_number(threshold, "threshold")
-    axes = new_axes(ax, 6.5, 6)
-    _add_f1_lines(axes)
-    for (name, (precision, recall, thresholds)), (color, dash) in zip(checked.items(), line_styles()):
+    limit = math.inf if threshold is None else check_number(threshold, "threshold")
+    axes = style.new_axes(ax, 6.5, 6)
+    for level in (0.2, 0.4, 0.6, 0.8, 0.9):
+        x = np.linspace(level / (2 - level), 1, 100)
+        axes.plot(x, level * x / (2 * x - level), color="0.85", linewidth=0.8, zorder=1)
+        axes.annotate(f"F1 {level:g}", (1, x[0]), fontsize=7, color="0.5", ha="right", va="bottom")
+    for (name, (precision, recall, thresholds)), (color, dash) in zip(checked.items(), style.line_styles()):
         f1, best_threshold = best_f1(precision, recall, thresholds)
         best = int(np.argmax(thresholds == best_threshold))
         text = f"best F1 {f1:.2f} at {best_threshold:.2f}"
         label = f"{name}: {text}" if name else text
         axes.plot(recall, precision, color=color, linestyle=dash, linewidth=1.8, label=label, zorder=3)
         axes.plot(recall[best], precision[best], "o", color=color, zorder=4)
-        used = np.flatnonzero(thresholds > limit) if limit is not None else np.empty(0, np.intp)
+        used = np.flatnonzero(thresholds > limit)
         if len(used):
             axes.plot(recall[used[-1]], precision[used[-1]], "s", color=color, mfc="white", zorder=4)
     axes.set(xlim=(0, 1.01), ylim=(0, 1.01), aspect="equal")
-    axes.set_xlabel("recall (fraction of vehicles found)")
-    axes.set_ylabel("precision (fraction of boxes that are correct)")
-    legend_above(axes, fontsize=8)
+    axes.set(xlabel="recall (fraction of vehicles found)")
+    axes.set(ylabel="precision (fraction of boxes that are correct)")
+    style.legend_above(axes, fontsize=8)
     return axes
 
 
@@ -116,13 +171,6 @@ def _check_curve(curve: object, name: str) -> Curve:
     return precision, recall, thresholds
 
 
-def _add_f1_lines(axes: Axes) -> None:
-    for f1 in (0.2, 0.4, 0.6, 0.8, 0.9):
-        recall = np.linspace(f1 / (2 - f1), 1, 100)
-        axes.plot(recall, f1 * recall / (2 * recall - f1), color="0.85", linewidth=0.8, zorder=1)
-        axes.annotate(f"F1 {f1:g}", (1, f1 / (2 - f1)), fontsize=7, color="0.5", ha="right", va="bottom")
-
-
 def plot_f1(
     scores: Mapping[str, DetectionScores] | Mapping[str, Mapping[str, DetectionScores]],
     *,
@@ -137,8 +185,7 @@ def plot_f1(
         Results of `evaluate_detections` by source; or by detector, then by source.
     metric
         ``"f1"``, ``"precision"``, ``"recall"``, ``"average_precision"`` or ``"mean_iou"``.
-    ax
-        Where to draw; None for a new figure.
+    ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
@@ -170,19 +217,19 @@ def plot_f1(
     sources = list(dict.fromkeys(source for by_source in detectors.values() for source in by_source))
     if not sources:
         raise InvalidInputError("scores must hold at least one source; got none")
-    axes = new_axes(ax, 2.5 + 1.3 * len(sources), 4)
+    axes = style.new_axes(ax, 2.5 + 1.3 * len(sources), 4)
     width = 0.8 / len(detectors)
     for number, (name, by_source) in enumerate(detectors.items()):
-        values = [getattr(by_source[source], metric) if source in by_source else np.nan for source in sources]
+        values = [getattr(by_source.get(source), metric, np.nan) for source in sources]
         positions = np.arange(len(sources)) + (number - (len(detectors) - 1) / 2) * width
         color = LINE_COLORS[number % len(LINE_COLORS)]
         bars = axes.bar(positions, values, width * 0.94, color=color, label=name)
         axes.bar_label(bars, ["" if np.isnan(v) else f"{v:.2f}" for v in values], padding=2, fontsize=8)
     axes.set_xticks(range(len(sources)), [str(source) for source in sources])
     axes.set(ylim=(0, 1.1), ylabel=_METRIC_NAMES.get(metric, metric))
-    hide_spines(axes)
+    axes.spines[["top", "right"]].set_visible(False)
     if nested:
-        legend_above(axes, 3)
+        style.legend_above(axes, 3)
     return axes
 
 
@@ -200,27 +247,19 @@ def plot_errors(
 
     Parameters
     ----------
-    frames
-        Frames with their true boxes.
-    predictions
-        Predicted boxes with scores, such as those of `FrameBoxes.from_detections`.
+    frames, predictions
+        Frames with their true boxes; and predicted boxes with scores, as `FrameBoxes.from_detections` makes.
     kind
         ``"missed"``: labelled vehicles without a detection, largest first, with the largest IoU of any
         detection. ``"false"``: detections without a labelled vehicle, highest score first.
-    iou
-        Minimum IoU of a detection and its vehicle, as in `evaluate_detections`.
-    count
-        Maximum number of errors to show.
-    columns
-        Crops per row.
-    ax
-        Where to draw; None for a new figure.
+    iou, count, columns
+        Minimum IoU of a detection and its vehicle; maximum number of errors to show; and crops per row.
+    ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
     matplotlib.axes.Axes
-        Contains one image per error, with dashed labelled boxes and solid detections. The title states the
-        total number of errors.
+        One image per error, with dashed labelled boxes and solid detections; the title counts all errors.
 
     Raises
     ------
@@ -234,65 +273,46 @@ def plot_errors(
     >>> plot_errors(frames, FrameBoxes([], None, [], scores=[])).get_title()
     '1 of 1 vehicles missed'
     """
-    check_type(
-        frames, "frames", LabelledFrames, "pair frames and labels with LabelledFrames(name, frames, labels)"
-    )
+    check_type(frames, "frames", LabelledFrames, "pass LabelledFrames(name, frames, labels)")
     check_choice(kind, "kind", ("missed", "false"))
     min_iou = check_number(iou, "iou", above=0, high=1)
     max_count = check_integer(count, "count", low=1, high=1000)
     predictions, labels, keys = prepare_evaluation(predictions, frames.labels, frames.keys)
     matches = match_detections(predictions, labels, keys, min_iou)
     if kind == "missed":
-        side, rows = labels, np.setdiff1d(matches.usable, matches.match)
+        side, rows, importance = labels, matches.missed, box_areas(labels.boxes)
         title = f"{len(rows):,} of {len(matches.usable):,} vehicles missed"
-        order = np.argsort(-box_areas(side.boxes[rows]), kind="stable")
     else:
         side, rows = predictions, np.flatnonzero((matches.match < 0) & ~matches.ignored)
+        importance = np.zeros(len(side)) if side.scores is None else side.scores
         title = f"{len(rows):,} of {len(predictions):,} detections are false positives"
-        order = np.arange(len(rows)) if side.scores is None else np.argsort(-side.scores[rows], kind="stable")
-    shown = rows[order[:max_count]].tolist()
-    crops = [_crop(_read_frame(frames, side.frames[row]), side.boxes[row]) for row in shown]
-    axes, tiles = add_tiles(
-        ax,
-        [crop for crop, _ in crops],
-        [_caption(side, row, predictions, kind) for row in shown],
-        columns=min(check_integer(columns, "columns", low=1, high=100), max(len(shown), 1)),
-        inches=1.9,
-        caption_lines=2,
-    )
+    shown = rows[np.argsort(-importance[rows], kind="stable")[:max_count]].tolist()
+    crops = [_crop(frames, side.frames[row], side.boxes[row]) for row in shown]
+    captions = [_caption(side, row, predictions, kind) for row in shown]
+    tiles = [(image, caption) for (image, _), caption in zip(crops, captions)]
+    axes, places = style.add_tiles(ax, tiles, columns=columns, inches=1.9, caption_lines=2)
     axes.set_title(title, fontsize=10)
-    for row, crop, tile in zip(shown, crops, tiles):
-        key = side.frames[row]
-        true = labels.frame(key)
-        _add_cropped_boxes(axes, true.boxes[~true.ignore], crop, tile, TRUTH, "--")
-        _add_cropped_boxes(axes, predictions.frame(key).boxes, crop, tile, SKY, "-")
-        if kind == "false":
-            _add_cropped_boxes(axes, side.boxes[[row]], crop, tile, VERMILION, "-")
+    entries = [("labelled", "0.6", "--"), ("detected", SKY, "-"), ("false positive", VERMILION, "-")]
+    entries = entries[: 2 if kind == "missed" else 3]
+    for row, (image, corner), (left, top, pixel) in zip(shown, crops, places):
+        true, found = labels.frame(side.frames[row]), predictions.frame(side.frames[row])
+        layers = (true.boxes[~true.ignore], found.boxes, side.boxes[[row]])
+        for boxes, color, (_, _, linestyle) in zip(layers, (TRUTH, SKY, VERMILION), entries):
+            clipped = clip_boxes(boxes - np.tile(corner, 2), image.shape)
+            clipped = clipped[(clipped[:, 2:] - clipped[:, :2] >= 2).all(axis=1)]
+            if len(clipped):
+                placed = clipped * pixel + np.array([left, top, left, top])
+                style.add_boxes(axes, placed, color, linewidths=1.3, linestyles=linestyle)
     if shown:
-        entries: list[tuple[str, Any, Any]] = [("labelled", "0.6", "--"), ("detected", SKY, "-")]
-        entries += [("false positive", VERMILION, "-")] if kind == "false" else []
-        axes.legend(
-            handles=legend_lines(*entries),
-            loc="upper right",
-            bbox_to_anchor=(1, 0),
-            ncols=3,
-            fontsize=8,
-            frameon=False,
-        )
+        options: dict[str, Any] = {"bbox_to_anchor": (1, 0), "ncols": 3, "fontsize": 8, "frameon": False}
+        axes.legend(handles=style.legend_lines(*entries), loc="upper right", **options)
     return axes
 
 
-def _read_frame(frames: LabelledFrames, key: FrameKey) -> Image:
+def _crop(frames: LabelledFrames, key: FrameKey, box: NDArray[Any]) -> tuple[Image, tuple[int, int]]:
+    """Cut out a square around the center of a box, 1.8 times its longer side; and its upper left corner."""
     images = frames.frames
-    return images[images.names.index(str(key))] if isinstance(images, FrameSet) else images[key]
-
-
-Crop = tuple[Image, tuple[int, int]]
-"""An image cut out of a frame, and the frame's pixel at its upper left corner."""
-
-
-def _crop(image: Image, box: NDArray[Any]) -> Crop:
-    """Cut out a square around the center of a box, 1.8 times its longer side."""
+    image = images[images.names.index(str(key))] if isinstance(images, FrameSet) else images[key]
     height, width = image.shape[:2]
     x, y = (box[:2] + box[2:]) / 2
     half = max(24.0, 0.9 * float((box[2:] - box[:2]).max()))
@@ -315,23 +335,6 @@ def _caption(side: FrameBoxes, row: int, predictions: FrameBoxes, kind: str) -> 
     return f"{name if len(name) <= 24 else '...' + name[-21:]}\n{text}"
 
 
-def _add_cropped_boxes(
-    axes: Axes,
-    boxes: NDArray[Any],
-    crop: Crop,
-    tile: tuple[float, float, float],
-    color: Color,
-    linestyle: str,
-) -> None:
-    """Draw the parts of boxes that lie inside a crop onto its tile (left, top, pixel size)."""
-    (image, corner), (left, top, pixel) = crop, tile
-    clipped = clip_boxes(boxes - np.tile(corner, 2), image.shape)
-    clipped = clipped[(clipped[:, 2:] - clipped[:, :2] >= 2).all(axis=1)]
-    if len(clipped):
-        placed = clipped * pixel + np.array([left, top, left, top])
-        add_boxes(axes, placed, color, linewidths=1.3, linestyles=linestyle)
-
-
 # Ratio of the largest to the smallest value above which the x axis is logarithmic.
 _LOG_RATIO = 20
 # Number of characters of tick labels that fit under the x axis without rotation.
@@ -352,14 +355,10 @@ def plot_tradeoff(
     ----------
     table
         Results of `compare_configurations` or `search_parameters`; rows without either value are left out.
-    quality
-        Column of the y axis; higher is better.
-    cost
-        Column of the x axis; lower is better.
-    label
-        Column of the text beside the points of the front; None for no text.
-    ax
-        Where to draw; None for a new figure.
+    quality, cost, label
+        Columns of the y axis, where higher is better, of the x axis, where lower is better, and of the text
+        beside the points of the front, None for no text.
+    ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
@@ -383,7 +382,7 @@ def plot_tradeoff(
         raise InvalidInputError(f"table has no row with both {quality} and {cost}; measure them first")
     if label is not None:
         check_column(table, label)
-    axes = new_axes(ax)
+    axes = style.new_axes(ax)
     x, y = numeric_column(table, cost), numeric_column(table, quality)
     shown = ~np.isnan(x) & ~np.isnan(y)
     axes.scatter(x[shown], y[shown], s=24, color="0.6", label="measured", zorder=2)
@@ -391,10 +390,9 @@ def plot_tradeoff(
     if label is not None:
         for x, y, text in zip(front[cost], front[quality], front[label]):
             axes.annotate(str(text), (x, y), (4, 6), textcoords="offset points", fontsize=8)
-    axes.set_xlabel(cost.replace("_", " "))
-    axes.set_ylabel(quality.replace("_", " "))
-    axes.margins(0.12)
+    axes.set(xlabel=cost.replace("_", " "), ylabel=quality.replace("_", " "))
     axes.grid(alpha=0.3)
+    axes.margins(0.12)
     axes.legend(loc="lower right")
     return axes
 
@@ -413,21 +411,17 @@ def plot_parameter(
     ----------
     table
         Results of `compare_configurations` or `search_parameters`; rows without the measurement are left out.
-    parameter
-        Column of the x axis, such as ``"C"`` or ``"orient"``.
-    quality
-        Column of the y axis, a measurement.
-    by
-        Column that groups the rows into lines, such as ``"split"``; None for one line.
-    ax
-        Where to draw; None for a new figure.
+    parameter, quality, by
+        Columns of the x axis, such as ``"C"``, of the y axis, a measurement, and of the groups of rows that
+        form lines, such as ``"split"``, None for one line.
+    ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
     matplotlib.axes.Axes
-        One line for each value of `by`. Error bars show the standard deviation over rows with the same
-        `parameter` and `by`. The x axis is logarithmic if its numbers span more than a factor of 20, and
-        evenly spaced if it holds text.
+        One line for each value of `by`, with the standard deviation over rows with the same `parameter` and
+        `by` as error bars. The x axis is logarithmic if its numbers span more than a factor of 20, and evenly
+        spaced if it holds text.
 
     Raises
     ------
@@ -444,41 +438,35 @@ def plot_parameter(
     columns = [parameter] if by is None else [parameter, by]
     for name in columns:
         check_column(table, name)
-    measured = table[~np.isnan(numeric_column(table, quality))].dropna(subset=columns)
+    measured = table[~np.isnan(numeric_column(table, quality))].dropna(subset=columns).reset_index(drop=True)
     if measured.empty:
         raise InvalidInputError(f"table has no row with both {parameter} and {quality}; measure them first")
-    axes = new_axes(ax)
-    values = measured[parameter].unique().tolist()
+    axes = style.new_axes(ax)
+    values = measured[parameter].tolist()
     numeric = all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
-    values = sorted(values) if numeric else values
-    x_of = {value: value if numeric else index for index, value in enumerate(values)}
+    x, names = (np.array(values), ()) if numeric else measured[parameter].factorize()
     groups = [(None, measured)] if by is None else measured.groupby(by, sort=False)
-    for (name, rows), (color, dash) in zip(groups, line_styles()):
-        runs = rows.groupby(parameter, sort=False)[quality].agg(["mean", "std"])
-        runs.index = runs.index.map(x_of)
-        runs = runs.sort_index()
-        axes.errorbar(
+    for (name, rows), (color, dash) in zip(groups, style.line_styles()):
+        runs = rows[quality].groupby(x[rows.index]).agg(["mean", "std"])
+        lines = axes.errorbar(
             runs.index,
             runs["mean"],
-            yerr=runs["std"],
+            runs["std"],
             fmt="o",
             linestyle=dash,
             color=color,
             capsize=3,
             markersize=4,
-            label=None if by is None else str(name),
         )
+        lines.set_label(None if by is None else str(name))
     if not numeric:
-        texts = [str(value) for value in values]
-        axes.set_xticks(range(len(values)), texts)
-        if max(map(len, texts)) * len(texts) > _MAX_TICK_CHARACTERS:
-            axes.tick_params(axis="x", rotation=30)
-            for label in axes.get_xticklabels():
-                label.set_horizontalalignment("right")
-    elif values[0] > 0 and values[-1] > _LOG_RATIO * values[0]:
+        texts = [str(name) for name in names]
+        turned = max(map(len, texts)) * len(texts) > _MAX_TICK_CHARACTERS
+        align = "right" if turned else "center"
+        axes.set_xticks(range(len(texts)), texts, rotation=30 if turned else 0, horizontalalignment=align)
+    elif x.min() > 0 and x.max() > _LOG_RATIO * x.min():
         axes.set_xscale("log")
-    axes.set_xlabel(parameter.replace("_", " "))
-    axes.set_ylabel(quality.replace("_", " "))
+    axes.set(xlabel=parameter.replace("_", " "), ylabel=quality.replace("_", " "))
     axes.grid(alpha=0.3)
     if by is not None:
         axes.legend(title=by.replace("_", " "), fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))

@@ -14,28 +14,9 @@ from vehicle_detection._common import check_image, check_number, check_type, des
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import frame_heat, heat_threshold, label_heat
-from vehicle_detection.params import HeatParams, PixelBand, SearchParams
-from vehicle_detection.plotting.style import (
-    BLUE,
-    COLORS,
-    SKY,
-    TRUTH,
-    VERMILION,
-    YELLOW,
-    Boxes,
-    FigureLike,
-    Image,
-    add_boxes,
-    add_image,
-    box_array,
-    check_scores,
-    filled_axes,
-    hide_spines,
-    legend_lines,
-    new_axes,
-    new_figure,
-    subplot_grid,
-)
+from vehicle_detection.params import HeatParams, SearchParams
+from vehicle_detection.plotting import style
+from vehicle_detection.plotting.style import BLUE, SKY, TRUTH, VERMILION, YELLOW, Boxes, FigureLike, Image
 from vehicle_detection.windows import band_windows
 
 if TYPE_CHECKING:
@@ -54,23 +35,17 @@ def plot_windows(
 
     Parameters
     ----------
-    image
-        ``(H, W, 3)`` uint8 RGB.
-    windows
-        `Detections`, as `find_cars` returns, or ``(N, 4)`` boxes without scores, as `slide_window` returns,
-        drawn in one color.
-    truth
-        Labelled boxes, drawn with dashed lines.
-    title
-        The title; None for the number of windows.
-    ax
-        Where to draw; None for a new figure.
+    image, windows
+        ``(H, W, 3)`` uint8 RGB; and `Detections`, as `find_cars` returns, or ``(N, 4)`` boxes without scores,
+        as `slide_window` returns, drawn in one color.
+    truth, title
+        Labelled boxes, drawn with dashed lines; and the title, by default the number of windows.
+    ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
     matplotlib.axes.Axes
-        The first collection contains the windows in ascending order of score, so that the best are on top;
-        its array contains the scores.
+        The first collection contains the windows in ascending order of score; its array contains the scores.
 
     Raises
     ------
@@ -85,22 +60,23 @@ def plot_windows(
     ([0.5, 1.5], '2 windows')
     """
     height, width = check_image(image).shape[:2]
-    boxes = box_array(windows, "windows")
-    true = None if truth is None else box_array(truth, "truth")
-    axes = new_axes(ax, 8.5, 8.5 * height / width + 0.6)
-    add_image(axes, image, ticks=True)
+    boxes = style.box_array(windows, "windows")
+    true = None if truth is None else style.box_array(truth, "truth")
+    axes = style.new_axes(ax, 8.5, 8.5 * height / width + 0.6)
+    style.add_image(axes, image, ticks=True)
     linewidth = 1.4 if len(boxes) < 60 else 0.8
     if isinstance(windows, Detections) and len(windows):
         order = np.argsort(windows.scores, kind="stable")
-        lines = add_boxes(axes, boxes[order], halo=len(boxes) < 400, linewidths=linewidth)
+        lines = style.add_boxes(axes, boxes[order], halo=len(boxes) < 400, linewidths=linewidth)
         lines.set_array(windows.scores[order])
         lines.set_cmap("plasma")
         axes.figure.colorbar(lines, ax=axes, shrink=0.75, pad=0.02).set_label("score")
     else:
-        add_boxes(axes, boxes, SKY, halo=False, linewidths=linewidth)
+        style.add_boxes(axes, boxes, SKY, halo=False, linewidths=linewidth)
     if true is not None:
-        add_boxes(axes, true, TRUTH, linestyles="--", linewidths=2.0)
+        style.add_boxes(axes, true, TRUTH, linestyles="--", linewidths=2.0)
     _expand_limits(axes, boxes, width, height)
+    axes.set(xlabel="x (px)", ylabel="y (px)")
     axes.set_title(_count(len(boxes), "window") if title is None else title, fontsize=10)
     return axes
 
@@ -123,12 +99,9 @@ def plot_bands(
 
     Parameters
     ----------
-    image
-        ``(H, W, 3)`` uint8 RGB frame.
-    search
-        The bands; by default ``SearchParams.preset()``.
-    figure
-        Where to draw; None for a new figure.
+    image, search
+        ``(H, W, 3)`` uint8 RGB frame, and the bands, by default ``SearchParams.preset()``.
+    figure : matplotlib.figure.Figure or SubFigure, optional
 
     Returns
     -------
@@ -158,15 +131,22 @@ def plot_bands(
     bounds = np.array([[band.x1, band.y1, band.x2, band.y2] for band in bands])
     visible = max(width, bounds[:, 2].max()) - min(0, bounds[:, 0].min())
     panel_height = 13 / columns * height / visible + 0.3
-    figure = new_figure(figure, 13, rows * panel_height + 0.4, layout="compressed")
-    for panel, band, bound in zip(filled_axes(figure, rows, columns, len(bands)), bands, bounds):
-        add_image(panel, image)
+    size = 13, rows * panel_height + 0.4
+    figure, grid = style.new_panels(figure, size, rows, columns, count=len(bands), layout="compressed")
+    for panel, band, bound in zip(grid.flat, bands, bounds):
+        style.add_image(panel, image)
         panel.axhline(search.horizon * height, color="white", linestyle="--", linewidth=0.8)
-        windows = _add_band(panel, band, bound[None])
+        windows = band_windows(band)
+        shift = np.array([[band.step[0], 0] * 2, [0, band.step[1]] * 2])
+        # A low or narrow band may not have a second window in that direction.
+        neighbors = [row for row in windows[:1] + shift if (windows == row).all(axis=1).any()]
+        style.add_boxes(panel, bound[None], YELLOW)
+        style.add_boxes(panel, np.array(neighbors).reshape(-1, 4), SKY, linewidths=1.0)
+        style.add_boxes(panel, windows[:1], VERMILION, linewidths=1.4)
         _expand_limits(panel, bounds, width, height)
-        size, step = (f"{x}x{y}" for x, y in (band.window, band.step))
-        panel.set_title(f"{size} px, step {step}, {_count(windows, 'window')}", fontsize=9)
-    handles = legend_lines(
+        side, step = (f"{x}x{y}" for x, y in (band.window, band.step))
+        panel.set_title(f"{side} px, step {step}, {_count(len(windows), 'window')}", fontsize=9)
+    handles = style.legend_lines(
         ("band", YELLOW, "-"),
         ("first window", VERMILION, "-"),
         ("next windows to the right and down", SKY, "-"),
@@ -176,19 +156,6 @@ def plot_bands(
     return figure
 
 
-def _add_band(panel: Axes, band: PixelBand, bound: NDArray[Any]) -> int:
-    """Draw a band and return its number of windows."""
-    windows = band_windows(band)
-    first = windows[:1]
-    shift = np.array([[band.step[0], 0] * 2, [0, band.step[1]] * 2])
-    # A low or narrow band may not have a second window in that direction.
-    neighbors = [row for row in first + shift if (windows == row).all(axis=1).any()]
-    add_boxes(panel, bound, YELLOW)
-    add_boxes(panel, np.array(neighbors).reshape(-1, 4), SKY, linewidths=1.0)
-    add_boxes(panel, first, VERMILION, linewidths=1.4)
-    return len(windows)
-
-
 def plot_comparison(fast: ArrayLike, reference: ArrayLike, *, figure: FigureLike | None = None) -> FigureLike:
     """Plot the scores of the fast search against those of the reference, window by window.
 
@@ -196,14 +163,12 @@ def plot_comparison(fast: ArrayLike, reference: ArrayLike, *, figure: FigureLike
     ----------
     fast, reference
         ``(N,)`` scores of the same windows in the same order, such as ``find_cars(...).scores``.
-    figure
-        Where to draw; None for a new figure.
+    figure : matplotlib.figure.Figure or SubFigure, optional
 
     Returns
     -------
     matplotlib.figure.Figure or SubFigure
-        Two panels: a scatter plot of the scores with the line of equality, and a histogram of the
-        differences, whose title states the maximum.
+        A scatter plot of the scores, and a histogram of the differences, whose title states the maximum.
 
     Raises
     ------
@@ -216,13 +181,12 @@ def plot_comparison(fast: ArrayLike, reference: ArrayLike, *, figure: FigureLike
     >>> figure.axes[1].get_title()
     'maximum difference 0.25'
     """
-    x, y = check_scores(reference, "reference"), check_scores(fast, "fast")
+    x, y = style.check_scores(reference, "reference"), style.check_scores(fast, "fast")
     if len(x) != len(y):
         raise InvalidInputError(
             f"fast and reference must be scores of the same windows; got {len(y)} and {len(x)} scores"
         )
-    figure = new_figure(figure, 10, 4.2)
-    left, right = subplot_grid(figure, 1, 2)[0]
+    figure, ((left, right),) = style.new_panels(figure, (10, 4.2), 1, 2)
     ends = [min(x.min(), y.min()), max(x.max(), y.max())]
     left.plot(ends, ends, color="0.3", linewidth=0.8, label="equal")
     left.scatter(x, y, s=5, color=BLUE, alpha=0.5, linewidths=0, label=_count(len(x), "window"))
@@ -244,12 +208,9 @@ def plot_speedups(
 
     Parameters
     ----------
-    seconds
-        Time of each method in seconds.
-    reference
-        Name of the method that the others are compared with; None for the slowest.
-    ax
-        Where to draw; None for a new figure.
+    seconds, reference
+        Time of each method; and name of the method to compare the others with, None for the slowest.
+    ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
@@ -274,14 +235,14 @@ def plot_speedups(
     baseline = max(times, key=times.__getitem__) if reference is None else reference
     if baseline not in times:
         raise InvalidInputError(f"reference must be one of {', '.join(times)}; got {describe(reference)}")
-    axes = new_axes(ax, 8, 0.8 + 0.45 * len(times))
+    axes = style.new_axes(ax, 8, 0.8 + 0.45 * len(times))
     values = [1000 * value for value in times.values()]
     bars = axes.barh(list(times), values, color=["0.6" if name == baseline else BLUE for name in times])
     texts = [_format_time(value, times[baseline] / value) for value in times.values()]
     axes.bar_label(bars, texts, padding=3, fontsize=9)
     axes.set(xscale="log", xlim=(min(values) / 3, max(values) * 12), xlabel="time (ms)")
     axes.invert_yaxis()
-    hide_spines(axes)
+    axes.spines[["top", "right"]].set_visible(False)
     return axes
 
 
@@ -308,16 +269,12 @@ def plot_heatmap(
 
     Parameters
     ----------
-    image
-        ``(H, W, 3)`` uint8 RGB frame.
-    windows
-        Its positive windows.
-    params
-        Weighting, threshold and fraction of the peak; by default as in `bounding_boxes`.
-    heat
-        ``(H, W)`` heat map, such as the mean over the last frames; None computes that of `windows`.
-    figure
-        Where to draw; None for a new figure.
+    image, windows
+        ``(H, W, 3)`` uint8 RGB frame, and its positive windows.
+    params, heat
+        Weighting, threshold and fraction of the peak, by default as in `bounding_boxes`; and ``(H, W)`` heat
+        map, such as the mean over the last frames, by default that of `windows`.
+    figure : matplotlib.figure.Figure or SubFigure, optional
 
     Returns
     -------
@@ -349,20 +306,20 @@ def plot_heatmap(
             "compute it with add_heat"
         )
     found, threshold = label_heat(given, params), heat_threshold(params)
-    figure = new_figure(figure, 15, 5 * height / width + 0.5, layout="compressed")
-    first, second, third = subplot_grid(figure, 1, 3)[0]
-    add_image(first, image)
-    add_boxes(first, windows.boxes, SKY, halo=False, linewidths=0.8)
+    size = 15, 5 * height / width + 0.5
+    figure, ((first, second, third),) = style.new_panels(figure, size, 1, 3, layout="compressed")
+    style.add_image(first, image)
+    style.add_boxes(first, windows.boxes, SKY, halo=False, linewidths=0.8)
     first.set_title(_count(len(windows), "window"), fontsize=10)
     peak = float(given.max())
-    add_image(second, given, cmap="inferno", vmin=0, vmax=max(peak, 1e-6))
+    style.add_image(second, given, cmap="inferno", vmin=0, vmax=max(peak, 1e-6))
     bar = second.figure.colorbar(second.images[0], ax=second, shrink=0.8, pad=0.02)
     bar.set_label("sum of scores" if params.weighting == "score" else "windows")
     if threshold <= peak:
         bar.ax.axhline(threshold, color=SKY, linewidth=2)
     second.set_title(f"heat, peak {peak:.1f}", fontsize=10)
-    add_image(third, _color_regions(image, given, threshold))
-    add_boxes(third, found.boxes, YELLOW, linewidths=2.0)
+    style.add_image(third, _color_regions(image, given, threshold))
+    style.add_boxes(third, found.boxes, YELLOW, linewidths=2.0)
     third.set_title(f"{_count(len(found), 'region')} above {threshold:g}", fontsize=10)
     return figure
 
@@ -371,6 +328,6 @@ def _color_regions(image: Image, heat: NDArray[Any], threshold: float) -> Image:
     """Blend a color over each connected region above the threshold, on a gray copy of the frame."""
     labels, _ = ndimage.label(heat > threshold, structure=np.ones((3, 3)))
     gray = np.repeat(image.mean(axis=2, keepdims=True) * 0.8, 3, axis=2)
-    colors = 255 * np.array(COLORS)[(labels - 1) % len(COLORS)]
+    colors = 255 * np.array(style.COLORS)[(labels - 1) % len(style.COLORS)]
     blended = np.where(labels[..., None] > 0, 0.45 * gray + 0.55 * colors, gray)
     return np.asarray(blended.round(), np.uint8)

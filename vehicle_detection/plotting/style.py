@@ -6,13 +6,13 @@ import functools
 import io
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Union
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_boxes, check_image, check_type, describe
+from vehicle_detection._common import check_boxes, check_image, check_integer, check_type, describe
 from vehicle_detection.boxes import Detections
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.errors import InvalidInputError
@@ -65,51 +65,38 @@ def _notebook_figure_class() -> type[Figure]:
     return NotebookFigure
 
 
-def new_figure(
+def new_panels(
     figure: FigureLike | None,
-    width: float,
-    height: float,
+    size: tuple[float, float],
+    rows: int,
+    columns: int,
     *,
+    count: int | None = None,
     layout: Literal["constrained", "compressed"] = "constrained",
-) -> FigureLike:
-    """Return `figure`, or a new one (size in inches) that pyplot does not manage."""
-    if figure is None:
-        return _notebook_figure_class()(figsize=(width, height), layout=layout)
+    sharex: bool = False,
+) -> tuple[FigureLike, NDArray[Any]]:
+    """Create ``(rows, columns)`` Axes, the first `count` visible, in `figure` or a new one (inches)."""
     from matplotlib.figure import FigureBase
 
+    if figure is None:
+        figure = _notebook_figure_class()(figsize=size, layout=layout)
     check_type(figure, "figure", FigureBase, "pass a Figure, a SubFigure, or None for a new figure")
-    return figure
+    grid = np.asarray(figure.subplots(rows, columns, squeeze=False, sharex=sharex))
+    for unused in grid.flat[grid.size if count is None else count :]:
+        unused.remove()
+    return figure, grid
 
 
 def new_axes(ax: Axes | None, width: float = 7.0, height: float = 4.5) -> Axes:
     """Return `ax`, or the Axes of a new pyplot figure (size in inches)."""
+    from matplotlib.axes import Axes as AxesClass
+
     if ax is None:
         import matplotlib.pyplot as plt
 
-        axes: Axes = plt.subplots(figsize=(width, height), layout="constrained")[1]
-        return axes
-    from matplotlib.axes import Axes as AxesClass
-
+        ax = plt.subplots(figsize=(width, height), layout="constrained")[1]
     check_type(ax, "ax", AxesClass, "pass matplotlib Axes, or None for a new figure")
     return ax
-
-
-def subplot_grid(figure: FigureLike, rows: int, columns: int, **options: Any) -> NDArray[Any]:
-    """Create ``(rows, columns)`` Axes."""
-    return np.asarray(figure.subplots(rows, columns, squeeze=False, **options))
-
-
-def filled_axes(figure: FigureLike, rows: int, columns: int, count: int) -> list[Axes]:
-    """Create the first `count` Axes of a grid, row by row."""
-    grid = subplot_grid(figure, rows, columns)
-    for unused in grid.flat[count:]:
-        unused.remove()
-    return list(grid.flat[:count])
-
-
-def hide_spines(axes: Axes) -> None:
-    """Hide the upper and the right border of a chart."""
-    axes.spines[["top", "right"]].set_visible(False)
 
 
 def legend_above(axes: Axes, columns: int = 1, *, fontsize: int = 9) -> Legend:
@@ -135,14 +122,13 @@ def check_displayable(image: object, name: str) -> NDArray[Any]:
 
 def check_list(values: object, name: str, kind: str) -> list[Any]:
     """Return `values` as a list with at least one entry; `kind` names the entries in the message."""
-    single = isinstance(values, np.ndarray) and values.ndim < 4
-    if single or isinstance(values, (str, bytes)) or not hasattr(values, "__iter__"):
-        raise InvalidInputError(
-            f"{name} must be a list of {kind}, got {describe(values)}; wrap a single one in a list"
-        )
-    listed = list(values)
+    single = isinstance(values, (str, bytes)) or (isinstance(values, np.ndarray) and values.ndim < 4)
+    listed = list(values) if isinstance(values, Iterable) and not single else []
     if not listed:
-        raise InvalidInputError(f"{name} must be a list of {kind}, at least one; got an empty list")
+        raise InvalidInputError(
+            f"{name} must be a list of {kind}, at least one; got {describe(values)}; "
+            "wrap a single one in a list"
+        )
     return listed
 
 
@@ -197,23 +183,22 @@ def box_array(boxes: Boxes, name: str = "boxes") -> NDArray[Any]:
 
 
 def add_image(ax: Axes, image: NDArray[Any], title: str = "", *, ticks: bool = False, **options: Any) -> None:
-    """Show an image with data coordinates equal to half-open pixel coordinates; `ticks` labels the axes."""
+    """Show an image, by default with half-open pixels as coordinates; `options` are those of ``imshow``."""
     height, width = image.shape[:2]
+    options.setdefault("extent", (0, width, height, 0))
     if image.ndim == 2:
         options.setdefault("cmap", "gray")
     if max(height, width) <= _MAX_PIXELATED:
         options.setdefault("interpolation", "nearest")
-    ax.imshow(image, extent=(0, width, height, 0), **options)
+    ax.imshow(image, **options)
     if title:
         ax.set_title(title, fontsize=9)
-    if ticks:
-        ax.set(xlabel="x (px)", ylabel="y (px)")
-    else:
+    if not ticks:
         ax.set(xticks=[], yticks=[])
 
 
 def add_boxes(
-    ax: Axes, boxes: NDArray[Any], color: Any = None, *, halo: bool = True, **options: Any
+    ax: Axes, boxes: ArrayLike, color: Any = None, *, halo: bool = True, **options: Any
 ) -> LineCollection:
     """Draw ``(N, 4)`` boxes as one line collection; `halo` adds a dark edge for contrast."""
     from matplotlib.collections import LineCollection
@@ -230,50 +215,46 @@ def add_boxes(
 
 def evenly_spaced(count: int, max_rows: int) -> NDArray[np.intp]:
     """At most `max_rows` evenly spaced row numbers out of `count`."""
-    if count <= max_rows:
-        return np.arange(count)
-    return np.linspace(0, count - 1, max_rows).round().astype(np.intp)
+    return np.linspace(0, count - 1, min(count, max_rows)).round().astype(np.intp)
 
 
 def add_tiles(
     ax: Axes | None,
-    images: Sequence[NDArray[Any]],
-    captions: Sequence[str],
+    tiles: Sequence[tuple[NDArray[Any] | None, str]],
     *,
     columns: int,
     inches: float,
-    caption_lines: int,
+    caption_lines: int = 1,
     colors: Sequence[Any] | None = None,
 ) -> tuple[Axes, list[tuple[float, float, float]]]:
-    """Draw images on a grid in one Axes, with captions below and an optional colored edge each.
+    """Draw images with captions below on a grid in one Axes; None leaves a tile empty.
 
-    Returns the Axes, and for each image its left and top and the size of a pixel in data coordinates.
+    `colors` draws an edge around each image. Returns the Axes, and for each image its left and top and the
+    size of a pixel in data coordinates.
     """
-    rows = max(math.ceil(len(images) / columns), 1)
+    columns = max(min(check_integer(columns, "columns", low=1, high=100), len(tiles)), 1)
+    rows = max(math.ceil(len(tiles) / columns), 1)
     # Height of a tile with its caption; its width is 1.
     pitch = (inches + 0.17 * caption_lines) / inches
     axes = new_axes(ax, max(3.5, columns * inches + 0.1), rows * pitch * inches + 0.35)
     axes.set_axis_off()
     axes.set_aspect("equal")
     places = []
-    for index, (image, caption, color) in enumerate(zip(images, captions, colors or [None] * len(images))):
+    for index, (image, caption) in enumerate(tiles):
+        if image is None:
+            continue
+        row, column = divmod(index, columns)
         height, width = image.shape[:2]
         pixel = 0.94 / max(height, width)
-        left = index % columns + (1 - width * pixel) / 2
-        top = index // columns * pitch + (1 - height * pixel) / 2
+        left = column + (1 - width * pixel) / 2
+        top = row * pitch + (1 - height * pixel) / 2
         right, bottom = left + width * pixel, top + height * pixel
         # All images share one Axes: creating dozens of Axes takes seconds.
-        axes.imshow(
-            image,
-            extent=(left, right, bottom, top),
-            interpolation="nearest" if max(height, width) <= _MAX_PIXELATED else None,
-            cmap="gray" if image.ndim == 2 else None,
-        )
-        if color is not None:
-            add_boxes(axes, np.array([[left, top, right, bottom]]), color, halo=False, linewidths=2.0)
+        add_image(axes, image, extent=(left, right, bottom, top))
+        if colors:
+            add_boxes(axes, [[left, top, right, bottom]], colors[index], halo=False, linewidths=2.0)
         if caption:
-            center = index % columns + 0.5
-            axes.text(center, index // columns * pitch + 1.0, caption, ha="center", va="top", fontsize=7)
+            axes.text(column + 0.5, row * pitch + 1.0, caption, ha="center", va="top", fontsize=7)
         places.append((left, top, pixel))
     # imshow changes the limits to those of its image.
     axes.set_xlim(-0.02, columns + 0.02)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,18 +14,8 @@ from vehicle_detection._common import check_number, check_type, describe
 from vehicle_detection.detector import FrameResult
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import NO_TRACK, FrameBoxes
-from vehicle_detection.plotting.style import (
-    COLORS,
-    LINESTYLES,
-    YELLOW,
-    Color,
-    FigureLike,
-    hide_spines,
-    legend_above,
-    new_axes,
-    new_figure,
-    subplot_grid,
-)
+from vehicle_detection.plotting import style
+from vehicle_detection.plotting.style import COLORS, LINESTYLES, YELLOW, FigureLike
 from vehicle_detection.synthetic import VehicleTruth
 from vehicle_detection.video import VideoReport
 
@@ -34,12 +24,12 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-_QUANTITIES = {
-    "center": "center of the box, x (px)",
-    "width": "width of the box (px)",
-    "distance": "distance (m)",
-    "speed": "speed relative to\nthe camera (m/s)",
-}
+_LABELS = (
+    "center of the box, x (px)",
+    "width of the box (px)",
+    "distance (m)",
+    "speed relative to\nthe camera (m/s)",
+)
 # A line is interrupted where consecutive rows are more than this many frames apart.
 _MAX_GAP = 1.5
 # Replaces the yellow of the video, which is hard to see on white.
@@ -48,12 +38,8 @@ _DARK_YELLOW = (0.80, 0.73, 0.1)
 _STAGES = ("decode", "search", "regions", "track", "draw", "encode")
 
 
-class _TrackSeries(NamedTuple):
-    """One track over time: columns of equal length, NaN where a value is unknown."""
-
-    time: Floats
-    values: dict[str, Floats]
-    stds: dict[str, Floats]
+# Number and time of a track in a frame, its box, distance and speed, and their standard errors.
+Row = tuple[int, float, Any, float | None, float | None, float | None, float | None]
 
 
 def plot_tracks(
@@ -74,18 +60,14 @@ def plot_tracks(
     truth
         True boxes, drawn as black dots: labels, or the ``truth`` of a rendered drive, which includes
         distances and speeds. Ignored boxes are left out.
-    fps
-        Frame rate, for frames without a time.
-    min_frames
-        Tracks with fewer frames are left out.
-    figure
-        Where to draw; None for a new figure.
+    fps, min_frames
+        Frame rate, for frames without a time; and number of frames below which a track is left out.
+    figure : matplotlib.figure.Figure or SubFigure, optional
 
     Returns
     -------
     matplotlib.figure.Figure or SubFigure
-        Four panels with a common time axis. Distances and speeds of results have bands of one standard
-        error.
+        Four panels over time; distances and speeds of results have bands of one standard error.
 
     Raises
     ------
@@ -102,132 +84,104 @@ def plot_tracks(
     rate = check_number(fps, "fps", above=0, high=1e6)
     shortest = check_number(min_frames, "min_frames", low=1)
     if isinstance(results, FrameBoxes):
-        tracks = _series_of_boxes(results, rate, "results")
+        tracks = _split_tracks(_rows_of_boxes(results, rate, "results"))
     else:
-        tracks = _series_of_results(results, rate)
-    tracks = {number: series for number, series in tracks.items() if len(series.time) >= shortest}
+        tracks = _split_tracks(_rows_of_results(results, rate))
+    tracks = {number: columns for number, columns in tracks.items() if columns.shape[1] >= shortest}
     if not tracks:
         raise InvalidInputError(
             "results must hold at least one track to plot, got none; pass results with shown tracks"
         )
-    figure = new_figure(figure, 10, 9)
-    axes = dict(zip(_QUANTITIES, subplot_grid(figure, len(_QUANTITIES), 1, sharex=True)[:, 0]))
-    for number, series in sorted(tracks.items()):
-        color, style = _track_style(number)
-        time, values, stds = _insert_gaps(series, rate)
-        for name, panel in axes.items():
-            value = values[name]
-            panel.plot(time, value, color=color, linestyle=style, linewidth=1.8, label=f"#{number}")
-            if name in stds:
-                low, high = value - stds[name], value + stds[name]
-                panel.fill_between(time, low, high, color=color, alpha=0.25, linewidth=0)
+    figure, grid = style.new_panels(figure, (10, 9), 4, 1, sharex=True)
+    for number, known in tracks.items():
+        # Color of the track as in the video; the line style differs between tracks of one color.
+        cycle, index = divmod(number - 1, len(COLORS))
+        color = _DARK_YELLOW if COLORS[index] == YELLOW else COLORS[index]
+        dash = LINESTYLES[cycle % len(LINESTYLES)]
+        time, *columns = _insert_gaps(known, rate)
+        for panel, values, stds in zip(grid.flat, columns[:4], columns[4:]):
+            panel.plot(time, values, color=color, linestyle=dash, linewidth=1.8, label=f"#{number}")
+            if not np.isnan(stds).all():
+                panel.fill_between(time, values - stds, values + stds, color=color, alpha=0.25, linewidth=0)
     if truth is not None:
-        true_tracks = _series_of_boxes(_truth_boxes(truth), rate, "truth").values()
-        for index, series in enumerate(true_tracks):
-            for name, panel in axes.items():
-                label = None if index else "truth"
-                panel.plot(series.time, series.values[name], "k.", markersize=2, label=label)
-    for name, panel in axes.items():
-        panel.set_ylabel(_QUANTITIES[name])
+        for index, (time, *columns) in enumerate(_split_tracks(_rows_of_truth(truth, rate)).values()):
+            for panel, values in zip(grid.flat, columns):
+                panel.plot(time, values, "k.", markersize=2, label=None if index else "truth")
+    for panel, label in zip(grid.flat, _LABELS):
+        panel.set_ylabel(label)
         panel.grid(alpha=0.3)
-    axes["speed"].axhline(0, color="black", linewidth=0.6)
-    axes["speed"].set_xlabel("time (s)")
-    handles, labels = axes["center"].get_legend_handles_labels()
+    grid[-1, 0].axhline(0, color="black", linewidth=0.6)
+    grid[-1, 0].set_xlabel("time (s)")
+    handles, labels = grid[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", fontsize=9, title="track")
     return figure
 
 
-def _track_style(number: int) -> tuple[Color, str]:
-    """Color of a track as in the video, and a line style that differs between tracks of one color."""
-    cycle, index = divmod(number - 1, len(COLORS))
-    color = _DARK_YELLOW if COLORS[index] == YELLOW else COLORS[index]
-    return color, LINESTYLES[cycle % len(LINESTYLES)]
-
-
-def _truth_boxes(truth: object) -> FrameBoxes:
-    """Return the true boxes that are not ignored, from labels or the truth of a rendered drive."""
-    if isinstance(truth, FrameBoxes):
-        return truth[~truth.ignore]
-    if not isinstance(truth, Sequence) or not all(
-        isinstance(row, VehicleTruth) for rows in truth for row in rows
-    ):
-        raise InvalidInputError(
-            f"truth must be FrameBoxes or the truth of a rendered drive, got {describe(truth)}; "
-            "read a file with read_labels or pass drive.truth"
-        )
-    listed = [(frame, row) for frame, rows in enumerate(truth) for row in rows if not row.ignore]
-    return FrameBoxes(
-        [frame for frame, _ in listed],
-        np.array([row.track for _, row in listed], np.int64),
-        np.array([row.box for _, row in listed], np.float64).reshape(-1, 4),
-        distance_m=np.array([row.distance_m for _, row in listed]),
-        speed_mps=np.array([row.speed_mps for _, row in listed]),
-    )
-
-
-def _series_of_results(results: object, rate: float) -> dict[int, _TrackSeries]:
+def _rows_of_results(results: object, rate: float) -> Iterator[Row]:
     if not isinstance(results, Iterable):
         raise InvalidInputError(
             f"results must be the FrameResult of each frame, or FrameBoxes; got {describe(results)}; "
             "collect what detector.process returns"
         )
-    rows: dict[int, list[tuple[float | None, ...]]] = {}
     for result in results:
         check_type(result, "results", FrameResult, "collect what detector.process returns")
         time = result.index / rate if result.time is None else result.time
         for track in result.shown:
-            x1, _, x2, _ = track.box.tolist()
-            estimates = (track.distance_m, track.distance_std_m, track.speed_mps, track.speed_std_mps)
-            rows.setdefault(track.id, []).append((time, (x1 + x2) / 2, x2 - x1, *estimates))
-    tracks = {}
-    for number, listed in rows.items():
-        # None becomes NaN.
-        time, center, width, distance, distance_std, speed, speed_std = np.array(listed, np.float64).T
-        tracks[number] = _TrackSeries(
-            time,
-            {"center": center, "width": width, "distance": distance, "speed": speed},
-            {"distance": distance_std, "speed": speed_std},
-        )
-    return tracks
+            stds = track.distance_std_m, track.speed_std_mps
+            yield track.id, time, track.box, track.distance_m, track.speed_mps, *stds
 
 
-def _series_of_boxes(labels: FrameBoxes, rate: float, name: str) -> dict[int, _TrackSeries]:
+def _rows_of_boxes(labels: FrameBoxes, rate: float, name: str) -> Iterator[Row]:
     if any(isinstance(key, str) for key in labels.frame_keys):
         raise InvalidInputError(
             f"{name} must have numbered frames, got names such as {labels.frame_keys[0]!r}; "
             "convert them with FrameBoxes.renamed"
         )
-    times = np.array([int(key) for key in labels.frames], np.float64) / rate
-    unknown = np.full(len(labels), math.nan)
-    x1, _, x2, _ = labels.boxes.T
-    columns = {
-        "center": (x1 + x2) / 2,
-        "width": x2 - x1,
-        "distance": unknown if labels.distance_m is None else labels.distance_m,
-        "speed": unknown if labels.speed_mps is None else labels.speed_mps,
-    }
-    tracks = {}
-    for number in np.unique(labels.tracks[labels.tracks != NO_TRACK]).tolist():
-        rows = np.flatnonzero(labels.tracks == number)
-        rows = rows[np.argsort(times[rows], kind="stable")]
-        values = {name: column[rows] for name, column in columns.items()}
-        tracks[number] = _TrackSeries(times[rows], values, {})
-    return tracks
+    unknown = [None] * len(labels)
+    distances = unknown if labels.distance_m is None else labels.distance_m
+    speeds = unknown if labels.speed_mps is None else labels.speed_mps
+    times = np.array(labels.frames, np.float64) / rate
+    for row in np.argsort(times, kind="stable"):
+        if labels.tracks[row] != NO_TRACK:
+            yield labels.tracks[row], times[row], labels.boxes[row], distances[row], speeds[row], None, None
 
 
-def _insert_gaps(series: _TrackSeries, rate: float) -> _TrackSeries:
-    """Insert a row of NaN where frames are missing, so that the line is interrupted."""
-    steps = np.diff(series.time)
-    usual = max(1 / rate, float(steps.min(initial=math.inf)) if len(steps) else 0.0)
+def _rows_of_truth(truth: object, rate: float) -> Iterator[Row]:
+    """Rows of the true boxes that are not ignored, from labels or the truth of a rendered drive."""
+    if isinstance(truth, FrameBoxes):
+        yield from _rows_of_boxes(truth[~truth.ignore], rate, "truth")
+        return
+    frames = truth if isinstance(truth, Sequence) else [[truth]]
+    for frame, rows in enumerate(frames):
+        for row in rows:
+            if not isinstance(row, VehicleTruth):
+                raise InvalidInputError(
+                    f"truth must be FrameBoxes or the truth of a rendered drive, got {describe(truth)}; "
+                    "read a file with read_labels or pass drive.truth"
+                )
+            if not row.ignore:
+                yield row.track, frame / rate, row.box, row.distance_m, row.speed_mps, None, None
+
+
+def _split_tracks(rows: Iterable[Row]) -> dict[int, Floats]:
+    """``(9, N)`` columns of each track: time, the values of the panels, and their standard errors."""
+    table = [
+        (number, time, (box[0] + box[2]) / 2, box[2] - box[0], distance, speed, None, None, *stds)
+        for number, time, box, distance, speed, *stds in rows
+    ]
+    columns = np.array(table, np.float64).reshape(-1, 10).T  # None becomes NaN
+    return {int(number): columns[1:, columns[0] == number] for number in np.unique(columns[0])}
+
+
+def _insert_gaps(columns: Floats, rate: float) -> Floats:
+    """Insert NaN where frames are missing, so that the line is interrupted."""
+    time = columns[0]
+    steps = np.diff(time)
+    usual = max(1 / rate, steps.min(initial=math.inf))
     after = np.flatnonzero(steps > _MAX_GAP * usual) + 1
-
-    def insert_nan(columns: dict[str, Floats]) -> dict[str, Floats]:
-        return {name: np.insert(values, after, math.nan) for name, values in columns.items()}
-
-    middle = (series.time[after - 1] + series.time[after]) / 2
-    return _TrackSeries(
-        np.insert(series.time, after, middle), insert_nan(series.values), insert_nan(series.stds)
-    )
+    result = np.insert(columns, after, math.nan, axis=1)
+    result[0] = np.insert(time, after, (time[after - 1] + time[after]) / 2)
+    return result
 
 
 Run = VideoReport | Sequence[FrameResult]
@@ -239,16 +193,14 @@ def plot_stage_times(runs: Run | Mapping[str, Run], *, ax: Axes | None = None) -
     Parameters
     ----------
     runs
-        The report of `process_video`, or the detector's result of each frame; or a mapping from names to
-        several of them.
-    ax
-        Where to draw; None for a new figure.
+        The report of `process_video`, or the detector's result of each frame; or several of them by name.
+    ax : matplotlib.axes.Axes, optional
 
     Returns
     -------
     matplotlib.axes.Axes
-        Contains a stacked bar per run, in milliseconds per frame. Stages of a video run in parallel, so the
-        bar may be longer than the time between two frames.
+        A stacked bar per run, in milliseconds per frame. Stages of a video run in parallel, so the bar may
+        be longer than the time between two frames.
 
     Raises
     ------
@@ -266,11 +218,11 @@ def plot_stage_times(runs: Run | Mapping[str, Run], *, ax: Axes | None = None) -
     if not named:
         raise InvalidInputError("runs must hold at least one run; got none")
     times = {str(name): _stage_milliseconds(run) for name, run in named.items()}
-    known = dict.fromkeys(stage for stages in times.values() for stage in stages)
-    stages = sorted(known, key=lambda stage: _STAGES.index(stage) if stage in _STAGES else len(_STAGES))
-    axes = new_axes(ax, 9, 1.3 + 0.55 * len(times))
+    stages = list(dict.fromkeys([*_STAGES, *(stage for run in times.values() for stage in run)]))
+    stages = [stage for stage in stages if any(stage in run for run in times.values())]
+    axes = style.new_axes(ax, 9, 1.3 + 0.55 * len(times))
     left = np.zeros(len(times))
-    longest = max(sum(stages.values()) for stages in times.values())
+    longest = max(sum(run.values()) for run in times.values())
     for number, stage in enumerate(stages):
         values = np.array([run.get(stage, 0.0) for run in times.values()])
         color = COLORS[number % len(COLORS)]
@@ -285,24 +237,25 @@ def plot_stage_times(runs: Run | Mapping[str, Run], *, ax: Axes | None = None) -
     axes.invert_yaxis()
     axes.margins(x=0.12)
     axes.set_xlabel("work (ms per frame)")
-    legend_above(axes, max(len(stages), 1))
-    hide_spines(axes)
+    style.legend_above(axes, max(len(stages), 1))
+    axes.spines[["top", "right"]].set_visible(False)
     return axes
 
 
 def _stage_milliseconds(run: object) -> dict[str, float]:
     """Milliseconds per frame of each stage."""
     if isinstance(run, VideoReport):
-        frames, seconds = run.frames, Counter(run.stages)
+        frames, parts = run.frames, [run.stages]
     elif isinstance(run, (list, tuple)) and all(isinstance(result, FrameResult) for result in run):
-        frames, seconds = len(run), Counter()
-        for result in run:
-            seconds.update(result.seconds)
+        frames, parts = len(run), [result.seconds for result in run]
     else:
         raise InvalidInputError(
-            f"runs must be a VideoReport or a list of FrameResult, or a mapping from names to them; "
+            "runs must be a VideoReport or a list of FrameResult, or a mapping from names to them; "
             f"got {describe(run)}"
         )
     if not frames:
         raise InvalidInputError("runs must have at least one frame each; got a run without any")
+    seconds: Counter[str] = Counter()
+    for part in parts:
+        seconds.update(part)
     return {stage: 1000 * value / frames for stage, value in seconds.items()}

@@ -58,41 +58,41 @@ class FeatureCache:
         n_jobs: int | None = None,
     ) -> None:
         self.patches = check_patches(patches, PATCH_SIZE)
-        self.folder = None if folder is None else _make_folder(folder)
+        self.digest = digest_of(self.patches)
+        self._folder = None if folder is None else Path(folder)
         self._max_bytes = check_number(memory_mb, "memory_mb", low=0) * 1e6
         self._n_jobs = n_jobs
         self._in_memory: OrderedDict[tuple[FeatureParams, bool], NDArray[np.float32]] = OrderedDict()
-        self.digest = digest_of(self.patches)
+        try:
+            if self._folder is not None:
+                self._folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InvalidInputError(
+                f"cache must be a folder, {folder} cannot be created ({error.strerror}); choose another"
+            ) from error
 
     def rows(
         self, params: FeatureParams, rows: NDArray[np.intp], *, mirrored: bool = False
     ) -> NDArray[np.float32]:
-        """Features of some patches as a new array ``(len(rows), length)`` float32.
-
-        If the set is not cached, few rows are computed without the others.
-        """
-        if not self._is_cached(params, mirrored) and len(rows) < len(self.patches) / 4:
+        """Features of some patches as a new ``(len(rows), length)`` float32 array."""
+        path = self._path(params, mirrored)
+        cached = (params, mirrored) in self._in_memory or (path is not None and path.exists())
+        # Few rows of an uncached set are computed without the others.
+        if not cached and len(rows) < len(self.patches) / 4:
             return self._compute(params, mirrored, rows)
         return self.all(params, mirrored=mirrored)[rows]
 
     def all(self, params: FeatureParams, *, mirrored: bool = False) -> NDArray[np.float32]:
         """Features of all patches, or of the mirrored patches: ``(N, length)`` float32, read-only."""
-        key = (params, mirrored)
-        features = self._in_memory.get(key)
-        if features is None:
+        key, cached = (params, mirrored), self._in_memory
+        if key not in cached:
             features = self._load(params, mirrored)
-            if features is None:
-                features = self._compute(params, mirrored, slice(None))
-                self._save(features, params, mirrored)
             features.setflags(write=False)
-            self._in_memory[key] = features
-        self._in_memory.move_to_end(key)
-        while len(self._in_memory) > 1 and self._n_bytes() > self._max_bytes:
-            self._in_memory.popitem(last=False)
-        return features
-
-    def _n_bytes(self) -> int:
-        return sum(features.nbytes for features in self._in_memory.values())
+            cached[key] = features
+        cached.move_to_end(key)
+        while len(cached) > 1 and sum(each.nbytes for each in cached.values()) > self._max_bytes:
+            cached.popitem(last=False)
+        return cached[key]
 
     def _compute(
         self, params: FeatureParams, mirrored: bool, rows: NDArray[np.intp] | slice
@@ -103,44 +103,25 @@ class FeatureCache:
         return extract_features(patches, params, n_jobs=self._n_jobs)
 
     def _path(self, params: FeatureParams, mirrored: bool) -> Path | None:
-        if self.folder is None:
+        if self._folder is None:
             return None
-        return self.folder / f"{digest_of(self.digest, dataclasses.asdict(params), mirrored)}.npy"
+        return self._folder / f"{digest_of(self.digest, dataclasses.asdict(params), mirrored)}.npy"
 
-    def _is_cached(self, params: FeatureParams, mirrored: bool) -> bool:
+    def _load(self, params: FeatureParams, mirrored: bool) -> NDArray[np.float32]:
+        """Read features from their file; compute and save them if it is missing, damaged or outdated."""
         path = self._path(params, mirrored)
-        return (params, mirrored) in self._in_memory or (path is not None and path.exists())
-
-    def _save(self, features: NDArray[np.float32], params: FeatureParams, mirrored: bool) -> None:
-        path = self._path(params, mirrored)
+        if path is not None and path.exists():
+            expected = self._compute(params, mirrored, slice(_N_CHECKED))
+            try:
+                features = np.asarray(np.load(path, allow_pickle=False))
+                has_shape = features.shape == (len(self.patches), params.length)
+                if has_shape and features.dtype == np.float32 and (features[:_N_CHECKED] == expected).all():
+                    return features
+                _LOGGER.warning("cached features %s are from another release; computing them again", path)
+            except (OSError, ValueError, EOFError):
+                _LOGGER.warning("cached features %s are damaged; computing them again", path)
+        features = self._compute(params, mirrored, slice(None))
         if path is not None:
             with atomic_write(path, "cache") as part, part.open("wb") as file:
                 np.save(file, features, allow_pickle=False)
-
-    def _load(self, params: FeatureParams, mirrored: bool) -> NDArray[np.float32] | None:
-        """Read features from their file; None if it is missing, damaged or from another release."""
-        path = self._path(params, mirrored)
-        if path is None or not path.exists():
-            return None
-        try:
-            features = np.asarray(np.load(path, allow_pickle=False))
-        except (OSError, ValueError, EOFError):
-            _LOGGER.warning("cached features %s are damaged; computing them again", path)
-            return None
-        expected = self._compute(params, mirrored, slice(_N_CHECKED))
-        has_shape = features.shape == (len(self.patches), params.length) and features.dtype == np.float32
-        if not has_shape or not np.array_equal(features[:_N_CHECKED], expected):
-            _LOGGER.warning("cached features %s are from another release; computing them again", path)
-            return None
         return features
-
-
-def _make_folder(folder: str | os.PathLike[str]) -> Path:
-    path = Path(folder)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InvalidInputError(
-            f"cache must be a folder, {path} cannot be created ({error.strerror}); choose another"
-        ) from error
-    return path

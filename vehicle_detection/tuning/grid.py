@@ -60,10 +60,9 @@ def read_configurations(
     given: object = configurations
     if isinstance(given, Mapping):
         pairs: list[tuple[str | None, Any]] = list(given.items())
-    elif isinstance(given, Iterable) and not isinstance(given, (str, bytes)):
-        pairs = [(None, each) for each in given]
     else:
-        pairs = []
+        listed = isinstance(given, Iterable) and not isinstance(given, (str, bytes))
+        pairs = [(None, each) for each in configurations] if listed else []
     if not pairs:
         raise InvalidInputError(
             "configurations must be a mapping from names to FeatureParams or a list of them, with at least "
@@ -135,15 +134,11 @@ def parse_grid(text: str) -> dict[str, list[Any]]:
             )
         if name in grid:
             raise InvalidInputError(f"grid names {name} twice; put all its values into one list")
-        grid[name] = [_parse_value(value) for value in values.split(",")]
+        grid[name] = [_BOOLEANS.get(each.lower(), number_or_text(each)) for each in values.split(",")]
     if not grid:
         raise InvalidInputError("grid is empty; name at least one option, such as 'orient=8,9'")
     _check_names(grid, "grid")
     return grid
-
-
-def _parse_value(text: str) -> Any:
-    return _BOOLEANS.get(text.lower(), number_or_text(text))
 
 
 def _check_names(options: Mapping[str, Any], name: str) -> None:
@@ -157,8 +152,7 @@ def describe_params(params: FeatureParams) -> str:
     for preset in FeatureParams.PRESETS:
         if FeatureParams.preset(preset) == params:
             return preset
-    defaults = dataclasses.asdict(FeatureParams())
-    values = dataclasses.asdict(params)
+    defaults, values = dataclasses.asdict(FeatureParams()), dataclasses.asdict(params)
     return _join_options({key: value for key, value in values.items() if value != defaults[key]})
 
 

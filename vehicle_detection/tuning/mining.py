@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer, check_number
-from vehicle_detection.boxes import Detections, intersection_matrix, non_max_suppression
+from vehicle_detection.boxes import intersection_matrix, non_max_suppression
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.evaluation import FrameBoxes, Frames, LabelledFrames, keyed_frames
@@ -32,44 +32,36 @@ def mine_negatives(
     """Cut the false positive windows of labelled frames out as training patches.
 
     A window is a false positive if it touches no labelled box, whether that box is scored or ignored. Every
-    vehicle in the frames must therefore be labelled, at least coarsely. Do not evaluate on mined frames.
+    vehicle in the frames must therefore be labelled, at least coarsely. Do not evaluate on mined frames. The
+    detector is then trained again with its false positives (Dalal and Triggs, CVPR 2005, section 4).
 
     Parameters
     ----------
-    frames
-        Images by key, a list of images with their numbers as keys, or the frames of `load_frames`.
-    labels
-        True boxes of these frames; a frame without a box counts as empty.
-    classifier
-        The model whose false positives are collected.
-    search_params
-        Where and at which sizes to search; the default is ``SearchParams.preset("default")``.
-    min_score
-        Windows above this score are collected; a value below 0 includes near misses.
-    max_overlap
-        Of windows that overlap by more than this IoU only the best is kept; 1 keeps all.
-    max_per_frame
-        Number of patches to keep per frame, those with the highest scores; None keeps all.
+    frames, labels
+        Images by key, a list of images with their numbers as keys, or the frames of `load_frames`; and their
+        true boxes. A frame without a box counts as empty.
+    classifier, n_jobs
+        The model whose false positives are collected, and the threads of its search.
+    search_params, min_score
+        Where and at which sizes to search, by default ``SearchParams.preset()``; windows above the score are
+        collected, and a value below 0 includes near misses.
+    max_overlap, max_per_frame
+        Of windows that overlap by more than this IoU only the best is kept; 1 keeps all. Of each frame only
+        this number of patches with the highest scores is kept; None keeps all.
     source
         Source folder in the names of the patches.
-    n_jobs
-        Threads of the search.
 
     Returns
     -------
     PatchSet
         Non-vehicles, 64x64 pixels, frame by frame, highest score first, with the names
-        ``non-vehicles/<source>/<frame>_<x1>_<y1>_<side>.png``; may be empty. Append them to the training
-        patches with ``PatchSet.concatenate``.
+        ``non-vehicles/<source>/<frame>_<x1>_<y1>_<side>.png``; may be empty. `PatchSet.concatenate` appends
+        them to the training patches.
 
     Raises
     ------
     InvalidInputError
         If an argument is malformed, or `labels` holds none of the frames.
-
-    Notes
-    -----
-    Dalal and Triggs (CVPR 2005), section 4: the detector is retrained with its own false positives.
 
     Examples
     --------
@@ -88,7 +80,10 @@ def mine_negatives(
     names: list[str] = []
     with contextlib.closing(classifier.open_search(n_jobs)) as search:
         for key, image in labelled:
-            windows = _false_windows(search.find(image, params).windows, labelled.labels.frame(key).boxes)
+            windows = search.find(image, params).windows
+            labelled_boxes = labelled.labels.frame(key).boxes
+            touching = intersection_matrix(windows.boxes.astype(np.float64), labelled_boxes) > 0
+            windows = windows[np.flatnonzero(~touching.any(axis=1))]
             kept = windows[non_max_suppression(windows.boxes, windows.scores, threshold=overlap)]
             for box in np.rint(kept.boxes[:limit]).astype(np.int64):
                 patches.append(_cut_patch(image, box))
@@ -97,12 +92,6 @@ def mine_negatives(
                 names.append(f"non-vehicles/{source}/{stem}_{x1}_{y1}_{x2 - x1}.png")
     stacked = np.stack(patches) if patches else np.empty((0, PATCH_SIZE, PATCH_SIZE, 3), np.uint8)
     return PatchSet(stacked, np.zeros(len(stacked), np.bool_), tuple(names))
-
-
-def _false_windows(windows: Detections, boxes: NDArray[np.float64]) -> Detections:
-    """Windows that touch none of the boxes."""
-    touching = intersection_matrix(windows.boxes.astype(np.float64), boxes) > 0
-    return windows[np.flatnonzero(~touching.any(axis=1))]
 
 
 def _cut_patch(image: NDArray[np.uint8], box: NDArray[np.int64]) -> NDArray[np.uint8]:

@@ -66,11 +66,9 @@ def pareto_front(table: DataFrame, quality: str = "accuracy", cost: str = "searc
 
     Parameters
     ----------
-    table
-        Results, such as those of `compare_configurations`.
-    quality, cost
-        Numeric columns: a higher quality and a lower cost are better. Rows without either value are
-        left out. Of equal rows the first one is kept.
+    table, quality, cost
+        Results, such as those of `compare_configurations`, and numeric columns: a higher quality and a lower
+        cost are better. Rows without either value are left out. Of equal rows the first one is kept.
 
     Returns
     -------
@@ -104,19 +102,15 @@ def write_results(table: DataFrame, path: str | os.PathLike[str]) -> None:
     """Write a table atomically as ``.csv``, ``.jsonl`` or ``.parquet`` (needs pyarrow)."""
     suffix = _check_suffix(path, (".csv", ".jsonl", ".parquet"), "path")
     if suffix == ".parquet":
-        _write_parquet(table, path)
+        # A Parquet column has one type, but hog_channel is 0 or "ALL": write mixed columns as text.
+        mixed = [name for name in table if table[name].dropna().map(type).nunique() > 1]
+        table = table.assign(**{name: table[name].map(str, na_action="ignore") for name in mixed})
+        write_parquet(path, table.reset_index(drop=True))
         return
     lines = [_csv_line(table.columns)] if suffix == ".csv" else []
     lines += [_format_row(row, table.columns, suffix) for row in table.to_dict("records")]
     with atomic_write(path, "path") as part:
         part.write_text("".join(lines), encoding="utf-8", newline="")
-
-
-def _write_parquet(table: DataFrame, path: str | os.PathLike[str]) -> None:
-    # A Parquet column has one type, but hog_channel is 0 or "ALL": write mixed columns as text.
-    mixed = [name for name in table if table[name].dropna().map(type).nunique() > 1]
-    table = table.assign(**{name: table[name].map(str, na_action="ignore") for name in mixed})
-    write_parquet(path, table.reset_index(drop=True))
 
 
 def read_results(path: str | os.PathLike[str]) -> DataFrame:
@@ -158,21 +152,18 @@ def read_results(path: str | os.PathLike[str]) -> DataFrame:
     return make_table(rows, columns)
 
 
-class RowStore:
+class RowStore(dict[str, Mapping[str, Any]]):
     """Rows by their ``trial``; each new one is appended to a file and synced to disk at once.
 
     `path` is a ``.csv`` or ``.jsonl`` file, read first if it exists; None keeps the rows in memory only.
     """
 
     def __init__(self, path: str | os.PathLike[str] | None, columns: Sequence[str]) -> None:
+        super().__init__()
         self._columns = tuple(columns)
-        self._path: Path | None = None
-        self._rows: dict[str, Mapping[str, Any]] = {}
-        if path is None:
-            return
-        self._suffix = _check_suffix(path, (".csv", ".jsonl"), "store")
-        self._path = check_target(path, "store")
-        if not self._path.exists():
+        self._suffix = "" if path is None else _check_suffix(path, (".csv", ".jsonl"), "store")
+        self._path = None if path is None else check_target(path, "store")
+        if self._path is None or not self._path.exists():
             return
         text = _complete_lines(self._path)
         header, rows = _parse(text, self._path, self._suffix)
@@ -182,17 +173,11 @@ class RowStore:
             )
         # Remove an incomplete last line: the next row would be appended to it.
         os.truncate(self._path, len(text.encode("utf-8")))
-        self._rows = {str(row["trial"]): row for row in rows if row.get("trial")}
-
-    def __contains__(self, trial: str) -> bool:
-        return trial in self._rows
-
-    def __getitem__(self, trial: str) -> Mapping[str, Any]:
-        return self._rows[trial]
+        self.update({str(row["trial"]): row for row in rows if row.get("trial")})
 
     def add(self, row: Mapping[str, Any]) -> None:
         """Store a finished row."""
-        self._rows[row["trial"]] = row
+        self[row["trial"]] = row
         if self._path is None:
             return
         line = _format_row(row, self._columns, self._suffix)
@@ -213,24 +198,21 @@ def _check_suffix(path: str | os.PathLike[str], allowed: tuple[str, ...], name: 
 
 def _csv_line(values: Iterable[Any]) -> str:
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerow(["" if value is None else value for value in values])
+    csv.writer(text, lineterminator="\n").writerow(values)
     return text.getvalue()
 
 
 def _format_row(row: Mapping[str, Any], columns: Iterable[str], suffix: str) -> str:
-    """Format a row as one line of a ``.csv`` or ``.jsonl`` file."""
-    values = {name: _to_plain(row.get(name)) for name in columns}
+    """Format a row as one line of a file; NaN becomes None, and a line break in text a space."""
+    values: dict[str, Any] = {}
+    for name in columns:
+        value = row.get(name)
+        value = value.item() if isinstance(value, np.generic) else value
+        missing = isinstance(value, float) and not math.isfinite(value)
+        values[name] = " ".join(value.split()) if isinstance(value, str) else None if missing else value
     if suffix == ".csv":
         return _csv_line(values.values())
     return json.dumps(values, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def _to_plain(value: Any) -> Any:
-    """Convert a cell to a JSON value: NaN to None, and line breaks in text to spaces."""
-    value = value.item() if isinstance(value, np.generic) else value
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return " ".join(value.split()) if isinstance(value, str) else value
 
 
 def _complete_lines(file: Path) -> str:
@@ -257,12 +239,12 @@ def _parse(text: str, file: Path, suffix: str) -> tuple[list[str], list[dict[str
                 raise _damaged_line(file, number)
             rows.append(row)
         return list(dict.fromkeys(name for row in rows for name in row)), rows
-    lines = list(csv.reader(io.StringIO(text)))
-    for number, cells in enumerate(lines[1:], start=2):
-        if len(cells) != len(lines[0]):
+    header, *lines = csv.reader(io.StringIO(text)) if text else [[]]
+    for number, cells in enumerate(lines, start=2):
+        if len(cells) != len(header):
             raise _damaged_line(file, number)
-        rows.append({name: _parse_cell(name, cell) for name, cell in zip(lines[0], cells)})
-    return lines[0] if lines else [], rows
+        rows.append({name: _parse_cell(name, cell) for name, cell in zip(header, cells)})
+    return header, rows
 
 
 def _damaged_line(file: Path, number: int) -> DatasetError:

@@ -52,32 +52,28 @@ def compare_configurations(
 
     Parameters
     ----------
-    patch_set
-        The patches.
-    configurations
-        `FeatureParams`, names of presets, or mappings of fields of `FeatureParams` and of ``C``,
-        ``mirror`` and ``positive_weight``; as a mapping from names or as a list.
-    splits
+    patch_set, configurations
+        The patches; and `FeatureParams`, names of presets, or mappings of fields of `FeatureParams` and of
+        ``C``, ``mirror`` and ``positive_weight``, as a mapping from names or as a list.
+    splits, seeds
         One or more of ``"sequences"``, ``"groups"``, ``"random"`` (near duplicates in both parts, like the
         course's split), ``"gti_to_kitti"`` (train on GTI, test on KITTI and Extras) and ``"kitti_to_gti"``;
-        or a mapping from names to splits.
-    seeds
-        Seeds of the splits ``"random"`` and ``"groups"``, one row each; other splits use the first.
+        or a mapping from names to splits. ``"random"`` and ``"groups"`` give one row per seed; other splits
+        use the first.
     C, mirror, positive_weight
         Training options of configurations that do not set them; several values of C are all tried. A
         misclassified vehicle costs `positive_weight` times a misclassified non-vehicle.
-    options
-        What is measured besides the accuracy; the default is ``TrialOptions()``.
+    options, progress
+        What is measured besides the accuracy, by default ``TrialOptions()``; and whether to show a progress
+        bar on standard error.
     store
         A ``.csv`` or ``.jsonl`` file to which each row is appended as soon as it is measured. Rows that it
         already holds are not measured again; an incomplete last line is dropped.
-    progress
-        Show a progress bar on standard error.
 
     Returns
     -------
     pandas.DataFrame
-        One row per trial. NaN marks a missing value. The columns are:
+        One row per trial, with NaN for missing values:
 
         - ``status``: ``"ok"``; ``"partial"`` if the fast search does not support the features, so that
           neither frames nor speed are measured; ``"failed"`` if the combination is impossible.
@@ -103,26 +99,21 @@ def compare_configurations(
     >>> from vehicle_detection import render_patches
     >>> patches, labels = render_patches(40)
     >>> patch_set = PatchSet(patches, labels, [f"drawn/{number}.png" for number in range(40)])
-    >>> table = compare_configurations(
-    ...     patch_set,
-    ...     [{"orient": 4}, {"orient": 0}],
-    ...     splits="random",
-    ...     options=TrialOptions(time_search=False),
-    ... )
-    >>> table["status"].tolist()
+    >>> untimed = TrialOptions(time_search=False)
+    >>> grid = [{"orient": 4}, {"orient": 0}]
+    >>> compare_configurations(patch_set, grid, splits="random", options=untimed)["status"].tolist()
     ['ok', 'failed']
     """
     values = [C] if isinstance(C, (int, float)) else list(C)
     if not values:
         raise InvalidInputError("C must be a number or several; got none")
     checked_seeds = check_seeds(seeds)
+    defaults = {"mirror": mirror, "positive_weight": positive_weight}
     # A configuration that sets C itself is tried with that value only.
     candidates = [
         candidate
         for number, value in enumerate(values)
-        for candidate in read_configurations(
-            configurations, defaults={"C": value, "mirror": mirror, "positive_weight": positive_weight}
-        )
+        for candidate in read_configurations(configurations, defaults={**defaults, "C": value})
         if number == 0 or "C" not in candidate.options
     ]
     evaluator = TrialEvaluator(patch_set, options or TrialOptions())
@@ -138,9 +129,9 @@ def compare_configurations(
             if candidate.config is None:
                 runner.add_failed(candidate, stage="compare")
                 continue
-            for name, seed, split in trials:
+            for split_name, seed, split in trials:
                 runner.run(
-                    candidate.config, split, seed, name=candidate.name, split_name=name, stage="compare"
+                    candidate.config, split, seed, name=candidate.name, split_name=split_name, stage="compare"
                 )
     return runner.table()
 
@@ -169,21 +160,17 @@ def search_parameters(
 
     Parameters
     ----------
-    patch_set
-        The patches.
-    grid
-        Lists of values by name: fields of `FeatureParams`, ``C``, ``mirror`` and ``positive_weight``; the
-        others keep their defaults. Impossible combinations are reported and skipped.
-    split
-        ``"sequences"``, ``"groups"`` or ``"random"``: how the folds and the finalists' split are made.
-    n_folds
-        Number of folds.
+    patch_set, grid
+        The patches; and lists of values by name: fields of `FeatureParams`, ``C``, ``mirror`` and
+        ``positive_weight``. The others keep their defaults. Impossible combinations are reported and skipped.
+    split, n_folds
+        ``"sequences"``, ``"groups"`` or ``"random"``: how the folds and the finalists' split are made; and
+        number of folds.
     n_candidates
         Number of combinations to draw at random (``HalvingRandomSearchCV``); None tries all.
-    factor
-        One of `factor` candidates survives a round, and the number of patches grows by `factor`.
-    n_finalists
-        Number of best candidates to measure in full.
+    factor, n_finalists
+        One of `factor` candidates survives a round, and the number of patches grows by `factor`; and number
+        of best candidates to measure in full.
     random_state
         Seed of the draw, the folds and the training. The same seed repeats the search, so that an
         interrupted one continues from its store.
@@ -209,13 +196,8 @@ def search_parameters(
     >>> from vehicle_detection import render_patches
     >>> patches, labels = render_patches(60)
     >>> patch_set = PatchSet(patches, labels, [f"drawn/{number}.png" for number in range(60)])
-    >>> table = search_parameters(
-    ...     patch_set,
-    ...     {"orient": [4], "C": [1e-5, 1e-3]},
-    ...     split="random",
-    ...     n_finalists=1,
-    ...     options=TrialOptions(time_search=False),
-    ... )
+    >>> grid, untimed = {"orient": [4], "C": [1e-5, 1e-3]}, TrialOptions(time_search=False)
+    >>> table = search_parameters(patch_set, grid, split="random", n_finalists=1, options=untimed)
     >>> table["stage"].value_counts().to_dict()
     {'halving': 6, 'final': 1}
     """
@@ -320,10 +302,7 @@ def _halve(
 
 
 def _make_estimator(runner: TrialRunner, fold_of: NDArray[np.intp], split: str, seed: int) -> Any:
-    """Build a scikit-learn estimator over row numbers that runs a trial when it is scored.
-
-    Only then are both sides of the trial known, so that the runner can look it up in the store.
-    """
+    """Build an estimator over row numbers; its score runs the trial, as only then both sides are known."""
     from sklearn.base import BaseEstimator, ClassifierMixin
 
     class Trial(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
@@ -376,12 +355,12 @@ def make_splits(
             yield name, seed, make_split(patch_set, name, random_state=seed)
 
 
-def check_seeds(seeds: Sequence[int]) -> tuple[int, ...]:
+def check_seeds(seeds: object) -> tuple[int, ...]:
     """Return the seeds if they are different integers."""
-    given: object = seeds
-    if isinstance(given, (str, bytes)) or not isinstance(given, Iterable):
-        raise InvalidInputError(f"seeds must be a list of integers, such as range(5); got {describe(given)}")
-    checked = tuple(check_integer(seed, "seeds", low=0, high=2**32 - 1) for seed in given)
+    listed = tuple(seeds) if isinstance(seeds, Iterable) and not isinstance(seeds, (str, bytes)) else ()
+    checked = tuple(check_integer(seed, "seeds", low=0, high=2**32 - 1) for seed in listed)
     if not checked or len(set(checked)) < len(checked):
-        raise InvalidInputError(f"seeds must be different integers, at least one; got {describe(seeds)}")
+        raise InvalidInputError(
+            f"seeds must be a list of different integers, such as range(5); got {describe(seeds)}"
+        )
     return checked

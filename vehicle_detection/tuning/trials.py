@@ -57,16 +57,14 @@ class TrialOptions:
     Attributes
     ----------
     frames
-        One or more sets of labelled frames, with different names. Each classifier is evaluated on them,
-        frame by frame and without tracking.
+        Sets of labelled frames of different names, on which classifiers are evaluated without tracking.
     search_params, region_params
         Parameters of the detector on these frames. The search is also timed with `search_params`.
     time_search
         Measure the time of the fast search of a 1280x720 frame on one core.
-    cache
-        Folder that keeps features between runs, or a `FeatureCache` of the same patches.
-    n_jobs
-        Threads of the feature extraction.
+    cache, n_jobs
+        Folder that keeps features between runs, or a `FeatureCache` of the same patches; and threads of the
+        feature extraction.
 
     Raises
     ------
@@ -131,14 +129,8 @@ class TrialEvaluator:
 
     def trial_id(self, config: TrialConfig, split: Split, seed: int, *, on_frames: bool = True) -> str:
         """Hash of everything that the result depends on."""
-        return digest_of(
-            self._patches_digest,
-            config.to_columns(),
-            split.train,
-            split.test,
-            seed,
-            self._options_digest if on_frames else None,
-        )
+        options = self._options_digest if on_frames else None
+        return digest_of(self._patches_digest, config.to_columns(), split.train, split.test, seed, options)
 
     def evaluate(
         self, config: TrialConfig, split: Split, seed: int, *, on_frames: bool = True
@@ -181,29 +173,22 @@ class TrialEvaluator:
 
     def _score_frames(self, classifier: VehicleClassifier) -> dict[str, Any]:
         """Mean of each metric over the sets of frames, and the F1 score of each set as text."""
-        scores = [self._score_set(classifier, each) for each in self.options.frame_sets]
+        scores = {each.name: self._score_set(classifier, each) for each in self.options.frame_sets}
         row: dict[str, Any] = {}
-        for name in _FRAME_METRICS:
-            values = [score[name] for score in scores if not math.isnan(score[name])]
-            row[name] = float(np.mean(values)) if values else None
-        by_set = [f"{s.name} {score['frame_f1']:.4f}" for s, score in zip(self.options.frame_sets, scores)]
-        return {**row, "frame_f1_by_set": "; ".join(by_set)}
+        for metric, values in zip(_FRAME_METRICS, zip(*scores.values())):
+            known = [value for value in values if not math.isnan(value)]
+            row[metric] = float(np.mean(known)) if known else None
+        by_set = "; ".join(f"{name} {f1:.4f}" for name, (f1, *_) in scores.items())
+        return {**row, "frame_f1_by_set": by_set}
 
-    def _score_set(self, classifier: VehicleClassifier, frames: LabelledFrames) -> dict[str, float]:
-        with VehicleDetector(
-            classifier,
-            search_params=self.options.search_params,
-            region_params=self.options.region_params,
-            horizon=frames.horizon,
-        ) as detector:
+    def _score_set(self, classifier: VehicleClassifier, frames: LabelledFrames) -> tuple[float, ...]:
+        """Values of `_FRAME_METRICS` on a set of frames."""
+        parts = {name: getattr(self.options, name) for name in ("search_params", "region_params")}
+        with VehicleDetector(classifier, **parts, horizon=frames.horizon) as detector:
             found = FrameBoxes.from_detections({key: detector.detect(image) for key, image in frames})
         scores = evaluate_detections(found, frames.labels, frames=frames.keys)
-        return {
-            "frame_f1": scores.f1,
-            "frame_best_f1": best_f1(*precision_recall_curve(found, frames.labels))[0],
-            "frame_average_precision": scores.average_precision,
-            "frame_iou": scores.mean_iou,
-        }
+        best, _ = best_f1(*precision_recall_curve(found, frames.labels))
+        return scores.f1, best, scores.average_precision, scores.mean_iou
 
     def _time_search(self, classifier: VehicleClassifier) -> float:
         """Milliseconds of the fast search of a 1280x720 frame on one core: the fastest of several runs."""
@@ -252,9 +237,8 @@ class TrialRunner:
         measured = self.evaluator.evaluate(config, split, seed, on_frames=on_frames)
         row = self._append({**measured, **config.to_columns(), **labels})
         self._store.add(row)
-        _LOGGER.info(
-            "%s, C=%g, %s: %s", name, config.training.C, split_name, row["accuracy"] or row["message"]
-        )
+        outcome = row["accuracy"] or row["message"]
+        _LOGGER.info("%s, C=%g, %s: %s", name, config.training.C, split_name, outcome)
         return row
 
     def add_failed(self, candidate: Candidate, *, stage: str) -> None:
