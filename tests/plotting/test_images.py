@@ -76,7 +76,7 @@ def test_the_grid_has_no_empty_panels():
             (gray_image(),),
             r"images must be a list of images, at least one; got an array of shape \(90, 160, 3\)",
         ),
-        (([gray_image() / 255],), r"images\[0\] must be an \(H, W, 3\) uint8 RGB array.*scale its values 0-1"),
+        (([gray_image() / 255],), r"images\[0\] must be an \(H, W, 3\) uint8 RGB .*scale its values 0-1"),
         (([gray_image()], ["a", "b"]), "titles must have one value for each of the 1 images, got 2"),
     ],
 )

@@ -37,8 +37,7 @@ ARCHIVES: dict[str, dict[str, int]] = {
 }  # fmt: skip
 # Labels by folder name, without hyphens and underscores.
 CLASS_FOLDERS = {"vehicles": True, "cars": True, "nonvehicles": False, "notcars": False}
-# Age from which a partial download counts as left behind by a killed process.
-STALE_SECONDS = 3600.0
+STALE_SECONDS = 3600.0  # age from which a partial download counts as left behind by a killed process
 # Errors of zipfile on a damaged archive; RuntimeError if it is encrypted.
 _ZIP_ERRORS = (
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, RuntimeError, ValueError, OSError,
@@ -191,7 +190,9 @@ def _decode_rows(
             except InvalidInputError as error:
                 raise DatasetError(f"{error}; replace or remove it") from error
             except _ZIP_ERRORS as error:
-                raise DatasetError(f"{where} cannot be read ({error}); download it again") from error
+                raise DatasetError(
+                    f"{where} cannot be read ({error}); download or unpack it again"
+                ) from error
             if image.shape != out.shape[1:]:
                 height, width = image.shape[:2]
                 expected = f"{out.shape[1]}x{out.shape[1]}"
@@ -284,10 +285,9 @@ def _fetch(target: Path, address: str, counts: dict[str, int], progress: bool) -
     if target.is_file():
         try:
             verify_archive(target, counts, shown=str(target))
+            return target
         except DatasetError as error:
             _LOGGER.warning("the existing file is not the archive, downloading it again: %s", error)
-        else:
-            return target
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -318,25 +318,21 @@ def _download(address: str, part: Path, progress: bool) -> None:
     try:
         download(address, str(part), None)
     except OSError as error:  # also the base class of the errors of requests
-        raise DatasetError(f"{address} {_download_problem(error, part.parent)}") from error
+        match error:
+            case requests.HTTPError(response=requests.Response(status_code=status)):
+                problem = f"returns {status}; pass the url of a folder with {' and '.join(ARCHIVES)}"
+            case requests.exceptions.ChunkedEncodingError():
+                problem = "was cut off during the download; call again to restart it"
+            case requests.ConnectionError() | requests.Timeout():
+                remedy = "check the network and call again, or download the file in a browser"
+                problem = f"cannot be reached ({type(error).__name__}); {remedy}"
+            case requests.RequestException():
+                problem = f"cannot be downloaded ({type(error).__name__}); check url"
+            case _:
+                remedy = "free some space or choose another folder"
+                problem = f"cannot be stored in {part.parent}: {error.strerror}; {remedy}"
+        raise DatasetError(f"{address} {problem}") from error
     finally:
         # pooch leaves the connection open when it raises.
         for response in responses:
             response.close()
-
-
-def _download_problem(error: OSError, folder: Path) -> str:
-    """Say why a download failed, and what to do."""
-    import requests
-
-    match error:
-        case requests.HTTPError(response=requests.Response(status_code=status)):
-            return f"returns {status}; pass the url of a folder with {' and '.join(ARCHIVES)}"
-        case requests.exceptions.ChunkedEncodingError():
-            return "was cut off during the download; call again to restart it"
-        case requests.ConnectionError() | requests.Timeout():
-            remedy = "check the network and call again, or download the file in a browser"
-            return f"cannot be reached ({type(error).__name__}); {remedy}"
-        case requests.RequestException():
-            return f"cannot be downloaded ({type(error).__name__}); check url"
-    return f"cannot be stored in {folder}: {error.strerror}; free some space or choose another folder"

@@ -173,11 +173,6 @@ def load_patches(
         Side in pixels that every patch must have; threads, None for one per core, at most 8; and whether to
         show a progress bar on standard error.
 
-    Returns
-    -------
-    PatchSet
-        The patches, with their labels and names.
-
     Raises
     ------
     DatasetError

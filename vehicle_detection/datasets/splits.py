@@ -23,6 +23,7 @@ class Split:
     """Row numbers of training and test patches; unpacks as ``train, test = split``.
 
     Both parts are ``(N,)`` intp, not empty, and share no row; anything else raises an `InvalidInputError`.
+    Functions return all rows (`split_sources`: those of its sources), ascending in each part.
     """
 
     train: NDArray[np.intp]
@@ -59,11 +60,6 @@ def split_random(
         The set, or its ``(N,)`` labels.
     test_size, random_state
         Fraction of test patches, in (0, 1), rounded up to whole patches; and the seed.
-
-    Returns
-    -------
-    Split
-        All rows, in ascending order within each part.
 
     Raises
     ------
@@ -107,11 +103,6 @@ def split_sequences(patch_set: PatchSet, *, test_size: float = 0.2) -> Split:
         Fraction of each folder to test on, in (0, 1), rounded. A folder of two or more patches gives at least
         one to each part; a single patch goes to the training part.
 
-    Returns
-    -------
-    Split
-        As of `split_random`.
-
     Raises
     ------
     InvalidInputError
@@ -151,17 +142,9 @@ def split_groups(
     ----------
     patch_set, test_size
         As for `split_sequences`, but of each class in a folder; large groups may make the test part smaller.
-    threshold
-        Correlation, in (0, 1], from which two patches are near duplicates, as in `find_near_duplicates`. On
-        the course's vehicles, most pairs at 0.9 show the same car; at 0.85 a quarter of all patches fall into
-        one group by chance.
-    random_state
-        Seed.
-
-    Returns
-    -------
-    Split
-        As of `split_random`.
+    threshold, random_state
+        As in `find_near_duplicates`, and the seed. On the course's vehicles, most pairs at 0.9 show the same
+        car; at 0.85 a quarter of all patches fall into one group by chance.
 
     Raises
     ------

@@ -1,8 +1,7 @@
 """An explorer for notebooks: change the detector's parameters and see what it finds in a frame.
 
-`Explorer` keeps the parameters and computes windows, boxes and images without any widget. A frame is searched
-once per model, horizon and set of bands; thresholds and region parameters only select from the cached result.
-`Explorer.widget` adds sliders that set the same parameters.
+A frame is searched once per horizon and band; thresholds and region parameters only select from the cached
+result. `Explorer.widget` adds sliders that set the same parameters.
 """
 
 from __future__ import annotations
@@ -49,18 +48,10 @@ VIEWS: tuple[View, ...] = get_args(View)
 _ALL_SCORES = -1e6
 _CACHED_SEARCHES, _CACHED_FRAMES = 64, 8
 _BOX_COLOR, _HORIZON_COLOR = TRACK_COLORS[1], (255, 255, 255)
-# Windows of this score or more are drawn in the brightest color.
-_MAX_COLOR_SCORE = 2.0
+_MAX_COLOR_SCORE = 2.0  # windows of this score or more are drawn in the brightest color
 
 Value = TypeVar("Value")
 Params = TypeVar("Params", HeatParams, RegionParams)
-
-
-class _FrameImage(NamedTuple):
-    """A frame, and a copy not wider than the explorer's images."""
-
-    full: Image
-    small: Image
 
 
 class _FrameWindows(NamedTuple):
@@ -71,6 +62,18 @@ class _FrameWindows(NamedTuple):
     vehicles: Detections | None  # boxes predicted by the model
 
 
+def _cached(method: Callable[[Explorer], Value]) -> Callable[[Explorer], Value]:
+    """Keep the result of a method for the current parameters."""
+
+    @functools.wraps(method)
+    def cached(self: Explorer) -> Value:
+        state = (self.frame, self.search_params, self.bands, self.region_params)
+        result: Value = self._compute(method, state)
+        return result
+
+    return cached
+
+
 class Explorer:
     """Run the detector on a few frames and change its parameters one by one.
 
@@ -78,27 +81,22 @@ class Explorer:
 
     Parameters
     ----------
-    frames
-        ``(H, W, 3)`` uint8 RGB images or paths of image files, in a list or by name; or a `FrameSet`.
+    frames, width
+        ``(H, W, 3)`` uint8 RGB images or paths of image files, in a list or by name, or a `FrameSet`; and the
+        width in pixels to which displayed images are reduced.
     model, search_params, region_params, camera, horizon
         As in `VehicleDetector`.
-    width
-        Images are reduced to this width in pixels, so that they are displayed quickly.
 
     Attributes
     ----------
-    names, model
-        Names of the frames, and the model.
-    frame, view
-        Name of the current frame, and what images show.
+    model, names, frame, view
+        The model; names of the frames and of the current one; and what images show.
     search_params, bands
         Current search parameters; for a classifier of patches with all bands, of which those numbered in
         `bands` are searched.
-    method
-        ``"groups"``: boxes from groups of agreeing windows, or those that the model predicts. ``"heat"``:
-        boxes from the heat map.
-    group_params, heat_params
-        Current `RegionParams` of ``"groups"`` and `HeatParams` of ``"heat"``.
+    method, group_params, heat_params
+        ``"groups"``: boxes from groups of agreeing windows, or those that the model predicts, with
+        `RegionParams`. ``"heat"``: boxes from the heat map, with `HeatParams`.
 
     Raises
     ------
@@ -132,9 +130,9 @@ class Explorer:
         self._width = check_integer(width, "width", low=16, high=10_000)
         self._camera = camera
         self._search = detector.model.open_search()
-        self._read_frame = functools.lru_cache(_CACHED_FRAMES)(self._read_frame_uncached)
+        self._read_frame = functools.lru_cache(_CACHED_FRAMES)(lambda name: self._readers[name]())
         self._search_frame = functools.lru_cache(_CACHED_SEARCHES)(self._search_frame_uncached)
-        self._compute = functools.lru_cache(3)(lambda function, state: function())
+        self._compute = functools.lru_cache(3)(lambda method, state: method(self))
         self.model = detector.model
         self.names = tuple(self._readers)
         self.frame = self.names[0]
@@ -214,17 +212,32 @@ class Explorer:
         groups = _replace(self.group_params, min_peak=min_peak, min_evidence=min_evidence)
         self.method, self.heat_params, self.group_params = method, heat, groups
 
+    @_cached
     def windows(self) -> Detections:
         """Positive windows of the current frame."""
-        return self._cached(self._select_windows)
+        found = self._find()
+        selected = found.windows.scores > self.search_params.min_score
+        if found.bands is not None:
+            selected &= np.isin(found.bands, self.bands)
+        return found.windows[selected]
 
+    @_cached
     def heat_map(self) -> NDArray[np.float32]:
         """Heat map of the positive windows, ``(H, W)`` float32."""
-        return self._cached(self._compute_heat)
+        return frame_heat(self._read_frame(self.frame).shape, self.windows(), self.heat_params)
 
+    @_cached
     def boxes(self) -> Detections:
         """Boxes of the vehicles, equal to those of `VehicleDetector.detect` with these parameters."""
-        return self._cached(self._find_boxes)
+        if self.method == "heat":
+            return label_heat(self.heat_map(), self.heat_params)
+        found = self._find()
+        if found.vehicles is not None:
+            return found.vehicles
+        shape = self._read_frame(self.frame).shape[:2]
+        params: Any = self.search_params
+        camera = self._camera or Camera.for_frame(shape, horizon=params.horizon)
+        return find_vehicles(self.windows(), camera, shape, self.group_params)
 
     def detector(self, **options: Any) -> VehicleDetector:
         """Create a detector with the current parameters, for a script or a video.
@@ -241,15 +254,15 @@ class Explorer:
         return VehicleDetector(self.model, search_params=params, **options)
 
     def render(self) -> Image:
-        """Draw the current frame with its boxes, the horizon, and the windows or heat map of the view.
-
-        The image is ``(h, w, 3)`` uint8 RGB, not wider than `width`.
-        """
-        full, small = self._read_frame(self.frame)
-        scale = small.shape[1] / full.shape[1]
-        image = small.copy()
+        """Draw the frame with boxes, horizon and the view's windows or heat map: ``(h, w, 3)`` uint8 RGB."""
+        image = self._read_frame(self.frame).copy()
+        height, width = image.shape[:2]
+        scale = min(self._width / width, 1.0)
+        if scale < 1:
+            size = (self._width, max(1, round(height * self._width / width)))
+            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
         if self.view == "heat":
-            heat = np.asarray(cv2.resize(self.heat_map(), small.shape[1::-1]), np.float32)
+            heat = np.asarray(cv2.resize(self.heat_map(), image.shape[1::-1]), np.float32)
             image = blend(image, heat_image(heat), 0.6)
         if self.search_params.horizon is not None:
             row = min(round(self.search_params.horizon * len(image)), len(image) - 1)
@@ -260,7 +273,7 @@ class Explorer:
 
     def summary(self) -> str:
         """Describe in a line what was found."""
-        height, width = self._read_frame(self.frame).full.shape[:2]
+        height, width = self._read_frame(self.frame).shape[:2]
         found = self._find()
         total = "" if found.bands is None else f" of {len(found.windows):,}"
         windows, boxes = len(self.windows()), len(self.boxes())
@@ -309,60 +322,25 @@ class Explorer:
             # ipywidgets does not display exceptions of callbacks.
             panel.show_error(str(error))
 
-    def _cached(self, compute: Callable[[], Value]) -> Value:
-        """Return the result of `compute` for the current parameters, computed once."""
-        state = (self.frame, self.search_params, self.bands, self.region_params)
-        result: Value = self._compute(compute, state)
-        return result
-
-    def _select_windows(self) -> Detections:
-        found = self._find()
-        selected = found.windows.scores > self.search_params.min_score
-        if found.bands is not None:
-            selected &= np.isin(found.bands, self.bands)
-        return found.windows[selected]
-
-    def _compute_heat(self) -> NDArray[np.float32]:
-        return frame_heat(self._read_frame(self.frame).full.shape, self.windows(), self.heat_params)
-
-    def _find_boxes(self) -> Detections:
-        if self.method == "heat":
-            return label_heat(self.heat_map(), self.heat_params)
-        found = self._find()
-        if found.vehicles is not None:
-            return found.vehicles
-        shape = self._read_frame(self.frame).full.shape[:2]
-        params: Any = self.search_params
-        camera = self._camera or Camera.for_frame(shape, horizon=params.horizon)
-        return find_vehicles(self.windows(), camera, shape, self.group_params)
-
-    def _read_frame_uncached(self, name: str) -> _FrameImage:
-        image = self._readers[name]()
-        height, width = image.shape[:2]
-        if width <= self._width:
-            return _FrameImage(image, image)
-        size = (self._width, max(1, round(height * self._width / width)))
-        return _FrameImage(image, np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8))
-
     def _find(self) -> _FrameWindows:
         """Search the current frame with a low threshold, which serves all higher ones."""
         lowest = _ALL_SCORES if self._all_bands else min(0.0, self.search_params.min_score)
         return self._search_frame(self.frame, dataclasses.replace(self.search_params, min_score=lowest))
 
     def _search_frame_uncached(self, name: str, params: Any) -> _FrameWindows:
-        image = self._read_frame(name).full
+        image = self._read_frame(name)
         if not self._all_bands:
             found = self._search.find(image, params)
             return _FrameWindows(found.windows, None, found.vehicles)
         params.place(image.shape)  # raises if no band fits
-        parts, numbers = [], []
+        parts = {}
         for number, band in enumerate(params.bands):
             if band.place(image.shape, params.horizon, params.horizontal_padding) is not None:
-                parts.append(self._search.find(image, dataclasses.replace(params, bands=(band,))).windows)
-                numbers.append(np.full(len(parts[-1]), number))
-        boxes = np.concatenate([part.boxes for part in parts])
-        scores = np.concatenate([part.scores for part in parts])
-        return _FrameWindows(Detections(boxes, scores), np.concatenate(numbers), None)
+                parts[number] = self._search.find(image, dataclasses.replace(params, bands=(band,))).windows
+        boxes = np.concatenate([part.boxes for part in parts.values()])
+        scores = np.concatenate([part.scores for part in parts.values()])
+        numbers = np.repeat(list(parts), [len(part) for part in parts.values()])
+        return _FrameWindows(Detections(boxes, scores), numbers, None)
 
 
 def _replace(params: Params, **changes: Any) -> Params:

@@ -33,22 +33,15 @@ from vehicle_detection.params import MixtureParams
 
 Floats = NDArray[np.float64]
 
-# Smallest margin of an evaluated box, and the thresholds to choose from.
-_MIN_MARGIN = -1.0
-_THRESHOLDS = np.arange(-1.0, 1.5, 0.02)
+_MIN_MARGIN = -1.0  # of an evaluated box
+_THRESHOLDS = np.arange(-1.0, 1.5, 0.02)  # to choose from
 
 FOLD_COLUMNS = {
-    "f1": ("F1", 3),
-    "best_f1": ("best F1", 3),
-    "average_precision": ("AP", 3),
-    "precision": ("precision", 3),
-    "recall": ("recall", 3),
-    "mean_iou": ("mean IoU", 3),
-    "false_per_frame": ("false", 2),
-    "false_per_empty_frame": ("on empty", 2),
-    "region_f1": ("region F1", 3),
+    "f1": ("F1", 3), "best_f1": ("best F1", 3), "average_precision": ("AP", 3), "precision": ("precision", 3),
+    "recall": ("recall", 3), "mean_iou": ("mean IoU", 3), "false_per_frame": ("false", 2),
+    "false_per_empty_frame": ("on empty", 2), "region_f1": ("region F1", 3),
     "region_average_precision": ("region AP", 3),
-}
+}  # fmt: skip
 """Columns of a table of `FoldScore`: titles and decimals."""
 
 
@@ -132,6 +125,10 @@ def cross_validate_mixture(
 ) -> tuple[TemplateMixture, list[FoldScore], list[FoldDetections]]:
     """Train a mixture on all sources, calibrated and evaluated by leaving out one source at a time.
 
+    The threshold of the model has the best F1 over all left-out sources together, so every vehicle has the
+    same weight. The log-odds are fitted to the same detections (Platt, "Probabilistic outputs for support
+    vector machines", 1999).
+
     Parameters
     ----------
     sources, extra_sources
@@ -150,12 +147,6 @@ def cross_validate_mixture(
     ------
     InvalidInputError
         If there are fewer than two sources, or `train_mixture` finds too few vehicles without one of them.
-
-    Notes
-    -----
-    The threshold of the model has the best F1 over all left-out sources together, so every vehicle has the
-    same weight. The log-odds are fitted to the same detections (Platt, "Probabilistic outputs for support
-    vector machines", 1999).
     """
     sources = check_sources(sources, min_count=2)
     extra = check_sources((*sources, *check_sources(extra_sources, min_count=0)))[len(sources) :]
@@ -219,10 +210,7 @@ def score_fold(fold: FoldDetections, threshold: float) -> FoldScore:
 
 
 def best_threshold(folds: Sequence[FoldDetections]) -> float:
-    """Threshold with the best F1 over all vehicles of the folds together.
-
-    The mean of their F1 would give a fold with a few dozen vehicles the same weight as one with hundreds.
-    """
+    """Threshold with the best F1 over the vehicles of all folds together, each with the same weight."""
     margins, hits = _joined_hits(folds)
     above = margins[:, None] >= _THRESHOLDS
     right, shown = above[hits].sum(axis=0), above.sum(axis=0)

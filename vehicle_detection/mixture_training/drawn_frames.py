@@ -14,22 +14,13 @@ from vehicle_detection.synthetic import Drive, render_drive
 
 # Options of `render_drive`; "truncated" chooses frames in which the border truncates a vehicle.
 _CASES: tuple[dict[str, Any], ...] = (
-    {},
-    {"scenario": "overtaking"},
-    {"scenario": "crossing"},
-    {"scenario": "occlusion"},
-    {"scenario": "empty"},
-    {"rain": 0.6},
-    {"light": "overcast"},
-    {"light": "dusk"},
-    {"light": "night"},
-    {"shape": (540, 960)},
-    {"shape": (1080, 1920)},
-    {"light": "night", "rain": 0.6},
-    {"light": "night", "shape": (540, 960)},
+    {}, {"scenario": "overtaking"}, {"scenario": "crossing"}, {"scenario": "occlusion"},
+    {"scenario": "empty"}, {"rain": 0.6}, {"light": "overcast"}, {"light": "dusk"}, {"light": "night"},
+    {"shape": (540, 960)}, {"shape": (1080, 1920)},
+    {"light": "night", "rain": 0.6}, {"light": "night", "shape": (540, 960)},
     {"scenario": "overtaking", "truncated": True},
     {"scenario": "overtaking", "light": "night", "truncated": True},
-)
+)  # fmt: skip
 
 _FRAMES = 200
 # Smallest fraction of a truncated vehicle outside the frame; one frame in so many is searched for one.
@@ -57,23 +48,18 @@ def drawn_source(*, drives: int = 2 * len(_CASES), frames: int = 2, random_state
         chosen = np.linspace(0, len(drive) - 1, n_frames + 2)[1:-1].astype(int).tolist()
         if case.get("truncated", False):
             chosen = [_closest_truncation(drive, index) for index in chosen]
-        parts.append(_labelled(f"drawn {number + 1}", drive, chosen))
+        scenes = {index: drive[index] for index in chosen}
+        images: dict[FrameKey, Any] = {index: scene.image for index, scene in scenes.items()}
+        rows = [(index, row) for index, scene in scenes.items() for row in scene.truth]
+        labels = FrameBoxes(
+            [index for index, _ in rows],
+            np.array([row.track for _, row in rows], np.intp),
+            np.array([row.box for _, row in rows], np.float64).reshape(-1, 4),
+            ignore=np.array([row.ignore for _, row in rows], np.bool_),
+            frame_keys=chosen,
+        )
+        parts.append(LabelledFrames(f"drawn {number + 1}", images, labels))
     return FrameDataset("drawn", tuple(parts))
-
-
-def _labelled(name: str, drive: Drive, chosen: list[int]) -> LabelledFrames:
-    """Render the chosen frames of a drive with their labels."""
-    scenes = {index: drive[index] for index in chosen}
-    images: dict[FrameKey, Any] = {index: scene.image for index, scene in scenes.items()}
-    rows = [(index, row) for index, scene in scenes.items() for row in scene.truth]
-    labels = FrameBoxes(
-        [index for index, _ in rows],
-        np.array([row.track for _, row in rows], np.intp),
-        np.array([row.box for _, row in rows], np.float64).reshape(-1, 4),
-        ignore=np.array([row.ignore for _, row in rows], np.bool_),
-        frame_keys=chosen,
-    )
-    return LabelledFrames(name, images, labels)
 
 
 def _closest_truncation(drive: Drive, index: int) -> int:

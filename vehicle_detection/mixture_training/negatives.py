@@ -33,12 +33,9 @@ Block = tuple[tuple[int, ...], NDArray[np.float32]]
 
 # Margin above which a window is a hard negative, and the most of them per pyramid level.
 _HARD_MARGIN, _MAX_PER_LEVEL = -0.9, 400
-# Expected number of random windows per pyramid level.
-_RANDOM_PER_LEVEL = 0.15
-# A negative overlaps no vehicle by this IoU, and no ignored box by this fraction of its own area.
-_MAX_OVERLAP = 0.3
-# IoU above which two negatives of a frame are duplicates.
-_DUPLICATE_IOU = 0.7
+_RANDOM_PER_LEVEL = 0.15  # expected number of random windows per pyramid level
+_MAX_OVERLAP = 0.3  # of a negative: IoU with a vehicle, and fraction of its own area in an ignored box
+_DUPLICATE_IOU = 0.7  # IoU above which two negatives of a frame are duplicates
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,14 +200,13 @@ class NegativePool:
         fresh: list[list[NDArray[np.float32]]] = [[] for _ in self.rows]
         for number, negatives in found:
             for index, place, features in negatives:
-                key = (number, *place)
-                if key not in self._known[index]:
-                    self._known[index].add(key)
+                if (number, *place) not in self._known[index]:
+                    self._known[index].add((number, *place))
                     fresh[index].append(features)
         for index, rows in enumerate(fresh):
             if rows:
-                self.rows[index] = np.concatenate([self.rows[index], np.array(rows, np.float32)])
-        return sum(len(rows) for rows in fresh)
+                self.rows[index] = np.concatenate([self.rows[index], rows])
+        return sum(map(len, fresh))
 
     def trim(self, templates: Sequence[MixtureTemplate], max_count: int) -> None:
         """Drop the negatives with the lowest margins beyond `max_count`; `add` does not take them again."""

@@ -25,14 +25,10 @@ Rows = NDArray[np.float32]
 VehicleSamples = Iterator[tuple[Image, Floats]]
 """Images, each with the box of one vehicle."""
 
-# A box this close to a border, in pixels, counts as truncated by it.
-_BORDER_DISTANCE = 3
-# Range of the fraction of a vehicle that stays visible when it is truncated artificially.
-_VISIBLE_RANGE = (0.3, 0.85)
-# Typical box of the vehicle on a patch, as fractions of its sides.
-_BOX_ON_PATCH = np.array([0.05, 0.14, 0.95, 0.89])
-# A cell counts as inside an image if less than this fraction of it lies outside.
-_MAX_OUTSIDE = 0.3
+_BORDER_DISTANCE = 3  # px; a box this close to a border counts as truncated by it
+_VISIBLE_RANGE = (0.3, 0.85)  # fraction of a vehicle that stays visible when it is truncated artificially
+_BOX_ON_PATCH = np.array([0.05, 0.14, 0.95, 0.89])  # typical box of a vehicle, as fractions of the sides
+_MAX_OUTSIDE = 0.3  # fraction of a cell outside the image from which on the cell counts as outside
 
 
 def window_features(image: Image, box: Floats, template: MixtureTemplate) -> NDArray[np.float32]:
@@ -163,7 +159,7 @@ def _matching_templates(box: Floats, templates: Sequence[MixtureTemplate], toler
     return [int(index) for index in np.flatnonzero((distance == distance.min()) | (distance < tolerance))]
 
 
-def align_mirrored(rows: Rows, rng: np.random.Generator, tries: int = 5) -> Rows:
+def align_mirrored(rows: Rows, rng: np.random.Generator) -> Rows:
     """Keep one of each two neighboring rows, a sample and its mirror image, so that all show the same side.
 
     k-means with two clusters that are each other's mirror image, from a few random starts.
@@ -174,7 +170,7 @@ def align_mirrored(rows: Rows, rng: np.random.Generator, tries: int = 5) -> Rows
     centered = pairs - pairs.mean(axis=(0, 1))
     numbers = np.arange(len(pairs))
     best, best_norm = np.zeros(len(pairs), np.intp), -1.0
-    for _ in range(tries):
+    for _ in range(5):
         chosen = rng.integers(0, 2, len(pairs))
         for _ in range(15):
             mean = centered[numbers, chosen].mean(axis=0)

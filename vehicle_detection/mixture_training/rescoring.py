@@ -12,8 +12,6 @@ from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.mixture import (
     CROP_CELLS,
     N_CHANNELS,
-    N_COLOR_FEATURES,
-    N_EDGE_FEATURES,
     MixtureSearch,
     Projection,
     Rescorer,
@@ -37,8 +35,7 @@ _GAMMA, _C = 0.5, 3.0
 _MIN_POSITIVE_IOU, _NEGATIVE_IOU = 0.55, (0.15, 0.45)
 # Positive copies of a labelled box, the jitter of all but the first, and negatives beside each labelled box.
 _COPIES, _JITTER_SCALE, _BESIDE = 3, 0.06, 2
-# Margin of the weakest proposals to train on, lower than that of any box that is rescored.
-_MIN_MARGIN = -1.1
+_MIN_MARGIN = -1.1  # of the proposals to train on, lower than that of any box that is rescored
 
 
 def train_rescorer(
@@ -48,11 +45,7 @@ def train_rescorer(
     rng: np.random.Generator,
     pool: ThreadPoolExecutor,
 ) -> Rescorer | None:
-    """Train a rescorer on the boxes that a search proposes; None if one of the classes has no sample.
-
-    Positives are the labelled boxes, also slightly shifted, and the proposals on them. Negatives are the
-    proposals where no vehicle is, and boxes that show only a part of one.
-    """
+    """Train a rescorer on the boxes that a search proposes; None if one of the classes has no sample."""
     from sklearn.svm import SVC
 
     seeds = rng.integers(2**32, size=len(frames)).tolist()
@@ -83,7 +76,7 @@ def train_rescorer(
 def _sample_boxes(
     frame: TrainingFrame, search: MixtureSearch, params: MixtureParams, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Positive and negative boxes of a frame."""
+    """Positive boxes (labels, shifted labels, proposals on them) and negatives (other proposals, parts)."""
     windows = search.score_windows(frame.image, PyramidParams())
     proposals = search.model.propose_boxes(frame.image, windows, min_margin=_MIN_MARGIN)[0]
     negatives = proposals[is_negative(proposals, frame)]
@@ -99,9 +92,8 @@ def _sample_boxes(
 
 
 def _join(parts: Sequence[Crops]) -> Crops:
-    edges = np.concatenate([np.empty((0, N_EDGE_FEATURES), np.float32), *(each for each, _ in parts)])
-    colors = np.concatenate([np.empty((0, N_COLOR_FEATURES), np.float32), *(each for _, each in parts)])
-    return edges, colors
+    edges, colors = zip(*parts)
+    return np.concatenate(edges), np.concatenate(colors)
 
 
 def _mirror(crops: Crops) -> Crops:

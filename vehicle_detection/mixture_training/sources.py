@@ -67,10 +67,10 @@ def check_sources(sources: object, *, min_count: int = 1) -> tuple[FrameDataset,
     if len(names) < min_count:
         expected = "at least two, so that one can be left out" if min_count > 1 else "at least one"
         raise InvalidInputError(f"sources must be {expected}; got {len(names)}: add labelled frames")
-    twice = min((name for name in names if names.count(name) > 1), default=None)
+    twice = {name for name in names if names.count(name) > 1}
     if twice:
         raise InvalidInputError(
-            f"sources must have different names, got {twice!r} twice; merge them into one"
+            f"sources must have different names, got {min(twice)!r} twice; merge them into one"
         )
     return tuple(sources)
 
@@ -84,8 +84,7 @@ def find_sources(
     """Read a folder of labelled frames, as one data set for each file ``labels/NAME.csv``.
 
     Its frames are in ``frames/NAME/``, ``NAME/`` or ``videos/NAME.mp4``, of which `clip_rate` frames per
-    second are taken, because neighboring frames show nearly the same. `min_labelled_widths` gives the
-    ``min_labelled_width`` of data sets by name; 0 for the others.
+    second are taken. `min_labelled_widths` gives the ``min_labelled_width`` of data sets by name, else 0.
     """
     root = Path(folder)
     if not root.is_dir():

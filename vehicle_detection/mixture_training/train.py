@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_image, check_integer, check_type, describe, resolve_jobs
+from vehicle_detection._common import check_image, check_integer, check_type, resolve_jobs
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture import (
@@ -52,6 +52,7 @@ from vehicle_detection.params import MixtureParams
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 Rows = NDArray[np.float32]
+Templates = list[MixtureTemplate]
 log = logging.getLogger(__name__)
 
 # Maximum number of solver iterations in mining rounds and at the end.
@@ -68,6 +69,10 @@ def train_mixture(
     on_step: Callable[[str], object] | None = None,
 ) -> TemplateMixture:
     """Train a mixture of templates.
+
+    Linear SVMs on vehicles and on windows without one: random windows at first, then hard negatives of the
+    current templates (Felzenszwalb et al., PAMI 2010, section 5). Their detections in the training frames
+    then train the box regressor and the rescorer.
 
     Parameters
     ----------
@@ -90,20 +95,12 @@ def train_mixture(
     ------
     InvalidInputError
         If there is no source, no vehicle for one of the templates, or a patch is not an image.
-
-    Notes
-    -----
-    Linear SVMs on vehicles and on windows without one: random windows at first, then hard negatives of the
-    current templates (Felzenszwalb et al., PAMI 2010, section 5). Their detections in the training frames
-    then train the box regressor and the rescorer.
     """
     sources = check_sources(sources)
     params = params if params is not None else MixtureParams()
     check_type(params, "params", MixtureParams, "omit it for the defaults")
     check_integer(random_state, "random_state", low=0, high=2**32 - 1)
-    given: object = patches
-    if not isinstance(given, (list, tuple, np.ndarray)):
-        raise InvalidInputError(f"patches must be a list of images, got {describe(given)}")
+    check_type(patches, "patches", (list, tuple, np.ndarray), "pass a list of images")
     for image in patches:
         check_image(image, "patches")
     with ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
@@ -142,9 +139,7 @@ class _Training:
             mixture = replace(mixture, rescorer=rescorer)
         return mixture
 
-    def positives(
-        self, patches: Sequence[Image], inner: Sequence[MixtureTemplate], border: Sequence[MixtureTemplate]
-    ) -> list[Rows]:
+    def positives(self, patches: Sequence[Image], inner: Templates, border: Templates) -> list[Rows]:
         """Features of the positive samples of each template."""
         params, rng = self.params, self.rng
         whole = vehicle_features(whole_vehicles(self.frames, params, rng), inner, params)
@@ -162,17 +157,15 @@ class _Training:
             whole[index] = align_mirrored(whole[index], rng)
         return whole + truncated
 
-    def train_templates(
-        self, templates: list[MixtureTemplate], positives: Sequence[Rows]
-    ) -> list[MixtureTemplate]:
+    def train_templates(self, templates: Templates, positives: Sequence[Rows]) -> Templates:
         """Train the templates, mining hard negatives in rounds; mirrored templates are added at the end."""
         params, frames = self.params, self.frames
         mirrored = params.mirrored + (False,) * len(params.border_shapes)
         negatives = NegativePool([rows.shape[1] for rows in positives])
 
         def solve(
-            templates: list[MixtureTemplate], vectors: list[Floats], iterations: int
-        ) -> tuple[list[MixtureTemplate], list[Floats]]:
+            templates: Templates, vectors: list[Floats], iterations: int
+        ) -> tuple[Templates, list[Floats]]:
             def fit(template: MixtureTemplate, start: Floats, rows: Rows, others: Rows) -> Floats:
                 C = params.border_C if template.border else params.C
                 return _fit_svm(rows, others, C, params.positive_weight, start=start, iterations=iterations)
@@ -199,10 +192,7 @@ class _Training:
         return [view.template for view in with_mirrored(biased, mirrored)]
 
     def fit_box_regressor(self, search: MixtureSearch | None = None) -> BoxRegressor:
-        """Fit the shifts from found and from jittered boxes to the labels, by ridge regression.
-
-        Without a search, from the jittered boxes alone.
-        """
+        """Fit the shifts from jittered (with a search also found) boxes to labels by ridge regression."""
         from sklearn.linear_model import Ridge
 
         params = self.params

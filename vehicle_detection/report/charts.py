@@ -1,8 +1,7 @@
 """SVG charts over the time of a video.
 
-Horizontal positions are percentages of the chart's width, so that a chart fits any screen; text sizes and
-heights are pixels, so that they stay readable. Curves are drawn in a nested SVG that is stretched to the
-width, with lines of constant width.
+Horizontal positions are percentages of the width, so that a chart fits any screen; text sizes and heights are
+pixels. Curves are drawn in a nested SVG that is stretched to the width, with lines of constant width.
 """
 
 from __future__ import annotations
@@ -142,11 +141,8 @@ def gantt(tracks: Sequence[TrackHistory], axis: TimeAxis, *, label: str) -> str:
         bar = {"y": _decimal(middle - _BAR_HEIGHT / 2), "height": _BAR_HEIGHT, "rx": 3}
         for start, stop in track.spans(max(1, axis.frames // _CURVE_WIDTH)):
             parts.append(svg_element("rect", x=axis.percent(start), width=axis.percent(stop - start), **bar))
-        button = {
-            "role": "button",
-            "tabindex": 0,
-            "aria_label": f"Track {track.id}, {times}: show in the video",
-        }
+        action = f"Track {track.id}, {times}: show in the video"
+        button = {"role": "button", "tabindex": 0, "aria_label": action}
         seek = {"data_frame": track.first, "data_track": track.id}
         bars.append(svg_element("g", *parts, class_=f"bar c{track.color}", **button, **seek))
     height = _ROW_HEIGHT * (max(rows, default=-1) + 1)
@@ -199,7 +195,10 @@ def curve(
         half_widths[np.searchsorted(bins, std_bins)] = std_values
     lines, bands = [], []
     for run in split_runs(bins):
-        lines.append(_line(_points(bins[run], values[run], time_axis, value_axis), time_axis))
+        points = _points(bins[run], values[run], time_axis, value_axis)
+        # A single point gets a short line, as a line without length is invisible.
+        end = max(time_axis.bin_width / time_axis.frames * _CURVE_WIDTH, 2) if len(points) == 1 else 0
+        lines.append(f"M{' '.join(points)}" + (f"h{_decimal(end)}" if end else ""))
         if std is not None:
             upper = _points(bins[run], values[run] + half_widths[run], time_axis, value_axis)
             lower = _points(bins[run], values[run] - half_widths[run], time_axis, value_axis)
@@ -273,12 +272,6 @@ def _points(bins: NDArray[np.int64], values: Floats, time_axis: TimeAxis, value_
         f"{time_axis.x((number + 0.5) * time_axis.bin_width)},{_decimal(value_axis.y(value))}"
         for number, value in zip(bins.tolist(), clipped.tolist())
     ]
-
-
-def _line(points: list[str], axis: TimeAxis) -> str:
-    # A single point gets a short line, as a line without length is invisible.
-    end = f"h{_decimal(max(axis.bin_width / axis.frames * _CURVE_WIDTH, 2))}" if len(points) == 1 else ""
-    return f"M{' '.join(points)}{end}"
 
 
 def _decimal(value: float) -> str:

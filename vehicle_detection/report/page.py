@@ -91,13 +91,12 @@ def render_page(
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"time": format_time, "plural": pluralize, "value": format_value}
+    filters = {"time": format_time, "plural": pluralize, "value": format_value, "hash": _csp_hash}
+    environment.filters |= filters
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
     return environment.from_string(template).generate(
         css=css,
         script=script,
-        css_hash=_csp_hash(css),
-        script_hash=_csp_hash(script),
         source=source,
         report=report,
         fps=axis.fps,

@@ -26,10 +26,9 @@ class ReportWriter:
     path, video, source
         The page to write (.html or .htm), the annotated video (the target of `process_video`) if one is
         written, and the source video for the title.
-    detector
-        The :class:`VehicleDetector`, for settings and model; None leaves them out.
-    embed_limit
-        A video of more bytes than this is linked instead of embedded; their relative places must then stay.
+    detector, embed_limit
+        The :class:`VehicleDetector`, for settings and model; and the number of bytes from which on a video is
+        linked instead of embedded: page and video must then be moved together.
 
     Raises
     ------
@@ -77,10 +76,7 @@ class ReportWriter:
         self.write(result.index, result.time, result.tracks)
 
     def write(self, frame_index: int, time: float | None, tracks: Iterable[Any]) -> None:
-        """Add the tracks of the next frame; only those with ``track.shown`` are kept.
-
-        Frames are numbered from 0 without gaps; `time` is that in the source in seconds, None if unknown.
-        """
+        """Add the shown tracks of the next frame, numbered from 0; `time` is that in the source (s)."""
         self._log.add(frame_index, time, tracks)
 
     def finish(self, report: VideoReport) -> None:

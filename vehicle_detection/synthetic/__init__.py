@@ -1,7 +1,6 @@
 """Synthetic road scenes, drives and training patches with exact ground truth.
 
-A pinhole camera looks along a flat, straight road; vehicles are painted bodies in true perspective. Boxes,
-distances and speeds are therefore known exactly, and the library can be tried and tested without photographs.
+A pinhole camera looks along a flat, straight road; vehicles are painted bodies in true perspective.
 """
 
 from vehicle_detection.synthetic.drive import Drive, render_drive, write_labels

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from vehicle_detection.synthetic.raster import Color, Doubles, Floats
 from vehicle_detection.synthetic.shapes import profile_at
-from vehicle_detection.synthetic.surface import Mask, Outline, SurfaceCanvas, round_corners
+from vehicle_detection.synthetic.surface import Mask, SurfaceCanvas, round_corners
 
 if TYPE_CHECKING:
     from vehicle_detection.synthetic.vehicles import VehicleBody
@@ -46,7 +46,7 @@ class BodyPainter:
         corners = [(-bottom, low), (bottom, low), (top, high), (-top, high)]
         return self.paint_glass(round_corners(corners, radius), seats=True)
 
-    def paint_glass(self, outline: Outline, *, seats: bool) -> Mask:
+    def paint_glass(self, outline: Doubles, *, seats: bool) -> Mask:
         """Paint a pane: a dark cabin behind it, the reflected sky on it, a dark seal around it."""
         canvas, look = self.canvas, self.look
         gain = self.by_light(0.3, 1.0)
@@ -76,7 +76,7 @@ class BodyPainter:
             if rng.random() < 0.85:
                 self.paint_box(x, y, rng.uniform(0.02, 0.045), 0.066, (40, 42, 48), 0.8)
 
-    def paint_lamp(self, outline: Outline, color: Color) -> None:
+    def paint_lamp(self, outline: Doubles, color: Color) -> None:
         """Paint a lamp: its glass, darker at the rim, and its light."""
         canvas, lamps = self.canvas, self.light.lamps
         mask = canvas.polygon(outline)

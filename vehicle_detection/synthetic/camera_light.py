@@ -171,10 +171,7 @@ class Sensor:
         return np.asarray(cv2.GaussianBlur(streaks, (3, 3), 0.7), np.uint8)
 
     def expose(self, image: Image, frame: int, *, crop_blur: float | None = None) -> Image:
-        """Turn a drawn ``(H, W, 3)`` image into the image that the camera delivers.
-
-        With `crop_blur`, the lens blur (standard deviation in px), it is a crop: no vignette and rain.
-        """
+        """Turn a drawn image, or with the lens blur of a crop (px) a crop, into what the camera delivers."""
         rng = np.random.default_rng([self._config.seed, 2, frame])
         height, width = image.shape[:2]
         exposed = cv2.GaussianBlur(_develop(image), (0, 0), crop_blur or self._blur)

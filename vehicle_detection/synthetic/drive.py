@@ -77,28 +77,26 @@ def make_traffic(scenario: str, duration: float, rng: Rng) -> tuple[Road, list[T
         return road, ahead + _oncoming_vehicles(road, duration, rng, first_track=len(ahead) + 1)
     side = 1 if rng.random() < 0.5 else -1
     if scenario == "overtaking":
-        return road, [
-            TrafficVehicle(
-                track=1, start=rng.uniform(-3.0, -1.5), lane_from=side * LANE,
-                speed=min(max(45 / max(duration, 1.0), 5.0), 9.0),
-                **random_appearance(rng, ("hatchback", "estate", "sedan", "mpv", "suv")),
-            ),
-            TrafficVehicle(track=2, start=70.0, sway=1.0, lane_from=-side * LANE, **random_appearance(rng)),
-        ]  # fmt: skip
+        near = TrafficVehicle(
+            track=1, start=rng.uniform(-3.0, -1.5), lane_from=side * LANE,
+            speed=min(max(45 / max(duration, 1.0), 5.0), 9.0),
+            **random_appearance(rng, ("hatchback", "estate", "sedan", "mpv", "suv")),
+        )  # fmt: skip
+        far = TrafficVehicle(track=2, start=70.0, sway=1.0, lane_from=-side * LANE, **random_appearance(rng))
+        return road, [near, far]
     cars = ("hatchback", "estate", "sedan")
     crossing = scenario == "crossing"
     near_start, far_start, change_for = (20.0, 33.0, 5.0) if crossing else (15.0, 36.0, 6.5)
-    return road, [
-        TrafficVehicle(
-            track=1, start=near_start, sway=0.6, period=9.0, phase=rng.uniform(0, 6),
-            lane_from=side * LANE, lane_to=-side * LANE, change_at=duration / 2, change_for=change_for,
-            **random_appearance(rng, cars if crossing else ("suv", "mpv", "van")),
-        ),
-        TrafficVehicle(
-            track=2, start=far_start, sway=0.8, period=11.0, phase=rng.uniform(0, 6),
-            **random_appearance(rng, cars),
-        ),
-    ]  # fmt: skip
+    near = TrafficVehicle(
+        track=1, start=near_start, sway=0.6, period=9.0, phase=rng.uniform(0, 6),
+        lane_from=side * LANE, lane_to=-side * LANE, change_at=duration / 2, change_for=change_for,
+        **random_appearance(rng, cars if crossing else ("suv", "mpv", "van")),
+    )  # fmt: skip
+    far = TrafficVehicle(
+        track=2, start=far_start, sway=0.8, period=11.0, phase=rng.uniform(0, 6),
+        **random_appearance(rng, cars),
+    )  # fmt: skip
+    return road, [near, far]
 
 
 def _vehicles_ahead(road: Road, duration: float, rng: Rng) -> list[TrafficVehicle]:

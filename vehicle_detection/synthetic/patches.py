@@ -94,10 +94,10 @@ class PatchScene:
         if rng.random() < 0.3:
             lateral = rng.uniform(-0.3, 0.3) * LANE
         image = self.empty.copy()
-        box = draw_vehicle(image, self.config, VehiclePose(body, 1, lateral, distance))
-        if box is None or box[0] <= 0 or box[2] >= _WIDTH or box[3] >= _HEIGHT:
+        sprite = draw_vehicle(image, self.config, VehiclePose(body, 1, lateral, distance))
+        if sprite is None or sprite.box[0] <= 0 or sprite.box[2] >= _WIDTH or sprite.box[3] >= _HEIGHT:
             return None
-        return image, box
+        return image, np.array(sprite.box, np.int64)
 
     def vehicle(self, size: int, rng: Rng) -> Image:
         """Cut out a square around a vehicle, as a ``(size, size, 3)`` patch."""

@@ -39,8 +39,7 @@ def _amplitudes(shape: tuple[int, int], falloff: float, stretch: float) -> Float
 
 def tile_to(tile: NDArray[Dtype], height: int, width: int) -> NDArray[Dtype]:
     """Repeat a seamless ``(h, w, ...)`` tile to `height` rows and `width` columns."""
-    repeats = (height // tile.shape[0] + 1, width // tile.shape[1] + 1, *(1,) * (tile.ndim - 2))
-    return np.tile(tile, repeats)[:height, :width]
+    return tile.take(range(height), axis=0, mode="wrap").take(range(width), axis=1, mode="wrap")
 
 
 def blend(target: Floats, color: NDArray[Any], alpha: NDArray[Any]) -> None:

@@ -101,26 +101,22 @@ def composite(
     for oncoming in (True, False):
         group = [pose for pose in poses if pose.oncoming == oncoming]
         for pose in sorted(group, key=lambda pose: -pose.distance):
-            sprite = draw_sprite(pose, config)
-            if sprite is None:
-                continue
-            if image is not None:
-                _draw_into(image, config, pose, sprite)
-            instance_map[sprite.region][sprite.solid] = pose.track
-            drawn.append((pose, sprite))
+            sprite = draw_vehicle(image, config, pose)
+            if sprite is not None:
+                instance_map[sprite.region][sprite.solid] = pose.track
+                drawn.append((pose, sprite))
         if oncoming:
             scenery.draw_barrier(canvas, travel)
     truth = (ground_truth(pose, sprite, instance_map, config) for pose, sprite in drawn)
     return tuple(sorted(truth, key=lambda row: row.track)), instance_map
 
 
-def draw_vehicle(image: Image, config: SceneConfig, pose: VehiclePose) -> NDArray[np.int64] | None:
-    """Draw a single vehicle into `image` in place and return its box; None if it is outside."""
+def draw_vehicle(image: Image | None, config: SceneConfig, pose: VehiclePose) -> Sprite | None:
+    """Draw a single vehicle into `image`, if given, in place and return it; None if it is outside."""
     sprite = draw_sprite(pose, config)
-    if sprite is None:
-        return None
-    _draw_into(image, config, pose, sprite)
-    return np.array(sprite.box, np.int64)
+    if sprite is not None and image is not None:
+        _draw_into(image, config, pose, sprite)
+    return sprite
 
 
 def ground_truth(

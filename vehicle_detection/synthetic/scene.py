@@ -26,17 +26,13 @@ RandomState = int | np.random.Generator | None
 
 @dataclass(frozen=True, kw_only=True)
 class SceneVehicle:
-    """A vehicle to place in a scene; `kind` and `color` are random if they are None.
+    """A vehicle to place in a scene; `kind` and `color` are random if they are None."""
 
-    `distance_m` is along the road from the camera to the nearer tires, `lateral_m` from the camera to the
-    right to the middle of the vehicle (a lane is 3.6 m wide). `view` is the end that the camera sees.
-    """
-
-    distance_m: float
-    lateral_m: float = 0.0
+    distance_m: float  # along the road from the camera to the nearer tires
+    lateral_m: float = 0.0  # from the camera to the right to the vehicle's middle; a lane is 3.6 m wide
     kind: str | None = None  # hatchback, estate, sedan, mpv, suv, van or truck
     color: str | None = None  # one of `COLORS`
-    view: str = "rear"  # or front
+    view: str = "rear"  # the end that the camera sees, rear or front
     speed_mps: float = 0.0  # away from the camera; only for the ground truth
 
     def __post_init__(self) -> None:

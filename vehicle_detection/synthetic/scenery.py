@@ -1,7 +1,4 @@
-"""The road and its surroundings for one camera and light.
-
-What does not change along a drive is drawn once; the rest is shifted by the distance traveled.
-"""
+"""The road and its surroundings, drawn once for a camera and light and shifted by the distance traveled."""
 
 from __future__ import annotations
 
@@ -115,10 +112,7 @@ def _paint_below(sky: Floats, edge: Doubles, color: Floats, contrast: float, noi
 def _mipmap_parts(
     footprint: Doubles, n_levels: int, shown: NDArray[np.bool_] | bool = True
 ) -> Iterator[tuple[int, slice]]:
-    """Yield the mipmap levels in use and the rows (or columns) that take their texture from each.
-
-    `footprint` is the number of texels per pixel of each row (or column); level `n` halves them `n` times.
-    """
+    """Yield the mipmap levels in use and the rows or columns that use each, by their texels per pixel."""
     chosen = np.clip(np.rint(np.log2(np.maximum(footprint, 1))), 0, n_levels - 1).astype(int)
     for level in range(n_levels):
         here = np.flatnonzero(shown & (chosen == level))
@@ -381,23 +375,19 @@ def _draw_sign(rng: Rng, light: Light) -> Floats:
 
 
 def draw_layer(image: Image, rgba: Floats, light: Light, distance: float, *, offset: float = 0.0) -> None:
-    """Composite premultiplied ``(h, w, 4)`` RGBA, 0-255, at a distance (m) over an image in place.
-
-    `offset` is added before the values are truncated to integers; 0.5 rounds them.
-    """
+    """Composite premultiplied RGBA at a distance (m) over an image in place; an `offset` of 0.5 rounds."""
     clear = light.transmission(distance)
     alpha = rgba[..., 3:] / 255
     color = rgba[..., :3] * (clear * light.headlight_gain(distance)) + light.haze * (1 - clear) * alpha
     image[:] = np.clip(alpha_over(image, color, alpha) + offset, 0, 255)
 
 
-class Canvas:
+class Canvas(NamedTuple):
     """An image to fill polygons in, and the map of the vehicle that each pixel shows."""
 
-    def __init__(
-        self, config: SceneConfig, image: Image | None, instance_map: NDArray[np.int32] | None = None
-    ) -> None:
-        self.config, self.image, self.instance_map = config, image, instance_map
+    config: SceneConfig
+    image: Image | None
+    instance_map: NDArray[np.int32] | None = None
 
     def fill(self, corners: Doubles, color: Doubles) -> None:
         """Fill a polygon of ``(column, row)`` corners; it hides the vehicles behind it."""
@@ -439,7 +429,10 @@ class Scenery:
         self._left_line = np.array([206, 158, 46]) * wear if rng.random() < 0.5 else self._white
         self._backdrop = draw_backdrop(config, dryness, rng)
         self._ground = Ground(config, road, dryness, rng)
-        self._hedges = self._make_hedges(dryness, rng)
+        # Rows of shrubs on both sides, tall ones behind low ones.
+        right, left = road.verge, road.barrier - 3 * LANE - 5.0
+        rows = [(right + 11.0, 1.5, 6.5), (left - 7.0, 1.5, 6.5), (right + rng.uniform(4, 7), -1.2, 1.8)]
+        self._hedges = [Hedge(config, *row, dryness, rng) for row in rows if rng.random() < 0.65]
         self._props = self._make_props(dryness, rng)
 
     def render(self, travel: float) -> Image:
@@ -523,12 +516,6 @@ class Scenery:
         self._draw_posts(canvas, x + 0.1, travel, every=4.0, top=0.72, width=0.12, color=(92, 92, 92))
         for low, high, tone in _RAIL_BANDS:
             self._draw_wall(canvas, x, low, high, (tone, tone, tone + 2))
-
-    def _make_hedges(self, dryness: float, rng: Rng) -> list[Hedge]:
-        """Rows of shrubs on both sides, tall ones behind low ones."""
-        right, left = self.road.verge, self.road.barrier - 3 * LANE - 5.0
-        rows = [(right + 11.0, 1.5, 6.5), (left - 7.0, 1.5, 6.5), (right + rng.uniform(4, 7), -1.2, 1.8)]
-        return [Hedge(self.config, *row, dryness, rng) for row in rows if rng.random() < 0.65]
 
     def _make_props(self, dryness: float, rng: Rng) -> list[_Prop]:
         """Trees and bushes on both sides, signs on the right."""

@@ -12,8 +12,6 @@ from vehicle_detection.synthetic.raster import Doubles, Floats, blend
 
 PIXELS_PER_METER = 112
 
-Outline = Doubles
-
 
 @dataclass(frozen=True, eq=False)
 class Surface:
@@ -26,10 +24,7 @@ class Surface:
     _mipmaps: dict[tuple[int, ...], Floats] = field(default_factory=dict, init=False)
 
     def mipmap(self, x_ratio: float, y_ratio: float) -> tuple[Floats, float, float]:
-        """Return the surface at about the size it is drawn at, and its pixels per meter along x and y.
-
-        The ratios are the number of full-size pixels per drawn sample along each axis.
-        """
+        """Return the surface reduced by up to these ratios, and its pixels per meter along x and y."""
         steps = [int(np.clip(np.log2(max(ratio, 1.0)) + 0.25, 0, 6)) for ratio in (x_ratio, y_ratio)]
         height, width = self.rgba.shape[:2]
         size = (max(1, width >> steps[0]), max(1, height >> steps[1]))
@@ -119,7 +114,7 @@ class SurfaceCanvas:
         return Surface(np.dstack([color, self.alpha * 255]), self.left, self.top, depth)
 
 
-def round_corners(corners: ArrayLike, radius: float) -> Outline:
+def round_corners(corners: ArrayLike, radius: float) -> Doubles:
     """Replace each corner of a polygon by a curve that starts `radius` before it."""
     points = np.asarray(corners, np.float64)
     if radius <= 0:

@@ -1,9 +1,4 @@
-"""Painted bodies of vehicles.
-
-The visible surfaces are those of a rounded box: the end towards the camera, whose depth is a function of
-height and lateral position; the flank; and the underside. The depth gives the normals for the shading, and
-lets `render` draw the surfaces in perspective.
-"""
+"""Painted bodies of vehicles: the end towards the camera, with its depth, the flank and the underside."""
 
 from __future__ import annotations
 
