@@ -223,6 +223,15 @@ def test_windows_are_weighted_by_their_scores():
     assert len(bounding_boxes(SHAPE, Detections.empty())) == 0
 
 
+def test_bounding_boxes_of_boxes_without_scores(found):
+    params = HeatParams(weighting="count", threshold=0, peak_fraction=0)
+    expected = bounding_boxes(SHAPE, found, params=params)
+    result = bounding_boxes(SHAPE, found.boxes, params=params)
+    np.testing.assert_array_equal(result.boxes, expected.boxes)
+    with pytest.raises(InvalidInputError, match=r"windows must be a Detections, .*weighting=\"count\""):
+        bounding_boxes(SHAPE, found.boxes)
+
+
 @given(st.lists(heats, min_size=1, max_size=5), st.integers(1, 4))
 @settings(max_examples=20)
 def test_history_is_the_mean_of_the_last_frames(maps, frames):

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_boxes, check_integer, check_number, describe
+from vehicle_detection._common import check_boxes, check_integer, check_number, check_type, describe
 from vehicle_detection.boxes import Detections, clip_boxes
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import HeatParams, SearchParams
@@ -186,15 +186,14 @@ def _connected_components(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], N
     return labels, stats  # type: ignore[return-value]
 
 
-def bounding_boxes(
-    shape: tuple[int, ...], windows: Detections, *, params: HeatParams | None = None
-) -> Detections:
+def bounding_boxes(shape: tuple[int, ...], windows: Any, *, params: HeatParams | None = None) -> Detections:
     """Find the boxes of a frame's positive windows: heat map, threshold and labels in one call.
 
     Parameters
     ----------
     shape, windows
-        ``(height, width, ...)`` of the frame, and its positive windows.
+        ``(height, width, ...)`` of the frame, and its positive windows; boxes without scores are enough for
+        ``weighting="count"``.
     params
         By default ``HeatParams()``. Without a threshold in it, that for the windows of `find_cars`.
 
@@ -210,6 +209,12 @@ def bounding_boxes(
     [[0, 0, 12, 8]]
     """
     params = params or HeatParams()
+    check_type(params, "params", HeatParams, "omit it for the default")
+    if params.weighting == "count" and not isinstance(windows, Detections):
+        boxes = check_boxes(windows, "windows")
+        windows = Detections(boxes, np.ones(len(boxes)))
+    remedy = 'pass Detections(boxes, scores), or HeatParams(weighting="count") for boxes without scores'
+    check_type(windows, "windows", Detections, remedy)
     return label_heat(frame_heat(shape, windows, params), params)
 
 

@@ -312,3 +312,11 @@ def test_invalid_arguments():
         split_leakage(patches, Split([0], [5]))
     with pytest.raises(InvalidInputError, match=r"patches must be an \(N, 64, 64, 3\) uint8"):
         find_near_duplicates(np.zeros((2, 3)))
+
+
+@pytest.mark.parametrize("split", [split_sequences, split_groups, split_sources])
+def test_splits_need_a_patch_set(split):
+    with pytest.raises(
+        InvalidInputError, match=r"patch_set must be a PatchSet, .*; read one with load_train"
+    ):
+        split(np.zeros((2, 64, 64, 3), np.uint8))

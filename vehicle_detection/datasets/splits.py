@@ -9,11 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_integer, check_number, check_patches, describe
+from vehicle_detection._common import check_integer, check_number, check_patches, check_type, describe
 from vehicle_detection.datasets.archives import natural_key, parent_folder
 from vehicle_detection.datasets.patches import PatchSet, check_labels
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import PATCH_SIZE
+
+_PATCH_SET_REMEDY = "read one with load_training_patches"
 
 _CHUNK = 512  # Rows compared with all others at a time, to limit the memory of the correlation matrix.
 
@@ -114,6 +116,7 @@ def split_sequences(patch_set: PatchSet, *, test_size: float = 0.2) -> Split:
     >>> split_sequences(PatchSet(np.zeros((5, 64, 64, 3), np.uint8), [1] * 5, names)).test
     array([4])
     """
+    check_type(patch_set, "patch_set", PatchSet, _PATCH_SET_REMEDY)
     fraction = _check_test_size(test_size)
     folders: dict[str, list[int]] = {}
     for row, name in enumerate(patch_set.names):
@@ -159,6 +162,7 @@ def split_groups(
     >>> split_groups(patch_set, test_size=0.4).test
     array([4, 5])
     """
+    check_type(patch_set, "patch_set", PatchSet, _PATCH_SET_REMEDY)
     fraction = _check_test_size(test_size)
     limit = check_number(threshold, "threshold", above=0, high=1)
     seed = check_integer(random_state, "random_state", low=0, high=2**32 - 1)
@@ -209,6 +213,7 @@ def split_sources(
     >>> split_sources(PatchSet(np.zeros((4, 64, 64, 3), np.uint8), [1, 0, 1, 0], names)).test
     array([2, 3])
     """
+    check_type(patch_set, "patch_set", PatchSet, _PATCH_SET_REMEDY)
     known = ", ".join(patch_set.counts()) or "none"
     masks = []
     for side, prefixes in (("train", train), ("test", test)):
@@ -351,6 +356,8 @@ def split_leakage(patch_set: PatchSet, split: Split, *, threshold: float = 0.95)
     >>> split_leakage(patch_set, Split([0, 1], [2, 3]))
     0.5
     """
+    check_type(patch_set, "patch_set", PatchSet, _PATCH_SET_REMEDY)
+    check_type(split, "split", Split, "split_sequences and others return one")
     limit = check_number(threshold, "threshold", above=0, high=1)
     last = max(int(rows.max()) for rows in split)
     if last >= len(patch_set):
