@@ -223,7 +223,8 @@ def test_windows_are_weighted_by_their_scores():
     assert len(bounding_boxes(SHAPE, Detections.empty())) == 0
 
 
-def test_bounding_boxes_of_boxes_without_scores(found):
+def test_bounding_boxes_of_boxes_without_scores():
+    found = Detections([[0, 0, 8, 8], [4, 0, 12, 8]], [2.0, 1.5])
     params = HeatParams(weighting="count", threshold=0, peak_fraction=0)
     expected = bounding_boxes(SHAPE, found, params=params)
     result = bounding_boxes(SHAPE, found.boxes, params=params)
