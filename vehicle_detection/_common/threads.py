@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import TypeVar
 
 import cv2
@@ -21,11 +23,36 @@ Result = TypeVar("Result")
 JOBS_VARIABLE = "VEHICLE_DETECTION_JOBS"
 
 
-def available_cores() -> int:
-    """Return the number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+def available_cores(root: Path = Path("/")) -> int:
+    """Return the number of cores that this process may use: its affinity, and the CPU quota of its container.
+
+    `root` is the folder of ``proc`` and ``sys``.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quotas = [math.ceil(quota) for quota in _cpu_quotas(root)]
+    return max(1, min([cores, *quotas]))
+
+
+def _cpu_quotas(root: Path) -> Iterator[float]:
+    """Yield the CPU quotas of this process's Linux control groups, versions 2 and 1, in cores."""
+    groups = root / "sys/fs/cgroup"
+    try:
+        # Version 2: a line "0::/group"; a quota of a parent group applies too.
+        own = (root / "proc/self/cgroup").read_text().rpartition("0::")[2].strip().strip("/")
+    except OSError:
+        return
+    folders = [groups / own, *(groups / own).parents]
+    files = [folder / "cpu.max" for folder in folders if folder.is_relative_to(groups)]
+    for file in (*files, groups / "cpu/cpu.cfs_quota_us"):
+        try:
+            words = file.read_text().split()
+            if file.name != "cpu.max":
+                words += file.with_name("cpu.cfs_period_us").read_text().split()
+            quota, period = float(words[0]), float(words[1])
+        except (OSError, ValueError, IndexError):  # no such version, or "max": no limit
+            continue
+        if quota > 0 and period > 0:
+            yield quota / period
 
 
 def resolve_jobs(n_jobs: int | None = None) -> int:
