@@ -6,15 +6,14 @@ import copy
 import os
 import time as clock
 import warnings
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_image, check_number, check_type, describe
+from vehicle_detection._common import check_image, check_integer, check_number, check_type, describe
 from vehicle_detection.boxes import Detections, ScoreScale
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import VehicleClassifier
@@ -22,7 +21,7 @@ from vehicle_detection.drawing import draw_boxes, draw_diagnostics, draw_tracks
 from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.function_model import DetectorFunction, FunctionModel
 from vehicle_detection.heatmap import HeatHistory, frame_heat, label_heat
-from vehicle_detection.images import read_image
+from vehicle_detection.images import is_cut, make_thumbnail, read_image
 from vehicle_detection.mixture import TemplateMixture, load_model
 from vehicle_detection.params import (
     FunctionParams,
@@ -34,15 +33,14 @@ from vehicle_detection.params import (
 )
 from vehicle_detection.regions import find_vehicles
 from vehicle_detection.search import FrameSearch, SearchResult
-from vehicle_detection.tracking import Track, Tracker
+from vehicle_detection.tracking import Track, Tracker, interpolate_tracks
 
 Path = str | os.PathLike[str]
 Model = VehicleClassifier | TemplateMixture | FunctionModel
 Clip = TypeVar("Clip")
 
-CUT_DIFFERENCE = 40.0
-"""Mean absolute difference of consecutive thumbnails, 0-255, above which the scene has been cut."""
-
+# Searches per second of a video, at least, where the frame rate decides.
+_MIN_SEARCH_RATE = 12.0
 # Standard error of the horizon as a fraction of the search's horizon tolerance.
 _HORIZON_STD = 0.4
 # Frame rate that is assumed where it is unknown.
@@ -69,6 +67,9 @@ class FrameResult:
         All tracks; those with ``track.shown`` are vehicles to draw.
     seconds
         Time spent per stage: ``"search"``, ``"regions"``, ``"track"``.
+    searched
+        Whether the frame was searched. If not, it has neither windows nor detections, and its tracks are
+        interpolated or predicted.
     """
 
     index: int
@@ -77,6 +78,7 @@ class FrameResult:
     detections: Detections
     tracks: tuple[Track, ...]
     seconds: dict[str, float] = field(default_factory=dict)
+    searched: bool = True
 
     @property
     def shown(self) -> tuple[Track, ...]:
@@ -117,6 +119,10 @@ class VehicleDetector:
         Height of the horizon as a fraction of the frame's height; overrides that of `search_params`.
     n_jobs
         Threads of the search of one frame.
+    every
+        Search every n-th frame of a video, to save time. The tracks of the frames between are interpolated
+        by `process_video`, and predicted by `process`. None: `process_video` searches at least 12 frames per
+        second, but every frame for heat maps, `diagnostics` and functions; `process` searches every frame.
     diagnostics
         `annotate` shows the frame, its positive windows, the heat map and the tracks side by side.
 
@@ -151,6 +157,7 @@ class VehicleDetector:
         camera: Camera | None = None,
         horizon: float | None = None,
         n_jobs: int | None = None,
+        every: int | None = None,
         diagnostics: bool = False,
     ) -> None:
         self.model = _load(model)
@@ -170,6 +177,7 @@ class VehicleDetector:
         self.track_params = track_params or TrackParams()
         self.camera = camera
         self.diagnostics = diagnostics
+        self.every = None if every is None else check_integer(every, "every", low=1, high=1000)
         self._search: FrameSearch = self.model.open_search(n_jobs, method)
         self._heat_params = region_params if isinstance(region_params, HeatParams) else None
         self._speed_warning = True
@@ -190,6 +198,8 @@ class VehicleDetector:
         """
         self._fps = None if fps is None else check_number(fps, "fps", above=0, high=1e6)
         self._index = 0
+        self._skipped = 0  # frames since the last search
+        self._shape: tuple[int, int] | None = None
         self._first: tuple[NDArray[np.uint8], FrameResult] | None = None
         self._thumbnail: NDArray[np.float32] | None = None
         self._heat_history = HeatHistory((self._heat_params or HeatParams()).frames)
@@ -250,6 +260,14 @@ class VehicleDetector:
         std = _HORIZON_STD * params.horizon_tolerance * shape[0]
         return Camera.for_frame(shape, horizon=params.horizon, horizon_std_px=std)
 
+    def search_interval(self, fps: float) -> int:
+        """Interval of the frames that `process_video` searches at a frame rate: 1 for every frame."""
+        if self.every is not None:
+            return self.every
+        if self._heat_params or self.diagnostics or isinstance(self.model, FunctionModel):
+            return 1
+        return max(1, int(fps / _MIN_SEARCH_RATE))
+
     def process(self, frame: NDArray[np.uint8], time: float | None = None) -> FrameResult:
         """Search the next frame of a video and track its vehicles.
 
@@ -267,11 +285,49 @@ class VehicleDetector:
         DetectorError
             If the detector is a function that fails; the message names the frame.
         """
+        start = clock.perf_counter()
+        thumbnail = make_thumbnail(check_image(frame, "frame"))
+        due = self._tracker is None or self._skipped + 1 >= (self.every or 1) or self._is_cut(thumbnail)
+        if not due and self._tracker is not None:
+            self.skip(thumbnail)
+            tracks = self._tracker.predict(time=time, frames=self._skipped)
+            return _unsearched(self._index - 1, time, tracks, start)
         try:
             found = self.search(frame)
         except DetectorError as error:
             raise DetectorError(f"frame {self._index}: {error}") from error
         return self.track(found, time=time)
+
+    def skip(self, thumbnail: NDArray[np.float32]) -> None:
+        """Count the next frame, which is not searched, given its `make_thumbnail`."""
+        self._index += 1
+        self._skipped += 1
+        self._thumbnail = thumbnail
+
+    def interpolate(
+        self, before: FrameResult, after: FrameResult | None, times: Sequence[float]
+    ) -> list[FrameResult]:
+        """Return the results of the frames between two searched frames, with interpolated tracks.
+
+        Parameters
+        ----------
+        before, after
+            Results of the searched frames; `after` is None at the end of a video.
+        times
+            Times of the frames between, in seconds. `before` and `after` must have times too.
+        """
+        if self._shape is None or before.time is None or (after is not None and after.time is None):
+            raise InvalidInputError("before and after must have times; pass time= to track")
+        results = []
+        for number, time in enumerate(times):
+            start = clock.perf_counter()
+            dt_after, following = 0.0, tuple[Track, ...]()
+            if after is not None and after.time is not None:
+                following, dt_after = after.tracks, after.time - time
+            dt = time - before.time
+            tracks = interpolate_tracks(before.tracks, following, dt, dt_after, self._shape)
+            results.append(_unsearched(before.index + 1 + number, time, tracks, start))
+        return results
 
     def track(self, found: SearchResult, *, time: float | None = None) -> FrameResult:
         """Update the tracks with the search result of the next frame, in frame order.
@@ -288,10 +344,11 @@ class VehicleDetector:
         A cut to another scene, a frame of another size and a time that goes backwards end all tracks.
         """
         start = clock.perf_counter()
+        self._shape = found.shape
         if self._tracker is None:
             self._tracker = Tracker(self.track_params, fps=self._fps or _USUAL_FPS)
         self._tracker.set_camera(self._camera_of(found.shape))
-        if self._is_cut(found):
+        if self._is_cut(found.thumbnail):
             self._heat_history.clear()
             self._tracker.end_tracks()
         self._thumbnail = found.thumbnail
@@ -301,7 +358,8 @@ class VehicleDetector:
         else:
             detections = self._fit_boxes(found)
         detected = clock.perf_counter()
-        tracks = self._tracker.update(detections, found.shape, time=time)
+        tracks = self._tracker.update(detections, found.shape, time=time, frames=self._skipped + 1)
+        self._skipped = 0
         seconds = {
             "search": found.seconds,
             "regions": detected - start,
@@ -311,11 +369,8 @@ class VehicleDetector:
         self._index += 1
         return result
 
-    def _is_cut(self, found: SearchResult) -> bool:
-        if self._thumbnail is None:
-            return False
-        difference = float(cv2.norm(self._thumbnail, found.thumbnail, cv2.NORM_L1))
-        return difference > CUT_DIFFERENCE * found.thumbnail.size
+    def _is_cut(self, thumbnail: NDArray[np.float32]) -> bool:
+        return self._thumbnail is not None and is_cut(self._thumbnail, thumbnail)
 
     def annotate(self, frame: NDArray[np.uint8], result: FrameResult) -> NDArray[np.uint8]:
         """Draw the vehicles of a result on a copy of its frame."""
@@ -524,6 +579,12 @@ def detector_from(
         name=name,
     )
     return VehicleDetector(model, **options)
+
+
+def _unsearched(index: int, time: float | None, tracks: tuple[Track, ...], start: float) -> FrameResult:
+    """Make the result of a frame that is not searched; `start` is the time before its tracking."""
+    none, seconds = Detections.empty(), {"track": clock.perf_counter() - start}
+    return FrameResult(index, time, none, none, tracks, seconds, searched=False)
 
 
 def _positive(vehicles: Detections) -> Detections:

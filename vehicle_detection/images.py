@@ -13,6 +13,23 @@ from numpy.typing import NDArray
 from vehicle_detection._common import atomic_write, check_image
 from vehicle_detection.errors import InvalidInputError
 
+_THUMBNAIL_SHAPE = (18, 32)
+# Mean absolute difference of the thumbnails of consecutive frames, 0-255, above which the scene has been cut.
+_CUT_DIFFERENCE = 40.0
+
+
+def make_thumbnail(frame: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Gray thumbnail of a frame, ``(18, 32)`` float32, for `is_cut`; subsampling is enough for it."""
+    height, width = frame.shape[:2]
+    rows = np.linspace(0, height - 1, _THUMBNAIL_SHAPE[0]).astype(int)
+    columns = np.linspace(0, width - 1, _THUMBNAIL_SHAPE[1]).astype(int)
+    return np.asarray(frame[np.ix_(rows, columns)].mean(axis=2, dtype=np.float32))
+
+
+def is_cut(first: NDArray[np.float32], second: NDArray[np.float32]) -> bool:
+    """Whether the scene was cut between two consecutive frames, given their thumbnails."""
+    return float(cv2.norm(first, second, cv2.NORM_L1)) > _CUT_DIFFERENCE * first.size
+
 
 def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
     """Decode an image file's bytes to ``(H, W, 3)`` uint8 RGB; `name` is the file's name for errors.

@@ -49,6 +49,7 @@ from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import convert_color, hog_source, pick_hog_channels
+from vehicle_detection.images import make_thumbnail
 from vehicle_detection.params import (
     PATCH_SIZE,
     FeatureParams,
@@ -58,8 +59,6 @@ from vehicle_detection.params import (
     SearchParams,
 )
 from vehicle_detection.windows import band_windows, search_windows
-
-_THUMBNAIL_SHAPE = (18, 32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,12 +125,8 @@ class FrameSearch(ABC):
         check_type(params, "params", self.params_type, "omit it for the default")
         check_number(min_vehicle_score, "min_vehicle_score")
         windows, vehicles = self._search(frame, params, min_vehicle_score)
-        height, width = frame.shape[:2]
-        # Subsampling is enough to detect a cut.
-        rows = np.linspace(0, height - 1, _THUMBNAIL_SHAPE[0]).astype(int)
-        columns = np.linspace(0, width - 1, _THUMBNAIL_SHAPE[1]).astype(int)
-        thumbnail = frame[np.ix_(rows, columns)].mean(axis=2, dtype=np.float32)
-        return SearchResult(windows, vehicles, (height, width), thumbnail, time.perf_counter() - start)
+        thumbnail, shape = make_thumbnail(frame), (frame.shape[0], frame.shape[1])
+        return SearchResult(windows, vehicles, shape, thumbnail, time.perf_counter() - start)
 
     @abstractmethod
     def _search(

@@ -212,7 +212,7 @@ def _detect_each(
 
 
 @app.command()
-@option_names(target="--output")
+@option_names(target="--output", workers="--jobs")
 def video(
     source: Annotated[Path, Argument(metavar="SOURCE", help="Video to read.")],
     output: Annotated[
@@ -236,6 +236,13 @@ def video(
         Option(
             metavar="F|auto", help=f'{HORIZON_HELP} "auto": estimated from vehicles in a sample of frames.'
         ),
+    ] = None,
+    every: Annotated[
+        int | None,
+        Option(metavar="N", help="Search every N-th frame, interpolate between; default: 12 a second."),
+    ] = None,
+    jobs: Annotated[
+        int | None, Option(metavar="N", help="Frames searched in parallel; default: one per core, at most 4.")
     ] = None,
     no_audio: Annotated[bool, Option("--no-audio", help="Write no sound.")] = False,
     quiet: Annotated[bool, Option("-q", "--quiet", help="Print errors only.")] = False,
@@ -261,7 +268,9 @@ def video(
                 fraction = _estimate_horizon(source, detector, start, end, quiet)
         else:
             fraction = None if horizon is None else _parse_horizon(horizon)
-        detector = stack.enter_context(VehicleDetector(loaded, horizon=fraction, diagnostics=diagnostics))
+        detector = stack.enter_context(
+            VehicleDetector(loaded, horizon=fraction, every=every, diagnostics=diagnostics)
+        )
         page = None
         if report is not None:
             with option_names(path="--report"):
@@ -275,6 +284,7 @@ def video(
             end=end,
             audio=not no_audio,
             preset=preset,
+            workers=jobs,
             progress=not quiet,
             on_result=lambda result: [write(result) for write in writers],
         )

@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_number, check_type
+from vehicle_detection._common import check_integer, check_number, check_type
 from vehicle_detection.boxes import Detections, Floats, box_areas
 from vehicle_detection.camera import Camera, FrameShape, check_shape, truncated_edges
 from vehicle_detection.params import TrackParams
@@ -110,7 +110,12 @@ class Tracker:
         self._tracks: tuple[Track, ...] = ()
 
     def update(
-        self, detections: Detections, shape: tuple[int, ...], *, time: float | None = None
+        self,
+        detections: Detections,
+        shape: tuple[int, ...],
+        *,
+        time: float | None = None,
+        frames: int = 1,
     ) -> tuple[Track, ...]:
         """Process the detections of the next frame and return all tracks, including those not shown.
 
@@ -119,10 +124,10 @@ class Tracker:
         detections, shape
             Boxes and scores (log-odds) of this frame, and its ``(height, width, ...)``. The confidences of a
             ``supervision.Detections`` are taken as probabilities.
-        time
-            Time of the frame in seconds; by default one frame after the last. A frame with the same time as
-            the last one changes nothing. An earlier time, a gap of more than ``params.max_gap`` and another
-            `shape` end all tracks.
+        time, frames
+            Time of the frame in seconds, by default `frames` frames after the last. A frame with the same
+            time as the last one changes nothing. An earlier time, a gap of more than ``params.max_gap`` and
+            another `shape` end all tracks.
 
         Returns
         -------
@@ -133,7 +138,7 @@ class Tracker:
             detections = Detections.from_supervision(detections)
         check_type(detections, "detections", Detections, "pass Detections(boxes, scores)")
         frame = check_shape(shape)
-        dt = self._advance(frame, time)
+        dt = self._advance(frame, time, check_integer(frames, "frames", low=1))
         if dt == 0:
             return self._tracks
         boxes, scores = _sorted_inside(detections, frame)
@@ -152,13 +157,13 @@ class Tracker:
         self._tracks, self._at_start = self._snapshot(frame, self._states), False
         return self._tracks
 
-    def predict(self, *, time: float | None = None) -> tuple[Track, ...]:
+    def predict(self, *, time: float | None = None, frames: int = 1) -> tuple[Track, ...]:
         """Estimate where the confirmed tracks will be, without changing the state of the tracker.
 
         Parameters
         ----------
-        time
-            Time in seconds, not before the last frame; by default one frame after it.
+        time, frames
+            Time in seconds, not before the last frame; by default `frames` frames after it.
 
         Returns
         -------
@@ -187,7 +192,9 @@ class Tracker:
         (array([796., 400., 896., 490.]), array([800., 400., 900., 490.]))
         """
         last = 0.0 if self._time is None else self._time
-        dt = self._frame_seconds if time is None else check_number(time, "time", low=last, high=1e12) - last
+        dt = check_integer(frames, "frames", low=1) * self._frame_seconds
+        if time is not None:
+            dt = check_number(time, "time", low=last, high=1e12) - last
         confirmed = [row for row, track in enumerate(self._live) if track.id]
         if self._shape is None or not confirmed:
             return ()
@@ -208,9 +215,9 @@ class Tracker:
             if area >= 1
         )
 
-    def _advance(self, frame: FrameShape, time: float | None) -> float:
+    def _advance(self, frame: FrameShape, time: float | None, frames: int) -> float:
         """Set the time of this frame and return the seconds since the last; end all tracks at a jump."""
-        usual = self._frame_seconds
+        usual = frames * self._frame_seconds
         last = -usual if self._time is None else self._time
         now = last + usual if time is None else check_number(time, "time", low=-1e12, high=1e12)
         dt = usual if self._time is None else now - last

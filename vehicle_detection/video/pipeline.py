@@ -6,9 +6,10 @@ import contextlib
 import threading
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import describe
 from vehicle_detection.errors import DetectorError, InvalidInputError
+from vehicle_detection.images import is_cut, make_thumbnail
 from vehicle_detection.video.streams import FrameReader, FrameWriter
 
 Item = TypeVar("Item")
@@ -39,6 +41,27 @@ class VideoDetector(Protocol):
 
     def reset(self, *, fps: float) -> None:
         """Forget all frames."""
+
+
+class IntervalDetector(VideoDetector, Protocol):
+    """A detector that need not search every frame."""
+
+    def search_interval(self, fps: float, /) -> int:
+        """Interval of the frames to search, at a frame rate."""
+
+    def skip(self, thumbnail: NDArray[np.float32], /) -> None:
+        """Count the next frame, which is not searched."""
+
+    def interpolate(self, before: Any, after: Any, times: Sequence[float], /) -> list[Any]:
+        """Results of the frames at `times` between two searched frames; `after` may be None."""
+
+
+@dataclass
+class _QueuedFrame:
+    time: float
+    frame: Frame
+    thumbnail: NDArray[np.float32]
+    search: Future[tuple[Any, float]] | None  # None: the frame is not searched
 
 
 class QueueClosed(Exception):  # noqa: N818 - a signal between threads, not an error
@@ -106,21 +129,24 @@ class FramePipeline:
     where it must not interrupt the start of a process or the removal of a file.
 
     `open_writer` returns a context that, on exit, completes the target or removes it after an error.
+
+    With an `interval` above 1, only every n-th frame and the first one of each scene are searched. The frames
+    between wait for the next searched frame, and get interpolated tracks.
     """
 
     def __init__(
         self,
         open_reader: Callable[[], FrameReader],
         open_writer: Callable[[], AbstractContextManager[FrameWriter]] | None,
-        detector: VideoDetector,
+        detector: VideoDetector | IntervalDetector,
         workers: int,
+        interval: int = 1,
     ) -> None:
         self._seconds: defaultdict[str, float] = defaultdict(float)
         self._open_reader, self._open_writer = open_reader, open_writer
-        self._detector, self._workers = detector, workers
-        self._searched: ClosableQueue[tuple[float, Frame, Future[tuple[Any, float]]]] = ClosableQueue(
-            workers + 1
-        )
+        self._detector: Any = detector
+        self._workers, self._interval = workers, interval
+        self._searched: ClosableQueue[_QueuedFrame] = ClosableQueue(workers * interval + 1)
         self._drawn: ClosableQueue[Frame] = ClosableQueue(2)
         self._results: ClosableQueue[Any] = ClosableQueue(4)
         self._streams: list[FrameReader | FrameWriter] = []
@@ -186,17 +212,18 @@ class FramePipeline:
         try:
             for thread in threads:
                 thread.start()
-            for moment, frame, search in self._searched:
-                try:
-                    found, seconds = search.result()
-                except DetectorError as error:
-                    raise DetectorError(f"at {moment:.2f} s: {error}") from error
-                result = self._detector.track(found, time=moment)
-                self._add_times(result, seconds)
-                if writer is not None:
-                    self._drawn.put(self._draw(frame, result))
-                del frame, found, search  # free the frame before waiting for the next one
-                self._results.put(result)
+            waiting: list[_QueuedFrame] = []
+            before = None
+            for item in self._searched:
+                if item.search is None:
+                    waiting.append(item)
+                    continue
+                result = self._track(item, waiting)
+                self._emit_between(before, result, waiting, draw=writer is not None)
+                self._emit(item.frame, result, draw=writer is not None)
+                waiting, before = [], result
+                del item  # free the frame before waiting for the next one
+            self._emit_between(before, None, waiting, draw=writer is not None)
             self._drawn.finish()
             for thread in threads:
                 thread.join()
@@ -215,10 +242,46 @@ class FramePipeline:
         if writer is not None:
             self._seconds["encode"] += writer.cpu_seconds
 
+    def _track(self, item: _QueuedFrame, waiting: list[_QueuedFrame]) -> Any:
+        """Track a searched frame after the `waiting` ones, which are not searched."""
+        assert item.search is not None
+        try:
+            found, seconds = item.search.result()
+        except DetectorError as error:
+            raise DetectorError(f"at {item.time:.2f} s: {error}") from error
+        for skipped in waiting:
+            self._detector.skip(skipped.thumbnail)
+        self._seconds["search"] += seconds
+        return self._detector.track(found, time=item.time)
+
+    def _emit_between(self, before: Any, after: Any, waiting: list[_QueuedFrame], *, draw: bool) -> None:
+        """Interpolate the results of the `waiting` frames, draw and queue them."""
+        if waiting:
+            results = self._detector.interpolate(before, after, [item.time for item in waiting])
+            for item, result in zip(waiting, results, strict=True):
+                self._emit(item.frame, result, draw=draw)
+
+    def _emit(self, frame: Frame, result: Any, *, draw: bool) -> None:
+        """Draw a frame's result, and queue it."""
+        for name, seconds in result.seconds.items():
+            if name != "search":  # measured here, because a detector may omit it
+                self._seconds[name] += seconds
+        if draw:
+            self._drawn.put(self._draw(frame, result))
+        self._results.put(result)
+
     def _decode(self, reader: FrameReader, pool: ThreadPoolExecutor) -> None:
         try:
+            last, skipped = None, 0
             for _, moment, frame in reader:
-                self._searched.put((moment, frame, pool.submit(self._search, frame)))
+                thumbnail = make_thumbnail(frame)
+                skipped += 1
+                if last is None or skipped >= self._interval or is_cut(last, thumbnail):
+                    search, skipped = pool.submit(self._search, frame), 0
+                else:
+                    search = None
+                self._searched.put(_QueuedFrame(moment, frame, thumbnail, search))
+                last = thumbnail
         except QueueClosed:
             return
         except BaseException as error:  # raised in the tracking thread
@@ -231,12 +294,6 @@ class FramePipeline:
     def _search(self, frame: Frame) -> tuple[Any, float]:
         start = time.perf_counter()
         return self._detector.search(frame), time.perf_counter() - start
-
-    def _add_times(self, result: Any, search_seconds: float) -> None:
-        self._seconds["search"] += search_seconds
-        for name, seconds in result.seconds.items():
-            if name != "search":  # measured here, because a detector may omit it
-                self._seconds[name] += seconds
 
     def _draw(self, frame: Frame, result: Any) -> Frame:
         start = time.perf_counter()

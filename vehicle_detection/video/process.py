@@ -194,6 +194,9 @@ def process_video(
 ) -> VideoReport:
     """Detect and track the vehicles of a video, and write a copy with their boxes.
 
+    A `VehicleDetector` searches at least 12 frames per second and interpolates the tracks of the frames
+    between, unless its option `every` says otherwise.
+
     The copy is H.264 in yuv420p, which browsers play, with the frame rate, all frames and the sound of the
     source. The rotation stored in the source is applied. A varying frame rate is converted to a constant one.
     An odd width or height is extended by one pixel, which repeats the last column or row.
@@ -265,6 +268,7 @@ def process_video(
         None if output is None else functools.partial(_open_writer, output, info, preset, sound),
         detector,
         n_workers,
+        interval=getattr(detector, "search_interval", lambda fps: 1)(float(info.fps)),
     )
     frames, track_ids = 0, set[int]()
     total = count or max(info.frames - first, 0) or None

@@ -1,0 +1,65 @@
+"""Tracks of the frames between two searched frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from vehicle_detection.boxes import Floats, clip_boxes
+from vehicle_detection.tracking.track import TIME_TOLERANCE, Track
+
+_INTERPOLATED = (
+    "score",
+    "age",
+    "time_since_update",
+    "distance_m",
+    "distance_std_m",
+    "speed_mps",
+    "speed_std_mps",
+)
+
+
+def interpolate_tracks(
+    before: Sequence[Track], after: Sequence[Track], dt: float, dt_after: float, shape: tuple[int, ...]
+) -> tuple[Track, ...]:
+    """Estimate the confirmed tracks of a frame between two frames by linear interpolation.
+
+    The frame is `dt` seconds after the tracks `before` and `dt_after` seconds before the tracks `after`;
+    `shape` is its ``(height, width, ...)``. A track that has ended in `after`, or that was not confirmed yet
+    in `before`, moves at its velocity, unless it is outside the frame.
+    """
+    following = {track.id: track for track in after}
+    found = []
+    for track in before:
+        other = following.pop(track.id, None)
+        if track.id:
+            found.append(_move(track, dt, shape) if other is None else _mean(track, other, dt, dt_after))
+    # Detected before this frame, but confirmed after it.
+    started = [track for track in following.values() if track.id and track.age >= dt_after - TIME_TOLERANCE]
+    found += [_move(track, -dt_after, shape) for track in started]
+    return tuple(track for track in found if (track.box[2:] - track.box[:2]).min() >= 1)
+
+
+def _mean(first: Track, second: Track, dt: float, dt_after: float) -> Track:
+    """Interpolate between two states of a track."""
+    fraction = dt / (dt + dt_after)
+    values: dict[str, Any] = {"box": _read_only(first.box + fraction * (second.box - first.box))}
+    for name in _INTERPOLATED:
+        a, b = getattr(first, name), getattr(second, name)
+        if a is not None and b is not None:
+            values[name] = (1 - fraction) * a + fraction * b
+    return replace(first, **values)
+
+
+def _move(track: Track, dt: float, shape: tuple[int, ...]) -> Track:
+    """Move a track by `dt` seconds at its velocity."""
+    box = clip_boxes((track.box + dt * np.tile(track.velocity, 2))[None], shape)[0]
+    return replace(track, box=_read_only(box), age=track.age + dt)
+
+
+def _read_only(box: Floats) -> Floats:
+    box.setflags(write=False)
+    return box
