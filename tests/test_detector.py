@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tests.video.clips import write_clip
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import Template, VehicleClassifier
@@ -25,6 +26,7 @@ from vehicle_detection.params import (
 )
 from vehicle_detection.synthetic import render_scene
 from vehicle_detection.tracking import Tracker
+from vehicle_detection.video import process_video
 
 HEIGHT, WIDTH = 180, 320
 SIDES = (160, 200, 250)  # of windows in a 1280 wide frame: 40, 50 and 62 pixels in these
@@ -227,6 +229,84 @@ def test_reset_takes_the_frame_rate():
     for fps in (0, -25, np.nan, "25"):
         with pytest.raises(InvalidInputError, match="fps must be a number, greater than 0"):
             slow.reset(fps=fps)
+
+
+def test_every_second_frame_is_predicted():
+    frames = drive(20)
+    every, second = make(), make(every=2)
+    expected = [every.process(frame) for frame in frames]
+    results = [second.process(frame) for frame in frames]
+    assert [result.index for result in results] == list(range(20))
+    assert [result.searched for result in results] == [True, False] * 10
+    for result, other in zip(results[8:], expected[8:]):
+        (first, *_), (same, *_) = result.shown, other.shown
+        assert first.id == same.id == 1
+        assert iou_matrix([first.box], [same.box])[0, 0] > 0.9
+    predicted = results[9]
+    assert len(predicted.windows) == len(predicted.detections) == 0
+    assert predicted.tracks[0].state == "coasting"
+    # Times are those of the frames, also where they are not given.
+    assert results[18].tracks[0].age == pytest.approx(18 / 25)
+    timed = make(every=2)
+    again = [timed.process(frame, time=index / 25) for index, frame in enumerate(frames)]
+    np.testing.assert_allclose(again[18].tracks[0].box, results[18].tracks[0].box)
+
+
+def test_a_cut_is_searched_at_once():
+    detector = make(every=5)
+    for _ in range(12):
+        detector.process(frame_with(CAR))
+    result = detector.process(frame_with(CAR, light=200))
+    assert result.searched
+    assert 1 not in ids_of(result)
+    assert not detector.process(frame_with(CAR, light=200)).searched
+
+
+@pytest.mark.parametrize(
+    ("options", "fps", "interval"),
+    [
+        ({}, 10, 1),
+        ({}, 23.976, 2),
+        ({}, 24, 2),
+        ({}, 30, 2),
+        ({}, 60, 5),
+        ({"every": 1}, 60, 1),
+        ({"every": 3}, 10, 3),
+        ({"regions": "heat"}, 60, 1),
+        ({"diagnostics": True}, 60, 1),
+    ],
+)
+def test_the_interval_of_searches_in_a_video(options, fps, interval):
+    assert make(**options).search_interval(fps) == interval
+
+
+def test_a_video_is_interpolated_between_searches(tmp_path):
+    source = write_clip(tmp_path / "drive.mp4", drive(21))
+    runs = []
+    for workers in (1, 3):
+        results = []
+        process_video(source, None, make(every=2), workers=workers, on_result=results.append)
+        runs.append(results)
+    assert_same_drive(*runs)
+    results = runs[0]
+    assert [result.searched for result in results] == [True, False] * 10 + [True]
+    for index in range(9, 19, 2):
+        before, between, after = (results[index + step].shown[0] for step in (-1, 0, 1))
+        assert before.id == between.id == after.id == 1
+        np.testing.assert_allclose(between.box, (before.box + after.box) / 2)
+
+
+def test_frames_between_need_times():
+    detector = make()
+    before, after = (detector.process(frame_with(CAR)) for _ in range(2))
+    with pytest.raises(InvalidInputError, match="before and after must have times; pass time= to track"):
+        detector.interpolate(before, after, [0.02])
+
+
+@pytest.mark.parametrize("every", [0, -1, 1.5, "2", True])
+def test_a_bad_interval_is_refused(every):
+    with pytest.raises(InvalidInputError, match="every must be an integer from 1 to 1000"):
+        make(every=every)
 
 
 @pytest.mark.parametrize("regions", ["fitted", "heat"])

@@ -266,7 +266,7 @@ class VehicleDetector:
             return self.every
         if self._heat_params or self.diagnostics or isinstance(self.model, FunctionModel):
             return 1
-        return max(1, int(fps / _MIN_SEARCH_RATE))
+        return max(1, int(fps / _MIN_SEARCH_RATE + 0.01))  # 23.976 counts as 24
 
     def process(self, frame: NDArray[np.uint8], time: float | None = None) -> FrameResult:
         """Search the next frame of a video and track its vehicles.

@@ -13,8 +13,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.helpers import StubDetector, start_interruptible
-from tests.video.clips import child_processes, ffmpeg, frame_numbers, gray_frames, running_threads, write_clip
+from tests.helpers import Result, StubDetector, start_interruptible
+from tests.video.clips import (
+    LEVELS,
+    NTSC,
+    child_processes,
+    ffmpeg,
+    frame_numbers,
+    gray_frames,
+    running_threads,
+    write_clip,
+)
 from vehicle_detection.errors import InvalidInputError, VideoError
 from vehicle_detection.video import process, process_video
 
@@ -179,3 +188,57 @@ def test_an_interrupt_at_any_time_leaves_no_file_and_no_process(clip, tmp_path):
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, earlier)
+
+
+class IntervalStub(StubDetector):
+    """Searches every n-th frame, and interpolates the brightness of the others."""
+
+    def __init__(self, interval):
+        super().__init__()
+        self.interval, self.searched, self.skipped = interval, [], []
+
+    def search_interval(self, fps):
+        assert fps > 0
+        return self.interval
+
+    def search(self, frame):
+        found = super().search(frame)
+        self.searched.append(round((found - 10) / LEVELS))
+        return found
+
+    def skip(self, thumbnail):
+        self.skipped.append(round((float(thumbnail.mean()) - 10) / LEVELS))
+        self.index += 1
+
+    def interpolate(self, before, after, times):
+        last = before.brightness if after is None else after.brightness
+        mean = (before.brightness + last) / 2
+        return [Result(before.index + 1 + number, mean, time) for number, time in enumerate(times)]
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+@pytest.mark.parametrize("interval", [1, 2, 3, 50])
+def test_frames_between_the_searched_ones_are_interpolated(clip, tmp_path, interval, workers):
+    target, results = tmp_path / "out.mp4", []
+    detector = IntervalStub(interval)
+    report = process_video(clip, target, detector, workers=workers, on_result=results.append)
+    frames = report.frames
+    assert sorted(detector.searched) == list(range(0, frames, interval))
+    assert detector.skipped == [n for n in range(max(detector.searched)) if n % interval]
+    assert [result.index for result in results] == list(range(frames))
+    assert [result.time for result in results] == pytest.approx(np.arange(frames) / float(NTSC))
+    assert frame_numbers(target) == list(range(frames))
+    if interval == 2:
+        assert results[1].brightness == (results[0].brightness + results[2].brightness) / 2
+
+
+def test_the_first_frame_of_a_scene_is_searched(tmp_path):
+    frames = [np.full((48, 64, 3), level, np.uint8) for level in [20] * 4 + [200] * 3 + [20] * 4]
+    detector = IntervalStub(3)
+    detector.search = lambda frame: detector.searched.append(int(frame.mean())) or float(frame.mean())
+    results = []
+    source = write_clip(tmp_path / "cuts.mp4", frames)
+    process_video(source, None, detector, workers=1, on_result=results.append)
+    # Frames 0 and 3; the cuts at 4 and 7; and 10.
+    assert [round(level, -1) for level in detector.searched] == [20, 20, 200, 20, 20]
+    assert [result.index for result in results] == list(range(11))

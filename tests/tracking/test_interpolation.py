@@ -1,0 +1,55 @@
+import numpy as np
+import pytest
+
+from vehicle_detection.tracking import Track, interpolate_tracks
+
+SHAPE = (720, 1280, 3)
+
+
+def track(number, box, *, velocity=(0.0, 0.0), age=1.0, **options):
+    return Track(
+        id=number,
+        box=np.array(box, float),
+        score=1.0,
+        state="confirmed",
+        shown=True,
+        age=age,
+        misses=0,
+        time_since_update=0.0,
+        velocity=velocity,
+        **options,
+    )
+
+
+def test_a_track_of_both_frames_is_interpolated():
+    first = track(3, [100, 200, 150, 260], age=1.0, distance_m=20.0, speed_mps=2.0)
+    second = track(3, [104, 202, 156, 264], age=1.08, distance_m=18.0, speed_mps=None)
+    (found,) = interpolate_tracks([first], [second], 0.02, 0.06, SHAPE)
+    np.testing.assert_allclose(found.box, [101, 200.5, 151.5, 261])
+    assert (found.id, found.state, found.shown) == (3, "confirmed", True)
+    assert found.age == pytest.approx(1.02)
+    assert found.distance_m == pytest.approx(19.5)
+    assert found.speed_mps == 2.0
+    with pytest.raises(ValueError, match="read-only"):
+        found.box[0] = 0
+
+
+def test_a_track_that_has_ended_moves_on():
+    first = track(1, [100, 200, 150, 260], velocity=(50.0, -25.0), age=2.0)
+    (found,) = interpolate_tracks([first], [], 0.04, 0.04, SHAPE)
+    np.testing.assert_allclose(found.box, [102, 199, 152, 259])
+    assert found.age == pytest.approx(2.04)
+    assert (
+        interpolate_tracks([track(1, [0, 200, 3, 260], velocity=(-100.0, 0.0))], [], 0.04, 0.04, SHAPE) == ()
+    )
+
+
+def test_a_track_is_shown_from_its_first_detection_on():
+    tentative = track(0, [100, 200, 150, 260])
+    confirmed = track(5, [104, 200, 154, 260], velocity=(50.0, 0.0), age=0.3)
+    (found,) = interpolate_tracks([tentative], [confirmed], 0.04, 0.04, SHAPE)
+    np.testing.assert_allclose(found.box, [102, 200, 152, 260])
+    assert (found.id, found.age) == (5, pytest.approx(0.26))
+    # One that was detected for the first time after this frame is not shown, and neither are tentative ones.
+    new = track(5, [104, 200, 154, 260], age=0.0)
+    assert interpolate_tracks([tentative], [new, track(0, [0, 0, 9, 9])], 0.04, 0.04, SHAPE) == ()
