@@ -35,7 +35,7 @@ def run(context: Context) -> list[Row]:
             f"features of {COUNT:,} patches, {params.length} long, one core",
             seconds,
             unit="s",
-            target=at_most(6),
+            target=at_most(3),
             material=material,
         ),
         Row(f"scikit-image, extrapolated from {SAMPLE} patches", slow, unit="s"),

@@ -8,18 +8,19 @@ from pathlib import Path
 from benchmarks._material import CLIP, Context, clip, data_folder, drawn_drive
 from benchmarks._report import Row, Target, at_least, at_most
 from vehicle_detection import (
+    FrameResult,
     VehicleDetector,
     evaluate_detections,
     evaluate_tracks,
     load_frames,
-    read_frames,
+    process_video,
     read_labels,
 )
 from vehicle_detection.evaluation import FrameBoxes
 
 
 def run(context: Context) -> list[Row]:
-    """Score images by `detect` and clips by `process`; without the real data, a rendered drive."""
+    """Score images by `detect` and clips by `process_video`; without the real data, a rendered drive."""
     folder = data_folder()
     if folder is None:
         source, material = clip(context.work)
@@ -54,9 +55,9 @@ def _clip_rows(
     name: str, source: Path, labels: Path, *, model: str = "default", min_f1: float = 1.0, material: str = ""
 ) -> list[Row]:
     """Track the vehicles of a clip and score the tracks that are drawn."""
-    with VehicleDetector(model) as detector, read_frames(source) as frames:
-        detector.reset(fps=float(frames.info.fps))
-        results = [detector.process(frame, time) for _, time, frame in frames]
+    results: list[FrameResult] = []
+    with VehicleDetector(model) as detector:
+        process_video(source, None, detector, progress=False, on_result=results.append)
     scores = evaluate_tracks(
         FrameBoxes.from_results(results), read_labels(labels), frames=range(len(results))
     )

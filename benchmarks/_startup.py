@@ -33,14 +33,14 @@ def run(context: Context) -> list[Row]:
             "import vehicle_detection",
             median_of(start["import"] for start in warm),
             unit="s",
-            target=at_most(0.5),
+            target=at_most(0.1),
             material=f"medians of {WARM} warm and {COLD} cold starts, {material}",
         ),
         Row(
             "first frame after the import, kernels in the cache",
             median_of(start["first_frame"] for start in warm),
             unit="s",
-            target=at_most(2.0),
+            target=at_most(1.5),
         ),
         Row(
             "first frame after the import, no kernel in the cache",
