@@ -70,7 +70,7 @@ def test_search_rows(frame, classifier):
     rows = {row.what: row for row in compare_searches(frame, classifier, SEARCH, "scene", rounds=1, calls=2)}
     assert rows["windows searched"].value > 200
     assert rows["faster than course method, two cores"].value > 1
-    assert rows["faster than HOG alone, two cores"].target == at_least(90)
+    assert rows["faster than HOG alone, two cores"].target == at_least(80)
     assert rows["maximum difference of a score"].verdict == "met"
 
 
