@@ -384,8 +384,8 @@ def read_labels(
         a JSON Lines or Parquet (needs pyarrow) file with these columns, a KITTI ``label_2`` folder, a
         MOTChallenge text file, a COCO JSON file, or a list of COCO results.
     format
-        ``"csv"``, ``"jsonl"``, ``"parquet"``, ``"kitti"``, ``"mot"`` or ``"coco"``; None chooses by suffix
-        and content.
+        ``"csv"``, ``"jsonl"``, ``"parquet"``, ``"kitti"``, ``"mot"``, ``"coco"`` or ``"coco_results"``; None
+        chooses by suffix and content.
     classes
         KITTI types, COCO category names or MOT class numbers that are vehicles, in upper or lower case.
         None takes car, van, truck, bus and vehicle, and every row of a MOT file.
@@ -425,7 +425,7 @@ def read_labels(
     """
     source = Path(path)
     if format is not None:
-        check_choice(format, "format", ("csv", "jsonl", "parquet", "kitti", "mot", "coco"))
+        check_choice(format, "format", ("csv", "jsonl", "parquet", "kitti", "mot", "coco", "coco_results"))
     if not source.exists():
         raise DatasetError(f"{source} does not exist; check the path")
     kind = format or _guess_format(source)
@@ -436,7 +436,7 @@ def read_labels(
     chosen = None if classes is None else frozenset(str(name).lower() for name in classes)
     if kind in ("csv", "jsonl", "parquet"):  # these files hold vehicles only
         found = {"csv": _read_csv, "jsonl": _read_json_lines, "parquet": _read_parquet}[kind](source)
-    elif kind == "coco":
+    elif kind in ("coco", "coco_results"):  # told apart by their content
         found = _read_coco(source, chosen, None if truth is None else Path(truth))
     else:
         found = {"kitti": _read_kitti, "mot": _read_mot}[kind](source, chosen)
