@@ -297,7 +297,9 @@ def find_car_windows(
     orient, pix_per_cell, cell_per_block, spatial_size, hist_bins
         As in `extract_features`, of the features that the classifier was trained on.
     color_space, hog_channel, spatial_feat, hist_feat, hog_feat, hist_range, transform_sqrt, spatial_order
-        As in `extract_features`; the defaults are what the quiz computes.
+        As in `extract_features`. The quiz comes with functions that order the bins by channel and take the
+        range of each channel: pass ``spatial_order="channels", hist_range=None`` for a model trained with
+        them.
     cells_per_step
         Step between windows, in cells.
     divide_by
