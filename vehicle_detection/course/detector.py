@@ -101,7 +101,7 @@ class HeatmapDetector(VehicleDetector):
                 )
             search_hits = _WindowSearch(clf, scaler, (ystart, ystop), tuple(scales), cells_per_step, options)
             model = FunctionModel(
-                function=search_hits, score="logit", thread_safe=True, name="the window search"
+                function=search_hits, score="logit", thread_safe=True, name="find_car_windows"
             )
             super().__init__(model, region_params=heat.for_search(search), horizon=_HORIZON)
         self._speed_warning = False
