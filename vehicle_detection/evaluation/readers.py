@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vehicle_detection._common import check_choice
+from vehicle_detection._common import check_choice, check_type
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation.frame_boxes import (
@@ -407,7 +407,7 @@ def read_labels(
         If the file is missing, has none of these formats, or holds an invalid row; the message names the
         line.
     InvalidInputError
-        If `format` or `shape` is none of the values above, or pyarrow is missing.
+        If `path`, `format` or `shape` is none of the values above, or pyarrow is missing.
 
     Notes
     -----
@@ -423,6 +423,7 @@ def read_labels(
     ...
     vehicle_detection.errors.DatasetError: labels/missing.csv does not exist; check the path
     """
+    check_type(path, "path", (str, os.PathLike), "pass the path of a file or folder")
     source = Path(path)
     if format is not None:
         check_choice(format, "format", ("csv", "jsonl", "parquet", "kitti", "mot", "coco", "coco_results"))
