@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.linear_model import LogisticRegression
+from sklearn.model_selection import GridSearchCV
 from sklearn.naive_bayes import GaussianNB
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
@@ -146,12 +147,25 @@ def test_any_linear_estimator(patches, labels, options):
     assert found.metadata["training"]["estimator"] == "LogisticRegression(C=0.001)"
 
 
+def test_a_grid_search_as_the_estimator(patches, labels):
+    grid = GridSearchCV(LinearSVC(random_state=0), {"C": [1e-2]}, cv=2)
+    found = train_classifier(patches, labels, params=SMALL, estimator=grid)
+    expected = train_classifier(patches, labels, params=SMALL, C=1e-2)
+    np.testing.assert_allclose(
+        found.decision_function(patches), expected.decision_function(patches), rtol=1e-3, atol=1e-3
+    )
+
+
 def test_estimators_that_cannot_be_used(patches, labels):
     def train(estimator, **options):
         train_classifier(patches, labels, params=SMALL, estimator=estimator, **options)
 
-    with pytest.raises(InvalidInputError, match="such as LinearSVC; got GaussianNB"):
+    with pytest.raises(
+        InvalidInputError, match=r"estimator must be a linear .* such as LinearSVC; got GaussianN"
+    ):
         train(GaussianNB())
+    with pytest.raises(InvalidInputError, match=r"estimator must be a scikit-learn classifier .*type"):
+        train(LinearSVC)
     with pytest.raises(InvalidInputError, match="estimator must be a scikit-learn classifier without its"):
         train(make_pipeline(StandardScaler(), LinearSVC()))
     with pytest.raises(InvalidInputError, match=r"must be a scikit-learn classifier .*; got 'svm'"):

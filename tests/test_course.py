@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import label
 from sklearn.linear_model import LogisticRegression, SGDClassifier
+from sklearn.model_selection import GridSearchCV
 from sklearn.naive_bayes import GaussianNB
 from sklearn.preprocessing import MinMaxScaler, RobustScaler, StandardScaler
 from sklearn.svm import SVC, LinearSVC
@@ -371,6 +372,22 @@ def test_the_fast_search_is_used_where_it_applies(models, monkeypatch):
     lesson.search_windows(FRAMES["uint8"], PAIRS, *case.model, **case.options)
 
 
+def test_a_grid_search_uses_the_fast_search_too(models, monkeypatch):
+    case = models["all", "uint8"]
+    scaler = case.model[1]
+    grid = GridSearchCV(LinearSVC(random_state=0, max_iter=10_000), {"C": [0.01]}, cv=2)
+    grid.fit(scaler.transform(case.X), LABELS)
+    arguments = (9, 8, 2, (16, 16), 16)
+    hits = [
+        lesson.find_car_windows(FRAMES["uint8"], 60, 200, 1.5, clf, scaler, *arguments, divide_by=1)
+        for clf in (grid, grid.best_estimator_)
+    ]
+    assert hits[0] == hits[1] != []
+    monkeypatch.setattr(windows_module, "_predicts_car", None)
+    lesson.find_car_windows(FRAMES["uint8"], 60, 200, 1.5, grid, scaler, *arguments, divide_by=1)
+    lesson.search_windows(FRAMES["uint8"], PAIRS, grid, scaler, **case.options)
+
+
 def test_a_changed_model_is_noticed(models):
     case = models["all", "uint8"]
     scaler, svc = case.model[1], LinearSVC(C=0.01, random_state=0, max_iter=10_000)
@@ -474,6 +491,7 @@ def test_boxes_in_every_form():
         DETECTIONS,
         tuple(PAIRS),
         DETECTIONS.boxes,
+        SimpleNamespace(xyxy=DETECTIONS.boxes),  # as supervision.Detections
     ):
         np.testing.assert_array_equal(lesson.draw_boxes(image, boxes), expected)
         np.testing.assert_array_equal(lesson.add_heat(np.zeros((208, 330)), boxes), heat)

@@ -143,3 +143,10 @@ def test_it_finds_all_vehicles_of_the_courses_images(real_data):
 def test_invalid_arguments_are_rejected(arguments, message):
     with pytest.raises(InvalidInputError, match=message):
         HeatmapDetector(**arguments)
+
+
+def test_options_are_checked_before_the_first_frame(estimators):
+    with pytest.raises(InvalidInputError, match="fitted on 6108 features, but these options give 8460"):
+        HeatmapDetector(*estimators)
+    with pytest.raises(TypeError, match="spatial"):
+        HeatmapDetector(*estimators, **FEATURES, spatial=True)

@@ -483,7 +483,7 @@ GOOD = frame_with(CAR)
         (GOOD[..., 0], "COLOR_GRAY2RGB"),
         (np.dstack([GOOD, GOOD[..., 0]]), "drop the alpha channel"),
         (GOOD / 255, r"scale its values 0-1"),
-        (GOOD.astype(np.uint16) * 257, "scale a 16-bit image"),
+        (GOOD.astype(np.uint16) * 257, "scale 16-bit values"),
         (GOOD[:0], "the image is empty"),
         (GOOD[None], "pass one image"),
         (None, "read files with vehicle_detection.read_image"),

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from sklearn.svm import LinearSVC
 
 from tests.video.clips import write_clip
 from vehicle_detection.boxes import Detections
@@ -236,3 +237,8 @@ def test_invalid_arguments_are_rejected(options, message):
 def test_a_function_as_the_model_names_the_remedy():
     with pytest.raises(InvalidInputError, match=r"model must not be a function, .*; pass it"):
         VehicleDetector(find_red)
+
+
+def test_an_estimator_as_the_model_names_the_remedy():
+    with pytest.raises(InvalidInputError, match=r"not be an estimator of scikit-learn.*from_pipeline"):
+        VehicleDetector(LinearSVC())

@@ -223,6 +223,12 @@ def test_windows_are_weighted_by_their_scores():
     assert len(bounding_boxes(SHAPE, Detections.empty())) == 0
 
 
+@pytest.mark.parametrize("shape", [720, None, (720,), np.zeros((72, 128, 3), np.uint8)])
+def test_bounding_boxes_rejects_what_is_no_shape(shape):
+    with pytest.raises(InvalidInputError, match=r"shape must be \(height, width, ...\).*; pass image.shape"):
+        bounding_boxes(shape, Detections.empty())
+
+
 def test_bounding_boxes_of_boxes_without_scores():
     found = Detections([[0, 0, 8, 8], [4, 0, 12, 8]], [2.0, 1.5])
     params = HeatParams(weighting="count", threshold=0, peak_fraction=0)

@@ -322,5 +322,7 @@ def test_find_vehicles_checks_its_arguments():
     camera = Camera.for_frame((720, 1280))
     with pytest.raises(InvalidInputError, match=r"windows must be a Detections, .*; pass Detections\(boxes"):
         find_vehicles(np.zeros((2, 4)), camera, (720, 1280))
+    with pytest.raises(InvalidInputError, match=r"shape must be .*; pass image.shape"):
+        find_vehicles(Detections.empty(), camera, np.zeros((72, 128, 3), np.uint8))
     with pytest.raises(InvalidInputError, match="camera must be a Camera"):
         find_vehicles(Detections.empty(), (720, 1280), (720, 1280))

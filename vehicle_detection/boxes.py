@@ -102,8 +102,11 @@ def clip_boxes(boxes: ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
     array([[ 0, 10, 20, 50]])
     """
     array = check_boxes(boxes)
-    if len(shape) < 2 or shape[0] < 1 or shape[1] < 1:
-        raise InvalidInputError(f"shape must be (height, width, ...) of an image, got {describe(shape)}")
+    given: object = shape
+    if not isinstance(given, (tuple, list)) or len(shape) < 2 or shape[0] < 1 or shape[1] < 1:
+        raise InvalidInputError(
+            f"shape must be (height, width, ...) of an image, got {describe(shape)}; pass image.shape"
+        )
     height, width = shape[:2]
     limits = np.array([width, height, width, height])
     return np.asarray(np.clip(array, 0, limits), array.dtype)

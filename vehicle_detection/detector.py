@@ -599,6 +599,11 @@ def _load(model: object) -> Model:
         raise InvalidInputError(
             f"model must not be a function, got {describe(model)}; pass it to detector_from"
         )
+    if hasattr(model, "predict") and not isinstance(model, VehicleClassifier):
+        raise InvalidInputError(
+            f"model must not be an estimator of scikit-learn, got {describe(model)}; convert it with "
+            "VehicleClassifier.from_pipeline((classifier, scaler), params), or use HeatmapDetector"
+        )
     if not isinstance(model, FunctionModel):
         kinds = VehicleClassifier, TemplateMixture
         check_type(model, "model", kinds, "pass a name, the path of a model file, or what load_model returns")

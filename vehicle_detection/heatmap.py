@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check_boxes, check_integer, check_number, check_type, describe
 from vehicle_detection.boxes import Detections, clip_boxes
+from vehicle_detection.camera import check_shape
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import HeatParams, SearchParams
 
@@ -202,6 +203,11 @@ def bounding_boxes(shape: tuple[int, ...], windows: Any, *, params: HeatParams |
     Detections
         Boxes and the heat of their peaks.
 
+    Raises
+    ------
+    InvalidInputError
+        If `shape` is not the shape of an image or the windows have no scores for ``weighting="score"``.
+
     Examples
     --------
     >>> windows = Detections([[0, 0, 8, 8], [4, 0, 12, 8]], [2.0, 1.5])
@@ -233,7 +239,7 @@ def label_heat(heatmap: NDArray[Any], params: HeatParams) -> Detections:
 def frame_heat(shape: tuple[int, ...], windows: Detections, params: HeatParams) -> NDArray[np.float32]:
     """Heat of one frame's windows, ``(H, W)`` float32, weighted as `params` say."""
     scores = windows.scores.clip(0) if params.weighting == "score" else None
-    return add_heat(np.zeros(shape[:2], np.float32), windows.boxes, scores=scores)
+    return add_heat(np.zeros(check_shape(shape), np.float32), windows.boxes, scores=scores)
 
 
 class HeatHistory:

@@ -23,7 +23,7 @@ from vehicle_detection.boxes import (
     intersection_matrix,
     overlap_matrices,
 )
-from vehicle_detection.camera import Camera
+from vehicle_detection.camera import Camera, check_shape
 from vehicle_detection.params import RegionParams
 
 
@@ -65,7 +65,7 @@ def find_vehicles(
     check_type(windows, "windows", Detections, "pass Detections(boxes, scores)")
     check_type(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
     check_type(params, "params", RegionParams, "omit it for the default")
-    return fit_boxes(group_windows(windows, params), camera, shape, params)
+    return fit_boxes(group_windows(windows, params), camera, check_shape(shape), params)
 
 
 def group_windows(windows: Detections, params: RegionParams) -> Detections:

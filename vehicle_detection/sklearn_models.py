@@ -67,7 +67,8 @@ def fit_estimator(
     from sklearn.preprocessing import StandardScaler
     from sklearn.utils.validation import has_fit_parameter
 
-    if not hasattr(estimator, "fit") or not hasattr(estimator, "get_params") or hasattr(estimator, "steps"):
+    is_estimator = hasattr(estimator, "fit") and hasattr(estimator, "get_params")
+    if not is_estimator or isinstance(estimator, type) or hasattr(estimator, "steps"):
         raise InvalidInputError(
             f"estimator must be a scikit-learn classifier without its scaler; got {describe(estimator)}"
         )
@@ -80,7 +81,13 @@ def fit_estimator(
     scaled = scaler.transform(features)
     scaled *= gains.astype(np.float32)
     fitted = clone(estimator).fit(scaled, labels, **({"sample_weight": weights} if weighted else {}))
-    template = fold_estimators([scaler, fitted], len(gains))
+    try:
+        template = fold_estimators([scaler, *_flatten(fitted)], len(gains))
+    except InvalidInputError as error:
+        raise InvalidInputError(
+            f"estimator must be a linear classifier, such as LinearSVC; got {describe(estimator)}. "
+            "compare_classifiers trains any classifier, and vehicle_detection.course searches with it"
+        ) from error
     return Template(template.mean, template.scale / gains, template.coef, template.intercept)
 
 

@@ -674,6 +674,9 @@ def test_defaults_are_those_of_the_library(monkeypatch, material, tmp_path):
     assert given["C"] == classifier.DEFAULT_C
     assert given["params"] == load_classifier().params
     assert (given["mirror"], given["random_state"], given["split"]) == (True, 0, "random")
+    recipe = load_classifier().metadata["training"]
+    for name in ("C", "gamma", "degraded", "mirror", "random_state"):
+        assert given[name] == recipe[name], name
 
 
 def test_fetch_prints_the_paths_of_the_patches(monkeypatch, tmp_path):

@@ -40,6 +40,10 @@ def test_empty_frame_boxes_and_from_detections():
     assert found.frame_keys == ("a", "b")
     assert found.tracks.tolist() == [-1]
     assert len(FrameBoxes.from_detections({})) == 0
+    with pytest.raises(InvalidInputError, match=r"detections must be a Mapping, got .*dict\(enumerate"):
+        FrameBoxes.from_detections([Detections.empty()])
+    with pytest.raises(InvalidInputError, match=r"detections\['a'\] must be a Detections, got"):
+        FrameBoxes.from_detections({"a": np.zeros((0, 4))})
 
 
 def test_columns_are_copies():

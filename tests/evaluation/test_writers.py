@@ -113,9 +113,10 @@ def test_coco_results_are_read_with_their_truth(tmp_path_factory, boxes):
     write_labels(boxes[:0], folder / "truth.json")
     found = {"path": folder / "found.json", "truth": folder / "truth.json"}
     write_labels(boxes, format="coco_results", **found)
-    read = read_labels(**found)
-    assert_equal(read, boxes, (*SCORED, *RANGES), tolerance=1e-8)
-    assert read.frame_keys == boxes.frame_keys
+    for form in (None, "coco_results"):
+        read = read_labels(format=form, **found)
+        assert_equal(read, boxes, (*SCORED, *RANGES), tolerance=1e-8)
+        assert read.frame_keys == boxes.frame_keys
 
 
 @given(frame_boxes(file_names))

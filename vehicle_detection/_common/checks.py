@@ -44,17 +44,22 @@ def check_image(image: object, name: str = "image") -> NDArray[np.uint8]:
         remedy = "pass one image with three color channels"
     elif image.shape[0] == 0 or image.shape[1] == 0:
         remedy = "the image is empty"
-    elif image.dtype.kind == "f" and image.max() > 1:
-        remedy = "convert its values 0-255 with image.round().astype(numpy.uint8)"
-    elif image.dtype.kind == "f":
-        remedy = "scale its values 0-1 with (image * 255).round().astype(numpy.uint8)"
-    elif image.dtype == np.uint16:
-        remedy = "scale a 16-bit image with (image // 257).astype(numpy.uint8)"
     elif image.dtype != np.uint8:
-        remedy = "convert it with image.astype(numpy.uint8) once its values lie in 0-255"
+        remedy = _conversion_to_uint8(image, "image")
     else:
         return image
     raise InvalidInputError(f"{name} must be an (H, W, 3) uint8 RGB array, got {describe(image)}; {remedy}")
+
+
+def _conversion_to_uint8(values: NDArray[Any], name: str) -> str:
+    """Say how to convert an array of another type."""
+    if values.dtype.kind == "f" and values.max(initial=0) > 1:
+        return f"convert its values 0-255 with {name}.round().astype(numpy.uint8)"
+    if values.dtype.kind == "f":
+        return f"scale its values 0-1 with ({name} * 255).round().astype(numpy.uint8)"
+    if values.dtype == np.uint16:
+        return f"scale 16-bit values with ({name} // 257).astype(numpy.uint8)"
+    return f"convert it with {name}.astype(numpy.uint8) once its values lie in 0-255"
 
 
 def check_channel(channel: object, name: str = "img") -> NDArray[np.uint8]:
@@ -78,17 +83,20 @@ def check_patches(patches: object, size: int, name: str = "patches") -> NDArray[
                     f"resize it with cv2.resize(image, ({size}, {size}))"
                 )
         return np.stack(images) if images else np.empty((0, size, size, 3), np.uint8)
-    if (
-        not isinstance(patches, np.ndarray)
-        or patches.dtype != np.uint8
-        or patches.ndim != 4
-        or patches.shape[1:] != (size, size, 3)
-    ):
-        raise InvalidInputError(
-            f"{name} must be an (N, {size}, {size}, 3) uint8 RGB array or a list of such images, "
-            f"got {describe(patches)}; read a folder or zip with vehicle_detection.load_patches"
-        )
-    return patches
+    remedy = "read a folder or zip with vehicle_detection.load_patches"
+    if isinstance(patches, np.ndarray):
+        if patches.ndim == 4 and patches.shape[1:] == (size, size, 3):
+            if patches.dtype == np.uint8:
+                return patches
+            remedy = _conversion_to_uint8(patches, name)
+        elif patches.shape == (size, size, 3):
+            remedy = f"pass a single patch as {name}[None]"
+        elif patches.ndim in (3, 4):
+            remedy = f"resize each image with cv2.resize(image, ({size}, {size}))"
+    raise InvalidInputError(
+        f"{name} must be an (N, {size}, {size}, 3) uint8 RGB array or a list of such images, "
+        f"got {describe(patches)}; {remedy}"
+    )
 
 
 def check_boxes(boxes: Any, name: str = "boxes") -> NDArray[Any]:

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer, check_number, describe
-from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 
 Image = NDArray[Any]
@@ -45,10 +44,16 @@ def check_range(limits: Any, name: str) -> tuple[float, float] | None:
     return low, check_number(limits[1], name, above=low)
 
 
+def box_rows(boxes: Any) -> Any:
+    """Return the boxes of `Detections` or ``supervision.Detections``, other values as they are."""
+    boxes = getattr(boxes, "boxes", boxes)
+    return getattr(boxes, "xyxy", boxes)
+
+
 def corner_array(boxes: Any, name: str) -> NDArray[np.int64]:
-    """Return boxes as ``(N, 4)`` whole pixels, from corner pairs, an array or `Detections`."""
+    """Return boxes as ``(N, 4)`` whole pixels, from corner pairs, an array or detections."""
     try:
-        array = np.asarray(boxes.boxes if isinstance(boxes, Detections) else boxes)
+        array = np.asarray(box_rows(boxes))
     except ValueError:  # rows of different lengths
         array = np.array(None)
     if array.size == 0:

@@ -101,7 +101,7 @@ class HeatmapDetector(VehicleDetector):
                 )
             search_hits = _WindowSearch(clf, scaler, (ystart, ystop), tuple(scales), cells_per_step, options)
             model = FunctionModel(
-                function=search_hits, score="logit", thread_safe=True, name="the window search"
+                function=search_hits, score="logit", thread_safe=True, name="find_car_windows"
             )
             super().__init__(model, region_params=heat.for_search(search), horizon=_HORIZON)
         self._speed_warning = False
@@ -160,6 +160,8 @@ class _WindowSearch:
         defaults = {"orient": 9, "pix_per_cell": 8, "cell_per_block": 2, "spatial_size": (32, 32)}
         self._arguments = {"svc": clf, "X_scaler": scaler, "cells_per_step": cells_per_step}
         self._arguments |= defaults | {"hist_bins": 32} | options
+        # An image of one window checks the options and the estimators before the first frame.
+        find_car_windows(np.zeros((PATCH_SIZE, PATCH_SIZE, 3), np.uint8), None, None, 1, **self._arguments)
 
     def __call__(self, image: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[np.float64]]:
         factor = max(image.shape) / REFERENCE_WIDTH

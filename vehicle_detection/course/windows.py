@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_choice, check_integer, check_number, describe
-from vehicle_detection.boxes import Detections
 from vehicle_detection.classifier import VehicleClassifier
-from vehicle_detection.course.checks import Image, check_lesson_image, corner_array
+from vehicle_detection.course.checks import Image, box_rows, check_lesson_image, corner_array
 from vehicle_detection.course.features import (
     Size,
     SpatialOrder,
@@ -209,7 +208,7 @@ def search_windows(
             f"windows must be non-empty and start inside the {width}x{height} image; got "
             f"{corners[row].tolist()} in row {row}"
         )
-    rows = windows.boxes if isinstance(windows, Detections) else windows
+    rows = box_rows(windows)
     found: list[Any] = []
     for start in range(0, len(corners), _CHUNK):
         patches = [
@@ -298,7 +297,9 @@ def find_car_windows(
     orient, pix_per_cell, cell_per_block, spatial_size, hist_bins
         As in `extract_features`, of the features that the classifier was trained on.
     color_space, hog_channel, spatial_feat, hist_feat, hog_feat, hist_range, transform_sqrt, spatial_order
-        As in `extract_features`; the defaults are what the quiz computes.
+        As in `extract_features`. The quiz comes with functions that order the bins by channel and take the
+        range of each channel: pass ``spatial_order="channels", hist_range=None`` for a model trained with
+        them.
     cells_per_step
         Step between windows, in cells.
     divide_by
@@ -481,6 +482,7 @@ _last_search: tuple[list[Any], FeatureParams, BandSearch] | None = None
 def _open_search(clf: Any, scaler: Any, params: FeatureParams) -> BandSearch | None:
     """Return a search with a linear classifier, the last one if its model is the same; None for others."""
     global _last_search
+    clf = getattr(clf, "best_estimator_", clf)  # of a GridSearchCV
     names = ("coef_", "intercept_", "mean_", "center_", "min_", "scale_")
     state = [type(clf), type(scaler), scaler.get_params() if hasattr(scaler, "get_params") else None]
     state += [getattr(each, name, None) for each in (clf, scaler) for name in names]
@@ -513,6 +515,7 @@ def _classify_patches(
 
 def _library_classifier(clf: Any, scaler: Any, params: FeatureParams) -> VehicleClassifier | None:
     """Return a linear classifier and its scaler as the library's classifier; None for other estimators."""
+    clf = getattr(clf, "best_estimator_", clf)  # of a GridSearchCV
     # Only classes of scikit-learn: others may predict in another way.
     if not all(type(estimator).__module__.startswith("sklearn.") for estimator in (clf, scaler)):
         return None

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_boxes, describe
+from vehicle_detection._common import check_boxes, check_type, describe
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.export import check_items, is_result, shown_tracks
@@ -177,7 +177,16 @@ class FrameBoxes:
 
     @classmethod
     def from_detections(cls, detections: Mapping[FrameKey, Detections]) -> FrameBoxes:
-        """Collect the detections of each frame; frames without any still count as frames."""
+        """Collect the detections of each frame; frames without any still count as frames.
+
+        Raises
+        ------
+        InvalidInputError
+            If `detections` is not a dictionary of `Detections` by frame.
+        """
+        check_type(detections, "detections", Mapping, "pass dict(enumerate(detections)) for a list")
+        for key, found in detections.items():
+            check_type(found, f"detections[{key!r}]", Detections, "pass Detections(boxes, scores)")
         parts = [Detections.empty(), *detections.values()]
         return cls(
             [key for key, found in detections.items() for _ in range(len(found))],

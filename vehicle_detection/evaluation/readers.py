@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vehicle_detection._common import check_choice
+from vehicle_detection._common import check_choice, check_type
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation.frame_boxes import (
@@ -384,8 +384,8 @@ def read_labels(
         a JSON Lines or Parquet (needs pyarrow) file with these columns, a KITTI ``label_2`` folder, a
         MOTChallenge text file, a COCO JSON file, or a list of COCO results.
     format
-        ``"csv"``, ``"jsonl"``, ``"parquet"``, ``"kitti"``, ``"mot"`` or ``"coco"``; None chooses by suffix
-        and content.
+        ``"csv"``, ``"jsonl"``, ``"parquet"``, ``"kitti"``, ``"mot"``, ``"coco"`` or ``"coco_results"``; None
+        chooses by suffix and content.
     classes
         KITTI types, COCO category names or MOT class numbers that are vehicles, in upper or lower case.
         None takes car, van, truck, bus and vehicle, and every row of a MOT file.
@@ -407,7 +407,7 @@ def read_labels(
         If the file is missing, has none of these formats, or holds an invalid row; the message names the
         line.
     InvalidInputError
-        If `format` or `shape` is none of the values above, or pyarrow is missing.
+        If `path`, `format` or `shape` is none of the values above, or pyarrow is missing.
 
     Notes
     -----
@@ -423,9 +423,10 @@ def read_labels(
     ...
     vehicle_detection.errors.DatasetError: labels/missing.csv does not exist; check the path
     """
+    check_type(path, "path", (str, os.PathLike), "pass the path of a file or folder")
     source = Path(path)
     if format is not None:
-        check_choice(format, "format", ("csv", "jsonl", "parquet", "kitti", "mot", "coco"))
+        check_choice(format, "format", ("csv", "jsonl", "parquet", "kitti", "mot", "coco", "coco_results"))
     if not source.exists():
         raise DatasetError(f"{source} does not exist; check the path")
     kind = format or _guess_format(source)
@@ -436,7 +437,7 @@ def read_labels(
     chosen = None if classes is None else frozenset(str(name).lower() for name in classes)
     if kind in ("csv", "jsonl", "parquet"):  # these files hold vehicles only
         found = {"csv": _read_csv, "jsonl": _read_json_lines, "parquet": _read_parquet}[kind](source)
-    elif kind == "coco":
+    elif kind in ("coco", "coco_results"):  # told apart by their content
         found = _read_coco(source, chosen, None if truth is None else Path(truth))
     else:
         found = {"kitti": _read_kitti, "mot": _read_mot}[kind](source, chosen)
