@@ -10,7 +10,18 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks import _accuracy, _drives, _features, _frames, _memory, _scaling, _search, _startup, _video
+from benchmarks import (
+    _accuracy,
+    _drives,
+    _features,
+    _frames,
+    _memory,
+    _scaling,
+    _search,
+    _startup,
+    _video,
+    _wrappers,
+)
 from benchmarks._material import DATA_VARIABLE, Context, is_real
 from benchmarks._report import Row, print_table, write_json
 
@@ -24,6 +35,7 @@ BENCHMARKS: dict[str, Callable[[Context], list[Row]]] = {
     "frames": _frames.run,
     "drives": _drives.run,
     "scaling": _scaling.run,
+    "wrappers": _wrappers.run,
 }
 
 OUTPUT = Path(__file__).with_name("results.json")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from itertools import islice
 from typing import Any, TypeVar
 
 import cv2
@@ -262,7 +263,11 @@ class HeatHistory:
         if self._maps and self._maps[-1].shape != heat.shape:
             self._maps.clear()
         self._maps.append(heat)
-        return np.asarray(np.mean(self._maps, axis=0), np.float32)
+        mean = self._maps[0].copy()
+        for other in islice(self._maps, 1, None):
+            mean += other
+        mean /= len(self._maps)
+        return mean
 
     def clear(self) -> None:
         """Remove all frames."""

@@ -131,8 +131,8 @@ def get_hog_features(
 
 def bin_spatial(
     img: Image,
-    size: Size = (32, 32),
-    *,
+    size: Size | str = (32, 32),
+    *last_size: Size,
     color_space: str = "RGB",
     order: SpatialOrder = "interleaved",
 ) -> NDArray[Any]:
@@ -144,6 +144,8 @@ def bin_spatial(
         ``(H, W, 3)``, uint8 or float.
     size
         ``(width, height)`` to resize to, or one number for both.
+    last_size
+        The size, if the color space comes first, as in an early quiz: ``bin_spatial(img, "HSV", (16, 16))``.
     color_space
         Color space to convert to first, from RGB.
     order
@@ -164,6 +166,10 @@ def bin_spatial(
     """
     image = check_lesson_image(img)
     check_choice(order, "order", SPATIAL_ORDERS)
+    if isinstance(size, str):
+        color_space, size = size, *(last_size or ((32, 32),))
+    elif last_size:
+        raise InvalidInputError(f"bin_spatial takes an image and a size; got {len(last_size)} more")
     if color_space != "RGB":
         image = convert_color(image, color_space)
     small = np.asarray(cv2.resize(image, check_size(size, "size")))

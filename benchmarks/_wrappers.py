@@ -1,0 +1,71 @@
+"""The lesson functions of `vehicle_detection.course` compared with the main API on the same input."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+import vehicle_detection as vd
+from benchmarks._material import Context, patches, searched_frame
+from benchmarks._report import Row, at_most
+from benchmarks._timing import median_of, seconds_of
+from vehicle_detection import course
+from vehicle_detection.params import PixelBand
+from vehicle_detection.search import BandSearch
+
+ROUNDS = 15
+_SCALE, _TOP, _BOTTOM = 1.5, 400, 656
+
+
+def run(context: Context) -> list[Row]:
+    """Alternately call each lesson function and its counterpart."""
+    frame, source = searched_frame()
+    found, kind = patches()
+    some = np.ascontiguousarray(found.patches[:: max(1, len(found) // 800)])
+    labels = found.labels[:: max(1, len(found) // 800)].astype(int)
+    params = vd.FeatureParams(spatial_size=32, spatial_order="interleaved")
+    features = np.array(course.extract_features(some, "YCrCb", hog_channel="ALL"))
+    model = vd.train_classifier(some, labels, params=params, mirror=False)
+    _, scaler, svc = (step for _, step in model.to_pipeline().steps)
+    search = BandSearch(model, n_jobs=1)
+    side = round(64 * _SCALE)
+    band = PixelBand(0, _TOP, frame.shape[1], _BOTTOM, (side, side), (side // 4, side // 4))
+    windows = vd.slide_window(frame, y_start_stop=(_TOP, _BOTTOM), xy_window=(side, side))
+    pairs = course.slide_window(frame, (None, None), (_TOP, _BOTTOM), (side, side), formula="new")
+    heat = np.zeros(frame.shape[:2], np.float32)
+    sizes = (9, 8, 2, (32, 32), 32)
+    options = {"divide_by": 1, "resize": "before conversion"}
+    compared: dict[str, tuple[Callable[[], object], Callable[[], object]]] = {
+        "extract_features": (
+            lambda: course.extract_features(some, "YCrCb", hog_channel="ALL"),
+            lambda: vd.extract_features(some, params),
+        ),
+        "search_windows": (
+            lambda: course.search_windows(frame, pairs, svc, scaler, "YCrCb", hog_channel="ALL"),
+            lambda: vd.search_windows(frame, windows, model, n_jobs=1),
+        ),
+        "find_cars": (
+            lambda: course.find_car_windows(frame, _TOP, _BOTTOM, _SCALE, svc, scaler, *sizes, **options),
+            lambda: search.score_map(frame, band),
+        ),
+        "add_heat": (lambda: course.add_heat(heat, pairs), lambda: vd.add_heat(heat, windows)),
+        "draw_boxes": (lambda: course.draw_boxes(frame, pairs), lambda: vd.draw_boxes(frame, windows)),
+    }
+    assert features.shape == (len(some), params.length)
+    rows = []
+    for name, (wrapper, main) in compared.items():
+        for function in (wrapper, main):  # compile kernels, allocate memory
+            function()
+        seconds = [(seconds_of(wrapper), seconds_of(main)) for _ in range(ROUNDS)]
+        ours, theirs = (median_of(column) for column in zip(*seconds))
+        rows.append(
+            Row(
+                f"course.{name}: time relative to the main API",
+                ours / theirs,
+                unit="x",
+                target=at_most(1.1),
+                material=f"{source}, {len(some)} patches ({kind})" if not rows else "",
+            )
+        )
+    return rows
