@@ -166,8 +166,8 @@ def bin_spatial(
     """
     image = check_lesson_image(img)
     check_choice(order, "order", SPATIAL_ORDERS)
-    if isinstance(size, str):
-        color_space, size = size, *(last_size or ((32, 32),))
+    if isinstance(size, str) and len(last_size) <= 1:
+        color_space, size = size, last_size[0] if last_size else (32, 32)
     elif last_size:
         raise InvalidInputError(f"bin_spatial takes an image and a size; got {len(last_size)} more")
     if color_space != "RGB":
