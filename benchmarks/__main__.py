@@ -12,6 +12,7 @@ from rich.console import Console
 
 from benchmarks import (
     _accuracy,
+    _compare,
     _drives,
     _features,
     _frames,
@@ -47,6 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHMARKS))
     parser.add_argument("--long", action="store_true", help="memory: also a run of 3,000 frames")
     parser.add_argument("--plots", type=Path, metavar="DIR", help="scaling: write scaling.png to this folder")
+    parser.add_argument("--compare", metavar="REF", help="only compare the speed with another commit's")
     parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FILE", help="the JSON file to write")
     options = parser.parse_args(arguments)
     unknown = sorted(set(options.names) - set(BENCHMARKS))
@@ -60,6 +62,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     results = {}
     with tempfile.TemporaryDirectory(prefix="benchmarks") as work:
         context = Context(Path(work), plots=options.plots, long=options.long)
+        if options.compare:
+            print_table({"compare": _compare.compare(context, options.compare)}, console)
+            return
         for name in options.names or BENCHMARKS:
             console.print(f"measuring {name} ...", highlight=False)
             results[name] = BENCHMARKS[name](context)
