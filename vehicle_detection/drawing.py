@@ -10,7 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from vehicle_detection._common import check_boxes, check_choice, check_image, check_integer, describe
 from vehicle_detection.boxes import Detections
@@ -125,7 +124,9 @@ def draw_labeled_bboxes(image: Image, labels: tuple[NDArray[Any], int]) -> Image
             f"labels[0] must be integers of the image's shape {shape}, got {describe(array)}; "
             "label the heat map of this image"
         )
-    regions = [region for region in ndimage.find_objects(array, max_label=count) if region is not None]
+    from scipy.ndimage import find_objects
+
+    regions = [region for region in find_objects(array, max_label=count) if region is not None]
     return draw_boxes(image, [[x.start, y.start, x.stop, y.stop] for y, x in regions])
 
 

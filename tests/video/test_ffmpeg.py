@@ -1,6 +1,8 @@
 """Properties of video files."""
 
 import os
+import shutil
+import sys
 from fractions import Fraction
 
 import pytest
@@ -9,7 +11,7 @@ from tests.helpers import StubDetector
 from tests.video.clips import NTSC, ffmpeg, gray_frames, write_clip
 from vehicle_detection.errors import VideoError
 from vehicle_detection.video import probe_video, process_video, read_frames
-from vehicle_detection.video.ffmpeg import frame_rate
+from vehicle_detection.video.ffmpeg import ffmpeg_binary, frame_rate
 
 
 @pytest.mark.parametrize("fps", [NTSC, Fraction(60000, 1001), Fraction(24000, 1001), 25, 30, Fraction(25, 2)])
@@ -93,3 +95,26 @@ def test_a_missing_ffmpeg(clip, monkeypatch):
     monkeypatch.setattr("moviepy.config.FFMPEG_BINARY", "/nowhere/ffmpeg")
     with pytest.raises(VideoError, match=r"ffmpeg cannot be started .* reinstall imageio-ffmpeg"):
         probe_video(clip)
+
+
+@pytest.mark.parametrize(
+    ("variable", "expected"),
+    [
+        (None, None),
+        ("ffmpeg-imageio", None),
+        ("/some/ffmpeg", "/some/ffmpeg"),
+        ("auto-detect", "/found/ffmpeg"),
+    ],
+)
+def test_the_ffmpeg_of_moviepy_is_used_without_importing_it(monkeypatch, variable, expected):
+    if expected is None:
+        from imageio_ffmpeg import get_ffmpeg_exe
+
+        expected = get_ffmpeg_exe()
+    monkeypatch.delitem(sys.modules, "moviepy.config", raising=False)
+    monkeypatch.setattr(shutil, "which", lambda name: f"/found/{name}")
+    monkeypatch.delenv("FFMPEG_BINARY", raising=False)
+    if variable is not None:
+        monkeypatch.setenv("FFMPEG_BINARY", variable)
+    assert ffmpeg_binary() == expected
+    assert "moviepy.config" not in sys.modules

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -182,14 +183,27 @@ def _resampling_rate(rate: Fraction, mean: Fraction) -> Fraction:
     return mean.limit_denominator(1001) if rate > 60 and rate > 2 * mean else rate
 
 
+def ffmpeg_binary() -> str:
+    """Return the ffmpeg that moviepy uses, without importing moviepy, which takes half a second."""
+    config = sys.modules.get("moviepy.config")
+    if config is not None:
+        return str(config.FFMPEG_BINARY)
+    chosen = os.environ.get("FFMPEG_BINARY", "ffmpeg-imageio")
+    if chosen == "auto-detect":
+        return shutil.which("ffmpeg") or "ffmpeg"
+    if chosen != "ffmpeg-imageio":
+        return chosen
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    return str(get_ffmpeg_exe())
+
+
 class Process:
     """A running ffmpeg. Its log goes to a file, because a full pipe would block it."""
 
     def __init__(
         self, options: Sequence[str], *, level: str = "error", stdin: bool = False, stdout: bool = False
     ) -> None:
-        from moviepy.config import FFMPEG_BINARY  # set by moviepy or by the user
-
         # In its own process group, so that Ctrl-C in the terminal reaches only Python, which ends ffmpeg. Not
         # in its own session: Linux schedules by session, which costs a third of the speed on a busy machine.
         group: dict[str, Any] = {"process_group": 0}
@@ -202,7 +216,7 @@ class Process:
             self._log = on_error.enter_context(tempfile.TemporaryFile())
             try:
                 self._popen: subprocess.Popen[bytes] = subprocess.Popen(
-                    [FFMPEG_BINARY, "-hide_banner", "-loglevel", level, *options],
+                    [ffmpeg_binary(), "-hide_banner", "-loglevel", level, *options],
                     stdin=subprocess.PIPE if stdin else subprocess.DEVNULL,
                     stdout=subprocess.PIPE if stdout else subprocess.DEVNULL,
                     stderr=self._log,
