@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from vehicle_detection.boxes import Floats, box_areas, intersection_matrix, iter_nms, overlap_matrices
 from vehicle_detection.params import TrackParams
@@ -23,6 +22,9 @@ def match_boxes(predicted: Floats, measured: Floats, max_distance: Floats) -> li
     """
     if not len(predicted) or not len(measured):
         return []
+    # Imported here, because it takes 0.2 s, which images and the first frame of a video do not need.
+    from scipy.optimize import linear_sum_assignment
+
     iou, _ = overlap_matrices(predicted, measured)
     distance = center_distances(predicted, measured) / max_distance[:, None]
     areas, others = (np.log(np.maximum(box_areas(boxes), 1.0)) for boxes in (predicted, measured))
