@@ -32,7 +32,8 @@ from vehicle_detection.tuning.trials import COLUMNS, TrialEvaluator, TrialOption
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-_MIN_PATCHES = 300  # Of the first halving round: scores on fewer patches are too noisy to rank candidates.
+# Of the first round of successive halving: scores on fewer patches are too noisy to rank candidates.
+_MIN_PATCHES = 300
 
 
 def compare_configurations(
