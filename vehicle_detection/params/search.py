@@ -193,7 +193,7 @@ class SearchParams:
         if not fitting:
             raise InvalidInputError(
                 f"image of {shape[1]}x{shape[0]} pixels holds no search window below the horizon at "
-                f"{self.horizon:g} of its height; pass a larger image or another horizon, or search other bands"
+                f"{self.horizon:g} of its height; pass a larger image, or change horizon or bands"
             )
         return fitting
 
