@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 import os
 import threading
@@ -29,11 +30,16 @@ def available_cores(root: Path = Path("/")) -> int:
     `root` is the folder of ``proc`` and ``sys``.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    quotas = [math.ceil(quota) for quota in _cpu_quotas(root)]
-    return max(1, min([cores, *quotas]))
+    return max(1, min(cores, math.ceil(_cpu_quota(root))))
 
 
-def _cpu_quotas(root: Path) -> Iterator[float]:
+@functools.cache
+def _cpu_quota(root: Path) -> float:
+    """Return the lowest CPU quota of this process's control groups, in cores; 1 million without one."""
+    return min(_read_cpu_quotas(root), default=1e6)
+
+
+def _read_cpu_quotas(root: Path) -> Iterator[float]:
     """Yield the CPU quotas of this process's Linux control groups, versions 2 and 1, in cores."""
     groups = root / "sys/fs/cgroup"
     try:

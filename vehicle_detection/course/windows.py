@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import warnings
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -460,9 +461,10 @@ def _fast_scores(
         return None
     if params.spatial_feat and (params.spatial_size % params.cells or PATCH_SIZE % params.spatial_size):
         return None
-    search = _open_search(clf, scaler, params)
-    if search is None:
+    classifier = _library_classifier(clf, scaler, params)
+    if classifier is None:
         return None
+    search = _open_search(classifier)
     filters = search.filters
     hog = options.hog_maps(converted)
     hist, tables = converted, filters.tables
@@ -475,30 +477,9 @@ def _fast_scores(
     return filters.score_maps(maps, converted, hist, tables, search.workspace)
 
 
-# The last model and its search: a system calls `find_cars` for each scale and frame with the same model.
-_last_search: tuple[list[Any], FeatureParams, BandSearch] | None = None
-
-
-def _open_search(clf: Any, scaler: Any, params: FeatureParams) -> BandSearch | None:
-    """Return a search with a linear classifier, the last one if its model is the same; None for others."""
-    global _last_search
-    clf = getattr(clf, "best_estimator_", clf)  # of a GridSearchCV
-    names = ("coef_", "intercept_", "mean_", "center_", "min_", "scale_")
-    state = [type(clf), type(scaler), scaler.get_params() if hasattr(scaler, "get_params") else None]
-    state += [getattr(each, name, None) for each in (clf, scaler) for name in names]
-    last = _last_search
-    if last is not None and last[1] == params and all(map(_equal, last[0], state)):
-        return last[2]
-    classifier = _library_classifier(clf, scaler, params)
-    if classifier is None:
-        return None
-    search = BandSearch(classifier, n_jobs=1)
-    _last_search = (copy.deepcopy(state), params, search)
-    return search
-
-
-def _equal(first: Any, second: Any) -> bool:
-    return np.array_equal(first, second) if isinstance(first, np.ndarray) else bool(first == second)
+@functools.lru_cache(maxsize=1)
+def _open_search(classifier: VehicleClassifier) -> BandSearch:
+    return BandSearch(classifier, n_jobs=1)
 
 
 def _classify_patches(
@@ -513,16 +494,36 @@ def _classify_patches(
     return _predicts_car(np.array(options.compute(patches)), clf, scaler)
 
 
+# The attributes that a linear classifier and a scaler compute with.
+_MODEL_STATE = (
+    "classes_", "coef_", "intercept_", "mean_", "center_", "min_", "scale_", "with_mean", "with_std", "clip",
+)  # fmt: skip
+# The last model: a system calls `find_cars` for each scale and frame with the same one.
+_last_model: tuple[list[Any], FeatureParams, VehicleClassifier] | None = None
+
+
 def _library_classifier(clf: Any, scaler: Any, params: FeatureParams) -> VehicleClassifier | None:
     """Return a linear classifier and its scaler as the library's classifier; None for other estimators."""
+    global _last_model
     clf = getattr(clf, "best_estimator_", clf)  # of a GridSearchCV
     # Only classes of scikit-learn: others may predict in another way.
     if not all(type(estimator).__module__.startswith("sklearn.") for estimator in (clf, scaler)):
         return None
+    state: list[Any] = [type(clf), type(scaler)]
+    state += [getattr(each, name, None) for each in (clf, scaler) for name in _MODEL_STATE]
+    last = _last_model
+    if last is not None and last[1] == params and all(map(_equal, last[0], state)):
+        return last[2]
     try:
-        return VehicleClassifier(params, (fold_estimators([scaler, clf], params.length),))
+        classifier = VehicleClassifier(params, (fold_estimators([scaler, clf], params.length),))
     except InvalidInputError:
         return None
+    _last_model = (copy.deepcopy(state), params, classifier)
+    return classifier
+
+
+def _equal(first: Any, second: Any) -> bool:
+    return np.array_equal(first, second) if isinstance(first, np.ndarray) else bool(first == second)
 
 
 def _predicts_car(features: NDArray[np.float64], clf: Any, scaler: Any) -> NDArray[np.bool_]:
