@@ -358,6 +358,13 @@ class _Filters:
             space: convert_color(band, space, out=workspace.take(band.shape, np.uint8, space))
             for space in params.used_color_spaces
         }
+        return self.score_converted(band, converted, workspace)
+
+    def score_converted(
+        self, band: NDArray[np.uint8], converted: dict[str, NDArray[np.uint8]], workspace: Workspace
+    ) -> NDArray[np.float32]:
+        """Scores of all windows of a resized band, given its conversion to each color space."""
+        params = self.params
         hog = self._hog_maps(band, converted, workspace) if params.hog_feat else []
         spatial, hist = (converted.get(space, band) for space in (params.spatial_space, params.hist_space))
         return self.score_maps(hog, spatial, hist, self.tables, workspace)

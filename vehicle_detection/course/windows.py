@@ -466,14 +466,18 @@ def _fast_scores(
         return None
     search = _open_search(classifier)
     filters = search.filters
-    hog = options.hog_maps(converted)
-    hist, tables = converted, filters.tables
-    if options.hist_feat and (converted.dtype != np.uint8 or not options.has_library_range):
+    if converted.dtype == np.uint8 and options.has_library_range:
+        return filters.score_converted(converted, {params.color_space: converted}, search.workspace)
+    hist, tables = converted, None
+    if options.hist_feat:
         assert options.hist_range is not None
         hist = bin_indices(converted, options.hist_bins, options.hist_range)
         # The last bin, of values out of range, has no weight.
         tables = np.pad(filters.weights_by_bin, ((0, 0), (0, 0), (0, 1)))
-    maps = [hog.reshape(-1, *hog.shape[4:])] if options.hog_feat else []
+    maps = []
+    if options.hog_feat:
+        hog = options.hog_maps(converted)
+        maps = [hog.reshape(-1, *hog.shape[4:])]
     return filters.score_maps(maps, converted, hist, tables, search.workspace)
 
 
