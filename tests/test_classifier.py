@@ -120,7 +120,7 @@ def test_degraded_copies_have_their_weight(patches, labels):
 
 def test_the_default_is_linear_svc_behind_a_scaler(patches, labels):
     found = train_classifier(patches, labels, params=SMALL, C=0.01, mirror=False)
-    pipeline = make_pipeline(StandardScaler(), LinearSVC(C=0.01, random_state=0, max_iter=10_000))
+    pipeline = make_pipeline(StandardScaler(), LinearSVC(C=0.01, tol=1e-6, random_state=0, max_iter=10_000))
     features = extract_features(patches, SMALL)
     expected = pipeline.fit(features, labels).decision_function(features)
     np.testing.assert_allclose(found.decision_function(features), expected, rtol=1e-5, atol=1e-5)

@@ -49,10 +49,13 @@ def _flatten(model: Any) -> list[Any]:
 
 
 def linear_svc(C: float, random_state: int) -> Any:
-    """Return the unfitted ``LinearSVC`` of `train_classifier`."""
+    """Return the unfitted ``LinearSVC`` of `train_classifier`.
+
+    With its usual tolerance, scores on all of the course's patches are off by up to 0.01, in the same time.
+    """
     from sklearn.svm import LinearSVC
 
-    return LinearSVC(C=C, random_state=random_state, max_iter=10_000)
+    return LinearSVC(C=C, tol=1e-6, random_state=random_state, max_iter=10_000)
 
 
 def fit_estimator(
