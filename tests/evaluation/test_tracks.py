@@ -3,7 +3,6 @@ import math
 import motmetrics
 import numpy as np
 import pytest
-import trackeval
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -145,7 +144,8 @@ def test_track_scores_equal_those_of_motmetrics(trial):
 
 
 def trackeval_hota(found, labels):
-    """Scores of TrackEval for the same boxes; it numbers ids from 0."""
+    """Scores of TrackEval, where it is installed, for the same boxes; it numbers ids from 0."""
+    trackeval = pytest.importorskip("trackeval")
 
     def numbered(side):
         order = {track: number for number, track in enumerate(np.unique(side.tracks).tolist())}
@@ -201,13 +201,24 @@ def random_clip(seed, frames, cars):
     return boxes_of(*sides[1]), boxes_of(*sides[0])
 
 
-@pytest.mark.parametrize(("seed", "frames", "cars"), [(0, 40, 3), (1, 200, 8), (2, 100, 20)])
-def test_hota_of_longer_clips_equals_that_of_trackeval(seed, frames, cars):
-    found, labels = random_clip(seed, frames, cars)
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ((0, 40, 3), [0.457914644547, 0.397990153682, 0.52692598926, 0.760298645282]),
+        ((1, 200, 8), [0.320385852512, 0.492026463188, 0.209032618238, 0.766242905537]),
+        ((2, 100, 20), [0.449067961274, 0.527963869918, 0.382111555145, 0.764329127214]),
+        ((3, 60, 6), [0.516364488366, 0.477750686932, 0.558288370279, 0.766597507178]),
+        ((4, 150, 12), [0.385341688993, 0.513874046093, 0.28930974888, 0.766112835158]),
+    ],
+)
+def test_hota_of_longer_clips_equals_that_of_trackeval(arguments, expected):
+    # HOTA, DetA, AssA and LocA by TrackEval 1.3.0, which is no dependency of the tests: it needs OpenCV's
+    # build with windows, which does not load on a server.
+    found, labels = random_clip(*arguments)
     scores = evaluate_tracks(found, labels)
-    ours = [scores.hota, scores.deta, scores.assa, scores.loca]
-    assert 0.2 < scores.hota < 0.9
-    np.testing.assert_allclose(ours, trackeval_hota(found, labels), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        [scores.hota, scores.deta, scores.assa, scores.loca], expected, rtol=0, atol=1e-9
+    )
 
 
 def test_hota_by_hand():
