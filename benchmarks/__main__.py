@@ -17,6 +17,7 @@ from benchmarks import (
     _features,
     _frames,
     _memory,
+    _peers,
     _scaling,
     _search,
     _startup,
@@ -37,13 +38,17 @@ BENCHMARKS: dict[str, Callable[[Context], list[Row]]] = {
     "drives": _drives.run,
     "scaling": _scaling.run,
     "wrappers": _wrappers.run,
+    "peers": _peers.run,
 }
+
+ON_REQUEST = {"peers"}
+"""Benchmarks that run only by name: this one installs packages."""
 
 OUTPUT = Path(__file__).with_name("results.json")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the named benchmarks, all of them by default."""
+    """Run the named benchmarks, by default all but those on request."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHMARKS))
     parser.add_argument("--long", action="store_true", help="memory: also a run of 3,000 frames")
@@ -65,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if options.compare:
             print_table({"compare": _compare.compare(context, options.compare)}, console)
             return
-        for name in options.names or BENCHMARKS:
+        for name in options.names or [name for name in BENCHMARKS if name not in ON_REQUEST]:
             console.print(f"measuring {name} ...", highlight=False)
             results[name] = BENCHMARKS[name](context)
     print_table(results, console)
