@@ -262,6 +262,17 @@ def test_a_cut_is_searched_at_once():
     assert not detector.process(frame_with(CAR, light=200)).searched
 
 
+def test_a_frame_that_does_not_follow_is_searched():
+    detector = make(every=50)
+    assert detector.process(frame_with(CAR), time=1.0).searched
+    assert not detector.process(frame_with(CAR), time=1.04).searched
+    assert detector.process(frame_with(CAR), time=0.5).searched  # back in time
+    assert detector.process(frame_with(CAR), time=9.0).searched  # a gap
+    wide = frame_with(CAR, width=WIDTH + 40)
+    assert detector.process(wide, time=9.04).searched
+    assert not detector.process(wide, time=9.08).searched
+
+
 @pytest.mark.parametrize(
     ("options", "fps", "interval"),
     [

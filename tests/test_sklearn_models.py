@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
-from sklearn.linear_model import LogisticRegression, RidgeClassifier, SGDClassifier
+from sklearn.linear_model import LogisticRegression, LogisticRegressionCV, RidgeClassifier, SGDClassifier
 from sklearn.model_selection import GridSearchCV
 from sklearn.naive_bayes import GaussianNB
 from sklearn.pipeline import Pipeline, make_pipeline
@@ -123,6 +123,20 @@ def test_a_search_over_the_classifier_alone(patches, labels):
     np.testing.assert_allclose(classifier.decision_function(rows), expected, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+def test_a_classifier_that_searches_its_own_parameter(patches, labels):
+    rows = StandardScaler().fit_transform(extract_features(patches, SMALL))
+    fitted = LogisticRegressionCV(Cs=[1e-3, 1e-2], cv=2).fit(rows, labels)
+    classifier = VehicleClassifier.from_pipeline(fitted, SMALL)
+    np.testing.assert_allclose(
+        classifier.decision_function(rows), fitted.decision_function(rows), rtol=1e-4, atol=1e-4
+    )
+
+
+class StandardScale(StandardScaler):
+    """Scales like no scaler that the conversion knows."""
+
+
 class Squared(LinearSVC):
     """Looks linear and is not."""
 
@@ -148,6 +162,8 @@ def test_pipelines_that_cannot_be_converted(patches, labels):
         take(3)
     with pytest.raises(InvalidInputError, match="such as LinearSVC; got GaussianNB"):
         take(make_pipeline(StandardScaler(), GaussianNB()).fit(rows, labels))
+    with pytest.raises(InvalidInputError, match="before the classifier; got StandardScale,"):
+        take(make_pipeline(StandardScale(), LinearSVC(C=1e-3)).fit(rows, labels))
     with pytest.raises(InvalidInputError, match="before the classifier; got PCA"):
         take(make_pipeline(PCA(4), LinearSVC()).fit(rows, labels))
     with pytest.raises(InvalidInputError, match=r"train with MinMaxScaler\(clip=False\)"):

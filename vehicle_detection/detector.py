@@ -199,7 +199,8 @@ class VehicleDetector:
         self._fps = None if fps is None else check_number(fps, "fps", above=0, high=1e6)
         self._index = 0
         self._skipped = 0  # frames since the last search
-        self._shape: tuple[int, int] | None = None
+        self._shape: tuple[int, int] | None = None  # of the last searched frame
+        self._time: float | None = None
         self._first: tuple[NDArray[np.uint8], FrameResult] | None = None
         self._thumbnail: NDArray[np.float32] | None = None
         self._heat_history = HeatHistory((self._heat_params or HeatParams()).frames)
@@ -287,8 +288,10 @@ class VehicleDetector:
         """
         start = clock.perf_counter()
         thumbnail = make_thumbnail(check_image(frame, "frame"))
-        due = self._tracker is None or self._skipped + 1 >= (self.every or 1) or self._is_cut(thumbnail)
-        if not due and self._tracker is not None:
+        follows = frame.shape[:2] == self._shape and not self._is_cut(thumbnail)
+        if time is not None and self._time is not None:
+            follows &= 0 < time - self._time <= self.track_params.max_gap
+        if follows and self._tracker is not None and self._skipped + 1 < (self.every or 1):
             self.skip(thumbnail)
             tracks = self._tracker.predict(time=time, frames=self._skipped)
             return _unsearched(self._index - 1, time, tracks, start)
@@ -344,7 +347,7 @@ class VehicleDetector:
         A cut to another scene, a frame of another size and a time that goes backwards end all tracks.
         """
         start = clock.perf_counter()
-        self._shape = found.shape
+        self._shape, self._time = found.shape, time
         if self._tracker is None:
             self._tracker = Tracker(self.track_params, fps=self._fps or _USUAL_FPS)
         self._tracker.set_camera(self._camera_of(found.shape))

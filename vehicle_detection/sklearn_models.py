@@ -13,7 +13,7 @@ from vehicle_detection.classifier import Template
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import FeatureParams
 
-_SCALERS = "StandardScaler, RobustScaler, MinMaxScaler or MaxAbsScaler"
+_SCALERS = ("StandardScaler", "RobustScaler", "MinMaxScaler", "MaxAbsScaler")
 
 
 def split_pipeline(model: Any) -> tuple[FeatureParams | None, list[Any]]:
@@ -40,7 +40,7 @@ def _flatten(model: Any) -> list[Any]:
         return [step for _, part in model.steps for step in _flatten(part)]
     if model is None or isinstance(model, str):  # "passthrough"
         return []
-    if hasattr(model, "cv") and hasattr(model, "refit"):
+    if hasattr(model, "estimator") and hasattr(model, "refit"):  # GridSearchCV and its relatives
         if not hasattr(model, "best_estimator_"):
             name = type(model).__name__
             raise InvalidInputError(f"pipeline must be fitted, with refit=True; its {name} is not")
@@ -115,11 +115,11 @@ def fold_estimators(steps: Sequence[Any], length: int) -> Template:
 def _scaling(scaler: Any, length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Offset and factor of a fitted scaler, which computes ``(x - offset) / factor``."""
     name = type(scaler).__name__
-    if name not in _SCALERS or hasattr(scaler, "predict"):
+    if name not in _SCALERS:
         raise InvalidInputError(
-            f"pipeline must hold {_SCALERS} before the classifier; got {name}, which does not scale each "
-            "feature by itself. Train with one of these, or search with vehicle_detection.course, which "
-            "accepts any scikit-learn estimator"
+            f"pipeline must hold only {', '.join(_SCALERS)} before the classifier; got {name}, which does "
+            "not scale each feature by itself. Train with one of these, or search with "
+            "vehicle_detection.course, which accepts any scikit-learn estimator"
         )
     if getattr(scaler, "n_features_in_", None) is None:
         raise InvalidInputError(f"pipeline must be fitted; its {name} is not: call fit first")
@@ -140,11 +140,11 @@ def _scaling(scaler: Any, length: int) -> tuple[NDArray[np.float64], NDArray[np.
 def _weights(classifier: Any, length: int) -> tuple[NDArray[np.float64], float]:
     """Weights and intercept of a fitted linear classifier of two classes."""
     name = type(classifier).__name__
-    if not hasattr(classifier, "decision_function") and not hasattr(classifier, "predict"):
+    if not hasattr(classifier, "predict"):
         raise InvalidInputError(f"pipeline must end in a linear classifier; got {describe(classifier)}")
     if not hasattr(classifier, "classes_"):
         raise InvalidInputError(f"pipeline must be fitted; its {name} is not: call fit first")
-    if not hasattr(classifier, "coef_"):
+    if not hasattr(classifier, "coef_") or not hasattr(classifier, "decision_function"):
         raise InvalidInputError(
             f"pipeline must end in a linear classifier, such as LinearSVC; got {name}. Search with "
             "vehicle_detection.course, which accepts any scikit-learn estimator"
