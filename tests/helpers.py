@@ -16,8 +16,6 @@ from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
 from vehicle_detection.images import write_image
 from vehicle_detection.mixture import (
     N_CHANNELS,
-    N_REGRESSION_FEATURES,
-    BoxRegressor,
     MixtureTemplate,
     TemplateMixture,
 )
@@ -65,7 +63,7 @@ def random_classifier(params, seed=0, *, templates=1, bias=0.0):
 
 def mixture_template(columns=9, rows=8, seed=0, bias=0.0, padding=(1.0, 1.0), *, border=False):
     """A template of a mixture with random weights."""
-    weights = np.random.default_rng(seed).normal(0, 0.05, (rows, columns, N_CHANNELS))
+    weights = np.random.default_rng(seed).normal(0, 0.06, (rows, columns, N_CHANNELS))
     return MixtureTemplate(weights, bias, padding, border)
 
 
@@ -73,9 +71,7 @@ def random_mixture(**options):
     """A mixture that was never trained; some of all windows score above 0."""
     shapes = ((9, 8), (12, 8), (8, 10))
     templates = tuple(mixture_template(*shape, seed, -0.2) for seed, shape in enumerate(shapes))
-    rng = np.random.default_rng(3)
-    weights = rng.normal(0, 1e-3, (N_REGRESSION_FEATURES, 4))
-    return TemplateMixture(templates, BoxRegressor(weights, rng.normal(0, 0.01, 4)), **options)
+    return TemplateMixture(templates, **options)
 
 
 SMALL_MIXTURE = MixtureParams(

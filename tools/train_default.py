@@ -29,7 +29,7 @@ from vehicle_detection.mixture_training import (
     write_curves,
 )
 
-ROADS = ("camvid", "india", "indonesia")
+ROADS = ("camvid", "dawn", "india", "indonesia")
 """Sets of frames that are sources of their own."""
 
 COURSE_SETS = ("project_clip", "test_images", "test_video")

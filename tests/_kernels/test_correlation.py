@@ -7,8 +7,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vehicle_detection._common import Workspace
-from vehicle_detection._kernels import Filter, correlation
-from vehicle_detection._kernels.vector import Block, block_adder, host_block
+from vehicle_detection._kernels import Filter, PackedFilters, correlation
+from vehicle_detection._kernels.vector import (
+    BYTES,
+    HALF_WORDS,
+    Block,
+    PackedFormat,
+    block_adder,
+    host_block,
+    host_packing,
+)
 
 KERNELS = {"blocks": correlation._correlate_blocks, "plain": correlation._correlate_plain}
 
@@ -108,7 +116,7 @@ def test_values_beyond_the_last_cell_are_not_used():
     assert np.isfinite(scores).all()
 
 
-@pytest.mark.parametrize("block", [Block(16, 8, 3), Block(8, 4, 3), Block(4, 8, 3), Block(4, 4, 3)])
+@pytest.mark.parametrize("block", [Block(16, 8, 3), Block(8, 4, 2), Block(4, 8, 3), Block(4, 4, 3)])
 def test_blocks_of_every_processor_add_the_same_products(block):
     add_products = block_adder(block)
 
@@ -131,4 +139,111 @@ def test_blocks_of_every_processor_add_the_same_products(block):
 
 def test_this_processor_has_a_block():
     assert host_block().rows % 4 == 0
-    assert host_block().columns == 3 * host_block().lanes
+    assert host_block().columns == host_block().vectors * host_block().lanes
+
+
+# The bytes are tested where the processor multiplies them; everywhere the result is that of integers.
+PACKINGS = sorted({HALF_WORDS, host_packing()})
+
+
+@pytest.mark.parametrize("packing", [BYTES, HALF_WORDS])
+def test_packed_values_are_in_the_bits_of_a_word(packing):
+    values = np.array([[1, 255, 0, 127], [-1, -128, 5, 0]])
+    words = packing.pack(values)
+    assert words.dtype == packing.dtype
+    assert words.shape == (2, 4 // packing.per_word)
+    bits = 32 // packing.per_word
+    parts = [(words.astype(np.int64) >> (bits * part)) % 2**bits for part in range(packing.per_word)]
+    np.testing.assert_array_equal(np.stack(parts, axis=-1).reshape(2, 4), values % 2**bits)
+
+
+def packed_reference(weights, cells, limit):
+    """Rows, columns and scores of the windows with an integer score above a limit."""
+    scores = reference(weights, cells).round().astype(np.int64)
+    rows, columns = np.nonzero(scores > limit)
+    return np.column_stack([rows, columns, scores[rows, columns]])
+
+
+@pytest.mark.parametrize("packing", PACKINGS)
+@settings(max_examples=60, deadline=None)
+@given(
+    sizes=st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9)), min_size=1, max_size=3),
+    more=st.tuples(st.integers(0, 6), st.integers(0, 90)),
+    groups=st.integers(1, 7),
+    extreme=st.booleans(),
+    seed=st.integers(0, 99),
+)
+def test_windows_are_those_with_the_highest_sums_of_integers(packing, sizes, more, groups, extreme, seed):
+    rng = np.random.default_rng(seed)
+    rows, columns = (max(size[axis] for size in sizes) + more[axis] for axis in range(2))
+    cells = rng.integers(255 if extreme else 0, 256, (4 * groups, rows, columns))
+    weights = [rng.normal(size=(*size, 4 * groups)) for size in sizes]
+    if extreme:
+        # The largest products of bytes, which overflow 16 bits.
+        weights = [np.where(each > -1.5, 1.0, -1.0) for each in weights]
+    filters = PackedFilters(weights, packing=packing)
+    packed = np.ascontiguousarray(packing.pack(cells.transpose(1, 2, 0)).transpose(2, 0, 1))
+    row_ranges = [(0, rows), *[(min(1, rows - size[0]), rows) for size in sizes[1:]]]
+    rounded = [np.rint(each / unit) for each, unit in zip(weights, filters.units)]
+    assert max(np.abs(each).max() for each in rounded) == 127
+    for bound in (-1e12, 0.0, 1e12):
+        search = filters.on_map(columns, range(len(sizes)), row_ranges, [bound] * len(sizes))
+        found = search.find(packed)
+        for number, (each, (first, _)) in enumerate(zip(rounded, row_ranges)):
+            expected = packed_reference(each, cells, np.floor(bound / filters.units[number]))
+            expected = expected[expected[:, 0] >= first]
+            np.testing.assert_array_equal(found[found[:, 0] == number][:, 1:], expected)
+
+
+def test_columns_of_a_map_become_channels():
+    rng = np.random.default_rng(1)
+    cells, weights = rng.integers(0, 256, (8, 30, 9)), rng.normal(size=(4, 3, 8))
+    packed = np.ascontiguousarray(HALF_WORDS.pack(cells.transpose(1, 2, 0)).transpose(2, 0, 1))
+    whole = PackedFilters([weights], packing=HALF_WORDS).on_map(3, [0], [(0, 30)], [-1e12])
+    strip = PackedFilters([weights.reshape(1, 4, -1)], packing=HALF_WORDS).on_map(30, [0], [(0, 1)], [-1e12])
+    expected = whole.find(np.ascontiguousarray(packed[:, :, 5:8]))
+    found = strip.find(packed, np.arange(5, 8))
+    np.testing.assert_array_equal(found[:, [0, 2, 3]], expected[:, [0, 1, 3]])
+
+
+def test_no_template_is_no_search():
+    assert PackedFilters([]).on_map(9, [], [], []) is None
+
+
+def test_a_processor_without_the_instruction_uses_half_words(caplog):
+    broken = mock.Mock()
+    broken.compile.side_effect = RuntimeError("no such intrinsic")
+    correlation._packed_format.cache_clear()
+    try:
+        with mock.patch.object(correlation, "_find_windows", broken):
+            assert correlation._packed_format() == HALF_WORDS
+    finally:
+        correlation._packed_format.cache_clear()
+    assert [record.getMessage() for record in caplog.records] == [
+        "correlation uses slower instructions: no such intrinsic"
+    ]
+    assert correlation._packed_format() == host_packing()
+
+
+@pytest.mark.parametrize(
+    ("features", "packing", "block"),
+    [
+        ({"avx512f": True, "avx512bw": True, "avx512vnni": True, "avx": True}, BYTES, Block(16, 8, 3)),
+        ({"avx512f": True, "avx": True, "avx2": True}, HALF_WORDS, Block(16, 8, 3)),
+        ({"avxvnni": True, "avx": True, "avx2": True}, BYTES, Block(8, 4, 2)),
+        ({"avx": True, "avx2": True}, HALF_WORDS, Block(8, 4, 2)),
+        ({"neon": True}, HALF_WORDS, Block(4, 8, 3)),
+        ({}, HALF_WORDS, Block(4, 4, 3)),
+    ],
+)
+def test_the_processor_decides_the_format_and_the_block(features, packing, block):
+    with mock.patch("llvmlite.binding.get_host_cpu_features", return_value=features):
+        assert host_packing() == packing
+        assert host_block() == block
+    assert isinstance(packing, PackedFormat)
+
+
+def test_code_for_another_processor_uses_no_special_instructions():
+    with mock.patch.object(numba.config, "CPU_NAME", "generic"):
+        assert host_packing() == HALF_WORDS
+        assert host_block() == Block(4, 4, 3)

@@ -716,7 +716,7 @@ def test_info_of_the_shipped_models():
     assert out.startswith(f"default: 6 templates, threshold {default.threshold:.2f} (log-odds)\n")
     assert re.search(r"box of 7x6 cells\s*\n", out)
     assert "box of 6x6 cells at the frame's border" in out
-    assert re.search(r"rescoring +[\d,]+ support vectors, blend weight 0.4", out)
+    assert re.search(r"rescoring +network of [\d,]+ weights, blend weight 0\.\d+", out)
     for name, scores in default.metadata["metrics"]["left_out"].items():
         assert re.search(rf"{name} .*{scores['f1']:.3f}", out)
 

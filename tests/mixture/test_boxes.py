@@ -1,13 +1,9 @@
-import dataclasses
-
 import numpy as np
-import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
-from vehicle_detection.boxes import iou_matrix, overlap_matrices
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture import N_REGRESSION_FEATURES, BoxRegressor, vote_boxes
+from vehicle_detection.boxes import greedy_nms, iou_matrix, overlap_matrices
+from vehicle_detection.mixture import vote_boxes
 from vehicle_detection.mixture.boxes import ScoredWindows, nms
 
 
@@ -69,44 +65,6 @@ def test_nms_removes_the_weaker_of_two_overlapping_boxes(count, seed):
         better = scores[rows] >= scores[row]
         assert (((iou > 0.35) | (cover > 0.75)) & better).any()
     assert nms(kept, scores[rows]).tolist() == list(range(len(rows)))
-
-
-@given(seed=st.integers(0, 100), count=st.integers(0, 6))
-@settings(max_examples=15)
-def test_regressed_boxes_are_inside_the_image(seed, count):
-    windows = random_windows(count, seed)
-    image = np.random.default_rng(seed).integers(0, 256, (90, 110, 3), dtype=np.uint8)
-    strong = BoxRegressor(np.random.default_rng(seed).normal(0, 0.1, (N_REGRESSION_FEATURES, 4)), np.zeros(4))
-    for regressor in (strong, dataclasses.replace(strong, n_iterations=3), BoxRegressor.none()):
-        boxes, margins = regressor.apply(image, windows)
-        assert len(boxes) == len(margins) <= count
-        assert (boxes[:, :2] >= 0).all()
-        assert (boxes[:, 2:] <= (110, 90)).all()
-        assert (boxes[:, 2:] > boxes[:, :2]).all()
-    assert not BoxRegressor.none().shifts(image, windows.boxes).any()
-
-
-def test_regression_is_repeated_while_a_box_moves():
-    image = np.random.default_rng(1).integers(0, 256, (200, 200, 3), dtype=np.uint8)
-    windows = ScoredWindows(np.array([[50.0, 50.0, 100.0, 100.0]]), np.array([1.0]), np.array([0]))
-    weights = np.zeros((N_REGRESSION_FEATURES, 4))
-    for shift, n_iterations, expected in [
-        (0.2, 1, [50, 50, 110, 100]),
-        (0.2, 3, [50, 50, 136.4, 100]),
-        (0.1, 3, [50, 50, 105, 100]),
-        (0.9, 2, [50, 50, 134.5, 100]),
-    ]:
-        regressor = BoxRegressor(weights, np.array([0, 0, shift, 0]), n_iterations)
-        boxes, _ = regressor.apply(image, windows)
-        np.testing.assert_allclose(boxes, [expected], rtol=1e-6)
-    assert windows.boxes.tolist() == [[50, 50, 100, 100]]
-
-
-@pytest.mark.parametrize("side", [N_REGRESSION_FEATURES - 1, 0])
-def test_invalid_regressors_are_rejected(side):
-    with pytest.raises(
-        InvalidInputError, match=rf"box_regressor.weights must be .* \({N_REGRESSION_FEATURES}, 4\)"
-    ):
-        BoxRegressor(np.zeros((side, 4)), np.zeros(4))
-    with pytest.raises(InvalidInputError, match=r"box_regressor.bias must be finite numbers of shape \(4\)"):
-        BoxRegressor(np.zeros((N_REGRESSION_FEATURES, 4)), np.zeros(3))
+    expected = greedy_nms(boxes, scores, max_iou=0.35, max_coverage=0.75)
+    np.testing.assert_array_equal(rows, expected)
+    np.testing.assert_array_equal(nms(boxes, scores, max_boxes=3), expected[:3])

@@ -1,14 +1,16 @@
 import cv2
 import numpy as np
+import pytest
 
 from vehicle_detection.mixture import (
     N_CHANNELS,
     N_COLOR_FEATURES,
     N_EDGE_FEATURES,
-    N_REGRESSION_FEATURES,
-    regression_features,
+    EdgePyramid,
+    edge_features,
     rescoring_features,
 )
+from vehicle_detection.synthetic import render_scene
 
 BOXES = np.array([[20.0, 30.0, 80.0, 70.0], [-10.0, 5.0, 30.0, 60.0], [100.5, 40.2, 180.0, 130.0]])
 
@@ -16,33 +18,55 @@ BOXES = np.array([[20.0, 30.0, 80.0, 70.0], [-10.0, 5.0, 30.0, 60.0], [100.5, 40
 def test_features_of_a_box_do_not_depend_on_its_position():
     image = np.random.default_rng(4).integers(0, 256, (200, 300, 3), dtype=np.uint8)
     inner, same = np.array([[96.0, 64.0, 160.0, 128.0]]), np.array([[0.0, 0.0, 64.0, 64.0]])
-    whole, part = regression_features(image, inner), regression_features(image[64:128, 96:160], same)
-    assert whole.shape == (1, N_REGRESSION_FEATURES)
-    one, two = (each[0, :-4].reshape(N_CHANNELS, 12, 12)[:, 4:8, 4:8] for each in (whole, part))
+    pyramid, part_pyramid = EdgePyramid(image), EdgePyramid(image[64:128, 96:160])
+    whole, part = edge_features(pyramid, inner), edge_features(part_pyramid, same)
+    assert whole.shape == (1, N_EDGE_FEATURES)
+    one, two = (each.reshape(N_CHANNELS, 12, 12)[:, 4:8, 4:8] for each in (whole, part))
     np.testing.assert_allclose(one, two, atol=1e-5)
-    outside = regression_features(image, np.array([[-20.0, -10.0, 20.0, 90.0], [280.0, 150.0, 360.0, 250.0]]))
-    np.testing.assert_allclose(outside[:, -4:], [[0.5, 0.1, 0, 0], [0, 0, 0.75, 0.5]])
 
 
-def test_regression_and_rescoring_have_the_same_edge_features():
+@pytest.mark.parametrize("side", [30.0, 47.0, 49.0, 90.0])
+def test_small_and_large_boxes_have_similar_features(side):
+    # The same scene at two sizes, one of which may be computed from small squares.
+    image = render_scene(shape=(360, 640), vehicles=3, random_state=5).image
+    large = cv2.resize(image, (1280, 720), interpolation=cv2.INTER_CUBIC)
+    box = np.array([[300.0, 180.0, 300.0 + side, 180.0 + side]])
+    one, two = edge_features(EdgePyramid(image), box)[0], edge_features(EdgePyramid(large), 2 * box)[0]
+    assert np.corrcoef(one, two)[0, 1] > 0.85
+
+
+def test_small_boxes_at_the_border_of_a_frame():
+    image = render_scene(shape=(360, 640), vehicles=3, random_state=5).image[180:240, 300:380]
+    boxes = np.array([[-9.0, -9, 20, 15], [70, 50, 95, 75], [-90, -90, -60, -70], [200, 200, 230, 230]])
+    assert np.isfinite(edge_features(EdgePyramid(image), boxes)).all()
+    padded = np.pad(image, ((40, 40), (40, 40), (0, 0)), mode="edge")
+    expected, found = (
+        edge_features(EdgePyramid(padded), boxes[:2] + 40),
+        edge_features(EdgePyramid(image), boxes[:2]),
+    )
+    assert np.corrcoef(expected.ravel(), found.ravel())[0, 1] > 0.98
+
+
+def test_rescoring_has_edge_features():
     image = np.random.default_rng(0).integers(0, 256, (120, 160, 3), dtype=np.uint8)
-    edges, colors = rescoring_features(image, BOXES)
-    np.testing.assert_array_equal(edges, regression_features(image, BOXES)[:, :-4])
+    pyramid = EdgePyramid(image)
+    edges, colors = rescoring_features(pyramid, BOXES)
+    np.testing.assert_array_equal(edges, edge_features(pyramid, BOXES))
     assert colors.shape == (3, N_COLOR_FEATURES)
     assert edges.dtype == colors.dtype == np.float32
 
 
 def test_no_boxes():
-    image = np.zeros((120, 160, 3), np.uint8)
-    assert regression_features(image, BOXES[:0]).shape == (0, N_REGRESSION_FEATURES)
-    for part, length in zip(rescoring_features(image, BOXES[:0]), (N_EDGE_FEATURES, N_COLOR_FEATURES)):
+    pyramid = EdgePyramid(np.zeros((120, 160, 3), np.uint8))
+    assert edge_features(pyramid, BOXES[:0]).shape == (0, N_EDGE_FEATURES)
+    for part, length in zip(rescoring_features(pyramid, BOXES[:0]), (N_EDGE_FEATURES, N_COLOR_FEATURES)):
         assert part.shape == (0, length)
 
 
 def test_colors_are_standardized_lightness_and_scaled_a_and_b():
     image = np.zeros((120, 120, 3), np.uint8)
     image[:, :60], image[:, 60:] = (200, 40, 40), (40, 40, 200)
-    _, (colors,) = rescoring_features(image, np.array([[20.0, 20.0, 100.0, 100.0]]))
+    _, (colors,) = rescoring_features(EdgePyramid(image), np.array([[20.0, 20.0, 100.0, 100.0]]))
     lightness, a, b = colors.reshape(3, 12, 12)
     assert abs(float(lightness.mean())) < 1e-5
     expected = cv2.cvtColor(np.float32([[[200, 40, 40], [40, 40, 200]]]) / 255, cv2.COLOR_RGB2LAB)[0]
@@ -56,7 +80,8 @@ def test_lightness_features_hardly_depend_on_exposure():
     ramp = np.tile(np.linspace(40, 200, 120)[None, :, None], (120, 1, 3))
     box = np.array([[20.0, 20.0, 100.0, 100.0]])
     bright, dark = (
-        rescoring_features((ramp * exposure).astype(np.uint8), box)[1][0, :144] for exposure in (1.0, 0.6)
+        rescoring_features(EdgePyramid((ramp * exposure).astype(np.uint8)), box)[1][0, :144]
+        for exposure in (1.0, 0.6)
     )
     assert np.abs(bright - dark).max() < 0.2
     assert bright.std() > 0.7

@@ -67,12 +67,11 @@ def test_the_search_uses_the_smoothed_frame():
     search = MixtureSearch(model, n_jobs=1)
     found = search.find(image).vehicles
     smooth = denoise(image)
+    min_margin = model.margin_of(0.0)
     boxes, margins = model.detect_vehicles(
-        smooth, search.score_windows(smooth, PyramidParams()), min_margin=model.margin_of(0.0)
+        *search.score_windows(smooth, PyramidParams()), min_margin=min_margin
     )
     np.testing.assert_array_equal(found.boxes, boxes)
     np.testing.assert_array_equal(found.scores, model.scores(margins))
-    boxes, _ = model.detect_vehicles(
-        image, search.score_windows(image, PyramidParams()), min_margin=model.margin_of(0.0)
-    )
+    boxes, _ = model.detect_vehicles(*search.score_windows(image, PyramidParams()), min_margin=min_margin)
     assert not np.array_equal(found.boxes, boxes)

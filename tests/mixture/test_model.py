@@ -10,7 +10,7 @@ from vehicle_detection._common import FORMAT_VERSION
 from vehicle_detection._common.model_file import FORMAT, checksum
 from vehicle_detection.classifier import VehicleClassifier, load_classifier
 from vehicle_detection.errors import InvalidInputError, ModelFileError
-from vehicle_detection.mixture import N_CHANNELS, BoxRegressor, MixtureSearch, TemplateMixture, load_model
+from vehicle_detection.mixture import N_CHANNELS, EdgePyramid, MixtureSearch, TemplateMixture, load_model
 from vehicle_detection.mixture.boxes import ScoredWindows
 from vehicle_detection.params import PyramidParams
 from vehicle_detection.synthetic import render_scene
@@ -23,7 +23,6 @@ ROAD = render_scene(shape=(360, 640), vehicles=3, random_state=5).image
     [
         ({"templates": ()}, "templates must hold at least one template; got none"),
         ({"templates": (5,)}, "templates must be a MixtureTemplate, got 5"),
-        ({"box_regressor": None}, "box_regressor must be a BoxRegressor, got None"),
         ({"slope": 0.0}, "slope must be a number, greater than 0"),
         ({"slope": -1.0}, "slope must be a number, greater than 0"),
         ({"offset": np.nan}, "offset must be a number"),
@@ -38,11 +37,11 @@ def test_invalid_mixtures_are_rejected(changes, message):
 
 def test_the_size_prior_raises_the_margins_of_near_vehicles():
     model = random_mixture()
-    found = MixtureSearch(model, n_jobs=1).score_windows(ROAD, PyramidParams())
+    pyramid, found = MixtureSearch(model, n_jobs=1).score_windows(ROAD, PyramidParams())
     min_margin = float(np.quantile(found.margins, 0.2))
-    boxes, margins = model.detect_vehicles(ROAD, found, min_margin=min_margin)
+    boxes, margins = model.detect_vehicles(pyramid, found, min_margin=min_margin)
     with_prior = dataclasses.replace(model, size_prior_weight=0.1)
-    others, raised = with_prior.detect_vehicles(ROAD, found, min_margin=min_margin)
+    others, raised = with_prior.detect_vehicles(pyramid, found, min_margin=min_margin)
     before = {tuple(box): margin for box, margin in zip(boxes, margins)}
     common = [row for row, box in enumerate(others) if tuple(box) in before]
     assert len(common) > 3
@@ -54,38 +53,34 @@ def test_the_size_prior_raises_the_margins_of_near_vehicles():
 
 
 def test_many_votes_raise_a_margin():
-    model = dataclasses.replace(random_mixture(), box_regressor=BoxRegressor.none())
+    model, pyramid = random_mixture(), EdgePyramid(ROAD)
     vehicle, copies = [100.0, 100.0, 200.0, 180.0], 30
     boxes = np.array([[400.0, 100.0, 500.0, 180.0], *[vehicle] * copies])
     windows = ScoredWindows(boxes, np.array([0.5, *[0.4] * copies]), np.zeros(copies + 1, np.intp))
-    assert model.detect_vehicles(ROAD, windows, min_margin=0.0)[1].tolist() == [0.5, 0.4]
+    assert model.detect_vehicles(pyramid, windows, min_margin=0.0)[1].tolist() == [0.5, 0.4]
     with_votes = dataclasses.replace(model, vote_weight=0.1)
-    found, margins = with_votes.detect_vehicles(ROAD, windows, min_margin=0.0)
+    found, margins = with_votes.detect_vehicles(pyramid, windows, min_margin=0.0)
     assert found.tolist() == [vehicle, boxes[0].tolist()]
     # The vote masses are 30 * 1.5 and 1.6.
     np.testing.assert_allclose(margins, [0.4 + 0.1 * (np.log(46) - 2), 0.5 + 0.1 * (np.log(2.6) - 2)])
-    assert len(with_votes.detect_vehicles(ROAD, windows, min_margin=0.5)[0]) == 1
+    assert len(with_votes.detect_vehicles(pyramid, windows, min_margin=0.5)[0]) == 1
     # The gain is limited to 2 units.
     more = ScoredWindows(np.array([vehicle] * 90), np.full(90, 0.4), np.zeros(90, np.intp))
-    np.testing.assert_allclose(with_votes.detect_vehicles(ROAD, more, min_margin=0.0)[1], [0.6])
+    np.testing.assert_allclose(with_votes.detect_vehicles(pyramid, more, min_margin=0.0)[1], [0.6])
 
 
 def test_a_saved_model_is_loaded_bit_by_bit(tmp_path):
     path = tmp_path / "model.safetensors"
     options = {"slope": 1.7, "offset": 0.1, "threshold": -0.3, "size_prior_weight": 0.02, "vote_weight": 0.04}
     model = random_mixture(**options, metadata={"a": [1, {"b": None}]})
-    box_regressor = dataclasses.replace(model.box_regressor, n_iterations=2)
     templates = *model.templates, mixture_template(5, 6, seed=4, border=True)
-    model = dataclasses.replace(model, templates=templates, box_regressor=box_regressor)
+    model = dataclasses.replace(model, templates=templates)
     model.save(path)
     loaded = load_model(path)
     assert isinstance(loaded, TemplateMixture)
     for one, other in zip(model.templates, loaded.templates, strict=True):
         assert one.weights.tobytes() == other.weights.tobytes()
         assert (one.bias, one.padding, one.border) == (other.bias, other.padding, other.border)
-    assert loaded.box_regressor.weights.tobytes() == model.box_regressor.weights.tobytes()
-    assert loaded.box_regressor.bias.tobytes() == model.box_regressor.bias.tobytes()
-    assert loaded.box_regressor.n_iterations == 2
     assert {name: getattr(loaded, name) for name in options} == options
     assert loaded.metadata == {"a": [1, {"b": None}]}
     first = path.read_bytes()
@@ -114,8 +109,6 @@ def write_file(path, tensors=None, params=None, *, params_text=None, **changes):
 
     model = random_mixture()
     content = {
-        "box_regressor.weights": model.box_regressor.weights,
-        "box_regressor.bias": model.box_regressor.bias,
         **{f"{index}.weights": template.weights for index, template in enumerate(model.templates)},
         **(tensors or {}),
     }
@@ -129,7 +122,6 @@ def write_file(path, tensors=None, params=None, *, params_text=None, **changes):
         "threshold": 0.0,
         "size_prior_weight": 0.0,
         "vote_weight": 0.0,
-        "n_iterations": 1,
         **(params or {}),
     }
     header = {
@@ -144,6 +136,12 @@ def write_file(path, tensors=None, params=None, *, params_text=None, **changes):
     header.setdefault("sha256", checksum(header, content))
     path.write_bytes(save(content, metadata=header))
     return path
+
+
+def test_a_file_of_an_earlier_version_is_recognized(tmp_path):
+    old = {"box_regressor.weights": np.zeros((9, 4), np.float32)}
+    with pytest.raises(ModelFileError, match="for features of an earlier version; train it again"):
+        load_model(write_file(tmp_path / "m.safetensors", old))
 
 
 def test_the_files_of_these_tests_are_valid(tmp_path):
@@ -161,8 +159,6 @@ def test_the_files_of_these_tests_are_valid(tmp_path):
         ),
         ({"1.weights": np.zeros((3, 4, 5), np.float32)}, {}, "weights must be finite numbers of shape"),
         ({"2.weights": None}, {}, "'2.weights'"),
-        ({"box_regressor.bias": None}, {}, "'box_regressor.bias'"),
-        ({"box_regressor.weights": np.zeros((5, 4), np.float32)}, {}, "box_regressor.weights must be"),
         ({}, {"biases": None}, "'biases'"),
         ({}, {"biases": [0.0]}, "argument"),
         ({}, {"biases": [], "paddings": [], "borders": []}, "at least one template"),
@@ -172,12 +168,8 @@ def test_the_files_of_these_tests_are_valid(tmp_path):
         ({}, {"borders": [True]}, "argument"),
         ({}, {"borders": [1, 0, 0]}, "border must be True or False"),
         ({}, {"slope": 0.0}, "slope must be a number"),
-        ({}, {"n_iterations": 0}, "n_iterations must be an integer from 1"),
         ({}, {"vote_weight": "much"}, "could not convert"),
-        *(
-            ({}, {name: None}, f"'{name}'")
-            for name in ("threshold", "borders", "n_iterations", "vote_weight")
-        ),
+        *(({}, {name: None}, f"'{name}'") for name in ("threshold", "borders", "vote_weight")),
     ],
 )
 def test_inconsistent_files_are_rejected(tmp_path, tensors, params, message):
@@ -235,7 +227,10 @@ def test_the_shipped_models():
     assert isinstance(default, TemplateMixture)
     assert isinstance(highway, VehicleClassifier)
     assert default.metadata["metrics"]["left_out"].keys() >= {"india", "camvid", "indonesia", "project_clip"}
-    assert set(default.metadata["data"]) == {"india", "camvid", "indonesia", "course", "drawn", "patches"}
+    assert set(default.metadata["data"]) == {
+        *("camvid", "dawn", "india", "indonesia"),
+        *("course", "drawn", "patches"),
+    }
     assert highway.metadata == load_classifier().metadata
     with pytest.raises(
         ModelFileError,

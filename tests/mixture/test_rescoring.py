@@ -1,112 +1,132 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.helpers import mixture_template
+from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.mixture import (
-    N_COLOR_FEATURES,
-    N_EDGE_FEATURES,
-    BoxRegressor,
+    EdgePyramid,
+    Layer,
     MixtureSearch,
-    Projection,
     Rescorer,
     TemplateMixture,
     load_model,
     rescoring_features,
 )
 from vehicle_detection.mixture.boxes import nms
-from vehicle_detection.mixture.rescoring import RESCORE_MIN
+from vehicle_detection.mixture.rescoring import LAYERS, RESCORE_MIN, network_inputs
 from vehicle_detection.params import PyramidParams
 
 BOXES = np.array([[20.0, 30.0, 80.0, 70.0], [-10.0, 5.0, 30.0, 60.0], [100.5, 40.2, 180.0, 130.0]])
+# Outputs and inputs of each layer.
+SHAPES = [(4, 9 * 23), (6, 9 * 4), (5, 9 * 6), (7, 4 * 5), (5, 7)]
 
 
-def random_rescorer(seed=0, count=5, **changes):
+def random_rescorer(seed=0, blend_weight=0.4):
     rng = np.random.default_rng(seed)
-    values = {
-        "edges": Projection(rng.normal(0, 0.1, N_EDGE_FEATURES), rng.normal(0, 0.05, (4, N_EDGE_FEATURES))),
-        "colors": Projection(
-            rng.normal(0, 0.1, N_COLOR_FEATURES), rng.normal(0, 0.05, (3, N_COLOR_FEATURES))
-        ),
-        "vectors": rng.normal(0, 1, (count, 7)),
-        "weights": rng.normal(0, 1, count),
-        "bias": 0.25,
-        "gamma": 0.5,
-        "blend_weight": 0.4,
-    }
-    return Rescorer(**(values | changes))
+    layers = [Layer(rng.normal(0, 0.2, shape), rng.normal(0, 0.2, shape[0])) for shape in SHAPES]
+    return Rescorer(tuple(layers), blend_weight)
 
 
 def one_template_mixture(**options):
-    return TemplateMixture((mixture_template(seed=1),), BoxRegressor.none(), **options)
+    return TemplateMixture((mixture_template(seed=1),), **options)
 
 
 def noise(seed, shape=(120, 160, 3)):
     return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
 
 
-@given(seed=st.integers(0, 1000), rows=st.integers(0, 5), count=st.integers(1, 6))
-def test_the_decision_function_is_a_sum_of_kernels(seed, rows, count):
-    rescorer = random_rescorer(seed, count)
-    points = np.random.default_rng(seed + 1).normal(0, 1, (rows, 7)).astype(np.float32)
-    expected = [
-        sum(
-            weight * np.exp(-0.5 * ((point - vector) ** 2).sum())
-            for vector, weight in zip(rescorer.vectors, rescorer.weights)
-        )
-        + 0.25
-        for point in points.astype(np.float64)
-    ]
-    np.testing.assert_allclose(rescorer.decision_function(points), expected, atol=1e-4)
+def network_reference(rescorer, crop):
+    """Outputs for one crop ``(23, 12, 12)``, cell by cell in double precision."""
+    values = crop.astype(np.float64)
+    for layer, stride in zip(rescorer.layers[:3], (1, 2, 1)):
+        side = (values.shape[1] - 3) // stride + 1
+        found = np.zeros((len(layer.bias), side, side))
+        weights = layer.weights.reshape(-1, 3, 3, len(values))
+        for y, x in np.ndindex(side, side):
+            part = values[:, y * stride : y * stride + 3, x * stride : x * stride + 3]
+            found[:, y, x] = np.einsum("oijc,cij->o", weights, part) + layer.bias
+        values = np.maximum(found, 0)
+    hidden = np.maximum(rescorer.layers[3].weights @ values.ravel() + rescorer.layers[3].bias, 0)
+    return rescorer.layers[4].weights @ hidden + rescorer.layers[4].bias
 
 
-def test_rescoring_blends_margins_and_decision_margins():
-    rescorer, image = random_rescorer(), noise(1)
+@given(seed=st.integers(0, 1000), count=st.integers(0, 5))
+@settings(max_examples=25)
+def test_the_network_equals_the_reference(seed, count):
+    rescorer = random_rescorer(seed)
+    inputs = np.random.default_rng(seed).normal(0, 1, (23, count, 12, 12)).astype(np.float32)
+    log_odds, shifts = rescorer.predict(inputs)
+    expected = np.array([network_reference(rescorer, inputs[:, row]) for row in range(count)]).reshape(-1, 5)
+    np.testing.assert_allclose(log_odds, expected[:, 0], atol=1e-4)
+    np.testing.assert_allclose(shifts, expected[:, 1:].clip(-0.4, 0.4), atol=1e-4)
+
+
+def test_the_outputs_of_a_crop_do_not_depend_on_the_others():
+    rescorer = random_rescorer()
+    inputs = np.random.default_rng(3).normal(0, 1, (23, 40, 12, 12)).astype(np.float32)
+    log_odds, shifts = rescorer.predict(inputs)
+    for rows in (slice(7, 8), slice(3, 30)):
+        part = rescorer.predict(np.ascontiguousarray(inputs[:, rows]))
+        np.testing.assert_array_equal(part[0], log_odds[rows])
+        np.testing.assert_array_equal(part[1], shifts[rows])
+
+
+def test_rescoring_adds_log_odds_and_corrects_boxes():
+    rescorer, pyramid = random_rescorer(), EdgePyramid(noise(1))
     margins = np.array([0.5, -0.2, 1.0])
-    decisions = rescorer.decision_function(rescorer.project(*rescoring_features(image, BOXES)))
-    np.testing.assert_allclose(rescorer.apply(image, BOXES, margins), 0.6 * margins + 0.4 * decisions)
-    assert rescorer.apply(image, BOXES[:0], margins[:0]).shape == (0,)
+    log_odds, shifts = rescorer.predict(network_inputs(*rescoring_features(pyramid, BOXES)))
+    boxes, found = rescorer.apply(pyramid, BOXES, margins)
+    np.testing.assert_allclose(found, margins + 0.4 * log_odds.clip(-6, 6))
+    expected = BOXES + shifts * np.tile(BOXES[:, 2:] - BOXES[:, :2], 2)
+    np.testing.assert_allclose(boxes, clip_boxes(expected, (120, 160)))
+    boxes, found = rescorer.apply(pyramid, BOXES[:0], margins[:0])
+    assert boxes.shape == (0, 4)
+    assert found.shape == (0,)
 
 
 def test_nms_uses_the_rescored_margins():
     image = noise(2, (200, 300, 3))
     model = one_template_mixture(rescorer=random_rescorer(4))
     search = MixtureSearch(model, n_jobs=1)
-    windows = search.score_windows(image, PyramidParams(min_width=24, horizon=None))
-    proposals, margins = model.propose_boxes(image, windows, min_margin=RESCORE_MIN)
-    rescored = model.rescorer.apply(image, proposals, margins)
-    rows = nms(proposals, rescored)
+    pyramid, windows = search.score_windows(image, PyramidParams(min_width=24, horizon=None))
+    proposals, margins = model.propose_boxes(pyramid, windows, min_margin=RESCORE_MIN)
+    corrected, rescored = model.rescorer.apply(pyramid, proposals, margins)
+    rows = nms(corrected, rescored)
     assert len(rows) < len(proposals)
-    boxes, found = model.detect_vehicles(image, windows, min_margin=-9.0)
-    np.testing.assert_array_equal(boxes, proposals[rows])
+    boxes, found = model.detect_vehicles(pyramid, windows, min_margin=-9.0)
+    np.testing.assert_array_equal(boxes, corrected[rows])
     np.testing.assert_array_equal(found, rescored[rows])
     middle = float(np.median(found))
-    boxes, fewer = model.detect_vehicles(image, windows, min_margin=middle)
+    boxes, fewer = model.detect_vehicles(pyramid, windows, min_margin=middle)
     np.testing.assert_array_equal(fewer, found[found >= middle])
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("number", "weights", "bias", "message"),
     [
-        ({"edges": Projection(np.zeros(9), np.zeros((4, 9)))}, r"rescorer.edges must take 4032 values"),
-        (
-            {"colors": Projection(np.zeros(9), np.zeros((3, 9)))},
-            r"rescorer.colors must take 432 values",
-        ),
-        ({"vectors": np.zeros((5, 6))}, r"rescorer.vectors must be finite numbers of shape \(any, 7\)"),
-        ({"vectors": np.full((5, 7), 1e6)}, "rescorer.vectors must be numbers below 65,504"),
-        ({"weights": np.zeros(4)}, r"rescorer.weights must be finite numbers of shape \(5\)"),
-        ({"weights": np.full(5, np.nan)}, "rescorer.weights must be finite numbers"),
-        ({"bias": "much"}, "rescorer.bias must be a number"),
-        ({"gamma": 0.0}, "rescorer.gamma must be a number"),
-        ({"blend_weight": 1.5}, "rescorer.blend_weight must be a number"),
+        (0, np.zeros((4, 9)), np.zeros(4), r"rescorer.convolution 1 must be .* shape \(4, 207\)"),
+        (1, np.zeros((6, 35)), np.zeros(6), r"rescorer.convolution 2 must be .* shape \(6, 36\)"),
+        (2, np.full((5, 54), np.nan), np.zeros(5), r"rescorer.convolution 3 must be finite numbers"),
+        (3, np.zeros((7, 20)), np.zeros((7, 1)), r"rescorer.hidden bias must be .* shape \(7\)"),
+        (4, np.zeros((4, 7)), np.zeros(4), r"rescorer.output must have 5 outputs, got 4; train again"),
+        (4, "many", np.zeros(5), "rescorer.output must be finite numbers"),
     ],
 )
-def test_invalid_rescorers_are_rejected(changes, message):
+def test_invalid_layers_are_rejected(number, weights, bias, message):
+    layers = list(random_rescorer().layers)
+    layers[number] = Layer(weights, bias)
     with pytest.raises(InvalidInputError, match=message):
-        random_rescorer(**changes)
+        Rescorer(tuple(layers), 0.4)
+
+
+def test_invalid_rescorers_are_rejected():
+    with pytest.raises(InvalidInputError, match="layers must be 5, got 1; train again"):
+        Rescorer(random_rescorer().layers[:1], 0.4)
+    with pytest.raises(InvalidInputError, match=r"rescorer\.blend_weight must be a number"):
+        random_rescorer(blend_weight=1.5)
 
 
 def test_a_mixture_takes_a_rescorer_or_none():
@@ -118,15 +138,12 @@ def test_a_model_file_preserves_the_rescorer(tmp_path):
     model = one_template_mixture(rescorer=random_rescorer(), slope=2.0)
     model.save(tmp_path / "model.safetensors")
     loaded = load_model(tmp_path / "model.safetensors")
-    for name in ("vectors", "weights", "bias", "gamma", "blend_weight"):
-        np.testing.assert_array_equal(
-            getattr(loaded.rescorer, name), getattr(model.rescorer, name), strict=True
-        )
-    image = noise(5)
-    np.testing.assert_array_equal(
-        loaded.rescorer.apply(image, BOXES, np.zeros(3)),
-        model.rescorer.apply(image, BOXES, np.zeros(3)),
-    )
+    assert loaded.rescorer.blend_weight == model.rescorer.blend_weight
+    pyramid = EdgePyramid(noise(5))
+    for found, expected in zip(
+        loaded.rescorer.apply(pyramid, BOXES, np.zeros(3)), model.rescorer.apply(pyramid, BOXES, np.zeros(3))
+    ):
+        np.testing.assert_array_equal(found, expected)
     one_template_mixture().save(tmp_path / "plain.safetensors")
     assert load_model(tmp_path / "plain.safetensors").rescorer is None
 
@@ -134,8 +151,10 @@ def test_a_model_file_preserves_the_rescorer(tmp_path):
 def test_a_file_with_an_incomplete_rescorer_is_rejected(tmp_path, monkeypatch):
     model = one_template_mixture(rescorer=random_rescorer())
     tensors = model.rescorer.tensors()
-    tensors.pop("rescorer.vectors")
+    tensors.pop(f"rescorer.{LAYERS[3]}.bias")
     monkeypatch.setattr(Rescorer, "tensors", lambda self: tensors)
     model.save(tmp_path / "model.safetensors")
-    with pytest.raises(ModelFileError, match=r"model.safetensors does not fit its own parameters.*vectors"):
+    with pytest.raises(
+        ModelFileError, match=r"model.safetensors does not fit its own parameters.*hidden.bias"
+    ):
         load_model(tmp_path / "model.safetensors")

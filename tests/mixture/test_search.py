@@ -8,7 +8,7 @@ from vehicle_detection import VehicleDetector
 from vehicle_detection.boxes import box_areas, clip_boxes
 from vehicle_detection.classifier import load_classifier
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture import BoxRegressor, MixtureSearch, TemplateMixture, load_model
+from vehicle_detection.mixture import MixtureSearch, TemplateMixture, load_model
 from vehicle_detection.mixture.search import _MAX_WINDOWS
 from vehicle_detection.params import HeatParams, PyramidParams, SearchParams
 from vehicle_detection.search import find_cars
@@ -80,7 +80,7 @@ def test_minimum_score_and_threshold():
 
 @pytest.mark.parametrize("horizon", [0.3, 0.5, 0.62])
 def test_a_known_horizon_limits_the_positions_of_vehicles(horizon):
-    model = TemplateMixture((mixture_template(bias=0.5),), BoxRegressor.none())
+    model = TemplateMixture((mixture_template(bias=0.5),))
     params = PyramidParams(horizon=horizon, min_width=40, min_score=-3.0)
     boxes = search_once(model, ROAD, params).windows.boxes
     # Truncated windows may be anywhere at the frame's border.
@@ -99,14 +99,14 @@ def test_windows_of_a_border_template_end_at_the_border():
         templates=(mixture_template(bias=-0.5), mixture_template(5, 6, seed=4, bias=1.0, border=True)),
     )
     search = MixtureSearch(model, n_jobs=1)
-    found = search.score_windows(ROAD, PyramidParams())
+    _, found = search.score_windows(ROAD, PyramidParams())
     at_border = found.boxes[found.templates == 1]
     assert (at_border[:, 0] == 0).any()
     assert (at_border[:, 2] == 640).any()
     assert ((at_border[:, 0] == 0) | (at_border[:, 2] == 640)).all()
     # It does not change the sizes at which the other template is searched.
     alone = dataclasses.replace(model, templates=model.templates[:1])
-    expected = MixtureSearch(alone, n_jobs=1).score_windows(ROAD, PyramidParams())
+    _, expected = MixtureSearch(alone, n_jobs=1).score_windows(ROAD, PyramidParams())
     others = found.boxes[found.templates == 0]
     np.testing.assert_array_equal(others, expected.boxes[: len(others)])
 

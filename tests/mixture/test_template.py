@@ -1,5 +1,3 @@
-import dataclasses
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,13 +7,12 @@ from tests.helpers import mixture_template
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture import (
     N_CHANNELS,
+    CellGrid,
     FeatureMap,
     MixtureTemplate,
-    feature_maps,
-    image_pyramid,
+    frame_grid,
     mirror_channels,
 )
-from vehicle_detection.mixture.features import PyramidLevel
 
 BORDER_TEMPLATE = mixture_template(5, 6, seed=4, border=True)
 
@@ -55,14 +52,12 @@ def test_a_mirrored_template_gives_the_same_margins_on_a_mirrored_map():
 def test_boxes_exclude_the_padding():
     template = mixture_template(9, 8, padding=(1.0, 0.5))
     assert template.box_cells == (7, 7)
-    ((_, level),) = feature_maps(
-        image_pyramid(np.zeros((160, 160, 3), np.uint8)), PyramidLevel(None, 8.0), (0, 160)
-    )
+    grid = frame_grid(8.0, (160, 160))
     first = np.array([0])
-    (box,) = template.boxes(level, first, first)
-    assert box.tolist() == [level.left + 8, level.top + 4, level.left + 64, level.top + 60]
-    (box,) = template.boxes(level, first + 3, first + 5)
-    assert box.tolist() == [level.left + 48, level.top + 28, level.left + 104, level.top + 84]
+    (box,) = template.boxes(grid, first, first)
+    assert box.tolist() == [grid.left + 8, grid.top + 4, grid.left + 64, grid.top + 60]
+    (box,) = template.boxes(grid, first + 3, first + 5)
+    assert box.tolist() == [grid.left + 48, grid.top + 28, grid.left + 104, grid.top + 84]
 
 
 def test_a_border_template_has_padding_on_one_side():
@@ -73,20 +68,22 @@ def test_a_border_template_has_padding_on_one_side():
 def test_both_borders_give_the_same_windows(seed, columns, rows):
     rng = np.random.default_rng(seed)
     channels = rng.uniform(0, 0.3, (N_CHANNELS, rows, columns)).astype(np.float32)
-    feature_map = FeatureMap(channels, 0.0, 4.0, 8.0, 8.0)
-    mirrored = dataclasses.replace(feature_map, channels=mirror_channels(channels))
+    grid = CellGrid(0.0, 4.0, 8.0, 8.0, rows, columns)
     template, width = BORDER_TEMPLATE, columns * 8.0
-    boxes, margins = template.border_windows(feature_map, width, left=False, min_margin=-9.0)
-    assert len(boxes) == (rows - 5 if columns >= 5 and rows >= 6 else 0)
+    strip = template.border_strip(FeatureMap(channels, grid), width, left=False)
+    other = template.border_strip(FeatureMap(mirror_channels(channels), grid), 0.0, left=True)
+    assert (strip is None) == (other is None) == (columns < 5)
+    if strip is None or other is None:
+        return
+    margins = template.margins(strip)
+    assert margins.shape == (max(rows - 5, 0), 1)
+    np.testing.assert_array_equal(template.margins(other), margins)
+    boxes = template.border_boxes(grid, np.arange(len(margins)), width, left=False)
     assert (boxes[:, 2] == width).all()
     assert (boxes[:, 2:] - boxes[:, :2] == 32).all()
-    others, same = template.border_windows(mirrored, 0.0, left=True, min_margin=-9.0)
-    np.testing.assert_array_equal(same, margins)
+    others = template.border_boxes(grid, np.arange(len(margins)), 0.0, left=True)
     np.testing.assert_array_equal(others[:, [1, 3]], boxes[:, [1, 3]])
     np.testing.assert_array_equal(others[:, [0, 2]], width - boxes[:, [2, 0]])
-    if len(boxes):
-        inside = feature_map.channels[:, :, columns - 5 :]
-        np.testing.assert_allclose(template.margins(np.ascontiguousarray(inside))[:, 0], margins)
 
 
 def test_weights_are_copied_and_read_only():
@@ -102,8 +99,8 @@ def test_weights_are_copied_and_read_only():
     ("changes", "message"),
     [
         (
-            {"weights": np.zeros((3, 4, 27))},
-            r"weights must be finite numbers of shape \(any, any, 28\), got an",
+            {"weights": np.zeros((3, 4, 28))},
+            r"weights must be finite numbers of shape \(any, any, 20\), got an",
         ),
         ({"weights": np.zeros((4, N_CHANNELS))}, r"weights must be .*; train again"),
         ({"weights": np.zeros((0, 4, N_CHANNELS))}, "weights must be finite numbers"),

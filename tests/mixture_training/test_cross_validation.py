@@ -119,6 +119,9 @@ def test_fold_scores_by_hand():
     assert score.average_precision == pytest.approx(0.25 + 0.25 * 0.75 + 0.25 * 0.75)
     assert (score.mean_iou, score.false_per_frame, score.false_per_empty_frame) == (1.0, 0.2, 0.0)
     assert "false_per_empty_frame" not in score_fold(fold_of([1.0], [True]), 0.0).to_dict()
+    # At IoU 0.7 the same boxes are right; log-odds of 0 state a probability of one half for each box.
+    assert score.strict_average_precision == score.average_precision
+    assert score_fold(fold, 0.0, (0.0, 0.0)).calibration_error == pytest.approx(0.25)
 
 
 def test_a_vehicle_in_an_ignored_group_is_not_false_in_the_region_scores():
@@ -143,6 +146,7 @@ def test_fold_scores_without_detections_or_vehicles():
     assert (nothing.f1, nothing.best_f1, nothing.average_precision, nothing.recall) == (0, 0, 0, 0)
     assert math.isnan(nothing.precision)
     assert "precision" not in nothing.to_dict()
+    assert "calibration_error" not in nothing.to_dict()
     empty = fold_of([0.3, 0.6], [False, False], frames=2, empty=2)
     assert score_fold(empty, 0.5).false_per_empty_frame == 0.5
 

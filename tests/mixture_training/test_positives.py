@@ -1,26 +1,36 @@
 import dataclasses
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.helpers import SMALL_MIXTURE, scene_of
+from tests.helpers import SMALL_MIXTURE, drawn
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture import N_CHANNELS, BoxRegressor, MixtureTemplate, mirror_channels
-from vehicle_detection.mixture_training import train_mixture
+from vehicle_detection.mixture import N_CHANNELS, EdgePyramid, MixtureTemplate, mirror_channels
+from vehicle_detection.mixture_training import FrameDataset, train_mixture
+from vehicle_detection.mixture_training.patches import (
+    BoxRegressor,
+    fit_box_regressor,
+    locate_on_patch,
+    patch_features,
+)
 from vehicle_detection.mixture_training.positives import (
     align_mirrored,
     jitter_boxes,
-    locate_on_patch,
-    patch_features,
     truncated_vehicles,
     vehicle_features,
     whole_vehicles,
     window_features,
 )
 from vehicle_detection.mixture_training.sources import TrainingFrame, load_training_frames
+
+
+def flat(samples):
+    """Pairs of an image and one box."""
+    return [(image, box) for image, boxes in samples for box in boxes]
 
 
 def blank(columns=8, rows=7):
@@ -33,8 +43,9 @@ def test_whole_vehicles_are_also_taken_from_relit_frames(drawn_source):
     for count in (0, 2):
         params = dataclasses.replace(SMALL_MIXTURE, copies=3, relit_copies=count)
         seen = list(whole_vehicles(frames, params, np.random.default_rng(0)))
-        assert len(seen) == (3 + count) * len(wide)
-        relit = [box for image, box in seen if not any(image is frame.image for frame in frames)]
+        assert sum(len(boxes) for _, boxes in seen) == (3 + count) * len(wide)
+        unknown = [boxes for image, boxes in seen if not any(image is frame.image for frame in frames)]
+        relit = [box for boxes in unknown for box in boxes]
         assert len(relit) == count * len(wide)
         assert {tuple(box) for box in relit} == ({tuple(box) for box in wide} if count else set())
 
@@ -56,7 +67,7 @@ def test_jittered_boxes_still_overlap_their_vehicles(seed, count):
 def test_truncated_vehicles_end_at_the_border(drawn_source):
     params = dataclasses.replace(SMALL_MIXTURE, border_shapes=((4, 5),))
     frames = load_training_frames([drawn_source])
-    seen = list(truncated_vehicles(frames, params, np.random.default_rng(0)))
+    seen = flat(truncated_vehicles(frames, params, np.random.default_rng(0)))
     assert len(seen) > len(frames)
     for image, box in seen:
         assert box[2] == image.shape[1]
@@ -69,9 +80,8 @@ def test_a_vehicle_truncated_by_the_border_is_copied():
     )
     for copies in (1, 5):
         params = dataclasses.replace(SMALL_MIXTURE, border_copies=copies)
-        seen = [
-            box for _, box in truncated_vehicles([cut], params, np.random.default_rng(0)) if box[2] == 160
-        ]
+        found = flat(truncated_vehicles([cut], params, np.random.default_rng(0)))
+        seen = [box for _, box in found if box[2] == 160]
         assert len(seen) == copies
         assert seen[0].tolist() == [110, 20, 160, 60]
         assert len({tuple(box) for box in seen}) == len(seen)
@@ -94,34 +104,23 @@ def test_aligned_samples_show_the_same_side():
     assert align_mirrored(np.empty((0, 8), np.float32), rng).shape == (0, 8)
 
 
-def patch_of(seed):
-    """Square patch around the widest vehicle of a scene, and its box; None if the patch leaves the image."""
-    scene = scene_of(seed)
-    box = np.array(max((v.box for v in scene.truth), key=lambda box: box[2] - box[0], default=(0, 0, 0, 0)))
-    side = round(1.1 * max(box[2] - box[0], box[3] - box[1]))
-    left, top = np.round((box[:2] + box[2:] - side) / 2).astype(int)
-    inside = left >= 0 and top >= 0 and left + side <= 356 and top + side <= 200
-    if side < 45 or not inside:
-        return None
-    return scene.image[top : top + side, left : left + side], box - np.tile([left, top], 2)
-
-
-def test_a_vehicle_is_located_on_its_patch(drawn_source):
-    model = train_mixture(
-        [drawn_source], dataclasses.replace(SMALL_MIXTURE, mining_schedule=(0.2,)), n_jobs=1
-    )
-    found = [patch for patch in map(patch_of, range(100, 140)) if patch is not None]
-    assert len(found) > 5
-    before, after = (
-        [iou_matrix([locate_on_patch(image, placing)], [box])[0, 0] for image, box in found]
-        for placing in (BoxRegressor.none(), model.box_regressor)
-    )
-    assert np.mean(after) > np.mean(before)
-    assert np.mean(after) > 0.75
-    image, _ = found[0]
-    inside = locate_on_patch(image, model.box_regressor)
-    assert (inside[:2] >= 0).all()
-    assert (inside[2:] <= image.shape[1::-1]).all()
+def test_the_regressor_corrects_misplaced_boxes(drawn_source):
+    frames = load_training_frames([drawn_source])
+    with ThreadPoolExecutor(1) as pool:
+        regressor = fit_box_regressor(frames, SMALL_MIXTURE, np.random.default_rng(0), pool)
+    before, after = [], []
+    for frame in load_training_frames([FrameDataset("others", (drawn(range(20, 30)),))]):
+        wide = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= SMALL_MIXTURE.min_width]
+        boxes = jitter_boxes(wide, np.random.default_rng(5))
+        shifts = regressor.shifts(EdgePyramid(frame.image), boxes)
+        corrected = boxes + shifts * np.tile(boxes[:, 2:] - boxes[:, :2], 2)
+        before += np.diag(iou_matrix(boxes, wide)).tolist()
+        after += np.diag(iou_matrix(corrected, wide)).tolist()
+        box = locate_on_patch(frame.image, regressor)
+        assert (box[:2] >= 0).all()
+        assert (box[2:] <= frame.image.shape[1::-1]).all()
+    assert len(before) > 10
+    assert np.mean(after) > np.mean(before) + 0.1
 
 
 def test_cells_outside_a_patch_take_the_mean_features():
@@ -136,7 +135,7 @@ def test_cells_outside_a_patch_take_the_mean_features():
     ring = np.zeros((7, 8), bool)
     ring[:, [0, -1]] = True
     np.testing.assert_allclose(plain[ring], mean[ring], rtol=1e-6)
-    own = window_features(image, locate_on_patch(image, none), template).transpose(1, 2, 0)
+    own = window_features(EdgePyramid(image), locate_on_patch(image, none), template).transpose(1, 2, 0)
     np.testing.assert_array_equal(plain[~ring], own[~ring])
     back = mirror_channels(mirrored.transpose(2, 0, 1)).transpose(1, 2, 0)
     np.testing.assert_array_equal(back, plain)
@@ -148,7 +147,7 @@ def test_a_patch_with_a_wide_margin_needs_no_mean_features():
     shrink = BoxRegressor(np.zeros_like(BoxRegressor.none().weights), [0.2, 0.2, -0.2, -0.2])
     known = np.zeros((1, blank().weights.size), np.float32)
     (rows,) = patch_features([image], shrink, [blank()], [known], SMALL_MIXTURE)
-    own = window_features(image, locate_on_patch(image, shrink), blank())
+    own = window_features(EdgePyramid(image), locate_on_patch(image, shrink), blank())
     np.testing.assert_array_equal(rows[0], own.transpose(1, 2, 0).ravel())
 
 
@@ -180,7 +179,9 @@ def test_invalid_patches(drawn_source, patches, message):
 
 
 def test_patches_add_positive_samples(drawn_source):
-    patches = [patch[0] for patch in map(patch_of, range(100, 140)) if patch is not None]
+    frames = load_training_frames([drawn_source])
+    boxes = [(frame.image, *frame.boxes[0].astype(int)) for frame in frames if len(frame.boxes)]
+    patches = [image[max(y1 - 2, 0) : y2 + 2, max(x1 - 2, 0) : x2 + 2] for image, x1, y1, x2, y2 in boxes]
     params = dataclasses.replace(SMALL_MIXTURE, mining_schedule=(0.2,))
     lines = []
     models = [

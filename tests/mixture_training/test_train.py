@@ -70,7 +70,7 @@ def test_border_templates(drawn_source):
         for box in frame.boxes:
             end = round((box[0] + box[2]) / 2)
             if box[2] - box[0] > 70 and end > 60:
-                seen = search.score_windows(np.ascontiguousarray(frame.image[:, :end]), PyramidParams())
+                _, seen = search.score_windows(np.ascontiguousarray(frame.image[:, :end]), PyramidParams())
                 shown = np.array([[box[0], box[1], end, box[3]]])
                 hit = (seen.templates > 0) & (iou_matrix(seen.boxes, shown)[:, 0] > 0.5)
                 margins.append(seen.margins[hit].max(initial=-2))

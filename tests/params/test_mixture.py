@@ -28,7 +28,6 @@ from vehicle_detection.errors import InvalidInputError
         ({"border_bias": np.nan}, "border_bias must be a number"),
         ({"size_prior_weight": "much"}, "size_prior_weight must be a number"),
         ({"vote_weight": -0.1}, "vote_weight must be a number, at least 0"),
-        ({"n_iterations": 0}, "n_iterations must be an integer from 1"),
         ({"padding": -1}, "padding must be a number"),
         ({"C": 0}, "C must be a number, greater than 0"),
         ({"border_C": 0}, "border_C must be a number, greater than 0"),

@@ -25,6 +25,8 @@ SCORE = FoldScore(
     best_f1=0.96,
     region_f1=0.81,
     region_average_precision=0.93,
+    strict_average_precision=0.61,
+    calibration_error=0.05,
 )
 
 
@@ -34,8 +36,11 @@ def test_the_card_lists_the_measurements(small_mixture, tmp_path):
     assert card.startswith("# Model card: small\n\nA mixture of 1 linear SVM templates")
     assert "python -m tools.train_default DATA -o small.safetensors --card small.md --seed 3" in card
     assert "Templates, in cells of the vehicle's box: 6x5\n" in card
-    assert f"{len(small_mixture.rescorer.weights):,} support vectors" in card
-    row = "| first | 7 | 13 | 0.800 | 0.960 | 0.923 | 0.706 | 0.923 | 0.820 | 0.71 | - | 0.810 | 0.930 |"
+    assert f"{small_mixture.rescorer.n_weights:,} weights" in card
+    row = (
+        "| first | 7 | 13 | 0.800 | 0.960 | 0.923 | 0.706 | 0.923 | 0.820 | 0.71 | - | 0.810 | 0.930 | "
+        "0.610 | 0.050 |"
+    )
     assert row in card
     assert "- one: 7 frames, " in card
     assert "- 5 vehicles on the course's patches" in card
@@ -47,7 +52,7 @@ def test_the_card_of_a_model_without_rescorer_and_patches(small_mixture, tmp_pat
     plain = dataclasses.replace(small_mixture, rescorer=None)
     write_card(tmp_path / "m.md", plain, [], SOURCES, seed=0)
     card = (tmp_path / "m.md").read_text()
-    assert "support vectors" not in card
+    assert "Rescoring" not in card
     assert "the course's patches" not in card
 
 

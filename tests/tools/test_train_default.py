@@ -31,9 +31,9 @@ def write_patches(folder, count):
 
 def test_sources_of_the_data_folder(data):
     found = train_default.load_sources(data)
-    assert [source.name for source in found] == ["camvid", "india", "indonesia", "course"]
-    assert [[len(part) for part in source.sets] for source in found] == [[1], [1], [1], [2, 2, 2]]
-    assert [source.min_labelled_width for source in found] == [0.0, 0.0, 60.0, 0.0]
+    assert [source.name for source in found] == ["camvid", "dawn", "india", "indonesia", "course"]
+    assert [[len(part) for part in source.sets] for source in found] == [[1], [1], [1], [1], [2, 2, 2]]
+    assert [source.min_labelled_width for source in found] == [0.0, 0.0, 0.0, 60.0, 0.0]
     assert [part.name for part in found[-1].sets] == ["project_clip", "test_images", "test_video"]
     (data / "labels" / "india.csv").unlink()
     with pytest.raises(DatasetError, match=r"data lacks labels/india\.csv"):
@@ -76,6 +76,7 @@ def test_the_command_writes_model_card_curves_and_pictures(
     train_default.main(list(map(str, words)))
     assert load_model(model).metadata["data"] == {
         "camvid": 1,
+        "dawn": 1,
         "india": 1,
         "indonesia": 1,
         "course": 6,
@@ -90,7 +91,7 @@ def test_the_command_writes_model_card_curves_and_pictures(
     assert curves.read_text().startswith("frames,margin,precision,recall\ncamvid,")
     names = {path.name for path in pictures.iterdir()}
     assert {"curves.png", "india-missed.png", "test_video-false.png"} <= names
-    assert len(names) == 13
+    assert len(names) == 15
     assert (pictures / "curves.png").read_bytes()[:4] == b"\x89PNG"
     out = capsys.readouterr().out
     assert out.startswith("trained\ncamvid: F1 ")

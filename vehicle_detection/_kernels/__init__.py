@@ -1,6 +1,7 @@
 """Compiled numba kernels: HOG, FHOG, color, correlation, matrix products and the SVM solver."""
 
-from vehicle_detection._kernels.correlation import Filter
+from vehicle_detection._kernels.correlation import DenseLayer, Filter, PackedFilters, PackedSearch
+from vehicle_detection._kernels.fhog import cell_means
 from vehicle_detection._kernels.hog import (
     bin_of_value,
     degree_bounds,
@@ -8,17 +9,24 @@ from vehicle_detection._kernels.hog import (
     sqrt_gradients,
 )
 from vehicle_detection._kernels.linear_svm import fit_svm
-from vehicle_detection._kernels.matmul import matmul
+from vehicle_detection._kernels.suppression import suppress, vote
+from vehicle_detection._kernels.vector import PackedFormat
 from vehicle_detection._kernels.yuv import channels_from_planes, planes_from_channels
 
 __all__ = [
+    "DenseLayer",
     "Filter",
+    "PackedFilters",
+    "PackedFormat",
+    "PackedSearch",
     "bin_of_value",
+    "cell_means",
     "channels_from_planes",
     "degree_bounds",
     "fit_svm",
-    "matmul",
     "orientation_cotangents",
     "planes_from_channels",
     "sqrt_gradients",
+    "suppress",
+    "vote",
 ]

@@ -2,66 +2,75 @@
 
 from __future__ import annotations
 
+import math
+
+import numba
 import numpy as np
 
 from vehicle_detection._kernels.jit import jit
 
-# Columns whose sums of all orientations fit into the first-level cache.
-_COLUMNS = 512
+SQUARE, SMALL_SQUARE = 4, 2
+"""Sides in pixels of the squares over which gradients are summed, and of those for crops of small cells."""
+
+# Replicated pixels left of the image in a row of square roots: a square, and a neighbor for its gradients.
+_LEFT = SQUARE + 1
 
 
 @jit
-def _sqrt_row(row, out):
-    """Write ``sqrt(255 * value)`` of a row; the two values beyond its ends make the gradient there zero."""
+def _sqrt_row(row, roots):
+    """Write ``sqrt(255 * value)`` of a row of pixels after `_LEFT` others, and replicate its ends."""
     width = len(row)
     scale = np.float32(255)
+    inner = roots[_LEFT:]
     for x in range(width):
-        out[x + 1] = np.sqrt(scale * np.float32(row[x]))
-    out[0], out[width + 1] = out[2], out[width - 1]
+        inner[x] = np.sqrt(scale * np.float32(row[x]))
+    for x in range(_LEFT):
+        roots[x] = inner[0]
+    for x in range(width, len(inner)):
+        inner[x] = inner[width - 1]
 
 
 @jit
-def orientation_sums(channels, cotangents, sums):
-    """Sum gradient magnitudes by 16 signed orientations over squares of 4x4 pixels.
+def orientation_sums(channels, cotangents, square, first, sums):
+    """Sum gradient magnitudes by 16 signed orientations over squares of `square` pixels a side.
 
     `channels` is ``(3, H, W)`` uint8, `cotangents` ``(8,)`` float32 of the angles 11.25, 33.75, ..., 168.75
-    degrees, and `sums` the output ``(16, rows, columns)`` float32, at most a quarter of the image's size.
+    degrees, and `square` 4 or 2. `sums` is the output ``(rows, columns, 16)`` float32: of the rows of squares
+    from `first` on, and of the columns from -1 on. Squares may lie beyond the image, whose borders are
+    replicated.
 
     The gradients are those of ``sqrt(255 * value)``, which gives dark regions more weight; of the three
     channels, the one with the longest gradient is used (Dalal and Triggs, CVPR 2005, sections 6.1 and 6.2).
     Bin `k` is centered on ``22.5 k`` degrees and bin ``k + 8`` is opposite to it, so vertical and horizontal
     edges are in the middle of a bin, and mirroring an image permutes the bins. A gradient is beyond a bound
-    if the ratio ``gx / gy`` is at most its cotangent. The sum of a bin is the difference of the sums beyond
-    its two bounds, which stay in registers over the four rows of a square.
+    if the ratio ``gx / gy`` is at most its cotangent; the number of these bounds is its bin.
     """
     height, width = channels.shape[1:]
-    rows, columns = sums.shape[1:]
-    wide = 4 * columns
-    # Square roots of three successive rows, in a ring.
-    roots = np.empty((3, 3, width + 2), np.float32)
-    for c in range(3):
-        _sqrt_row(channels[c, 0], roots[c, 0])
-    # Ratios of four rows; magnitudes of gradients with angles in [0, 180) degrees, and of the opposite ones.
-    ratios = np.empty((4, wide), np.float32)
-    magnitudes = np.empty((2, 4, wide), np.float32)
-    bins = np.empty((2, 8, _COLUMNS), np.float32)
-    beyond = np.empty((2, _COLUMNS), np.float32)
+    rows, columns = sums.shape[:2]
+    wide, skipped = square * columns, SQUARE - square
+    # Square roots of three successive rows, in a ring; row y is in place (y + 6) % 3, which is not negative.
+    roots = np.empty((3, 3, max(wide + skipped + 2, width + _LEFT + 1)), np.float32)
+    for y in range(square * first - 1, square * first + 1):
+        for c in range(3):
+            _sqrt_row(channels[c, min(max(y, 0), height - 1)], roots[(y + 6) % 3, c])
+    magnitudes, bins = np.empty(wide, np.float32), np.empty(wide, np.int32)
     c0, c1, c2, c3 = cotangents[0], cotangents[1], cotangents[2], cotangents[3]
     c4, c5, c6, c7 = cotangents[4], cotangents[5], cotangents[6], cotangents[7]
     zero, infinite = np.float32(0), np.float32(np.inf)
+    flat = sums.reshape(rows, -1)
     for row in range(rows):
-        for part in range(4):
-            y = 4 * row + part
-            if y + 1 < height:
-                for c in range(3):
-                    _sqrt_row(channels[c, y + 1], roots[c, (y + 1) % 3])
-            middle = y % 3
-            up, down = ((y - 1) % 3, (y + 1) % 3) if 0 < y < height - 1 else (middle, middle)
-            left0, left1, left2 = roots[0, middle], roots[1, middle], roots[2, middle]
+        out = flat[row]
+        for i in range(16 * columns):
+            out[i] = zero
+        for part in range(square):
+            y = square * (first + row) + part
+            for c in range(3):
+                _sqrt_row(channels[c, min(max(y + 1, 0), height - 1)], roots[(y + 7) % 3, c])
+            middle, up, down = roots[(y + 6) % 3], roots[(y + 5) % 3], roots[(y + 7) % 3]
+            left0, left1, left2 = middle[0, skipped:], middle[1, skipped:], middle[2, skipped:]
             right0, right1, right2 = left0[2:], left1[2:], left2[2:]
-            up0, up1, up2 = roots[0, up, 1:], roots[1, up, 1:], roots[2, up, 1:]
-            down0, down1, down2 = roots[0, down, 1:], roots[1, down, 1:], roots[2, down, 1:]
-            ratio, positive, negative = ratios[part], magnitudes[0, part], magnitudes[1, part]
+            up0, up1, up2 = up[0, skipped + 1 :], up[1, skipped + 1 :], up[2, skipped + 1 :]
+            down0, down1, down2 = down[0, skipped + 1 :], down[1, skipped + 1 :], down[2, skipped + 1 :]
             for x in range(wide):
                 gx, gy = right0[x] - left0[x], down0[x] - up0[x]
                 squared = gx * gx + gy * gy
@@ -72,157 +81,270 @@ def orientation_sums(channels, cotangents, sums):
                 squared = other if other > squared else squared
                 hx, hy = right2[x] - left2[x], down2[x] - up2[x]
                 other = hx * hx + hy * hy
-                longest_x = hx if other > squared else gx
-                longest_y = hy if other > squared else gy
-                magnitude = np.sqrt(other if other > squared else squared)
+                gx = hx if other > squared else gx
+                gy = hy if other > squared else gy
+                magnitudes[x] = np.sqrt(other if other > squared else squared)
                 # A horizontal gradient counts as angle 0 here; its sign selects the half circle.
-                ratio[x] = longest_x / longest_y if longest_y != zero else infinite
-                sign = longest_x if longest_y == zero else longest_y
-                positive[x] = magnitude if sign > zero else zero
-                negative[x] = zero if sign > zero else magnitude
-        for first in range(0, wide, _COLUMNS):
-            n = min(_COLUMNS, wide - first)
-            tile = ratios[:, first : first + n]
-            for half in range(2):
-                magnitude, out, last = magnitudes[half, :, first : first + n], bins[half], beyond[half]
-                for x in range(n):
-                    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = zero
-                    for part in range(4):
-                        q, m = tile[part, x], magnitude[part, x]
-                        s0 += m
-                        s1 += m if q <= c0 else zero
-                        s2 += m if q <= c1 else zero
-                        s3 += m if q <= c2 else zero
-                        s4 += m if q <= c3 else zero
-                        s5 += m if q <= c4 else zero
-                        s6 += m if q <= c5 else zero
-                        s7 += m if q <= c6 else zero
-                        s8 += m if q <= c7 else zero
-                    out[0, x] = s0 - s1
-                    out[1, x] = s1 - s2
-                    out[2, x] = s2 - s3
-                    out[3, x] = s3 - s4
-                    out[4, x] = s4 - s5
-                    out[5, x] = s5 - s6
-                    out[6, x] = s6 - s7
-                    out[7, x] = s7 - s8
-                    last[x] = s8
-            for half in range(2):
-                # Gradients beyond the last bound belong to the first bin of the other half circle.
-                line, last = bins[half, 0], beyond[1 - half]
-                for x in range(n):
-                    line[x] += last[x]
-                for k in range(8):
-                    line, out = bins[half, k], sums[8 * half + k, row, first // 4 : (first + n) // 4]
-                    for x in range(n // 4):
-                        out[x] = (line[4 * x] + line[4 * x + 1]) + (line[4 * x + 2] + line[4 * x + 3])
+                q = gx / gy if gy != zero else infinite
+                low = np.int32(q <= c0) + np.int32(q <= c1) + np.int32(q <= c2) + np.int32(q <= c3)
+                high = np.int32(q <= c4) + np.int32(q <= c5) + np.int32(q <= c6) + np.int32(q <= c7)
+                half = np.int32(0) if (gx if gy == zero else gy) > zero else np.int32(8)
+                # Beyond the last bound lies the first bin of the other half circle.
+                bins[x] = (low + high + half) & np.int32(15)
+            # Unsigned places: a signed one might be negative, which takes a test.
+            if square == SQUARE:
+                for x in range(columns):
+                    place = np.uint64(16 * x)
+                    out[place + np.uint64(bins[4 * x])] += magnitudes[4 * x]
+                    out[place + np.uint64(bins[4 * x + 1])] += magnitudes[4 * x + 1]
+                    out[place + np.uint64(bins[4 * x + 2])] += magnitudes[4 * x + 2]
+                    out[place + np.uint64(bins[4 * x + 3])] += magnitudes[4 * x + 3]
+            else:
+                for x in range(columns):
+                    place = np.uint64(16 * x)
+                    out[place + np.uint64(bins[2 * x])] += magnitudes[2 * x]
+                    out[place + np.uint64(bins[2 * x + 1])] += magnitudes[2 * x + 1]
 
 
 @jit
-def pool_bilinear(sums, scale, cells):
-    """Pool squares into cells of 2x2 squares by bilinear interpolation, with replicated borders.
+def _tent_taps(start, step, squares, taps, index, weights):
+    """Weights of the squares around each cell, along one axis, by bilinear interpolation.
 
-    `sums` is ``(16, 2 * rows, 2 * columns)`` float32 or larger, `cells` the output ``(16, rows, columns)``.
-    The weights along each axis, 1, 3, 3, 1 times `scale`, are those of bilinear interpolation at the squares'
-    centers.
+    `start` and `step` are the first cell's corner and the size of a cell, in squares. A square's weight is
+    the integral of a tent over it, whose base is two cells wide and whose area is 1. Squares beyond -1 and
+    `squares` are replicas of these. `index` and `weights` are the outputs, ``(cells, >= taps)``; indices
+    count from the square -1.
     """
-    count, rows, columns = cells.shape
-    line = np.empty(2 * columns, np.float32)
-    three = np.float32(3)
-    for k in range(count):
-        for y in range(rows):
-            a = sums[k, max(2 * y - 1, 0)]
-            b, c = sums[k, 2 * y], sums[k, 2 * y + 1]
-            d = sums[k, min(2 * y + 2, 2 * rows - 1)]
-            for x in range(2 * columns):
-                line[x] = (a[x] + d[x]) + three * (b[x] + c[x])
+    for cell in range(len(index)):
+        center = start + (cell + 0.5) * step
+        low = math.floor(center - step)
+        before = 0.0
+        for tap in range(taps):
+            # Integral of the tent up to the square's end.
+            end = min(max((low + tap + 1 - center) / step, -1.0), 1.0)
+            area = 0.5 * (1 + end) * (1 + end) if end < 0 else 1 - 0.5 * (1 - end) * (1 - end)
+            index[cell, tap] = min(max(low + tap, -1), squares) + 1
+            weights[cell, tap] = np.float32(area - before)
+            before = area
+
+
+@jit
+def _resample(sums, square, first, squares, grid, cells):
+    """Interpolate the sums of squares at the cells of a grid.
+
+    `sums` and `square` are as in `orientation_sums`, with one column of squares beyond each side; `first` is
+    the first row, and `squares` the number of rows that the image has. `grid` is left, top, width and height
+    of the first cell in squares, and `cells` the output ``(16, rows, columns)``, in gray levels of the mean
+    gradient.
+    """
+    _, rows, columns = cells.shape
+    left, top, step_x, step_y = grid
+    # Two taps at a time along a row, at first four; those beyond the tent have no weight.
+    taps_x, taps_y = max(4, 2 * math.ceil((2 * step_x + 1) / 2)), math.ceil(2 * step_y) + 1
+    index_x, weights_x = np.empty((columns, taps_x), np.int64), np.empty((columns, taps_x), np.float32)
+    index_y, weights_y = np.empty((rows, taps_y), np.int64), np.empty((rows, taps_y), np.float32)
+    _tent_taps(left, step_x, sums.shape[1] - 2, taps_x, index_x, weights_x)
+    _tent_taps(top, step_y, squares, taps_y, index_y, weights_y)
+    low, high = index_x[0, 0], index_x[columns - 1, taps_x - 1] + 1
+    count = 16 * (high - low)
+    flat = sums.reshape(len(sums), -1)
+    line, row = np.empty(count, np.float32), np.empty((columns, 16), np.float32)
+    inner = line.reshape(-1, 16)
+    scale = np.float32(1 / (square * square))
+    for y in range(rows):
+        for tap in range(taps_y):
+            # Rows that were not computed are replaced by the closest one.
+            place = min(max(index_y[y, tap] - 1 - first, 0), len(sums) - 1)
+            source, weight = flat[place, 16 * low : 16 * high], weights_y[y, tap] * scale
+            if tap == 0:
+                for i in range(count):
+                    line[i] = weight * source[i]
+            elif weight != 0:
+                for i in range(count):
+                    line[i] += weight * source[i]
+        for x in range(columns):
+            a, b = index_x[x, 0] - low, index_x[x, 1] - low
+            c, d = index_x[x, 2] - low, index_x[x, 3] - low
+            wa, wb, wc, wd = weights_x[x, 0], weights_x[x, 1], weights_x[x, 2], weights_x[x, 3]
+            for k in range(16):
+                pair = wa * inner[a, k] + wb * inner[b, k]
+                row[x, k] = pair + (wc * inner[c, k] + wd * inner[d, k])
+            for tap in range(4, taps_x, 2):
+                a, b = index_x[x, tap] - low, index_x[x, tap + 1] - low
+                wa, wb = weights_x[x, tap], weights_x[x, tap + 1]
+                for k in range(16):
+                    row[x, k] += wa * inner[a, k] + wb * inner[b, k]
+        for k in range(16):
             out = cells[k, y]
             for x in range(columns):
-                ends = line[max(2 * x - 1, 0)] + line[min(2 * x + 2, 2 * columns - 1)]
-                out[x] = (ends + three * (line[2 * x] + line[2 * x + 1])) * scale
+                out[x] = row[x, k]
 
 
 @jit
-def smooth_cells(sums, scale, cells):
-    """Smooth cells of one square, ``(16, rows, columns)`` float32, with replicated borders.
-
-    The weights along each axis, 1, 6, 1 times `scale`, are the average weights of bilinear interpolation of a
-    cell's pixels between the cell and its neighbors.
-    """
-    count, rows, columns = cells.shape
-    line = np.empty(columns + 2, np.float32)
-    six = np.float32(6)
-    for k in range(count):
-        for y in range(rows):
-            above, middle, below = sums[k, max(y - 1, 0)], sums[k, y], sums[k, min(y + 1, rows - 1)]
-            inner = line[1 : columns + 1]
-            for x in range(columns):
-                inner[x] = (above[x] + below[x]) + six * middle[x]
-            line[0], line[columns + 1] = line[1], line[columns]
-            left, right, out = line[:columns], line[2:], cells[k, y]
-            for x in range(columns):
-                out[x] = ((left[x] + right[x]) + six * inner[x]) * scale
-
-
-@jit
-def fhog_normalize(cells, eps, channels):
-    """Normalize each cell by the four blocks of 2x2 cells that contain it, and clip at 0.2.
-
-    `cells` is ``(16, rows, columns)`` float32, `eps` is added to the energy of a block, and `channels` is the
-    output ``(28, rows, columns)``: sums over the normalizations for each of 16 signed and 8 unsigned
-    orientations, and sums over the orientations for each of the four normalizations. Felzenszwalb et al.,
-    "Object detection with discriminatively trained part-based models" (PAMI 2010), section 6.2.
-    """
+def _block_factors(cells, eps, factors):
+    """Write the normalization of each block of 2x2 cells, ``1 / sqrt(energy + eps)``."""
     rows, columns = cells.shape[1:]
-    energy = np.zeros((rows + 2, columns + 2), np.float32)
-    blocks = np.empty((2, columns + 1), np.float32)
-    texture = np.empty((4, columns), np.float32)
-    clip, half, texture_scale = np.float32(0.2), np.float32(0.5), np.float32(0.2357)
-    zero, one = np.float32(0), np.float32(1)
-    for k in range(8):
-        for y in range(rows):
-            out = energy[y + 1, 1 : columns + 1]
+    energy = np.empty((2, columns), np.float32)
+    one = np.float32(1)
+    for y in range(rows):
+        line, above = energy[y % 2], energy[(y + 1) % 2]
+        for x in range(columns):
+            line[x] = np.float32(0)
+        for k in range(8):
             positive, negative = cells[k, y], cells[k + 8, y]
             for x in range(columns):
                 both = positive[x] + negative[x]
-                out[x] += both * both
-    # Replicate the border. Loops, because slice assignments take seconds to compile.
-    for x in range(1, columns + 1):
-        energy[0, x] = energy[1, x]
-        energy[rows + 1, x] = energy[rows, x]
-    for y in range(rows + 2):
-        energy[y, 0] = energy[y, 1]
-        energy[y, columns + 1] = energy[y, columns]
-    for y in range(rows):
-        for side in range(2):
-            upper, lower = energy[y + side], energy[y + side + 1]
-            out = blocks[side]
-            for x in range(columns + 1):
-                out[x] = one / np.sqrt(upper[x] + upper[x + 1] + lower[x] + lower[x + 1] + eps)
-        n0, n1 = blocks[0, :columns], blocks[0, 1:]
-        n2, n3 = blocks[1, :columns], blocks[1, 1:]
-        t0, t1, t2, t3 = texture[0], texture[1], texture[2], texture[3]
+                line[x] += both * both
+        if y:
+            out = factors[y - 1]
+            for x in range(columns - 1):
+                out[x] = one / np.sqrt(above[x] + above[x + 1] + line[x] + line[x + 1] + eps)
+
+
+@jit
+def _normalize_row(cells, factors, y, channels):
+    """Normalize the cells of row `y` by the four blocks of 2x2 cells that contain each, and clip at 0.2.
+
+    `cells` ``(16, rows, columns)`` and `factors` ``(rows - 1, columns - 1)`` include one cell more on each
+    side than `channels`, the output ``(20, columns - 2)``: sums over the normalizations for each of 16
+    orientations, and sums over the orientations for each of the four normalizations. Felzenszwalb et al.,
+    "Object detection with discriminatively trained part-based models" (PAMI 2010), section 6.2.
+    """
+    columns = channels.shape[1]
+    clip, half, texture_scale = np.float32(0.2), np.float32(0.5), np.float32(0.2357)
+    n0, n1 = factors[y, :columns], factors[y, 1:]
+    n2, n3 = factors[y + 1, :columns], factors[y + 1, 1:]
+    t0, t1, t2, t3 = channels[16], channels[17], channels[18], channels[19]
+    for x in range(columns):
+        t0[x] = t1[x] = t2[x] = t3[x] = np.float32(0)
+    for k in range(16):
+        line, out = cells[k, y + 1, 1:], channels[k]
         for x in range(columns):
-            t0[x] = t1[x] = t2[x] = t3[x] = zero
-        for k in range(16):
-            line, out = cells[k, y], channels[k, y]
-            for x in range(columns):
-                value = line[x]
-                q0, q1 = min(value * n0[x], clip), min(value * n1[x], clip)
-                q2, q3 = min(value * n2[x], clip), min(value * n3[x], clip)
-                t0[x] += q0
-                t1[x] += q1
-                t2[x] += q2
-                t3[x] += q3
-                out[x] = half * ((q0 + q1) + (q2 + q3))
-        for k in range(8):
-            positive, negative, out = cells[k, y], cells[k + 8, y], channels[16 + k, y]
-            for x in range(columns):
-                value = positive[x] + negative[x]
-                q0, q1 = min(value * n0[x], clip), min(value * n1[x], clip)
-                q2, q3 = min(value * n2[x], clip), min(value * n3[x], clip)
-                out[x] = half * ((q0 + q1) + (q2 + q3))
-        for k in range(4):
-            line, out = texture[k], channels[24 + k, y]
-            for x in range(columns):
-                out[x] = texture_scale * line[x]
+            value = line[x]
+            q0, q1 = min(value * n0[x], clip), min(value * n1[x], clip)
+            q2, q3 = min(value * n2[x], clip), min(value * n3[x], clip)
+            t0[x] += q0
+            t1[x] += q1
+            t2[x] += q2
+            t3[x] += q3
+            out[x] = half * ((q0 + q1) + (q2 + q3))
+    for k in range(16, 20):
+        out = channels[k]
+        for x in range(columns):
+            out[x] *= texture_scale
+
+
+@jit
+def fhog_channels(sums, first, squares, grids, eps, channels):
+    """FHOG channels at the cells of several grids, ``(grids, 20, rows, columns)`` float32.
+
+    `grids` is ``(grids, 4)`` float64: left, top, width and height of each grid's first cell in squares.
+    `sums`, `first` and `squares` are as in `_resample`; `eps` is added to the energy of a block.
+    """
+    count, _, rows, columns = channels.shape
+    cells = np.empty((16, rows + 2, columns + 2), np.float32)
+    factors = np.empty((rows + 1, columns + 1), np.float32)
+    for number in range(count):
+        left, top, step_x, step_y = grids[number]
+        _resample(sums, SQUARE, first, squares, (left - step_x, top - step_y, step_x, step_y), cells)
+        _block_factors(cells, eps, factors)
+        for y in range(rows):
+            _normalize_row(cells, factors, y, channels[number, :, y])
+
+
+@jit
+def small_fhog_channels(planes, cotangents, grids, eps, channels):
+    """FHOG channels at the cells of several grids of small cells, from sums over small squares around each.
+
+    `planes` is ``(3, H, W)`` uint8, and `grids` as in `fhog_channels`, but in pixels.
+    """
+    count, _, rows, columns = channels.shape
+    height, width = planes.shape[1:]
+    cells = np.empty((16, rows + 2, columns + 2), np.float32)
+    factors = np.empty((rows + 1, columns + 1), np.float32)
+    for number in range(count):
+        left, top, step_x, step_y = grids[number]
+        # Two cells and two squares around the grid; the image's own border is replicated.
+        low_x, high_x = math.floor(left - 2 * step_x) - 4, math.ceil(left + (columns + 2) * step_x) + 4
+        low_y, high_y = math.floor(top - 2 * step_y) - 4, math.ceil(top + (rows + 2) * step_y) + 4
+        low_x, low_y = min(max(low_x, 0), width - 1), min(max(low_y, 0), height - 1)
+        high_x, high_y = min(max(high_x, low_x + 1), width), min(max(high_y, low_y + 1), height)
+        down, across = (high_y - low_y + 1) // SMALL_SQUARE, (high_x - low_x + 1) // SMALL_SQUARE
+        sums = np.empty((down + 2, across + 2, 16), np.float32)
+        region = planes[:, low_y:high_y, low_x:high_x]
+        orientation_sums(region, cotangents, SMALL_SQUARE, -1, sums)
+        left, top = (left - low_x - step_x) / SMALL_SQUARE, (top - low_y - step_y) / SMALL_SQUARE
+        grid = left, top, step_x / SMALL_SQUARE, step_y / SMALL_SQUARE
+        _resample(sums, SMALL_SQUARE, -1, down, grid, cells)
+        _block_factors(cells, eps, factors)
+        for y in range(rows):
+            _normalize_row(cells, factors, y, channels[number, :, y])
+
+
+@jit
+def packed_channels(sums, first, squares, grid, eps, scales, per_word, cells, packed):
+    """FHOG channels at the cells of a grid as small integers, several in each word of 32 bits.
+
+    The value of channel `k` is multiplied by ``scales[k]``, rounded, and limited to 255. `packed` is the
+    output ``(20 / per_word, rows, columns)`` int32; the first channel is in the lowest bits. `cells` is
+    memory, ``(16, rows + 2, columns + 2)``; the other arguments are as in `fhog_channels`.
+    """
+    words, rows, columns = packed.shape
+    factors = np.empty((rows + 1, columns + 1), np.float32)
+    line = np.empty((20, columns), np.float32)
+    left, top, step_x, step_y = grid[0], grid[1], grid[2], grid[3]
+    _resample(sums, SQUARE, first, squares, (left - step_x, top - step_y, step_x, step_y), cells)
+    _block_factors(cells, eps, factors)
+    half, limit = np.float32(0.5), np.float32(255)
+    for y in range(rows):
+        _normalize_row(cells, factors, y, line)
+        for word in range(words):
+            out = packed[word, y]
+            if per_word == 4:
+                a, b, c, d = line[4 * word], line[4 * word + 1], line[4 * word + 2], line[4 * word + 3]
+                sa, sb, sc, sd = (
+                    scales[4 * word],
+                    scales[4 * word + 1],
+                    scales[4 * word + 2],
+                    scales[4 * word + 3],
+                )
+                for x in range(columns):
+                    low = numba.int32(min(a[x] * sa + half, limit)) | (
+                        numba.int32(min(b[x] * sb + half, limit)) << 8
+                    )
+                    high = numba.int32(min(c[x] * sc + half, limit)) | (
+                        numba.int32(min(d[x] * sd + half, limit)) << 8
+                    )
+                    out[x] = low | (high << 16)
+            else:
+                a, b = line[2 * word], line[2 * word + 1]
+                sa, sb = scales[2 * word], scales[2 * word + 1]
+                for x in range(columns):
+                    out[x] = numba.int32(min(a[x] * sa + half, limit)) | (
+                        numba.int32(min(b[x] * sb + half, limit)) << 16
+                    )
+
+
+@jit
+def cell_means(planes, grid, means):
+    """Mean values of an image in the cells of a grid, with replicated borders.
+
+    `planes` is ``(3, H, W)`` uint8, `grid` the left, top, width and height of the first cell in pixels, and
+    `means` the output ``(rows, columns, 3)`` float32. Cells are rounded to whole pixels.
+    """
+    height, width = planes.shape[1:]
+    rows, columns = means.shape[:2]
+    left, top, step_x, step_y = grid[0], grid[1], grid[2], grid[3]
+    for row in range(rows):
+        start_y = math.floor(top + row * step_y + 0.5)
+        stop_y = max(math.floor(top + (row + 1) * step_y + 0.5), start_y + 1)
+        for column in range(columns):
+            start_x = math.floor(left + column * step_x + 0.5)
+            stop_x = max(math.floor(left + (column + 1) * step_x + 0.5), start_x + 1)
+            for c in range(3):
+                total = 0
+                for y in range(start_y, stop_y):
+                    line = planes[c, min(max(y, 0), height - 1)]
+                    for x in range(start_x, stop_x):
+                        total += line[min(max(x, 0), width - 1)]
+                means[row, column, c] = total / ((stop_y - start_y) * (stop_x - start_x))

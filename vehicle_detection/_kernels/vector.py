@@ -7,12 +7,15 @@ products. Here a block of sums stays in registers over the whole depth of the pr
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+import numba
+import numpy as np
 from llvmlite import binding, ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
+from numpy.typing import NDArray
 
 
 class Block(NamedTuple):
@@ -34,12 +37,56 @@ def host_block() -> Block:
     AVX-512 has 32 registers of 16 floats, NEON 32 of 4, AVX 16 of 8 and SSE 16 of 4. A few of them hold the
     factors.
     """
-    features = binding.get_host_cpu_features()
+    features = _host_features()
     if features.get("avx512f"):
         return Block(16, 8, 3)
     if features.get("avx"):
-        return Block(8, 4, 3)
+        return Block(8, 4, 2)
     return Block(4, 8 if features.get("neon") else 4, 3)
+
+
+class PackedFormat(NamedTuple):
+    """Small integers in words of 32 bits: unsigned ones of up to 8 bits, and signed factors of 8 bits.
+
+    The type of the words tells the kernels the format: int32 holds four bytes, uint32 two half-words.
+    """
+
+    per_word: int
+
+    @property
+    def dtype(self) -> type[np.int32] | type[np.uint32]:
+        """Type of the words."""
+        return np.int32 if self.per_word == 4 else np.uint32
+
+    def pack(self, values: NDArray[np.integer]) -> NDArray[Any]:
+        """Pack the last axis, of a multiple of `per_word` values; the first one is in the lowest bits."""
+        bits = 32 // self.per_word
+        groups = values.astype(np.int64).reshape(*values.shape[:-1], -1, self.per_word) & (2**bits - 1)
+        words = (groups << (bits * np.arange(self.per_word))).sum(axis=-1)
+        return np.asarray(words.astype(np.uint32).view(self.dtype))
+
+
+BYTES, HALF_WORDS = PackedFormat(4), PackedFormat(2)
+
+
+def host_packing() -> PackedFormat:
+    """Choose the format for this processor: bytes where it multiplies them (VNNI), else half-words."""
+    return BYTES if _vnni_lanes() else HALF_WORDS
+
+
+def _host_features() -> Mapping[str, bool]:
+    """Features of the processor that numba compiles for."""
+    if numba.config.CPU_NAME or numba.config.CPU_FEATURES:
+        return {}  # another processor than the host
+    return binding.get_host_cpu_features()  # type: ignore[no-any-return]
+
+
+def _vnni_lanes() -> int:
+    """Words of a vector of which the processor multiplies four bytes each and adds the products; 0: none."""
+    features = _host_features()
+    if features.get("avx512vnni") and features.get("avx512f"):
+        return 16
+    return 8 if features.get("avxvnni") else 0
 
 
 def block_adder(block: Block) -> Callable[..., None]:
@@ -47,12 +94,11 @@ def block_adder(block: Block) -> Callable[..., None]:
 
     For each row `r` of the block it adds ``weights[index, :, r] @ channels[:, first : first + columns]`` to
     ``sums[position + offsets[index, r] :]``. `weights` is ``(blocks, depth, rows)``, `channels`
-    ``(depth, N)``, `sums` 1-D, all float32, and `offsets` ``(blocks, rows)`` intp; all are C-contiguous.
-    Nothing is checked.
+    ``(depth, N)``, `sums` 1-D, and `offsets` ``(blocks, rows)`` intp; all are C-contiguous. Numbers are
+    float32, or words of a `PackedFormat` with sums of int32. Nothing is checked.
     """
     lanes, rows, vectors = block
-    float_type, int_type = ir.FloatType(), ir.IntType(32)
-    vector = ir.VectorType(float_type, lanes)
+    int_type = ir.IntType(32)
 
     @intrinsic
     def add_products(
@@ -66,12 +112,15 @@ def block_adder(block: Block) -> Callable[..., None]:
         position: Any,
     ) -> Any:
         signature = types.void(weights, types.intp, channels, types.intp, sums, offsets, types.intp)
+        products = _PRODUCTS[channels.dtype]
 
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
             left, right, out, shifts = (
                 context.make_array(signature.args[number])(context, builder, arguments[number])
                 for number in (0, 2, 4, 5)
             )
+            element = ir.FloatType() if channels.dtype == types.float32 else int_type
+            vector = ir.VectorType(element, lanes)
 
             def constant(value: int) -> Any:
                 return context.get_constant(types.intp, value)
@@ -94,9 +143,6 @@ def block_adder(block: Block) -> Callable[..., None]:
             def vector_offsets(offset: Any) -> list[Any]:
                 return [builder.add(offset, constant(4 * lanes * part)) for part in range(vectors)]
 
-            multiply_add = cgutils.get_or_insert_function(
-                builder.module, ir.FunctionType(vector, [vector] * 3), f"llvm.fmuladd.v{lanes}f32"
-            )
             index_type = context.get_value_type(types.intp)
             depth = cgutils.unpack_tuple(builder, left.shape)[1]
             block_bytes = cgutils.unpack_tuple(builder, left.strides)[0]
@@ -113,9 +159,9 @@ def block_adder(block: Block) -> Callable[..., None]:
             values = [load(right, offset, vector) for offset in vector_offsets(channel)]
             updated = []
             for row, line in enumerate(totals):
-                factor = broadcast(load(left, builder.add(weight, constant(4 * row)), float_type))
+                factor = broadcast(load(left, builder.add(weight, constant(4 * row)), element))
                 updated.append(
-                    [builder.call(multiply_add, [factor, value, total]) for value, total in zip(values, line)]
+                    [products(builder, total, value, factor) for value, total in zip(values, line)]
                 )
             for counter, origin, step in (
                 (count, constant(0), constant(1)),
@@ -126,22 +172,74 @@ def block_adder(block: Block) -> Callable[..., None]:
                 counter.add_incoming(builder.add(counter, step), loop)
             for line, updated_line in zip(totals, updated):
                 for total, new_total in zip(line, updated_line):
-                    total.add_incoming(ir.Constant(vector, [0.0] * lanes), start)
+                    total.add_incoming(ir.Constant(vector, [0] * lanes), start)
                     total.add_incoming(new_total, loop)
             unfinished = builder.icmp_signed("<", builder.add(count, constant(1)), depth)
             builder.cbranch(unfinished, loop, done)
             builder.position_at_end(done)
             index_bytes = context.get_abi_sizeof(index_type)
             block_offset = builder.mul(arguments[1], constant(rows * index_bytes))
+            add = builder.fadd if channels.dtype == types.float32 else builder.add
             for row, line in enumerate(updated):
                 shift = load(shifts, builder.add(block_offset, constant(row * index_bytes)), index_type)
                 origin = builder.mul(builder.add(arguments[6], shift), constant(4))
                 for offset, total in zip(vector_offsets(origin), line):
                     known = load(out, offset, vector)
-                    stored = builder.store(builder.fadd(known, total), address(out, offset, vector))
+                    stored = builder.store(add(known, total), address(out, offset, vector))
                     stored.align = 4
             return context.get_dummy_value()
 
         return signature, generate
 
     return add_products  # type: ignore[no-any-return]
+
+
+def _add_floats(builder: Any, total: Any, value: Any, factor: Any) -> Any:
+    """``total + value * factor``."""
+    lanes = total.type.count
+    kind = ir.FunctionType(total.type, [total.type] * 3)
+    function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.fmuladd.v{lanes}f32")
+    return builder.call(function, [factor, value, total])
+
+
+def _add_bytes(builder: Any, total: Any, value: Any, factor: Any) -> Any:
+    """Add four products of an unsigned and a signed byte to each lane: the instruction ``vpdpbusd``."""
+    lanes = total.type.count
+    operand = ir.VectorType(ir.IntType(8), 4 * lanes) if binding.llvm_version_info[0] >= 22 else total.type
+    kind = ir.FunctionType(total.type, [total.type, operand, operand])
+    name = f"llvm.x86.avx512.vpdpbusd.{32 * lanes}"
+    function = cgutils.get_or_insert_function(builder.module, kind, name)
+    return builder.call(function, [total, builder.bitcast(value, operand), builder.bitcast(factor, operand)])
+
+
+def _add_half_words(builder: Any, total: Any, value: Any, factor: Any) -> Any:
+    """Add two products of half-words to each lane: the instruction ``pmaddwd`` where there is one."""
+    lanes = total.type.count
+    halves = ir.VectorType(ir.IntType(16), 2 * lanes)
+    value, factor = builder.bitcast(value, halves), builder.bitcast(factor, halves)
+    name = _multiply_add_name(lanes)
+    if name is not None:
+        kind = ir.FunctionType(total.type, [halves, halves])
+        function = cgutils.get_or_insert_function(builder.module, kind, name)
+        return builder.add(total, builder.call(function, [value, factor]))
+    for half in range(2):
+        chosen = ir.Constant(ir.VectorType(ir.IntType(32), lanes), list(range(half, 2 * lanes, 2)))
+        parts = (
+            builder.shuffle_vector(each, ir.Constant(halves, ir.Undefined), chosen)
+            for each in (value, factor)
+        )
+        total = builder.add(total, builder.mul(*(builder.sext(part, total.type) for part in parts)))
+    return total
+
+
+def _multiply_add_name(lanes: int) -> str | None:
+    """LLVM's name of ``pmaddwd`` for vectors of so many sums; None without it."""
+    features = _host_features()
+    if lanes == 16 and features.get("avx512bw"):
+        return "llvm.x86.avx512.pmaddw.d.512"
+    if lanes == 8 and features.get("avx2"):
+        return "llvm.x86.avx2.pmadd.wd"
+    return "llvm.x86.sse2.pmadd.wd" if lanes == 4 and features.get("sse2") else None
+
+
+_PRODUCTS = {types.float32: _add_floats, types.int32: _add_bytes, types.uint32: _add_half_words}

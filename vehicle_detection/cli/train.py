@@ -25,6 +25,9 @@ from vehicle_detection.cli.output import (
 if TYPE_CHECKING:
     from vehicle_detection.training import TrainingReport
 
+# Columns of the model card that a terminal has no room for.
+_HIDDEN_FOLD_COLUMNS = "best_f1", "strict_average_precision", "calibration_error"
+
 
 @option_names(random_state="--seed", patches_or_labels="--vehicles and --non-vehicles")
 def train(
@@ -180,9 +183,14 @@ def print_fold_scores(scores: Mapping[str, Mapping[str, Any]]) -> None:
     """Print a table of the values of `FoldScore`, with a row per set of frames."""
     from vehicle_detection.mixture_training import FOLD_COLUMNS, format_fold
 
-    titles = (title for title, _ in FOLD_COLUMNS.values())
-    rows = [(name, *format_fold(values)) for name, values in scores.items()]
-    print_table("on sources left out of training, IoU 0.5", ("frames", *titles), rows)
+    shown = [number for number, name in enumerate(FOLD_COLUMNS) if name not in _HIDDEN_FOLD_COLUMNS]
+    titles = [title for title, _ in FOLD_COLUMNS.values()]
+    rows = []
+    for name, values in scores.items():
+        cells = format_fold(values)
+        rows.append((name, *(cells[number] for number in shown)))
+    heads = ("frames", *(titles[number] for number in shown))
+    print_table("on sources left out of training, IoU 0.5", heads, rows)
 
 
 @option_names(random_state="--seed", sources="DATA")

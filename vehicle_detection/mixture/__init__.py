@@ -1,57 +1,68 @@
 """The mixture of templates: a model for any road, and its search."""
 
-from vehicle_detection.mixture.boxes import BoxRegressor, mostly_inside, nms, vote_boxes
+from vehicle_detection.mixture.boxes import mostly_inside, nms, vote_boxes
 from vehicle_detection.mixture.crops import (
     CROP_CELLS,
     N_COLOR_FEATURES,
     N_EDGE_FEATURES,
-    N_REGRESSION_FEATURES,
-    crop_channels,
-    regression_features,
+    edge_features,
     rescoring_features,
+    window_grid,
 )
 from vehicle_detection.mixture.denoise import denoise
 from vehicle_detection.mixture.features import (
-    COARSE,
-    FINE,
+    MIRROR_ORDER,
     N_CHANNELS,
+    CellGrid,
+    EdgePyramid,
     FeatureMap,
-    feature_maps,
-    image_pyramid,
     mirror_channels,
-    pyramid_levels,
 )
 from vehicle_detection.mixture.model import TemplateMixture, load_model
-from vehicle_detection.mixture.rescoring import Projection, Rescorer
-from vehicle_detection.mixture.search import MixtureSearch
+from vehicle_detection.mixture.rescoring import (
+    KERNEL,
+    N_INPUTS,
+    STRIDES,
+    Layer,
+    Rescorer,
+    flatten,
+    last_cells,
+    network_inputs,
+    unfold,
+)
+from vehicle_detection.mixture.search import MixtureSearch, frame_grid
 from vehicle_detection.mixture.template import MixtureTemplate, smallest_box
 
 __all__ = [
-    "COARSE",
     "CROP_CELLS",
-    "FINE",
+    "KERNEL",
+    "MIRROR_ORDER",
     "N_CHANNELS",
     "N_COLOR_FEATURES",
     "N_EDGE_FEATURES",
-    "N_REGRESSION_FEATURES",
-    "BoxRegressor",
+    "N_INPUTS",
+    "STRIDES",
+    "CellGrid",
+    "EdgePyramid",
     "FeatureMap",
+    "Layer",
     "MixtureSearch",
     "MixtureTemplate",
-    "Projection",
     "Rescorer",
     "TemplateMixture",
-    "crop_channels",
     "denoise",
-    "feature_maps",
-    "image_pyramid",
+    "edge_features",
+    "flatten",
+    "frame_grid",
+    "last_cells",
     "load_model",
     "mirror_channels",
     "mostly_inside",
+    "network_inputs",
     "nms",
-    "pyramid_levels",
-    "regression_features",
     "rescoring_features",
     "smallest_box",
+    "unfold",
     "vote_boxes",
+    "window_grid",
 ]

@@ -1,18 +1,16 @@
-"""Windows of several templates to boxes: voting, non-maximum suppression and box regression."""
+"""Windows of several templates to boxes: voting and non-maximum suppression."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_integer, finite_array
-from vehicle_detection.boxes import box_areas, clip_boxes, greedy_nms, iter_nms
-from vehicle_detection.mixture.crops import N_REGRESSION_FEATURES, regression_features
+from vehicle_detection._kernels import suppress, vote
+from vehicle_detection.boxes import box_areas, clip_boxes
 
 MIN_MARGIN = -1.0
 """Minimum margin of a window that takes part in the voting."""
@@ -20,15 +18,12 @@ MIN_MARGIN = -1.0
 # A window votes for a box at an IoU above the first; of two boxes on one vehicle, the weaker one is removed
 # at an IoU above the second or if more than the third of the smaller one is covered.
 _VOTE_IOU, _NMS_IOU, _NMS_COVER = 0.5, 0.35, 0.75
-# IoU above which two regressed boxes are duplicates.
-_DUPLICATE_IOU = 0.7
+# IoU above which two proposed boxes are duplicates.
+DUPLICATE_IOU = 0.7
 # A window's vote is its margin above this one.
 _VOTE_MARGIN = -1.1
 _MAX_VEHICLES = 60
 _MIN_VISIBLE_FRACTION = 0.35
-# Largest shift of an edge per regression step, as a fraction of the box's side; a box is regressed again if
-# one of its edges moved by more than the second.
-_MAX_SHIFT, _SETTLED_SHIFT = 0.3, 0.15
 
 Floats = NDArray[np.float64]
 
@@ -82,22 +77,12 @@ def vote_boxes(
     `windows` are sorted, best first; those below `min_margin` vote but are not kept. Also returns the vote
     mass of each kept window: the sum of the voters' margins above `_VOTE_MARGIN`.
     """
-    order = np.flatnonzero(windows.margins >= min_margin)
-    boxes: list[Floats] = []
-    kept: list[int] = []
-    vote_mass: list[float] = []
     strengths = np.maximum(windows.margins - _VOTE_MARGIN, 0)
-    weights = strengths**2
-    for best, iou in islice(iter_nms(windows.boxes, order, max_iou=_VOTE_IOU), max_boxes):
-        voters = iou > _VOTE_IOU
-        vote_mass.append(float(strengths @ voters))
-        votes = weights * voters
-        votes[best] = max(votes[best], 1e-9)
-        boxes.append(votes @ windows.boxes / votes.sum())
-        kept.append(best)
-    rows = np.array(kept, np.intp)
-    groups = ScoredWindows(np.array(boxes).reshape(-1, 4), windows.margins[rows], windows.templates[rows])
-    return groups, np.array(vote_mass)
+    order = np.flatnonzero(windows.margins >= min_margin)
+    kept = suppress(windows.boxes, order, _VOTE_IOU, np.inf, max_boxes)
+    boxes, vote_mass = np.empty((len(kept), 4)), np.empty(len(kept))
+    vote(windows.boxes, strengths, kept, _VOTE_IOU, boxes, vote_mass)
+    return ScoredWindows(boxes, windows.margins[kept], windows.templates[kept]), vote_mass
 
 
 def nms(
@@ -113,52 +98,5 @@ def nms(
     A box is removed by a better one at an IoU above `iou`, or if more than `cover` of the smaller one is
     covered.
     """
-    return greedy_nms(boxes, scores, max_iou=iou, max_coverage=cover, max_boxes=max_boxes)
-
-
-@dataclass(frozen=True, eq=False)
-class BoxRegressor:
-    """A linear regression of the shifts of a box's edges from the features of its crop.
-
-    `weights` ``(length, 4)`` and `bias` ``(4,)`` float32 give shifts as fractions of the box's sides, from
-    `regression_features`. The regression runs `n_iterations` times; from the second time on only for boxes
-    whose last shift was large, because the crop of a misplaced box shows too little of its vehicle.
-    """
-
-    weights: NDArray[np.float32]
-    bias: NDArray[np.float32]
-    n_iterations: int = 1
-
-    def __post_init__(self) -> None:
-        check_integer(self.n_iterations, "n_iterations", low=1, high=10)
-        weights = finite_array(self.weights, "box_regressor.weights", (N_REGRESSION_FEATURES, 4))
-        object.__setattr__(self, "weights", weights)
-        object.__setattr__(self, "bias", finite_array(self.bias, "box_regressor.bias", (4,)))
-
-    @classmethod
-    def none(cls) -> BoxRegressor:
-        """Return a regressor that shifts nothing."""
-        return cls(np.zeros((N_REGRESSION_FEATURES, 4), np.float32), np.zeros(4, np.float32))
-
-    def shifts(self, image: NDArray[np.uint8], boxes: Floats) -> Floats:
-        """Shifts of the edges of each box, ``(N, 4)``, as fractions of the box's sides."""
-        if not len(boxes):
-            return np.empty((0, 4))
-        shifts = regression_features(image, boxes) @ self.weights + self.bias
-        return np.clip(shifts.astype(np.float64), -_MAX_SHIFT, _MAX_SHIFT)
-
-    def apply(self, image: NDArray[np.uint8], windows: ScoredWindows) -> tuple[Floats, Floats]:
-        """Correct boxes, clip them to the image, and remove near duplicates of better ones."""
-        boxes, margins = windows.boxes.copy(), windows.margins
-        moving = np.ones(len(boxes), np.bool_)
-        for _ in range(self.n_iterations):
-            # Shifts of at most 0.3 from both sides leave at least two fifths of a side.
-            sides = np.tile(boxes[moving, 2:] - boxes[moving, :2], 2)
-            shifts = self.shifts(image, boxes[moving])
-            boxes[moving] += shifts * sides
-            moving[moving] = np.abs(shifts).max(axis=1, initial=0) > _SETTLED_SHIFT
-            inside = clip_boxes(boxes, image.shape)
-            rows = nms(inside, margins, iou=_DUPLICATE_IOU, cover=np.inf)
-            rows = rows[box_areas(inside[rows]) > 0]
-            boxes, margins, moving = boxes[rows], margins[rows], moving[rows]
-        return np.asarray(clip_boxes(boxes, image.shape), np.float64), margins
+    order = np.argsort(-scores, kind="stable")
+    return np.asarray(suppress(boxes, order, iou, cover, len(boxes) if max_boxes is None else max_boxes))

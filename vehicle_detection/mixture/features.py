@@ -1,35 +1,35 @@
-"""FHOG channels of an image pyramid: the features of each cell of a frame.
+"""FHOG channels of the cells of a frame, at any position and size, from one edge pyramid.
 
-A cell has 28 channels: 16 signed and 8 unsigned gradient orientations, each normalized by the contrast around
-the cell, and 4 texture sums. The gradients are those of the square roots of the pixel values, which gives
-dark regions more weight. Felzenszwalb et al., "Object detection with discriminatively trained part-based
-models" (PAMI 2010), section 6, with 8 unsigned orientations instead of 9.
+The gradients of a frame are summed over small squares once per octave. A cell of any size is interpolated
+from these sums: one pass over the pixels serves all window sizes and all crops.
+
+A cell has 20 channels: 16 signed gradient orientations, each normalized by the contrast around the cell, and
+4 texture sums. The gradients are those of the square roots of the pixel values, which gives dark regions more
+weight. Felzenszwalb et al., "Object detection with discriminatively trained part-based models" (PAMI 2010),
+section 6, without unsigned orientations, which are nearly sums of signed ones; Dollár et al., "Fast feature
+pyramids for object detection" (PAMI 2014), for features between the octaves.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import NEW_ARRAYS, Workspace
+from vehicle_detection._common import NEW_ARRAYS, ThreadTeam, Workspace
+from vehicle_detection._kernels import PackedFormat
 from vehicle_detection._kernels import fhog as _fhog_kernels
 
-N_CHANNELS = 28
+SQUARE = _fhog_kernels.SQUARE
+
+N_CHANNELS = 20
 """FHOG channels of a cell."""
 
-COARSE, FINE = 8, 4
-"""Side of a cell in pixels of the resized frame. Fine cells avoid enlarging the frame for small vehicles."""
-
-BORDER, WIDE_BORDER = 24, 48
-"""Replicated pixels around a resized frame. The wide border is for levels of coarse cells only: vehicles of
-that size are near, and often truncated by the frame's border."""
-
-MIRROR_ORDER = np.concatenate([(8 - np.arange(16)) % 16, 16 + (8 - np.arange(8)) % 8, [25, 24, 27, 26]])
+MIRROR_ORDER = np.concatenate([(8 - np.arange(16)) % 16, [17, 16, 19, 18]])
 """Channel of the mirrored image that corresponds to each channel."""
 
 _BIN_BOUNDS = np.deg2rad(np.arange(11.25, 180, 22.5))
@@ -37,133 +37,189 @@ _COTANGENTS = (np.cos(_BIN_BOUNDS) / np.sin(_BIN_BOUNDS)).astype(np.float32)
 # Added to the energy of a block, in squared gray levels of the mean gradient. Noise of one gray level on a
 # medium gray surface has about this energy, and must not be normalized to full contrast.
 _EPS = np.float32(2)
+# Smallest cell of every octave but the first, in pixels of the resized frame: cells have 1.5 to 3 squares a
+# side. And the shortest side of a resized frame.
+_MIN_CELL, _MIN_SIDE = 6.0, 16
+# Largest values of an orientation and of a texture sum: four and sixteen terms of 0.2, weighted.
+# Rows of squares that one thread computes at a time.
+_PART_ROWS = 24
+_LARGEST = np.where(np.arange(N_CHANNELS) < 16, 0.4, 0.2357 * 16 * 0.2)
 
+CHANNEL_SCALES = (255 / _LARGEST).astype(np.float32)
+"""Factor of each channel that maps its range to 0 to 255."""
 
-def orientation_sums(image: NDArray[np.uint8], workspace: Workspace = NEW_ARRAYS) -> NDArray[np.float32]:
-    """Gradient magnitudes by signed orientation, summed over 4x4 pixels; ``(16, H // 4, W // 4)``."""
-    height, width = image.shape[:2]
-    channels = workspace.take((3, height, width), np.uint8, "channels")
-    cv2.split(image, list(channels))
-    sums = workspace.take((16, height // FINE, width // FINE), np.float32, "sums")
-    _fhog_kernels.orientation_sums(channels, _COTANGENTS, sums)
-    return sums
-
-
-def channels_from_sums(
-    sums: NDArray[np.float32], cell: int, workspace: Workspace = NEW_ARRAYS
-) -> NDArray[np.float32]:
-    """FHOG channels of `FINE` or `COARSE` cells from `orientation_sums`; ``(28, H // cell, W // cell)``."""
-    per_cell = cell // FINE
-    shape = sums.shape[1] // per_cell, sums.shape[2] // per_cell
-    cells = workspace.take((16, *shape), np.float32, "cells")
-    if per_cell == 1:
-        _fhog_kernels.smooth_cells(sums, np.float32(1 / (64 * cell * cell)), cells)
-    else:
-        _fhog_kernels.pool_bilinear(sums, np.float32(1 / (16 * cell * cell)), cells)
-    channels = workspace.take((N_CHANNELS, *shape), np.float32, "fhog")
-    _fhog_kernels.fhog_normalize(cells, _EPS, channels)
-    return channels
-
-
-def fhog_channels(
-    image: NDArray[np.uint8], cell: int, workspace: Workspace = NEW_ARRAYS
-) -> NDArray[np.float32]:
-    """FHOG channels of an image of at least one cell, ``(28, H // cell, W // cell)`` float32."""
-    return channels_from_sums(orientation_sums(image, workspace), cell, workspace)
+Rows = tuple[int, int]
+"""Half-open range of rows of a frame."""
 
 
 def mirror_channels(channels: NDArray[np.float32]) -> NDArray[np.float32]:
-    """FHOG channels ``(28, rows, columns)`` of the mirrored image."""
+    """FHOG channels ``(20, rows, columns)`` of the mirrored image."""
     return np.ascontiguousarray(channels[MIRROR_ORDER, :, ::-1])
+
+
+@dataclass(frozen=True)
+class CellGrid:
+    """A grid of cells in pixels of the frame; `left` and `top` are its corner, negative beyond the border."""
+
+    left: float
+    top: float
+    step_x: float  # width and height of a cell
+    step_y: float
+    rows: int
+    columns: int
 
 
 @dataclass(frozen=True, eq=False)
 class FeatureMap:
-    """FHOG channels of a frame at one cell size, with their position in pixels of the frame."""
+    """FHOG channels of a grid of cells, ``(20, rows, columns)``."""
 
-    channels: NDArray[np.float32]  # (28, rows, columns)
-    left: float  # position of the first cell's corner, negative beyond the frame's border
-    top: float
-    step_x: float  # width and height of a cell
-    step_y: float
+    channels: NDArray[np.float32]
+    grid: CellGrid
 
 
-def image_pyramid(image: NDArray[np.uint8], min_side: int = 64) -> list[NDArray[np.uint8]]:
-    """Halve an image repeatedly while its shorter side stays at least `min_side` pixels."""
-    images = [image]
-    while min(images[-1].shape[:2]) >= 2 * min_side:
-        height, width = images[-1].shape[:2]
-        smaller = cv2.resize(images[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-        images.append(np.asarray(smaller, np.uint8))
-    return images
+@dataclass(frozen=True, eq=False)
+class Octave:
+    """A frame at 1, 1/2, 1/4, ... of its size, with its sums of gradients by orientation."""
+
+    planes: NDArray[np.uint8]  # (3, H, W)
+    sums: NDArray[np.float32]  # (rows, columns, 16), of squares from row `first` and column -1 on
+    first: int
+
+    def split(self, rows: int) -> list[Octave]:
+        """Split the sums into parts of at most so many rows."""
+        starts = range(0, len(self.sums), rows)
+        return [Octave(self.planes, self.sums[start : start + rows], self.first + start) for start in starts]
+
+    def compute(self) -> None:
+        """Compute the sums, in place."""
+        _fhog_kernels.orientation_sums(self.planes, _COTANGENTS, SQUARE, self.first, self.sums)
 
 
-@dataclass(frozen=True)
-class PyramidLevel:
-    """One resized frame with fine cells, coarse cells or both; their sizes in pixels of the frame."""
+class EdgePyramid:
+    """Gradient sums of a frame in octaves, from which the channels of any cell follow.
 
-    fine: float | None
-    coarse: float | None
-
-    @property
-    def scale(self) -> float:
-        """Size of the resized frame relative to the frame."""
-        return FINE / self.fine if self.fine is not None else COARSE / (self.coarse or COARSE)
-
-    @property
-    def sizes(self) -> list[tuple[float, int]]:
-        """Size of each kind of cell, in pixels of the frame and of the resized frame."""
-        both = (self.fine, FINE), (self.coarse, COARSE)
-        return [(size, cell) for size, cell in both if size is not None]
-
-
-def pyramid_levels(sizes: list[float], *, share: bool = True) -> list[PyramidLevel]:
-    """Choose fine or coarse cells for each cell size; with `share`, a size and its double share a level."""
-    fine = [size for size in sizes if size < COARSE]
-    coarse = [size for size in sizes if size >= COARSE]
-    levels = []
-    for size in fine:
-        double = next((other for other in coarse if share and abs(other / size - 2) < 1e-6), None)
-        if double is not None:
-            coarse.remove(double)
-        levels.append(PyramidLevel(size, double))
-    return levels + [PyramidLevel(None, size) for size in coarse]
-
-
-def feature_maps(
-    images: list[NDArray[np.uint8]],
-    level: PyramidLevel,
-    rows: tuple[int, int],
-    workspace: Workspace = NEW_ARRAYS,
-) -> Iterator[tuple[float, FeatureMap]]:
-    """Yield each cell size of a level, in pixels of the frame, with the feature map of a range of rows.
-
-    `images` is the `image_pyramid` of the frame, `rows` a half-open range in the frame. With reused memory
-    (`workspace`), a map is valid until the next one.
+    Parameters
+    ----------
+    image
+        ``(H, W, 3)`` uint8 RGB.
+    row_ranges
+        For each octave, the rows of the frame whose sums are needed; None or beyond the end: all rows. Cells
+        elsewhere take the nearest known rows.
+    workspace, team
+        Memory and threads of a search; with that memory, a pyramid is valid until the next one.
     """
-    height, width = images[0].shape[:2]
-    octave = min(max(int(math.log2(1 / level.scale)), 0), len(images) - 1)
-    source = images[octave]
-    # The strip consists of whole rows of the source; `top` and `bottom` are its exact limits in the frame.
-    count = source.shape[0]
-    first = min(round(rows[0] * count / height), count - 1)
-    last = max(round(rows[1] * count / height), first + 1)
-    strip = source[first:last]
-    top, bottom = first * height / count, last * height / count
-    size = max(round(width * level.scale), COARSE), max(round((bottom - top) * level.scale), COARSE)
-    small = np.asarray(
-        cv2.resize(strip, size, dst=workspace.take((size[1], size[0], 3), np.uint8, "strip")), np.uint8
-    )
-    # Only the frame's own border is replicated: `rows` already includes the context of the windows.
-    border = BORDER if level.fine is not None else WIDE_BORDER
-    above, below = (border if at_border else 0 for at_border in (first == 0, last == count))
-    padding = (above, below + -(size[1] + above + below) % COARSE, border, border + -size[0] % COARSE)
-    shape = (size[1] + padding[0] + padding[1], size[0] + padding[2] + padding[3], 3)
-    memory = workspace.take(shape, np.uint8, "padded")
-    padded = np.asarray(cv2.copyMakeBorder(small, *padding, cv2.BORDER_REPLICATE, dst=memory), np.uint8)
-    sums = orientation_sums(padded, workspace)
-    pixel_x, pixel_y = width / size[0], (bottom - top) / size[1]
-    left, top = -border * pixel_x, top - above * pixel_y
-    for cell_size, cell in level.sizes:
-        channels = channels_from_sums(sums, cell, workspace)
-        yield cell_size, FeatureMap(channels, left, top, cell * pixel_x, cell * pixel_y)
+
+    def __init__(
+        self,
+        image: NDArray[np.uint8],
+        row_ranges: Sequence[Rows] = (),
+        workspace: Workspace = NEW_ARRAYS,
+        team: ThreadTeam | None = None,
+    ) -> None:
+        self.shape = image.shape[0], image.shape[1]
+        planes = workspace.take((3, *self.shape), np.uint8, "planes 0")
+        cv2.split(image, list(planes))
+        self.octaves: list[Octave] = []
+        parts: list[Octave] = []
+        for number in range(octave_count(self.shape)):
+            if number:
+                planes = _half_size(planes, workspace, f"planes {number}")
+            scale, squares = 2**number * SQUARE, -(-planes.shape[1] // SQUARE)
+            top, bottom = row_ranges[number] if number < len(row_ranges) else (0, self.shape[0])
+            # One row of squares beyond the image is the replica of its border.
+            first = min(max(math.floor(top / scale) - 1, -1), squares - 1)
+            last = max(min(math.ceil(bottom / scale) + 1, squares + 1), first + 1)
+            size = last - first, -(-planes.shape[2] // SQUARE) + 2, 16
+            octave = Octave(planes, workspace.take(size, np.float32, f"sums {number}"), first)
+            self.octaves.append(octave)
+            parts += octave.split(_PART_ROWS)
+        if team is None:
+            for part in parts:
+                part.compute()
+        else:
+            team.map(Octave.compute, parts, cost=lambda part: part.sums.size)
+
+    def octave_of(self, cell_size: float) -> int:
+        """Octave from which cells of a size in pixels of the frame are interpolated."""
+        return octave_of(cell_size, len(self.octaves))
+
+    def crops(self, grids: NDArray[np.float64], rows: int, columns: int) -> NDArray[np.float32]:
+        """FHOG channels of several grids of as many cells, ``(N, 20, rows, columns)``.
+
+        `grids` is ``(N, 4)``: left, top, width and height of each grid's first cell in pixels of the frame.
+        Small cells are computed from the pixels, in more detail than those of `feature_map`.
+        """
+        channels = np.empty((len(grids), N_CHANNELS, rows, columns), np.float32)
+        sizes = np.sqrt(grids[:, 2] * grids[:, 3])
+        numbers = np.array([octave_of(size, len(self.octaves)) for size in sizes.tolist()], np.intp)
+        numbers[sizes < _MIN_CELL] = -1
+        for number in np.unique(numbers).tolist():
+            chosen = numbers == number
+            found = np.empty((int(chosen.sum()), *channels.shape[1:]), np.float32)
+            if number < 0:
+                planes = self.octaves[0].planes
+                _fhog_kernels.small_fhog_channels(planes, _COTANGENTS, grids[chosen], _EPS, found)
+            else:
+                self._interpolate(number, grids[chosen], found)
+            channels[chosen] = found
+        return channels
+
+    def _interpolate(self, number: int, grids: NDArray[np.float64], channels: NDArray[np.float32]) -> None:
+        octave = self.octaves[number]
+        squares = -(-octave.planes.shape[1] // SQUARE)
+        scaled = grids / (SQUARE * 2**number)
+        _fhog_kernels.fhog_channels(octave.sums, octave.first, squares, scaled, _EPS, channels)
+
+    def feature_map(self, grid: CellGrid) -> FeatureMap:
+        """FHOG channels of one grid."""
+        corner = np.array([[grid.left, grid.top, grid.step_x, grid.step_y]])
+        channels = np.empty((1, N_CHANNELS, grid.rows, grid.columns), np.float32)
+        self._interpolate(self.octave_of(math.sqrt(grid.step_x * grid.step_y)), corner, channels)
+        return FeatureMap(channels[0], grid)
+
+    def packed_channels(
+        self, grid: CellGrid, packing: PackedFormat, workspace: Workspace = NEW_ARRAYS
+    ) -> NDArray[np.int32] | NDArray[np.uint32]:
+        """FHOG channels of a grid, times `CHANNEL_SCALES` and rounded, as words of several channels.
+
+        ``(words, rows, columns)``; the value of a word's first channel is in its lowest bits.
+        """
+        number = self.octave_of(math.sqrt(grid.step_x * grid.step_y))
+        octave, scale = self.octaves[number], SQUARE * 2**number
+        cells = workspace.take((16, grid.rows + 2, grid.columns + 2), np.float32, "cells")
+        shape = N_CHANNELS // packing.per_word, grid.rows, grid.columns
+        packed = workspace.take(shape, packing.dtype, "packed")
+        _fhog_kernels.packed_channels(
+            octave.sums,
+            octave.first,
+            -(-octave.planes.shape[1] // SQUARE),
+            np.array([grid.left, grid.top, grid.step_x, grid.step_y]) / scale,
+            _EPS,
+            CHANNEL_SCALES,
+            packing.per_word,
+            cells,
+            packed,
+        )
+        return packed
+
+
+def octave_count(shape: tuple[int, ...]) -> int:
+    """Return the number of octaves of a frame of ``(height, width, ...)``."""
+    return max(math.floor(math.log2(min(shape[:2]) / _MIN_SIDE)), 0) + 1
+
+
+def octave_of(cell_size: float, count: int) -> int:
+    """Return the octave, of `count`, from which cells of a size in pixels of the frame are interpolated."""
+    return min(max(math.floor(math.log2(cell_size / _MIN_CELL)), 0), count - 1)
+
+
+def _half_size(planes: NDArray[np.uint8], workspace: Workspace, name: str) -> NDArray[np.uint8]:
+    """Average 2x2 pixels; an odd last row or column is replicated first."""
+    odd = planes.shape[1] % 2, planes.shape[2] % 2
+    if any(odd):
+        planes = np.pad(planes, ((0, 0), (0, odd[0]), (0, odd[1])), mode="edge")
+    height, width = planes.shape[1] // 2, planes.shape[2] // 2
+    half = workspace.take((3, height, width), np.uint8, name)
+    for plane, out in zip(planes, half):
+        cv2.resize(plane, (width, height), dst=out, interpolation=cv2.INTER_AREA)
+    return half

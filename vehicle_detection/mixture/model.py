@@ -2,8 +2,8 @@
 
 A car from behind, a car from the side and a bus do not fit one square window. Each template has its own shape
 and is a linear SVM over the same FHOG channels, so one pyramid of a frame serves them all. Their windows
-become boxes by voting, a linear box regression, rescoring and non-maximum suppression.
-Felzenszwalb et al. (PAMI 2010) for the mixture and the box regression; Ohn-Bar and Trivedi, "Learning to
+become boxes by voting, rescoring with box correction, and non-maximum suppression. Felzenszwalb et al. (PAMI
+2010) for the mixture; Ohn-Bar and Trivedi, "Learning to
 detect vehicles by clustering appearance patterns" (IEEE T-ITS 2015) for vehicles.
 """
 
@@ -18,10 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_number, check_type, read_model, write_model
+from vehicle_detection.boxes import box_areas, clip_boxes
 from vehicle_detection.classifier import KIND as PATCH_KIND
 from vehicle_detection.classifier import VehicleClassifier, build_classifier
 from vehicle_detection.errors import InvalidInputError, ModelFileError
-from vehicle_detection.mixture.boxes import BoxRegressor, ScoredWindows, nms, vote_boxes
+from vehicle_detection.mixture.boxes import DUPLICATE_IOU, ScoredWindows, nms, vote_boxes
+from vehicle_detection.mixture.features import EdgePyramid
 from vehicle_detection.mixture.rescoring import RESCORE_MIN, Rescorer
 from vehicle_detection.mixture.template import MixtureTemplate
 from vehicle_detection.params import PyramidParams
@@ -43,10 +45,9 @@ class TemplateMixture:
     ----------
     templates
         One or more `MixtureTemplate`.
-    box_regressor
-        Corrects the boxes that the windows vote for.
     rescorer
-        Second stage that rescores the corrected boxes; None: the templates alone decide.
+        Second stage that rescores and corrects the boxes that the windows vote for; None: the templates alone
+        decide.
     slope, offset
         Platt scaling: ``slope * margin + offset`` is the log-odds that a box contains a vehicle.
     threshold
@@ -75,7 +76,6 @@ class TemplateMixture:
     search_params_type: ClassVar[type[PyramidParams]] = PyramidParams
 
     templates: tuple[MixtureTemplate, ...]
-    box_regressor: BoxRegressor
     slope: float = 1.0
     offset: float = 0.0
     threshold: float = 0.0
@@ -90,7 +90,6 @@ class TemplateMixture:
             raise InvalidInputError("templates must hold at least one template; got none")
         for template in templates:
             check_type(template, "templates", MixtureTemplate, "train_mixture creates them")
-        check_type(self.box_regressor, "box_regressor", BoxRegressor, "train_mixture creates one")
         if self.rescorer is not None:
             check_type(self.rescorer, "rescorer", Rescorer, "pass None, or train with train_mixture")
         check_number(self.slope, "slope", above=0, high=1e9)
@@ -134,7 +133,7 @@ class TemplateMixture:
         }
         if self.rescorer is not None:
             facts["rescoring"] = (
-                f"{len(self.rescorer.weights):,} support vectors, blend weight {self.rescorer.blend_weight:g}"
+                f"network of {self.rescorer.n_weights:,} weights, blend weight {self.rescorer.blend_weight:g}"
             )
         return f"{len(self.templates)} templates, threshold {self.threshold:.2f} (log-odds)", facts
 
@@ -147,37 +146,37 @@ class TemplateMixture:
         return (score + self.threshold - self.offset) / self.slope
 
     def detect_vehicles(
-        self, image: NDArray[np.uint8], windows: ScoredWindows, *, min_margin: float
+        self, pyramid: EdgePyramid, windows: ScoredWindows, *, min_margin: float
     ) -> tuple[Floats, Floats]:
         """Boxes and margins of the vehicles that the windows of a frame propose, best first."""
         # Rescoring may raise a margin, so keep every box above RESCORE_MIN until it has run.
         proposal_min = min_margin if self.rescorer is None else RESCORE_MIN
-        boxes, margins = self.propose_boxes(image, windows, min_margin=proposal_min)
+        boxes, margins = self.propose_boxes(pyramid, windows, min_margin=proposal_min)
         if self.rescorer is not None:
-            margins = self.rescorer.apply(image, boxes, margins)
+            boxes, margins = self.rescorer.apply(pyramid, boxes, margins)
         rows = nms(boxes, margins)
-        rows = rows[margins[rows] >= min_margin]
+        rows = rows[(margins[rows] >= min_margin) & (box_areas(boxes[rows]) > 0)]
         return boxes[rows], margins[rows]
 
     def propose_boxes(
-        self, image: NDArray[np.uint8], windows: ScoredWindows, *, min_margin: float
+        self, pyramid: EdgePyramid, windows: ScoredWindows, *, min_margin: float
     ) -> tuple[Floats, Floats]:
-        """Corrected boxes and their margins before rescoring; several may cover one vehicle."""
+        """Boxes inside the frame and their margins before rescoring; several may cover one vehicle."""
         # Upper bounds: the size prior adds at most log2(4) = 2 units, the votes at most 2.
         min_window = min_margin - 2 * self.size_prior_weight - 2 * self.vote_weight
         grouped, vote_mass = vote_boxes(windows, min_margin=min_window)
         margins = grouped.margins + self.vote_weight * np.minimum(np.log1p(vote_mass) - 2, 2)
-        # One regression step makes a box at most 1.6 times as high: 0.68 octaves.
-        slack = 0.68 * self.box_regressor.n_iterations * self.size_prior_weight
-        upper_bound = margins + self._size_prior(grouped.boxes, image) + slack
-        grouped = replace(grouped, margins=margins)[upper_bound >= min_margin]
-        boxes, margins = self.box_regressor.apply(image, grouped)
-        margins = margins + self._size_prior(boxes, image)
-        kept = margins >= min_margin
-        return boxes[kept], margins[kept]
+        boxes = clip_boxes(grouped.boxes, pyramid.shape)
+        margins = margins + self._size_prior(boxes, pyramid)
+        kept = np.flatnonzero((margins >= min_margin) & (box_areas(boxes) > 0))
+        boxes, margins = boxes[kept], margins[kept]
+        rows = nms(boxes, margins, iou=DUPLICATE_IOU, cover=np.inf)
+        return boxes[rows], margins[rows]
 
-    def _size_prior(self, boxes: Floats, image: NDArray[np.uint8]) -> Floats:
-        return np.asarray(self.size_prior_weight * np.log2(4 * (boxes[:, 3] - boxes[:, 1]) / image.shape[0]))
+    def _size_prior(self, boxes: Floats, pyramid: EdgePyramid) -> Floats:
+        return np.asarray(
+            self.size_prior_weight * np.log2(4 * (boxes[:, 3] - boxes[:, 1]) / pyramid.shape[0])
+        )
 
     def with_metadata(self, metadata: Mapping[str, Any]) -> TemplateMixture:
         """Return the same model with other metadata."""
@@ -185,10 +184,7 @@ class TemplateMixture:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the model as a safetensors file: tensors and JSON, no executable content."""
-        tensors: dict[str, NDArray[Any]] = {
-            "box_regressor.weights": self.box_regressor.weights,
-            "box_regressor.bias": self.box_regressor.bias,
-        }
+        tensors: dict[str, NDArray[Any]] = {}
         for index, template in enumerate(self.templates):
             tensors[f"{index}.weights"] = template.weights
         params: dict[str, Any] = {
@@ -200,7 +196,6 @@ class TemplateMixture:
             "threshold": self.threshold,
             "size_prior_weight": self.size_prior_weight,
             "vote_weight": self.vote_weight,
-            "n_iterations": self.box_regressor.n_iterations,
         }
         if self.rescorer is not None:
             tensors |= self.rescorer.tensors()
@@ -234,6 +229,10 @@ def load_model(path: str | os.PathLike[str] = "default") -> TemplateMixture | Ve
     if data.kind != KIND:
         raise ModelFileError(f"{data.name} holds a model of the unknown kind {data.kind!r}; train one")
     params, tensors = data.params, data.tensors
+    if "box_regressor.weights" in tensors:
+        raise ModelFileError(
+            f"{data.name} is a mixture for features of an earlier version; train it again with train_mixture"
+        )
     try:
         rows = zip(params["biases"], params["paddings"], params["borders"], strict=True)
         templates = tuple(
@@ -242,12 +241,9 @@ def load_model(path: str | os.PathLike[str] = "default") -> TemplateMixture | Ve
             )
             for index, (bias, padding, border) in enumerate(rows)
         )
-        regressor = BoxRegressor(
-            tensors["box_regressor.weights"], tensors["box_regressor.bias"], params["n_iterations"]
-        )
         names = "slope", "offset", "threshold", "size_prior_weight", "vote_weight"
         numbers = {name: float(params[name]) for name in names}
         rescorer = Rescorer.build(tensors, params["rescorer"]) if "rescorer" in params else None
-        return TemplateMixture(templates, regressor, **numbers, rescorer=rescorer, metadata=data.metadata)
+        return TemplateMixture(templates, **numbers, rescorer=rescorer, metadata=data.metadata)
     except (InvalidInputError, KeyError, IndexError, TypeError, ValueError) as error:
         raise ModelFileError(f"{data.name} does not fit its own parameters: {error}") from error

@@ -1,4 +1,4 @@
-"""Rescoring: a second-stage RBF SVM on the boxes that the templates propose."""
+"""Rescoring: a second stage that scores and corrects the boxes that the templates propose."""
 
 from __future__ import annotations
 
@@ -9,123 +9,170 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_number, describe, finite_array
-from vehicle_detection._kernels import matmul
+from vehicle_detection._common import check_number, finite_array
+from vehicle_detection._kernels import DenseLayer
+from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture.crops import N_COLOR_FEATURES, N_EDGE_FEATURES, rescoring_features
+from vehicle_detection.mixture.crops import CROP_CELLS, rescoring_features
+from vehicle_detection.mixture.features import N_CHANNELS, EdgePyramid
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 
-RESCORE_MIN = -0.8
+RESCORE_MIN = -1.0
 """Minimum margin of a proposed box that is rescored."""
+
+N_INPUTS = N_CHANNELS + 3
+"""Channels of a crop: edges and colors."""
+
+KERNEL, STRIDES = 3, (1, 2, 1)
+"""Side of the convolutions in cells, and the step of each."""
+
+MAX_CORRECTION = 0.4
+"""Largest shift of an edge, as a fraction of the box's side."""
+
+LAYERS = ("convolution 1", "convolution 2", "convolution 3", "hidden", "output")
+"""Layers of the network."""
+
+# Range of edge channels to about -0.5 to 1.5, and of colors to about -1 to 1; log-odds are limited.
+_EDGE_SCALE, _EDGE_OFFSET, _COLOR_SCALE, _MAX_LOG_ODDS = 5, -0.5, 0.5, 6
 
 
 @dataclass(frozen=True, eq=False)
-class Projection:
-    """Scaled principal components; arrays are rounded to half precision, as in the model file."""
+class Layer:
+    """Weights ``(outputs, inputs)`` and biases ``(outputs,)`` of a layer.
 
-    mean: NDArray[np.float32]  # (length,)
-    axes: NDArray[np.float32]  # (count, length)
-    _columns: NDArray[np.float32] = field(init=False, repr=False)
+    The inputs of a convolution are the channels of its 3x3 cells, cell by cell.
+    """
 
-    def __post_init__(self) -> None:
-        mean = _half_precision(self.mean, "rescorer.mean", (None,))
-        axes = _half_precision(self.axes, "rescorer.axes", (None, len(mean)))
-        columns = np.ascontiguousarray(axes.T)
-        for name, array in ("mean", mean), ("axes", axes), ("_columns", columns):
-            object.__setattr__(self, name, array)
-
-    def __call__(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Project features, ``(N, length)`` to ``(N, count)``."""
-        return matmul(rows - self.mean, self._columns)
+    weights: Singles
+    bias: Singles
 
 
 @dataclass(frozen=True, eq=False)
 class Rescorer:
-    """An RBF SVM on the projected edge and color features of boxes.
+    """A small convolutional network on the edges and colors of a box's cells.
 
-    `vectors` and `weights` are rounded to half precision. The kernel is ``exp(-gamma * distance**2)``.
+    Three convolutions of 3x3 cells and a hidden layer, with rectified outputs, give the log-odds of a vehicle
+    and the shifts of the box's four edges: LeCun et al., "Gradient-based learning applied to document
+    recognition" (Proc. IEEE 1998); Girshick, "Fast R-CNN" (ICCV 2015), for the two outputs.
+
+    Attributes
+    ----------
+    layers
+        The five `LAYERS`.
+    blend_weight
+        Factor of the log-odds in the final margin: margin of the templates plus weighted log-odds.
     """
 
-    edges: Projection  # of the two kinds of `rescoring_features`
-    colors: Projection
-    vectors: NDArray[np.float32]  # (n, count): support vectors, projected edges first
-    weights: NDArray[np.float32]  # (n,): dual coefficients with the sign of the class
-    bias: float
-    gamma: float
-    blend_weight: float  # weight of the rescorer in the final margin; that of the templates is the rest to 1
-    _columns: NDArray[np.float32] = field(init=False, repr=False)
-    _squares: NDArray[np.float32] = field(init=False, repr=False)
+    layers: tuple[Layer, ...]
+    blend_weight: float
+    _products: tuple[DenseLayer, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        lengths = (self.edges, "edges", N_EDGE_FEATURES), (self.colors, "colors", N_COLOR_FEATURES)
-        for projection, name, length in lengths:
-            if len(projection.mean) != length:
-                raise InvalidInputError(
-                    f"rescorer.{name} must take {length} values, got {len(projection.mean)}; train again"
-                )
-        count = len(self.edges.axes) + len(self.colors.axes)
-        vectors = _half_precision(self.vectors, "rescorer.vectors", (None, count))
-        weights = _half_precision(self.weights, "rescorer.weights", (len(vectors),))
-        check_number(self.bias, "rescorer.bias")
-        check_number(self.gamma, "rescorer.gamma", above=0, high=1e6)
+        if len(self.layers) != len(LAYERS):
+            raise InvalidInputError(f"layers must be {len(LAYERS)}, got {len(self.layers)}; train again")
+        layers = []
+        inputs = KERNEL**2 * N_INPUTS
+        for number, (name, layer) in enumerate(zip(LAYERS, self.layers)):
+            outputs = len(np.atleast_1d(layer.bias))
+            weights = finite_array(layer.weights, f"rescorer.{name}", (outputs, inputs))
+            bias = finite_array(layer.bias, f"rescorer.{name} bias", (outputs,))
+            layers.append(Layer(weights, bias))
+            inputs = outputs * (KERNEL**2 if number < 2 else last_cells() if number == 2 else 1)
+        if len(layers[-1].bias) != 5:
+            raise InvalidInputError(
+                f"rescorer.{LAYERS[-1]} must have 5 outputs, got {len(layers[-1].bias)}; train again"
+            )
         check_number(self.blend_weight, "rescorer.blend_weight", above=0, high=1)
-        object.__setattr__(self, "vectors", vectors)
-        object.__setattr__(self, "weights", weights)
-        object.__setattr__(self, "_columns", np.ascontiguousarray(vectors.T))
-        object.__setattr__(self, "_squares", (vectors**2).sum(axis=1))
+        object.__setattr__(self, "layers", tuple(layers))
+        object.__setattr__(self, "_products", tuple(DenseLayer(layer.weights) for layer in layers))
 
-    def project(self, edges: NDArray[np.float32], colors: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Project `rescoring_features` to the space of the support vectors, ``(N, count)``."""
-        return np.hstack([self.edges(edges), self.colors(colors)])
+    @property
+    def n_weights(self) -> int:
+        """Number of trained numbers."""
+        return sum(layer.weights.size + layer.bias.size for layer in self.layers)
 
-    def decision_function(self, points: NDArray[np.float32]) -> Floats:
-        """SVM decision values of projected features: at least about 1 for vehicles, at most -1 for others."""
-        distances = (points**2).sum(axis=1)[:, None] + self._squares - 2 * matmul(points, self._columns)
-        kernels = np.exp(-np.float32(self.gamma) * distances) * self.weights
-        return np.asarray(kernels.sum(axis=1, dtype=np.float64) + self.bias)
+    def predict(self, inputs: Singles) -> tuple[Floats, Floats]:
+        """Log-odds ``(N,)`` and shifts of the edges ``(N, 4)``, as fractions of a box's sides, of crops.
 
-    def apply(self, image: NDArray[np.uint8], boxes: Floats, margins: Floats) -> Floats:
-        """Weighted mean of the margins that the templates gave and the decision values of the boxes."""
+        `inputs` are `network_inputs`.
+        """
+        values = inputs
+        for number, (layer, product) in enumerate(zip(self.layers, self._products)):
+            columns = values
+            if number < len(STRIDES):
+                columns, shape = unfold(values, STRIDES[number])
+            values = product(columns) + layer.bias[:, None]
+            if number + 1 < len(LAYERS):
+                np.maximum(values, 0, out=values)
+            if number < len(STRIDES):
+                values = values.reshape(len(layer.bias), *shape)
+            if number + 1 == len(STRIDES):
+                values = flatten(values)
+        outputs = values.T.astype(np.float64)
+        return outputs[:, 0], np.clip(outputs[:, 1:], -MAX_CORRECTION, MAX_CORRECTION)
+
+    def apply(self, pyramid: EdgePyramid, boxes: Floats, margins: Floats) -> tuple[Floats, Floats]:
+        """Corrected boxes, clipped to the frame, and their margins."""
         if not len(boxes):
-            return margins
-        decisions = self.decision_function(self.project(*rescoring_features(image, boxes)))
-        return np.asarray((1 - self.blend_weight) * margins + self.blend_weight * decisions, np.float64)
+            return boxes, margins
+        log_odds, shifts = self.predict(network_inputs(*rescoring_features(pyramid, boxes)))
+        limited = np.clip(log_odds, -_MAX_LOG_ODDS, _MAX_LOG_ODDS)
+        corrected = boxes + shifts * np.tile(boxes[:, 2:] - boxes[:, :2], 2)
+        return clip_boxes(corrected, pyramid.shape), np.asarray(margins + self.blend_weight * limited)
 
     def tensors(self) -> dict[str, NDArray[Any]]:
-        """Arrays for the model file by name, in half precision."""
-        arrays = {
-            "edges.mean": self.edges.mean,
-            "edges.axes": self.edges.axes,
-            "colors.mean": self.colors.mean,
-            "colors.axes": self.colors.axes,
-            "vectors": self.vectors,
-            "weights": self.weights,
-        }
-        return {f"rescorer.{name}": array.astype(np.float16) for name, array in arrays.items()}
+        """Arrays for the model file by name."""
+        arrays = {}
+        for name, layer in zip(LAYERS, self.layers):
+            arrays[f"rescorer.{name}.weights"], arrays[f"rescorer.{name}.bias"] = layer.weights, layer.bias
+        return arrays
 
     def numbers(self) -> dict[str, float]:
         """Numbers for the model file."""
-        return {"bias": self.bias, "gamma": self.gamma, "blend_weight": self.blend_weight}
+        return {"blend_weight": self.blend_weight}
 
     @classmethod
     def build(cls, tensors: Mapping[str, NDArray[Any]], numbers: Mapping[str, float]) -> Rescorer:
         """Rebuild a rescorer from its `tensors` and `numbers`."""
-        edges, colors = (
-            Projection(tensors[f"rescorer.{name}.mean"], tensors[f"rescorer.{name}.axes"])
-            for name in ("edges", "colors")
-        )
-        arrays = tensors["rescorer.vectors"], tensors["rescorer.weights"]
-        scalars = (float(numbers[name]) for name in ("bias", "gamma", "blend_weight"))
-        return cls(edges, colors, *arrays, *scalars)
+        layers = [
+            Layer(tensors[f"rescorer.{name}.weights"], tensors[f"rescorer.{name}.bias"]) for name in LAYERS
+        ]
+        return cls(tuple(layers), float(numbers["blend_weight"]))
 
 
-def _half_precision(values: object, name: str, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
-    """Check finite numbers and round them to half precision, as float32."""
-    array = finite_array(values, name, shape)
-    with np.errstate(over="ignore"):
-        rounded = array.astype(np.float16).astype(np.float32)
-    if not np.isfinite(rounded).all():
-        raise InvalidInputError(f"{name} must be numbers below 65,504, got {describe(values)}; train again")
-    rounded.setflags(write=False)
-    return rounded
+def network_inputs(edges: Singles, colors: Singles) -> Singles:
+    """Arrange `rescoring_features` as the network's inputs, ``(23, N, 12, 12)``."""
+    scaled = edges * np.float32(_EDGE_SCALE) + np.float32(_EDGE_OFFSET), colors * np.float32(_COLOR_SCALE)
+    inputs = np.hstack(scaled).reshape(len(edges), N_INPUTS, CROP_CELLS, CROP_CELLS)
+    return np.ascontiguousarray(inputs.swapaxes(0, 1))
+
+
+def unfold(values: Singles, stride: int) -> tuple[Singles, tuple[int, int, int]]:
+    """List the 3x3 cells around each output of a convolution, ``(9 * channels, outputs)``.
+
+    `values` is ``(channels, N, rows, columns)``; also returns the outputs' shape, ``(N, rows, columns)``.
+    """
+    channels, count, rows, columns = values.shape
+    high, wide = ((side - KERNEL) // stride + 1 for side in (rows, columns))
+    unfolded = np.empty((KERNEL, KERNEL, channels, count, high, wide), np.float32)
+    for i in range(KERNEL):
+        for j in range(KERNEL):
+            stop_y, stop_x = i + stride * (high - 1) + 1, j + stride * (wide - 1) + 1
+            unfolded[i, j] = values[:, :, i:stop_y:stride, j:stop_x:stride]
+    return unfolded.reshape(KERNEL**2 * channels, -1), (count, high, wide)
+
+
+def flatten(values: Singles) -> Singles:
+    """List the values of each crop, ``(channels * rows * columns, N)``."""
+    channels, count, rows, columns = values.shape
+    return np.ascontiguousarray(values.transpose(0, 2, 3, 1)).reshape(channels * rows * columns, count)
+
+
+def last_cells() -> int:
+    """Count the cells of a crop after the last convolution."""
+    side = CROP_CELLS
+    for stride in STRIDES:
+        side = (side - KERNEL) // stride + 1
+    return side**2

@@ -1,38 +1,64 @@
-"""The search of a frame with a mixture of templates, over one FHOG pyramid."""
+"""The search of a frame with a mixture of templates, over one edge pyramid."""
 
 from __future__ import annotations
+
+import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    Workspace,
-    check_type,
-    single_threaded_opencv,
-)
+from vehicle_detection._common import check_type, single_threaded_opencv
+from vehicle_detection._kernels import PackedFilters, PackedSearch
 from vehicle_detection.boxes import Detections
-from vehicle_detection.mixture.boxes import MIN_MARGIN, ScoredWindows
+from vehicle_detection.mixture.boxes import MIN_MARGIN, ScoredWindows, mostly_inside
 from vehicle_detection.mixture.denoise import denoise
 from vehicle_detection.mixture.features import (
-    COARSE,
-    FeatureMap,
-    PyramidLevel,
-    feature_maps,
-    image_pyramid,
-    pyramid_levels,
+    CHANNEL_SCALES,
+    MIRROR_ORDER,
+    CellGrid,
+    EdgePyramid,
+    Rows,
+    octave_count,
+    octave_of,
 )
 from vehicle_detection.mixture.model import TemplateMixture
 from vehicle_detection.mixture.template import MixtureTemplate, smallest_box
 from vehicle_detection.params import PyramidParams
 from vehicle_detection.search import FrameSearch
 
+# Cells that windows may extend beyond the frame, and cells around the windows of an octave whose gradients
+# are computed too, for crops.
+_BEYOND, _CONTEXT = 4, 4
 _MAX_WINDOWS = 2000
+_MAX_PLANS = 8
+
+
+INNER, RIGHT, LEFT = range(3)
+"""Where windows lie: anywhere, or at a border of the frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """The cells of one size, and the templates that search them: inside, at the right and the left border."""
+
+    grid: CellGrid
+    searches: list[tuple[int, list[int], PackedSearch]]  # where, indices of templates, search
+
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """What to search in frames of one shape, and the rows of the frame that each octave needs."""
+
+    levels: list[_Level]
+    row_ranges: list[Rows]
 
 
 class MixtureSearch(FrameSearch):
     """The search of frames with a mixture of templates.
 
-    Vehicles lie inside the frame; windows may extend beyond it. Sensor noise is removed first.
+    Vehicles lie inside the frame; windows may extend beyond it. Sensor noise is removed first. The weights
+    are rounded to 8 bits, and so are the channels: a margin differs by about 0.002 from the exact one.
     """
 
     params_type = PyramidParams
@@ -41,77 +67,180 @@ class MixtureSearch(FrameSearch):
         check_type(model, "model", TemplateMixture, 'load_model("default") or train_mixture return one')
         super().__init__(n_jobs)
         self.model = model
+        templates = model.templates
+        self._numbers = [
+            [index for index, each in enumerate(templates) if each.border == border]
+            for border in (False, True, True)
+        ]
+        scaled = [each.weights / CHANNEL_SCALES for each in templates]
+        # Windows at a border have one position in each row, so their cells become channels; the first ones
+        # are those at the border.
+        self._strip_cells = np.arange(
+            max((scaled[index].shape[1] for index in self._numbers[RIGHT]), default=0), dtype=np.intp
+        )
+        self._filters = [
+            PackedFilters([scaled[index] for index in self._numbers[INNER]]),
+            PackedFilters([self._strip_weights(scaled[index][:, ::-1]) for index in self._numbers[RIGHT]]),
+            PackedFilters(
+                [self._strip_weights(scaled[index][:, ::-1, MIRROR_ORDER]) for index in self._numbers[LEFT]]
+            ),
+        ]
+        # Of each place and template.
+        self._units = np.zeros((len(self._filters), len(templates)))
+        for units, numbers, filters in zip(self._units, self._numbers, self._filters):
+            units[numbers] = filters.units
+        self._plans: dict[tuple[tuple[int, int], PyramidParams], _Plan] = {}
+
+    def _strip_weights(self, weights: NDArray[np.float32]) -> NDArray[np.float32]:
+        missing = len(self._strip_cells) - weights.shape[1]
+        return np.pad(weights, ((0, 0), (0, missing), (0, 0))).reshape(1, len(weights), -1)
 
     def _search(
         self, frame: NDArray[np.uint8], params: PyramidParams, min_vehicle_score: float
     ) -> tuple[Detections, Detections]:
         model = self.model
         with single_threaded_opencv():
-            image = denoise(frame)
-            found = self.score_windows(image, params)
+            pyramid, found = self.score_windows(denoise(frame), params)
             boxes, margins = model.detect_vehicles(
-                image, found, min_margin=model.margin_of(min_vehicle_score)
+                pyramid, found, min_margin=model.margin_of(min_vehicle_score)
             )
         scores = model.scores(found.margins)
         shown = scores >= params.min_score
         return Detections(found.boxes[shown], scores[shown]), Detections(boxes, model.scores(margins))
 
-    def score_windows(self, image: NDArray[np.uint8], params: PyramidParams) -> ScoredWindows:
+    def score_windows(
+        self, image: NDArray[np.uint8], params: PyramidParams
+    ) -> tuple[EdgePyramid, ScoredWindows]:
         """Windows with their templates' margins, best first; weak ones are included because they vote.
 
-        Sensor noise is not removed here.
+        Sensor noise is not removed here. The pyramid is valid until the next search in the same thread.
         """
-        min_margin = np.float32(min(MIN_MARGIN, self.model.margin_of(params.min_score)))
-        shape = image.shape[:2]
-        sizes = params.sizes(*smallest_box(self.model.templates), shape)
-        levels = pyramid_levels(sizes, share=params.horizon is None)
+        min_margin = min(MIN_MARGIN, self.model.margin_of(params.min_score))
+        plan = self._plan((image.shape[0], image.shape[1]), params, min_margin)
         with single_threaded_opencv():
-            images = image_pyramid(image)
-            parts = self._team.map(
-                lambda level: self._search_level(images, level, params, min_margin),
-                levels,
-                cost=lambda level: level.scale,
+            pyramid = EdgePyramid(image, plan.row_ranges, self.workspace, self._team)
+            found = self._team.map(
+                lambda level: self._search_level(pyramid, level),
+                plan.levels,
+                cost=lambda level: level.grid.rows * level.grid.columns,
             )
-        return ScoredWindows.join(parts, shape).best(_MAX_WINDOWS)
+        windows = self._to_windows([level.grid for level in plan.levels], found, pyramid.shape)
+        return pyramid, windows.best(_MAX_WINDOWS)
 
-    def _search_level(
-        self,
-        images: list[NDArray[np.uint8]],
-        level: PyramidLevel,
-        params: PyramidParams,
-        min_margin: np.float32,
+    def _search_level(self, pyramid: EdgePyramid, level: _Level) -> NDArray[np.int32]:
+        """Windows on the cells of one size: place, template, row, column and score; ``(N, 5)``."""
+        grid, workspace = level.grid, self.workspace
+        packed = pyramid.packed_channels(grid, self._filters[INNER].packing, workspace)
+        found = [np.empty((0, 5), np.int32)]
+        for place, templates, search in level.searches:
+            cells = np.minimum(_BEYOND + self._strip_cells, grid.columns - 1)
+            columns = {INNER: cells[:0], LEFT: cells, RIGHT: grid.columns - 1 - cells}[place]
+            windows = search.find(packed, columns, workspace)
+            if place != INNER:
+                windows[:, 1] = windows[:, 2]
+            table = np.empty((len(windows), 5), np.int32)
+            table[:, 0], table[:, 1] = place, np.array(templates)[windows[:, 0]]
+            table[:, 2:] = windows[:, 1:]
+            found.append(table)
+        return np.concatenate(found)
+
+    def _to_windows(
+        self, grids: list[CellGrid], found: list[NDArray[np.int32]], shape: tuple[int, int]
     ) -> ScoredWindows:
-        """Windows of all templates on one resized frame."""
-        shape = images[0].shape[:2]
-        templates = {
-            size: [
-                (index, template)
-                for index, template in enumerate(self.model.templates)
+        """Boxes and margins of the windows of all sizes, without those mostly outside the frame."""
+        place, index, row, column, score = np.concatenate([np.empty((0, 5), np.int32), *found]).T
+        level = np.repeat(np.arange(len(found)), [len(each) for each in found])
+        corners = np.array([(grid.left, grid.top) for grid in grids]).reshape(-1, 2)[level]
+        steps = np.array([(grid.step_x, grid.step_y) for grid in grids]).reshape(-1, 2)[level]
+        templates = self.model.templates
+        sizes = np.array([each.box_cells for each in templates])[index] * steps
+        padding = np.array([each.padding for each in templates])[index]
+        start = corners + (np.column_stack([column, row]) + padding) * steps
+        start[place == LEFT, 0] = 0
+        at_right = place == RIGHT
+        start[at_right, 0] = shape[1] - sizes[at_right, 0]
+        margins = score * self._units[place, index] + np.array([each.bias for each in templates])[index]
+        boxes = np.hstack([start, start + sizes])
+        inside = mostly_inside(boxes, shape)
+        return ScoredWindows(boxes, margins, index.astype(np.intp))[np.flatnonzero(inside)]
+
+    def _plan(self, shape: tuple[int, int], params: PyramidParams, min_margin: float) -> _Plan:
+        plan = self._plans.get((shape, params))
+        if plan is None:
+            plan = self._make_plan(shape, params, min_margin)
+            while len(self._plans) >= _MAX_PLANS:
+                self._plans.pop(next(iter(self._plans)), None)
+            self._plans[shape, params] = plan
+        return plan
+
+    def _make_plan(self, shape: tuple[int, int], params: PyramidParams, min_margin: float) -> _Plan:
+        """Choose the templates and the rows of each cell size."""
+        templates = self.model.templates
+        levels = []
+        octaves: list[list[Rows]] = [[] for _ in range(octave_count(shape))]
+        for size in params.sizes(*smallest_box(templates), shape):
+            columns = frame_grid(size, shape).columns
+            used = [
+                index
+                for index, template in enumerate(templates)
                 if template.box_cells[0] * size >= params.min_width * 0.999
                 and template.box_cells[1] * size <= params.max_height * shape[0]
+                and template.weights.shape[1] <= columns - _BEYOND * template.border
             ]
-            for size, _ in level.sizes
-        }
-        ranges = [
-            _row_range(template, size, params, shape)
-            for size, used in templates.items()
-            for _, template in used
+            ranges = {index: _row_range(templates[index], size, params, shape) for index in used}
+            rows = (
+                min((top for top, _ in ranges.values()), default=0),
+                max((bottom for _, bottom in ranges.values()), default=0),
+            )
+            if rows[1] - rows[0] < size:
+                continue
+            grid = frame_grid(size, shape, rows)
+            searches = []
+            for place, (numbers, filters) in enumerate(zip(self._numbers, self._filters)):
+                chosen = [number for number, index in enumerate(numbers) if index in ranges]
+                indices = [numbers[number] for number in chosen]
+                spans = [_cell_rows(grid, ranges[index], shape) for index in indices]
+                if place != INNER:
+                    spans = [(0, 1)] * len(indices)
+                columns = grid.columns if place == INNER else grid.rows
+                bounds = [min_margin - templates[index].bias for index in indices]
+                search = filters.on_map(columns, chosen, spans, bounds)
+                if search is not None:
+                    searches.append((place, indices, search))
+            levels.append(_Level(grid, searches))
+            context = math.ceil(_CONTEXT * size)
+            octaves[octave_of(size, len(octaves))].append((rows[0] - context, rows[1] + context))
+        row_ranges = [
+            (max(min(top for top, _ in each), 0), min(max(bottom for _, bottom in each), shape[0]))
+            if each
+            else (0, shape[0])
+            for each in octaves
         ]
-        rows = min((top for top, _ in ranges), default=0), max((bottom for _, bottom in ranges), default=0)
-        if min(rows[1] - rows[0], shape[1]) * level.scale < COARSE:
-            return ScoredWindows.empty()
-        workspace = self.workspace
-        found = [
-            _score_template(index, template, feature_map, min_margin, shape[1], workspace)
-            for size, feature_map in feature_maps(images, level, rows, workspace)
-            for index, template in templates[size]
-        ]
-        return ScoredWindows.join(found, shape)
+        return _Plan(levels, row_ranges)
 
 
-def _row_range(
-    template: MixtureTemplate, size: float, params: PyramidParams, shape: tuple[int, ...]
-) -> tuple[int, int]:
+def frame_grid(size: float, shape: tuple[int, ...], rows: Rows | None = None) -> CellGrid:
+    """Cells of about a size in pixels on some rows of a frame, and beyond its borders.
+
+    The width of a cell is rounded so that whole cells lie between the left and the right border.
+    """
+    height, width = shape[:2]
+    top, bottom = (0, height) if rows is None else rows
+    inside = max(round(width / size), 1)
+    step_x = width / inside
+    above, below = (_BEYOND if at_border else 0 for at_border in (top == 0, bottom == height))
+    count = max(math.ceil((bottom - top) / size), 1) + above + below
+    return CellGrid(-_BEYOND * step_x, top - above * size, step_x, size, count, inside + 2 * _BEYOND)
+
+
+def _cell_rows(grid: CellGrid, rows: Rows, shape: tuple[int, ...]) -> Rows:
+    """Rows of a grid that cover a half-open range of rows of the frame, and those beyond its borders."""
+    first = 0 if rows[0] == 0 else math.floor((rows[0] - grid.top) / grid.step_y)
+    last = grid.rows if rows[1] == shape[0] else math.ceil((rows[1] - grid.top) / grid.step_y)
+    return first, min(last, grid.rows)
+
+
+def _row_range(template: MixtureTemplate, size: float, params: PyramidParams, shape: tuple[int, ...]) -> Rows:
     """Rows of the frame that a template with cells of `size` pixels covers, as a half-open range."""
     width, height = (cells * size for cells in template.box_cells)
     if template.border:
@@ -120,28 +249,3 @@ def _row_range(
     top, bottom = params.rows(width, height, shape)
     padding = round(template.padding[1] * size)
     return max(0, top - padding), min(shape[0], bottom + padding)
-
-
-def _score_template(
-    index: int,
-    template: MixtureTemplate,
-    feature_map: FeatureMap,
-    min_margin: np.float32,
-    width: int,
-    workspace: Workspace,
-) -> ScoredWindows:
-    """Windows of one template above `min_margin` on the feature map of a frame of `width` pixels."""
-    if template.border:
-        found = [
-            template.border_windows(
-                feature_map, x, left=left, min_margin=float(min_margin), workspace=workspace
-            )
-            for left, x in ((True, 0.0), (False, float(width)))
-        ]
-        boxes, margins = (np.concatenate(part) for part in zip(*found))
-    else:
-        grid = template.margins(feature_map.channels, workspace)
-        rows, columns = (grid > min_margin).nonzero()
-        boxes = template.boxes(feature_map, rows, columns)
-        margins = grid[rows, columns].astype(np.float64)
-    return ScoredWindows(boxes, margins, np.full(len(boxes), index, np.intp))

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import NEW_ARRAYS, Workspace, check_number, describe, finite_array
+from vehicle_detection._common import check_number, describe, finite_array
 from vehicle_detection._kernels import Filter
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture.features import N_CHANNELS, FeatureMap, mirror_channels
+from vehicle_detection.mixture.features import N_CHANNELS, CellGrid, FeatureMap, mirror_channels
 
 Floats = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ class MixtureTemplate:
     border, without padding there. Its mirror image is used at the left border.
     """
 
-    weights: NDArray[np.float32]  # (rows, columns, 28)
+    weights: NDArray[np.float32]  # (rows, columns, 20)
     bias: float
     padding: tuple[float, float]  # cells left and right of the vehicle's box, and above and below it
     border: bool = False
@@ -62,9 +62,7 @@ class MixtureTemplate:
     def _strip_filter(self) -> Filter:
         return Filter(self.weights.transpose(0, 2, 1).reshape(1, len(self.weights), -1))
 
-    def margins(
-        self, channels: NDArray[np.float32], workspace: Workspace = NEW_ARRAYS
-    ) -> NDArray[np.float32]:
+    def margins(self, channels: NDArray[np.float32]) -> NDArray[np.float32]:
         """Margin of every window of FHOG channels, ``(rows, columns)``; empty if no window fits."""
         rows, columns = self.weights.shape[:2]
         shape = max(channels.shape[1] - rows + 1, 0), max(channels.shape[2] - columns + 1, 0)
@@ -72,57 +70,39 @@ class MixtureTemplate:
         if margins.shape[1] == 1:
             # A strip as wide as the template: place its windows side by side, which vectorizes better.
             line = np.ascontiguousarray(channels.transpose(0, 2, 1)).reshape(-1, 1, channels.shape[1])
-            self._strip_filter.add_to(line, margins.reshape(1, -1), workspace)
+            self._strip_filter.add_to(line, margins.reshape(1, -1))
         elif margins.size:
-            self._filter.add_to(channels, margins, workspace)
+            self._filter.add_to(channels, margins)
         return margins
 
-    def boxes(self, feature_map: FeatureMap, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Floats:
+    def boxes(self, grid: CellGrid, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Floats:
         """Boxes, in pixels of the frame, of the windows that start at these cells; ``(N, 4)``."""
         width, height = self.box_cells
-        left = feature_map.left + (columns + self.padding[0]) * feature_map.step_x
-        top = feature_map.top + (rows + self.padding[1]) * feature_map.step_y
-        right, bottom = left + width * feature_map.step_x, top + height * feature_map.step_y
-        return np.stack([left, top, right, bottom], axis=1)
-
-    def border_windows(
-        self,
-        feature_map: FeatureMap,
-        border_x: float,
-        *,
-        left: bool,
-        min_margin: float,
-        workspace: Workspace = NEW_ARRAYS,
-    ) -> tuple[Floats, Floats]:
-        """Boxes and margins above `min_margin` of the windows at the left or right border of the frame."""
-        strip = self.border_strip(feature_map, border_x, left=left)
-        margins = self.margins(strip, workspace)[:, 0] if strip is not None else np.empty(0, np.float32)
-        rows = np.flatnonzero(margins > min_margin)
-        return self.border_boxes(feature_map, rows, border_x, left=left), margins[rows].astype(np.float64)
+        left = grid.left + (columns + self.padding[0]) * grid.step_x
+        top = grid.top + (rows + self.padding[1]) * grid.step_y
+        return np.stack([left, top, left + width * grid.step_x, top + height * grid.step_y], axis=1)
 
     def border_strip(
         self, feature_map: FeatureMap, border_x: float, *, left: bool
     ) -> NDArray[np.float32] | None:
-        """FHOG channels ``(28, rows, columns of the template)`` that end at a border in column `border_x`.
+        """FHOG channels ``(20, rows, columns of the template)`` that end at a border in column `border_x`.
 
         They are mirrored at the left border. None if the map has too few columns.
         """
-        columns = self.weights.shape[1]
-        first = round((border_x - feature_map.left) / feature_map.step_x) - (0 if left else columns)
+        columns, grid = self.weights.shape[1], feature_map.grid
+        first = round((border_x - grid.left) / grid.step_x) - (0 if left else columns)
         if first < 0 or first + columns > feature_map.channels.shape[2]:
             return None
         strip = feature_map.channels[:, :, first : first + columns]
         return mirror_channels(strip) if left else np.ascontiguousarray(strip)
 
-    def border_boxes(
-        self, feature_map: FeatureMap, rows: NDArray[np.intp], border_x: float, *, left: bool
-    ) -> Floats:
-        """Boxes, in pixels of the frame, of the windows of a `border_strip` that start in these rows."""
-        width = self.box_cells[0] * feature_map.step_x
-        top = feature_map.top + (rows + self.padding[1]) * feature_map.step_y
+    def border_boxes(self, grid: CellGrid, rows: NDArray[np.intp], border_x: float, *, left: bool) -> Floats:
+        """Boxes, in pixels of the frame, of the windows that start in these rows and end at a border."""
+        width = self.box_cells[0] * grid.step_x
+        top = grid.top + (rows + self.padding[1]) * grid.step_y
         boxes = np.empty((len(rows), 4))
         boxes[:, 0], boxes[:, 2] = (border_x, border_x + width) if left else (border_x - width, border_x)
-        boxes[:, 1], boxes[:, 3] = top, top + self.box_cells[1] * feature_map.step_y
+        boxes[:, 1], boxes[:, 3] = top, top + self.box_cells[1] * grid.step_y
         return boxes
 
 

@@ -22,6 +22,7 @@ from vehicle_detection.evaluation import (
     LabelledFrames,
     best_f1,
     calibrate_scores,
+    calibration_error,
     evaluate_detections,
     match_detections,
     precision_recall_curve,
@@ -35,12 +36,15 @@ Floats = NDArray[np.float64]
 
 _MIN_MARGIN = -1.0  # of an evaluated box
 _THRESHOLDS = np.arange(-1.0, 1.5, 0.02)  # to choose from
+# In F-beta, a false box counts twice as much as a missed vehicle.
+_BETA_SQUARED = 0.5
 
 FOLD_COLUMNS = {
     "f1": ("F1", 3), "best_f1": ("best F1", 3), "average_precision": ("AP", 3), "precision": ("precision", 3),
     "recall": ("recall", 3), "mean_iou": ("mean IoU", 3), "false_per_frame": ("false", 2),
     "false_per_empty_frame": ("on empty", 2), "region_f1": ("region F1", 3),
-    "region_average_precision": ("region AP", 3),
+    "region_average_precision": ("region AP", 3), "strict_average_precision": ("AP 0.7", 3),
+    "calibration_error": ("ECE", 3),
 }  # fmt: skip
 """Columns of a table of `FoldScore`: titles and decimals."""
 
@@ -68,6 +72,8 @@ class FoldScore:
     best_f1: float  # at the best threshold of this set
     region_f1: float
     region_average_precision: float
+    strict_average_precision: float  # region average precision at IoU 0.7
+    calibration_error: float  # of the probabilities fitted to the other sources
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON, rounded to four digits, without those that are NaN."""
@@ -99,8 +105,8 @@ class FoldDetections:
 
     @cached_property
     def matches(self) -> DetectionMatches:
-        """Predictions matched to labels at IoU 0.5."""
-        return match_detections(self.predictions, self.labels, self.frames.keys, 0.5)
+        """Predictions matched to labels at IoU 0.5; ignored boxes are regions."""
+        return match_detections(self.predictions, self.labels, self.frames.keys, 0.5, ignored_as_regions=True)
 
     @property
     def hits(self) -> tuple[Floats, NDArray[np.bool_]]:
@@ -125,9 +131,10 @@ def cross_validate_mixture(
 ) -> tuple[TemplateMixture, list[FoldScore], list[FoldDetections]]:
     """Train a mixture on all sources, calibrated and evaluated by leaving out one source at a time.
 
-    The threshold of the model has the best F1 over all left-out sources together, so every vehicle has the
-    same weight. The log-odds are fitted to the same detections (Platt, "Probabilistic outputs for support
-    vector machines", 1999).
+    The threshold of the model has the best F-beta over all left-out sources together, so every vehicle has
+    the same weight; a false box counts twice as much as a missed one, and ignored boxes are regions. The
+    log-odds are fitted to the same detections (Platt, "Probabilistic outputs for support vector machines",
+    1999).
 
     Parameters
     ----------
@@ -159,10 +166,10 @@ def cross_validate_mixture(
         folds += detect_in_source(mixture, left_out, n_jobs=n_jobs)
         if on_step:
             on_step(f"{left_out.name}: evaluated a model trained without this source")
-    scores = [
-        score_fold(fold, best_threshold([other for other in folds if other.source != fold.source]))
-        for fold in folds
-    ]
+    scores = []
+    for fold in folds:
+        others = [other for other in folds if other.source != fold.source]
+        scores.append(score_fold(fold, best_threshold(others), fit_log_odds(others)))
     mixture = train_mixture([*sources, *extra], params, on_step=on_step, **options)
     slope, offset = fit_log_odds(folds)
     threshold = slope * best_threshold(folds) + offset
@@ -183,13 +190,19 @@ def detect_in_source(
     return [FoldDetections(source.name, part, boxes) for part, boxes in zip(source.sets, found)]
 
 
-def score_fold(fold: FoldDetections, threshold: float) -> FoldScore:
-    """Score the detections of a fold at a threshold and over all thresholds."""
+def score_fold(
+    fold: FoldDetections, threshold: float, log_odds: tuple[float, float] = (1.0, 0.0)
+) -> FoldScore:
+    """Score a fold's detections at a threshold and over all, with slope and offset of their log-odds."""
+    slope, offset = log_odds
     labels, kept = fold.labels, fold.above(threshold)
     scores = evaluate_detections(kept, labels)
     region_scores = evaluate_detections(kept, labels, ignored_as_regions=True)
     every = evaluate_detections(fold.predictions, labels)
     every_region = evaluate_detections(fold.predictions, labels, ignored_as_regions=True)
+    strict = evaluate_detections(fold.predictions, labels, iou=0.7, ignored_as_regions=True)
+    margins, hits = fold.hits
+    probabilities = 1 / (1 + np.exp(-(slope * margins + offset).clip(-500, 500)))
     empty = [key for key in fold.frames.keys if not len(labels.rows(key))]
     false_on_empty = sum(len(kept.rows(key)) for key in empty)
     at_threshold = {name: getattr(scores, name) for name in ("f1", "precision", "recall", "mean_iou")}
@@ -206,16 +219,19 @@ def score_fold(fold: FoldDetections, threshold: float) -> FoldScore:
         best_f1=best_f1(*precision_recall_curve(fold.predictions, labels))[0],
         region_f1=region_scores.f1,
         region_average_precision=every_region.average_precision,
+        strict_average_precision=strict.average_precision,
+        calibration_error=calibration_error(probabilities, hits) if len(hits) else math.nan,
     )
 
 
 def best_threshold(folds: Sequence[FoldDetections]) -> float:
-    """Threshold with the best F1 over the vehicles of all folds together, each with the same weight."""
+    """Threshold with the best F-beta over the vehicles of all folds together, each with the same weight."""
     margins, hits = _joined_hits(folds)
     above = margins[:, None] >= _THRESHOLDS
     right, shown = above[hits].sum(axis=0), above.sum(axis=0)
     vehicles = sum(len(fold.matches.usable) for fold in folds)
-    return best_f1(right / np.maximum(shown, 1), right / max(vehicles, 1), _THRESHOLDS)[1]
+    scores = right / np.maximum(shown + _BETA_SQUARED * vehicles, 1e-9)
+    return float(_THRESHOLDS[int(np.argmax(scores))])
 
 
 def _joined_hits(folds: Sequence[FoldDetections]) -> tuple[Floats, NDArray[np.bool_]]:

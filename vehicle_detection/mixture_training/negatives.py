@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from vehicle_detection._common import single_threaded_opencv
 from vehicle_detection.boxes import box_areas, greedy_nms, intersection_matrix, iou_matrix
 from vehicle_detection.mixture import (
+    EdgePyramid,
     FeatureMap,
     MixtureTemplate,
-    feature_maps,
-    image_pyramid,
+    frame_grid,
     mirror_channels,
     mostly_inside,
-    pyramid_levels,
     smallest_box,
 )
 from vehicle_detection.mixture_training.sources import TrainingFrame
@@ -29,7 +28,7 @@ Floats = NDArray[np.float64]
 Choice = Callable[[NDArray[np.float32]], NDArray[np.intp]]
 """Chooses windows by their margins; returns indices."""
 Block = tuple[tuple[int, ...], NDArray[np.float32]]
-"""Position and features, ``(28, rows, columns)``, of a window."""
+"""Position and features, ``(20, rows, columns)``, of a window."""
 
 # Margin above which a window is a hard negative, and the most of them per pyramid level.
 _HARD_MARGIN, _MAX_PER_LEVEL = -0.9, 400
@@ -109,11 +108,9 @@ def _negatives(
     """Negatives of a frame among the windows that `choose` takes, for each view."""
     shape = frame.image.shape[:2]
     sizes = params.search.sizes(*smallest_box([view.template for view in views]), shape)
-    maps: list[FeatureMap] = []
     with single_threaded_opencv():
-        images = image_pyramid(frame.image)
-        for level in pyramid_levels(sizes):
-            maps += [features for _, features in feature_maps(images, level, (0, shape[0]))]
+        pyramid = EdgePyramid(frame.image)
+    maps = [pyramid.feature_map(frame_grid(size, shape)) for size in sizes]
     found = []
     for number, view in enumerate(views):
         blocks = _border_blocks if view.template.border else _inner_blocks
@@ -131,7 +128,7 @@ def _inner_blocks(
         grid = view.template.margins(features.channels)
         rows, columns = np.divmod(choose(grid.ravel()), max(grid.shape[1], 1))
         places += [(size, row, column) for row, column in zip(rows.tolist(), columns.tolist())]
-        boxes.append(view.template.boxes(features, rows, columns))
+        boxes.append(view.template.boxes(features.grid, rows, columns))
         margins.append(grid[rows, columns].astype(np.float64))
     height, width = view.template.weights.shape[:2]
     for chosen in _select(frame, np.concatenate(boxes), np.concatenate(margins), params.max_per_frame):
@@ -152,13 +149,16 @@ def _border_blocks(
         places, boxes, margins = [], [np.empty((0, 4))], [np.empty(0)]
         for size, features in enumerate(maps):
             strip = template.border_strip(features, end, left=left)
-            if strip is None or template.box_cells[0] * features.step_x <= 0.999 * params.search.min_width:
+            if (
+                strip is None
+                or template.box_cells[0] * features.grid.step_x <= 0.999 * params.search.min_width
+            ):
                 continue
             strips[size] = strip
             line = template.margins(strip).ravel()
             rows = choose(line)
             places += [(size, row) for row in rows.tolist()]
-            boxes.append(template.border_boxes(features, rows, end, left=left))
+            boxes.append(template.border_boxes(features.grid, rows, end, left=left))
             margins.append(line[rows].astype(np.float64))
         visible = truncate_labels(frame, end, left=left)
         max_count = max(1, params.max_per_frame // 5)

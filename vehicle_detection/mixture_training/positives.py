@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import relight
 from vehicle_detection.mixture import (
-    COARSE,
-    FINE,
-    BoxRegressor,
+    EdgePyramid,
     MixtureTemplate,
-    crop_channels,
     mirror_channels,
+    window_grid,
 )
 from vehicle_detection.mixture_training.sources import TrainingFrame
 from vehicle_detection.params import MixtureParams
@@ -22,25 +20,23 @@ from vehicle_detection.params import MixtureParams
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 Rows = NDArray[np.float32]
-VehicleSamples = Iterator[tuple[Image, Floats]]
-"""Images, each with the box of one vehicle."""
+VehicleSamples = Iterator[tuple[Image, Sequence[Floats]]]
+"""Images, each with boxes of vehicles."""
 
 _BORDER_DISTANCE = 3  # px; a box this close to a border counts as truncated by it
 _VISIBLE_RANGE = (0.3, 0.85)  # fraction of a vehicle that stays visible when it is truncated artificially
-_BOX_ON_PATCH = np.array([0.05, 0.14, 0.95, 0.89])  # typical box of a vehicle, as fractions of the sides
 _MAX_OUTSIDE = 0.3  # fraction of a cell outside the image from which on the cell counts as outside
 
 
-def window_features(image: Image, box: Floats, template: MixtureTemplate) -> NDArray[np.float32]:
-    """Features of the template's window around a box, ``(28, rows, columns)``."""
+def window_features(pyramid: EdgePyramid, box: Floats, template: MixtureTemplate) -> NDArray[np.float32]:
+    """Features of the template's window around a box, ``(20, rows, columns)``."""
     box_cells = template.box_cells
     rows, columns = template.weights.shape[:2]
-    step_x, step_y = (box[2] - box[0]) / box_cells[0], (box[3] - box[1]) / box_cells[1]
-    cell = FINE if np.sqrt(step_x * step_y) < COARSE else COARSE
     if template.border:
-        # The window ends with the box, so its padding is warped as a part of the box.
+        # The window ends with the box, so its padding is a part of the box.
+        step_x = (box[2] - box[0]) / box_cells[0]
         box, box_cells = box - [template.padding[0] * step_x, 0, 0, 0], (float(columns), box_cells[1])
-    return crop_channels(image, box.tolist(), box_cells, (columns, rows), cell)
+    return pyramid.feature_map(window_grid(box.tolist(), box_cells, (columns, rows))).channels
 
 
 def whole_vehicles(
@@ -49,13 +45,12 @@ def whole_vehicles(
     """Yield the vehicles at their boxes, at shifted boxes, and in relit frames."""
     for frame in frames:
         boxes = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.min_width]
-        for box in boxes:
-            for copy in range(params.copies):
-                yield frame.image, _shifted(box, copy, params, rng)
+        yield (
+            frame.image,
+            [_shifted(box, copy, params, rng) for box in boxes for copy in range(params.copies)],
+        )
         for _ in range(params.relit_copies if len(boxes) else 0):
-            image = relight(frame.image, rng)
-            for box in boxes:
-                yield image, box
+            yield relight(frame.image, rng), list(boxes)
 
 
 def truncated_vehicles(
@@ -68,13 +63,12 @@ def truncated_vehicles(
         for image, boxes in (frame.image, frame.boxes), (mirrored, mirror_boxes(frame.boxes, width)):
             for box in boxes[boxes[:, 2] - boxes[:, 0] >= params.min_width]:
                 if box[2] >= width - _BORDER_DISTANCE:
-                    for copy in range(params.border_copies):
-                        x1, y1, _, y2 = _shifted(box, copy, params, rng)
-                        yield image, np.array([x1, y1, width, y2])
+                    copies = [_shifted(box, copy, params, rng) for copy in range(params.border_copies)]
+                    yield image, [np.array([x1, y1, width, y2]) for x1, y1, _, y2 in copies]
                 end = round(box[0] + rng.uniform(*_VISIBLE_RANGE) * (box[2] - box[0]))
                 wide_enough = params.min_width <= end - box[0] and end < width - _BORDER_DISTANCE
                 if box[0] > _BORDER_DISTANCE and wide_enough:
-                    yield image[:, :end], np.array([*box[:2], end, box[3]])
+                    yield image[:, :end], [np.array([*box[:2], end, box[3]])]
 
 
 def _shifted(box: Floats, copy: int, params: MixtureParams, rng: np.random.Generator) -> Floats:
@@ -96,48 +90,23 @@ def vehicle_features(
 ) -> list[Rows]:
     """Features of the samples of each template, ``(N, length)``; whole vehicles are mirrored, too.
 
-    Cells outside the image take the features in `means`, ``(28, rows, columns)`` for each template.
+    Cells outside the image take the features in `means`, ``(20, rows, columns)`` for each template.
     """
     found: list[list[Rows]] = [[] for _ in templates]
-    for image, box in samples if templates else ():
-        for index in _matching_templates(box, templates, params.aspect_tolerance):
-            template = templates[index]
-            channels = window_features(image, box, template)
-            if means is not None:
-                channels = np.where(_outside_cells(image, box, template), means[index], channels)
-            # The samples of border templates already come from both sides.
-            views = (channels,) if template.border else (channels, mirror_channels(channels))
-            found[index] += [view.transpose(1, 2, 0).ravel() for view in views]
+    for image, boxes in samples if templates else ():
+        if not len(boxes):
+            continue
+        pyramid = EdgePyramid(image)
+        for box in boxes:
+            for index in _matching_templates(box, templates, params.aspect_tolerance):
+                template = templates[index]
+                channels = window_features(pyramid, box, template)
+                if means is not None:
+                    channels = np.where(_outside_cells(image, box, template), means[index], channels)
+                # The samples of border templates already come from both sides.
+                views = (channels,) if template.border else (channels, mirror_channels(channels))
+                found[index] += [view.transpose(1, 2, 0).ravel() for view in views]
     return [np.array(rows, np.float32).reshape(-1, t.weights.size) for rows, t in zip(found, templates)]
-
-
-def patch_features(
-    patches: Sequence[Image],
-    regressor: BoxRegressor,
-    templates: Sequence[MixtureTemplate],
-    known: Sequence[Rows],
-    params: MixtureParams,
-) -> list[Rows]:
-    """Features of the vehicles on patches for templates of whole vehicles, as in `vehicle_features`.
-
-    A patch does not show the surroundings of its vehicle, so cells outside it take the mean over the features
-    of vehicles in frames, `known`. The regressor locates the vehicle on its patch.
-    """
-    means = [
-        rows.mean(axis=0).reshape(template.weights.shape).transpose(2, 0, 1)
-        for template, rows in zip(templates, known)
-    ]
-    samples = ((image, locate_on_patch(image, regressor)) for image in patches)
-    return vehicle_features(samples, templates, params, means)
-
-
-def locate_on_patch(image: Image, regressor: BoxRegressor) -> Floats:
-    """Box of the vehicle on a patch: the typical box, corrected twice."""
-    size = np.tile(image.shape[1::-1], 2)
-    box = _BOX_ON_PATCH * size
-    for _ in range(2):
-        box = box + regressor.shifts(image, box[None])[0] * np.tile(box[2:] - box[:2], 2)
-    return np.asarray(np.clip(box, 0, size), np.float64)
 
 
 def _outside_cells(image: Image, box: Floats, template: MixtureTemplate) -> NDArray[np.bool_]:

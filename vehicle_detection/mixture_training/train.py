@@ -13,17 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_image, check_integer, check_type, resolve_jobs
-from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture import (
     N_CHANNELS,
-    N_REGRESSION_FEATURES,
-    BoxRegressor,
-    MixtureSearch,
     MixtureTemplate,
     TemplateMixture,
-    regression_features,
-    vote_boxes,
 )
 from vehicle_detection.mixture_training.negatives import (
     NegativePool,
@@ -31,11 +25,9 @@ from vehicle_detection.mixture_training.negatives import (
     random_windows,
     with_mirrored,
 )
+from vehicle_detection.mixture_training.patches import fit_box_regressor, patch_features
 from vehicle_detection.mixture_training.positives import (
     align_mirrored,
-    jitter_boxes,
-    mirror_boxes,
-    patch_features,
     truncated_vehicles,
     vehicle_features,
     whole_vehicles,
@@ -119,7 +111,7 @@ class _Training:
     report: Callable[[str], object]
 
     def run(self, patches: Sequence[Image]) -> TemplateMixture:
-        """Train the templates, then the box regressor and the rescorer on what these find."""
+        """Train the templates, then the rescorer on what they find."""
         params = self.params
         inner = [_blank(shape, params.padding) for shape in params.shapes]
         border = [_blank(shape, params.padding, border=True) for shape in params.border_shapes]
@@ -127,12 +119,9 @@ class _Training:
         self.report(f"vehicles per template: {', '.join(str(len(rows)) for rows in positives)}")
         mixture = TemplateMixture(
             tuple(self.train_templates([*inner, *border], positives)),
-            BoxRegressor.none(),
             size_prior_weight=params.size_prior_weight,
             vote_weight=params.vote_weight,
         )
-        with mixture.open_search(n_jobs=1) as search:
-            mixture = replace(mixture, box_regressor=self.fit_box_regressor(search))
         if params.blend_weight:
             with mixture.open_search(n_jobs=1) as search:
                 rescorer = train_rescorer(self.frames, search, params, self.rng, self.pool)
@@ -151,7 +140,9 @@ class _Training:
                     f"at least {params.min_width:g} pixels wide; label more, or train without that shape"
                 )
         if len(patches):
-            more = patch_features(patches, self.fit_box_regressor(), inner, whole, params)
+            more = patch_features(
+                patches, fit_box_regressor(self.frames, params, rng, self.pool), inner, whole, params
+            )
             whole = [np.concatenate(both) for both in zip(whole, more)]
         for index in np.flatnonzero(params.mirrored).tolist():
             whole[index] = align_mirrored(whole[index], rng)
@@ -190,41 +181,6 @@ class _Training:
         templates, _ = solve(templates, vectors, _FINAL_ITERATIONS)
         biased = [replace(each, bias=each.bias + params.border_bias * each.border) for each in templates]
         return [view.template for view in with_mirrored(biased, mirrored)]
-
-    def fit_box_regressor(self, search: MixtureSearch | None = None) -> BoxRegressor:
-        """Fit the shifts from jittered (with a search also found) boxes to labels by ridge regression."""
-        from sklearn.linear_model import Ridge
-
-        params = self.params
-
-        def samples(frame: TrainingFrame, seed: int) -> tuple[Rows, Floats]:
-            """Features and shifts of some boxes of a frame and of its mirror image."""
-            if not len(frame.boxes):
-                return np.empty((0, N_REGRESSION_FEATURES), np.float32), np.empty((0, 4))
-            found = np.empty((0, 4))
-            if search is not None:
-                windows = search.score_windows(frame.image, params.search)
-                found = vote_boxes(windows, min_margin=-1.0)[0].boxes
-            overlap = iou_matrix(found, frame.boxes)
-            near = overlap.max(axis=1) >= 0.4
-            wide = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= params.min_width]
-            copies = np.tile(wide, (params.copies, 1))
-            boxes = np.concatenate([found[near], jitter_boxes(copies, np.random.default_rng(seed))])
-            labels = np.concatenate([frame.boxes[overlap.argmax(axis=1)[near]], copies])
-            shifts = (labels - boxes) / np.tile(boxes[:, 2:] - boxes[:, :2], 2)
-            mirrored = np.ascontiguousarray(frame.image[:, ::-1])
-            mirrored_boxes = mirror_boxes(boxes, frame.image.shape[1])
-            features = regression_features(frame.image, boxes), regression_features(mirrored, mirrored_boxes)
-            return np.concatenate(features), np.concatenate([shifts, mirror_boxes(shifts, 0)])
-
-        seeds = self.rng.integers(2**32, size=len(self.frames)).tolist()
-        found = self.pool.map(samples, self.frames, seeds)
-        features, shifts = (np.concatenate(side) for side in zip(*found))
-        if not len(features):
-            return BoxRegressor.none()
-        ridge = Ridge(alpha=30.0).fit(features.astype(np.float64), np.clip(shifts, -0.5, 0.5))
-        weights, bias = ridge.coef_.T.astype(np.float32), ridge.intercept_.astype(np.float32)
-        return BoxRegressor(weights, bias, params.n_iterations)
 
 
 def _blank(shape: tuple[float, float], padding: float, *, border: bool = False) -> MixtureTemplate:

@@ -36,8 +36,8 @@ class MixtureParams:
         Inverse regularization strength, as in ``LinearSVC``, of the templates and of the border templates.
     positive_weight
         Total weight of all positives of a template; each negative weighs 1.
-    size_prior_weight, vote_weight, n_iterations, blend_weight
-        As in `TemplateMixture`, `BoxRegressor` and `Rescorer`; with a `blend_weight` of 0 no rescorer is
+    size_prior_weight, vote_weight, blend_weight
+        As in `TemplateMixture` and `Rescorer`; with a `blend_weight` of 0 no rescorer is
         trained.
     min_width
         Width in pixels of the narrowest box to train on.
@@ -79,8 +79,7 @@ class MixtureParams:
     positive_weight: float = 1500.0
     size_prior_weight: float = 0.03
     vote_weight: float = 0.1
-    n_iterations: int = 2
-    blend_weight: float = 0.4
+    blend_weight: float = 0.1
     min_width: float = 28.0
     aspect_tolerance: float = 0.2
     copies: int = 2
@@ -111,7 +110,6 @@ class MixtureParams:
         check_number(self.positive_weight, "positive_weight", above=0, high=1e9)
         for name in "size_prior_weight", "vote_weight":
             check_number(getattr(self, name), name, low=0)
-        check_integer(self.n_iterations, "n_iterations", low=1, high=10)
         check_number(self.blend_weight, "blend_weight", low=0, high=1)
         check_number(self.min_width, "min_width", low=8, high=10_000)
         check_number(self.aspect_tolerance, "aspect_tolerance", low=0, high=10)
