@@ -19,7 +19,7 @@ from .datasets import (
     split_sources,
 )
 from .detector import FrameResult, VehicleDetector, detector_from
-from .drawing import draw_boxes, draw_diagnostics, draw_labeled_bboxes, draw_tracks
+from .drawing import draw_boxes, draw_detections, draw_diagnostics, draw_labeled_bboxes, draw_tracks
 from .errors import (
     DatasetError,
     DetectorError,
@@ -58,6 +58,7 @@ from .images import read_image, write_image
 from .mixture import TemplateMixture, load_model
 from .mixture_training import FrameDataset, cross_validate_mixture, train_mixture
 from .params import (
+    DrawParams,
     FeatureParams,
     FunctionParams,
     HeatParams,
@@ -93,6 +94,7 @@ __all__ = [
     "DetectionScores",
     "Detections",
     "DetectorError",
+    "DrawParams",
     "Explorer",
     "FeatureParams",
     "FrameBoxes",
@@ -145,6 +147,7 @@ __all__ = [
     "cross_validate_mixture",
     "detector_from",
     "draw_boxes",
+    "draw_detections",
     "draw_diagnostics",
     "draw_labeled_bboxes",
     "draw_tracks",

@@ -17,13 +17,14 @@ from vehicle_detection._common import check_image, check_integer, check_number, 
 from vehicle_detection.boxes import Detections, ScoreScale
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import VehicleClassifier
-from vehicle_detection.drawing import draw_boxes, draw_diagnostics, draw_tracks
+from vehicle_detection.drawing import TrackDrawer, draw_boxes, draw_diagnostics
 from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.function_model import DetectorFunction, FunctionModel
 from vehicle_detection.heatmap import HeatHistory, frame_heat, label_heat
 from vehicle_detection.images import is_cut, make_thumbnail, read_image
 from vehicle_detection.mixture import TemplateMixture, load_model
 from vehicle_detection.params import (
+    DrawParams,
     FunctionParams,
     HeatParams,
     PyramidParams,
@@ -112,6 +113,8 @@ class VehicleDetector:
         threshold in it, the threshold fits the model and its search.
     track_params
         Parameters of the tracker.
+    draw_params
+        What `annotate` and `process_video` draw: labels, lines, colors, a bird's-eye view.
     camera
         The camera, for distances and boxes; by default a dash-cam with the search's horizon, as an estimate
         that tracking refines.
@@ -154,6 +157,7 @@ class VehicleDetector:
         search_params: SearchParams | PyramidParams | FunctionParams | None = None,
         region_params: RegionParams | HeatParams | None = None,
         track_params: TrackParams | None = None,
+        draw_params: DrawParams | None = None,
         camera: Camera | None = None,
         horizon: float | None = None,
         n_jobs: int | None = None,
@@ -165,6 +169,7 @@ class VehicleDetector:
             ("search_params", search_params, self.model.search_params_type),
             ("region_params", region_params, (RegionParams, HeatParams)),
             ("track_params", track_params, TrackParams),
+            ("draw_params", draw_params, DrawParams),
             ("camera", camera, Camera),
         ):
             if value is not None:
@@ -175,6 +180,7 @@ class VehicleDetector:
             region_params = region_params.for_search(self.search_params)
         self.region_params = region_params or RegionParams()
         self.track_params = track_params or TrackParams()
+        self.draw_params = draw_params or DrawParams()
         self.camera = camera
         self.diagnostics = diagnostics
         self.every = None if every is None else check_integer(every, "every", low=1, high=1000)
@@ -206,6 +212,7 @@ class VehicleDetector:
         self._heat_history = HeatHistory((self._heat_params or HeatParams()).frames)
         self._heat: NDArray[np.float32] | None = None
         self._tracker: Tracker | None = None
+        self._drawer = TrackDrawer(self.draw_params)
 
     def search(self, frame: NDArray[np.uint8]) -> SearchResult:
         """Search one frame for windows and vehicles; needs no other frame, and is thread-safe.
@@ -376,11 +383,27 @@ class VehicleDetector:
         return self._thumbnail is not None and is_cut(self._thumbnail, thumbnail)
 
     def annotate(self, frame: NDArray[np.uint8], result: FrameResult) -> NDArray[np.uint8]:
-        """Draw the vehicles of a result on a copy of its frame."""
+        """Draw the vehicles of a result on a copy of its frame, as `draw_params` says.
+
+        Drawn in their order, the frames of a video have labels that keep their places, and trails in the
+        bird's-eye view.
+        """
         if self.diagnostics:
             heat = frame_heat(frame.shape, result.windows, self._heat_params or HeatParams())
             return draw_diagnostics(frame, result.windows, heat, result.tracks)
-        return draw_tracks(frame, result.tracks)
+        return self._drawer.draw(
+            frame,
+            result.tracks,
+            time=result.index / (self._fps or _USUAL_FPS) if result.time is None else result.time,
+            searched=result.searched,
+            camera=self._camera_of(frame.shape[:2]),
+        )
+
+    def annotated_shape(self, shape: tuple[int, ...]) -> tuple[int, int, int]:
+        """Shape of what `annotate` returns for a frame of this shape; a view beside it adds columns."""
+        if self.diagnostics:
+            return shape[0], shape[1], 3
+        return self._drawer.output_shape(shape)
 
     def __call__(self, frame: NDArray[np.uint8] | Path) -> NDArray[np.uint8]:
         """Return the next frame annotated.

@@ -30,6 +30,7 @@ from vehicle_detection.cli.output import output_folder, run_interruptible
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.mixture import load_model
+from vehicle_detection.params import DrawParams
 from vehicle_detection.synthetic import render_drive, render_patches
 from vehicle_detection.video import probe_video, read_frames
 
@@ -233,6 +234,19 @@ def test_detect_writes_annotated_images_and_boxes(monkeypatch, picture, tmp_path
     assert changed[20, 10:60].all()
     assert changed[50:120, 100].all()
     assert not changed[130:].any()
+    assert changed[:20, 10:60].any()  # the score
+
+
+def test_detect_draws_scores_and_lines_as_asked(monkeypatch, picture, tmp_path):
+    found = Detections([[100, 60, 180, 120]], [1.5])
+    monkeypatch.setattr(detector.VehicleDetector, "detect", lambda self, image: found)
+    image, changed = read_image(picture), {}
+    for name, words in {"plain": [], "bare": ["--labels", "none"], "wide": ["--line-width", 5]}.items():
+        succeed("detect", picture, "-o", tmp_path / name, *words)
+        changed[name] = (read_image(tmp_path / name / "road.png") != image).any(axis=2)
+    assert changed["plain"][:60].any()
+    assert not changed["bare"][:60].any()
+    assert changed["wide"][90, 100:140].sum() == 5
 
 
 def test_detect_accepts_every_kind_of_image(picture, tmp_path):
@@ -299,6 +313,8 @@ def bad_images(material, tmp):
             tmp / "out",
         ],
         r"--boxes \S+road.png is one of the images": [road, "--boxes", road],
+        r"--labels must be one of 'score', 'none'; got 'id'": [road, "--labels", "id"],
+        r"--line-width must be an integer from 1 to 1000; got 0": [road, "--line-width", 0],
         r"--boxes must end in .csv, .* got 'boxes.doc'": [road, "--boxes", tmp / "boxes.doc"],
         r"--boxes needs an existing folder, \S+none is not one": [
             road,
@@ -410,6 +426,26 @@ def test_video_can_be_quiet_and_take_a_part(clip, tmp_path):
     assert "wrote" not in out
 
 
+def test_video_draws_as_asked(clip, tmp_path, monkeypatch):
+    drawn = []
+    process = video.process_video
+
+    def watch(source, target, detector, **options):
+        drawn.append(detector.draw_params)
+        return process(source, target, detector, **options)
+
+    monkeypatch.setattr(video, "process_video", watch)
+    target = tmp_path / "out.mp4"
+    succeed("video", clip, "-o", target, "--end", 0.1)
+    words = ["--labels", "id, score", "--line-width", 3, "--color-by", "distance", "--panel", "side"]
+    succeed("video", clip, "-o", target, "--end", 0.1, *words)
+    assert probe_video(target).shape == (270, 480 + 82, 3)
+    succeed("video", clip, "-o", target, "--end", 0.1, "--labels", "none", "--panel", "corner")
+    assert probe_video(target).shape == (270, 480, 3)
+    wide = DrawParams(labels=("id", "score"), line_width=3, color_by="distance", panel="side")
+    assert drawn == [DrawParams(), wide, DrawParams(labels=(), panel="corner")]
+
+
 def test_video_estimates_the_horizon(clip, tmp_path, monkeypatch):
     words = ["video", clip, "-o", tmp_path / "out.mp4", "--end", 0.12, "--horizon", "auto"]
     found = HorizonEstimate(horizon=0.551, horizon_std=0.012, camera_height_m=1.3, n_boxes=40)
@@ -450,6 +486,11 @@ def bad_videos(material, tmp):
         r"--start must be a number, at least 0": [clip, "-o", target, "--start", -1],
         r"--end must be a number, .* got nan": [clip, "-o", target, "--end", "nan"],
         r"--preset must be one of 'ultrafast'": [clip, "-o", target, "--preset", "hasty"],
+        r"--labels must be one of 'id', .*; got 'name'": [clip, "-o", target, "--labels", "id,name"],
+        r"--labels must be one of 'id', .*; got ''": [clip, "-o", target, "--labels", ""],
+        r"--line-width must be an integer from 1 to 1000": [clip, "-o", target, "--line-width", 0],
+        r"--color-by must be one of 'id', 'distance'": [clip, "-o", target, "--color-by", "speed"],
+        r"--panel must be one of 'none', 'corner', 'side'": [clip, "-o", target, "--panel", "left"],
         r"--horizon must be a number": [clip, "-o", target, "--horizon", -0.5],
         r"--horizon must be a fraction .* or auto; got 'high'": [clip, "-o", target, "--horizon", "high"],
         r"--tracks must end in .csv, .*got 'tracks.doc'": [

@@ -33,6 +33,7 @@ from vehicle_detection.errors import DatasetError, InvalidInputError, VehicleDet
 if TYPE_CHECKING:
     from vehicle_detection.boxes import Detections
     from vehicle_detection.detector import VehicleDetector
+    from vehicle_detection.params import DrawParams
 
 FAILURE, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
 
@@ -105,6 +106,10 @@ def _global_options(
 Model = Annotated[
     str, Option(metavar="NAME|FILE", help='"default" (any road), "highway" (fastest), or a model file.')
 ]
+LineWidth = Annotated[
+    int | None,
+    Option("--line-width", metavar="N", help="Width of the boxes in pixels; default: by size of the frame."),
+]
 HORIZON_HELP = "Height of the horizon as a fraction of the frame's height, 0 at the top."
 
 
@@ -141,14 +146,22 @@ def detect(
     boxes: Annotated[Path | None, Option(metavar="FILE.csv", help="Boxes by file name.")] = None,
     model: Model = "default",
     horizon: Annotated[float | None, Option(metavar="F", help=HORIZON_HELP)] = None,
+    labels: Annotated[
+        str, Option(metavar="score|none", help="Labels of the boxes in annotated images.")
+    ] = "score",
+    line_width: LineWidth = None,
 ) -> None:
     """Detect the vehicles of images."""
+    from vehicle_detection._common import check_choice, check_integer
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.export import write_boxes
 
+    check_choice(labels, "labels", ("score", "none"))
+    if line_width is not None:
+        check_integer(line_width, "line_width", low=1, high=1000)
     _check_images(images, output, boxes)
     with VehicleDetector(model, horizon=horizon) as detector, output_folder(output, "--output"):
-        found = _detect_each(images, detector, output)
+        found = _detect_each(images, detector, output, scores=labels == "score", line_width=line_width)
         if boxes is None:
             for _ in found:
                 pass
@@ -184,12 +197,17 @@ def _check_images(images: list[Path], output: Path | None, boxes: Path | None) -
 
 
 def _detect_each(
-    images: list[Path], detector: VehicleDetector, output: Path | None
+    images: list[Path],
+    detector: VehicleDetector,
+    output: Path | None,
+    *,
+    scores: bool = True,
+    line_width: int | None = None,
 ) -> Iterator[tuple[str, Detections]]:
     """Detect the vehicles of each image, print them, and write the annotated image."""
     import cv2
 
-    from vehicle_detection.drawing import draw_boxes
+    from vehicle_detection.drawing import draw_detections
     from vehicle_detection.images import read_image, write_image
 
     for path in images:
@@ -204,9 +222,8 @@ def _detect_each(
         )
         typer.echo(f"{path}: {len(found)} vehicle{'s' * (len(found) != 1)}{listed}")
         if output is not None:
-            thickness = max(2, round(max(image.shape) / 320))
             suffix = path.suffix if cv2.haveImageWriter(f"image{path.suffix}") else f"{path.suffix}.png"
-            drawn = draw_boxes(image, found.boxes, color=(230, 159, 0), thickness=thickness)
+            drawn = draw_detections(image, found, line_width=line_width, scores=scores)
             write_image(output / (path.stem + suffix), drawn)
         yield path.name, found
 
@@ -230,6 +247,18 @@ def video(
     model: Model = "default",
     start: Annotated[float | None, Option(metavar="S", help="Start time in seconds.")] = None,
     end: Annotated[float | None, Option(metavar="S", help="End time in seconds.")] = None,
+    labels: Annotated[
+        str,
+        Option(metavar="LIST", help="Fields of the labels: some of id,distance,speed,score,std, or none."),
+    ] = "id,distance,speed",
+    line_width: LineWidth = None,
+    color_by: Annotated[
+        str, Option(metavar="id|distance", help="What the colors of the boxes stand for.")
+    ] = "id",
+    panel: Annotated[
+        str,
+        Option(metavar="corner|side|none", help="Bird's-eye view in the frame's corner, or beside it."),
+    ] = "none",
     preset: Annotated[str, Option(metavar="P", help="Encoder speed, ultrafast to placebo.")] = "veryfast",
     horizon: Annotated[
         str | None,
@@ -255,6 +284,7 @@ def video(
     from vehicle_detection.report import ReportWriter
     from vehicle_detection.video import process_video
 
+    draw_params = _draw_params(labels, line_width=line_width, color_by=color_by, panel=panel)
     outputs = {"--output": output, "--tracks": tracks, "--report": report}
     check_distinct_paths(outputs, {"SOURCE": source})
     with contextlib.ExitStack() as stack:
@@ -269,7 +299,9 @@ def video(
         else:
             fraction = None if horizon is None else _parse_horizon(horizon)
         detector = stack.enter_context(
-            VehicleDetector(loaded, horizon=fraction, every=every, diagnostics=diagnostics)
+            VehicleDetector(
+                loaded, horizon=fraction, every=every, diagnostics=diagnostics, draw_params=draw_params
+            )
         )
         page = None
         if report is not None:
@@ -295,6 +327,14 @@ def video(
         typer.echo("\n".join(lines if profile else lines[:1]))
     if not quiet:
         typer.echo(f"wrote {', '.join(str(path) for path in outputs.values() if path is not None)}")
+
+
+def _draw_params(labels: str, **options: Any) -> DrawParams:
+    """Parameters of the annotations, with labels given as a comma-separated list or "none"."""
+    from vehicle_detection.params import DrawParams
+
+    fields = [field.strip() for field in labels.split(",")]
+    return DrawParams(labels=() if fields == ["none"] else fields, **options)
 
 
 def _parse_horizon(text: str) -> float:

@@ -11,6 +11,7 @@ uniform colormaps.
 
 from __future__ import annotations
 
+from vehicle_detection.plotting.birds_eye import plot_birds_eye
 from vehicle_detection.plotting.features import plot_channels, plot_features, plot_hog, plot_weights
 from vehicle_detection.plotting.images import (
     ImageDescription,
@@ -43,6 +44,7 @@ __all__ = [
     "describe_image",
     "plot_balance",
     "plot_bands",
+    "plot_birds_eye",
     "plot_channels",
     "plot_comparison",
     "plot_errors",

@@ -37,7 +37,10 @@ class VideoDetector(Protocol):
         """
 
     def annotate(self, frame: Frame, result: Any, /) -> Frame:
-        """Draw a result on a copy of its frame."""
+        """Draw a result on a copy of its frame.
+
+        If the copy has another shape, a method ``annotated_shape`` returns it for that of a frame.
+        """
 
     def reset(self, *, fps: float) -> None:
         """Forget all frames."""
@@ -132,6 +135,8 @@ class FramePipeline:
 
     With an `interval` above 1, only every n-th frame and the first one of each scene are searched. The frames
     between wait for the next searched frame, and get interpolated tracks.
+
+    `drawn_shape` is the shape of drawn frames, by default that of the frames themselves.
     """
 
     def __init__(
@@ -141,11 +146,12 @@ class FramePipeline:
         detector: VideoDetector | IntervalDetector,
         workers: int,
         interval: int = 1,
+        drawn_shape: tuple[int, ...] | None = None,
     ) -> None:
         self._seconds: defaultdict[str, float] = defaultdict(float)
         self._open_reader, self._open_writer = open_reader, open_writer
         self._detector: Any = detector
-        self._workers, self._interval = workers, interval
+        self._workers, self._interval, self._drawn_shape = workers, interval, drawn_shape
         self._searched: ClosableQueue[_QueuedFrame] = ClosableQueue(workers * interval + 1)
         self._drawn: ClosableQueue[Frame] = ClosableQueue(2)
         self._results: ClosableQueue[Any] = ClosableQueue(4)
@@ -298,9 +304,10 @@ class FramePipeline:
     def _draw(self, frame: Frame, result: Any) -> Frame:
         start = time.perf_counter()
         drawn = self._detector.annotate(frame, result)
-        if getattr(drawn, "shape", None) != frame.shape or drawn.dtype != np.uint8:
+        expected = self._drawn_shape or frame.shape
+        if getattr(drawn, "shape", None) != expected or drawn.dtype != np.uint8:
             raise InvalidInputError(
-                f"detector.annotate must return a {frame.shape} uint8 array, got {describe(drawn)}; "
+                f"detector.annotate must return a {expected} uint8 array, got {describe(drawn)}; "
                 "draw on a copy of the frame"
             )
         self._seconds["draw"] += time.perf_counter() - start

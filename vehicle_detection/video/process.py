@@ -6,6 +6,7 @@ The result does not depend on the number of workers, and only a few frames are i
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import math
 import os
@@ -210,7 +211,8 @@ def process_video(
         write no video.
     detector
         A :class:`VehicleDetector`, or another object with its methods ``search``, ``track``, ``annotate``
-        and ``reset``.
+        and ``reset``; optionally ``annotated_shape(shape)``, the shape of what ``annotate`` returns for a
+        frame, by default that of the frame.
     start, end
         Time range in seconds: frames with ``start <= time < end`` are processed. None: no limit.
     audio
@@ -263,11 +265,14 @@ def process_video(
     sound = _audio_source(path, info, end, first) if audio and info.has_audio else None
     detector.reset(fps=float(info.fps))
     started = time.perf_counter()
+    drawn_shape = getattr(detector, "annotated_shape", lambda shape: shape)(info.shape)
+    drawn_info = dataclasses.replace(info, height=drawn_shape[0], width=drawn_shape[1])
     pipeline = FramePipeline(
         functools.partial(FrameReader, path, info, first=first, count=count),
-        None if output is None else functools.partial(_open_writer, output, info, preset, sound),
+        None if output is None else functools.partial(_open_writer, output, drawn_info, preset, sound),
         detector,
         n_workers,
+        drawn_shape=drawn_shape,
         interval=getattr(detector, "search_interval", lambda fps: 1)(float(info.fps)),
     )
     frames, track_ids = 0, set[int]()

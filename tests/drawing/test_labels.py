@@ -1,0 +1,121 @@
+"""Placement of labels."""
+
+import itertools
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vehicle_detection.drawing.labels import LabelPlacer, LabelRequest
+
+SHAPE = (720, 1280, 3)
+FIELDS = ("#3", "24 m", "-1.2 m/s")
+
+
+def request(key, x, y, width=100, height=80, fields=FIELDS):
+    return LabelRequest(key, fields, (x, y, x + width, y + height))
+
+
+def overlap(first, second):
+    return max(min(first[2], second[2]) - max(first[0], second[0]), 0) * max(
+        min(first[3], second[3]) - max(first[1], second[1]), 0
+    )
+
+
+def test_a_label_lies_above_its_box():
+    box = request(1, 600, 400)
+    (label,) = LabelPlacer().place([box], SHAPE)
+    assert label.rectangle[0] == 600
+    assert label.rectangle[3] == 400
+    assert label.leader is None
+
+
+@pytest.mark.parametrize(("width", "lines"), [(40, 2), (100, 2), (200, 1)])
+def test_a_label_is_not_much_wider_than_its_box(width, lines):
+    (label,) = LabelPlacer().place([request(1, 600, 400, width)], SHAPE)
+    assert len(label.lines) == lines
+    assert "  ".join(label.lines) == "  ".join(FIELDS)
+    assert label.rectangle[2] - label.rectangle[0] <= max(width, 0.075 * SHAPE[1])
+
+
+def test_the_size_does_not_depend_on_the_digits():
+    sizes = set()
+    for text in ("-1.1 m/s", "-0.8 m/s"):
+        (label,) = LabelPlacer().place([request(1, 600, 400, fields=(text,))], SHAPE)
+        sizes.add((label.rectangle[2], label.rectangle[1]))
+    assert len(sizes) == 1
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "width", "height"),
+    [(600, 0, 100, 80), (1200, 0, 80, 80), (0, 640, 100, 80), (1240, 680, 40, 40), (0, 0, 1280, 720)],
+)
+def test_labels_at_the_border_stay_in_the_image(x, y, width, height):
+    box = request(1, x, y, width, height)
+    (label,) = LabelPlacer().place([box], SHAPE)
+    assert label.rectangle[0] >= 0
+    assert label.rectangle[1] >= 0
+    assert label.rectangle[2] <= SHAPE[1]
+    assert label.rectangle[3] <= SHAPE[0]
+    if (width, height) != (1280, 720):
+        assert overlap(label.rectangle, box.box) == 0
+
+
+def test_a_row_of_vehicles_has_all_labels_outside_all_boxes():
+    row = [request(key, 500 + 45 * key, 400 + 2 * key, 70, 60) for key in range(6)]
+    labels = LabelPlacer().place(row, SHAPE)
+    for label, box in itertools.product(labels, row):
+        assert overlap(label.rectangle, box.box) == 0
+    for first, second in itertools.combinations(labels, 2):
+        assert overlap(first.rectangle, second.rectangle) == 0
+    assert any(label.leader for label in labels)
+
+
+def test_a_leader_line_runs_from_the_box_to_its_label():
+    row = [request(key, 500 + 45 * key, 400 + 2 * key, 70, 60) for key in range(6)]
+    for box, label in zip(row, LabelPlacer().place(row, SHAPE), strict=True):
+        if label.leader:
+            (x, y), (end_x, end_y) = label.leader
+            assert box.box[0] <= x < box.box[2]
+            assert y == box.box[1]
+            assert label.rectangle[0] <= end_x < label.rectangle[2]
+            assert end_y == label.rectangle[3]
+
+
+def test_labels_avoid_blocked_areas():
+    blocked = (500, 300, 800, 400)
+    (label,) = LabelPlacer().place([request(1, 600, 400)], SHAPE, [blocked])
+    assert overlap(label.rectangle, blocked) == 0
+
+
+def test_a_label_keeps_its_place_until_the_better_one_has_some_space():
+    placer, blocker = LabelPlacer(), request(0, 560, 330, 250, 60, fields=())
+    first = placer.place([blocker, request(1, 600, 400)], SHAPE)[1]
+    assert first.rectangle[1] == 480  # below
+    # One pixel is enough for a new label, but not to move a label.
+    freed = request(0, 560, 300, 250, 400 - 300 - (first.rectangle[3] - first.rectangle[1]), fields=())
+    assert placer.place([freed, request(1, 600, 400)], SHAPE)[1].rectangle[1] == 480
+    assert LabelPlacer().place([freed, request(1, 600, 400)], SHAPE)[1].rectangle[3] == 400
+    away = request(0, 560, 200, 250, 60, fields=())
+    assert placer.place([away, request(1, 600, 400)], SHAPE)[1].rectangle[3] == 400
+
+
+def test_a_request_without_text_has_no_label():
+    assert LabelPlacer().place([request(1, 600, 400, fields=())], SHAPE) == [None]
+
+
+@settings(max_examples=40)
+@given(
+    st.lists(st.tuples(*[st.integers(-200, 1500)] * 2, *[st.integers(1, 400)] * 2), max_size=6),
+    st.integers(60, 800),
+    st.integers(60, 1300),
+)
+def test_all_labels_stay_in_the_image_and_are_repeatable(boxes, height, width):
+    requests = [request(key, *box, fields=("#1",)) for key, box in enumerate(boxes)]
+    placer = LabelPlacer()
+    labels = placer.place(requests, (height, width))
+    for label in labels:
+        assert 0 <= label.rectangle[0] < label.rectangle[2] <= width
+        assert 0 <= label.rectangle[1] < label.rectangle[3] <= height
+    assert LabelPlacer().place(requests, (height, width)) == labels
+    assert placer.place(requests, (height, width)) == labels

@@ -1,0 +1,42 @@
+"""Drawing on images and video: boxes, labeled regions, detections, tracks with labels, bird's-eye views."""
+
+from vehicle_detection.drawing.birds_eye import (
+    LANE_WIDTH_M,
+    MAX_SPEED_STD,
+    TRAIL_SECONDS,
+    BirdsEyePanel,
+    RoadPosition,
+    Trails,
+    road_position,
+)
+from vehicle_detection.drawing.boxes import draw_boxes, draw_detections, draw_labeled_bboxes
+from vehicle_detection.drawing.diagnostics import draw_diagnostics, heat_image
+from vehicle_detection.drawing.primitives import blend
+from vehicle_detection.drawing.tracks import (
+    TRACK_COLORS,
+    TrackDrawer,
+    draw_tracks,
+    track_color,
+    track_text,
+)
+
+__all__ = [
+    "LANE_WIDTH_M",
+    "MAX_SPEED_STD",
+    "TRACK_COLORS",
+    "TRAIL_SECONDS",
+    "BirdsEyePanel",
+    "RoadPosition",
+    "TrackDrawer",
+    "Trails",
+    "blend",
+    "draw_boxes",
+    "draw_detections",
+    "draw_diagnostics",
+    "draw_labeled_bboxes",
+    "draw_tracks",
+    "heat_image",
+    "road_position",
+    "track_color",
+    "track_text",
+]

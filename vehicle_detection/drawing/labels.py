@@ -1,0 +1,205 @@
+"""Placement of labels beside boxes, so that they hide neither each other nor other vehicles."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Hashable, Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+
+from vehicle_detection.drawing.primitives import (
+    Color,
+    Image,
+    Rectangle,
+    draw_text,
+    fill_rectangle,
+    ink_on,
+    text_margin,
+    text_scale,
+    text_size,
+)
+
+# Width of an image up to which a label may be wider than its box, as a fraction of the image's width; a label
+# in more lines than the last one needs to be this much too wide.
+_FREE_WIDTH, _TOLERANCE = 0.075, 1.15
+# Weight of the hidden area at a label's last place.
+_LAST_WEIGHT = 0.7
+# Fraction of a box that a label inside may cover.
+_MAX_INSIDE = 0.12
+# Rows of labels on leader lines above a box.
+_LEADER_ROWS = 6
+# Numbers of the place inside a box, and of that for a label without a place in the image.
+_INSIDE, _ELSEWHERE = 6, 99
+_DIGIT = re.compile(r"\d")
+
+
+@dataclass(frozen=True)
+class Label:
+    """A placed label."""
+
+    lines: tuple[str, ...]
+    rectangle: Rectangle
+    scale: float
+    leader: tuple[tuple[int, int], tuple[int, int]] | None = None  # line from the box to the label
+
+
+@dataclass(frozen=True)
+class LabelRequest:
+    """A label to place: fields of text, at the box of a track with a constant key."""
+
+    key: Hashable
+    fields: tuple[str, ...]
+    box: Rectangle
+
+
+class LabelPlacer:
+    """Places the labels of a frame; a label keeps its place at its box while that place is free.
+
+    The places, in order of preference: above, below and beside the box, inside if that covers little of it,
+    then farther up on a leader line. If none is free, the label goes where it hides least.
+    """
+
+    def __init__(self) -> None:
+        self._last: dict[Hashable, tuple[int, int]] = {}  # lines and place of each label in the last frame
+
+    def place(
+        self, requests: list[LabelRequest], shape: tuple[int, ...], blocked: Sequence[Rectangle] = ()
+    ) -> list[Label | None]:
+        """Place labels in an image of this shape, outside `blocked` rectangles; None for one without text.
+
+        Earlier requests choose first, so that tracks by age give labels that stay where they are.
+        """
+        scale = text_scale(shape)
+        labels: list[Label | None] = []
+        last: dict[Hashable, tuple[int, int]] = {}
+        for number, request in enumerate(requests):
+            if not request.fields:
+                labels.append(None)
+                continue
+            count, place = self._last.get(request.key, (None, None))
+            lines, size, fitted = _break_lines(request, shape[1], scale, count)
+            obstacles = [other.box for other in requests[:number] + requests[number + 1 :]]
+            obstacles += [label.rectangle for label in labels if label is not None]
+            obstacles += blocked
+            place, rectangle = _choose(request.box, size, shape, obstacles, place, text_margin(scale))
+            labels.append(Label(lines, rectangle, fitted, _leader(request.box, rectangle)))
+            last[request.key] = len(lines), place
+        self._last = last
+        return labels
+
+
+def _break_lines(
+    request: LabelRequest, image_width: int, scale: float, last_count: int | None
+) -> tuple[tuple[str, ...], tuple[int, int], float]:
+    """Lines of a label that is not much wider than its box, their size in pixels, and the font scale."""
+    wide = max(request.box[2] - request.box[0], _FREE_WIDTH * image_width)
+    for count in range(1, len(request.fields) + 1):
+        lines = _split(request.fields, count)
+        # All digits count as the widest one, so that the size does not change with every number.
+        size = text_size([_DIGIT.sub("0", line) for line in lines], scale)
+        if size[0] <= wide * (_TOLERANCE if count == last_count else 1.0):
+            break
+    while size[0] > image_width and scale > 0.2:
+        scale *= 0.9
+        size = text_size([_DIGIT.sub("0", line) for line in lines], scale)
+    return lines, size, scale
+
+
+def _split(fields: Sequence[str], count: int) -> tuple[str, ...]:
+    """Join fields to `count` lines, the first lines with more fields."""
+    per_line, longer = divmod(len(fields), count)
+    lines, start = [], 0
+    for number in range(count):
+        end = start + per_line + (number < longer)
+        lines.append("  ".join(fields[start:end]))
+        start = end
+    return tuple(lines)
+
+
+def _choose(
+    box: Rectangle,
+    size: tuple[int, int],
+    shape: tuple[int, ...],
+    obstacles: Sequence[Rectangle],
+    last: int | None,
+    margin: int,
+) -> tuple[int, Rectangle]:
+    """Return number and rectangle of the best place for a label of this size."""
+    places: dict[int, Rectangle] = {}
+    for place, rectangle in _places(box, size, shape):
+        # A better place than the last one needs some more space, so that a label does not switch to and fro.
+        space = 0 if last is None or place == last else margin
+        if not any(_intersect(rectangle, other, space) for other in obstacles):
+            return place, rectangle
+        places[place] = rectangle
+    # Nothing is free: the place that hides least, where the last one counts less.
+    areas = {
+        place: _hidden_area(rectangle, obstacles) * (_LAST_WEIGHT if place == last else 1.0)
+        for place, rectangle in places.items()
+    }
+    best = min(areas, key=lambda place: (areas[place], place))
+    return best, places[best]
+
+
+def _places(box: Rectangle, size: tuple[int, int], shape: tuple[int, ...]) -> Iterator[tuple[int, Rectangle]]:
+    """Yield numbered places for a label inside the image, best first."""
+    (width, height), (rows, columns) = size, shape[:2]
+    found = False
+    for place, (x, y) in enumerate(_corners(box, size)):
+        inside = place == _INSIDE
+        if inside and width * height > _MAX_INSIDE * (box[2] - box[0]) * (box[3] - box[1]):
+            continue
+        # Above, below and inside, a label may be moved sideways into the image.
+        left = min(max(x, 0), max(columns - width, 0)) if place < 4 or inside else x
+        if left >= 0 and left + width <= columns and y >= 0 and y + height <= rows:
+            found = True
+            yield place, (left, y, left + width, y + height)
+    if not found:
+        left, top = min(max(box[0], 0), max(columns - width, 0)), min(max(box[1], 0), max(rows - height, 0))
+        yield _ELSEWHERE, (left, top, left + width, top + height)
+
+
+def _corners(box: Rectangle, size: tuple[int, int]) -> Iterator[tuple[int, int]]:
+    """Yield the upper left corners of a label's places."""
+    (x1, y1, x2, y2), (width, height) = box, size
+    yield from ((x1, y1 - height), (x2 - width, y1 - height), (x1, y2), (x2 - width, y2))
+    yield from ((x2, y1), (x1 - width, y1), (x1, y1))
+    gap = height // 2
+    for row in range(1, _LEADER_ROWS + 1):
+        y = y1 - (row + 1) * (height + gap // 2)
+        yield from (((x1 + x2 - width) // 2, y), (x2 + gap, y), (x1 - width - gap, y))
+
+
+def _leader(box: Rectangle, label: Rectangle) -> tuple[tuple[int, int], tuple[int, int]] | None:
+    """Line from the nearest points of a box to a label that does not touch it; None if it does."""
+    if _intersect(box, label, 1):
+        return None
+    x = min(max((box[0] + box[2]) // 2, label[0]), label[2] - 1)
+    return (min(max(x, box[0]), box[2] - 1), box[1]), (x, label[3] if label[3] <= box[1] else label[1])
+
+
+def _hidden_area(label: Rectangle, obstacles: Sequence[Rectangle]) -> int:
+    areas = (
+        max(min(label[2], other[2]) - max(label[0], other[0]), 0)
+        * max(min(label[3], other[3]) - max(label[1], other[1]), 0)
+        for other in obstacles
+    )
+    return sum(areas)
+
+
+def _intersect(first: Rectangle, second: Rectangle, space: int = 0) -> bool:
+    """Whether two rectangles are less than `space` pixels apart, or for 0 have a pixel in common."""
+    overlap_x = first[0] < second[2] + space and second[0] < first[2] + space
+    return overlap_x and first[1] < second[3] + space and second[1] < first[3] + space
+
+
+def draw_labels(image: Image, labels: Sequence[Label | None], colors: Sequence[Color], width: int) -> None:
+    """Draw placed labels and their leader lines into an image."""
+    drawn = [(label, color) for label, color in zip(labels, colors, strict=True) if label is not None]
+    for label, color in drawn:
+        if label.leader is not None:
+            cv2.line(image, *label.leader, color, max(1, width // 2), cv2.LINE_AA)
+    for label, color in drawn:
+        fill_rectangle(image, label.rectangle, color)
+        draw_text(image, list(label.lines), *label.rectangle[:2], label.scale, ink_on(color))
