@@ -17,6 +17,7 @@ from moviepy import (
 from tests.video.clips import write_clip
 from vehicle_detection.detector import VehicleDetector, detector_from
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.params import DrawParams
 from vehicle_detection.synthetic import render_drive
 from vehicle_detection.video import probe_video
 
@@ -273,3 +274,12 @@ def test_a_shipped_model_annotates_a_clip():
     clip = ImageSequenceClip([scene.image for scene in drive], fps=drive.fps)
     with VehicleDetector(n_jobs=1) as detector:
         assert len(pictures(detector.annotate_clip(clip))) == 8
+
+
+def test_a_view_beside_the_frame_widens_the_clip():
+    detector = detector_from(find_red, draw_params=DrawParams(panel="side"))
+    clip = detector.annotate_clip(clip_of(3))
+    height, width, _ = detector.annotated_shape((*SHAPE, 3))
+    assert width > SHAPE[1]
+    assert tuple(clip.size) == (width, height)
+    assert {frame.shape for frame in pictures(clip)} == {(height, width, 3)}

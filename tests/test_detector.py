@@ -13,10 +13,12 @@ from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.detector import FrameResult, VehicleDetector
+from vehicle_detection.drawing import draw_tracks
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, evaluate_detections, read_labels
 from vehicle_detection.mixture import load_model
 from vehicle_detection.params import (
+    DrawParams,
     FeatureParams,
     HeatParams,
     RegionParams,
@@ -250,6 +252,33 @@ def test_every_second_frame_is_predicted():
     timed = make(every=2)
     again = [timed.process(frame, time=index / 25) for index, frame in enumerate(frames)]
     np.testing.assert_allclose(again[18].tracks[0].box, results[18].tracks[0].box)
+
+
+def test_drawing_as_asked():
+    detector = make(draw_params=DrawParams(labels=(), line_width=1, panel="side"))
+    for frame in drive(20):
+        result = detector.process(frame)
+    assert result.shown
+    drawn = detector.annotate(frame, result)
+    assert drawn.shape == detector.annotated_shape(frame.shape)
+    assert drawn.shape[1] > frame.shape[1]
+    plain = draw_tracks(frame, result.tracks, labels=(), line_width=1)
+    np.testing.assert_array_equal(drawn[:, : frame.shape[1]], plain)
+    mosaic = make(diagnostics=True, draw_params=DrawParams(panel="side"))
+    assert mosaic.annotate(frame, mosaic.process(frame)).shape == mosaic.annotated_shape(frame.shape)
+    with pytest.raises(InvalidInputError, match="draw_params must be a DrawParams, got 3"):
+        make(draw_params=3)
+
+
+def test_boxes_between_searches_are_not_dashed():
+    frames, second = drive(20), make(every=2)
+    results = [second.process(frame) for frame in frames]
+    assert not results[19].searched
+    confirmed = [dataclasses.replace(track, state="confirmed") for track in results[19].tracks]
+    for frame, result in zip(frames[:-1], results):
+        second.annotate(frame, result)
+    drawn = second.annotate(frames[19], results[19])
+    np.testing.assert_array_equal(drawn, draw_tracks(frames[19], confirmed))
 
 
 def test_a_cut_is_searched_at_once():

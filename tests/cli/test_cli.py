@@ -25,7 +25,7 @@ from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import HorizonEstimate
 from vehicle_detection.classifier import VehicleClassifier, load_classifier
 from vehicle_detection.cli.app import app
-from vehicle_detection.cli.demo import FILES, SHEET, draw_clip
+from vehicle_detection.cli.demo import FILES, REPORT, SHEET, draw_clip, scored_truth
 from vehicle_detection.cli.output import output_folder, run_interruptible
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import read_image, write_image
@@ -550,6 +550,24 @@ def test_demo_draws_annotates_and_scores(tmp_path):
     assert read_image(tmp_path / "shown" / "contact_sheet.png").shape == (SHEET[0] * 360, SHEET[1] * 640, 3)
     words = [tmp_path / "shown" / "tracks.csv", tmp_path / "shown" / "labels.csv"]
     assert "Detections in" in succeed("evaluate", *words)
+
+
+def test_demo_writes_a_report(tmp_path):
+    folder = tmp_path / "shown"
+    out = succeed("demo", "-o", folder, "--frames", 3, "--report")
+    assert contents(folder) == sorted([*FILES, REPORT])
+    assert out.splitlines()[-1] == f"wrote {', '.join(FILES)}, {REPORT} in {folder}"
+    assert "data:video/mp4;base64," in (folder / REPORT).read_text(encoding="utf-8")
+    assert re.search(r"boxes +\d+ on a vehicle, \d+ missed, \d+ false", out)
+
+
+def test_demo_scores_oncoming_vehicles():
+    drive = render_drive(frames=120)
+    rows = [row for frame in range(0, 120, 8) for row in drive.truth_of(frame)]
+    for row, scored in zip(rows, scored_truth(rows), strict=True):
+        assert scored == replace(row, ignore=row.hard_to_see)
+        assert row.ignore == (row.hard_to_see or row.speed_mps < -40)
+    assert any(row.ignore and not row.hard_to_see for row in rows)
 
 
 def test_demo_refuses_bad_input(tmp_path, picture):

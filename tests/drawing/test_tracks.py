@@ -243,14 +243,3 @@ class TestDrawer:
             np.testing.assert_array_equal(drawer.draw(blank(), [track(state=state)], time=0.0), expected)
             between = drawer.draw(blank(), [track(state="coasting")], time=0.0, searched=False)
             np.testing.assert_array_equal(between, expected)
-
-    def test_a_label_keeps_its_place_while_vehicles_pass(self):
-        """The label switches sides at most twice while another vehicle passes behind the box."""
-        drawer, tops = TrackDrawer(DrawParams(labels=("id",))), []
-        for step in range(120):
-            pair = [track(), track((420 + 3 * step, 370, 480 + 3 * step, 420), id=2)]
-            drawn = drawer.draw(blank(), pair, time=step / 25)
-            bare = draw_tracks(blank(), pair, labels=())
-            rows, _ = np.nonzero((drawn != bare).any(axis=2) & (drawn == TRACK_COLORS[0]).all(axis=2))
-            tops.append(rows.min())
-        assert np.count_nonzero(np.diff(tops)) <= 2

@@ -80,6 +80,21 @@ def test_a_highway_has_vehicles_ahead_and_ignored_oncoming_ones():
     assert all(row.ignore for track in oncoming for row in tracks[track].values())
 
 
+def test_traffic_has_only_vehicles_ahead():
+    drive = render_drive(frames=100, shape=SMALL, scenario="traffic", random_state=1)
+    rows = [row for frame in (0, 50, 99) for row in drive.truth_of(frame)]
+    assert len({row.track for row in rows}) >= 3
+    assert all(abs(row.speed_mps) < 5 for row in rows)
+
+
+def test_the_truth_of_a_frame_is_that_of_the_drive():
+    drive = render_drive(frames=3, shape=SMALL)
+    assert [drive.truth_of(frame) for frame in range(3)] == list(drive.truth)
+    assert drive.truth_of(-1) == drive.truth[2]
+    with pytest.raises(InvalidInputError, match="frame number must be an integer from -3 to 2"):
+        drive.truth_of(3)
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_an_overtaking_car_enters_at_a_side_and_pulls_away(seed):
     drive = render_drive(frames=100, shape=SMALL, scenario="overtaking", random_state=seed)

@@ -25,7 +25,7 @@ from tests.video.clips import (
     write_clip,
 )
 from vehicle_detection.errors import InvalidInputError, VideoError
-from vehicle_detection.video import process, process_video
+from vehicle_detection.video import probe_video, process, process_video
 
 
 def test_the_result_does_not_depend_on_the_number_of_workers(clip, tmp_path):
@@ -121,6 +121,17 @@ def test_a_drawing_of_another_shape_is_refused(clip, tmp_path, drawn):
     stub = StubDetector()
     stub.annotate = lambda frame, result: drawn
     with pytest.raises(InvalidInputError, match=r"annotate must return a \(48, 64, 3\) uint8 array"):
+        process_video(clip, tmp_path / "out.mp4", stub)
+
+
+def test_a_drawing_may_have_a_shape_of_its_own(clip, tmp_path):
+    stub = StubDetector()
+    stub.annotated_shape = lambda shape: (shape[0], shape[1] + 30, 3)
+    stub.annotate = lambda frame, result: np.pad(frame, ((0, 0), (0, 30), (0, 0)))
+    process_video(clip, tmp_path / "out.mp4", stub)
+    assert probe_video(tmp_path / "out.mp4").shape == (48, 94, 3)
+    stub.annotate = lambda frame, result: frame
+    with pytest.raises(InvalidInputError, match=r"annotate must return a \(48, 94, 3\) uint8 array"):
         process_video(clip, tmp_path / "out.mp4", stub)
 
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,11 +17,15 @@ from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.evaluation import TrackScores, evaluate_tracks, read_labels
 from vehicle_detection.export import TrackWriter
 from vehicle_detection.images import write_image
-from vehicle_detection.synthetic import Drive, render_drive, write_labels
+from vehicle_detection.report import ReportWriter
+from vehicle_detection.synthetic import Drive, VehicleTruth, render_drive, write_labels
 from vehicle_detection.video import VideoReport, process_video, read_frames
 
 FILES = ("clip.mp4", "annotated.mp4", "tracks.csv", "labels.csv", "contact_sheet.png")
 """Files that the demo writes: drawn clip, annotated clip, tracks, ground truth, and some annotated frames."""
+
+REPORT = "report.html"
+"""File that the demo writes too if a report is asked for."""
 
 SHEET = (2, 3)
 """Rows and columns of the contact sheet."""
@@ -27,26 +34,32 @@ _TILE = (640, 360)
 
 
 def run_demo(
-    folder: Path, detector: VehicleDetector, *, frames: int, random_state: int
+    folder: Path, detector: VehicleDetector, *, frames: int, random_state: int, report: bool = False
 ) -> tuple[VideoReport, TrackScores]:
-    """Draw a drive, annotate and score it; an error leaves none of `FILES` in the folder."""
+    """Draw a drive, annotate and score it, oncoming vehicles too; an error leaves no file in the folder."""
     drive = render_drive(frames=frames, random_state=random_state)
     with tempfile.TemporaryDirectory(prefix=".demo.", dir=folder) as temporary:
         clip, annotated, tracks, labels, sheet = (Path(temporary) / name for name in FILES)
+        page = ReportWriter(Path(temporary) / REPORT, video=annotated, source=clip, detector=detector)
         draw_clip(drive, clip, labels, progress=True)
         # Compile the kernels now, so that the reported speed does not include it.
         detector.warm_up(drive.shape)
         with TrackWriter(tracks) as write:
-            report = process_video(clip, annotated, detector, on_result=write)
+            writers: list[Callable[[Any], object]] = [write, page]
+            done = process_video(
+                clip, annotated, detector, on_result=lambda result: [each(result) for each in writers]
+            )
         scores = evaluate_tracks(read_labels(tracks), read_labels(labels), frames=range(len(drive)))
         write_image(sheet, contact_sheet(annotated))
-        for name in FILES:
+        if report:
+            page.finish(done)
+        for name in (*FILES, REPORT) if report else FILES:
             (Path(temporary) / name).replace(folder / name)
-    return report, scores
+    return done, scores
 
 
 def draw_clip(drive: Drive, clip: Path, labels: Path, *, progress: bool = False) -> None:
-    """Write the frames of a drive as a video, and their ground truth as a table."""
+    """Write the frames of a drive as a video, and their ground truth as a table, with oncoming vehicles."""
     # moviepy, because `process_video` needs a source.
     from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
 
@@ -57,10 +70,15 @@ def draw_clip(drive: Drive, clip: Path, labels: Path, *, progress: bool = False)
         progress_bar(progress, len(drive), unit="frame", desc="drawing", terminal_only=True) as bar,
     ):
         for scene in drive:
-            truth.append(scene.truth)
+            truth.append(scored_truth(scene.truth))
             writer.write_frame(scene.image)
             bar.update()
     write_labels(labels, enumerate(truth))
+
+
+def scored_truth(rows: Sequence[VehicleTruth]) -> list[VehicleTruth]:
+    """Ground truth in which oncoming vehicles count as well."""
+    return [replace(row, ignore=int(row.hard_to_see)) for row in rows]
 
 
 def contact_sheet(video: Path) -> NDArray[np.uint8]:

@@ -20,9 +20,9 @@ from vehicle_detection.drawing.primitives import (
     text_size,
 )
 
-# Width of an image up to which a label may be wider than its box, as a fraction of the image's width; a label
-# in more lines than the last one needs to be this much too wide.
-_FREE_WIDTH, _TOLERANCE = 0.075, 1.15
+# Width in pixels up to which a label may be wider than its box, at font scale 1; to get another line, a label
+# must be this much too wide.
+_FREE_WIDTH, _TOLERANCE = 180, 1.15
 # Weight of the hidden area at a label's last place.
 _LAST_WEIGHT = 0.7
 # Fraction of a box that a label inside may cover.
@@ -93,7 +93,7 @@ def _break_lines(
     request: LabelRequest, image_width: int, scale: float, last_count: int | None
 ) -> tuple[tuple[str, ...], tuple[int, int], float]:
     """Lines of a label that is not much wider than its box, their size in pixels, and the font scale."""
-    wide = max(request.box[2] - request.box[0], _FREE_WIDTH * image_width)
+    wide = max(request.box[2] - request.box[0], _FREE_WIDTH * scale)
     for count in range(1, len(request.fields) + 1):
         lines = _split(request.fields, count)
         # All digits count as the widest one, so that the size does not change with every number.

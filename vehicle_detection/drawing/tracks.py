@@ -74,7 +74,8 @@ def draw_tracks(
 
     Notes
     -----
-    In a video, `VehicleDetector.annotate` also keeps each label in its place from frame to frame.
+    In a video, `VehicleDetector.annotate` also keeps each label in its place from frame to frame. Short lines
+    are wrapped, so that a label is not much wider than its box.
     """
     params = DrawParams(labels=labels, line_width=line_width, color_by=color_by)
     return TrackDrawer(params).draw(image, tracks)

@@ -20,7 +20,7 @@ from vehicle_detection.synthetic.scenery import LANE, Road
 from vehicle_detection.synthetic.shapes import random_appearance
 from vehicle_detection.synthetic.vehicles import VehicleBody
 
-SCENARIOS = ("highway", "overtaking", "crossing", "occlusion", "empty")
+SCENARIOS = ("highway", "overtaking", "crossing", "occlusion", "traffic", "empty")
 
 # Columns of a labels file; the first nine are those of manual labels.
 LABEL_COLUMNS = (
@@ -69,11 +69,13 @@ class TrafficVehicle:
 
 def make_traffic(scenario: str, duration: float, rng: Rng) -> tuple[Road, list[TrafficVehicle]]:
     """Return road and vehicles of a scenario that lasts `duration` seconds; its event is in the middle."""
-    road = Road(own=int(rng.integers(3)) if scenario in ("highway", "empty") else 1)
+    road = Road(own=int(rng.integers(3)) if scenario in ("highway", "traffic", "empty") else 1)
     if scenario == "empty":
         return road, []
-    if scenario == "highway":
+    if scenario in ("highway", "traffic"):
         ahead = _vehicles_ahead(road, duration, rng)
+        if scenario == "traffic":
+            return road, ahead
         return road, ahead + _oncoming_vehicles(road, duration, rng, first_track=len(ahead) + 1)
     side = 1 if rng.random() < 0.5 else -1
     if scenario == "overtaking":
@@ -148,8 +150,11 @@ class Drive:
 
     def __getitem__(self, index: int) -> Scene:
         """Render frame `index`; a negative index counts from the end, a slice is an error."""
-        frame = check_integer(index, "frame number", low=-self._frames, high=self._frames - 1) % self._frames
+        frame = self._check_index(index)
         return self._renderer.scene(*self._state(frame), frame)
+
+    def _check_index(self, index: int) -> int:
+        return check_integer(index, "frame number", low=-self._frames, high=self._frames - 1) % self._frames
 
     def __iter__(self) -> Iterator[Scene]:
         """Render one frame after the other."""
@@ -158,7 +163,11 @@ class Drive:
     @cached_property
     def truth(self) -> tuple[tuple[VehicleTruth, ...], ...]:
         """Ground truth of every frame, computed without rendering the images."""
-        return tuple(self._renderer.truth(*self._state(frame)) for frame in range(self._frames))
+        return tuple(self.truth_of(frame) for frame in range(self._frames))
+
+    def truth_of(self, index: int) -> tuple[VehicleTruth, ...]:
+        """Ground truth of frame `index`, computed without rendering the image."""
+        return self._renderer.truth(*self._state(self._check_index(index)))
 
     def _state(self, frame: int) -> tuple[list[VehiclePose], float, int]:
         """Poses of the vehicles that may be visible, distance traveled (m) and pitch offset (rows)."""
@@ -202,7 +211,8 @@ def render_drive(
         ``"highway"``: vehicles ahead in three lanes, oncoming ones behind a barrier. ``"overtaking"``: a car
         enters at the left or right edge of the image and pulls away. ``"crossing"``: in the middle of the
         drive a car crosses two lanes in front of another. ``"occlusion"``: the same, closer and slower, so
-        that the other car is hidden for about a second. ``"empty"``: no vehicles.
+        that the other car is hidden for about a second. ``"traffic"``: vehicles ahead in three lanes, none
+        oncoming. ``"empty"``: no vehicles.
     shape, horizon, camera_height_m, focal_px, light, rain, jpeg_quality, random_state
         As for `render_scene`.
     pitch_jitter_px

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -42,6 +42,11 @@ class VehicleTruth:
     occluded: int  # 0 visible, 1 partly occluded (10% or more), 2 largely occluded (over 50%)
     truncated: float  # fraction of `full_box` outside the image
     ignore: int
+
+    @property
+    def hard_to_see(self) -> bool:
+        """Whether it is largely occluded, truncated by more than 0.7, or narrower than 40 pixels."""
+        return self.occluded == 2 or self.truncated > 0.7 or self.box[2] - self.box[0] < 40
 
 
 @dataclass(frozen=True)
@@ -133,11 +138,11 @@ def ground_truth(
     visible = instance_map[sprite.region][sprite.solid] == pose.track
     fraction = 1 - np.count_nonzero(visible) / visible.size
     occluded = 2 if fraction > 0.5 else 1 if fraction >= 0.1 else 0
-    ignore = occluded == 2 or truncated > 0.7 or box[2] - box[0] < 40 or pose.oncoming
-    return VehicleTruth(
+    truth = VehicleTruth(
         pose.track, sprite.box, (x1, y1, x2, y2), pose.distance, pose.speed, fraction, occluded, truncated,
-        int(ignore),
+        ignore=int(pose.oncoming),
     )  # fmt: skip
+    return replace(truth, ignore=1) if truth.hard_to_see else truth
 
 
 def projected_box(pose: VehiclePose, config: SceneConfig) -> Doubles:
