@@ -46,9 +46,8 @@ class TestPosition:
 def test_trails_cover_a_time_and_drop_lost_tracks():
     trails = Trails()
     for step in range(100):
-        known = {1: road_position(track(distance_m=10.0 + step), CAMERA, SHAPE), 2: None}
-        result = trails.update(step / 25, known)
-    times = [time for time, _, _ in result[1]]
+        result = trails.update(step / 25, {1: (step, 10), 2: None})
+    times = [time for time, _ in result[1]]
     assert times == sorted(times)
     assert 3.96 - 1.5 <= times[0] < 3.96 - 1.3
     assert len(times) <= 20

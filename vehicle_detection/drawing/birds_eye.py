@@ -22,8 +22,9 @@ from vehicle_detection.drawing.primitives import (
 )
 from vehicle_detection.tracking import Track
 
-Trail = deque[tuple[float, float, float]]
-"""Time in seconds, lateral position and distance in meters of a track in the last frames."""
+Point = tuple[int, int]
+Trail = deque[tuple[float, Point]]
+"""Times in seconds, and positions in pixels, of a track in the last frames."""
 
 LANE_WIDTH_M = 3.6
 """Distance between the lines of the grid, where the camera is in the middle of its lane."""
@@ -41,8 +42,11 @@ _OWN_COLOR, _GRID_COLOR, _TEXT_COLOR = (235, 235, 235), (72, 78, 86), (170, 176,
 _BACKGROUND, _BACKGROUND_ALPHA, _ELLIPSE_ALPHA = (26, 29, 33), 0.78, 0.4
 # Sides of the view as fractions of the frame's height, and of its own height.
 _CORNER_HEIGHT, _SIDE_WIDTH, _ASPECT = 0.42, 0.3, 0.42
+# Lookup table of the frame's brightness behind the view.
+_DIMMED = np.rint(np.arange(256) * (1 - _BACKGROUND_ALPHA)).astype(np.uint8)
 _TRAIL_STEP = 0.08  # s
 _SHIFT = 4  # fractional bits of coordinates in OpenCV
+_FAR = 1e6  # limit of such coordinates
 
 
 class RoadPosition(NamedTuple):
@@ -88,13 +92,13 @@ class Trails:
     def __init__(self) -> None:
         self._trails: dict[int, Trail] = {}
 
-    def update(self, time: float, positions: Mapping[int, RoadPosition | None]) -> dict[int, Trail]:
-        """Add the positions of a frame by track id, at most one per 0.08 s; return all trails."""
-        trails = {key: self._trails.get(key) or deque() for key in positions}
+    def update(self, time: float, points: Mapping[int, Point | None]) -> dict[int, Trail]:
+        """Add the points of a frame by track id, at most one per 0.08 s; return all trails."""
+        trails = {key: self._trails.get(key) or deque() for key in points}
         for key, trail in trails.items():
-            position = positions[key]
-            if position is not None and not (trail and time < trail[-1][0] + _TRAIL_STEP):
-                trail.append((time, position.lateral_m, position.distance_m))
+            point = points[key]
+            if point is not None and not (trail and time < trail[-1][0] + _TRAIL_STEP):
+                trail.append((time, point))
             while trail and trail[0][0] < time - TRAIL_SECONDS:
                 trail.popleft()
         self._trails = trails
@@ -149,12 +153,10 @@ class BirdsEyePanel:
         height, width = self._grid.shape[:2]
         left = shape[1] if self._place == "side" else shape[1] - width
         view = canvas[:height, left : left + width]
-        if self._place == "side":
-            panel = self._grid.copy()
-        else:
-            panel = np.asarray(cv2.addWeighted(view, 1 - _BACKGROUND_ALPHA, self._dark, 1.0, 0), np.uint8)
+        view[:] = self._grid if self._place == "side" else cv2.add(cv2.LUT(view, _DIMMED), self._dark)
         positions = {track.id: road_position(track, camera, shape) for track in tracks}
-        trails = self._trails.update(time, positions)
+        points = {key: position and self._point(*position[:2]) for key, position in positions.items()}
+        trails = self._trails.update(time, points)
         shown = [
             (position, track, color)
             for track, color in zip(tracks, colors, strict=True)
@@ -163,12 +165,12 @@ class BirdsEyePanel:
         # Far to near, and all ellipses below all vehicles.
         shown.sort(key=lambda entry: -entry[0].distance_m)
         for position, _, color in shown:
-            self._draw_ellipse(panel, position, color)
+            self._draw_ellipse(view, position, color)
         for position, track, color in shown:
-            self._draw_trail(panel, trails[track.id], position, color)
-            self._draw_vehicle(panel, track, position, color, camera)
-            self._write_number(panel, track, position)
-        view[:] = panel
+            trail = [*(point for _, point in trails[track.id]), points[track.id]]
+            cv2.polylines(view, [np.array(trail, np.int32)], False, color, 1, cv2.LINE_AA, _SHIFT)
+            self._draw_vehicle(view, track, position, color, camera)
+            self._write_number(view, track, position)
         return left, 0, left + width, height
 
     def _draw_grid(self, height: int, width: int) -> Image:
@@ -195,16 +197,11 @@ class BirdsEyePanel:
             round(_ELLIPSE_ALPHA * value + (1 - _ELLIPSE_ALPHA) * dark)
             for value, dark in zip(color, _BACKGROUND, strict=True)
         )
-        center = self._pixels([(x, z)])[0].tolist()
+        center = self._point(x, z)
         unit = self._scale * (1 << _SHIFT)
         axes = [max(1, round(min(std * unit, 1e6))) for std in position[2:]]
         angle = math.degrees(math.atan2(-z, x))
         cv2.ellipse(panel, center, axes, angle, 0, 360, shade, cv2.FILLED, cv2.LINE_AA, _SHIFT)
-
-    def _draw_trail(self, panel: Image, trail: Trail, position: RoadPosition, color: Color) -> None:
-        points = self._pixels([*((x, z) for _, x, z in trail), position[:2]])
-        if len(points) > 1:
-            cv2.polylines(panel, [points], False, color, 1, cv2.LINE_AA, _SHIFT)
 
     def _draw_vehicle(
         self, panel: Image, track: Track, position: RoadPosition, color: Color, camera: Camera
@@ -237,14 +234,12 @@ class BirdsEyePanel:
     def _row(self, distance_m: float) -> int:
         return round((_AHEAD_M - distance_m) * self._scale)
 
+    def _point(self, lateral_m: float, distance_m: float) -> Point:
+        """Fixed-point pixel of a position in meters."""
+        unit, middle = self._scale * (1 << _SHIFT), self._width / 2 * (1 << _SHIFT)
+        column, row = middle + lateral_m * unit, (_AHEAD_M - distance_m) * unit
+        return round(min(max(column, -_FAR), _FAR)), round(min(max(row, -_FAR), _FAR))
+
     def _pixels(self, points: Iterable[tuple[float, float]]) -> NDArray[np.int32]:
         """``(N, 2)`` fixed-point pixels of points given by lateral position and distance in meters."""
-        unit, left, limit = self._scale * (1 << _SHIFT), self._width / 2 * (1 << _SHIFT), 1e6
-        pixels = [
-            (
-                round(min(max(left + x * unit, -limit), limit)),
-                round(min(max((_AHEAD_M - z) * unit, -limit), limit)),
-            )
-            for x, z in points
-        ]
-        return np.array(pixels, np.int32).reshape(-1, 2)
+        return np.array([self._point(*point) for point in points], np.int32)
