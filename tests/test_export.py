@@ -14,7 +14,9 @@ from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.export import (
     BOX_COLUMNS,
+    DIGITS,
     FORMATS,
+    STILL_COLUMNS,
     TRACK_COLUMNS,
     TrackWriter,
     write_boxes,
@@ -22,20 +24,18 @@ from vehicle_detection.export import (
 )
 
 ROWS = [
-    (0, 1, 10.0, 20.0, 50.25, 60.5, 1.5, 31.25, -0.5),
-    (0, 2, 100.0, 20.0, 150.0, 60.0, -0.125, None, None),
-    (2, 1, 12.0, 21.0, 52.0, 61.0, 1.0625, 31.0, 0.0),
+    (0, 1, 10.0, 20.0, 50.25, 60.5, 1.5, 31.25, -0.5, 0.9, 2.5, None),
+    (0, 2, 100.0, 20.0, 150.0, 60.0, -0.125, None, None, None, None, None),
+    (2, 1, 12.0, 21.0, 52.0, 61.0, 1.0625, 31.0, 0.0, 0.8, 2.25, 0.5),
 ]
 
 
 def track(row, *, shown=True):
-    _, number, *box, score, distance, speed = row
-    return SimpleNamespace(
-        id=number, box=np.array(box), score=score, distance_m=distance, speed_mps=speed, shown=shown
-    )
+    values = dict(zip(TRACK_COLUMNS[6:], row[6:]))
+    return SimpleNamespace(id=row[1], box=np.array(row[2:6]), shown=shown, **values)
 
 
-TENTATIVE = track((0, 0, 0.0, 0.0, 9.0, 9.0, 0.1, None, None), shown=False)
+TENTATIVE = track((0, 0, 0.0, 0.0, 9.0, 9.0, 0.1), shown=False)
 RESULTS = [
     SimpleNamespace(index=0, tracks=(track(ROWS[0]), TENTATIVE, track(ROWS[1]))),
     SimpleNamespace(index=1, tracks=()),
@@ -49,13 +49,16 @@ boxes = st.tuples(number, number, st.floats(0, 1e4), st.floats(0, 1e4)).map(
 unknown = st.none() | number
 rows = st.lists(
     st.builds(
-        lambda frame, vehicle, box, score, distance, speed: (frame, vehicle, *box, score, distance, speed),
+        lambda frame, vehicle, box, *others: (frame, vehicle, *box, *others),
         st.integers(0, 10**6),
         st.integers(1, 10**6),
         boxes,
         number,
         unknown,
         unknown,
+        st.none() | st.floats(0, 1),
+        st.none() | st.floats(0, 1e4),
+        st.none() | st.floats(0, 1e4),
     ),
     max_size=8,
 )
@@ -92,7 +95,7 @@ def test_tables_hold_the_rows(tmp_path_factory, given_rows):
         assert len(found) == len(given_rows)
         for row, wanted in zip(found, given_rows):
             assert row[:2] == wanted[:2]
-            for value, want, digits in zip(row[2:], wanted[2:], (2, 2, 2, 2, 4, 2, 2), strict=True):
+            for value, want, digits in zip(row[2:], wanted[2:], DIGITS.values(), strict=True):
                 assert (value is None) == (want is None)
                 if want is not None:
                     assert value == pytest.approx(want, abs=0.50001 * 10**-digits)
@@ -105,10 +108,10 @@ def test_tables_hold_the_rows(tmp_path_factory, given_rows):
 def test_csv_to_the_letter(tmp_path):
     assert write_tracks(RESULTS, tmp_path / "tracks.csv") == 3
     assert (tmp_path / "tracks.csv").read_bytes().decode() == (
-        "frame,track_id,x1,y1,x2,y2,score,distance_m,speed_mps\n"
-        "0,1,10.00,20.00,50.25,60.50,1.5000,31.25,-0.50\n"
-        "0,2,100.00,20.00,150.00,60.00,-0.1250,,\n"
-        "2,1,12.00,21.00,52.00,61.00,1.0625,31.00,0.00\n"
+        "frame,track_id,x1,y1,x2,y2,score,distance_m,speed_mps,confidence,distance_std_m,speed_std_mps\n"
+        "0,1,10.00,20.00,50.25,60.50,1.5000,31.25,-0.50,0.9000,2.50,\n"
+        "0,2,100.00,20.00,150.00,60.00,-0.1250,,,,,\n"
+        "2,1,12.00,21.00,52.00,61.00,1.0625,31.00,0.00,0.8000,2.25,0.50\n"
     )
 
 
@@ -198,6 +201,8 @@ def test_coco_is_a_data_set(tmp_path):
         "track_id": 1,
         "distance_m": 31.25,
         "speed_mps": -0.5,
+        "confidence": 0.9,
+        "distance_std_m": 2.5,
     }
     assert "distance_m" not in second
     # The ids of the images do not depend on which frames have rows.
@@ -285,7 +290,7 @@ def test_a_writer_can_be_used_again_but_only_inside_its_block(tmp_path):
 
 def test_boxes_of_stills(tmp_path):
     found = [
-        ("road, wet.jpg", Detections([[10, 20, 50, 60], [1, 2, 3, 4]], [1.5, 0.25])),
+        ("road, wet.jpg", Detections([[10, 20, 50, 60], [1, 2, 3, 4]], [1.5, 0.25], [0.82, 0.56])),
         ("empty.jpg", Detections.empty()),
         ('é "quoted".png', Detections([[0, 0, 9.5, 9]], [2])),
     ]
@@ -293,16 +298,19 @@ def test_boxes_of_stills(tmp_path):
     assert (
         (tmp_path / "b.csv")
         .read_text(encoding="utf-8")
-        .startswith('frame,track_id,x1,y1,x2,y2,score\n"road, wet.jpg",,10.00,20.00,50.00,60.00,1.5000\n')
+        .startswith(
+            "frame,track_id,x1,y1,x2,y2,score,confidence\n"
+            '"road, wet.jpg",,10.00,20.00,50.00,60.00,1.5000,0.8200\n'
+        )
     )
     read = read_csv(tmp_path / "b.csv")
-    assert tuple(read[0]) == BOX_COLUMNS
+    assert tuple(read[0]) == STILL_COLUMNS
     assert [row["frame"] for row in read] == ["road, wet.jpg", "road, wet.jpg", 'é "quoted".png']
     assert {row["track_id"] for row in read} == {""}
     for name in ("b.jsonl", "b.parquet"):
         assert write_boxes(found, tmp_path / name) == 3
     assert read_jsonl(tmp_path / "b.jsonl")[2] == dict(
-        zip(BOX_COLUMNS, ('é "quoted".png', None, 0.0, 0.0, 9.5, 9.0, 2.0))
+        zip(STILL_COLUMNS, ('é "quoted".png', None, 0.0, 0.0, 9.5, 9.0, 2.0, None))
     )
     table = pd.read_parquet(tmp_path / "b.parquet")
     assert table["frame"].tolist() == [row["frame"] for row in read]
@@ -334,7 +342,11 @@ def test_rows_of_stills(tmp_path):
     ("row", "message"),
     [
         ((0, 1, 2, 3), "row 0 must be a FrameResult or the values frame, track_id"),
-        ((0, 1, 2, 3, 4, 5, 6, 7, 8, 9), "row 0 must be a FrameResult or the values"),
+        ((0, 1, 2, 3, 4, 5, 6, 7, 8, 0.9, 1, 1, 1), "row 0 must be a FrameResult or the values"),
+        (
+            (0, 1, 2, 3, 4, 5, 6, 7, 8, 9),
+            "row 0: confidence must be a number, at least 0 and at most 1; got 9",
+        ),
         ("0,1,2,3,4,5,6", "row 0 must be a FrameResult or the values"),
         (7, "row 0 must be a FrameResult or the values"),
         ({"frame": 0, "track_id": 1}, "row 0 lacks x1, y1, x2, y2, score; its names must be frame"),

@@ -26,7 +26,7 @@ LAYERS = [
     "datasets regions tracking heatmap features video",
     "evaluation drawing classifier sklearn_models",
     "windows search mixture training function_model",
-    "course detector mixture_training report",
+    "confidence course detector mixture_training report",
     "tuning explorer",
     "plotting",
     "cli",

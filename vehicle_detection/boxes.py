@@ -209,6 +209,37 @@ def log_odds(scores: ArrayLike, score: ScoreScale, threshold: float | None = Non
     return np.asarray(np.log(p / (1 - p)) - math.log(limit / (1 - limit)))
 
 
+@dataclass(frozen=True)
+class Platt:
+    """The sigmoid ``1 / (1 + exp(a * score + b))``; `a` is negative where higher scores are vehicles."""
+
+    a: float
+    b: float
+
+    def __post_init__(self) -> None:
+        check_number(self.a, "a")
+        check_number(self.b, "b")
+
+    def probability(self, scores: ArrayLike) -> Floats:
+        """Probability of a vehicle for each score, float64 in [0, 1], of the same shape."""
+        values = np.asarray(scores)
+        if values.dtype.kind not in "iuf" or np.isnan(values).any():
+            raise InvalidInputError(f"scores must be numbers without NaN; got {describe(scores)}")
+        exponent = np.asarray(self.a * values.astype(np.float64) + self.b)
+        # Both branches avoid the overflow of exp, and keep small probabilities exact.
+        small = np.exp(-np.abs(exponent))
+        return np.asarray(np.where(exponent > 0, small, 1.0) / (1 + small))
+
+    def score(self, probability: float) -> float:
+        """Return the score that has this probability, in (0, 1), for use as a threshold."""
+        value = check_number(probability, "probability", above=0)
+        if value >= 1 or self.a == 0:
+            raise InvalidInputError(
+                f"probability must lie in (0, 1) and a must not be 0; got {value:g} and a={self.a:g}"
+            )
+        return float((np.log((1 - value) / value) - self.b) / self.a)
+
+
 def check_score_scale(score: object, threshold: float | None) -> ScoreScale:
     """Return the scale of `log_odds` if it and the threshold are valid."""
     if isinstance(score, (tuple, list)) and len(score) == 2:
@@ -245,11 +276,13 @@ class Detections:
     ----------
     boxes, scores
         ``(N, 4)`` boxes ``[x1, y1, x2, y2]``, and ``(N,)`` finite float64 scores.
+    confidences
+        ``(N,)`` calibrated probabilities of a vehicle in [0, 1]; None if they are unknown.
 
     Raises
     ------
     InvalidInputError
-        If the columns differ in length or contain NaN.
+        If the columns differ in length or contain NaN, or a confidence is not a probability.
 
     Examples
     --------
@@ -264,6 +297,7 @@ class Detections:
 
     boxes: NDArray[Any]
     scores: Floats
+    confidences: Floats | None = None
 
     def __post_init__(self) -> None:
         boxes = check_boxes(self.boxes)
@@ -278,6 +312,14 @@ class Detections:
             raise InvalidInputError("scores must be finite, got NaN or infinity; drop those rows")
         object.__setattr__(self, "boxes", boxes)
         object.__setattr__(self, "scores", scores.astype(np.float64, copy=False))
+        if self.confidences is not None:
+            confidences = _score_column(self.confidences)
+            if confidences.shape != scores.shape or not ((confidences >= 0) & (confidences <= 1)).all():
+                raise InvalidInputError(
+                    f"confidences must be a probability, 0 to 1, for each of the {len(boxes)} boxes, got "
+                    f"{describe(self.confidences)}; omit them where they are unknown"
+                )
+            object.__setattr__(self, "confidences", confidences)
 
     @classmethod
     def empty(cls) -> Detections:
@@ -347,7 +389,7 @@ class Detections:
     def to_supervision(self, *, tracker_id: ArrayLike | None = None) -> Any:
         """Convert to ``supervision.Detections``, for the drawing, counting and tracking of that library.
 
-        The confidence is the probability of the score, ``1 / (1 + exp(-score))``; a score of 0, the
+        The confidence is that of the detection or, if unknown, ``1 / (1 + exp(-score))``: a score of 0, the
         threshold of a vehicle, becomes 0.5. The class is 0.
 
         Parameters
@@ -368,9 +410,11 @@ class Detections:
                 "pip install supervision"
             ) from error
         ids = None if tracker_id is None else np.asarray(tracker_id, np.int64).reshape(-1)
+        known = self.confidences
+        confidences = Platt(-1.0, 0.0).probability(self.scores) if known is None else known
         return SupervisionDetections(
             xyxy=self.boxes.astype(np.float32),
-            confidence=(1 / (1 + np.exp(-self.scores.clip(-500, 500)))).astype(np.float32),
+            confidence=confidences.astype(np.float32),
             class_id=np.zeros(len(self), np.int64),
             tracker_id=ids,
         )
@@ -379,9 +423,9 @@ class Detections:
         """Join two sets of boxes, such as the windows of two searches."""
         if not isinstance(other, Detections):
             return NotImplemented
-        return Detections(
-            np.concatenate([self.boxes, other.boxes]), np.concatenate([self.scores, other.scores])
-        )
+        known = self.confidences is not None and other.confidences is not None
+        names = ("boxes", "scores", "confidences") if known else ("boxes", "scores")
+        return Detections(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
 
     def __repr__(self) -> str:
         if not len(self):
@@ -395,7 +439,8 @@ class Detections:
     def __getitem__(self, rows: int | slice | NDArray[Any] | list[int]) -> Detections:
         """Take one row by its index, or several by a slice, a mask or a list of indices."""
         taken = [rows] if isinstance(rows, (int, np.integer)) else rows
-        return Detections(self.boxes[taken], self.scores[taken])
+        known = self.confidences
+        return Detections(self.boxes[taken], self.scores[taken], None if known is None else known[taken])
 
     def __iter__(self) -> Iterator[tuple[NDArray[Any], float]]:
         """Yield ``(box, score)`` pairs."""

@@ -26,6 +26,7 @@ from vehicle_detection._common import (
     write_model,
 )
 from vehicle_detection._kernels import fit_svm
+from vehicle_detection.boxes import Platt
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.features import extract_features, read_patches
@@ -40,6 +41,10 @@ KIND = "patches"
 """Value of ``kind`` in the model files of patch classifiers."""
 
 DEFAULT_C = 1e-4
+
+# Fitted to the boxes of the model "highway" in labelled frames of the course's road, not to patches: most
+# windows of a frame show no vehicle.
+_BOX_CALIBRATION = Platt(-6.29, 5.74)
 
 CLASSIFIER_REMEDY = "load_classifier, train_classifier or VehicleClassifier.from_pipeline make one"
 
@@ -113,6 +118,15 @@ class VehicleClassifier:
                     f"templates must have {self.params.length} weights, the length of the features; "
                     f"got {len(template.coef)}"
                 )
+
+    @property
+    def calibration(self) -> Platt:
+        """Probability that a box contains a vehicle, by its best window's score, on the course's road.
+
+        Other roads have more lookalikes, and the probabilities there are too high; so may be those of models
+        with other features.
+        """
+        return _BOX_CALIBRATION
 
     def decision_function(self, X: ArrayLike) -> NDArray[np.float64]:
         """Score of each patch: its signed distance from the separating hyperplane, positive for a vehicle.

@@ -17,6 +17,7 @@ from vehicle_detection._common import check_image, check_integer, check_number, 
 from vehicle_detection.boxes import Detections, ScoreScale
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import VehicleClassifier
+from vehicle_detection.confidence import Model, calibration_of, with_confidence
 from vehicle_detection.drawing import TrackDrawer, draw_boxes, draw_diagnostics
 from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.function_model import DetectorFunction, FunctionModel
@@ -37,7 +38,6 @@ from vehicle_detection.search import FrameSearch, SearchResult
 from vehicle_detection.tracking import Track, Tracker, interpolate_tracks
 
 Path = str | os.PathLike[str]
-Model = VehicleClassifier | TemplateMixture | FunctionModel
 Clip = TypeVar("Clip")
 
 # Searches per second of a video, at least, where the frame rate decides.
@@ -89,7 +89,9 @@ class FrameResult:
     def to_supervision(self) -> Any:
         """Convert the shown tracks to ``supervision.Detections`` with their ids as ``tracker_id``."""
         boxes = np.array([track.box for track in self.shown]).reshape(-1, 4)
-        found = Detections(boxes, np.array([track.score for track in self.shown]))
+        confidences = [track.confidence for track in self.shown]
+        known = None if None in confidences else np.array(confidences, np.float64)
+        found = Detections(boxes, np.array([track.score for track in self.shown]), known)
         return found.to_supervision(tracker_id=[track.id for track in self.shown])
 
 
@@ -101,6 +103,9 @@ class VehicleDetector:
     model
         A name (``"default"`` for any road, ``"highway"``), the path of a model file, or a model. For a
         detector of your own see `detector_from`.
+    conf
+        Minimum confidence of a vehicle in a single image: its calibrated probability, 0 to 1. The search and
+        the tracker follow: scores are those above this threshold. None: the model's own threshold.
     method
         ``"shared"``: the fast search, features shared by all windows. ``"windows"``: the reference, one patch
         per window; for classifiers of patches.
@@ -153,6 +158,7 @@ class VehicleDetector:
         self,
         model: Path | Model = "default",
         *,
+        conf: float | None = None,
         method: Literal["shared", "windows"] = "shared",
         search_params: SearchParams | PyramidParams | FunctionParams | None = None,
         region_params: RegionParams | HeatParams | None = None,
@@ -174,6 +180,8 @@ class VehicleDetector:
         ):
             if value is not None:
                 check_type(value, name, kind, "omit it for the default")
+        if conf is not None:
+            self.model, region_params = with_confidence(self.model, region_params, conf)
         chosen = search_params or self.model.search_params_type.default()
         self.search_params: SearchParams | PyramidParams | FunctionParams = chosen.with_horizon(horizon)
         if isinstance(region_params, HeatParams):
@@ -186,6 +194,8 @@ class VehicleDetector:
         self.every = None if every is None else check_integer(every, "every", low=1, high=1000)
         self._search: FrameSearch = self.model.open_search(n_jobs, method)
         self._heat_params = region_params if isinstance(region_params, HeatParams) else None
+        # The heat of a region is no log-odds.
+        self._calibration = calibration_of(self.model) if self._heat_params is None else None
         self._speed_warning = True
         self.reset()
 
@@ -239,7 +249,7 @@ class VehicleDetector:
         Returns
         -------
         Detections
-            Boxes in pixels of the image, with scores.
+            Boxes in pixels of the image, with scores and, unless they come from a heat map, confidences.
 
         Raises
         ------
@@ -253,10 +263,13 @@ class VehicleDetector:
         return _positive(self._fit_boxes(found))
 
     def _fit_boxes(self, found: SearchResult) -> Detections:
-        if found.vehicles is not None:
-            return found.vehicles
-        assert isinstance(self.region_params, RegionParams)
-        return find_vehicles(found.windows, self._camera_of(found.shape), found.shape, self.region_params)
+        vehicles = found.vehicles
+        if vehicles is None:
+            assert isinstance(self.region_params, RegionParams)
+            camera = self._camera_of(found.shape)
+            vehicles = find_vehicles(found.windows, camera, found.shape, self.region_params)
+        assert self._calibration is not None
+        return Detections(vehicles.boxes, vehicles.scores, self._calibration.probability(vehicles.scores))
 
     def _camera_of(self, shape: tuple[int, int]) -> Camera:
         if self.camera is not None:
@@ -356,7 +369,8 @@ class VehicleDetector:
         start = clock.perf_counter()
         self._shape, self._time = found.shape, time
         if self._tracker is None:
-            self._tracker = Tracker(self.track_params, fps=self._fps or _USUAL_FPS)
+            fps = self._fps or _USUAL_FPS
+            self._tracker = Tracker(self.track_params, fps=fps, calibration=self._calibration)
         self._tracker.set_camera(self._camera_of(found.shape))
         if self._is_cut(found.thumbnail):
             self._heat_history.clear()

@@ -1,7 +1,7 @@
 """Write results to files: CSV, JSON Lines, Parquet, MOTChallenge text and COCO JSON.
 
-Every table has the columns ``frame,track_id,x1,y1,x2,y2,score``; tables of tracks also have
-``distance_m,speed_mps``.
+Every table has the columns ``frame,track_id,x1,y1,x2,y2,score``. Tables of tracks go on with
+``distance_m,speed_mps,confidence,distance_std_m,speed_std_mps``, tables of boxes with ``confidence``.
 """
 
 from __future__ import annotations
@@ -29,9 +29,11 @@ from vehicle_detection._common import (
 from vehicle_detection.errors import InvalidInputError
 
 BOX_COLUMNS = ("frame", "track_id", "x1", "y1", "x2", "y2", "score")
-TRACK_COLUMNS = (*BOX_COLUMNS, "distance_m", "speed_mps")
+"""Columns that every row has."""
+STILL_COLUMNS = (*BOX_COLUMNS, "confidence")
+TRACK_COLUMNS = (*BOX_COLUMNS, "distance_m", "speed_mps", "confidence", "distance_std_m", "speed_std_mps")
 
-DIGITS = dict(zip(TRACK_COLUMNS[2:], (2, 2, 2, 2, 4, 2, 2)))
+DIGITS = dict(zip(TRACK_COLUMNS[2:], (2, 2, 2, 2, 4, 2, 2, 4, 2, 2)))
 """Decimals of each column."""
 
 
@@ -47,6 +49,9 @@ class Row(NamedTuple):
     score: float | None
     distance_m: float | None = None
     speed_mps: float | None = None
+    confidence: float | None = None
+    distance_std_m: float | None = None
+    speed_std_mps: float | None = None
     ignore: bool = False
     visible: float = 1.0
 
@@ -76,8 +81,15 @@ def _rows_of(item: Any, number: int) -> list[Row]:
     """Rows of a frame's result, one per shown track; a row stays one row."""
     rows = [item]
     if is_result(item):
+        optional = TRACK_COLUMNS[len(BOX_COLUMNS) :]
         rows = [
-            (item.index, track.id, *track.box, track.score, track.distance_m, track.speed_mps)
+            (
+                item.index,
+                track.id,
+                *track.box,
+                track.score,
+                *(getattr(track, name, None) for name in optional),
+            )
             for track in shown_tracks(item)
         ]
     return [_check_row(row, number + place) for place, row in enumerate(rows)]
@@ -85,7 +97,7 @@ def _rows_of(item: Any, number: int) -> list[Row]:
 
 def _check_row(item: Any, number: int, *, stills: bool = False) -> Row:
     """Check and round one row; `number` counts rows from 0 for the error message."""
-    columns = BOX_COLUMNS if stills else TRACK_COLUMNS
+    columns = STILL_COLUMNS if stills else TRACK_COLUMNS
     values: list[Any] = []
     if isinstance(item, Mapping):
         missing = [name for name in BOX_COLUMNS if name not in item and not (stills and name == "track_id")]
@@ -100,12 +112,12 @@ def _check_row(item: Any, number: int, *, stills: bool = False) -> Row:
         raise InvalidInputError(
             f"row {number} must be a FrameResult or the values {', '.join(columns)}, got {describe(item)}"
         )
-    optional = ("track_id",) if stills else ("distance_m", "speed_mps")
-    checked: list[Any] = [
-        None if name in optional and _is_missing(value) else _check_value(value, number, name, stills)
+    optional = ("track_id",) * stills + columns[len(BOX_COLUMNS) :]
+    checked: dict[str, Any] = {
+        name: None if name in optional and _is_missing(value) else _check_value(value, number, name, stills)
         for name, value in zip(columns, values)
-    ]
-    row = Row(*checked)
+    }
+    row = Row(**checked)
     if row.x2 < row.x1 or row.y2 < row.y1:
         raise InvalidInputError(
             f"row {number} must have x1 <= x2 and y1 <= y2, got {list(row[2:6])}; "
@@ -131,7 +143,9 @@ def _check_value(value: Any, number: int, name: str, stills: bool) -> Any:
                 "write the frames of a video with write_tracks"
             )
         return os.fspath(value)
-    checked = check_number(value, where, low=0 if name == "frame" else -math.inf)
+    positive = name in ("frame", "confidence", "distance_std_m", "speed_std_mps")
+    high = 1.0 if name == "confidence" else math.inf
+    checked = check_number(value, where, low=0 if positive else -math.inf, high=high)
     if name in DIGITS:
         return round(checked, DIGITS[name]) + 0.0  # + 0.0 turns -0.0 into 0.0
     # A pandas column with missing values holds whole numbers as floats.
@@ -164,8 +178,8 @@ def write_tracks(
     ----------
     results
         One :class:`FrameResult` for each frame, of which the shown tracks are written; or rows, each a
-        mapping or a sequence of ``frame, track_id, x1, y1, x2, y2, score[, distance_m, speed_mps]``; or a
-        pandas table of such rows.
+        mapping or a sequence of ``frame, track_id, x1, y1, x2, y2, score[, distance_m, speed_mps,
+        confidence, distance_std_m, speed_std_mps]``; or a pandas table of such rows.
     path, format
         File to write, and its format: ``"csv"``, ``"jsonl"`` (one JSON object per line), ``"parquet"`` (needs
         pyarrow), ``"mot"`` (MOTChallenge text) or ``"coco"`` (JSON). None chooses by the suffix: .csv,
@@ -186,10 +200,12 @@ def write_tracks(
     Notes
     -----
     ``frame`` counts from 0, the first processed frame; boxes are half-open pixels with two decimals.
-    Unknown distances and speeds are empty in CSV and null elsewhere. MOT files count frames and pixels from
-    1, as the MOTChallenge tools do, and hold width and height. A COCO file is a data set whose image ids
-    are the frame numbers plus 1, whichever frames have tracks; for ``COCO.loadRes`` of pycocotools, write
-    ``FrameBoxes.from_results(results)`` with `write_labels`.
+    Unknown values are empty in CSV and null elsewhere. The score is the log-odds above the threshold, the
+    confidence a calibrated probability; speeds are relative to the camera.
+
+    MOT files count frames and pixels from 1, as the MOTChallenge tools do, and hold width and height. A COCO
+    file is a data set whose image ids are the frame numbers plus 1, whichever frames have tracks; for
+    ``COCO.loadRes`` of pycocotools, write ``FrameBoxes.from_results(results)`` with `write_labels`.
 
     Examples
     --------
@@ -198,9 +214,9 @@ def write_tracks(
     >>> write_tracks([(0, 1, 10, 20, 50.128, 60, 1.5), (1, 1, 12, 20, 52, 60, 1.25, 31.4, -0.5)], file)
     2
     >>> print(file.read_text().rstrip())
-    frame,track_id,x1,y1,x2,y2,score,distance_m,speed_mps
-    0,1,10.00,20.00,50.13,60.00,1.5000,,
-    1,1,12.00,20.00,52.00,60.00,1.2500,31.40,-0.50
+    frame,track_id,x1,y1,x2,y2,score,distance_m,speed_mps,confidence,distance_std_m,speed_std_mps
+    0,1,10.00,20.00,50.13,60.00,1.5000,,,,,
+    1,1,12.00,20.00,52.00,60.00,1.2500,31.40,-0.50,,,
     """
     kind = check_format(path, format, FORMATS.values())
     if kind in ("csv", "jsonl", "mot"):
@@ -228,8 +244,8 @@ def write_boxes(
     ----------
     boxes
         Pairs of an image's file name and its :class:`Detections`; or rows, each a mapping or a sequence of
-        ``frame, track_id, x1, y1, x2, y2, score`` with the file name as ``frame``, and None as ``track_id``
-        unless the boxes are numbered.
+        ``frame, track_id, x1, y1, x2, y2, score[, confidence]`` with the file name as ``frame``, and None as
+        ``track_id`` unless the boxes are numbered.
     path, format
         As in `write_tracks`, without ``"mot"``. The image ids of a COCO file depend on the file names alone;
         `write_labels` writes boxes with the ids of a ground truth.
@@ -249,11 +265,11 @@ def write_boxes(
     >>> import tempfile
     >>> from vehicle_detection.boxes import Detections
     >>> file = Path(tempfile.mkdtemp()) / "boxes.csv"
-    >>> write_boxes([("road.jpg", Detections([[10, 20, 50, 60]], [1.5]))], file)
+    >>> write_boxes([("road.jpg", Detections([[10, 20, 50, 60]], [1.5], [0.82]))], file)
     1
     >>> print(file.read_text().rstrip())
-    frame,track_id,x1,y1,x2,y2,score
-    road.jpg,,10.00,20.00,50.00,60.00,1.5000
+    frame,track_id,x1,y1,x2,y2,score,confidence
+    road.jpg,,10.00,20.00,50.00,60.00,1.5000,0.8200
     """
     kind = check_format(path, format, ("csv", "jsonl", "parquet", "coco"))
     names: list[int | str] = []
@@ -263,12 +279,18 @@ def write_boxes(
             name, found = item
             names.append(str(name))
             rows += [
-                _check_row((str(name), None, *box, score), len(rows), stills=True)
-                for box, score in zip(found.boxes, found.scores)
+                _check_row((str(name), None, *box, score, confidence), len(rows), stills=True)
+                for box, score, confidence in zip(found.boxes, found.scores, _confidences(found))
             ]
         else:
             rows.append(_check_row(item, len(rows), stills=True))
-    return _write_rows(rows, names, path, kind, BOX_COLUMNS)
+    return _write_rows(rows, names, path, kind, STILL_COLUMNS)
+
+
+def _confidences(found: Any) -> Sequence[float | None]:
+    """Confidence of each detection, None where unknown."""
+    known = getattr(found, "confidences", None)
+    return [None] * len(found.scores) if known is None else known
 
 
 class TrackWriter:
@@ -299,7 +321,7 @@ class TrackWriter:
     ...     write((0, 1, 10, 20, 50, 60, 1.5))
     >>> print(file.read_text().rstrip())
     {"frame": 0, "track_id": 1, "x1": 10.0, "y1": 20.0, "x2": 50.0, "y2": 60.0, "score": 1.5, \
-"distance_m": null, "speed_mps": null}
+"distance_m": null, "speed_mps": null, "confidence": null, "distance_std_m": null, "speed_std_mps": null}
     """
 
     def __init__(self, path: str | os.PathLike[str], *, format: str | None = None) -> None:  # noqa: A002
@@ -357,14 +379,18 @@ def _row_writer(file: IO[str], kind: str, columns: Sequence[str]) -> Callable[[R
     if kind == "csv":
         table = csv.writer(file, lineterminator="\n")
         table.writerow(columns)
-        return lambda row: table.writerow(_csv_cells(row)[: len(columns)])
+        return lambda row: table.writerow(_csv_cells(row, columns))
     if kind == "jsonl":
-        return lambda row: file.write(json.dumps(dict(zip(columns, row)), ensure_ascii=False) + "\n")
+        return lambda row: file.write(json.dumps(_values(row, columns), ensure_ascii=False) + "\n")
     return lambda row: file.write(mot_line(row) + "\n")
 
 
-def _csv_cells(row: Row) -> list[Any]:
-    numbers = zip(row[2:], DIGITS.values())
+def _values(row: Row, columns: Sequence[str]) -> dict[str, Any]:
+    return {name: getattr(row, name) for name in columns}
+
+
+def _csv_cells(row: Row, columns: Sequence[str]) -> list[Any]:
+    numbers = ((getattr(row, name), DIGITS[name]) for name in columns[2:])
     return [*row[:2], *("" if value is None else f"{value:.{digits}f}" for value, digits in numbers)]
 
 
@@ -395,7 +421,7 @@ def _write_rows(
 ) -> int:
     """Write all rows at once, in any format; return their number."""
     if kind == "parquet":
-        frame = "string" if columns == BOX_COLUMNS else "int64"
+        frame = "string" if columns == STILL_COLUMNS else "int64"
         types = {"frame": frame, "track_id": "int64"} | dict.fromkeys(columns[2:], "double")
         write_parquet(path, {name: [getattr(row, name) for row in rows] for name in columns}, types=types)
         return len(rows)
@@ -434,8 +460,8 @@ def _image_name(key: int | str) -> dict[str, Any]:
 
 
 def coco_result(row: Row, image_id: int, category_id: int) -> dict[str, Any]:
-    """COCO result: box, score and, if known, track, distance and speed of one detection."""
-    optional = {"track_id": row.track_id, "distance_m": row.distance_m, "speed_mps": row.speed_mps}
+    """COCO result: box, score and, if known, track, distance, speed and confidence of one detection."""
+    optional = {"track_id": row.track_id} | {name: getattr(row, name) for name in TRACK_COLUMNS[7:]}
     return {
         "image_id": image_id,
         "category_id": category_id,

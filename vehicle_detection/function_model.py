@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from vehicle_detection._common import check_type, describe
 from vehicle_detection.boxes import (
     Detections,
+    Platt,
     ScoreScale,
     box_areas,
     check_score_scale,
@@ -53,6 +55,14 @@ class FunctionModel:
         object.__setattr__(self, "score", check_score_scale(self.score, self.threshold))
         object.__setattr__(self, "name", name)
         object.__setattr__(self, "_lock", contextlib.nullcontext() if self.thread_safe else threading.Lock())
+
+    @property
+    def calibration(self) -> Platt:
+        """Probability of the log-odds above the threshold."""
+        limit = 0.0 if isinstance(self.score, tuple) or self.threshold is None else self.threshold
+        if self.score == "probability" and self.threshold is not None:
+            limit = math.log(limit / (1 - limit))
+        return Platt(-1.0, -limit)
 
     def open_search(
         self, n_jobs: int | None = None, method: Literal["shared", "windows"] = "shared"

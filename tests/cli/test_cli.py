@@ -31,7 +31,7 @@ from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.mixture import load_model
 from vehicle_detection.params import DrawParams
-from vehicle_detection.synthetic import render_drive, render_patches
+from vehicle_detection.synthetic import SceneVehicle, render_drive, render_patches, render_scene
 from vehicle_detection.video import probe_video, read_frames
 
 COMMANDS = ("demo", "detect", "video", "evaluate", "train", "train-frames", "tune", "fetch", "info")
@@ -213,21 +213,24 @@ def test_unexpected_errors_keep_their_traceback(monkeypatch, picture):
 
 
 def test_detect_writes_annotated_images_and_boxes(monkeypatch, picture, tmp_path):
-    found = [Detections([[10, 20, 60.4, 70], [100, 50, 180, 120]], [1.5, 0.25]), Detections.empty()]
+    found = [
+        Detections([[10, 20, 60.4, 70], [100, 50, 180, 120]], [1.5, 0.25], [0.82, 0.564]),
+        Detections.empty(),
+    ]
     answers = iter(found)
     monkeypatch.setattr(detector.VehicleDetector, "detect", lambda self, image: next(answers))
     other, folder, boxes = tmp_path / "other.jpg", tmp_path / "new" / "out", tmp_path / "boxes.csv"
     write_image(other, read_image(picture))
     out = succeed("detect", picture, other, "-o", folder, "--boxes", boxes)
     assert out.splitlines() == [
-        f"{picture}: 2 vehicles  [10 20 60 70] 1.50  [100 50 180 120] 0.25",
+        f"{picture}: 2 vehicles  [10 20 60 70] 82%  [100 50 180 120] 56%",
         f"{other}: 0 vehicles",
         f"wrote 2 boxes to {boxes}",
     ]
     assert boxes.read_text().splitlines() == [
-        HEADER,
-        "road.png,,10.00,20.00,60.40,70.00,1.5000",
-        "road.png,,100.00,50.00,180.00,120.00,0.2500",
+        f"{HEADER},confidence",
+        "road.png,,10.00,20.00,60.40,70.00,1.5000,0.8200",
+        "road.png,,100.00,50.00,180.00,120.00,0.2500,0.5640",
     ]
     assert contents(tmp_path / "new") == ["out", "out/other.jpg", "out/road.png"]
     changed = (read_image(folder / "road.png") != read_image(picture)).any(axis=2)
@@ -247,6 +250,21 @@ def test_detect_draws_scores_and_lines_as_asked(monkeypatch, picture, tmp_path):
     assert changed["plain"][:60].any()
     assert not changed["bare"][:60].any()
     assert changed["wide"][90, 100:140].sum() == 5
+
+
+def test_detect_keeps_boxes_of_a_minimum_confidence(tmp_path):
+    cars = [
+        SceneVehicle(distance_m=distance, lateral_m=lateral) for distance, lateral in ((14, 0), (34, 3.6))
+    ]
+    scene = render_scene(shape=(360, 640), vehicles=cars, lane=1, random_state=3)
+    write_image(tmp_path / "road.png", scene.image)
+    counts = {}
+    for conf in (0.1, 0.999):
+        succeed("detect", tmp_path / "road.png", "--conf", conf, "--boxes", tmp_path / "boxes.csv")
+        rows = (tmp_path / "boxes.csv").read_text().splitlines()[1:]
+        assert all(float(row.split(",")[-1]) >= conf for row in rows)
+        counts[conf] = len(rows)
+    assert counts[0.1] > counts[0.999]
 
 
 def test_detect_accepts_every_kind_of_image(picture, tmp_path):
@@ -303,6 +321,7 @@ def bad_images(material, tmp):
         r"floats.tiff must be a complete image file": [floats],
         r"image of 12x12 pixels holds no search window": [tiny, "--model", "highway"],
         r"--horizon must be a number, at least 0 and at most 1; got 2": [road, "--horizon", 2],
+        r"--conf must be a number, at least 0 and at most 1; got 7": [road, "--conf", 7],
         r"--horizon must be a number, .* got nan": [road, "--horizon", "nan"],
         r"--output \S+ is the folder of road.png, which would be overwritten": [road, "-o", material],
         r"--output must be a folder, \S+ cannot be created: File exists": [road, "-o", road],
@@ -396,7 +415,9 @@ def test_video_writes_an_annotated_copy_and_tracks(clip, tmp_path):
         "decode", "search", "regions", "track", "draw", "encode"
     ]  # fmt: skip
     assert lines[-1] == f"wrote {target}, {tracks}"
-    assert tracks.read_text().splitlines()[0] == f"{HEADER},distance_m,speed_mps"
+    assert tracks.read_text().splitlines()[0] == (
+        f"{HEADER},distance_m,speed_mps,confidence,distance_std_m,speed_std_mps"
+    )
     written, source = probe_video(target), probe_video(clip)
     assert (written.shape, written.fps, written.frames) == (source.shape, source.fps, source.frames)
     assert contents(tmp_path) == ["out.mp4", "tracks.csv"]

@@ -12,7 +12,7 @@ FPS = 25
 VOID_ELEMENTS = {"meta", "link", "source"}
 
 
-def track(number, *, distance=20.0, distance_std=2.0, speed=1.5, speed_std=0.5, score=1.0, shown=True):
+def track(number, *, distance=20.0, distance_std=2.0, speed=1.5, speed_std=0.5, confidence=1.0, shown=True):
     return SimpleNamespace(
         id=number,
         shown=shown,
@@ -20,7 +20,7 @@ def track(number, *, distance=20.0, distance_std=2.0, speed=1.5, speed_std=0.5, 
         distance_std_m=distance_std,
         speed_mps=speed,
         speed_std_mps=speed_std,
-        score=score,
+        confidence=confidence,
     )
 
 

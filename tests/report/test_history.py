@@ -53,7 +53,7 @@ def test_bins_hold_the_means_of_known_values(frames, width, data):
 
 
 def history(frames, distances):
-    columns = {name: np.full(len(frames), math.nan) for name in ("speed_mps", "speed_std_mps", "score")}
+    columns = {name: np.full(len(frames), math.nan) for name in ("speed_mps", "speed_std_mps", "confidence")}
     columns["distance_m"] = np.array(distances, float)
     columns["distance_std_m"] = np.ones(len(frames))
     return TrackHistory(1, np.array(frames, np.int64), columns)

@@ -133,7 +133,7 @@ class TestPage:
         rows = re.findall(r"<tr>(<th scope=\"row\">.*?)</tr>", text, re.DOTALL)
         cells = [re.findall(r"<t[hd].*?>(.*?)</t[hd]>", row) for row in rows]
         assert [re.sub("<.*?>", "", cell) for cell in cells[1]] == [
-            "#2", "0:00.4", "0:00.8", "10", "\N{EN DASH}", "\N{EN DASH}", "1.00",
+            "#2", "0:00.4", "0:00.8", "10", "\N{EN DASH}", "\N{EN DASH}", "100 %",
         ]  # fmt: skip
         assert "decode" in text
         assert "20.00" in text  # milliseconds per frame
@@ -173,7 +173,7 @@ class TestPage:
 
     @pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan, 1e300, 10**400, np.float32(math.inf)])
     def test_infinite_and_absurd_numbers_are_unknown(self, tmp_path, value):
-        extreme = track(1, distance=value, distance_std=value, speed=value, score=value)
+        extreme = track(1, distance=value, distance_std=value, speed=value, confidence=value)
         text = write_report(tmp_path, [[extreme]] * 3)
         StrictParser(text)
         assert "No distance is known." in text

@@ -110,6 +110,12 @@ LineWidth = Annotated[
     int | None,
     Option("--line-width", metavar="N", help="Width of the boxes in pixels; default: by size of the frame."),
 ]
+Confidence = Annotated[
+    float | None,
+    Option(
+        metavar="P", help="Minimum confidence, a probability from 0 to 1; default: the model's threshold."
+    ),
+]
 HORIZON_HELP = "Height of the horizon as a fraction of the frame's height, 0 at the top."
 
 
@@ -151,6 +157,7 @@ def detect(
     output: Annotated[Path | None, Option("-o", "--output", metavar="DIR", help="Annotated images.")] = None,
     boxes: Annotated[Path | None, Option(metavar="FILE.csv", help="Boxes by file name.")] = None,
     model: Model = "default",
+    conf: Confidence = None,
     horizon: Annotated[float | None, Option(metavar="F", help=HORIZON_HELP)] = None,
     labels: Annotated[
         str, Option(metavar="score|none", help="Labels of the boxes in annotated images.")
@@ -166,7 +173,7 @@ def detect(
     if line_width is not None:
         check_integer(line_width, "line_width", low=1, high=1000)
     _check_images(images, output, boxes)
-    with VehicleDetector(model, horizon=horizon) as detector, output_folder(output, "--output"):
+    with VehicleDetector(model, conf=conf, horizon=horizon) as detector, output_folder(output, "--output"):
         found = _detect_each(images, detector, output, scores=labels == "score", line_width=line_width)
         if boxes is None:
             for _ in found:
@@ -222,9 +229,11 @@ def _detect_each(
         for message in messages:
             print_error(f"warning: {path}: {message}")
         found = detector.detect(image)
+        known = found.confidences
+        values = [f"{score:.2f}" for score in found.scores] if known is None else [f"{p:.0%}" for p in known]
         listed = "".join(
-            f"  [{' '.join(f'{side:.0f}' for side in box)}] {score:.2f}"
-            for box, score in zip(found.boxes.tolist(), found.scores.tolist())
+            f"  [{' '.join(f'{side:.0f}' for side in box)}] {value}"
+            for box, value in zip(found.boxes.tolist(), values)
         )
         typer.echo(f"{path}: {len(found)} vehicle{'s' * (len(found) != 1)}{listed}")
         if output is not None:
@@ -251,6 +260,7 @@ def video(
         bool, Option("--diagnostics", help="Show frame, positive windows, heat map and tracks side by side.")
     ] = False,
     model: Model = "default",
+    conf: Confidence = None,
     start: Annotated[float | None, Option(metavar="S", help="Start time in seconds.")] = None,
     end: Annotated[float | None, Option(metavar="S", help="End time in seconds.")] = None,
     labels: Annotated[
@@ -300,13 +310,18 @@ def video(
                 writers.append(stack.enter_context(TrackWriter(tracks)))
         loaded = load_model(model)
         if horizon == "auto":
-            with VehicleDetector(loaded) as detector:
+            with VehicleDetector(loaded, conf=conf) as detector:
                 fraction = _estimate_horizon(source, detector, start, end, quiet)
         else:
             fraction = None if horizon is None else _parse_horizon(horizon)
         detector = stack.enter_context(
             VehicleDetector(
-                loaded, horizon=fraction, every=every, diagnostics=diagnostics, draw_params=draw_params
+                loaded,
+                conf=conf,
+                horizon=fraction,
+                every=every,
+                diagnostics=diagnostics,
+                draw_params=draw_params,
             )
         )
         page = None

@@ -207,7 +207,7 @@ def track_fields(track: Track, fields: Collection[str]) -> list[str]:
     with_std = "std" in fields
     parts = [f"#{track.id}"] if "id" in fields else []
     if "score" in fields:
-        parts.append(f"{track.score:.1f}")
+        parts.append(f"{track.score:.1f}" if track.confidence is None else f"{track.confidence:.0%}")
     if "distance" in fields and track.distance_m is not None and track.distance_std_m is not None:
         parts.append(f"{track.distance_m:.0f}{f' +-{track.distance_std_m:.0f}' if with_std else ''} m")
     if "speed" in fields and track.speed_mps is not None and (track.speed_std_mps or 0) <= MAX_SPEED_STD:

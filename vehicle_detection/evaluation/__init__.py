@@ -1,6 +1,7 @@
 """Labelled frames, label files, scores of detections and tracks, and calibration of scores."""
 
-from vehicle_detection.evaluation.calibration import Platt, calibrate_scores, calibration_error
+from vehicle_detection.boxes import Platt
+from vehicle_detection.evaluation.calibration import calibrate_scores, calibration_error
 from vehicle_detection.evaluation.detections import (
     DetectionScores,
     best_f1,

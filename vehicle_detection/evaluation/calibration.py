@@ -2,43 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_integer, check_number, describe
+from vehicle_detection._common import check_integer, describe
+from vehicle_detection.boxes import Platt
 from vehicle_detection.errors import InvalidInputError
-
-
-@dataclass(frozen=True)
-class Platt:
-    """The sigmoid ``1 / (1 + exp(a * score + b))``; `a` is negative where higher scores are vehicles."""
-
-    a: float
-    b: float
-
-    def __post_init__(self) -> None:
-        check_number(self.a, "a")
-        check_number(self.b, "b")
-
-    def probability(self, scores: ArrayLike) -> NDArray[np.float64]:
-        """Probability of a vehicle for each score, float64 in [0, 1], of the same shape."""
-        from scipy.special import expit
-
-        values = np.asarray(scores)
-        if values.dtype.kind not in "iuf" or np.isnan(values).any():
-            raise InvalidInputError(f"scores must be numbers without NaN; got {describe(scores)}")
-        return np.asarray(expit(-(self.a * values.astype(np.float64) + self.b)))
-
-    def score(self, probability: float) -> float:
-        """Return the score that has this probability, in (0, 1), for use as a threshold."""
-        value = check_number(probability, "probability", above=0)
-        if value >= 1 or self.a == 0:
-            raise InvalidInputError(
-                f"probability must lie in (0, 1) and a must not be 0; got {value:g} and a={self.a:g}"
-            )
-        return float((np.log((1 - value) / value) - self.b) / self.a)
 
 
 def calibrate_scores(scores: ArrayLike, labels: ArrayLike, *, prior: bool = True) -> Platt:

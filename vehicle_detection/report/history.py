@@ -19,7 +19,7 @@ from vehicle_detection.errors import InvalidInputError
 
 Floats = NDArray[np.float64]
 
-COLUMNS = ("distance_m", "distance_std_m", "speed_mps", "speed_std_mps", "score")
+COLUMNS = ("distance_m", "distance_std_m", "speed_mps", "speed_std_mps", "confidence")
 """Attributes of a track that are kept for each frame; NaN if unknown."""
 
 
@@ -55,10 +55,10 @@ class TrackHistory:
         return (self.id - 1) % len(TRACK_COLORS)
 
     @property
-    def mean_score(self) -> float | None:
-        """Mean of the known scores; None if none is known."""
-        scores = self.columns["score"]
-        known = scores[np.isfinite(scores)]
+    def mean_confidence(self) -> float | None:
+        """Mean of the known confidences; None if none is known."""
+        confidences = self.columns["confidence"]
+        known = confidences[np.isfinite(confidences)]
         return float(known.mean()) if known.size else None
 
     def spans(self, max_step: int = 1) -> list[tuple[int, int]]:

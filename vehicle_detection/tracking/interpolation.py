@@ -13,6 +13,7 @@ from vehicle_detection.tracking.track import TIME_TOLERANCE, Track
 
 _INTERPOLATED = (
     "score",
+    "confidence",
     "age",
     "time_since_update",
     "distance_m",

@@ -25,6 +25,8 @@ class Track:
         ``(4,)`` box inside the frame, read-only, and velocity of its center in pixels per second.
     score
         Exponential moving average of the detections' scores; a frame without a detection counts as 0.
+    confidence
+        Calibrated probability of the score, in [0, 1]: that the track shows a vehicle.
     state, shown
         ``"tentative"`` (not confirmed yet), ``"confirmed"`` (detected in this frame) or ``"coasting"``
         (confirmed, but not detected in this frame: the box is a prediction); whether to draw the track.
@@ -44,6 +46,7 @@ class Track:
     misses: int
     time_since_update: float
     velocity: tuple[float, float]
+    confidence: float | None = None
     distance_m: float | None = None
     distance_std_m: float | None = None
     speed_mps: float | None = None

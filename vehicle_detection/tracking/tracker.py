@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer, check_number, check_type
-from vehicle_detection.boxes import Detections, Floats, box_areas
+from vehicle_detection.boxes import Detections, Floats, Platt, box_areas
 from vehicle_detection.camera import Camera, FrameShape, check_shape, truncated_edges
 from vehicle_detection.params import TrackParams
 from vehicle_detection.tracking.association import covered_fractions, distinct_vehicles, merged_detections
@@ -42,6 +42,7 @@ _LEAVING, _LEFT, _HIDDEN = 0.5, 0.15, 0.5
 _MAX_COAST_DISTANCE = 0.5
 # Factors of `max_distance` for tentative tracks, and for low-score detections.
 _TENTATIVE_DISTANCE, _LOW_SCORE_DISTANCE = 0.6, 0.5
+_LOG_ODDS = Platt(-1.0, 0.0)
 
 
 class Tracker:
@@ -54,6 +55,9 @@ class Tracker:
     camera
         The camera, for distances and speeds; by default ``Camera.for_frame`` of the frame's size, with a
         horizon that is estimated from the vehicles.
+    calibration
+        Converts scores to the confidences of the tracks; by default scores are log-odds, and 0 is 50%. None
+        leaves the confidences unknown.
 
     Raises
     ------
@@ -71,12 +75,20 @@ class Tracker:
     """
 
     def __init__(
-        self, params: TrackParams | None = None, *, fps: float = 25.0, camera: Camera | None = None
+        self,
+        params: TrackParams | None = None,
+        *,
+        fps: float = 25.0,
+        camera: Camera | None = None,
+        calibration: Platt | None = _LOG_ODDS,
     ) -> None:
         if params is not None:
             check_type(params, "params", TrackParams, "pass TrackParams()")
         if camera is not None:
             check_type(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
+        if calibration is not None:
+            check_type(calibration, "calibration", Platt, "calibrate_scores makes one")
+        self._calibration = calibration
         self._frame_seconds = 1 / check_number(fps, "fps", above=0, high=1e6)
         self.params = params or TrackParams()
         self._smoother = make_smoother(self.params)
@@ -359,15 +371,22 @@ class Tracker:
         gap = np.array([track.time_since_update + dt for track in self._live[: len(boxes)]])
         ranges = estimate_distances(states, gap, self.camera)
         velocities = states.mean[:, 4:6].tolist()
+        scores = np.array([track.score for track in self._live[: len(boxes)]])
+        confidences = [None] * len(scores)
+        if self._calibration is not None:
+            confidences = self._calibration.probability(scores).tolist()
         fields = ("id", "score", "state", "shown", "age", "misses", "time_since_update")
         return tuple(
             Track(
                 box=box,
                 velocity=tuple(velocity),
+                confidence=confidence,
                 **estimate,
                 **{name: getattr(track, name) for name in fields},
             )
-            for track, box, velocity, estimate in zip(self._live, boxes, velocities, ranges)
+            for track, box, velocity, confidence, estimate in zip(
+                self._live, boxes, velocities, confidences, ranges
+            )
         )
 
 

@@ -1,0 +1,61 @@
+"""Confidence of boxes: calibrated probabilities of scores, and the threshold that a probability implies."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from vehicle_detection._common import check_number
+from vehicle_detection.boxes import Platt
+from vehicle_detection.classifier import VehicleClassifier
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.function_model import FunctionModel
+from vehicle_detection.mixture import TemplateMixture
+from vehicle_detection.params import HeatParams, RegionParams
+
+Model = VehicleClassifier | TemplateMixture | FunctionModel
+
+# Probabilities beyond these have no useful threshold.
+_MIN_CONF, _MAX_CONF = 0.001, 0.999
+
+
+def calibration_of(model: Model) -> Platt:
+    """Sigmoid that turns the scores of a model's boxes into probabilities of a vehicle."""
+    if isinstance(model, TemplateMixture):  # its scores are log-odds above its threshold
+        return Platt(-1.0, -model.threshold)
+    return model.calibration
+
+
+def with_confidence(
+    model: Model, regions: RegionParams | HeatParams | None, conf: float
+) -> tuple[Model, RegionParams | HeatParams | None]:
+    """Return model and region parameters that find the boxes with a confidence of at least `conf`.
+
+    Raises
+    ------
+    InvalidInputError
+        If `conf` is not a probability, or the boxes have none: those of a heat map and of functions whose
+        scores have a scale of their own.
+    """
+    limit = min(max(check_number(conf, "conf", low=0, high=1), _MIN_CONF), _MAX_CONF)
+    if isinstance(regions, HeatParams):
+        raise InvalidInputError(
+            f"conf must be None with a heat map, whose heat is no probability; got {conf:g}; set the "
+            "threshold of HeatParams"
+        )
+    if isinstance(model, VehicleClassifier):
+        params = regions or RegionParams()
+        peak = max(model.calibration.score(limit), 0.0)
+        # Weak groups of windows have less evidence in proportion.
+        evidence = params.min_evidence * min(peak / max(params.min_peak, 1e-9), 1.0)
+        return model, dataclasses.replace(params, min_peak=peak, min_evidence=evidence)
+    log_odds = math.log(limit / (1 - limit))
+    if isinstance(model, TemplateMixture):
+        return dataclasses.replace(model, threshold=log_odds), regions
+    if isinstance(model.score, tuple):
+        raise InvalidInputError(
+            f"conf must be None for scores on a scale of their own, got {conf:g}; change the lower end of "
+            "score=(low, high), or return probabilities"
+        )
+    threshold = limit if model.score == "probability" else log_odds
+    return dataclasses.replace(model, threshold=threshold), regions
