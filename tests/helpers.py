@@ -157,7 +157,7 @@ def boxes_on_a_road(horizon, camera_height, count=40, seed=0, noise=0.0):
     width = rng.uniform(30, 200, count)
     foot = horizon * SHAPE[0] + width * camera_height / 1.8 + rng.normal(0, noise, count) * width
     center = rng.uniform(300, 980, count)
-    return np.stack([center - width / 2, foot - 0.8 * width, center + width / 2, foot], axis=1)
+    return np.stack([center - width / 2, foot - width * 1.5 / 1.8, center + width / 2, foot], axis=1)
 
 
 @dataclass(frozen=True)

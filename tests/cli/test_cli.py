@@ -267,6 +267,34 @@ def test_detect_keeps_boxes_of_a_minimum_confidence(tmp_path):
     assert counts[0.1] > counts[0.999]
 
 
+def test_a_wrong_horizon_gives_a_warning(tmp_path):
+    cars = [
+        SceneVehicle(distance_m=distance, lateral_m=lateral)
+        for distance, lateral in ((15, 0), (19, 3.6), (28, -3.6), (38, 0.3), (42, 3.4))
+    ]
+    scene = render_scene(vehicles=cars, lane=1, random_state=3)
+    write_image(tmp_path / "road.png", scene.image)
+    result = run("detect", tmp_path / "road.png", "--horizon", 0.95)
+    assert result.exit_code == 0
+    assert ": 0 vehicles" in result.stdout
+    assert re.search(
+        r"warning: no vehicle was found with --horizon 0.95, but a search of all rows found "
+        r"\d boxes, whose horizon is 0.5\d; use --horizon 0.5\d",
+        result.stderr,
+    )
+    write_image(tmp_path / "empty.png", np.full((180, 320, 3), 90, np.uint8))
+    result = run("detect", tmp_path / "empty.png", "--horizon", 0.95)
+    assert "and too few with a search of all rows" in result.stderr
+    assert run("detect", tmp_path / "empty.png").stderr == ""
+
+
+def test_video_warns_of_a_wrong_horizon(clip, tmp_path, monkeypatch):
+    found = HorizonEstimate(horizon=0.551, horizon_std=0.012, camera_height_m=1.3, n_boxes=40)
+    monkeypatch.setattr(video, "estimate_video_horizon", lambda *_, **__: found)
+    result = run("video", clip, "-o", tmp_path / "out.mp4", "--end", 0.12, "--horizon", 0.95)
+    assert "warning: no vehicle was found with --horizon 0.95, but a search of all rows" in result.stderr
+
+
 def test_detect_accepts_every_kind_of_image(picture, tmp_path):
     image = cv2.imread(str(picture))
     gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
@@ -476,7 +504,7 @@ def test_video_estimates_the_horizon(clip, tmp_path, monkeypatch):
     result = run(*words)
     assert result.exit_code == 0
     assert (
-        "warning: --horizon auto: too few vehicles to estimate the horizon; searching all rows"
+        "warning: --horizon auto: too few vehicles to estimate the horizon; searching near the middle"
         in result.stderr
     )
     assert run(*words, "--quiet").output == ""

@@ -432,3 +432,13 @@ def test_a_given_heat_threshold_is_kept_and_checked_against_the_density():
 def test_invalid_function_params_are_rejected(options, message):
     with pytest.raises(InvalidInputError, match=message):
         FunctionParams(**options)
+
+
+@pytest.mark.parametrize("params", [SearchParams.default(), PyramidParams(), FunctionParams(horizon=0.4)])
+def test_everywhere_searches_all_rows(params):
+    everywhere = params.everywhere()
+    assert type(everywhere) is type(params)
+    if isinstance(params, PyramidParams):
+        assert everywhere.rows(100, 80, (720, 1280)) == (0, 720)
+    elif isinstance(params, SearchParams):
+        assert {(band.y1, band.y2) for band in everywhere.place((720, 1280))} == {(0, 720)}

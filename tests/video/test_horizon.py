@@ -5,6 +5,7 @@ import pytest
 
 from tests.helpers import boxes_on_a_road
 from vehicle_detection.boxes import Detections
+from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video import estimate_video_horizon
 
@@ -31,12 +32,12 @@ def clip(tmp_path_factory):
     return path
 
 
-def test_the_horizon_from_two_frames_per_second(clip):
-    detector = StubImageDetector(boxes_on_a_road(0.55, 1.3, 20, 1, 0.01))
+def test_the_horizon_from_fifteen_frames_of_a_short_video(clip):
+    detector = StubImageDetector(boxes_on_a_road(0.55, 1.3, 8, 1, 0.01))
     found = estimate_video_horizon(clip, detector)
-    assert detector.frames == 6
+    assert detector.frames == 12
     assert found.horizon == pytest.approx(0.55, abs=0.01)
-    assert estimate_video_horizon(clip, detector, start=1, end=2).n_boxes == 40
+    assert estimate_video_horizon(clip, detector, start=1, end=2).n_boxes == 64
 
 
 def test_no_more_frames_than_necessary(clip):
@@ -45,18 +46,31 @@ def test_no_more_frames_than_necessary(clip):
     assert detector.frames == 2
 
 
-@pytest.mark.parametrize("boxes", [np.empty((0, 4)), np.tile([600, 400, 660, 450], (9, 1))])
-def test_too_few_boxes_and_boxes_of_one_width(clip, boxes):
-    assert estimate_video_horizon(clip, StubImageDetector(boxes)) is None
+def test_boxes_of_one_size_suffice(clip):
+    found = estimate_video_horizon(clip, StubImageDetector(np.tile([600, 400, 660, 450], (9, 1))))
+    assert found.horizon == pytest.approx(405 / 720, abs=0.01)
+
+
+def test_too_few_boxes(clip):
+    assert estimate_video_horizon(clip, StubImageDetector(np.empty((0, 4)))) is None
 
 
 def test_an_uncertain_estimate_is_rejected(clip):
-    boxes = np.random.default_rng(0).uniform((0, 0, 300, 200), (200, 200, 1000, 700), (12, 4))
+    corners = np.random.default_rng(0).uniform((50, 50), (1100, 600), (12, 2))
+    boxes = np.hstack([corners, corners + np.array([70, 50])])
     assert estimate_video_horizon(clip, StubImageDetector(boxes), end=0.4) is None
 
 
-def test_an_implausible_camera_height_is_rejected(clip):
-    assert estimate_video_horizon(clip, StubImageDetector(boxes_on_a_road(0.55, 0.3, 20, 1, 0.01))) is None
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [("lane_lines_960x540", 0.54, 0.59), ("project_clip", 0.56, 0.61), ("test_video", 0.56, 0.61)],
+)
+def test_the_horizon_of_real_clips(real_data, name, low, high):
+    with VehicleDetector() as detector:
+        found = estimate_video_horizon(real_data / "videos" / f"{name}.mp4", detector)
+    assert low < found.horizon < high
+    assert found.horizon_std < 0.03
 
 
 def test_a_missing_video(tmp_path):

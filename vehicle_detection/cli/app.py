@@ -32,10 +32,12 @@ from vehicle_detection.errors import DatasetError, InvalidInputError, VehicleDet
 
 if TYPE_CHECKING:
     from vehicle_detection.boxes import Detections
+    from vehicle_detection.camera import HorizonEstimate
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.params import DrawParams
 
 FAILURE, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
+_CHECKED_IMAGES = 20  # images that are searched again if no vehicle was found
 
 
 class _Commands(TyperGroup):
@@ -175,6 +177,7 @@ def detect(
     _check_images(images, output, boxes)
     with VehicleDetector(model, conf=conf, horizon=horizon) as detector, output_folder(output, "--output"):
         found = _detect_each(images, detector, output, scores=labels == "score", line_width=line_width)
+        found = _warn_if_empty(found, images, detector, horizon)
         if boxes is None:
             for _ in found:
                 pass
@@ -207,6 +210,36 @@ def _check_images(images: list[Path], output: Path | None, boxes: Path | None) -
                 f"IMAGE {other} and {image} have the same file name, which identifies the results; "
                 "process one folder at a time"
             )
+
+
+def _warn_if_empty(
+    found: Iterator[tuple[str, Detections]],
+    images: list[Path],
+    detector: VehicleDetector,
+    horizon: float | None,
+) -> Iterator[tuple[str, Detections]]:
+    """Pass on what is found; if that is nothing, search some images without the given horizon."""
+    import numpy as np
+
+    from vehicle_detection.camera import estimate_horizon
+    from vehicle_detection.images import read_image
+
+    total = 0
+    for name, vehicles in found:
+        total += len(vehicles)
+        yield name, vehicles
+    if total or horizon is None:
+        return
+    boxes, shape = [np.empty((0, 4))], (1, 1)
+    with _everywhere(detector.model, None) as everywhere:
+        for image in map(read_image, images[:_CHECKED_IMAGES]):
+            if image.shape[:2] == shape or shape == (1, 1):
+                shape = image.shape[:2]
+                boxes.append(everywhere.detect(image).boxes)
+    estimate = None
+    with contextlib.suppress(InvalidInputError):  # too few boxes
+        estimate = estimate_horizon(np.concatenate(boxes), shape)
+    _warn_of_horizon(horizon, estimate)
 
 
 def _detect_each(
@@ -298,7 +331,7 @@ def video(
     from vehicle_detection.export import TrackWriter
     from vehicle_detection.mixture import load_model
     from vehicle_detection.report import ReportWriter
-    from vehicle_detection.video import process_video
+    from vehicle_detection.video import estimate_video_horizon, process_video
 
     draw_params = _draw_params(labels, line_width=line_width, color_by=color_by, panel=panel)
     outputs = {"--output": output, "--tracks": tracks, "--report": report}
@@ -310,7 +343,7 @@ def video(
                 writers.append(stack.enter_context(TrackWriter(tracks)))
         loaded = load_model(model)
         if horizon == "auto":
-            with VehicleDetector(loaded, conf=conf) as detector:
+            with _everywhere(loaded, conf) as detector:
                 fraction = _estimate_horizon(source, detector, start, end, quiet)
         else:
             fraction = None if horizon is None else _parse_horizon(horizon)
@@ -343,6 +376,9 @@ def video(
         )
     if page is not None:
         page.finish(done)
+    if not done.tracks and horizon not in (None, "auto"):
+        with _everywhere(loaded, conf) as detector:
+            _warn_of_horizon(horizon, estimate_video_horizon(source, detector, start=start, end=end))
     if not quiet or profile:
         lines = str(done).splitlines()
         typer.echo("\n".join(lines if profile else lines[:1]))
@@ -356,6 +392,24 @@ def _draw_params(labels: str, **options: Any) -> DrawParams:
 
     fields = [field.strip() for field in labels.split(",")]
     return DrawParams(labels=() if fields == ["none"] else fields, **options)
+
+
+def _everywhere(model: Any, conf: float | None) -> VehicleDetector:
+    """Open a detector that searches all rows, whatever the horizon."""
+    from vehicle_detection.detector import VehicleDetector
+
+    return VehicleDetector(model, conf=conf, search_params=model.search_params_type.default().everywhere())
+
+
+def _warn_of_horizon(horizon: str | float, found: HorizonEstimate | None) -> None:
+    """Print what a search of all rows found where none was found below a given horizon."""
+    message = f"warning: no vehicle was found with --horizon {horizon}, and too few with a search of all rows"
+    if found is not None:
+        message = (
+            f"warning: no vehicle was found with --horizon {horizon}, but a search of all rows found "
+            f"{found.n_boxes} boxes, whose horizon is {found.horizon:.2f}; use --horizon {found.horizon:.2f}"
+        )
+    print_error(message)
 
 
 def _parse_horizon(text: str) -> float:
@@ -377,7 +431,7 @@ def _estimate_horizon(
     if found is None:
         if not quiet:
             print_error(
-                "warning: --horizon auto: too few vehicles to estimate the horizon; searching all rows"
+                "warning: --horizon auto: too few vehicles to estimate the horizon; searching near the middle"
             )
         return None
     if not quiet:

@@ -155,6 +155,11 @@ class SearchParams:
         """Return the same parameters with another horizon; None keeps it."""
         return self if horizon is None else dataclasses.replace(self, horizon=horizon)
 
+    def everywhere(self) -> SearchParams:
+        """Return the same parameters for a search of all rows, whatever the horizon."""
+        bands = (dataclasses.replace(band, y=(-4096.0, 4096.0)) for band in self.bands)
+        return dataclasses.replace(self, bands=tuple(bands))
+
     @property
     def window_density(self) -> float:
         """Number of windows of similar size that cover a point, as the mean over the bands."""
@@ -275,6 +280,10 @@ class FunctionParams:
             return self
         return dataclasses.replace(self, horizon=horizon, horizon_tolerance=0.06)
 
+    def everywhere(self) -> FunctionParams:
+        """Return the same parameters: a function searches all rows."""
+        return self
+
     def heat_range(self, heat: HeatParams) -> HeatRange:
         """Heat thresholds for boxes of unknown density: any."""
         return HeatRange(0.0, 0.0, math.inf)
@@ -342,6 +351,10 @@ class PyramidParams:
         if horizon is None:
             return self
         return dataclasses.replace(self, horizon=horizon, horizon_tolerance=0.06)
+
+    def everywhere(self) -> PyramidParams:
+        """Return the same parameters for a search of all rows, whatever the horizon."""
+        return dataclasses.replace(self, horizon=None)
 
     def heat_range(self, heat: HeatParams) -> HeatRange:
         """Heat thresholds for the windows of this search, which are few: two to six on a vehicle."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Protocol
 
@@ -11,13 +12,13 @@ from numpy.typing import NDArray
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import HorizonEstimate, estimate_horizon
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.video.ffmpeg import VideoInfo
 from vehicle_detection.video.process import read_frames
 
 _MAX_STD = 0.05  # as a fraction of the frame's height
-# Camera heights in meters; side views, or vehicles that are all equally far away, give others.
-_MIN_CAMERA_HEIGHT, _MAX_CAMERA_HEIGHT = 0.6, 4.0
-# Seconds between searched frames, their maximum number, and the number of boxes that suffices.
-_INTERVAL, _MAX_FRAMES, _ENOUGH_BOXES = 0.5, 60, 150
+# Seconds between searched frames, their number at least (in a short video) and at most, and the number of
+# boxes that suffices.
+_INTERVAL, _MIN_FRAMES, _MAX_FRAMES, _ENOUGH_BOXES = 0.5, 15, 60, 150
 
 
 class ImageDetector(Protocol):
@@ -32,12 +33,12 @@ def estimate_video_horizon(
 ) -> HorizonEstimate | None:
     """Estimate the horizon from the vehicles in two frames per second of the first 30 seconds after `start`.
 
-    None if there are too few vehicles, or if the estimate is too uncertain or implies an implausible camera
-    height.
+    In a video of less than 7.5 seconds, frames follow one another faster. None if there are too few vehicles,
+    or if the estimate is too uncertain.
     """
     boxes: list[NDArray[np.floating]] = []
     with read_frames(source, start=start, end=end) as frames:
-        shape, step = frames.info.shape, max(1, round(_INTERVAL * float(frames.info.fps)))
+        shape, step = frames.info.shape, _step(frames.info, start, end)
         for count, (_, _, frame) in enumerate(frames):
             if count >= step * _MAX_FRAMES or sum(map(len, boxes)) >= _ENOUGH_BOXES:
                 break
@@ -45,9 +46,13 @@ def estimate_video_horizon(
                 boxes.append(detector.detect(frame).boxes)
     try:
         found = estimate_horizon(np.concatenate(boxes), shape)
-    except InvalidInputError:  # too few boxes, or all of one width
+    except InvalidInputError:  # too few boxes
         return None
-    plausible = (
-        found.horizon_std <= _MAX_STD and _MIN_CAMERA_HEIGHT <= found.camera_height_m <= _MAX_CAMERA_HEIGHT
-    )
-    return found if plausible and 0 <= found.horizon <= 1 else None
+    return found if found.horizon_std <= _MAX_STD and 0 <= found.horizon <= 1 else None
+
+
+def _step(info: VideoInfo, start: float | None, end: float | None) -> int:
+    """Frames from one searched frame to the next."""
+    fps = float(info.fps)
+    seconds = min(info.frames / fps, math.inf if end is None else end) - (start or 0.0)
+    return max(1, round(fps * min(_INTERVAL, seconds / _MIN_FRAMES)))
