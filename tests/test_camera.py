@@ -1,12 +1,21 @@
 import math
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import SHAPE, boxes_on_a_road
-from vehicle_detection.camera import Camera, estimate_horizon, lateral_offsets, truncated_edges
+from vehicle_detection.camera import (
+    LENSES,
+    Camera,
+    estimate_horizon,
+    lateral_offsets,
+    read_camera,
+    truncated_edges,
+    write_camera,
+)
 from vehicle_detection.errors import InvalidInputError
 
 CAMERA = Camera.for_frame(SHAPE)
@@ -52,7 +61,13 @@ def test_camera_rejects_invalid_values(arguments, message):
         (720, {}, r"shape must be \(height, width, ...\).*pass image.shape"),
         ((0, 100), {}, r"shape\[0\] must be an integer at least 1"),
         (SHAPE, {"field_of_view": 180}, "field_of_view must be a number, at least 1 and at most 170"),
-        (SHAPE, {"lens": 1.0}, "lens is not an argument of Camera.for_frame"),
+        (SHAPE, {"zoom": 1.0}, "zoom is not an argument of Camera.for_frame"),
+        (SHAPE, {"lens": "wide"}, "lens must be one of 'standard-58', 'wide-90', 'fisheye-120'"),
+        (
+            SHAPE,
+            {"fisheye": True, "k1": -0.9, "field_of_view": 150},
+            "k1 and k2 must keep the radius positive",
+        ),
         (SHAPE, {"focal_px": 1.0}, "focal_px is not an argument.*pass field_of_view"),
     ],
 )
@@ -146,3 +161,101 @@ def test_truncated_boxes_are_ignored():
 def test_too_few_boxes_are_rejected():
     with pytest.raises(InvalidInputError, match=r"^boxes must contain 4 vehicles .* got 3; use more frames"):
         estimate_horizon(boxes_on_a_road(0.5, 1.3, 3), SHAPE)
+
+
+# --- lenses ---
+
+
+@pytest.mark.parametrize(("k1", "k2"), [(0.0, 0.0), (0.08, -0.01), (-0.04, 0.003)])
+def test_rectified_points_equal_those_of_opencv(k1, k2):
+    camera = Camera.for_frame(SHAPE, field_of_view=140, fisheye=True, k1=k1, k2=k2)
+    corners = np.random.default_rng(0).uniform((40, 200), (1000, 500), (40, 2))
+    boxes = np.hstack([corners, corners + np.array([120, 90])])
+    rectified = camera.rectify_boxes(boxes, SHAPE)
+    matrix = np.array([[camera.focal_px, 0, 640], [0, camera.focal_px, 360], [0, 0, 1]])
+    middle = (boxes[:, :2] + boxes[:, 2:]) / 2
+    for column, points in (
+        (0, np.column_stack([boxes[:, 0], middle[:, 1]])),
+        (1, np.column_stack([middle[:, 0], boxes[:, 1]])),
+        (2, np.column_stack([boxes[:, 2], middle[:, 1]])),
+        (3, np.column_stack([middle[:, 0], boxes[:, 3]])),
+    ):
+        expected = cv2.fisheye.undistortPoints(points[:, None], matrix, np.array([k1, k2, 0, 0]), P=matrix)
+        np.testing.assert_allclose(rectified[:, column], expected[:, 0, column % 2], atol=1e-3)
+
+
+def test_a_fisheye_sees_its_field_of_view():
+    for lens, (angle, fisheye) in LENSES.items():
+        camera = Camera.for_frame(SHAPE, lens=lens)
+        assert camera.fisheye is fisheye
+        edge = camera.rectify_boxes(np.array([[600.0, 300, 1280, 420]]), SHAPE)[0, 2] - 640
+        degrees = 2 * math.degrees(math.atan(edge / camera.focal_px))
+        assert degrees == pytest.approx(min(angle, 160), abs=0.1)
+
+
+def test_a_pinhole_camera_keeps_boxes_and_horizon():
+    boxes = np.array([[600.0, 300, 700, 420]])
+    assert CAMERA.rectify_boxes(boxes, SHAPE) is boxes
+    assert CAMERA.to_pinhole(SHAPE) is CAMERA
+
+
+def test_the_horizon_of_a_fisheye_is_rectified():
+    camera = Camera.for_frame(SHAPE, lens="fisheye-140", horizon=0.6)
+    pinhole = camera.to_pinhole(SHAPE)
+    assert not pinhole.fisheye
+    angle = (camera.horizon_px - 360) / camera.focal_px
+    assert pinhole.horizon_px == pytest.approx(360 + camera.focal_px * math.tan(angle))
+
+
+def test_a_camera_file_holds_the_camera(tmp_path):
+    camera = Camera.for_frame(SHAPE, field_of_view=130, fisheye=True, k1=0.02, k2=-0.01, horizon=0.47)
+    write_camera(camera, tmp_path / "camera.json", SHAPE)
+    assert read_camera(tmp_path / "camera.json", SHAPE) == camera
+    half = read_camera(tmp_path / "camera.json", (360, 640))
+    assert half.focal_px == pytest.approx(camera.focal_px / 2)
+    assert half.horizon_px == pytest.approx(camera.horizon_px / 2)
+
+
+def test_a_camera_file_by_hand(tmp_path):
+    path = tmp_path / "camera.json"
+    path.write_text('{"lens": "wide-90", "horizon": 0.5, "height_m": 1.6}')
+    camera = read_camera(path, SHAPE)
+    assert (camera.focal_px, camera.horizon_px, camera.height_m) == (pytest.approx(640), 360, 1.6)
+    assert camera.horizon_std_px == 0
+    path.write_text('{"focal_px": 900, "image_size": [1280, 720]}')
+    camera = read_camera(path, SHAPE)
+    assert (camera.focal_px, camera.horizon_std_px) == (900, 36)
+    path.write_text("{}")
+    assert read_camera(path, SHAPE).focal_std == 0.25
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", r"camera file \S+ is not JSON"),
+        ("[1]", r"camera file \S+ must be an object with the names .*; got \[1\]"),
+        ('{"zoom": 1}', r"must be an object with the names .*; got zoom"),
+        ('{"focal_px": 900}', r"camera.json: focal_px needs image_size"),
+        (
+            '{"focal_px": 900, "lens": "wide-90", "image_size": [1280, 720]}',
+            "must hold lens or focal_px, not both",
+        ),
+        (
+            '{"focal_px": 900, "image_size": [1280, 960]}',
+            r"image_size must have the aspect ratio .* 1280x720",
+        ),
+        ('{"focal_px": 900, "image_size": 1280}', r"image_size must be \[width, height\], got 1280"),
+        ('{"field_of_view": 900}', r"camera.json: field_of_view must be a number"),
+        ('{"height_m": "low"}', r"camera.json: height_m must be a number"),
+    ],
+)
+def test_invalid_camera_files(tmp_path, text, message):
+    path = tmp_path / "camera.json"
+    path.write_text(text)
+    with pytest.raises(InvalidInputError, match=message):
+        read_camera(path, SHAPE)
+
+
+def test_a_missing_camera_file(tmp_path):
+    with pytest.raises(InvalidInputError, match=r"camera file \S+ cannot be read: No such file"):
+        read_camera(tmp_path / "camera.json", SHAPE)

@@ -9,7 +9,7 @@ import pytest
 
 from tests.video.clips import write_clip
 from vehicle_detection.boxes import iou_matrix
-from vehicle_detection.camera import Camera
+from vehicle_detection.camera import Camera, write_camera
 from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.detector import FrameResult, VehicleDetector
@@ -26,7 +26,7 @@ from vehicle_detection.params import (
     SearchParams,
     TrackParams,
 )
-from vehicle_detection.synthetic import render_scene
+from vehicle_detection.synthetic import SceneVehicle, render_scene
 from vehicle_detection.tracking import Tracker
 from vehicle_detection.video import process_video
 
@@ -575,7 +575,7 @@ def test_bad_options_are_refused(options, message):
 @pytest.mark.parametrize("name", ["search_params", "region_params", "track_params", "camera"])
 @pytest.mark.parametrize("value", ["default", 5, {}])
 def test_parameters_of_another_kind_are_refused(name, value):
-    with pytest.raises(InvalidInputError, match=rf"^{name} must be a [\w ]+, got .*; omit it"):
+    with pytest.raises(InvalidInputError, match=rf"^{name} must be a [\w ]+,.* got .*; omit it"):
         make(**{name: value})
 
 
@@ -654,3 +654,56 @@ def test_a_tracker_accepts_detections_of_supervision():
         tracks = tracker.update(found, (HEIGHT, WIDTH))
     assert [track.id for track in tracks] == [1]
     assert 1 < tracks[0].score < np.log(9)  # rising from 0
+
+
+def distance_of_a_car(scene, **options):
+    with VehicleDetector(**options) as detector:
+        detector.reset(fps=10)
+        for _ in range(8):
+            result = detector.process(scene.image)
+    (track,) = result.shown
+    return track, detector
+
+
+@pytest.fixture(scope="module")
+def wide_scene():
+    car = SceneVehicle(distance_m=9.0, kind="sedan", color="white")
+    return render_scene(vehicles=[car], lane=1, focal_px=640.0, camera_height_m=1.5, random_state=2)
+
+
+def test_a_known_lens_gives_the_distance(wide_scene, tmp_path):
+    track, detector = distance_of_a_car(wide_scene, field_of_view=90, camera_height_m=1.5, horizon=0.56)
+    assert detector.lens_is_known
+    assert track.distance_m == pytest.approx(9.0, rel=0.1)
+    assert track.distance_std_m < 0.2 * track.distance_m
+    write_camera(wide_scene.camera, tmp_path / "camera.json", (720, 1280))
+    track, detector = distance_of_a_car(wide_scene, camera=tmp_path / "camera.json")
+    assert detector.lens_is_known
+    assert track.distance_m == pytest.approx(9.0, rel=0.1)
+    track, _ = distance_of_a_car(wide_scene, camera="wide-90", camera_height_m=1.5)
+    assert track.distance_m == pytest.approx(9.0, rel=0.2)
+
+
+def test_an_unknown_lens_gives_a_large_error(wide_scene):
+    track, detector = distance_of_a_car(wide_scene)
+    assert not detector.lens_is_known
+    assert track.distance_m > 1.3 * 9.0
+    assert track.distance_std_m >= 0.25 * track.distance_m
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"field_of_view": 200}, "field_of_view must be a number, at least 1 and at most 170; got 200"),
+        ({"camera_height_m": 0}, "camera_height_m must be a number, greater than 0"),
+        ({"camera": "wide-90", "field_of_view": 90}, "field_of_view must be None with a camera"),
+        (
+            {"camera": Camera.for_frame((72, 128)), "camera_height_m": 1},
+            "camera_height_m must be None with a",
+        ),
+        ({"camera": 7}, "camera must be a Camera or str or PathLike, got 7"),
+    ],
+)
+def test_invalid_camera_options(options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        VehicleDetector(**options)

@@ -1,6 +1,6 @@
 from . import course, plotting
 from .boxes import Detections, clip_boxes, iou_matrix, non_max_suppression
-from .camera import Camera, HorizonEstimate, estimate_horizon
+from .camera import Camera, HorizonEstimate, estimate_horizon, read_camera, write_camera
 from .classifier import VehicleClassifier, load_classifier, train_classifier
 from .course import HeatmapDetector
 from .datasets import (
@@ -175,6 +175,7 @@ __all__ = [
     "precision_recall_curve",
     "probe_video",
     "process_video",
+    "read_camera",
     "read_frames",
     "read_image",
     "read_labels",
@@ -195,6 +196,7 @@ __all__ = [
     "train_classifier",
     "train_mixture",
     "write_boxes",
+    "write_camera",
     "write_image",
     "write_labels",
     "write_tracks",

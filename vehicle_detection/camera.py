@@ -1,21 +1,34 @@
-"""Camera over a flat road: its parameters and their uncertainty, and an estimate of its horizon.
+"""Camera over a flat road: lens, parameters and their uncertainty, its file, and an estimate of its horizon.
 
 The geometry is the pinhole camera (Hartley and Zisserman, *Multiple View Geometry*, chapter 6) over a flat
 road, as in Stein, Mano and Shashua, *Vision-based ACC with a single camera* (IV 2003): a road point seen `d`
 pixels below the horizon lies ``focal * height / d`` ahead, and a vehicle of known width seen `w` pixels wide
-lies ``focal * width / w`` ahead.
+lies ``focal * width / w`` ahead. Boxes from a fisheye lens are first converted to those of a pinhole camera
+with the model of OpenCV's ``cv2.fisheye`` (Kannala and Brandt, PAMI 2006).
 """
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import math
+import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_boxes, check_integer, check_number, describe
+from vehicle_detection._common import (
+    atomic_write,
+    check_boxes,
+    check_choice,
+    check_integer,
+    check_number,
+    check_type,
+    describe,
+)
 from vehicle_detection.errors import InvalidInputError
 
 Floats = NDArray[np.float64]
@@ -32,6 +45,25 @@ _CAMERA_HEIGHT, _CAMERA_HEIGHT_STD, _HORIZON_STD = 1.35, 0.3, 0.15
 # residual from which on a box is ignored, boxes that are as good as one because they show the same vehicle,
 # and 80th percentile of the absolute values of a normal distribution.
 _EDGE_STD_PX, _RELATIVE_STD, _BIWEIGHT, _CORRELATED_BOXES, _NORMAL_80 = 3.5, 0.12, 4.7, 3.0, 1.282
+
+
+# Largest angle from the optical axis (radians) at which boxes are converted to a pinhole camera.
+_MAX_ANGLE = math.radians(80)
+
+LENSES: dict[str, tuple[float, bool]] = {
+    "standard-58": (58.0, False),
+    "wide-90": (90.0, False),
+    "fisheye-120": (120.0, True),
+    "fisheye-140": (140.0, True),
+    "fisheye-170": (170.0, True),
+}
+"""Typical lenses: horizontal field of view in degrees, and whether the lens is a fisheye.
+
+Their errors are those of a guess; a calibrated camera (`read_camera`) is better.
+"""
+
+LENS_STD, GIVEN_LENS_STD, UNKNOWN_LENS_STD = 0.08, 0.03, 0.25
+"""Relative standard error of the focal length of a typical lens, of a given field of view, and of a guess."""
 
 
 def check_shape(shape: object, name: str = "shape") -> FrameShape:
@@ -70,6 +102,10 @@ class Camera:
     focal_std, height_std_m
         Standard errors of the focal length, as a fraction of it, and of the camera's height. They scale all
         distances alike.
+    fisheye, k1, k2
+        Whether the lens is a fisheye, and its coefficients: a ray at the angle ``a`` to the optical axis,
+        which is that of the frame's middle, meets the frame at
+        ``focal_px * a * (1 + k1 * a**2 + k2 * a**4)`` pixels from the middle.
 
     Examples
     --------
@@ -90,12 +126,18 @@ class Camera:
     bottom_std_px: float = 2.5
     pitch_std_px: float = 3.0
     box_std: float = 0.04
-    focal_std: float = 0.08
+    focal_std: float = LENS_STD
     height_std_m: float = 0.1
+    fisheye: bool = False
+    k1: float = 0.0
+    k2: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            if name in ("focal_px", "height_m", "vehicle_width_m", "vehicle_height_m"):
+        check_type(self.fisheye, "fisheye", bool, "pass True or False")
+        for name in self.__dataclass_fields__.keys() - {"fisheye"}:
+            if name in ("k1", "k2"):
+                check_number(getattr(self, name), name, low=-1, high=1)
+            elif name in ("focal_px", "height_m", "vehicle_width_m", "vehicle_height_m"):
                 check_number(getattr(self, name), name, above=0, high=1e6)
             else:
                 low = -1e6 if name == "horizon_px" else 0
@@ -109,7 +151,8 @@ class Camera:
         horizon: float = 0.56,
         field_of_view: float = 58.0,
         height_m: float = 1.3,
-        **known: float,
+        lens: str | None = None,
+        **known: Any,
     ) -> Camera:
         """Return a typical dash-cam for frames of this shape; pass what is known better by name.
 
@@ -122,11 +165,18 @@ class Camera:
             passed too.
         field_of_view
             Angle of view along the frame's longer side in degrees.
+        lens
+            Name of a typical lens, which replaces `field_of_view`: ``"standard-58"`` or ``"wide-90"``
+            (pinhole), ``"fisheye-120"``, ``"fisheye-140"`` or ``"fisheye-170"`` (``focal_px * angle``).
         **known
             Other attributes of the class, such as ``focal_std=0.01`` for a calibrated lens.
         """
         height, width = check_shape(shape)
         horizon = check_number(horizon, "horizon", low=-10, high=10)
+        if lens is not None:
+            check_choice(lens, "lens", LENSES)
+            field_of_view, fisheye = LENSES[lens]
+            known = {"fisheye": fisheye} | known
         angle = check_number(field_of_view, "field_of_view", low=1, high=170)
         unknown = sorted(known.keys() - cls.__dataclass_fields__.keys() | known.keys() & {"focal_px"})
         if unknown:
@@ -134,7 +184,14 @@ class Camera:
                 f"{unknown[0]} is not an argument of Camera.for_frame; pass field_of_view, "
                 "or build Camera(...)"
             )
-        focal = max(height, width) / (2 * math.tan(math.radians(angle) / 2))
+        half = math.radians(angle) / 2
+        k1, k2 = (check_number(known.get(name, 0.0), name, low=-1, high=1) for name in ("k1", "k2"))
+        radius = float(_fisheye_radius(np.array(half), k1, k2)) if known.get("fisheye") else math.tan(half)
+        if radius <= 0:
+            raise InvalidInputError(
+                f"k1 and k2 must keep the radius positive up to {angle / 2:g} degrees; got {k1:g} and {k2:g}"
+            )
+        focal = max(height, width) / (2 * radius)
         return cls(focal_px=focal, horizon_px=horizon * height, height_m=height_m, **known)
 
     @property
@@ -154,6 +211,177 @@ class Camera:
         ends with the far end of the side at the inner edge, `lateral_px` from the middle of the frame.
         """
         return self.focal_px * self.vehicle_width_m + self.vehicle_length_m * lateral_px
+
+    def rectify_boxes(self, boxes: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+        """Convert ``(N, 4)`` boxes to those of a pinhole camera with the same focal length.
+
+        Boxes of a pinhole camera are returned as they are. The middles of a box's edges are converted, and
+        points farther than 80 degrees from the optical axis are moved there.
+
+        Examples
+        --------
+        >>> camera = Camera.for_frame((720, 1280), lens="fisheye-120")
+        >>> camera.rectify_boxes(np.array([[900.0, 400, 1100, 520]]), (720, 1280)).round()
+        array([[ 920.,  405., 1219.,  547.]])
+        """
+        if not self.fisheye or not len(boxes):
+            return boxes
+        middle = (boxes[:, :2] + boxes[:, 2:]) / 2
+        columns = np.concatenate([boxes[:, 0], boxes[:, 2], middle[:, 0], middle[:, 0]])
+        rows = np.concatenate([middle[:, 1], middle[:, 1], boxes[:, 1], boxes[:, 3]])
+        x, y = self._rectify_points(columns, rows, shape)
+        left, right, _, _ = np.split(x, 4)
+        _, _, top, bottom = np.split(y, 4)
+        return np.stack([left, top, right, bottom], axis=1)
+
+    def to_pinhole(self, shape: tuple[int, ...]) -> Camera:
+        """Return the pinhole camera of the boxes that `rectify_boxes` returns."""
+        if not self.fisheye:
+            return self
+        _, row = self._rectify_points(np.array([shape[1] / 2]), np.array([self.horizon_px]), shape)
+        return dataclasses.replace(self, horizon_px=float(row[0]), fisheye=False, k1=0.0, k2=0.0)
+
+    def _rectify_points(self, x: Floats, y: Floats, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
+        """Convert points of a fisheye frame to a pinhole camera with the same focal length and middle."""
+        middle_x, middle_y = shape[1] / 2, shape[0] / 2
+        dx, dy = x - middle_x, y - middle_y
+        radius = np.hypot(dx, dy) / self.focal_px
+        angle = np.minimum(radius, _MAX_ANGLE)
+        for _ in range(10):  # Newton's method
+            slope = 1 + 3 * self.k1 * angle**2 + 5 * self.k2 * angle**4
+            step = (_fisheye_radius(angle, self.k1, self.k2) - radius) / np.maximum(slope, 0.1)
+            angle = np.clip(angle - step, 0.0, _MAX_ANGLE)
+        factor = np.tan(angle) / np.maximum(radius, 1e-9)
+        factor = np.where(radius < 1e-6, 1.0, factor)
+        return middle_x + factor * dx, middle_y + factor * dy
+
+
+def _fisheye_radius(angle: Floats, k1: float, k2: float) -> Floats:
+    """Distance from the middle of a fisheye frame in focal lengths, for rays at these angles (radians)."""
+    return angle * (1 + k1 * angle**2 + k2 * angle**4)
+
+
+def write_camera(camera: Camera, path: str | os.PathLike[str], shape: tuple[int, ...]) -> None:
+    """Write a camera as a JSON file.
+
+    Parameters
+    ----------
+    camera, path
+        The camera, and the file to write, .json.
+    shape
+        ``(height, width, ...)`` of the frames that its pixels refer to.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is malformed, or the folder is missing or read-only.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "camera.json"
+    >>> write_camera(Camera.for_frame((720, 1280), field_of_view=90), file, (720, 1280))
+    >>> round(read_camera(file, (360, 640)).focal_px)
+    320
+    """
+    check_type(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
+    height, width = check_shape(shape)
+    values = {"image_size": [width, height], **dataclasses.asdict(camera)}
+    with atomic_write(path, "path") as part:
+        part.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+
+
+def read_camera(path: str | os.PathLike[str], shape: tuple[int, ...]) -> Camera:
+    """Read a camera from a JSON file, for frames of a shape.
+
+    Parameters
+    ----------
+    path
+        A file of `write_camera`, or one written by hand. It is an object with attributes of `Camera`, all of
+        them optional. Instead of ``focal_px`` it may hold ``field_of_view`` (degrees along the longer side)
+        or ``lens`` (as in `Camera.for_frame`), and instead of ``horizon_px`` ``horizon`` (a fraction of the
+        height). With pixels it needs ``image_size``, ``[width, height]``; they are scaled to `shape`.
+    shape
+        ``(height, width, ...)`` of the frames.
+
+    Raises
+    ------
+    InvalidInputError
+        If the file is missing or malformed, or was made for frames of another aspect ratio.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "camera.json"
+    >>> _ = file.write_text('{"field_of_view": 120, "fisheye": true, "k1": 0.02, "height_m": 1.4}')
+    >>> camera = read_camera(file, (720, 1280))
+    >>> round(camera.focal_px), camera.height_m
+    (598, 1.4)
+    """
+    height, width = check_shape(shape)
+    values = _read_json(Path(path))
+    size = values.pop("image_size", None)
+    scale = 1.0
+    if size is not None:
+        if not isinstance(size, list) or len(size) != 2:
+            raise InvalidInputError(f"{path}: image_size must be [width, height], got {describe(size)}")
+        given = [check_integer(side, f"{path}: image_size", low=1) for side in size]
+        scale = width / given[0]
+        if abs(scale * given[1] - height) > 0.01 * height:
+            raise InvalidInputError(
+                f"{path}: image_size must have the aspect ratio of the frames, {width}x{height} pixels, got "
+                f"{given[0]}x{given[1]}; calibrate again, or give field_of_view and horizon"
+            )
+    pixels = [name for name in ("focal_px", "horizon_px", "horizon_std_px") if name in values]
+    if pixels and size is None:
+        raise InvalidInputError(f"{path}: {pixels[0]} needs image_size, [width, height] in pixels; add it")
+    for name in pixels:
+        values[name] = scale * check_number(values[name], f"{path}: {name}")
+    try:
+        return _build_camera(values, (height, width))
+    except InvalidInputError as error:
+        raise InvalidInputError(f"{path}: {error}") from None
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    """Read the object in a JSON file, and check its names."""
+    try:
+        values: Any = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InvalidInputError(
+            f"camera file {path} cannot be read: {error.strerror}; check the path"
+        ) from error
+    except ValueError as error:
+        raise InvalidInputError(f"camera file {path} is not JSON: {error}; see read_camera") from None
+    known = {"image_size", "field_of_view", "lens", "horizon", *Camera.__dataclass_fields__}
+    if not isinstance(values, dict) or values.keys() - known:
+        extra = sorted(values.keys() - known)[0] if isinstance(values, dict) else describe(values)
+        raise InvalidInputError(
+            f"camera file {path} must be an object with the names {', '.join(sorted(known))}; got {extra}"
+        )
+    for first, second in (("field_of_view", "focal_px"), ("lens", "focal_px"), ("horizon", "horizon_px")):
+        if first in values and second in values:
+            raise InvalidInputError(f"camera file {path} must hold {first} or {second}, not both; drop one")
+    return values
+
+
+def _build_camera(values: dict[str, Any], shape: FrameShape) -> Camera:
+    """Camera of the values of a file, in pixels of frames of this shape."""
+    if "focal_px" in values:
+        horizon = values.pop("horizon", None)
+        if horizon is not None:
+            values["horizon_px"] = check_number(horizon, "horizon", low=-10, high=10) * shape[0]
+        elif "horizon_px" not in values:
+            values |= {"horizon_px": 0.56 * shape[0], "horizon_std_px": 0.05 * shape[0]}
+        return Camera(**values)
+    if "lens" not in values:
+        accuracy = GIVEN_LENS_STD if "field_of_view" in values else UNKNOWN_LENS_STD
+        values = {"focal_std": accuracy} | values
+    if "horizon_px" in values:
+        values["horizon"] = values.pop("horizon_px") / shape[0]
+    elif "horizon" not in values:
+        values = {"horizon_std_px": 0.05 * shape[0]} | values
+    return Camera.for_frame(shape, **values)
 
 
 def lateral_offsets(boxes: NDArray[Any], shape: tuple[int, ...]) -> Floats:

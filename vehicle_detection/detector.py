@@ -7,7 +7,7 @@ import os
 import time as clock
 import warnings
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import check_image, check_integer, check_number, check_type, describe
 from vehicle_detection.boxes import Detections, ScoreScale
-from vehicle_detection.camera import Camera
+from vehicle_detection.camera import GIVEN_LENS_STD, LENSES, UNKNOWN_LENS_STD, Camera, read_camera
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.confidence import Model, calibration_of, with_confidence
 from vehicle_detection.drawing import TrackDrawer, draw_boxes, draw_diagnostics
@@ -42,8 +42,10 @@ Clip = TypeVar("Clip")
 
 # Searches per second of a video, at least, where the frame rate decides.
 _MIN_SEARCH_RATE = 12.0
-# Standard error of the horizon as a fraction of the search's horizon tolerance.
-_HORIZON_STD = 0.4
+# Standard error of the horizon as a fraction of the search's horizon tolerance: by default, and if given.
+_HORIZON_STD, _GIVEN_HORIZON_STD = 0.4, 0.2
+# Standard error of a given height of the camera (m).
+_GIVEN_HEIGHT_STD = 0.05
 # Frame rate that is assumed where it is unknown.
 _USUAL_FPS = 25.0
 # Frames: rounding error of a time times the frame rate, as in moviepy.
@@ -121,8 +123,13 @@ class VehicleDetector:
     draw_params
         What `annotate` and `process_video` draw: labels, lines, colors, a bird's-eye view.
     camera
-        The camera, for distances and boxes; by default a dash-cam with the search's horizon, as an estimate
-        that tracking refines.
+        The camera, for distances and boxes: a `Camera`, which fits frames of one size; a file of
+        `write_camera`; or the name of a lens, as in `Camera.for_frame`. By default a dash-cam with the
+        search's horizon, as an estimate that tracking refines.
+    field_of_view, camera_height_m
+        Horizontal angle of view in degrees of a lens without distortion, and height of the lens above the
+        road in meters, without a `Camera` or a file. If the lens is unknown, distances assume 58 degrees and
+        have a standard error of at least 25%.
     horizon
         Height of the horizon as a fraction of the frame's height; overrides that of `search_params`.
     n_jobs
@@ -164,7 +171,9 @@ class VehicleDetector:
         region_params: RegionParams | HeatParams | None = None,
         track_params: TrackParams | None = None,
         draw_params: DrawParams | None = None,
-        camera: Camera | None = None,
+        camera: Camera | Path | None = None,
+        field_of_view: float | None = None,
+        camera_height_m: float | None = None,
         horizon: float | None = None,
         n_jobs: int | None = None,
         every: int | None = None,
@@ -176,7 +185,7 @@ class VehicleDetector:
             ("region_params", region_params, (RegionParams, HeatParams)),
             ("track_params", track_params, TrackParams),
             ("draw_params", draw_params, DrawParams),
-            ("camera", camera, Camera),
+            ("camera", camera, (Camera, str, os.PathLike)),
         ):
             if value is not None:
                 check_type(value, name, kind, "omit it for the default")
@@ -190,6 +199,9 @@ class VehicleDetector:
         self.track_params = track_params or TrackParams()
         self.draw_params = draw_params or DrawParams()
         self.camera = camera
+        self._lens = _check_lens(camera, field_of_view, camera_height_m)
+        self._cameras: dict[tuple[int, int], Camera] = {}
+        self._horizon_given = horizon is not None
         self.diagnostics = diagnostics
         self.every = None if every is None else check_integer(every, "every", low=1, high=1000)
         self._search: FrameSearch = self.model.open_search(n_jobs, method)
@@ -272,14 +284,32 @@ class VehicleDetector:
         return Detections(vehicles.boxes, vehicles.scores, self._calibration.probability(vehicles.scores))
 
     def _camera_of(self, shape: tuple[int, int]) -> Camera:
-        if self.camera is not None:
+        if isinstance(self.camera, Camera):
             return self.camera
-        params = self.search_params
-        if params.horizon is None:
-            return Camera.for_frame(shape)
-        # The search tolerates a wrong horizon; the tracker estimates by how much it is wrong.
-        std = _HORIZON_STD * params.horizon_tolerance * shape[0]
-        return Camera.for_frame(shape, horizon=params.horizon, horizon_std_px=std)
+        if shape not in self._cameras:
+            self._cameras[shape] = self._open_camera(shape)
+        return self._cameras[shape]
+
+    def _open_camera(self, shape: tuple[int, int]) -> Camera:
+        """Camera for frames of this shape, from its file or from what is known of it."""
+        params, known = self.search_params, dict[str, Any]()
+        if params.horizon is not None:
+            # The search tolerates a wrong horizon; the tracker estimates by how much it is wrong.
+            std = (_GIVEN_HORIZON_STD if self._horizon_given else _HORIZON_STD) * params.horizon_tolerance
+            known = {"horizon": params.horizon, "horizon_std_px": std * shape[0]}
+        if self.camera is None or self.camera in LENSES:
+            return Camera.for_frame(shape, **known, **self._lens)
+        assert not isinstance(self.camera, Camera)
+        camera = read_camera(self.camera, shape)
+        if self._horizon_given:
+            row = known["horizon"] * shape[0]
+            camera = replace(camera, horizon_px=row, horizon_std_px=known["horizon_std_px"])
+        return camera
+
+    @property
+    def lens_is_known(self) -> bool:
+        """Whether the camera or its field of view was given; if not, distances are rough."""
+        return self.camera is not None or "field_of_view" in self._lens
 
     def search_interval(self, fps: float) -> int:
         """Interval of the frames that `process_video` searches at a frame rate: 1 for every frame."""
@@ -625,6 +655,34 @@ def _unsearched(index: int, time: float | None, tracks: tuple[Track, ...], start
     """Make the result of a frame that is not searched; `start` is the time before its tracking."""
     none, seconds = Detections.empty(), {"track": clock.perf_counter() - start}
     return FrameResult(index, time, none, none, tracks, seconds, searched=False)
+
+
+def _check_lens(camera: object, field_of_view: float | None, camera_height_m: float | None) -> dict[str, Any]:
+    """Arguments of `Camera.for_frame` that do not depend on the frame."""
+    if camera is not None and field_of_view is not None:
+        raise InvalidInputError(
+            f"field_of_view must be None with a camera, which has one; got {field_of_view}; omit one of them"
+        )
+    named = camera is None or (isinstance(camera, str) and camera in LENSES)
+    if not named and not isinstance(camera, Camera) and not os.path.isfile(str(camera)):
+        raise InvalidInputError(
+            f"camera must be a Camera, a file or one of {', '.join(LENSES)}, got {describe(camera)}; omit it"
+        )
+    if camera_height_m is not None and not named:
+        raise InvalidInputError(
+            f"camera_height_m must be None with a Camera or a file, which have one; got {camera_height_m}; "
+            "change it there"
+        )
+    known: dict[str, Any] = {"focal_std": UNKNOWN_LENS_STD} if camera is None else {}
+    if field_of_view is not None:
+        angle = check_number(field_of_view, "field_of_view", low=1, high=170)
+        known = {"field_of_view": angle, "focal_std": GIVEN_LENS_STD}
+    elif named and camera is not None:
+        known = {"lens": camera}
+    if camera_height_m is not None:
+        height = check_number(camera_height_m, "camera_height_m", above=0, high=100)
+        known |= {"height_m": height, "height_std_m": _GIVEN_HEIGHT_STD}
+    return known
 
 
 def _positive(vehicles: Detections) -> Detections:

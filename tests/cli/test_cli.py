@@ -1,3 +1,4 @@
+import csv
 import errno
 import functools
 import json
@@ -286,6 +287,38 @@ def test_a_wrong_horizon_gives_a_warning(tmp_path):
     result = run("detect", tmp_path / "empty.png", "--horizon", 0.95)
     assert "and too few with a search of all rows" in result.stderr
     assert run("detect", tmp_path / "empty.png").stderr == ""
+
+
+def test_video_takes_the_camera(tmp_path):
+    tables = {}
+    clip = tmp_path / "clip.mp4"
+    drive = render_drive(frames=12, shape=(720, 1280), scenario="crossing", random_state=1)
+    draw_clip(drive, clip, tmp_path / "labels.csv")
+    camera = tmp_path / "camera.json"
+    camera.write_text('{"field_of_view": 120, "height_m": 1.3, "horizon": 0.5}')
+    for words in ((), ("--fov", 58), ("--fov", 120, "--camera-height", 1.3), ("--camera", camera)):
+        tracks = tmp_path / "tracks.csv"
+        result = run("video", clip, "-o", tmp_path / "out.mp4", "--tracks", tracks, *words)
+        assert result.exit_code == 0
+        rows = [row for row in csv.DictReader(tracks.read_text().splitlines()) if row["distance_m"]]
+        assert rows
+        warned = "warning: distances assume a lens of 58 degrees" in result.stderr
+        assert warned == (not words)
+        tables[words] = {(row["frame"], row["track_id"]): float(row["distance_m"]) for row in rows}
+    standard, wide, file = (tables[words] for words in list(tables)[1:])
+    ratios = [wide[key] / standard[key] for key in wide.keys() & standard.keys()]
+    assert np.median(ratios) == pytest.approx(0.32, abs=0.06)
+    ratios = [wide[key] / file[key] for key in wide.keys() & file.keys()]
+    assert np.median(ratios) == pytest.approx(1, abs=0.15)
+    for words, message in (
+        (("--fov", 200), "--fov must be a number, at least 1 and at most 170"),
+        (("--camera-height", 0), "--camera-height must be a number"),
+        (("--camera", "missing.json"), "--camera must be a Camera, a file or one of standard-58, "),
+        (("--camera", "wide-90", "--fov", 90), "--fov must be None with a camera"),
+    ):
+        result = run("video", clip, "-o", tmp_path / "out.mp4", *words)
+        assert result.exit_code == 2
+        assert message in result.stderr
 
 
 def test_video_warns_of_a_wrong_horizon(clip, tmp_path, monkeypatch):

@@ -118,6 +118,21 @@ Confidence = Annotated[
         metavar="P", help="Minimum confidence, a probability from 0 to 1; default: the model's threshold."
     ),
 ]
+CameraFile = Annotated[
+    str | None,
+    Option(
+        metavar="NAME|FILE",
+        help="standard-58, wide-90, fisheye-120, fisheye-140, fisheye-170 (typical lenses), or a JSON file.",
+    ),
+]
+FieldOfView = Annotated[
+    float | None,
+    Option("--fov", metavar="DEG", help="Horizontal field of view in degrees, such as 90; default: 58."),
+]
+CameraHeight = Annotated[
+    float | None,
+    Option("--camera-height", metavar="M", help="Height of the lens above the road in meters; default: 1.3."),
+]
 HORIZON_HELP = "Height of the horizon as a fraction of the frame's height, 0 at the top."
 
 
@@ -277,7 +292,7 @@ def _detect_each(
 
 
 @app.command()
-@option_names(target="--output", workers="--jobs")
+@option_names(target="--output", workers="--jobs", field_of_view="--fov", camera_height_m="--camera-height")
 def video(
     source: Annotated[Path, Argument(metavar="SOURCE", help="Video to read.")],
     output: Annotated[
@@ -315,6 +330,9 @@ def video(
             metavar="F|auto", help=f'{HORIZON_HELP} "auto": estimated from vehicles in a sample of frames.'
         ),
     ] = None,
+    camera: CameraFile = None,
+    fov: FieldOfView = None,
+    camera_height: CameraHeight = None,
     every: Annotated[
         int | None,
         Option(metavar="N", help="Search every N-th frame, interpolate between; default: 12 a second."),
@@ -326,7 +344,7 @@ def video(
     quiet: Annotated[bool, Option("-q", "--quiet", help="Print errors only.")] = False,
     profile: Annotated[bool, Option("--profile", help="Print the time of each stage.")] = False,
 ) -> None:
-    """Track the vehicles of a video and write an annotated copy."""
+    """Track the vehicles of a video and write an annotated copy; speeds are relative to the camera."""
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.export import TrackWriter
     from vehicle_detection.mixture import load_model
@@ -351,6 +369,9 @@ def video(
             VehicleDetector(
                 loaded,
                 conf=conf,
+                camera=camera,
+                field_of_view=fov,
+                camera_height_m=camera_height,
                 horizon=fraction,
                 every=every,
                 diagnostics=diagnostics,
@@ -376,9 +397,14 @@ def video(
         )
     if page is not None:
         page.finish(done)
-    if not done.tracks and horizon not in (None, "auto"):
+    if not done.tracks and horizon not in (None, "auto") and not quiet:
         with _everywhere(loaded, conf) as detector:
             _warn_of_horizon(horizon, estimate_video_horizon(source, detector, start=start, end=end))
+    if done.tracks and not detector.lens_is_known and not quiet:
+        print_error(
+            "warning: distances assume a lens of 58 degrees, and may be wrong by a factor of 2 or more; pass "
+            "--fov or --camera"
+        )
     if not quiet or profile:
         lines = str(done).splitlines()
         typer.echo("\n".join(lines if profile else lines[:1]))

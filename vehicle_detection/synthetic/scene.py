@@ -79,8 +79,9 @@ def make_config(
     rain = check_number(rain, "rain", low=0.0, high=1.0)
     if jpeg_quality is not None:
         jpeg_quality = check_integer(jpeg_quality, "jpeg_quality", low=1, high=100)
-    exact = {"focal_std": 0.0, "height_std_m": 0.0}
-    camera = Camera(focal_px=focal_px, horizon_px=horizon_px, height_m=height_m, **exact)
+    camera = Camera(
+        focal_px=focal_px, horizon_px=horizon_px, height_m=height_m, focal_std=0.0, height_std_m=0.0
+    )
     seed = int(rng.integers(2**62))
     lighting = make_light(light, rain, np.random.default_rng([seed, 4]))
     return SceneConfig((height, width), camera, lighting, rain, jpeg_quality, margin, seed)

@@ -96,15 +96,19 @@ class Measurements(NamedTuple):
     """Detections assigned to tracks in one frame, as columns with one row per track."""
 
     boxes: Floats  # (N, 4)
+    road_boxes: Floats  # (N, 4) the same as seen by a pinhole camera
     truncated: Bools  # (N, 4) edges at the frame's border
     lateral_px: Floats  # (N,) distance of the inner edge from the frame's middle column
     merged: Bools  # (N,) whether the box shows another vehicle too
 
     @classmethod
-    def from_boxes(cls, boxes: Floats, frame: FrameShape, merged: ArrayLike = False) -> Measurements:
-        """Measure boxes in a frame of this shape."""
+    def from_boxes(
+        cls, boxes: Floats, frame: FrameShape, merged: ArrayLike = False, camera: Camera | None = None
+    ) -> Measurements:
+        """Measure boxes in a frame of this shape, seen by `camera` or, by default, a pinhole camera."""
         merged = np.broadcast_to(np.asarray(merged, np.bool_), len(boxes))
-        return cls(boxes, truncated_edges(boxes, frame), lateral_offsets(boxes, frame), merged)
+        road = boxes if camera is None else camera.rectify_boxes(boxes, frame)
+        return cls(boxes, road, truncated_edges(boxes, frame), lateral_offsets(road, frame), merged)
 
 
 class KalmanSmoother:
@@ -250,6 +254,8 @@ _WIDTH_TIME, _PITCH_TIME = 20.0, 2.0
 _UNSETTLED, _UNSETTLED_STD = 1.5, 0.5
 # Maximum relative error of a reported distance, age of its last measurement (s), and error of a speed (m/s).
 _MAX_RANGE_STD, _MAX_RANGE_AGE, _MAX_RANGE_SPEED_STD = 0.4, 0.5, 6.0
+# Aspect ratio above which a detector's boxes are narrower than the vehicle with its side.
+_MAX_ASPECT = 1.5
 
 
 def initiate_states(mean: Floats, cov: Floats, camera: Camera) -> KalmanStates:
@@ -286,7 +292,7 @@ def update_distances(
     # A merged box shows neither the bottom nor the width of its vehicles.
     visible = ~(measured.truncated | measured.merged[:, None])
     bottom_visible, width_visible = visible[:, 3], visible[:, 0] & visible[:, 2]
-    boxes, lateral_px = measured.boxes, measured.lateral_px
+    boxes, lateral_px = measured.road_boxes, measured.lateral_px
     sides = np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0)
     edge_std = np.hypot(camera.bottom_std_px * camera.pixel_scale, camera.box_std * sides)
     horizon_std = camera.total_horizon_std_px
@@ -316,7 +322,10 @@ def update_distances(
 
     # Logarithm of the width in pixels: log(width_scale) + log(relative width) - log(distance).
     innovation = np.log(sides[:, 0] / width_scale) - mean[:, 2] + np.log(mean[:, 0])
-    systematic = np.square(lateral_px * camera.vehicle_length_std_m / width_scale)
+    # Detectors cut the long sides of vehicles short, where the whole box would be wider than usual.
+    aspect = width_scale / (camera.focal_px * camera.vehicle_height_m)
+    cut_short = np.log(np.maximum(aspect / _MAX_ASPECT, 1.0))
+    systematic = np.square(lateral_px * camera.vehicle_length_std_m / width_scale) + np.square(cut_short)
     variance = np.square(edge_std[:, 0] / sides[:, 0]) * 2 * box_frames + systematic * pitch_frames
     jacobian[:, 0], jacobian[:, 2] = -1 / mean[:, 0], 1.0
     variance = np.where(width_visible, variance, np.inf)
@@ -343,11 +352,11 @@ def estimate_distances(
     """Distance and speed of each track with standard errors, as fields of `Track`; None where unknown."""
     distance, speed = states.range_mean[:, 0], states.range_mean[:, 1]
     distance_std, speed_std = np.sqrt(np.maximum(states.range_cov[:, [0, 1], [0, 1]], 0)).T
+    known = (distance_std <= _MAX_RANGE_STD * distance) & (time_since_update <= _MAX_RANGE_AGE)
+    speed_known = known & (speed_std <= _MAX_RANGE_SPEED_STD)
     # The focal length scales all measurements alike, so no filter averages its error out.
     distance_std = np.hypot(distance_std, distance * camera.focal_std)
     speed_std = np.hypot(speed_std, speed * camera.focal_std)
-    known = (distance_std <= _MAX_RANGE_STD * distance) & (time_since_update <= _MAX_RANGE_AGE)
-    speed_known = known & (speed_std <= _MAX_RANGE_SPEED_STD)
     columns = {
         "distance_m": (distance, known),
         "distance_std_m": (distance_std, known),

@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer, check_number, check_type
 from vehicle_detection.boxes import Detections, Floats, Platt, box_areas
-from vehicle_detection.camera import Camera, FrameShape, check_shape, truncated_edges
+from vehicle_detection.camera import (
+    UNKNOWN_LENS_STD,
+    Camera,
+    FrameShape,
+    check_shape,
+    truncated_edges,
+)
 from vehicle_detection.params import TrackParams
 from vehicle_detection.tracking.association import covered_fractions, distinct_vehicles, merged_detections
 from vehicle_detection.tracking.horizon_filter import HorizonFilter
@@ -97,8 +103,8 @@ class Tracker:
 
     def reset(self) -> None:
         """Restore the initial state: the next frame is the first, and the next vehicle gets the id 1."""
-        self._horizon = HorizonFilter(self._given_camera or _default_camera((720, 1280)))
         self._shape: FrameShape | None = None
+        self._horizon = self._open_horizon((720, 1280))
         self._time: float | None = None
         self._next_id = 1
         self.end_tracks()
@@ -106,11 +112,22 @@ class Tracker:
     def set_camera(self, camera: Camera) -> None:
         """Use another camera from the next frame on, for example if the size of the frames changes."""
         if camera != self._given_camera:
-            self._given_camera, self._horizon = camera, HorizonFilter(camera)
+            self._given_camera = camera
+            self._horizon = self._open_horizon(self._shape or (720, 1280))
+
+    def _open_horizon(self, frame: FrameShape) -> HorizonFilter:
+        """Start the estimate of the horizon for frames of this shape."""
+        return HorizonFilter((self._given_camera or _default_camera(frame)).to_pinhole(frame))
+
+    @property
+    def _lens(self) -> Camera | None:
+        """The camera, if boxes must be rectified."""
+        camera = self._given_camera
+        return camera if camera is not None and camera.fisheye else None
 
     @property
     def camera(self) -> Camera:
-        """The camera with the current estimate of its horizon."""
+        """The camera with the current estimate of its horizon; for a fisheye lens that of rectified boxes."""
         return self._horizon.camera
 
     def end_tracks(self) -> None:
@@ -238,7 +255,7 @@ class Tracker:
             self.end_tracks()
             dt = usual
         if self._shape != frame:
-            self._horizon = HorizonFilter(self._given_camera or _default_camera(frame))
+            self._horizon = self._open_horizon(frame)
         self._time, self._shape = now, frame
         return dt
 
@@ -255,7 +272,9 @@ class Tracker:
         unassigned[list(own.values())] = False
         rows = sorted(source)
         tracks, boxes = [self._live[row] for row in rows], boxes[[source[row] for row in rows]]
-        measured = Measurements.from_boxes(boxes, frame, [row in shared or row in merged for row in rows])
+        measured = Measurements.from_boxes(
+            boxes, frame, [row in shared or row in merged for row in rows], self._lens
+        )
         states = self._smoother.correct(self._states.take(rows), tracks, measured, dt)
         self._states = self._states.put(rows, self._update_distances(states, measured, dt))
         return unassigned
@@ -336,7 +355,7 @@ class Tracker:
         rows = distinct_vehicles(boxes, range(high), known, self.params) if high else []
         if not rows:
             return
-        measured = Measurements.from_boxes(boxes[rows], frame)
+        measured = Measurements.from_boxes(boxes[rows], frame, camera=self._lens)
         states = initiate_states(*self._smoother.initiate(measured), self.camera)
         self._states = self._states.join(self._update_distances(states, measured, dt))
         weight = 1 - math.exp(-dt / self.params.score_time_constant)
@@ -362,7 +381,10 @@ class Tracker:
         boxes, ids = self._states.boxes(), np.array([track.id for track in self._live], np.int64)
         visible = np.array([track.id > 0 and track.misses == 0 for track in self._live], np.bool_)
         visible &= ~truncated_edges(boxes, frame).any(axis=1)
-        self._horizon.update(ids[visible], boxes[visible], frame, dt)
+        road_boxes = boxes[visible]
+        if self._lens is not None:
+            road_boxes = self._lens.rectify_boxes(road_boxes, frame)
+        self._horizon.update(ids[visible], road_boxes, frame, dt)
 
     def _snapshot(self, frame: FrameShape, states: KalmanStates, dt: float = 0.0) -> tuple[Track, ...]:
         """Return the first tracks, whose states have been predicted by `dt` seconds."""
@@ -391,7 +413,7 @@ class Tracker:
 
 
 def _default_camera(frame: FrameShape) -> Camera:
-    return Camera.for_frame(frame, horizon_std_px=0.05 * frame[0])
+    return Camera.for_frame(frame, horizon_std_px=0.05 * frame[0], focal_std=UNKNOWN_LENS_STD)
 
 
 def _sorted_inside(detections: Detections, frame: FrameShape) -> tuple[Floats, Floats]:
