@@ -22,7 +22,7 @@ TREES = {name: ast.parse(path.read_text()) for name, path in FILES.items()}
 LAYERS = [
     "errors",
     "_common",
-    "params camera synthetic export images boxes _kernels",
+    "params camera synthetic export images boxes units _kernels",
     "datasets regions tracking heatmap features video",
     "evaluation drawing classifier sklearn_models",
     "windows search mixture training function_model",

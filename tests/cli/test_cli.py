@@ -312,6 +312,7 @@ def test_video_takes_the_camera(tmp_path):
     assert np.median(ratios) == pytest.approx(1, abs=0.15)
     for words, message in (
         (("--fov", 200), "--fov must be a number, at least 1 and at most 170"),
+        (("--units", "nautical"), "--units must be one of 'metric', 'imperial'; got 'nautical'"),
         (("--camera-height", 0), "--camera-height must be a number"),
         (("--camera", "missing.json"), "--camera must be a Camera, a file or one of standard-58, "),
         (("--camera", "wide-90", "--fov", 90), "--fov must be None with a camera"),

@@ -189,10 +189,13 @@ class TestTracks:
 
 class TestText:
     def test_shows_the_requested_and_known_fields(self):
-        assert track_text(track(), ("id", "distance", "speed")) == "#1  24 m  -1.8 m/s"
+        assert track_text(track(), ("id", "distance", "speed")) == "#1  24 m  -6 km/h"
         assert track_text(track(), ("distance", "std")) == "24 +-2 m"
-        assert track_text(track(), LABEL_FIELDS) == "#1  1.2  24 +-2 m  -1.8 +-0.5 m/s"
+        assert track_text(track(), LABEL_FIELDS) == "#1  1.2  24 +-2 m  -6 +-2 km/h"
         assert track_text(track(), ()) == ""
+        assert track_text(track(), ("distance", "speed"), "imperial") == "77 ft  -4 mph"
+        assert track_text(track(confidence=0.876), ("score",)) == "88%"
+        assert track_text(track(distance_std_m=6.0), ("distance",)) == "~24 m"
 
     def test_omits_unknown_values(self):
         unknown = track(distance_m=None, distance_std_m=None, speed_mps=None, speed_std_mps=None)

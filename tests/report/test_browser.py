@@ -293,16 +293,16 @@ def test_bars_and_charts_seek_in_the_video(browser, embedded):
 
 def test_hovering_over_a_chart_shows_the_values_there(browser, embedded):
     browser.open(embedded)
-    assert browser.run("document.querySelector('.readout').textContent") == "0:00.0#1 20 m +2.5 m/s"
+    assert browser.run("document.querySelector('.readout').textContent") == "0:00.0#1 20 m +9 km/h"
     browser.point("figure:nth-of-type(4) .plot", 0.609)
     readout = browser.run("document.querySelector('.readout').textContent")
-    assert readout == "0:01.2#1 23 m +2.5 m/s#2 \u22121.0 m/s"
+    assert readout == "0:01.2#1 23 m +9 km/h#2 \u22124 km/h"
     assert browser.run("document.querySelectorAll('.cursor.visible').length") == 4
     assert browser.run("document.querySelector('.cursor').getAttribute('x1')") == "61%"
     assert browser.run(f"{VIDEO}.currentTime") == 0
     browser.point("h1", 0.5)
     assert browser.run("document.querySelectorAll('.cursor.visible').length") == 0
-    assert browser.run("document.querySelector('.readout').textContent") == "0:00.0#1 20 m +2.5 m/s"
+    assert browser.run("document.querySelector('.readout').textContent") == "0:00.0#1 20 m +9 km/h"
     # Hovering over a bar fades the other tracks.
     browser.point(".bar[data-track='2']", 0.5)
     assert browser.run("[...document.querySelectorAll('.faded')].every(part => part.dataset.track === '1')")

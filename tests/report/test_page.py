@@ -28,6 +28,7 @@ from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import load_classifier
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drawing import TRACK_COLORS
+from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture import load_model
 from vehicle_detection.params import HeatParams, TrackParams
 from vehicle_detection.report import ReportWriter, page
@@ -129,7 +130,7 @@ class TestPage:
         assert counts["Length"] == "0:02.0"
         assert counts["Most at once"] == "2"
         assert counts["Longest track"] == "#1, 2.0 s"
-        assert counts["Nearest"] == "21 m, #1"
+        assert counts["Nearest"] == "21 \N{PLUS-MINUS SIGN} 2 m, #1"
         rows = re.findall(r"<tr>(<th scope=\"row\">.*?)</tr>", text, re.DOTALL)
         cells = [re.findall(r"<t[hd].*?>(.*?)</t[hd]>", row) for row in rows]
         assert [re.sub("<.*?>", "", cell) for cell in cells[1]] == [
@@ -138,6 +139,17 @@ class TestPage:
         assert "decode" in text
         assert "20.00" in text  # milliseconds per frame
         assert "75.0%" in text
+
+    def test_units(self, tmp_path):
+        frames = [[track(1, distance=30.48, speed=10.0)] for _ in range(5)]
+        text = write_report(tmp_path, frames, units="imperial")
+        assert "100 \N{PLUS-MINUS SIGN} 7 ft, #1" in text
+        assert "Miles per hour relative to the camera" in text
+        data = json.loads(script_data(text))
+        assert data["units"] == ["ft", "mph"]
+        assert (data["tracks"][0]["distance"], data["tracks"][0]["speed"]) == ([100.0] * 5, [22.4] * 5)
+        with pytest.raises(InvalidInputError, match="units must be one of 'metric', 'imperial'; got 'si'"):
+            ReportWriter(tmp_path / "report.html", units="si")
 
     def test_tells_where_a_part_of_the_source_starts(self, tmp_path):
         report = ReportWriter(tmp_path / "report.html")
@@ -162,14 +174,14 @@ class TestPage:
                 "spans": [[0, 4], [6, 9]],
                 "first": 0,
                 "distance": [10.0, 11.0, 12.0, 13.0, None, None, 16.0, 17.0, 18.0],
-                "speed": [-1.2, -1.2, -1.2, -1.2, None, None, -1.2, -1.2, -1.2],
+                "speed": [-4.5, -4.5, -4.5, -4.5, None, None, -4.5, -4.5, -4.5],
             }
         ]
 
     def test_speeds_with_large_standard_errors_are_hidden(self, tmp_path):
         frames = [[track(1, speed=9.0, speed_std=3.5 - index)] for index in range(3)]
         data = json.loads(script_data(write_report(tmp_path, frames)))
-        assert data["tracks"][0]["speed"] == [None, 9.0, 9.0]
+        assert data["tracks"][0]["speed"] == [None, 32.4, 32.4]
 
     @pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan, 1e300, 10**400, np.float32(math.inf)])
     def test_infinite_and_absurd_numbers_are_unknown(self, tmp_path, value):

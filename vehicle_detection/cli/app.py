@@ -323,6 +323,13 @@ def video(
         str,
         Option(metavar="corner|side|none", help="Bird's-eye view in the frame's corner, or beside it."),
     ] = "none",
+    units: Annotated[
+        str,
+        Option(
+            metavar="metric|imperial",
+            help="Labels and report in m and km/h, or ft and mph; speeds are relative to the camera.",
+        ),
+    ] = "metric",
     preset: Annotated[str, Option(metavar="P", help="Encoder speed, ultrafast to placebo.")] = "veryfast",
     horizon: Annotated[
         str | None,
@@ -351,7 +358,7 @@ def video(
     from vehicle_detection.report import ReportWriter
     from vehicle_detection.video import estimate_video_horizon, process_video
 
-    draw_params = _draw_params(labels, line_width=line_width, color_by=color_by, panel=panel)
+    draw_params = _draw_params(labels, line_width=line_width, color_by=color_by, panel=panel, units=units)
     outputs = {"--output": output, "--tracks": tracks, "--report": report}
     check_distinct_paths(outputs, {"SOURCE": source})
     with contextlib.ExitStack() as stack:
@@ -381,7 +388,9 @@ def video(
         page = None
         if report is not None:
             with option_names(path="--report"):
-                page = ReportWriter(report, video=output, source=source, detector=detector)
+                page = ReportWriter(
+                    report, video=output, source=source, detector=detector, units=draw_params.units
+                )
             writers.append(page)
         done = process_video(
             source,

@@ -68,7 +68,7 @@ def road_position(track: Track, camera: Camera, shape: tuple[int, ...]) -> RoadP
     distance, std = track.distance_m, track.distance_std_m
     if distance is None or std is None:
         return None
-    left, _, right, _ = track.box.tolist()
+    left, _, right, _ = camera.rectify_boxes(track.box[None], shape)[0].tolist()
     middle, focal = shape[1] / 2, camera.focal_px
     to_right = left + right > 2 * middle
     # Mirrored, if necessary, so that the vehicle is on the right.

@@ -54,6 +54,12 @@ def draw_boxes(image: Image, boxes: ArrayLike, *, color: Color = (0, 0, 255), th
     return result
 
 
+def _score_texts(detections: Detections) -> list[str]:
+    """Confidence of each detection, or its score where that is unknown."""
+    known = detections.confidences
+    return [f"{score:.2f}" for score in detections.scores] if known is None else [f"{p:.0%}" for p in known]
+
+
 def draw_labeled_bboxes(image: Image, labels: tuple[NDArray[Any], int]) -> Image:
     """Draw the bounding box of each labeled region on a copy of an image, as the course does.
 
@@ -111,7 +117,7 @@ def draw_detections(
     line_width: int | None = None,
     scores: bool = True,
 ) -> Image:
-    """Draw detections on a copy of an image, each with its score.
+    """Draw detections on a copy of an image, each with its confidence or, if that is unknown, its score.
 
     Parameters
     ----------
@@ -120,7 +126,7 @@ def draw_detections(
     color, line_width
         RGB, 0-255 each, and width of the lines in pixels; None: chosen for the size of the image.
     scores
-        Whether to write the scores, where they hide neither other boxes nor each other.
+        Whether to write them, where they hide neither other boxes nor each other.
 
     Returns
     -------
@@ -148,8 +154,8 @@ def draw_detections(
     result = draw_boxes(image, detections.boxes, color=color, thickness=width)
     if scores:
         requests = [
-            LabelRequest(row, (f"{score:.2f}",), round_box(box))
-            for row, (box, score) in enumerate(zip(detections.boxes, detections.scores.tolist()))
+            LabelRequest(row, (text,), round_box(box))
+            for row, (box, text) in enumerate(zip(detections.boxes, _score_texts(detections)))
         ]
         placed = LabelPlacer().place(requests, shape)
         draw_labels(result, placed, [color] * len(placed), width)

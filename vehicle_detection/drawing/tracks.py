@@ -24,6 +24,7 @@ from vehicle_detection.drawing.primitives import (
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import DrawParams
 from vehicle_detection.tracking import Track
+from vehicle_detection.units import UNITS
 
 TRACK_COLORS: tuple[Color, ...] = (
     (230, 159, 0),
@@ -159,7 +160,9 @@ class TrackDrawer:
         for track, color in sorted(zip(shown, colors), key=lambda pair: float(pair[0].box[3])):
             draw_outline(frame, round_box(track.box), color, width, dashed=track.id in dashed)
         requests = [
-            LabelRequest(track.id, tuple(track_fields(track, params.labels)), round_box(track.box))
+            LabelRequest(
+                track.id, tuple(track_fields(track, params.labels, params.units)), round_box(track.box)
+            )
             for track in shown
         ]
         draw_labels(frame, self._placer.place(requests, shape, blocked), colors, width)
@@ -197,21 +200,21 @@ def _distance_color(distance_m: float | None) -> Color:
     return _DISTANCE_COLORS[-1]
 
 
-def track_text(track: Track, fields: Collection[str]) -> str:
-    """Text of a track's label, such as "#3  24 m  -1.2 m/s"; empty if no field is known."""
-    return "  ".join(track_fields(track, fields))
+def track_text(track: Track, fields: Collection[str], units: str = "metric") -> str:
+    """Text of a track's label, such as "#3  24 m  -6 km/h"; empty if no field is known."""
+    return "  ".join(track_fields(track, fields, units))
 
 
-def track_fields(track: Track, fields: Collection[str]) -> list[str]:
-    """Texts of the known fields of a track's label, such as ["#3", "24 m", "-1.2 m/s"]."""
-    with_std = "std" in fields
+def track_fields(track: Track, fields: Collection[str], units: str = "metric") -> list[str]:
+    """Texts of the known fields of a track's label, such as ["#3", "24 m", "-6 km/h"]."""
+    with_std, chosen = "std" in fields, UNITS[units]
     parts = [f"#{track.id}"] if "id" in fields else []
     if "score" in fields:
         parts.append(f"{track.score:.1f}" if track.confidence is None else f"{track.confidence:.0%}")
     if "distance" in fields and track.distance_m is not None and track.distance_std_m is not None:
-        parts.append(f"{track.distance_m:.0f}{f' +-{track.distance_std_m:.0f}' if with_std else ''} m")
+        parts.append(chosen.distance_text(track.distance_m, track.distance_std_m, with_std=with_std))
     if "speed" in fields and track.speed_mps is not None and (track.speed_std_mps or 0) <= MAX_SPEED_STD:
-        parts.append(f"{track.speed_mps:+.1f}{f' +-{track.speed_std_mps or 0:.1f}' if with_std else ''} m/s")
+        parts.append(chosen.speed_text(track.speed_mps, track.speed_std_mps, with_std=with_std))
     return parts
 
 

@@ -8,6 +8,7 @@ from typing import Literal
 
 from vehicle_detection._common import check_choice, check_integer, describe
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.units import UNITS
 
 LABEL_FIELDS = ("id", "score", "distance", "speed", "std")
 """Fields of a track's label; ``"std"`` adds standard errors to distance and speed."""
@@ -26,9 +27,9 @@ class DrawParams:
     Attributes
     ----------
     labels
-        Fields of a label: ``"id"``, ``"score"``, ``"distance"`` (m), ``"speed"`` (m/s relative to the
-        camera, positive when moving away) and ``"std"`` (adds standard errors). Unknown values are omitted;
-        without a field there is no label.
+        Fields of a label: ``"id"``, ``"score"`` (the confidence, if known), ``"distance"`` (``~`` where its
+        standard error exceeds 20%), ``"speed"`` (relative to the camera, positive when moving away) and
+        ``"std"`` (adds standard errors). Unknown values are omitted; without a field there is no label.
     line_width
         Width of the boxes' lines in pixels; None: chosen for the size of the image.
     color_by
@@ -37,6 +38,8 @@ class DrawParams:
     panel
         Bird's-eye view of the tracks in a video: ``"corner"``, in the frame's upper right corner; ``"side"``,
         to the right of the frame, which makes the video wider; or ``"none"``.
+    units
+        Units of the labels: ``"metric"`` (m and km/h) or ``"imperial"`` (ft and mph).
 
     Examples
     --------
@@ -48,6 +51,7 @@ class DrawParams:
     line_width: int | None = None
     color_by: Literal["id", "distance"] = "id"
     panel: Literal["none", "corner", "side"] = "none"
+    units: Literal["metric", "imperial"] = "metric"
 
     def __post_init__(self) -> None:
         given: object = self.labels
@@ -63,3 +67,4 @@ class DrawParams:
             check_integer(self.line_width, "line_width", low=1, high=1000)
         check_choice(self.color_by, "color_by", COLORINGS)
         check_choice(self.panel, "panel", PANELS)
+        check_choice(self.units, "units", UNITS)

@@ -32,6 +32,7 @@ from vehicle_detection.report.charts import (
 from vehicle_detection.report.formatting import format_time, format_value, pluralize
 from vehicle_detection.report.history import Floats, TrackHistory, TrackLog, bin_means
 from vehicle_detection.training import SPLITS
+from vehicle_detection.units import UNITS, Units
 from vehicle_detection.video import VideoReport
 
 _COUNT_SECONDS = (1, 2, 5, 10, 15, 30, 60, 120, 300)  # durations of a bar in the chart of counts
@@ -80,13 +81,20 @@ class Group(NamedTuple):
 
 
 def render_page(
-    log: TrackLog, report: VideoReport, *, video: VideoEmbed | None, source: str | None, detector: Any
+    log: TrackLog,
+    report: VideoReport,
+    *,
+    video: VideoEmbed | None,
+    source: str | None,
+    detector: Any,
+    units: str = "metric",
 ) -> Iterator[str]:
     """Render the page in pieces; `detector` may lack settings or a model, which are then left out."""
     from jinja2 import Environment, StrictUndefined
 
     axis = TimeAxis(max(report.frames, len(log.counts), 1), float(report.fps))
-    tracks = [_without_imprecise_speeds(track) for track in log.histories()]
+    chosen = UNITS[units]
+    tracks = [_in_units(_without_imprecise_speeds(track), chosen) for track in log.histories()]
     css, script, template = map(_read, ("report.css", "report.js", "report.html.j2"))
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -101,15 +109,16 @@ def render_page(
         report=report,
         fps=axis.fps,
         first_time=log.first_time,
-        counts=_counts(tracks, log, report),
+        units=chosen,
+        counts=_counts(tracks, log, report, chosen),
         video=video,
         tracks=tracks,
-        figures=_figures(tracks, log, axis) if tracks else [],
+        figures=_figures(tracks, log, axis, chosen) if tracks else [],
         fraction_bar=fraction_bar,
         settings=_settings(detector, report.shape),
         model=_model_summary(getattr(detector, "model", None)),
         version=vehicle_detection.__version__,
-        data=_script_data(tracks, axis),
+        data=_script_data(tracks, axis) | {"units": [chosen.distance_symbol, chosen.speed_symbol]},
     )
 
 
@@ -122,28 +131,40 @@ def _csp_hash(code: str) -> str:
     return f"sha256-{base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()}"
 
 
-def _counts(tracks: Sequence[TrackHistory], log: TrackLog, report: VideoReport) -> dict[str, str]:
+def _in_units(track: TrackHistory, units: Units) -> TrackHistory:
+    """Convert distances and speeds, although the names of the columns say SI units."""
+    factors = {"distance_m": units.distance, "distance_std_m": units.distance}
+    factors |= {"speed_mps": units.speed, "speed_std_mps": units.speed}
+    columns = {name: factors.get(name, 1.0) * values for name, values in track.columns.items()}
+    return dataclasses.replace(track, columns=columns)
+
+
+def _counts(
+    tracks: Sequence[TrackHistory], log: TrackLog, report: VideoReport, units: Units
+) -> dict[str, str]:
     fps = float(report.fps)
     counts = {"Vehicles": f"{len(tracks):,}", "Frames": f"{report.frames:,}"}
     counts |= {"Length": format_time(report.frames / fps), "Most at once": str(max(log.counts, default=0))}
     if tracks:
         longest = max(tracks, key=lambda track: len(track.frames))
         counts["Longest track"] = f"#{longest.id}, {len(longest.frames) / fps:.1f} s"
-    nearest = [(found.distance_m, track.id) for track in tracks if (found := track.closest_approach(fps))]
+    nearest = [(found, track.id) for track in tracks if (found := track.closest_approach(fps))]
     if nearest:
-        counts["Nearest"] = "{:.0f} m, #{}".format(*min(nearest))
+        found, track_id = min(nearest, key=lambda each: (each[0].distance_m, each[1]))
+        error = "" if found.std_m is None else f" \N{PLUS-MINUS SIGN} {found.std_m:.0f}"
+        counts["Nearest"] = f"{found.distance_m:.0f}{error} {units.distance_symbol}, #{track_id}"
     return counts
 
 
-def _figures(tracks: Sequence[TrackHistory], log: TrackLog, axis: TimeAxis) -> list[Figure]:
+def _figures(tracks: Sequence[TrackHistory], log: TrackLog, axis: TimeAxis, units: Units) -> list[Figure]:
     label = f"Bars of {pluralize(len(tracks), 'track')}: when each was shown, as in the table of tracks."
     distances = [track.columns["distance_m"] for track in tracks]
     speeds = [bin_means(track.frames, track.columns["speed_mps"], axis.bin_width)[1] for track in tracks]
     return [
         Figure("Tracks", "When each vehicle was shown", gantt(tracks, axis, label=label)),
         _count_figure(log, axis),
-        _curve_figure("distance", np.concatenate(distances), tracks, axis),
-        _curve_figure("relative speed", np.concatenate(speeds), tracks, axis),
+        _curve_figure("distance", np.concatenate(distances), tracks, axis, units),
+        _curve_figure("relative speed", np.concatenate(speeds), tracks, axis, units),
     ]
 
 
@@ -161,7 +182,9 @@ def _count_figure(log: TrackLog, axis: TimeAxis) -> Figure:
     return Figure("Vehicles", f"Most shown at once in {interval}", svg)
 
 
-def _curve_figure(quantity: str, values: Floats, tracks: Sequence[TrackHistory], axis: TimeAxis) -> Figure:
+def _curve_figure(
+    quantity: str, values: Floats, tracks: Sequence[TrackHistory], axis: TimeAxis, units: Units
+) -> Figure:
     """Lines of the distance or of the relative speed of each track."""
     known = values[np.isfinite(values)]
     if not known.size:
@@ -169,11 +192,14 @@ def _curve_figure(quantity: str, values: Floats, tracks: Sequence[TrackHistory],
     low, high = float(known.min()), float(known.max())
     if quantity == "distance":
         name, std = "distance_m", "distance_std_m"
-        extent = f"{low:.0f} to {high:.0f} meters. The table of tracks lists the nearest ones."
-        note = "Meters along the road; the band is one standard error"
+        extent = f"{low:.0f} to {high:.0f} {units.distance_name}. The table of tracks lists the nearest ones."
+        note = f"{units.distance_name.capitalize()} along the road; the band is one standard error"
     else:
-        name, std, extent = "speed_mps", None, f"{low:.1f} to {high:.1f} m/s."
-        note = f"Meters per second, above 0 when moving away; standard error at most {MAX_SPEED_STD:g} m/s"
+        name, std, extent = "speed_mps", None, f"{low:.0f} to {high:.0f} {units.speed_symbol}."
+        note = (
+            f"{units.speed_name.capitalize()} relative to the camera, above 0 when moving away; standard "
+            f"error at most {units.speed * MAX_SPEED_STD:.0f} {units.speed_symbol}"
+        )
     value_axis = ValueAxis.covering(min(low, 0.0), max(high, 0.0), 150)
     curves = "".join(curve(track, name, axis, value_axis, std=std) for track in tracks)
     ends = end_labels(tracks, name, axis, value_axis)

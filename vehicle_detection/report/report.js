@@ -42,13 +42,13 @@ function showReadout(frame) {
   time.textContent = formatTime(frame / data.fps) + (visible.length ? "" : " no vehicle");
   readout.replaceChildren(time, ...visible.map(track => {
     const index = Math.floor(frame / data.step) - track.first, name = document.createElement("span");
-    const meters = track.distance[index], speed = track.speed[index];
+    const distance = track.distance[index], speed = track.speed[index];
     name.className = "c" + track.color;
     name.textContent = "#" + track.id;
-    if (meters != null) name.textContent += " " + meters.toFixed(0) + " m";
+    if (distance != null) name.textContent += " " + distance.toFixed(0) + " " + data.units[0];
     if (speed != null) {
       const sign = speed > 0 ? "+" : speed < 0 ? "\u2212" : "";
-      name.textContent += " " + sign + Math.abs(speed).toFixed(1) + " m/s";
+      name.textContent += " " + sign + Math.abs(speed).toFixed(0) + " " + data.units[1];
     }
     return name;
   }));

@@ -6,12 +6,20 @@ import os
 import urllib.parse
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from vehicle_detection._common import atomic_write, check_integer, check_target, check_type, describe
+from vehicle_detection._common import (
+    atomic_write,
+    check_choice,
+    check_integer,
+    check_target,
+    check_type,
+    describe,
+)
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.report.history import TrackLog
 from vehicle_detection.report.page import VideoEmbed, render_page
+from vehicle_detection.units import UNITS
 from vehicle_detection.video import VideoReport
 
 
@@ -29,6 +37,8 @@ class ReportWriter:
     detector, embed_limit
         The :class:`VehicleDetector`, for settings and model; and the number of bytes from which on a video is
         linked instead of embedded: page and video must then be moved together.
+    units
+        ``"metric"`` (m and km/h) or ``"imperial"`` (ft and mph).
 
     Raises
     ------
@@ -51,7 +61,10 @@ class ReportWriter:
         source: str | os.PathLike[str] | None = None,
         detector: Any = None,
         embed_limit: int = 60_000_000,
+        units: Literal["metric", "imperial"] = "metric",
     ) -> None:
+        check_choice(units, "units", UNITS)
+        self._units = units
         given: dict[str, Any] = {"path": path, "video": video, "source": source}
         for name, value in given.items():
             if not isinstance(value, (str, os.PathLike)) and (value is not None or name == "path"):
@@ -82,7 +95,12 @@ class ReportWriter:
     def finish(self, report: VideoReport) -> None:
         """Write the page, completely or not at all, with the `report` that `process_video` returned."""
         check_type(report, "report", VideoReport, "pass what process_video returned")
-        options = {"video": self._embed(), "source": self._source, "detector": self._detector}
+        options = {
+            "video": self._embed(),
+            "source": self._source,
+            "detector": self._detector,
+            "units": self._units,
+        }
         pieces = render_page(self._log, report, **options)
         with (
             atomic_write(self._path, "path") as part,
