@@ -152,7 +152,8 @@ def demo(
     from vehicle_detection.cli.demo import FILES, REPORT, run_demo
     from vehicle_detection.detector import VehicleDetector
 
-    with output_folder(output, "--output"), VehicleDetector() as detector:
+    # The field of view of the drawn camera.
+    with output_folder(output, "--output"), VehicleDetector(field_of_view=58) as detector:
         done, scores = run_demo(output, detector, frames=frames, random_state=seed, report=report)
     print_facts(
         f"{scores.frames} drawn frames of 1280x720, {scores.vehicles} vehicles, {scores.tracks} tracks",
