@@ -46,7 +46,7 @@ def test_the_size_prior_raises_the_margins_of_near_vehicles():
     common = [row for row, box in enumerate(others) if tuple(box) in before]
     assert len(common) > 3
     heights = others[common, 3] - others[common, 1]
-    expected = [before[tuple(others[row])] for row in common] + 0.1 * np.log2(4 * heights / 360)
+    expected = [before[tuple(others[row])] for row in common] + 0.1 * np.log2(heights / 64).clip(-2, 2)
     np.testing.assert_allclose(raised[common], expected)
     assert (raised >= min_margin).all()
     assert (np.diff(raised) <= 0).all()
@@ -69,9 +69,25 @@ def test_many_votes_raise_a_margin():
     np.testing.assert_allclose(with_votes.detect_vehicles(pyramid, more, min_margin=0.0)[1], [0.6])
 
 
+@pytest.mark.parametrize("candidates", [1, 7, 20])
+def test_many_candidates_lower_the_margins(candidates):
+    model, pyramid = random_mixture(), EdgePyramid(ROAD)
+    corners = np.array([(20 * (number % 10), 40 * (number // 10)) for number in range(candidates)], float)
+    boxes, margins = np.hstack([corners, corners + 15]), np.linspace(-0.9, 0.5, candidates)[::-1]
+    windows = ScoredWindows(boxes, margins, np.zeros(candidates, np.intp))
+    counted = dataclasses.replace(model, count_weight=0.2)
+    found, lowered = counted.detect_vehicles(pyramid, windows, min_margin=-2.0)
+    np.testing.assert_allclose(found, boxes)
+    np.testing.assert_allclose(lowered, margins - 0.2 * np.log((1 + candidates) / 8))
+    # The count includes the candidates that are not returned.
+    best = counted.detect_vehicles(pyramid, windows, min_margin=lowered[0])[1]
+    assert best.tolist() == [lowered[0]]
+
+
 def test_a_saved_model_is_loaded_bit_by_bit(tmp_path):
     path = tmp_path / "model.safetensors"
-    options = {"slope": 1.7, "offset": 0.1, "threshold": -0.3, "size_prior_weight": 0.02, "vote_weight": 0.04}
+    options = {"slope": 1.7, "offset": 0.1, "threshold": -0.3, "count_weight": 0.3}
+    options |= {"size_prior_weight": 0.02, "vote_weight": 0.04}
     model = random_mixture(**options, metadata={"a": [1, {"b": None}]})
     templates = *model.templates, mixture_template(5, 6, seed=4, border=True)
     model = dataclasses.replace(model, templates=templates)
@@ -122,6 +138,7 @@ def write_file(path, tensors=None, params=None, *, params_text=None, **changes):
         "threshold": 0.0,
         "size_prior_weight": 0.0,
         "vote_weight": 0.0,
+        "count_weight": 0.0,
         **(params or {}),
     }
     header = {

@@ -169,8 +169,8 @@ def test_every_vehicle_has_the_same_weight_in_the_best_threshold():
 
 def test_the_best_threshold_of_folds_without_vehicles_or_boxes():
     sets = [fold_of([], []), fold_of([], [], frames=2, empty=2), fold_of([0.5], [True])]
-    assert -1.0 <= best_threshold(sets) <= 0.5
-    assert best_threshold(sets[:2]) == -1.0
+    assert -2.0 <= best_threshold(sets) <= 0.5
+    assert best_threshold(sets[:2]) == -2.0
 
 
 def test_log_odds_increase_with_the_margin():

@@ -311,11 +311,11 @@ class TestLifeCycle:
 
     @pytest.mark.parametrize("fps", [10.0, 60.0])
     def test_confirmation_requires_hits_and_time_at_any_frame_rate(self, fps):
-        """At 10 fps three detections take 0.2 s; at 60 fps four take 0.05 s: neither is confirmed yet."""
+        """At 10 fps two detections take 0.1 s; at 60 fps three take 0.03 s: neither is confirmed yet."""
         tracker = Tracker(fps=fps)
         tracker.update(Detections.empty(), SHAPE)
         shown = [any(t.shown for t in tracker.update(found(CAR, score=9.0), SHAPE)) for _ in range(12)]
-        assert shown.index(True) + 1 == (4 if fps == 10 else 9)
+        assert shown.index(True) + 1 == (3 if fps == 10 else 9)
 
     def test_a_briefly_detected_vehicle_coasts_only_briefly(self):
         tracker = Tracker()
@@ -392,13 +392,24 @@ class TestOcclusion:
         steps = play(scene, 5, undetected=lambda name, t: name == "far" and 2 <= t < 3)
         assert all(track for time, _, track in matched(steps, "far") if 0.5 < time < 3)
 
-    def test_a_hidden_vehicle_is_shown_for_one_second_and_kept_for_two(self):
-        tracker, near, far = Tracker(), [300.0, 380, 800, 600], [745.0, 420, 835, 465]
+    @pytest.mark.parametrize(
+        ("left", "seconds"), [(745.0, 1.0), (690.0, 0.4)], ids=["partly visible", "not visible"]
+    )
+    def test_a_hidden_vehicle_is_shown_for_a_while_and_kept_for_four_seconds(self, left, seconds):
+        tracker, near, far = Tracker(), [300.0, 380, 800, 600], [left, 420, left + 90, 465]
         for _ in range(60):
             tracker.update(found(near, far), SHAPE)
-        steps = [tracker.update(found(near), SHAPE) for _ in range(70)]
-        assert sum(sum(t.shown for t in tracks) == 2 for tracks in steps) == 25
-        assert sum(len(tracks) == 2 for tracks in steps) == 50
+        steps = [tracker.update(found(near), SHAPE) for _ in range(130)]
+        assert sum(sum(t.shown for t in tracks) == 2 for tracks in steps) == 25 * seconds
+        assert sum(len(tracks) == 2 for tracks in steps) == pytest.approx(100, abs=5)
+
+    def test_a_vehicle_keeps_its_identity_after_a_long_occlusion(self):
+        near, tracker = [300.0, 380, 800, 600], Tracker()
+        far = [[500 + 2 * index, 420, 590 + 2 * index, 465] for index in range(240)]
+        for index, box in enumerate(far):
+            hidden = 60 <= index < 150
+            tracks = tracker.update(found(near, *[] if hidden else [box]), SHAPE)
+        assert {track.id for track in tracks if track.shown} == {1, 2}
 
     @pytest.mark.parametrize("seed", range(4))
     def test_crossing_vehicles_keep_their_identity(self, seed):
@@ -493,7 +504,8 @@ class TestTime:
             assert len(ids(steps, name)) == 1
             first = next(time for time, _, track in matched(steps, name) if track)
             assert 0.1 <= first <= 0.31
-            assert np.mean([overlap for time, overlap, _ in matched(steps, name) if time > 0.5]) > 0.88
+            overlaps = [overlap for time, overlap, track in matched(steps, name) if time > 0.5 and track]
+            assert np.mean(overlaps) > 0.88
         far = ids(steps, "far").pop()
         hidden = max(time for time, _, tracks in steps for t in tracks if t.id == far and t.shown)
         ended = max(time for time, _, tracks in steps for t in tracks if t.id == far)

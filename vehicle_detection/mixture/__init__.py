@@ -18,6 +18,7 @@ from vehicle_detection.mixture.features import (
     FeatureMap,
     mirror_channels,
 )
+from vehicle_detection.mixture.haze import prepare, reduce_haze
 from vehicle_detection.mixture.model import TemplateMixture, load_model
 from vehicle_detection.mixture.rescoring import (
     KERNEL,
@@ -60,6 +61,8 @@ __all__ = [
     "mostly_inside",
     "network_inputs",
     "nms",
+    "prepare",
+    "reduce_haze",
     "rescoring_features",
     "smallest_box",
     "unfold",

@@ -9,6 +9,7 @@ detect vehicles by clustering appearance patterns" (IEEE T-ITS 2015) for vehicle
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -33,6 +34,9 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
+# Height in pixels of a box, and number of candidates plus one, that leave a margin as it is.
+_USUAL_HEIGHT, _USUAL_COUNT = 64.0, 8
+
 KIND = "mixture"
 """Kind of the model files that hold a mixture of templates."""
 
@@ -53,11 +57,14 @@ class TemplateMixture:
     threshold
         Minimum log-odds of a vehicle.
     size_prior_weight
-        Margin added per doubling of a box's height above a quarter of the frame's height, and subtracted per
-        halving: small boxes have more places to occur by chance.
+        Margin added per doubling of a box's height above 64 pixels, and subtracted per halving, at most for
+        two: small boxes show less and have more places to occur by chance.
     vote_weight
         Margin added per unit of ``log(1 + vote mass) - 2``, at most 2 units: a vehicle is found by many
         windows of similar position and size, clutter by one or two.
+    count_weight
+        Margin subtracted per unit of ``log((1 + n) / 8)``, where `n` counts the candidates in the frame: the
+        more there are, the more of them are clutter.
     metadata
         Training facts stored in the model file. JSON values only.
 
@@ -81,6 +88,7 @@ class TemplateMixture:
     threshold: float = 0.0
     size_prior_weight: float = 0.0
     vote_weight: float = 0.0
+    count_weight: float = 0.0
     rescorer: Rescorer | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
@@ -97,6 +105,7 @@ class TemplateMixture:
         check_number(self.threshold, "threshold")
         check_number(self.size_prior_weight, "size_prior_weight", low=0)
         check_number(self.vote_weight, "vote_weight", low=0)
+        check_number(self.count_weight, "count_weight", low=0)
         object.__setattr__(self, "templates", templates)
 
     def open_search(
@@ -149,12 +158,12 @@ class TemplateMixture:
         self, pyramid: EdgePyramid, windows: ScoredWindows, *, min_margin: float
     ) -> tuple[Floats, Floats]:
         """Boxes and margins of the vehicles that the windows of a frame propose, best first."""
-        # Rescoring may raise a margin, so keep every box above RESCORE_MIN until it has run.
-        proposal_min = min_margin if self.rescorer is None else RESCORE_MIN
-        boxes, margins = self.propose_boxes(pyramid, windows, min_margin=proposal_min)
+        boxes, margins = self.propose_boxes(pyramid, windows, min_margin=RESCORE_MIN)
         if self.rescorer is not None:
             boxes, margins = self.rescorer.apply(pyramid, boxes, margins)
         rows = nms(boxes, margins)
+        count = np.count_nonzero(margins[rows] >= RESCORE_MIN)
+        margins = margins - self.count_weight * math.log((1 + count) / _USUAL_COUNT)
         rows = rows[(margins[rows] >= min_margin) & (box_areas(boxes[rows]) > 0)]
         return boxes[rows], margins[rows]
 
@@ -162,21 +171,17 @@ class TemplateMixture:
         self, pyramid: EdgePyramid, windows: ScoredWindows, *, min_margin: float
     ) -> tuple[Floats, Floats]:
         """Boxes inside the frame and their margins before rescoring; several may cover one vehicle."""
-        # Upper bounds: the size prior adds at most log2(4) = 2 units, the votes at most 2.
+        # The size prior and the votes add at most 2 units each.
         min_window = min_margin - 2 * self.size_prior_weight - 2 * self.vote_weight
         grouped, vote_mass = vote_boxes(windows, min_margin=min_window)
         margins = grouped.margins + self.vote_weight * np.minimum(np.log1p(vote_mass) - 2, 2)
         boxes = clip_boxes(grouped.boxes, pyramid.shape)
-        margins = margins + self._size_prior(boxes, pyramid)
+        heights = np.maximum(boxes[:, 3] - boxes[:, 1], 1)
+        margins = margins + self.size_prior_weight * np.log2(heights / _USUAL_HEIGHT).clip(-2, 2)
         kept = np.flatnonzero((margins >= min_margin) & (box_areas(boxes) > 0))
         boxes, margins = boxes[kept], margins[kept]
         rows = nms(boxes, margins, iou=DUPLICATE_IOU, cover=np.inf)
         return boxes[rows], margins[rows]
-
-    def _size_prior(self, boxes: Floats, pyramid: EdgePyramid) -> Floats:
-        return np.asarray(
-            self.size_prior_weight * np.log2(4 * (boxes[:, 3] - boxes[:, 1]) / pyramid.shape[0])
-        )
 
     def with_metadata(self, metadata: Mapping[str, Any]) -> TemplateMixture:
         """Return the same model with other metadata."""
@@ -196,6 +201,7 @@ class TemplateMixture:
             "threshold": self.threshold,
             "size_prior_weight": self.size_prior_weight,
             "vote_weight": self.vote_weight,
+            "count_weight": self.count_weight,
         }
         if self.rescorer is not None:
             tensors |= self.rescorer.tensors()
@@ -241,7 +247,7 @@ def load_model(path: str | os.PathLike[str] = "default") -> TemplateMixture | Ve
             )
             for index, (bias, padding, border) in enumerate(rows)
         )
-        names = "slope", "offset", "threshold", "size_prior_weight", "vote_weight"
+        names = "slope", "offset", "threshold", "size_prior_weight", "vote_weight", "count_weight"
         numbers = {name: float(params[name]) for name in names}
         rescorer = Rescorer.build(tensors, params["rescorer"]) if "rescorer" in params else None
         return TemplateMixture(templates, **numbers, rescorer=rescorer, metadata=data.metadata)

@@ -12,7 +12,6 @@ from vehicle_detection._common import check_type, single_threaded_opencv
 from vehicle_detection._kernels import PackedFilters, PackedSearch
 from vehicle_detection.boxes import Detections
 from vehicle_detection.mixture.boxes import MIN_MARGIN, ScoredWindows, mostly_inside
-from vehicle_detection.mixture.denoise import denoise
 from vehicle_detection.mixture.features import (
     CHANNEL_SCALES,
     MIRROR_ORDER,
@@ -22,6 +21,7 @@ from vehicle_detection.mixture.features import (
     octave_count,
     octave_of,
 )
+from vehicle_detection.mixture.haze import prepare
 from vehicle_detection.mixture.model import TemplateMixture
 from vehicle_detection.mixture.template import MixtureTemplate, smallest_box
 from vehicle_detection.params import PyramidParams
@@ -57,8 +57,9 @@ class _Plan:
 class MixtureSearch(FrameSearch):
     """The search of frames with a mixture of templates.
 
-    Vehicles lie inside the frame; windows may extend beyond it. Sensor noise is removed first. The weights
-    are rounded to 8 bits, and so are the channels: a margin differs by about 0.002 from the exact one.
+    Vehicles lie inside the frame; windows may extend beyond it. Sensor noise and haze are removed
+    first. The weights are rounded to 8 bits, and so are the channels: a margin differs by about 0.002 from
+    the exact one.
     """
 
     params_type = PyramidParams
@@ -100,7 +101,7 @@ class MixtureSearch(FrameSearch):
     ) -> tuple[Detections, Detections]:
         model = self.model
         with single_threaded_opencv():
-            pyramid, found = self.score_windows(denoise(frame), params)
+            pyramid, found = self.score_windows(prepare(frame), params)
             boxes, margins = model.detect_vehicles(
                 pyramid, found, min_margin=model.margin_of(min_vehicle_score)
             )
@@ -113,7 +114,8 @@ class MixtureSearch(FrameSearch):
     ) -> tuple[EdgePyramid, ScoredWindows]:
         """Windows with their templates' margins, best first; weak ones are included because they vote.
 
-        Sensor noise is not removed here. The pyramid is valid until the next search in the same thread.
+        Sensor noise and haze are not removed here. The pyramid is valid until the next search in the same
+        thread.
         """
         min_margin = min(MIN_MARGIN, self.model.margin_of(params.min_score))
         plan = self._plan((image.shape[0], image.shape[1]), params, min_margin)
@@ -183,7 +185,7 @@ class MixtureSearch(FrameSearch):
             used = [
                 index
                 for index, template in enumerate(templates)
-                if template.box_cells[0] * size >= params.min_width * 0.999
+                if template.box_cells[0] * size >= params.smallest_width(shape) * 0.999
                 and template.box_cells[1] * size <= params.max_height * shape[0]
                 and template.weights.shape[1] <= columns - _BEYOND * template.border
             ]

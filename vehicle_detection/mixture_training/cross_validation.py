@@ -34,8 +34,9 @@ from vehicle_detection.params import MixtureParams
 
 Floats = NDArray[np.float64]
 
-_MIN_MARGIN = -1.0  # of an evaluated box
-_THRESHOLDS = np.arange(-1.0, 1.5, 0.02)  # to choose from
+_MIN_MARGIN = -2.0  # of an evaluated box
+_THRESHOLDS = np.arange(-2.0, 1.5, 0.02)  # to choose from
+_MIN_PROBABILITY = 0.1  # of a box that counts in the calibration error
 # In F-beta, a false box counts twice as much as a missed vehicle.
 _BETA_SQUARED = 0.5
 
@@ -73,7 +74,7 @@ class FoldScore:
     region_f1: float
     region_average_precision: float
     strict_average_precision: float  # region average precision at IoU 0.7
-    calibration_error: float  # of the probabilities fitted to the other sources
+    calibration_error: float  # of probabilities from 0.1 on, fitted to the other sources
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON, rounded to four digits, without those that are NaN."""
@@ -203,6 +204,9 @@ def score_fold(
     strict = evaluate_detections(fold.predictions, labels, iou=0.7, ignored_as_regions=True)
     margins, hits = fold.hits
     probabilities = 1 / (1 + np.exp(-(slope * margins + offset).clip(-500, 500)))
+    # Boxes that are hardly ever vehicles are many, and would hide the errors of the others.
+    likely = probabilities >= _MIN_PROBABILITY
+    hits, probabilities = hits[likely], probabilities[likely]
     empty = [key for key in fold.frames.keys if not len(labels.rows(key))]
     false_on_empty = sum(len(kept.rows(key)) for key in empty)
     at_threshold = {name: getattr(scores, name) for name in ("f1", "precision", "recall", "mean_iou")}

@@ -143,16 +143,14 @@ def _border_blocks(
     """Negatives of one border template at the actual borders of a frame and at simulated ones."""
     template, width = view.template, frame.image.shape[1]
     height = template.weights.shape[0]
+    narrowest = params.search.smallest_width(frame.image.shape)
     for left, fraction in itertools.product((False, True), (1.0, *params.simulated_borders)):
         end = round(width * (1 - fraction if left else fraction))
         strips = {}
         places, boxes, margins = [], [np.empty((0, 4))], [np.empty(0)]
         for size, features in enumerate(maps):
             strip = template.border_strip(features, end, left=left)
-            if (
-                strip is None
-                or template.box_cells[0] * features.grid.step_x <= 0.999 * params.search.min_width
-            ):
+            if strip is None or template.box_cells[0] * features.grid.step_x <= 0.999 * narrowest:
                 continue
             strips[size] = strip
             line = template.margins(strip).ravel()

@@ -123,7 +123,7 @@ def _read_frames(root: Path, file: Path, clip_rate: float) -> LabelledFrames:
 class TrainingFrame:
     """A loaded frame and its labels."""
 
-    image: NDArray[np.uint8]  # (H, W, 3) RGB, denoised
+    image: NDArray[np.uint8]  # (H, W, 3) RGB, without noise and haze
     boxes: NDArray[np.float64]  # (N, 4) vehicles
     ignored: NDArray[np.float64]  # (M, 4) ignored boxes
     min_labelled_width: float  # width in pixels from which on every vehicle is labelled
@@ -132,7 +132,7 @@ class TrainingFrame:
 def load_training_frames(sources: Sequence[FrameDataset]) -> list[TrainingFrame]:
     """Load all frames of some data sets into memory."""
     # Imported here, because mypy takes the name for a module if it is the only one imported at the top.
-    from vehicle_detection.mixture import denoise
+    from vehicle_detection.mixture import prepare
 
     loaded = []
     for source in sources:
@@ -140,5 +140,5 @@ def load_training_frames(sources: Sequence[FrameDataset]) -> list[TrainingFrame]
             for key, image in part:
                 labels = part.labels.frame(key)
                 boxes, ignored = labels.boxes[~labels.ignore], labels.boxes[labels.ignore]
-                loaded.append(TrainingFrame(denoise(image), boxes, ignored, source.min_labelled_width))
+                loaded.append(TrainingFrame(prepare(image), boxes, ignored, source.min_labelled_width))
     return loaded

@@ -121,6 +121,7 @@ class _Training:
             tuple(self.train_templates([*inner, *border], positives)),
             size_prior_weight=params.size_prior_weight,
             vote_weight=params.vote_weight,
+            count_weight=params.count_weight,
         )
         if params.blend_weight:
             with mixture.open_search(n_jobs=1) as search:

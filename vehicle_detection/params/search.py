@@ -296,7 +296,8 @@ class PyramidParams:
     Attributes
     ----------
     min_width, max_height
-        Minimum width of a vehicle in pixels, and maximum height as a fraction of the frame's height.
+        Minimum width of a vehicle in pixels, and maximum height as a fraction of the frame's height. Without
+        a width: a fortieth of the frame's width, at least 24 and at most 32 pixels.
     per_octave
         Number of sizes per doubling.
     horizon
@@ -315,7 +316,7 @@ class PyramidParams:
     [10.0, 11.49, 13.2, 15.16, 17.41, 20.0]
     """
 
-    min_width: float = 32.0
+    min_width: float | None = None
     max_height: float = 0.8
     per_octave: int = 5
     horizon: float | None = 0.5
@@ -324,7 +325,8 @@ class PyramidParams:
     min_score: float = 0.0
 
     def __post_init__(self) -> None:
-        check_number(self.min_width, "min_width", low=16, high=10_000)
+        if self.min_width is not None:
+            check_number(self.min_width, "min_width", low=16, high=10_000)
         check_number(self.max_height, "max_height", above=0, high=2)
         check_integer(self.per_octave, "per_octave", low=1, high=32)
         if self.horizon is not None:
@@ -360,9 +362,19 @@ class PyramidParams:
         """Heat thresholds for the windows of this search, which are few: two to six on a vehicle."""
         return HeatRange(*(self.per_octave / 5 * value for value in _PYRAMID_HEAT[heat.weighting]))
 
+    def smallest_width(self, shape: tuple[int, ...]) -> float:
+        """Minimum width of a vehicle in pixels in a frame of `shape`.
+
+        >>> [PyramidParams().smallest_width(shape) for shape in [(360, 480), (720, 1280)]]
+        [24.0, 32.0]
+        """
+        if self.min_width is not None:
+            return self.min_width
+        return min(max(shape[1] / 40, 24.0), 32.0)
+
     def sizes(self, columns: float, rows: float, shape: tuple[int, ...]) -> list[float]:
         """Cell sizes in pixels of the frame, for boxes of `columns` by `rows` cells in a frame of `shape`."""
-        smallest = self.min_width / columns
+        smallest = self.smallest_width(shape) / columns
         largest = max(self.max_height * shape[0] / rows, smallest)
         count = math.floor(self.per_octave * math.log2(largest / smallest)) + 1
         return [smallest * 2 ** (step / self.per_octave) for step in range(count)]

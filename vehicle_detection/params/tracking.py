@@ -30,17 +30,19 @@ class TrackParams:
         ``score_time_constant * log(s / (s - confirm_score))`` seconds, and never if `s` is lower. Both
         shipped models detect vehicles in single images from score 0 on.
     confirm_hits, confirm_seconds
-        Minimum number of detections, and minimum time since the first one, before a track is confirmed.
+        Minimum number of detections beyond the number of frames without one, and minimum time since the first
+        one, before a track is confirmed.
     instant_confirm_score
         In the first frame, and in the first one after a scene cut, a detection with this score is confirmed
         at once, because no earlier frame could have shown it.
-    tentative_coast, max_coast
-        A tentative and a confirmed track end after these times without a detection; while a vehicle is hidden
-        by another one, time counts half.
-    show_coast
-        A confirmed track is shown for this time without a detection, and no longer than it was detected since
-        its confirmation. While another vehicle hides it, it is shown up to `max_coast`, and no longer than it
-        was detected. It is not shown once it must have moved by half of its size.
+    tentative_coast, max_coast, max_hidden
+        A tentative and a confirmed track end after these times without a detection. The time in which another
+        vehicle hides a confirmed one has a limit of its own, `max_hidden`.
+    show_coast, show_covered
+        A confirmed track is shown for `show_coast` without a detection, and no longer than it was detected
+        since its confirmation. While another vehicle hides it, it is shown up to `max_coast`, no longer than
+        it was detected, and for `show_covered` if nothing of it is visible. It is not shown once it must have
+        moved by half of its size.
     max_gap
         A longer gap between two frames ends all tracks.
     max_distance
@@ -69,12 +71,14 @@ class TrackParams:
     high_threshold: float = -0.3
     low_threshold: float = -1.5
     confirm_score: float = 0.2
-    confirm_hits: int = 4
+    confirm_hits: int = 3
     confirm_seconds: float = 0.12
     instant_confirm_score: float = 1.3
     tentative_coast: float = 0.1
     show_coast: float = 0.3
+    show_covered: float = 0.4
     max_coast: float = 1.0
+    max_hidden: float = 4.0
     max_gap: float = 1.0
     max_distance: float = 0.7
     max_iou: float = 0.3
@@ -90,7 +94,14 @@ class TrackParams:
         check_choice(self.smoother, "smoother", ("kalman", "history", "nearest"))
         for name in ("score_time_constant", "max_gap", "history_seconds"):
             check_number(getattr(self, name), name, above=0, high=3600)
-        times = ("confirm_seconds", "tentative_coast", "show_coast", "max_coast")
+        times = (
+            "confirm_seconds",
+            "tentative_coast",
+            "show_coast",
+            "show_covered",
+            "max_coast",
+            "max_hidden",
+        )
         for name in (*times, "measurement_correlation_time"):
             check_number(getattr(self, name), name, low=0, high=3600)
         for name in ("high_threshold", "low_threshold", "confirm_score", "instant_confirm_score"):

@@ -61,11 +61,14 @@ class TrackState:
     confirm_at_birth: bool = False  # whether its first detection suffices to confirm it
     id: int = 0
     hits: int = 1
-    misses: int = 0
+    misses: int = 0  # since the last detection
+    all_misses: int = 0
     age: float = 0.0
     time_since_update: float = 0.0
-    unexplained_gap: float = 0.0  # time without a detection; time behind another vehicle counts half
+    unexplained_gap: float = 0.0  # time without a detection while no other vehicle hides it
+    hidden_gap: float = 0.0  # time without a detection while another vehicle hides it
     coast_budget: float = 0.0  # time for which it is still shown without a detection
+    covered_budget: float = 0.0  # time for which it is still shown while nothing of it is visible
     hidden: bool = False  # whether another vehicle explains the missing detection
     lost: bool = False  # whether its predicted position is only a guess
     past_boxes: list[tuple[float, Floats]] = field(default_factory=list)  # for the smoother "history"
@@ -82,9 +85,12 @@ class TrackState:
         """Whether to draw it."""
         if not self.id or self.lost:
             return False
+        if not self.misses:
+            return True
         if self.hidden:  # shown for as long as it was detected before
-            return self.misses == 0 or 2 * self.time_since_update < self.age + TIME_TOLERANCE
-        return self.misses == 0 or self.coast_budget > -TIME_TOLERANCE
+            long_enough = 2 * self.time_since_update < self.age + TIME_TOLERANCE
+            return long_enough and self.covered_budget > -TIME_TOLERANCE
+        return self.coast_budget > -TIME_TOLERANCE
 
     def update_score(self, score: float | None, dt: float, params: TrackParams) -> None:
         """Advance by a frame, with the score of the assigned detection, or None without one."""
@@ -94,24 +100,30 @@ class TrackState:
         self.hidden = self.lost = False
         if score is None:
             self.misses += 1
+            self.all_misses += 1
             self.time_since_update += dt
         else:
             self.hits += 1
-            self.misses, self.time_since_update, self.unexplained_gap = 0, 0.0, 0.0
+            self.misses, self.time_since_update = 0, 0.0
+            self.unexplained_gap, self.hidden_gap, self.covered_budget = 0.0, 0.0, params.show_covered
             self.coast_budget = min(self.coast_budget + dt, params.show_coast) if self.id else 0.0
 
-    def mark_missed(self, dt: float, *, hidden: bool, lost: bool) -> None:
+    def mark_missed(self, dt: float, *, hidden: bool, covered: bool, lost: bool) -> None:
         """Account for a frame without a detection, behind another vehicle or for an unknown reason."""
         self.hidden, self.lost = hidden, lost
-        self.unexplained_gap += dt / 2 if hidden else dt
-        self.coast_budget -= 0.0 if hidden else dt
+        if hidden:
+            self.hidden_gap += dt
+            self.covered_budget -= dt if covered else 0.0
+        else:
+            self.unexplained_gap += dt
+            self.coast_budget -= dt
 
     def can_confirm(self, params: TrackParams) -> bool:
         """Whether a tentative track meets the conditions of confirmation in this frame."""
         if self.id or self.misses:
             return False
         return self.confirm_at_birth or (
-            self.hits >= params.confirm_hits
+            self.hits - self.all_misses >= params.confirm_hits
             and self.age > params.confirm_seconds - TIME_TOLERANCE
             and self.score >= params.confirm_score
         )
@@ -119,5 +131,6 @@ class TrackState:
     def is_expired(self, params: TrackParams) -> bool:
         """Whether it has had no detection for too long."""
         if self.id:
-            return self.unexplained_gap > params.max_coast + TIME_TOLERANCE
+            unexplained = self.unexplained_gap > params.max_coast + TIME_TOLERANCE
+            return unexplained or self.hidden_gap > params.max_hidden + TIME_TOLERANCE
         return self.time_since_update > params.tentative_coast + TIME_TOLERANCE

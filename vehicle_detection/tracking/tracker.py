@@ -42,13 +42,15 @@ from vehicle_detection.tracking.simple import make_smoother
 from vehicle_detection.tracking.track import TIME_TOLERANCE, Track, TrackState
 
 # Visible fraction of a box below which its vehicle leaves the frame if it moves outwards, and below which it
-# has left; covered fraction above which a vehicle is hidden.
-_LEAVING, _LEFT, _HIDDEN = 0.5, 0.15, 0.5
+# has left; covered fractions above which a vehicle is hidden, and above which nothing of it is visible.
+_LEAVING, _LEFT, _HIDDEN, _COVERED = 0.5, 0.15, 0.5, 0.9
 # Distance in box sizes that a track may coast before its position is only a guess.
 _MAX_COAST_DISTANCE = 0.5
 # Factors of `max_distance` for tentative tracks, and for low-score detections.
 _TENTATIVE_DISTANCE, _LOW_SCORE_DISTANCE = 0.6, 0.5
 _LOG_ODDS = Platt(-1.0, 0.0)
+# Seconds without a detection up to which that distance grows.
+_MAX_GAP = 2.0
 
 
 class Tracker:
@@ -296,7 +298,8 @@ class Tracker:
         confirmed = sum(track.id > 0 for track in self._live)
         # The distance grows with the time without a detection, and is smaller for tentative tracks, so that
         # false positives at changing places do not form a track.
-        factors = np.array([(1.0 if t.id else _TENTATIVE_DISTANCE) + t.time_since_update for t in self._live])
+        gaps = [min(track.time_since_update, _MAX_GAP) for track in self._live]
+        factors = np.array([1.0 if track.id else _TENTATIVE_DISTANCE for track in self._live]) + gaps
         max_distance = params.max_distance * factors
         # 1. Confirmed tracks with high-score detections.
         high = int((scores >= params.high_threshold).sum())
@@ -334,13 +337,14 @@ class Tracker:
         """Account for missing detections, given the boxes of all tracks and their parts inside the frame."""
         in_front = np.array([track.id > 0 and track.misses == 0 for track in self._live])
         nearer = whole[None, :, 3] > whole[:, None, 3]
-        covered = (covered_fractions(inside, inside) > _HIDDEN) & nearer & in_front
+        fractions = np.where(nearer & in_front, covered_fractions(inside, inside), 0.0).max(axis=1)
         gap = np.array([track.time_since_update for track in self._live])
         lost = coasted_distance(self._states.mean, gap) > _MAX_COAST_DISTANCE
         lost |= gap > self.params.max_coast + TIME_TOLERANCE
-        for track, is_covered, is_lost in zip(self._live, covered.any(axis=1).tolist(), lost.tolist()):
+        for track, fraction, is_lost in zip(self._live, fractions.tolist(), lost.tolist()):
             if track.misses:
-                track.mark_missed(dt, hidden=track.hidden or is_covered, lost=is_lost)
+                is_merged, covered = track.hidden, fraction > _COVERED and not track.hidden
+                track.mark_missed(dt, hidden=is_merged or fraction > _HIDDEN, covered=covered, lost=is_lost)
 
     def _keep(self, rows: list[int]) -> None:
         """Keep these tracks, in this order."""
