@@ -25,7 +25,7 @@ LAYERS = [
     "params camera synthetic export images boxes units _kernels",
     "datasets regions tracking heatmap features video",
     "evaluation drawing classifier sklearn_models",
-    "windows search mixture training function_model",
+    "windows search mixture training function_model events",
     "confidence course detector mixture_training report",
     "tuning explorer",
     "plotting",
@@ -43,6 +43,7 @@ UNSAFE = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marsh
 
 # Public names without an example in their docstring, and why.
 WITHOUT_EXAMPLE = {
+    "Event": "a result of find_events",
     "FrameResult": "a result of VehicleDetector",
     "HeatParams": "see bounding_boxes",
     "HorizonEstimate": "a result of estimate_horizon",
@@ -56,6 +57,7 @@ WITHOUT_EXAMPLE = {
     "DetectionScores": "a result of evaluate_detections",
     "FrameSet": "a result of load_frames",
     "TrackScores": "a result of evaluate_tracks",
+    "VehicleCounts": "a result of count_vehicles",
     "VideoInfo": "a result of probe_video",
     "cross_validate_mixture": "trains several models",
     "hog_image": "a picture",

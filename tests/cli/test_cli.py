@@ -473,7 +473,7 @@ def test_video_writes_an_annotated_copy_and_tracks(clip, tmp_path):
         r"10 frames of 480x270 in \d+\.\d s: .* frames/s, .* times real time, \d+ vehicle", lines[0]
     )
     assert lines[1].split() == ["stage", "ms/frame", "fraction"]
-    assert [line.split()[0] for line in lines[2:-1]] == [
+    assert [line.split()[0] for line in lines[2:8]] == [
         "decode", "search", "regions", "track", "draw", "encode"
     ]  # fmt: skip
     assert lines[-1] == f"wrote {target}, {tracks}"
@@ -497,6 +497,16 @@ def test_video_writes_a_page_and_diagnostics(clip, tmp_path):
         mosaic = next(frames)[2]
     # The heat map is black in an empty corner of the road; no frame of the clip is.
     assert mosaic[-8:, :8].max() < 40
+
+
+def test_video_writes_events_and_a_summary(clip, tmp_path):
+    target, events, clips = tmp_path / "out.mp4", tmp_path / "events.json", tmp_path / "clips"
+    words = ["--events", events, "--clips", clips, "--own-speed", 100, "--preset", "ultrafast"]
+    lines = succeed("video", clip, "-o", target, *words).splitlines()
+    assert re.search(r"\d+ met, \d+ overtaken, \d+ overtaking.*vehicles in view on average", lines[1])
+    assert lines[-1] == f"wrote {target}, {events}, {clips}"
+    found = json.loads(events.read_text())
+    assert [path.suffix for path in clips.iterdir()] == [".mp4"] * len(found)
 
 
 def test_video_can_be_quiet_and_take_a_part(clip, tmp_path):
@@ -586,6 +596,9 @@ def bad_videos(material, tmp):
         r"--tracks needs an existing folder": [clip, "-o", target, "--tracks", tmp / "none" / "tracks.csv"],
         r"--report must end in .html, .*got 'page.pdf'": [clip, "-o", target, "--report", tmp / "page.pdf"],
         r"--report \S+ is also --output \S+;": [clip, "-o", target, "--report", target],
+        r"--events must end in .csv or .json, got 'e.txt'": [clip, "-o", target, "--events", tmp / "e.txt"],
+        r"--own-speed must be a number, at least 0": [clip, "-o", target, "--own-speed", -1],
+        r"--clips must be a folder": [clip, "-o", target, "--clips", clip],
         r"--tracks \S+ is also SOURCE \S+;": [tmp / "a.csv", "-o", target, "--tracks", tmp / "a.csv"],
     }
 

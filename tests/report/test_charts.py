@@ -5,7 +5,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from tests.report.test_history import PRESENCE, log_of
+from tests.events.test_history import PRESENCE, log_of
 from vehicle_detection.report.charts import Label, TimeAxis, ValueAxis, _assign_rows, _separate_labels
 
 

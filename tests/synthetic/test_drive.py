@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from tests.helpers import check_truth
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.synthetic import render_drive, write_labels
-from vehicle_detection.synthetic.drive import LABEL_COLUMNS, make_traffic
+from vehicle_detection.synthetic.drive import LABEL_COLUMNS, SCENARIOS, make_traffic
 
 SMALL = (216, 384)
 
@@ -22,7 +22,7 @@ def truth_by_track(drive):
     return tracks
 
 
-@pytest.mark.parametrize("scenario", ["highway", "overtaking", "crossing", "occlusion", "empty"])
+@pytest.mark.parametrize("scenario", SCENARIOS)
 def test_frames_do_not_depend_on_each_other(scenario):
     first, second = (
         render_drive(frames=20, shape=SMALL, scenario=scenario, random_state=3) for _ in range(2)
@@ -39,7 +39,7 @@ def test_frames_do_not_depend_on_each_other(scenario):
 
 
 @given(
-    scenario=st.sampled_from(["highway", "overtaking", "crossing", "occlusion"]),
+    scenario=st.sampled_from([name for name in SCENARIOS if name != "empty"]),
     seed=st.integers(0, 10_000),
     fps=st.sampled_from([10.0, 25.0, 29.97]),
 )

@@ -305,6 +305,16 @@ def video(
     report: Annotated[
         Path | None, Option(metavar="FILE.html", help="Page with the video and its tracks.")
     ] = None,
+    events: Annotated[
+        Path | None, Option(metavar="FILE", help="Events, such as cut-ins and overtaking: .csv or .json.")
+    ] = None,
+    clips: Annotated[
+        Path | None, Option(metavar="DIR", help="Folder for a short annotated clip of each event.")
+    ] = None,
+    own_speed: Annotated[
+        float | None,
+        Option(metavar="KM/H", help="Speed of the own vehicle, for headways in seconds. Example: 100."),
+    ] = None,
     diagnostics: Annotated[
         bool, Option("--diagnostics", help="Show frame, positive windows, heat map and tracks side by side.")
     ] = False,
@@ -353,16 +363,20 @@ def video(
     profile: Annotated[bool, Option("--profile", help="Print the time of each stage.")] = False,
 ) -> None:
     """Track the vehicles of a video and write an annotated copy; speeds are relative to the camera."""
+    from vehicle_detection.cli.events import EventOptions, print_summary
     from vehicle_detection.detector import VehicleDetector
+    from vehicle_detection.events import TrackLog
     from vehicle_detection.export import TrackWriter
     from vehicle_detection.mixture import load_model
     from vehicle_detection.report import ReportWriter
     from vehicle_detection.video import estimate_video_horizon, process_video
 
     draw_params = _draw_params(labels, line_width=line_width, color_by=color_by, panel=panel, units=units)
-    outputs = {"--output": output, "--tracks": tracks, "--report": report}
+    outputs = {"--output": output, "--tracks": tracks, "--report": report, "--events": events}
     check_distinct_paths(outputs, {"SOURCE": source})
+    event_options = EventOptions(events, clips, own_speed)
     with contextlib.ExitStack() as stack:
+        stack.enter_context(output_folder(clips, "--clips"))
         writers: list[Callable[[Any], object]] = []
         if tracks is not None:
             with option_names(path="--tracks"):
@@ -392,7 +406,8 @@ def video(
                 page = ReportWriter(
                     report, video=output, source=source, detector=detector, units=draw_params.units
                 )
-            writers.append(page)
+        log = page.log if page else TrackLog()
+        writers.append(page or log)
         done = process_video(
             source,
             output,
@@ -405,8 +420,10 @@ def video(
             progress=not quiet,
             on_result=lambda result: [write(result) for write in writers],
         )
+        found = event_options.find(log, done, detector)
+        event_options.write(found, output, done)
     if page is not None:
-        page.finish(done)
+        page.finish(done, events=found)
     if not done.tracks and horizon not in (None, "auto") and not quiet:
         with _everywhere(loaded, conf) as detector:
             _warn_of_horizon(horizon, estimate_video_horizon(source, detector, start=start, end=end))
@@ -419,7 +436,9 @@ def video(
         lines = str(done).splitlines()
         typer.echo("\n".join(lines if profile else lines[:1]))
     if not quiet:
-        typer.echo(f"wrote {', '.join(str(path) for path in outputs.values() if path is not None)}")
+        print_summary(log, found, done)
+        written = [path for path in (*outputs.values(), clips) if path is not None]
+        typer.echo(f"wrote {', '.join(map(str, written))}")
 
 
 def _draw_params(labels: str, **options: Any) -> DrawParams:

@@ -14,8 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection.boxes import Floats
+from vehicle_detection.drawing import TRACK_COLORS
+from vehicle_detection.events import KINDS, Event, TrackHistory, bin_means, split_runs
 from vehicle_detection.report.formatting import format_time, format_value, svg_element
-from vehicle_detection.report.history import Floats, TrackHistory, bin_means, split_runs
 
 MAX_ROWS = 14
 """Largest number of tracks that get a row each in `gantt`; more tracks share rows."""
@@ -147,6 +149,29 @@ def gantt(tracks: Sequence[TrackHistory], axis: TimeAxis, *, label: str) -> str:
         bars.append(svg_element("g", *parts, class_=f"bar c{track.color}", **button, **seek))
     height = _ROW_HEIGHT * (max(rows, default=-1) + 1)
     return _graph(row_names, [*bars, *names], axis, height, role="group", label=label)
+
+
+def event_markers(events: Sequence[Event], axis: TimeAxis, *, label: str) -> str:
+    """Draw a marker for each event, in a row for each kind."""
+    kinds = [kind for kind in KINDS if any(event.kind == kind for event in events)]
+    names, markers = [], []
+    for row, kind in enumerate(kinds):
+        y = (row + 0.5) * _ROW_HEIGHT
+        names.append(
+            svg_element("text", KINDS[kind].capitalize(), class_="track-name", x=0, y=_decimal(y - 2))
+        )
+        for event in events:
+            if event.kind != kind:
+                continue
+            x, color = axis.percent(event.frame), f"c{(event.track_id - 1) % len(TRACK_COLORS)}"
+            parts = [
+                svg_element("title", str(event)),
+                svg_element("circle", cx=x, cy=_decimal(y + 6), r=5),
+            ]
+            button = {"role": "button", "tabindex": 0, "aria_label": f"{event}: show in the video"}
+            seek = {"data_frame": event.frame, "data_track": event.track_id}
+            markers.append(svg_element("g", *parts, class_=f"bar {color}", **button, **seek))
+    return _graph([], [*names, *markers], axis, _ROW_HEIGHT * len(kinds), role="group", label=label)
 
 
 def _assign_rows(tracks: Sequence[TrackHistory], axis: TimeAxis) -> list[int]:

@@ -16,8 +16,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import vehicle_detection
+from vehicle_detection.boxes import Floats
 from vehicle_detection.camera import Camera
 from vehicle_detection.drawing import MAX_SPEED_STD
+from vehicle_detection.events import (
+    KINDS,
+    Event,
+    TrackHistory,
+    TrackLog,
+    VehicleCounts,
+    bin_means,
+    count_vehicles,
+)
 from vehicle_detection.params import HeatParams
 from vehicle_detection.report.charts import (
     TimeAxis,
@@ -26,11 +36,11 @@ from vehicle_detection.report.charts import (
     count_bars,
     curve,
     end_labels,
+    event_markers,
     fraction_bar,
     gantt,
 )
 from vehicle_detection.report.formatting import format_time, format_value, pluralize
-from vehicle_detection.report.history import Floats, TrackHistory, TrackLog, bin_means
 from vehicle_detection.training import SPLITS
 from vehicle_detection.units import UNITS, Units
 from vehicle_detection.video import VideoReport
@@ -84,6 +94,7 @@ def render_page(
     log: TrackLog,
     report: VideoReport,
     *,
+    events: Sequence[Event],
     video: VideoEmbed | None,
     source: str | None,
     detector: Any,
@@ -113,7 +124,10 @@ def render_page(
         counts=_counts(tracks, log, report, chosen),
         video=video,
         tracks=tracks,
-        figures=_figures(tracks, log, axis, chosen) if tracks else [],
+        figures=_figures(tracks, log, events, axis, chosen) if tracks else [],
+        events=events,
+        event_kinds=KINDS,
+        minutes=_minute_table(count_vehicles(events, log, fps=axis.fps)) if tracks else None,
         fraction_bar=fraction_bar,
         settings=_settings(detector, report.shape),
         model=_model_summary(getattr(detector, "model", None)),
@@ -156,12 +170,32 @@ def _counts(
     return counts
 
 
-def _figures(tracks: Sequence[TrackHistory], log: TrackLog, axis: TimeAxis, units: Units) -> list[Figure]:
+def _minute_table(counts: VehicleCounts) -> Table:
+    """List the counts of each minute, and of the whole video."""
+    rows = []
+    for minute in counts.minutes + ((counts.total,) if len(counts.minutes) > 1 else ()):
+        whole = minute is counts.total
+        name = "Total" if whole else format_time(minute.start_s, tenths=False)
+        numbers = minute.met, minute.overtaken, minute.overtaking, minute.passed
+        rows.append([name, *map(str, numbers), f"{minute.mean_in_view:.1f}", str(minute.max_in_view)])
+    note = (
+        "Vehicles that came towards the camera, that it overtook, that overtook it, and that it passed "
+        "although their direction is uncertain; and vehicles in view."
+    )
+    header = ("From", "Met", "Overtaken", "Overtaking", "Passed", "Mean in view", "Most in view")
+    return Table("Counts by minute", note, header, rows)
+
+
+def _figures(
+    tracks: Sequence[TrackHistory], log: TrackLog, events: Sequence[Event], axis: TimeAxis, units: Units
+) -> list[Figure]:
     label = f"Bars of {pluralize(len(tracks), 'track')}: when each was shown, as in the table of tracks."
     distances = [track.columns["distance_m"] for track in tracks]
     speeds = [bin_means(track.frames, track.columns["speed_mps"], axis.bin_width)[1] for track in tracks]
+    marked = event_markers(events, axis, label=f"Markers of {pluralize(len(events), 'event')}.")
     return [
         Figure("Tracks", "When each vehicle was shown", gantt(tracks, axis, label=label)),
+        *([Figure("Events", "What the table of events lists", marked)] if events else []),
         _count_figure(log, axis),
         _curve_figure("distance", np.concatenate(distances), tracks, axis, units),
         _curve_figure("relative speed", np.concatenate(speeds), tracks, axis, units),

@@ -17,7 +17,7 @@ from vehicle_detection._common import (
     describe,
 )
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.report.history import TrackLog
+from vehicle_detection.events import Event, TrackLog, find_events
 from vehicle_detection.report.page import VideoEmbed, render_page
 from vehicle_detection.units import UNITS
 from vehicle_detection.video import VideoReport
@@ -39,6 +39,11 @@ class ReportWriter:
         linked instead of embedded: page and video must then be moved together.
     units
         ``"metric"`` (m and km/h) or ``"imperial"`` (ft and mph).
+
+    Attributes
+    ----------
+    log
+        `TrackLog` of the frames that were added.
 
     Raises
     ------
@@ -82,7 +87,7 @@ class ReportWriter:
         self._source = None if source is None else Path(source).name
         self._detector = detector
         self._embed_limit = check_integer(embed_limit, "embed_limit", low=0)
-        self._log = TrackLog()
+        self.log = TrackLog()
 
     def __call__(self, result: Any) -> None:
         """Add one frame's result: for ``process_video(..., on_result=...)``."""
@@ -90,18 +95,25 @@ class ReportWriter:
 
     def write(self, frame_index: int, time: float | None, tracks: Iterable[Any]) -> None:
         """Add the shown tracks of the next frame, numbered from 0; `time` is that in the source (s)."""
-        self._log.add(frame_index, time, tracks)
+        self.log.add(frame_index, time, tracks)
 
-    def finish(self, report: VideoReport) -> None:
-        """Write the page, completely or not at all, with the `report` that `process_video` returned."""
+    def finish(self, report: VideoReport, *, events: Iterable[Event] | None = None) -> None:
+        """Write the page, completely or not at all, with the `report` that `process_video` returned.
+
+        `events` are those that `find_events` found in `log`; None: they are found here.
+        """
         check_type(report, "report", VideoReport, "pass what process_video returned")
+        if events is None:
+            camera = getattr(self._detector, "camera", None)
+            events = find_events(self.log, fps=float(report.fps), shape=report.shape, camera=camera)
         options = {
+            "events": list(events),
             "video": self._embed(),
             "source": self._source,
             "detector": self._detector,
             "units": self._units,
         }
-        pieces = render_page(self._log, report, **options)
+        pieces = render_page(self.log, report, **options)
         with (
             atomic_write(self._path, "path") as part,
             # A file name may hold bytes that are not UTF-8; they become question marks.

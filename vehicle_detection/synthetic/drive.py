@@ -20,7 +20,9 @@ from vehicle_detection.synthetic.scenery import LANE, Road
 from vehicle_detection.synthetic.shapes import random_appearance
 from vehicle_detection.synthetic.vehicles import VehicleBody
 
-SCENARIOS = ("highway", "overtaking", "crossing", "occlusion", "traffic", "empty")
+SCENARIOS = (
+    "highway", "overtaking", "crossing", "occlusion", "traffic", "passing", "closing", "cut_in", "empty",
+)  # fmt: skip
 
 # Columns of a labels file; the first nine are those of manual labels.
 LABEL_COLUMNS = (
@@ -78,6 +80,24 @@ def make_traffic(scenario: str, duration: float, rng: Rng) -> tuple[Road, list[T
             return road, ahead
         return road, ahead + _oncoming_vehicles(road, duration, rng, first_track=len(ahead) + 1)
     side = 1 if rng.random() < 0.5 else -1
+    if scenario == "passing":
+        slow = _passing_vehicles(side * LANE, -rng.uniform(6.0, 10.0), duration, rng, first_track=1)
+        speed = rng.uniform(6.0, 10.0)
+        return road, slow + _passing_vehicles(-side * LANE, speed, duration, rng, first_track=len(slow) + 1)
+    if scenario == "closing":
+        near = TrafficVehicle(  # nearest after 4 s, at 9 to 18 m
+            track=1, start=rng.uniform(30.0, 36.0), sway=-rng.uniform(9.0, 10.5), period=8.0,
+            phase=-math.pi / 2, **random_appearance(rng),
+        )  # fmt: skip
+        return road, [near]
+    if scenario == "cut_in":
+        near = TrafficVehicle(
+            track=1, start=rng.uniform(14.0, 22.0), speed=rng.uniform(0.0, 0.6), sway=0.3,
+            lane_from=side * LANE, lane_to=0.0, change_at=duration / 2, change_for=rng.uniform(2.5, 4.0),
+            **random_appearance(rng),
+        )  # fmt: skip
+        far = TrafficVehicle(track=2, start=55.0, sway=0.8, lane_from=-side * LANE, **random_appearance(rng))
+        return road, [near, far]
     if scenario == "overtaking":
         near = TrafficVehicle(
             track=1, start=rng.uniform(-3.0, -1.5), lane_from=side * LANE,
@@ -114,6 +134,22 @@ def _vehicles_ahead(road: Road, duration: float, rng: Rng) -> list[TrafficVehicl
             )  # fmt: skip
             vehicles.append(vehicle)
             distance += rng.uniform(20, 36)
+    return vehicles
+
+
+def _passing_vehicles(
+    lane: float, speed: float, duration: float, rng: Rng, first_track: int
+) -> list[TrafficVehicle]:
+    """Vehicles of a lane, one after the other, that are beside the camera during the drive."""
+    vehicles: list[TrafficVehicle] = []
+    time = rng.uniform(2.0, 3.0)
+    while time < duration - 2.0:
+        vehicle = TrafficVehicle(
+            track=first_track + len(vehicles), start=-speed * time, speed=speed, lane_from=lane,
+            **random_appearance(rng),
+        )  # fmt: skip
+        vehicles.append(vehicle)
+        time += rng.uniform(2.5, 4.0)
     return vehicles
 
 
@@ -212,7 +248,9 @@ def render_drive(
         enters at the left or right edge of the image and pulls away. ``"crossing"``: in the middle of the
         drive a car crosses two lanes in front of another. ``"occlusion"``: the same, closer and slower, so
         that the other car is hidden for about a second. ``"traffic"``: vehicles ahead in three lanes, none
-        oncoming. ``"empty"``: no vehicles.
+        oncoming. ``"passing"``: vehicles that the camera overtakes in one lane, and that overtake it in
+        another. ``"closing"``: the distance to the vehicle ahead shrinks fast, and grows again.
+        ``"cut_in"``: a car moves into the lane of the camera. ``"empty"``: no vehicles.
     shape, horizon, camera_height_m, focal_px, light, rain, jpeg_quality, random_state
         As for `render_scene`.
     pitch_jitter_px

@@ -2,11 +2,12 @@
 
 from vehicle_detection.video.ffmpeg import VideoInfo
 from vehicle_detection.video.horizon import estimate_video_horizon
-from vehicle_detection.video.process import VideoReport, probe_video, process_video, read_frames
+from vehicle_detection.video.process import VideoReport, cut_video, probe_video, process_video, read_frames
 
 __all__ = [
     "VideoInfo",
     "VideoReport",
+    "cut_video",
     "estimate_video_horizon",
     "probe_video",
     "process_video",

@@ -299,6 +299,35 @@ def process_video(
     )
 
 
+def cut_video(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    start: float | None = None,
+    end: float | None = None,
+    preset: str = "veryfast",
+) -> int:
+    """Copy a part of a video, with its sound, to another file; returns the number of frames.
+
+    The arguments are those of `process_video`, and so are the errors.
+    """
+    path = _check_source(source)
+    output = _check_video_target(target, path)
+    _check_span(start, end)
+    check_choice(preset, "preset", PRESETS)
+    info = probe(path)
+    first, count = _frame_range(info, start, end)
+    sound = _audio_source(path, info, end, first) if info.has_audio else None
+    with (
+        FrameReader(path, info, first=first, count=count) as frames,
+        _open_writer(output, info, preset, sound) as writer,
+    ):
+        for _, _, frame in frames:
+            writer.write(frame)
+        writer.finish()
+    return frames.frames_read
+
+
 @contextlib.contextmanager
 def _open_writer(
     target: Path, info: VideoInfo, preset: str, audio: AudioSource | None

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.report.helpers import track
-from vehicle_detection.report.history import TrackHistory, TrackLog, bin_means
+from vehicle_detection.events.history import TrackHistory, TrackLog, bin_means
 
 PRESENCE = st.lists(st.sets(st.integers(1, 4)), max_size=40)
 

@@ -1,4 +1,4 @@
-"""Track data that a report keeps: a few numbers per track and frame, and no images."""
+"""The track table of a video: a few numbers per track and frame, and no images."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ from vehicle_detection.errors import InvalidInputError
 
 Floats = NDArray[np.float64]
 
-COLUMNS = ("distance_m", "distance_std_m", "speed_mps", "speed_std_mps", "confidence")
-"""Attributes of a track that are kept for each frame; NaN if unknown."""
+BOX_COLUMNS = ("x1", "y1", "x2", "y2")
+COLUMNS = ("distance_m", "distance_std_m", "speed_mps", "speed_std_mps", "confidence", *BOX_COLUMNS)
+"""Values of a track that are kept for each frame; NaN if unknown."""
 
 
 class ClosestApproach(NamedTuple):
@@ -55,6 +56,11 @@ class TrackHistory:
         return (self.id - 1) % len(TRACK_COLORS)
 
     @property
+    def boxes(self) -> Floats:
+        """``(N, 4)`` boxes ``[x1, y1, x2, y2]``; NaN if unknown."""
+        return np.stack([self.columns[name] for name in BOX_COLUMNS], axis=1)
+
+    @property
     def mean_confidence(self) -> float | None:
         """Mean of the known confidences; None if none is known."""
         confidences = self.columns["confidence"]
@@ -85,7 +91,18 @@ class TrackHistory:
 
 
 class TrackLog:
-    """Collects the shown tracks of each frame, 48 bytes for each track and frame."""
+    """Collect the shown tracks of a video while it is processed, 80 bytes for each track and frame.
+
+    Examples
+    --------
+    >>> from vehicle_detection import Detections, Tracker
+    >>> tracker, log = Tracker(fps=25), TrackLog()
+    >>> for frame in range(50):  # or: process_video(..., on_result=log)
+    ...     found = Detections([[600, 400, 700 + frame, 490 + frame]], [1.0])
+    ...     log.add(frame, frame / 25, tracker.update(found, (720, 1280, 3)))
+    >>> len(log.counts), [track.id for track in log.histories()]
+    (50, [1])
+    """
 
     def __init__(self) -> None:
         self.first_time: float | None = None  # of the first frame in the source, in seconds
@@ -94,6 +111,10 @@ class TrackLog:
         self._tracks: dict[int, list[array[Any]]] = defaultdict(
             lambda: [array("q"), *(array("d") for _ in COLUMNS)]
         )
+
+    def __call__(self, result: Any) -> None:
+        """Add one frame's result: for ``process_video(..., on_result=log)``."""
+        self.add(result.index, result.time, result.tracks)
 
     def add(self, index: int, time: float | None, tracks: Iterable[Any]) -> None:
         """Add the tracks of the next frame."""
@@ -138,7 +159,8 @@ def _rows(tracks: object) -> Iterator[tuple[int, list[float]]]:
                 f"tracks must have unique ids, got {track_id} twice in one frame; pass result.tracks"
             )
         seen.add(track_id)
-        yield track_id, [_number(getattr(track, name, None), name) for name in COLUMNS]
+        box = dict(zip(BOX_COLUMNS, getattr(track, "box", ())))
+        yield track_id, [_number(box.get(name, getattr(track, name, None)), name) for name in COLUMNS]
 
 
 def _number(value: Any, name: str) -> float:
