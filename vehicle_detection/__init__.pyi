@@ -78,6 +78,7 @@ from .params import (
     SearchParams,
     TrackParams,
 )
+from .privacy import blur_boxes
 from .regions import find_vehicles
 from .report import ReportWriter
 from .search import SearchResult, find_cars
@@ -147,6 +148,7 @@ __all__ = [
     "add_heat",
     "apply_threshold",
     "bin_spatial",
+    "blur_boxes",
     "bounding_boxes",
     "calibrate_scores",
     "calibration_error",

@@ -13,7 +13,14 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_image, check_integer, check_number, check_type, describe
+from vehicle_detection._common import (
+    check_choice,
+    check_image,
+    check_integer,
+    check_number,
+    check_type,
+    describe,
+)
 from vehicle_detection.boxes import Detections, ScoreScale
 from vehicle_detection.camera import GIVEN_LENS_STD, LENSES, UNKNOWN_LENS_STD, Camera, read_camera
 from vehicle_detection.classifier import VehicleClassifier
@@ -33,6 +40,7 @@ from vehicle_detection.params import (
     SearchParams,
     TrackParams,
 )
+from vehicle_detection.privacy import BLUR_REGIONS, blur_boxes
 from vehicle_detection.regions import find_vehicles
 from vehicle_detection.search import FrameSearch, SearchResult
 from vehicle_detection.tracking import Track, Tracker, interpolate_tracks
@@ -140,6 +148,10 @@ class VehicleDetector:
         second, but every frame for heat maps, `diagnostics` and functions; `process` searches every frame.
     diagnostics
         `annotate` shows the frame, its positive windows, the heat map and the tracks side by side.
+    blur
+        `annotate` blurs the vehicles, ``"vehicles"``, or the region of their license plates, ``"plates"``:
+        of every detection and track of the frame, also of tracks that are not detected or not shown. Vehicles
+        that are not found are not blurred: check the result before you publish it.
 
     Raises
     ------
@@ -178,6 +190,7 @@ class VehicleDetector:
         n_jobs: int | None = None,
         every: int | None = None,
         diagnostics: bool = False,
+        blur: Literal["vehicles", "plates"] | None = None,
     ) -> None:
         self.model = _load(model)
         for name, value, kind in (
@@ -203,6 +216,9 @@ class VehicleDetector:
         self._cameras: dict[tuple[int, int], Camera] = {}
         self._horizon_given = horizon is not None
         self.diagnostics = diagnostics
+        if blur is not None:
+            check_choice(blur, "blur", BLUR_REGIONS)
+        self.blur = blur
         self.every = None if every is None else check_integer(every, "every", low=1, high=1000)
         self._search: FrameSearch = self.model.open_search(n_jobs, method)
         self._heat_params = region_params if isinstance(region_params, HeatParams) else None
@@ -432,6 +448,10 @@ class VehicleDetector:
         Drawn in their order, the frames of a video have labels that keep their places, and trails in the
         bird's-eye view.
         """
+        if self.blur is not None:
+            tracked = np.array([track.box for track in result.tracks]).reshape(-1, 4)
+            boxes = np.concatenate([tracked, result.detections.boxes])
+            frame = blur_boxes(frame, boxes, region=self.blur)
         if self.diagnostics:
             heat = frame_heat(frame.shape, result.windows, self._heat_params or HeatParams())
             return draw_diagnostics(frame, result.windows, heat, result.tracks)
@@ -468,7 +488,9 @@ class VehicleDetector:
         """
         if isinstance(frame, (str, os.PathLike)):
             image = read_image(frame)
-            return draw_boxes(image, self.detect(image).boxes)
+            boxes = self.detect(image).boxes
+            image = image if self.blur is None else blur_boxes(image, boxes, region=self.blur)
+            return draw_boxes(image, boxes)
         if self._first is not None and self._index == 1 and np.array_equal(frame, self._first[0]):
             return self.annotate(frame, self._first[1])
         result = self.process(frame)

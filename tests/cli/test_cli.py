@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 import vehicle_detection
 from tests.helpers import SMALL_MIXTURE, drawn, start_interruptible, write_frame_set
+from tests.video.clips import write_clip
 from vehicle_detection import classifier, datasets, detector, mixture_training, training, video
 from vehicle_detection._common import files as _files
 from vehicle_detection.boxes import Detections
@@ -499,6 +500,26 @@ def test_video_writes_a_page_and_diagnostics(clip, tmp_path):
     assert mosaic[-8:, :8].max() < 40
 
 
+def test_detect_and_video_blur_vehicles(tmp_path):
+    image, road = tmp_path / "road.png", tmp_path / "road.mp4"
+    car = SceneVehicle(distance_m=14.0, kind="sedan", color="white")
+    scene = render_scene(shape=(360, 640), vehicles=[car], lane=1, random_state=1)
+    write_image(image, scene.image)
+    write_clip(road, [scene.image] * 3)
+    x1, y1, x2, y2 = scene.boxes[0].tolist()
+    inside = slice((3 * y1 + y2) // 4, (y1 + 3 * y2) // 4), slice((3 * x1 + x2) // 4, (x1 + 3 * x2) // 4)
+    contrasts = []
+    for folder, words in (("sharp", []), ("blurred", ["--blur", "vehicles"])):
+        succeed("detect", image, "-o", tmp_path / folder, *words)
+        succeed("video", road, "-o", tmp_path / f"{folder}.mp4", "--preset", "ultrafast", *words)
+        with read_frames(tmp_path / f"{folder}.mp4") as frames:
+            pictures = read_image(tmp_path / folder / "road.png"), next(frames)[2]
+        contrasts.append(
+            [np.abs(np.diff(picture[inside].mean(axis=2), axis=0)).max() for picture in pictures]
+        )
+    assert (np.array(contrasts[1]) < 0.5 * np.array(contrasts[0])).all()
+
+
 def test_video_writes_events_and_a_summary(clip, tmp_path):
     target, events, clips = tmp_path / "out.mp4", tmp_path / "events.json", tmp_path / "clips"
     words = ["--events", events, "--clips", clips, "--own-speed", 100, "--preset", "ultrafast"]
@@ -596,6 +617,7 @@ def bad_videos(material, tmp):
         r"--tracks needs an existing folder": [clip, "-o", target, "--tracks", tmp / "none" / "tracks.csv"],
         r"--report must end in .html, .*got 'page.pdf'": [clip, "-o", target, "--report", tmp / "page.pdf"],
         r"--report \S+ is also --output \S+;": [clip, "-o", target, "--report", target],
+        r"--blur must be one of 'vehicles', 'plates'; got 'faces'": [clip, "-o", target, "--blur", "faces"],
         r"--events must end in .csv or .json, got 'e.txt'": [clip, "-o", target, "--events", tmp / "e.txt"],
         r"--own-speed must be a number, at least 0": [clip, "-o", target, "--own-speed", -1],
         r"--clips must be a folder": [clip, "-o", target, "--clips", clip],

@@ -29,6 +29,7 @@ from vehicle_detection.classifier import load_classifier
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.events import Event
 from vehicle_detection.mixture import load_model
 from vehicle_detection.params import HeatParams, TrackParams
 from vehicle_detection.report import ReportWriter, page
@@ -318,3 +319,29 @@ class TestColors:
     def test_there_are_as_many_track_colors_as_in_the_video(self, scheme):
         names = [name for name in scheme if re.fullmatch(r"c\d", name)]
         assert names == [f"c{number}" for number in range(len(TRACK_COLORS))]
+
+
+def test_events_and_counts_are_listed_with_buttons_that_seek(tmp_path):
+    events = [
+        Event(kind="cut_in", track_id=2, frame=12, start_frame=8, end_frame=14, time_s=0.48, side="left",
+              distance_m=12.5, distance_std_m=1.5),
+        Event(kind="overtaken", track_id=1, frame=40, start_frame=30, end_frame=40, time_s=1.6, side="right"),
+    ]  # fmt: skip
+    writer = ReportWriter(tmp_path / "report.html")
+    for index, tracks in enumerate(FRAMES):
+        writer.write(index, index / FPS, tracks)
+    writer.finish(video_report(len(FRAMES)), events=events)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    parser = StrictParser(page)
+    markers = [each for each in parser.all("g") if "vehicle" in each.get("aria-label", "")]
+    assert [marker["data-frame"] for marker in markers] == ["12", "40"]
+    buttons = [each for each in parser.all("button") if "vehicle" in each.get("aria-label", "")]
+    assert [button["data-frame"] for button in buttons] == ["12", "40"]
+    assert "<td>12.5 ± 1.5 m</td>" in page
+    row = re.search(r'<th scope="row">0:00</th>(.*?)</tr>', page)[1]
+    assert re.findall("<td>(.*?)</td>", row) == ["0", "1", "0", "0", "1.2", "2"]
+
+
+def test_a_page_without_certain_events_says_so(tmp_path):
+    assert "No event is certain." in write_report(tmp_path, FRAMES)
+    assert "No event is certain." not in write_report(tmp_path, [[]])

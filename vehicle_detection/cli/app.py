@@ -133,6 +133,10 @@ CameraHeight = Annotated[
     float | None,
     Option("--camera-height", metavar="M", help="Height of the lens above the road in meters; default: 1.3."),
 ]
+Blur = Annotated[
+    str | None,
+    Option(metavar="R", help='Blur "vehicles" or the region of their "plates" in what is written.'),
+]
 HORIZON_HELP = "Height of the horizon as a fraction of the frame's height, 0 at the top."
 
 
@@ -181,6 +185,7 @@ def detect(
         str, Option(metavar="score|none", help="Labels of the boxes in annotated images.")
     ] = "score",
     line_width: LineWidth = None,
+    blur: Blur = None,
 ) -> None:
     """Detect the vehicles of images."""
     from vehicle_detection._common import check_choice, check_integer
@@ -191,7 +196,10 @@ def detect(
     if line_width is not None:
         check_integer(line_width, "line_width", low=1, high=1000)
     _check_images(images, output, boxes)
-    with VehicleDetector(model, conf=conf, horizon=horizon) as detector, output_folder(output, "--output"):
+    with (
+        VehicleDetector(model, conf=conf, horizon=horizon, blur=_parse_blur(blur)) as detector,
+        output_folder(output, "--output"),
+    ):
         found = _detect_each(images, detector, output, scores=labels == "score", line_width=line_width)
         found = _warn_if_empty(found, images, detector, horizon)
         if boxes is None:
@@ -271,6 +279,7 @@ def _detect_each(
 
     from vehicle_detection.drawing import draw_detections
     from vehicle_detection.images import read_image, write_image
+    from vehicle_detection.privacy import blur_boxes
 
     for path in images:
         with capture_stderr() as messages:
@@ -287,6 +296,8 @@ def _detect_each(
         typer.echo(f"{path}: {len(found)} vehicle{'s' * (len(found) != 1)}{listed}")
         if output is not None:
             suffix = path.suffix if cv2.haveImageWriter(f"image{path.suffix}") else f"{path.suffix}.png"
+            if detector.blur is not None:
+                image = blur_boxes(image, found.boxes, region=detector.blur)
             drawn = draw_detections(image, found, line_width=line_width, scores=scores)
             write_image(output / (path.stem + suffix), drawn)
         yield path.name, found
@@ -315,6 +326,7 @@ def video(
         float | None,
         Option(metavar="KM/H", help="Speed of the own vehicle, for headways in seconds. Example: 100."),
     ] = None,
+    blur: Blur = None,
     diagnostics: Annotated[
         bool, Option("--diagnostics", help="Show frame, positive windows, heat map and tracks side by side.")
     ] = False,
@@ -398,6 +410,7 @@ def video(
                 every=every,
                 diagnostics=diagnostics,
                 draw_params=draw_params,
+                blur=_parse_blur(blur),
             )
         )
         page = None
@@ -465,6 +478,16 @@ def _warn_of_horizon(horizon: str | float, found: HorizonEstimate | None) -> Non
             f"{found.n_boxes} boxes, whose horizon is {found.horizon:.2f}; use --horizon {found.horizon:.2f}"
         )
     print_error(message)
+
+
+def _parse_blur(text: str | None) -> Any:
+    """Check the region to blur before a model is loaded."""
+    from vehicle_detection._common import check_choice
+    from vehicle_detection.privacy import BLUR_REGIONS
+
+    if text is not None:
+        check_choice(text, "--blur", BLUR_REGIONS)
+    return text
 
 
 def _parse_horizon(text: str) -> float:

@@ -158,7 +158,7 @@ def event_markers(events: Sequence[Event], axis: TimeAxis, *, label: str) -> str
     for row, kind in enumerate(kinds):
         y = (row + 0.5) * _ROW_HEIGHT
         names.append(
-            svg_element("text", KINDS[kind].capitalize(), class_="track-name", x=0, y=_decimal(y - 2))
+            svg_element("text", KINDS[kind].capitalize(), class_="track-name", x=0, dx=4, y=_decimal(y - 2))
         )
         for event in events:
             if event.kind != kind:
