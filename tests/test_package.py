@@ -27,7 +27,7 @@ LAYERS = [
     "evaluation drawing privacy classifier sklearn_models",
     "windows search mixture training function_model events",
     "confidence course detector mixture_training report",
-    "tuning explorer",
+    "tuning explorer explanation",
     "plotting",
     "cli",
 ]

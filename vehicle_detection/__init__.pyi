@@ -50,6 +50,7 @@ from .events import (
     find_events,
     write_events,
 )
+from .explanation import Explanation, explain
 from .explorer import Explorer
 from .export import TrackWriter, write_boxes, write_tracks
 from .features import (
@@ -106,6 +107,7 @@ __all__ = [
     "DetectorError",
     "DrawParams",
     "Event",
+    "Explanation",
     "Explorer",
     "FeatureParams",
     "FrameBoxes",
@@ -170,6 +172,7 @@ __all__ = [
     "estimate_horizon",
     "evaluate_detections",
     "evaluate_tracks",
+    "explain",
     "extract_features",
     "fetch_patches",
     "find_cars",

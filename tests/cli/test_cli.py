@@ -500,6 +500,18 @@ def test_video_writes_a_page_and_diagnostics(clip, tmp_path):
     assert mosaic[-8:, :8].max() < 40
 
 
+def test_detect_explains_each_box(tmp_path):
+    image, why = tmp_path / "road.png", tmp_path / "why"
+    scene = render_scene(shape=(360, 640), vehicles=[SceneVehicle(distance_m=14.0)], lane=1, random_state=1)
+    write_image(image, scene.image)
+    out = succeed("detect", image, "--why", why)
+    assert re.search(
+        r"^  1: score \S+, template \d: margin \S+ = .* cells .* second stage$", out, re.MULTILINE
+    )
+    assert contents(why) == ["road.png_1.png"]
+    assert "--why must be a folder" in refuse("detect", image, "--why", image)
+
+
 def test_detect_and_video_blur_vehicles(tmp_path):
     image, road = tmp_path / "road.png", tmp_path / "road.mp4"
     car = SceneVehicle(distance_m=14.0, kind="sedan", color="white")

@@ -9,9 +9,9 @@ from tests.plotting.helpers import SMALL, gray_image, legend, new_axes, texts, t
 from vehicle_detection import plotting
 from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import extract_features, hog_image
+from vehicle_detection.features import extract_features, hog_image, sum_blocks
 from vehicle_detection.params import FeatureParams
-from vehicle_detection.plotting.features import add_glyphs, sum_blocks
+from vehicle_detection.plotting.features import add_glyphs
 from vehicle_detection.synthetic import render_patches
 
 

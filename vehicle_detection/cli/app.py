@@ -186,6 +186,9 @@ def detect(
     ] = "score",
     line_width: LineWidth = None,
     blur: Blur = None,
+    why: Annotated[
+        Path | None, Option(metavar="DIR", help="Pictures that explain each box: the share of each cell.")
+    ] = None,
 ) -> None:
     """Detect the vehicles of images."""
     from vehicle_detection._common import check_choice, check_integer
@@ -199,8 +202,9 @@ def detect(
     with (
         VehicleDetector(model, conf=conf, horizon=horizon, blur=_parse_blur(blur)) as detector,
         output_folder(output, "--output"),
+        output_folder(why, "--why"),
     ):
-        found = _detect_each(images, detector, output, scores=labels == "score", line_width=line_width)
+        found = _detect_each(images, detector, output, why, scores=labels == "score", line_width=line_width)
         found = _warn_if_empty(found, images, detector, horizon)
         if boxes is None:
             for _ in found:
@@ -270,6 +274,7 @@ def _detect_each(
     images: list[Path],
     detector: VehicleDetector,
     output: Path | None,
+    why: Path | None,
     *,
     scores: bool = True,
     line_width: int | None = None,
@@ -294,6 +299,8 @@ def _detect_each(
             for box, value in zip(found.boxes.tolist(), values)
         )
         typer.echo(f"{path}: {len(found)} vehicle{'s' * (len(found) != 1)}{listed}")
+        if why is not None:
+            _write_explanations(why, path.name, detector, image, found)
         if output is not None:
             suffix = path.suffix if cv2.haveImageWriter(f"image{path.suffix}") else f"{path.suffix}.png"
             if detector.blur is not None:
@@ -301,6 +308,22 @@ def _detect_each(
             drawn = draw_detections(image, found, line_width=line_width, scores=scores)
             write_image(output / (path.stem + suffix), drawn)
         yield path.name, found
+
+
+def _write_explanations(
+    folder: Path, name: str, detector: VehicleDetector, image: Any, found: Detections
+) -> None:
+    """Write a picture for each box of an image that says why it was found."""
+    from vehicle_detection._common import atomic_write
+    from vehicle_detection.explanation import explain
+    from vehicle_detection.plotting import plot_explanation
+
+    for number, box in enumerate(found.boxes, start=1):
+        explanation = explain(detector, image, box)
+        typer.echo(f"  {number}: {explanation}")
+        with atomic_write(folder / f"{name}_{number}.png", "--why") as part:
+            picture: Any = plot_explanation(image, explanation)
+            picture.savefig(part)
 
 
 @app.command()

@@ -15,6 +15,7 @@ from vehicle_detection.features.extract import (
     read_patches,
     single_img_features,
 )
+from vehicle_detection.features.layout import part_slices, sum_blocks
 
 if TYPE_CHECKING:
     from vehicle_detection.features.transformer import PatchFeatures
@@ -29,9 +30,11 @@ __all__ = [
     "hog_blocks",
     "hog_image",
     "hog_source",
+    "part_slices",
     "pick_hog_channels",
     "read_patches",
     "single_img_features",
+    "sum_blocks",
 ]
 
 

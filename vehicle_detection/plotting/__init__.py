@@ -12,6 +12,7 @@ uniform colormaps.
 from __future__ import annotations
 
 from vehicle_detection.plotting.birds_eye import plot_birds_eye
+from vehicle_detection.plotting.explanation import plot_explanation
 from vehicle_detection.plotting.features import plot_channels, plot_features, plot_hog, plot_weights
 from vehicle_detection.plotting.images import (
     ImageDescription,
@@ -48,6 +49,7 @@ __all__ = [
     "plot_channels",
     "plot_comparison",
     "plot_errors",
+    "plot_explanation",
     "plot_f1",
     "plot_features",
     "plot_heatmap",

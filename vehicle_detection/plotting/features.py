@@ -21,7 +21,14 @@ from vehicle_detection._common import (
 from vehicle_detection.classifier import CLASSIFIER_REMEDY, Template, VehicleClassifier
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import convert_color, extract_features, hog_blocks, hog_source
+from vehicle_detection.features import (
+    convert_color,
+    extract_features,
+    hog_blocks,
+    hog_source,
+    part_slices,
+    sum_blocks,
+)
 from vehicle_detection.params import COLOR_SPACES, PATCH_SIZE, FeatureParams
 from vehicle_detection.plotting import style
 from vehicle_detection.plotting.style import COLORS, LINE_COLORS, OTHER, VEHICLE, FigureLike, Image
@@ -48,19 +55,6 @@ def hog_channel_names(params: FeatureParams) -> tuple[str, ...]:
         return ("gray",)
     names = channel_names(params.color_space)
     return names if params.hog_channel == "ALL" else (names[int(params.hog_channel)],)
-
-
-def sum_blocks(blocks: NDArray[Any]) -> NDArray[np.float64]:
-    """Sum each cell of ``(block rows, block columns, b, b, orient)`` over the blocks that contain it.
-
-    Returns ``(rows, columns, orient)``; ``sum_blocks(np.ones_like(blocks))`` counts the blocks.
-    """
-    down, across, side, _, orient = blocks.shape
-    sums = np.zeros((down + side - 1, across + side - 1, orient))
-    for row in range(side):
-        for column in range(side):
-            sums[row : row + down, column : column + across] += blocks[:, :, row, column]
-    return sums
 
 
 def add_glyphs(
@@ -335,18 +329,6 @@ def _scaler(
     scale = features.std(axis=0)
     scale[scale == 0] = 1  # as StandardScaler does for constant features
     return model, features.mean(axis=0), scale
-
-
-def part_slices(params: FeatureParams) -> dict[str, slice]:
-    """Position of each part in the feature vector, if the vector has it."""
-    lengths = {
-        "spatial bins": params.spatial_length,
-        "color histogram": params.hist_length,
-        "HOG": params.hog_length - params.coarse_length,
-        "coarse HOG": params.coarse_length,
-    }
-    stops = itertools.accumulate(lengths.values())
-    return {name: slice(stop - lengths[name], stop) for name, stop in zip(lengths, stops) if lengths[name]}
 
 
 # Largest difference, in gray levels, between the mean patch and the patch shifted along the weights.
