@@ -2,14 +2,17 @@
 
 import dataclasses
 import functools
+import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from tests.events.drives import CAMERA, FPS, SHAPE, cut_in_times, passing_times, simulate
 from vehicle_detection import Event, TrackLog, find_events
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.events import estimate_motion
+from vehicle_detection.events import TrackHistory, estimate_motion
 
 SEEDS = (0, 1, 2)
 simulated = functools.cache(simulate)
@@ -146,6 +149,26 @@ def test_the_camera_changing_lanes_is_no_cut_in():
     companion = dataclasses.replace(mover, id=99, columns=columns)
     found = find_events([mover, companion], fps=FPS, shape=SHAPE)
     assert not listed(found, "cut_in")
+
+
+@given(seed=st.integers(0, 10_000), known=st.booleans(), speed=st.sampled_from([None, 20.0]))
+def test_any_track_gives_consistent_events(seed, known, speed):
+    rng = np.random.default_rng(seed)
+    frames = np.flatnonzero(rng.random(80) > 0.3)
+    steps = rng.normal(0, 12, (len(frames), 4)).cumsum(axis=0)
+    first = rng.uniform(-100, 700, 2)
+    x, y = first[0] + steps[:, 0], first[1] + steps[:, 1]
+    sides = 20 * np.exp(np.abs(steps[:, 2:]) / 30)
+    boxes = np.clip(np.stack([x, y, x + sides[:, 0], y + sides[:, 1]], axis=1), 0, [1280, 720, 1280, 720])
+    columns = dict(zip(("x1", "y1", "x2", "y2"), boxes.T))
+    distance = 2000 / sides[:, 1] if known else np.full(len(frames), np.nan)
+    columns |= {"distance_m": distance, "distance_std_m": 0.1 * distance}
+    track = TrackHistory(1, frames, columns)
+    for event in find_events([track], fps=FPS, shape=SHAPE, own_speed_mps=speed):
+        assert event.start_frame <= event.frame <= event.end_frame
+        assert event.ttc_s is None or event.ttc_s > 0
+        assert event.distance_m is None or event.distance_m > 0
+        assert all(math.isfinite(value) for value in vars(event).values() if isinstance(value, float))
 
 
 def test_no_tracks_give_no_events():

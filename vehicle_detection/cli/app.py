@@ -299,21 +299,22 @@ def _detect_each(
             for box, value in zip(found.boxes.tolist(), values)
         )
         typer.echo(f"{path}: {len(found)} vehicle{'s' * (len(found) != 1)}{listed}")
+        shown = image
+        if detector.blur is not None:
+            shown = blur_boxes(image, found.boxes, region=detector.blur)
         if why is not None:
-            _write_explanations(why, path.name, detector, image, found)
+            _write_explanations(why, path.name, detector, image, shown, found)
         if output is not None:
             suffix = path.suffix if cv2.haveImageWriter(f"image{path.suffix}") else f"{path.suffix}.png"
-            if detector.blur is not None:
-                image = blur_boxes(image, found.boxes, region=detector.blur)
-            drawn = draw_detections(image, found, line_width=line_width, scores=scores)
+            drawn = draw_detections(shown, found, line_width=line_width, scores=scores)
             write_image(output / (path.stem + suffix), drawn)
         yield path.name, found
 
 
 def _write_explanations(
-    folder: Path, name: str, detector: VehicleDetector, image: Any, found: Detections
+    folder: Path, name: str, detector: VehicleDetector, image: Any, shown: Any, found: Detections
 ) -> None:
-    """Write a picture for each box of an image that says why it was found."""
+    """Write a picture for each box of an image that says why it was found; it shows the image `shown`."""
     from vehicle_detection._common import atomic_write
     from vehicle_detection.explanation import explain
     from vehicle_detection.plotting import plot_explanation
@@ -322,7 +323,7 @@ def _write_explanations(
         explanation = explain(detector, image, box)
         typer.echo(f"  {number}: {explanation}")
         with atomic_write(folder / f"{name}_{number}.png", "--why") as part:
-            picture: Any = plot_explanation(image, explanation)
+            picture: Any = plot_explanation(shown, explanation)
             picture.savefig(part)
 
 

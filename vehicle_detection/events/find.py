@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check_number, check_type, describe
 from vehicle_detection.camera import Camera, check_shape
@@ -53,8 +53,9 @@ _CLOSING_TIME, _HARD_TIME, _HARD_DECELERATION, _MIN_CLOSING = 4.0, 2.5, 3.0, 0.3
 # Time (s) for which a vehicle is seen before and after its closest approach; else a smaller distance may have
 # been missed.
 _MIN_AROUND = 0.5
-# Longest duration (s) of a lane change.
-_LANE_CHANGE = 6.0
+# Longest duration (s) of a lane change, and its largest lateral speed (m/s): crossing vehicles, and all
+# vehicles while the camera turns, are faster.
+_LANE_CHANGE, _MAX_LATERAL_SPEED = 6.0, 3.0
 # Time (s) before it is beside the camera until which, or after it from which, a passing vehicle is seen; and
 # change of size that it must show.
 _PASSING_TIME, _PASSING_RATIO = 2.5, 1.3
@@ -230,7 +231,8 @@ class _Finder:
         motion = self.motion
         near = motion.in_path & (motion.distance_std <= _MAX_STD * motion.distance)
         for start, stop in self._runs(near, _MIN_FOLLOWING):
-            yield self._event("headway", start + int(np.argmin(motion.distance[start:stop])), start, stop)
+            rows = _rows(near, start, stop)
+            yield self._event("headway", int(rows[np.argmin(motion.distance[rows])]), start, stop)
 
     def closest(self) -> Iterable[Event]:
         """Yield the closest approach, if it was near."""
@@ -251,8 +253,9 @@ class _Finder:
             ahead = np.abs(motion.lateral + motion.lateral_rate * time) < LANE_HALF_WIDTH_M
             short = motion.in_path & ahead & (time > 0) & (time <= _CLOSING_TIME) & (std <= _MAX_STD * time)
         for start, stop in self._runs(short, _MIN_CLOSING):
-            row = start + int(np.argmin(time[start:stop]))
-            deceleration = float((motion.closing[start:stop] ** 2 / (2 * motion.distance[start:stop])).max())
+            rows = _rows(short, start, stop)
+            row = int(rows[np.argmin(time[rows])])
+            deceleration = float((motion.closing[rows] ** 2 / (2 * motion.distance[rows])).max())
             hard = time[row] <= _HARD_TIME or deceleration >= _HARD_DECELERATION
             yield self._event("hard_closing" if hard else "closing", row, start, stop)
 
@@ -268,6 +271,8 @@ class _Finder:
             if not before or motion.seconds[start] - motion.seconds[before[-1] - 1] > _LANE_CHANGE:
                 continue
             begin = before[-1] - 1
+            if np.nanmedian(np.abs(motion.lateral_rate[begin : start + 1])) > _MAX_LATERAL_SPEED:
+                continue
             if motion.lateral[begin] * motion.lateral[start] < -(LANE_HALF_WIDTH_M**2) or self._moved_alike(
                 others, begin, start
             ):
@@ -404,3 +409,8 @@ class _Finder:
             side=side,
             **stated,
         )
+
+
+def _rows(mask: Bools, start: int, stop: int) -> NDArray[np.intp]:
+    """Rows of a range where a mask holds."""
+    return np.asarray(start + np.flatnonzero(mask[start:stop]))
