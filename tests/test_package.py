@@ -27,7 +27,7 @@ LAYERS = [
     "evaluation drawing privacy classifier sklearn_models",
     "windows search mixture training function_model events",
     "confidence course detector mixture_training report",
-    "tuning explorer explanation",
+    "tuning explorer explanation stream",
     "plotting",
     "cli",
 ]
@@ -44,6 +44,9 @@ UNSAFE = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marsh
 # Public names without an example in their docstring, and why.
 WITHOUT_EXAMPLE = {
     "Event": "a result of find_events",
+    "FrameSource": "see open_source",
+    "TrackedFrame": "a result of track",
+    "Trip": "a result of find_trips",
     "FrameResult": "a result of VehicleDetector",
     "HeatParams": "see bounding_boxes",
     "HorizonEstimate": "a result of estimate_horizon",

@@ -83,6 +83,7 @@ from .privacy import blur_boxes
 from .regions import find_vehicles
 from .report import ReportWriter
 from .search import SearchResult, find_cars
+from .stream import TrackedFrame, track
 from .synthetic import render_drive, render_patches, render_scene
 from .tracking import Track, Tracker
 from .training import train_and_evaluate
@@ -95,7 +96,17 @@ from .tuning import (
     read_results,
     search_parameters,
 )
-from .video import VideoInfo, VideoReport, probe_video, process_video, read_frames
+from .video import (
+    FrameSource,
+    Trip,
+    VideoInfo,
+    VideoReport,
+    find_trips,
+    open_source,
+    probe_video,
+    process_video,
+    read_frames,
+)
 from .windows import search_windows, slide_window
 
 __version__: str
@@ -114,6 +125,7 @@ __all__ = [
     "FrameDataset",
     "FrameResult",
     "FrameSet",
+    "FrameSource",
     "FunctionParams",
     "HeatHistory",
     "HeatParams",
@@ -138,8 +150,10 @@ __all__ = [
     "TrackParams",
     "TrackScores",
     "TrackWriter",
+    "TrackedFrame",
     "Tracker",
     "TrialOptions",
+    "Trip",
     "VehicleClassifier",
     "VehicleCounts",
     "VehicleDetectionError",
@@ -178,6 +192,7 @@ __all__ = [
     "find_cars",
     "find_events",
     "find_near_duplicates",
+    "find_trips",
     "find_vehicles",
     "get_hog_features",
     "hog_image",
@@ -190,6 +205,7 @@ __all__ = [
     "load_training_patches",
     "mine_negatives",
     "non_max_suppression",
+    "open_source",
     "pareto_front",
     "plotting",
     "precision_recall_curve",
@@ -212,6 +228,7 @@ __all__ = [
     "split_random",
     "split_sequences",
     "split_sources",
+    "track",
     "train_and_evaluate",
     "train_classifier",
     "train_mixture",

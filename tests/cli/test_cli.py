@@ -214,6 +214,19 @@ def test_unexpected_errors_keep_their_traceback(monkeypatch, picture):
 # --- detect ---
 
 
+def test_the_segments_of_a_card_become_one_video(material, tmp_path):
+    card = tmp_path / "card"
+    card.mkdir()
+    for second in range(3):
+        shutil.copy(material / "clip.mp4", card / f"20260131_08150{second}_F.mp4")
+    shutil.copy(material / "clip.mp4", card / "20260131_081500_R.mp4")
+    error = refuse("video", card, "-o", tmp_path / "trip.mp4")
+    assert "holds 2 trips (front" in error
+    out = succeed("video", card / "*_F.mp4", "-o", tmp_path / "trip.mp4", "--tracks", tmp_path / "t.csv")
+    assert out.startswith(f"{3 * probe_video(material / 'clip.mp4').frames} frames")
+    assert contents(tmp_path)[-2:] == ["t.csv", "trip.mp4"]
+
+
 def test_detect_writes_annotated_images_and_boxes(monkeypatch, picture, tmp_path):
     found = [
         Detections([[10, 20, 60.4, 70], [100, 50, 180, 120]], [1.5, 0.25], [0.82, 0.564]),
@@ -598,7 +611,7 @@ def bad_videos(material, tmp):
         writer.release()
     return {
         r"SOURCE \S+missing.mp4 does not exist": [tmp / "missing.mp4", "-o", target],
-        r"SOURCE \S+empty is a folder": [material / "empty", "-o", target],
+        r"SOURCE \S+empty holds no videos and no images": [material / "empty", "-o", target],
         r"text.mp4 is not a video that ffmpeg can read": [material / "text.mp4", "-o", target],
         r"cut_clip.mp4 is not a video .*its index is missing": [material / "cut_clip.mp4", "-o", target],
         r"none.mp4 (has no|is not a video)": [tmp / "none.mp4", "-o", target],

@@ -125,7 +125,7 @@ def test_a_report_without_frames():
         ({"on_result": 3}, "on_result must be a function"),
         ({"detector": object()}, "detector must have the methods .* without search; pass a VehicleDetector"),
         ({"source": "missing.mp4"}, "source missing.mp4 does not exist"),
-        ({"source": "."}, "is a folder; choose a video file"),
+        ({"source": "."}, r"source \. holds no videos and no images; check the path"),
         ({"source": None}, "source must be the path of a video file"),
         ({"source": os.devnull}, "is not a regular file"),
         ({"target": "missing/out.mp4"}, "target needs an existing folder"),

@@ -330,7 +330,13 @@ def _write_explanations(
 @app.command()
 @option_names(target="--output", workers="--jobs", field_of_view="--fov", camera_height_m="--camera-height")
 def video(
-    source: Annotated[Path, Argument(metavar="SOURCE", help="Video to read.")],
+    source: Annotated[
+        str,
+        Argument(
+            metavar="SOURCE",
+            help="Video file; folder or quoted pattern of segments or images; URL; camera (0); or -.",
+        ),
+    ],
     output: Annotated[
         Path, Option("-o", "--output", metavar="TARGET", help="Video to write: .mp4, .m4v, .mov or .mkv.")
     ],
@@ -394,6 +400,9 @@ def video(
     jobs: Annotated[
         int | None, Option(metavar="N", help="Frames searched in parallel; default: one per core, at most 4.")
     ] = None,
+    live: Annotated[
+        bool, Option("--live", help="Drop frames of a pipe rather than lag; default for cameras and streams.")
+    ] = False,
     no_audio: Annotated[bool, Option("--no-audio", help="Write no sound.")] = False,
     quiet: Annotated[bool, Option("-q", "--quiet", help="Print errors only.")] = False,
     profile: Annotated[bool, Option("--profile", help="Print the time of each stage.")] = False,
@@ -405,11 +414,11 @@ def video(
     from vehicle_detection.export import TrackWriter
     from vehicle_detection.mixture import load_model
     from vehicle_detection.report import ReportWriter
-    from vehicle_detection.video import estimate_video_horizon, process_video
+    from vehicle_detection.video import estimate_video_horizon, open_source, process_video
 
     draw_params = _draw_params(labels, line_width=line_width, color_by=color_by, panel=panel, units=units)
     outputs = {"--output": output, "--tracks": tracks, "--report": report, "--events": events}
-    check_distinct_paths(outputs, {"SOURCE": source})
+    check_distinct_paths(outputs, {"SOURCE": Path(source)} if Path(source).exists() else {})
     event_options = EventOptions(events, clips, own_speed)
     with contextlib.ExitStack() as stack:
         stack.enter_context(output_folder(clips, "--clips"))
@@ -446,7 +455,7 @@ def video(
         log = page.log if page else TrackLog()
         writers.append(page or log)
         done = process_video(
-            source,
+            stack.enter_context(open_source(source, live=True)) if live else source,
             output,
             detector,
             start=start,
@@ -461,7 +470,7 @@ def video(
         event_options.write(found, output, done)
     if page is not None:
         page.finish(done, events=found)
-    if not done.tracks and horizon not in (None, "auto") and not quiet:
+    if not done.tracks and horizon not in (None, "auto") and not quiet and Path(source).exists():
         with _everywhere(loaded, conf) as detector:
             _warn_of_horizon(horizon, estimate_video_horizon(source, detector, start=start, end=end))
     if done.tracks and not detector.lens_is_known and not quiet:
@@ -524,7 +533,7 @@ def _parse_horizon(text: str) -> float:
 
 
 def _estimate_horizon(
-    source: Path, detector: VehicleDetector, start: float | None, end: float | None, quiet: bool
+    source: str, detector: VehicleDetector, start: float | None, end: float | None, quiet: bool
 ) -> float | None:
     """Estimate the horizon of a video from its vehicles, and print the result."""
     from vehicle_detection.video import estimate_video_horizon

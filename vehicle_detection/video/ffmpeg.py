@@ -84,17 +84,22 @@ class VideoInfo:
         return (self.height, self.width, 3)
 
 
-def probe(path: Path) -> VideoInfo:
+def input_options(path: Path | str) -> tuple[str, ...]:
+    """Return the options of ffmpeg that open a file, or the URL of one."""
+    return ("-i", path) if isinstance(path, str) else ("-i", f"file:{path}")
+
+
+def probe(path: Path | str) -> VideoInfo:
     """Read the properties of a video and decode its first frame; raise a VideoError if there is none."""
     # Python raises KeyboardInterrupt in the main thread only; another thread cannot lose the started process.
     with ThreadPoolExecutor(1, thread_name_prefix="vehicle-probe") as thread:
         return thread.submit(_probe, path).result()
 
 
-def _probe(path: Path) -> VideoInfo:
+def _probe(path: Path | str) -> VideoInfo:
     # "V" excludes cover pictures. Only the showinfo filter prints the exact frame rate.
     options = ("-map", "0:V:0", "-frames:v", "1", "-vf", "showinfo", "-f", "null", "-")
-    with contextlib.closing(Process(("-nostdin", "-i", f"file:{path}", *options), level="info")) as process:
+    with contextlib.closing(Process(("-nostdin", *input_options(path), *options), level="info")) as process:
         process.wait()
         log = process.log()
     header, mapped, decoded = log.partition("Stream mapping:")
@@ -160,9 +165,9 @@ def frame_rate(decoded: str, stream: str) -> tuple[Fraction, bool]:
     return (rate if constant else _resampling_rate(rate, mean)), constant
 
 
-def _frame_times(path: Path) -> list[float]:
+def _frame_times(path: Path | str) -> list[float]:
     """List the times of all frames in seconds, without decoding them."""
-    options = ("-nostdin", "-i", f"file:{path}", "-map", "0:V:0", "-c", "copy", "-f", "framecrc", "pipe:1")
+    options = ("-nostdin", *input_options(path), "-map", "0:V:0", "-c", "copy", "-f", "framecrc", "pipe:1")
     with contextlib.closing(Process(options, stdout=True)) as process:
         listing = process.stdout.read().decode()
         process.wait()
@@ -202,8 +207,14 @@ class Process:
     """A running ffmpeg. Its log goes to a file, because a full pipe would block it."""
 
     def __init__(
-        self, options: Sequence[str], *, level: str = "error", stdin: bool = False, stdout: bool = False
+        self,
+        options: Sequence[str],
+        *,
+        level: str = "error",
+        stdin: bool | int = False,
+        stdout: bool = False,
     ) -> None:
+        """Start ffmpeg; `stdin` is True for a pipe to it, or the descriptor of a file that it reads."""
         # In its own process group, so that Ctrl-C in the terminal reaches only Python, which ends ffmpeg. Not
         # in its own session: Linux schedules by session, which costs a third of the speed on a busy machine.
         group: dict[str, Any] = {"process_group": 0}
@@ -217,7 +228,9 @@ class Process:
             try:
                 self._popen: subprocess.Popen[bytes] = subprocess.Popen(
                     [ffmpeg_binary(), "-hide_banner", "-loglevel", level, *options],
-                    stdin=subprocess.PIPE if stdin else subprocess.DEVNULL,
+                    stdin=(subprocess.PIPE if stdin else subprocess.DEVNULL)
+                    if isinstance(stdin, bool)
+                    else stdin,
                     stdout=subprocess.PIPE if stdout else subprocess.DEVNULL,
                     stderr=self._log,
                     bufsize=0,

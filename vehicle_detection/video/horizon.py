@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,7 @@ from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import HorizonEstimate, estimate_horizon
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video.ffmpeg import VideoInfo
-from vehicle_detection.video.process import read_frames
+from vehicle_detection.video.sources import check_span, frame_range, open_source
 
 _MAX_STD = 0.05  # as a fraction of the frame's height
 # Seconds between searched frames, their number at least (in a short video) and at most, and the number of
@@ -29,7 +28,7 @@ class ImageDetector(Protocol):
 
 
 def estimate_video_horizon(
-    source: Path, detector: ImageDetector, *, start: float | None = None, end: float | None = None
+    source: Any, detector: ImageDetector, *, start: float | None = None, end: float | None = None
 ) -> HorizonEstimate | None:
     """Estimate the horizon from the vehicles in two frames per second of the first 30 seconds after `start`.
 
@@ -37,8 +36,13 @@ def estimate_video_horizon(
     or if the estimate is too uncertain.
     """
     boxes: list[NDArray[np.floating]] = []
-    with read_frames(source, start=start, end=end) as frames:
-        shape, step = frames.info.shape, _step(frames.info, start, end)
+    check_span(start, end)
+    with open_source(source) as opened, opened.read(*frame_range(opened.info, start, end)) as frames:
+        if not opened.rereadable:
+            raise InvalidInputError(
+                f"horizon cannot be estimated from {opened.name}, which is read only once; pass a fraction"
+            )
+        shape, step = opened.info.shape, _step(opened.info, start, end)
         for count, (_, _, frame) in enumerate(frames):
             if count >= step * _MAX_FRAMES or sum(map(len, boxes)) >= _ENOUGH_BOXES:
                 break

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from vehicle_detection._common import describe
 from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.images import is_cut, make_thumbnail
-from vehicle_detection.video.streams import FrameReader, FrameWriter
+from vehicle_detection.video.streams import FrameWriter, Reader
 
 Item = TypeVar("Item")
 Frame = NDArray[np.uint8]
@@ -65,6 +65,8 @@ class _QueuedFrame:
     frame: Frame
     thumbnail: NDArray[np.float32]
     search: Future[tuple[Any, float]] | None  # None: the frame is not searched
+    missed: int = 0  # frames that a live source dropped before this one
+    last_thumbnail: NDArray[np.float32] | None = None  # of the frame before
 
 
 class QueueClosed(Exception):  # noqa: N818 - a signal between threads, not an error
@@ -136,26 +138,34 @@ class FramePipeline:
     With an `interval` above 1, only every n-th frame and the first one of each scene are searched. The frames
     between wait for the next searched frame, and get interpolated tracks.
 
-    `drawn_shape` is the shape of drawn frames, by default that of the frames themselves.
+    `drawn_shape` is the shape of drawn frames, by default that of the frames themselves. Where a live source
+    drops frames, the next frame is searched, and the written video repeats the last frame as often, so that
+    its times stay those of the source.
     """
 
     def __init__(
         self,
-        open_reader: Callable[[], FrameReader],
+        open_reader: Callable[[], Reader],
         open_writer: Callable[[], AbstractContextManager[FrameWriter]] | None,
         detector: VideoDetector | IntervalDetector,
         workers: int,
         interval: int = 1,
         drawn_shape: tuple[int, ...] | None = None,
+        *,
+        with_frames: bool = False,
     ) -> None:
         self._seconds: defaultdict[str, float] = defaultdict(float)
         self._open_reader, self._open_writer = open_reader, open_writer
         self._detector: Any = detector
         self._workers, self._interval, self._drawn_shape = workers, interval, drawn_shape
+        self._with_frames = with_frames
+        self.missed_frames = 0
+        """Number of frames that a live source dropped."""
         self._searched: ClosableQueue[_QueuedFrame] = ClosableQueue(workers * interval + 1)
-        self._drawn: ClosableQueue[Frame] = ClosableQueue(2)
-        self._results: ClosableQueue[Any] = ClosableQueue(4)
-        self._streams: list[FrameReader | FrameWriter] = []
+        self._drawn: ClosableQueue[tuple[Frame, int]] = ClosableQueue(2)
+        self._results: ClosableQueue[tuple[Frame | None, Any]] = ClosableQueue(4)
+        self._reader: Reader | None = None
+        self._streams: list[Reader | FrameWriter] = []
         self._lock = threading.Lock()
         self._aborted = False
 
@@ -165,8 +175,11 @@ class FramePipeline:
         order = {"decode": -2, "search": -1, "draw": 1, "encode": 2}
         return dict(sorted(self._seconds.items(), key=lambda stage: order.get(stage[0], 0)))
 
-    def run(self) -> Generator[Any]:
-        """Yield the result of each frame, in order; closing the generator stops all threads."""
+    def run(self) -> Generator[tuple[Frame | None, Any]]:
+        """Yield the frame (None without `with_frames`) and the result of each frame, in order.
+
+        Closing the generator stops all threads.
+        """
         thread = threading.Thread(target=self._track_in_thread, name="vehicle-track")
         try:
             thread.start()
@@ -175,6 +188,12 @@ class FramePipeline:
             self._abort()  # no effect after a complete run
             if thread.is_alive():
                 thread.join()
+
+    def stop(self) -> None:
+        """End the source, so that the run completes with the frames read so far."""
+        with self._lock:
+            if self._reader is not None:
+                self._reader.kill()
 
     def _abort(self) -> None:
         """Stop all threads and streams, and prevent new ones."""
@@ -186,7 +205,7 @@ class FramePipeline:
         for stream in streams:
             stream.kill()
 
-    def _register(self, stream: FrameReader | FrameWriter) -> None:
+    def _register(self, stream: Reader | FrameWriter) -> None:
         with self._lock:
             if self._aborted:
                 raise QueueClosed
@@ -201,6 +220,7 @@ class FramePipeline:
                 for stream in (reader, writer):
                     if stream is not None:
                         self._register(stream)
+                self._reader = reader
                 self._run_threads(reader, writer)
         except QueueClosed:
             return
@@ -209,7 +229,7 @@ class FramePipeline:
         else:
             self._results.finish()
 
-    def _run_threads(self, reader: FrameReader, writer: FrameWriter | None) -> None:
+    def _run_threads(self, reader: Reader, writer: FrameWriter | None) -> None:
         """Decode and encode in threads, search in a pool, and track and draw in this thread."""
         pool = ThreadPoolExecutor(self._workers, thread_name_prefix="vehicle-search")
         threads = [threading.Thread(target=self._decode, args=(reader, pool), name="vehicle-decode")]
@@ -226,7 +246,7 @@ class FramePipeline:
                     continue
                 result = self._track(item, waiting)
                 self._emit_between(before, result, waiting, draw=writer is not None)
-                self._emit(item.frame, result, draw=writer is not None)
+                self._emit(item, result, draw=writer is not None)
                 waiting, before = [], result
                 del item  # free the frame before waiting for the next one
             self._emit_between(before, None, waiting, draw=writer is not None)
@@ -257,6 +277,9 @@ class FramePipeline:
             raise DetectorError(f"at {item.time:.2f} s: {error}") from error
         for skipped in waiting:
             self._detector.skip(skipped.thumbnail)
+        if item.missed and hasattr(self._detector, "skip"):
+            for _ in range(item.missed):
+                self._detector.skip(item.last_thumbnail)
         self._seconds["search"] += seconds
         return self._detector.track(found, time=item.time)
 
@@ -265,29 +288,31 @@ class FramePipeline:
         if waiting:
             results = self._detector.interpolate(before, after, [item.time for item in waiting])
             for item, result in zip(waiting, results, strict=True):
-                self._emit(item.frame, result, draw=draw)
+                self._emit(item, result, draw=draw)
 
-    def _emit(self, frame: Frame, result: Any, *, draw: bool) -> None:
+    def _emit(self, item: _QueuedFrame, result: Any, *, draw: bool) -> None:
         """Draw a frame's result, and queue it."""
         for name, seconds in result.seconds.items():
             if name != "search":  # measured here, because a detector may omit it
                 self._seconds[name] += seconds
         if draw:
-            self._drawn.put(self._draw(frame, result))
-        self._results.put(result)
+            self._drawn.put((self._draw(item.frame, result), item.missed))
+        self._results.put((item.frame if self._with_frames else None, result))
 
-    def _decode(self, reader: FrameReader, pool: ThreadPoolExecutor) -> None:
+    def _decode(self, reader: Reader, pool: ThreadPoolExecutor) -> None:
         try:
-            last, skipped = None, 0
-            for _, moment, frame in reader:
+            last, skipped, expected = None, 0, None
+            for index, moment, frame in reader:
                 thumbnail = make_thumbnail(frame)
                 skipped += 1
-                if last is None or skipped >= self._interval or is_cut(last, thumbnail):
+                missed = index - expected if expected is not None else 0
+                if last is None or missed or skipped >= self._interval or is_cut(last, thumbnail):
                     search, skipped = pool.submit(self._search, frame), 0
                 else:
                     search = None
-                self._searched.put(_QueuedFrame(moment, frame, thumbnail, search))
-                last = thumbnail
+                self._searched.put(_QueuedFrame(moment, frame, thumbnail, search, missed, last))
+                self.missed_frames += missed
+                last, expected = thumbnail, index + 1
         except QueueClosed:
             return
         except BaseException as error:  # raised in the tracking thread
@@ -315,7 +340,9 @@ class FramePipeline:
 
     def _encode(self, writer: FrameWriter) -> None:
         try:
-            for drawn in self._drawn:
+            for drawn, missed in self._drawn:
+                for _ in range(missed):
+                    writer.repeat()
                 writer.write(drawn)
             writer.finish()
         except QueueClosed:

@@ -1,4 +1,4 @@
-"""Annotate a video with its vehicles, and read frames and properties of a video.
+"""Annotate a video with its vehicles.
 
 The result does not depend on the number of workers, and only a few frames are in memory at any time.
 """
@@ -10,28 +10,33 @@ import dataclasses
 import functools
 import math
 import os
+import signal
+import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from vehicle_detection._common import (
     atomic_write,
     available_cores,
     check_choice,
     check_integer,
-    check_number,
     check_target,
     describe,
     progress_bar,
     single_threaded_opencv,
 )
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.video.ffmpeg import VideoInfo, probe
+from vehicle_detection.video.ffmpeg import VideoInfo
 from vehicle_detection.video.pipeline import FramePipeline, VideoDetector
-from vehicle_detection.video.streams import CONTAINERS, AudioSource, FrameReader, FrameWriter
+from vehicle_detection.video.sources import FrameSource, check_span, frame_range, open_source
+from vehicle_detection.video.streams import CONTAINERS, AudioSource, FrameWriter
 
 PRESETS = (
     "ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow", "placebo",
@@ -59,6 +64,8 @@ class VideoReport:
         time. Stages run in parallel, so their sum may exceed `seconds`.
     tracks
         Number of different tracks shown.
+    dropped
+        Number of frames of a live source that were dropped because the search was busy.
 
     Examples
     --------
@@ -82,6 +89,7 @@ class VideoReport:
     seconds: float
     stages: Mapping[str, float]
     tracks: int
+    dropped: int = 0
 
     @property
     def frames_per_second(self) -> float:
@@ -100,7 +108,8 @@ class VideoReport:
         vehicles = "1 vehicle" if self.tracks == 1 else f"{self.tracks} vehicles"
         lines = [
             f"{self.frames} frames of {width}x{height} in {self.seconds:.1f} s: {rate:.1f} frames/s, "
-            f"{rate / self.fps:.1f} times real time, {vehicles}",
+            f"{rate / self.fps:.1f} times real time, {vehicles}"
+            + (f", {self.dropped} frames dropped" if self.dropped else ""),
             "stage    ms/frame  fraction",
         ]
         fractions = self.stage_fractions
@@ -109,79 +118,8 @@ class VideoReport:
         return "\n".join(lines)
 
 
-def probe_video(path: str | os.PathLike[str]) -> VideoInfo:
-    """Read the properties of a video file: frame size, exact frame rate, length, sound and rotation.
-
-    Parameters
-    ----------
-    path
-        A file that ffmpeg can read.
-
-    Returns
-    -------
-    VideoInfo
-        The properties; ``frames`` is an estimate, because counting requires decoding the whole video.
-
-    Raises
-    ------
-    InvalidInputError
-        If the file is missing, a folder, or not readable.
-    VideoError
-        If the file is not a video, or its first frame cannot be decoded.
-
-    Examples
-    --------
-    >>> probe_video("missing.mp4")
-    Traceback (most recent call last):
-    ...
-    vehicle_detection.errors.InvalidInputError: source missing.mp4 does not exist; check the path
-    """
-    return probe(_check_source(path))
-
-
-def read_frames(
-    source: str | os.PathLike[str], *, start: float | None = None, end: float | None = None
-) -> FrameReader:
-    """Read the frames of a video, one at a time.
-
-    Parameters
-    ----------
-    source
-        A file that ffmpeg can read.
-    start, end
-        Time range in seconds: frames with ``start <= time < end`` are read. None: no limit.
-
-    Returns
-    -------
-    FrameReader
-        An iterator of ``(index, time, frame)``: the frame's number in the file from 0, its time in seconds,
-        and an upright ``(H, W, 3)`` uint8 RGB array. Its ``info`` is the file's `VideoInfo`. ffmpeg ends
-        after the last frame, and at the end of a ``with`` block.
-
-    Raises
-    ------
-    InvalidInputError
-        If the file is missing, or there is no frame between `start` and `end`.
-    VideoError
-        If the file is not a video; while reading, if it is incomplete.
-
-    Examples
-    --------
-    >>> with read_frames("missing.mp4", end=2.0) as frames:  # doctest: +IGNORE_EXCEPTION_DETAIL
-    ...     means = [frame.mean() for index, time, frame in frames]
-    Traceback (most recent call last):
-    ...
-    vehicle_detection.errors.InvalidInputError: source missing.mp4 does not exist; check the path
-    """
-    path = _check_source(source)
-    _check_span(start, end)
-    info = probe(path)
-    first, count = _frame_range(info, start, end)
-    return FrameReader(path, info, first=first, count=count)
-
-
 def process_video(
-    source: str | os.PathLike[str],
+    source: Any,
     target: str | os.PathLike[str] | None,
     detector: VideoDetector,
     *,
@@ -205,7 +143,8 @@ def process_video(
     Parameters
     ----------
     source
-        A video file that ffmpeg can read.
+        A video file, or any other source of `open_source`: the segments of a trip, images, standard input, a
+        camera or a network stream. Ctrl-C ends a live source, and completes the target.
     target
         The file to write: .mp4, .m4v, .mov or .mkv. After an error, an existing file is unchanged. None:
         write no video.
@@ -246,57 +185,165 @@ def process_video(
     >>> from vehicle_detection import VehicleDetector  # doctest: +SKIP
     >>> print(process_video("drive.mp4", "found.mp4", VehicleDetector()))  # doctest: +SKIP
     """
-    path = _check_source(source)
-    output = None if target is None else _check_video_target(target, path)
-    _check_span(start, end)
-    check_choice(preset, "preset", PRESETS)
-    n_workers = min(available_cores(), 4) if workers is None else check_integer(workers, "workers", low=1)
-    for method in ("search", "track", "annotate", "reset"):
-        if not callable(getattr(detector, method, None)):
-            raise InvalidInputError(
-                "detector must have the methods search, track, annotate and reset, "
-                f"got {describe(detector)} without {method}; pass a VehicleDetector()"
-            )
     if on_result is not None and not callable(on_result):
         raise InvalidInputError(f"on_result must be a function of a result, got {describe(on_result)}")
-
-    info = probe(path)
-    first, count = _frame_range(info, start, end)
-    sound = _audio_source(path, info, end, first) if audio and info.has_audio else None
-    detector.reset(fps=float(info.fps))
-    started = time.perf_counter()
-    drawn_shape = getattr(detector, "annotated_shape", lambda shape: shape)(info.shape)
-    drawn_info = dataclasses.replace(info, height=drawn_shape[0], width=drawn_shape[1])
-    pipeline = FramePipeline(
-        functools.partial(FrameReader, path, info, first=first, count=count),
-        None if output is None else functools.partial(_open_writer, output, drawn_info, preset, sound),
+    with VideoRun(
+        source,
         detector,
-        n_workers,
-        drawn_shape=drawn_shape,
-        interval=getattr(detector, "search_interval", lambda fps: 1)(float(info.fps)),
-    )
-    frames, track_ids = 0, set[int]()
-    total = count or max(info.frames - first, 0) or None
-    # The pipeline's threads use all cores; more threads would only compete with them.
-    with (
-        single_threaded_opencv(),
-        progress_bar(progress, total, unit="frame", terminal_only=True) as bar,
-        contextlib.closing(pipeline.run()) as results,
-    ):
-        for result in results:
-            frames += 1
-            track_ids.update(track.id for track in result.tracks if getattr(track, "shown", True))
-            if on_result is not None:
-                on_result(result)
-            bar.update()
-    return VideoReport(
-        frames=frames,
-        fps=info.fps,
-        shape=info.shape,
-        seconds=time.perf_counter() - started,
-        stages=pipeline.stage_seconds,
-        tracks=len(track_ids),
-    )
+        target=target,
+        start=start,
+        end=end,
+        audio=audio,
+        preset=preset,
+        workers=workers,
+    ) as run:
+        with _stop_on_interrupt(run), contextlib.closing(run.results(progress=progress)) as results:
+            for _, result in results:
+                if on_result is not None:
+                    on_result(result)
+        return run.report()
+
+
+class VideoRun:
+    """One pass of a detector over a source, which `process_video` and `track` have in common.
+
+    The arguments are those of `process_video`; `results` does the work, then `report` sums it up.
+    """
+
+    def __init__(
+        self,
+        source: Any,
+        detector: VideoDetector,
+        *,
+        target: str | os.PathLike[str] | None = None,
+        start: float | None = None,
+        end: float | None = None,
+        audio: bool = True,
+        preset: str = "veryfast",
+        workers: int | None = None,
+        with_frames: bool = False,
+    ) -> None:
+        check_span(start, end)
+        check_choice(preset, "preset", PRESETS)
+        n_workers = min(available_cores(), 4) if workers is None else check_integer(workers, "workers", low=1)
+        for method in ("search", "track", "annotate", "reset"):
+            if not callable(getattr(detector, method, None)):
+                raise InvalidInputError(
+                    "detector must have the methods search, track, annotate and reset, "
+                    f"got {describe(detector)} without {method}; pass a VehicleDetector()"
+                )
+        output = None if target is None else _check_video_target(target)
+        self._owned = not isinstance(source, FrameSource)
+        self.source = open_source(source)
+        try:
+            if output is not None:
+                _check_not_a_source(output, self.source.files)
+            self._set_up(output, detector, start, end, audio, preset, n_workers, with_frames)
+        except BaseException:
+            self.close()
+            raise
+
+    def _set_up(
+        self,
+        output: Path | None,
+        detector: VideoDetector,
+        start: float | None,
+        end: float | None,
+        audio: bool,
+        preset: str,
+        workers: int,
+        with_frames: bool,
+    ) -> None:
+        info = self.info = self.source.info
+        first, count = frame_range(info, start, end)
+        sound = _sound(self.source, first, end) if audio and output is not None else None
+        drawn_shape = getattr(detector, "annotated_shape", lambda shape: shape)(info.shape)
+        drawn = dataclasses.replace(info, height=drawn_shape[0], width=drawn_shape[1])
+        self._total = count or max(info.frames - first, 0) or None
+        self._frames, self._seconds, self._track_ids = 0, 0.0, set[int]()
+        self._detector = detector
+        self._pipeline = FramePipeline(
+            functools.partial(self.source.read, first, count),
+            None if output is None else functools.partial(_open_writer, output, drawn, preset, sound),
+            detector,
+            workers,
+            drawn_shape=drawn_shape,
+            interval=getattr(detector, "search_interval", lambda fps: 1)(float(info.fps)),
+            with_frames=with_frames,
+        )
+
+    def results(self, *, progress: bool = False) -> Generator[tuple[NDArray[np.uint8] | None, Any]]:
+        """Yield each frame, None without `with_frames`, and its result; closing it stops everything."""
+        self._detector.reset(fps=float(self.info.fps))
+        started = time.perf_counter()
+        try:
+            # The pipeline's threads use all cores; more threads would only compete with them.
+            with (
+                single_threaded_opencv(),
+                progress_bar(progress, self._total, unit="frame", terminal_only=True) as bar,
+                contextlib.closing(self._pipeline.run()) as results,
+            ):
+                for frame, result in results:
+                    self._frames += 1
+                    self._track_ids.update(
+                        track.id for track in result.tracks if getattr(track, "shown", True)
+                    )
+                    yield frame, result
+                    del frame, result
+                    bar.update()
+        finally:
+            self._seconds = time.perf_counter() - started
+
+    def report(self) -> VideoReport:
+        """Return counts and times of the finished pass."""
+        return VideoReport(
+            frames=self._frames,
+            fps=self.info.fps,
+            shape=self.info.shape,
+            seconds=self._seconds,
+            stages=self._pipeline.stage_seconds,
+            tracks=len(self._track_ids),
+            dropped=self._pipeline.missed_frames,
+        )
+
+    def stop(self) -> None:
+        """End the source; the frames read so far complete the run."""
+        self._pipeline.stop()
+
+    def close(self) -> None:
+        """Close the source, unless the caller opened it."""
+        if self._owned:
+            self.source.close()
+
+    def __enter__(self) -> VideoRun:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
+
+
+@contextlib.contextmanager
+def _stop_on_interrupt(run: VideoRun) -> Iterator[None]:
+    """Let the first Ctrl-C end a live source, which has no other end; a second one interrupts the run."""
+    if not run.source.live or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(*_: Any) -> None:
+        signal.signal(signal.SIGINT, before)
+        # In a thread: the handler may interrupt a thread that holds the locks which `stop` needs.
+        threading.Thread(target=run.stop, name="vehicle-stop").start()
+
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _sound(source: FrameSource, first: int, end: float | None) -> AudioSource | None:
+    """Sound of a source from a frame up to an end in seconds."""
+    return source.audio(first, None if end is None else float(Fraction(end) - first / source.info.fps))
 
 
 def cut_video(
@@ -311,21 +358,22 @@ def cut_video(
 
     The arguments are those of `process_video`, and so are the errors.
     """
-    path = _check_source(source)
-    output = _check_video_target(target, path)
-    _check_span(start, end)
+    check_span(start, end)
     check_choice(preset, "preset", PRESETS)
-    info = probe(path)
-    first, count = _frame_range(info, start, end)
-    sound = _audio_source(path, info, end, first) if info.has_audio else None
-    with (
-        FrameReader(path, info, first=first, count=count) as frames,
-        _open_writer(output, info, preset, sound) as writer,
-    ):
-        for _, _, frame in frames:
-            writer.write(frame)
-        writer.finish()
-    return frames.frames_read
+    output = _check_video_target(target)
+    with open_source(source) as opened:
+        _check_not_a_source(output, opened.files)
+        first, count = frame_range(opened.info, start, end)
+        with (
+            opened.read(first, count) as frames,
+            _open_writer(output, opened.info, preset, _sound(opened, first, end)) as writer,
+        ):
+            written = 0
+            for _, _, frame in frames:
+                writer.write(frame)
+                written += 1
+            writer.finish()
+    return written
 
 
 @contextlib.contextmanager
@@ -337,72 +385,19 @@ def _open_writer(
         yield writer
 
 
-def _as_path(value: object, name: str) -> Path:
-    if not isinstance(value, (str, os.PathLike)):
+def _check_video_target(target: object) -> Path:
+    if not isinstance(target, (str, os.PathLike)):
         raise InvalidInputError(
-            f"{name} must be the path of a video file, got {describe(value)}; pass a file name"
+            f"target must be the path of a video file, got {describe(target)}; pass a file name"
         )
-    return Path(value)
-
-
-def _check_source(source: str | os.PathLike[str]) -> Path:
-    path = _as_path(source, "source")
-    if path.is_dir():
-        raise InvalidInputError(f"source {path} is a folder; choose a video file in it")
-    if not path.exists():
-        raise InvalidInputError(f"source {path} does not exist; check the path")
-    if not path.is_file():
-        raise InvalidInputError(f"source {path} is not a regular file; record the stream to a file first")
-    if not os.access(path, os.R_OK):
-        raise InvalidInputError(f"source {path} is not readable; change its permissions")
-    return path
-
-
-def _check_video_target(target: str | os.PathLike[str], source: Path) -> Path:
-    path = check_target(_as_path(target, "target"))
+    path = check_target(target)
     if path.suffix.lower() not in CONTAINERS:
         raise InvalidInputError(
             f"target must end in {', '.join(CONTAINERS)}; got {path.name!r}, use {path.stem + '.mp4'!r}"
         )
-    if path.exists() and path.samefile(source):
-        raise InvalidInputError(f"target {path} is the source; choose another name")
     return path
 
 
-def _check_span(start: float | None, end: float | None) -> None:
-    for name, value in (("start", start), ("end", end)):
-        if value is not None:
-            check_number(value, name, low=0, high=1e7)
-    if end is not None and (start or 0) >= end:
-        raise InvalidInputError(
-            f"end must be later than the start; got {start or 0:g} s to {end:g} s, choose a later end"
-        )
-
-
-def _frame_range(info: VideoInfo, start: float | None, end: float | None) -> tuple[int, int | None]:
-    """Convert seconds to the index of the first frame and the number of frames."""
-    if start is not None and info.duration and start >= info.duration:
-        raise InvalidInputError(
-            f"start must be less than the video's length of {info.duration:g} s; got {start:g} s"
-        )
-    # Tolerance: a frame's rounded time selects that frame.
-    first, last = (
-        None if value is None else math.ceil(Fraction(value) * info.fps - Fraction(1, 100))
-        for value in (start, end)
-    )
-    first = first or 0
-    if last is not None and last <= first:
-        raise InvalidInputError(
-            f"end must be at least one frame later than the start, at {float(info.fps):g} frames/s; "
-            f"got {start or 0:g} s to {end:g} s, choose a later end"
-        )
-    return first, None if last is None else last - first
-
-
-def _audio_source(path: Path, info: VideoInfo, end: float | None, first: int) -> AudioSource:
-    """Select the sound of the processed frames."""
-    if not first and end is None:
-        return AudioSource(path=path)
-    start = float(first / info.fps)
-    length = None if end is None else float(Fraction(end)) - start
-    return AudioSource(path=path, start=start + info.start_time, length=length)
+def _check_not_a_source(target: Path, sources: Sequence[Path]) -> None:
+    if target.exists() and any(target.samefile(source) for source in sources):
+        raise InvalidInputError(f"target {target} is the source; choose another name")

@@ -7,16 +7,17 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection.errors import VideoError
-from vehicle_detection.video.ffmpeg import Process, VideoInfo, last_line
+from vehicle_detection.video.ffmpeg import Process, VideoInfo, input_options, last_line
 from vehicle_detection.video.yuv import FORMATS, planes_from_rgb, rgb_from_planes
 
 CONTAINERS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
@@ -30,6 +31,28 @@ _MAX_FRAME_DURATION = 5
 # More threads wait for each other, and the search needs the cores.
 _DECODER_THREADS = "2"
 _TRUNCATED = re.compile(r"partial file|ended prematurely")
+
+
+class Reader(Protocol):
+    """Frames of a source, in order: an iterator of ``(index, time, frame)`` and a context manager."""
+
+    info: VideoInfo
+
+    @property
+    def cpu_seconds(self) -> float:
+        """Processor time of ffmpeg, known after it has ended."""
+
+    def __iter__(self) -> Iterator[tuple[int, float, NDArray[np.uint8]]]: ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: Any) -> None: ...
+
+    def kill(self) -> None:
+        """End at once, from any thread; a thread that reads sees the end."""
+
+    def close(self) -> None:
+        """End and release everything."""
 
 
 class _FfmpegStream:
@@ -65,7 +88,9 @@ class FrameReader(_FfmpegStream):
     ``with`` block, and when the reader is deleted.
     """
 
-    def __init__(self, path: Path, info: VideoInfo, *, first: int = 0, count: int | None = None) -> None:
+    def __init__(
+        self, path: Path | str, info: VideoInfo, *, first: int = 0, count: int | None = None
+    ) -> None:
         self.info = info
         self.frames_read = 0
         self._killed = False
@@ -79,7 +104,7 @@ class FrameReader(_FfmpegStream):
             seek = float((first - early) / info.fps)
             filters = [f"fps={info.fps}:start_time=0", f"trim=start_frame={early}", *filters]
         options = ["-ss", f"{seek:.6f}"] if seek else []
-        options += ["-threads", _DECODER_THREADS, "-i", f"file:{path}"]
+        options += ["-threads", _DECODER_THREADS, *input_options(path)]
         options += ["-map", "0:V:0", "-vf", ",".join(filters)]
         if count is not None:
             options += ["-frames:v", str(count)]
@@ -150,9 +175,12 @@ class FrameReader(_FfmpegStream):
 
 @dataclass(frozen=True, kw_only=True)
 class AudioSource:
-    """Audio for a written video: all of a file's, or a part from `start` on, `length` seconds long."""
+    """Audio for a written video: all of a file's, or a part from `start` on, `length` seconds long.
 
-    path: Path
+    `input` are ffmpeg's options that open it.
+    """
+
+    input: tuple[str, ...]
     start: float | None = None
     length: float | None = None
 
@@ -179,7 +207,7 @@ class FrameWriter(_FfmpegStream):
                 video += ["-itsoffset", f"{info.start_time:.6f}"]
             sound += [] if audio.start is None else ["-ss", f"{audio.start:.6f}"]
             sound += [] if audio.length is None else ["-t", f"{audio.length:.6f}"]
-            sound += ["-vn", "-i", f"file:{audio.path}"]
+            sound += ["-vn", *audio.input]
             copied = whole and info.audio_codec in _COPIED_AUDIO[container]
             mapped += ["-map", f"1:a:{info.audio_track}"]
             mapped += ["-c:a", "copy"] if copied else ["-c:a", "aac", "-b:a", "192k"]
@@ -196,6 +224,10 @@ class FrameWriter(_FfmpegStream):
     def write(self, frame: NDArray[np.uint8]) -> None:
         """Send one frame to ffmpeg."""
         planes_from_rgb(frame, self._planes, self._channels)
+        self.repeat()
+
+    def repeat(self) -> None:
+        """Send the last frame once more."""
         view = self._planes.data.cast("B")
         done = 0
         try:

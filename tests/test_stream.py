@@ -1,0 +1,104 @@
+"""`track`: results as a generator and as a list."""
+
+import contextlib
+import gc
+import itertools
+
+import numpy as np
+import pytest
+
+from tests.helpers import random_mixture
+from tests.video.clips import child_processes, running_threads
+from vehicle_detection import TrackWriter, VehicleDetector, process_video, track
+from vehicle_detection.cli.demo import draw_clip
+from vehicle_detection.errors import InvalidInputError, VideoError
+from vehicle_detection.synthetic import render_drive
+from vehicle_detection.video import open_source, read_frames
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stream")
+    drive = render_drive(frames=12, shape=(180, 320), scenario="overtaking")
+    draw_clip(drive, folder / "clip.mp4", folder / "labels.csv")
+    return folder / "clip.mp4"
+
+
+@pytest.fixture(scope="module")
+def detector():
+    with VehicleDetector(random_mixture(), n_jobs=1, every=2) as detector:
+        yield detector
+
+
+def boxes(results):
+    return [
+        (result.index, result.time, [(track.id, track.box.tolist()) for track in result.tracks])
+        for result in results
+    ]
+
+
+def test_the_frames_are_those_of_process_video(clip, detector, tmp_path):
+    expected = []
+    with TrackWriter(tmp_path / "expected.csv") as write:
+        process_video(clip, None, detector, on_result=lambda each: (expected.append(each), write(each)))
+    assert any(result.tracks for result in expected)
+    found = []
+    with TrackWriter(tmp_path / "found.csv") as write:
+        for result in track(clip, detector, stream=True):
+            write(result)
+            found.append(result)
+    assert boxes(found) == boxes(expected) == boxes(track(clip, detector))
+    assert (tmp_path / "found.csv").read_bytes() == (tmp_path / "expected.csv").read_bytes()
+    assert [result.searched for result in found] == [True, False] * 6
+    assert all(result.shown == result.result.shown for result in found)
+    assert len(found[0].detections) == len(expected[0].detections)
+    with read_frames(clip) as frames:
+        for (_, time, frame), result in zip(frames, found, strict=True):
+            assert result.time == time
+            np.testing.assert_array_equal(result.frame, frame)
+            np.testing.assert_array_equal(result.picture, detector.annotate(frame, result.result))
+    assert found[0].picture is found[0].picture
+
+
+@pytest.mark.parametrize("end", ["close", "delete", "break", "error", "unused"])
+def test_closing_it_early_leaves_no_process(clip, detector, end):
+    before = child_processes()
+    results = track(clip, detector, stream=True)
+    if end != "unused":
+        assert next(results).index == 0
+        assert len(child_processes()) > len(before)
+    if end == "close":
+        results.close()
+    elif end == "break":
+        for _ in results:
+            break
+    elif end == "error":
+        with contextlib.suppress(ZeroDivisionError):
+            for result in results:
+                result.index / 0
+    del results
+    gc.collect()
+    assert child_processes() == before
+    assert not running_threads()
+
+
+def test_options_and_ranges(clip):
+    times = [result.time for result in track(clip, random_mixture(), start=0.1, end=0.3, every=1)]
+    with read_frames(clip, start=0.1, end=0.3) as frames:
+        assert times == [time for _, time, _ in frames]
+
+
+def test_a_source_that_is_opened_already(clip, detector):
+    with open_source(clip) as source:
+        assert len(list(itertools.islice(track(source, detector, stream=True), 3))) == 3
+        assert len(track(source, detector)) == 12
+
+
+def test_bad_arguments(clip, detector, tmp_path):
+    with pytest.raises(InvalidInputError, match=r"model is a detector, .* got every in addition"):
+        track(clip, detector, every=2)
+    with pytest.raises(InvalidInputError, match=r"source missing\.mp4 does not exist"):
+        track("missing.mp4", random_mixture(), stream=True)
+    (tmp_path / "text.mp4").write_text("no video")
+    with pytest.raises(VideoError, match="is not a video"):
+        track(tmp_path / "text.mp4", detector, stream=True)

@@ -1,0 +1,298 @@
+"""Sources other than single files: segments, images, pipes, network streams and other storage."""
+
+import contextlib
+import http.server
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from moviepy.config import FFMPEG_BINARY
+
+from tests.helpers import StubDetector, start_interruptible
+from tests.video.clips import ffmpeg, frame_numbers, gray_frames, sound_seconds, write_clip
+from vehicle_detection.errors import InvalidInputError, VideoError
+from vehicle_detection.images import write_image
+from vehicle_detection.video import open_source, probe_video, process_video, sources
+
+
+def numbers(source, **options):
+    """Frames of `gray_frames` that a source holds, and its indices and times."""
+    with open_source(source, **options) as opened:
+        rows = [(index, time, round((frame[8:-8, 8:-8].mean() - 10) / 10)) for index, time, frame in opened]
+    return tuple(zip(*rows))
+
+
+@pytest.fixture(scope="module")
+def card(folder):
+    """A card of three segments, which are cut from one clip, of two cameras."""
+    home = folder / "card"
+    home.mkdir()
+    frames = gray_frames(20)
+    for camera in "FR":
+        for start, part in ((0, frames[:8]), (1, frames[8:16]), (2, frames[16:])):
+            part = part if camera == "F" else part[::-1]
+            write_clip(home / f"20260131_08150{start}_{camera}.mp4", part, fps=8, sound=True)
+    (home / "._20260131_081500_F.mp4").write_text("not a video")
+    return home
+
+
+def test_segments_become_one_video(card, tmp_path):
+    pattern = str(card / "*F.mp4")
+    index, times, seen = numbers(pattern)
+    assert index == seen == tuple(range(20))
+    assert times == pytest.approx(np.arange(20) / 8)
+    report = process_video(pattern, tmp_path / "trip.mp4", StubDetector(), workers=2)
+    assert frame_numbers(tmp_path / "trip.mp4") == list(range(20))
+    assert report.frames == 20
+    # One vehicle for six frames each, as in a single file: the state is kept at the cuts.
+    assert report.tracks == 4
+    assert sound_seconds(tmp_path / "trip.mp4") == pytest.approx(2.5, abs=0.15)
+    assert os.listdir(tmp_path) == ["trip.mp4"]
+
+
+@pytest.mark.parametrize(("start", "end"), [(0.5, 1.25), (1.0, 2.25), (2.0, None), (0, 9)])
+def test_a_part_of_a_trip(card, tmp_path, start, end):
+    target = tmp_path / "part.mp4"
+    process_video(str(card / "*F.mp4"), target, StubDetector(), start=start, end=end)
+    expected = list(range(20))[int(start * 8) : None if end is None else int(end * 8)]
+    assert frame_numbers(target) == expected
+    assert sound_seconds(target) == pytest.approx(len(expected) / 8, abs=0.15)
+
+
+def test_segments_of_another_rate_and_size(tmp_path):
+    first = write_clip(tmp_path / "a.mp4", gray_frames(4), fps=8)
+    second = write_clip(tmp_path / "b.mp4", gray_frames(8, 128, 96), fps=16)
+    with open_source([first, second]) as source:
+        frames = list(source)
+    assert [frame.shape for _, _, frame in frames] == [(48, 64, 3)] * 8
+    assert not source.info.has_audio
+
+
+def test_a_folder_with_several_trips_lists_them(card):
+    with pytest.raises(
+        InvalidInputError, match=r"2 trips \(front, 3 files from 20260131_081500_F.mp4; rear,"
+    ):
+        open_source(card)
+
+
+def test_a_damaged_segment_is_named(card, tmp_path):
+    files = sorted(card.glob("2*F.mp4"))
+    cut = tmp_path / "cut.mp4"
+    cut.write_bytes(files[1].read_bytes()[:1000])
+    with pytest.raises(VideoError, match=r"cut\.mp4 is not a video"):
+        open_source([files[0], cut])
+
+
+def test_images_in_natural_order(tmp_path):
+    for number, frame in enumerate(gray_frames(11)):
+        write_image(tmp_path / f"frame{number}.png", frame)
+    index, times, seen = numbers(tmp_path, fps=5)
+    assert index == seen == tuple(range(11))
+    assert times == pytest.approx(np.arange(11) / 5)
+    process_video(str(tmp_path / "*.png"), tmp_path / "out.mp4", StubDetector(), start=0.08)
+    assert frame_numbers(tmp_path / "out.mp4") == list(range(2, 11))
+    with pytest.raises(InvalidInputError, match="must be videos or images, got both"):
+        open_source([tmp_path / "frame0.png", tmp_path / "out.mp4"])
+    write_image(tmp_path / "frame11.png", gray_frames(1, 32, 32)[0])
+    with pytest.raises(InvalidInputError, match=r"images of one size; \S+frame11.png is 32x32"):
+        numbers(str(tmp_path / "*.png"))
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ([], "at least one file"),
+        ("empty", "source empty holds no videos and no images"),
+        ("*.mp4", r"source \*\.mp4 holds no videos"),
+        ("-", "standard input, which is not a pipe"),
+        ("97", "there is no camera /dev/video97"),
+        (True, "source must be the path"),
+        ("warp://drive.mp4", r"source warp://drive.mp4 cannot be opened \(Protocol not known: warp"),
+        ("memory://missing.mp4", "memory://missing.mp4 does not exist; check the URL"),
+    ],
+)
+def test_bad_sources(tmp_path, monkeypatch, source, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InvalidInputError, match=message):
+        open_source(source)
+    with pytest.raises(InvalidInputError, match="fps must be a number"):
+        open_source("x.mp4", fps=0)
+
+
+def test_a_file_on_other_storage(clip):
+    fsspec = pytest.importorskip("fsspec")
+    with fsspec.open("memory://bucket/clip.mp4", "wb") as file:
+        file.write(clip.read_bytes())
+    with open_source("memory://bucket/clip.mp4") as source:
+        assert len(list(source)) == 20
+        assert source.name == "memory://bucket/clip.mp4"
+        assert source.files[0].exists()
+    assert not source.files[0].exists()
+
+
+def test_without_fsspec(monkeypatch):
+    monkeypatch.setitem(sys.modules, "fsspec", None)
+    with pytest.raises(InvalidInputError, match=r"needs fsspec; pip install 'vehicle-detection\[batch\]'"):
+        sources.open_filesystem("s3://bucket/x.mp4")
+
+
+# --- standard input and pipes ---
+
+FROM_STDIN = """
+import sys
+from tests.helpers import StubDetector
+from vehicle_detection.video import process_video
+print(process_video("-", sys.argv[1], StubDetector(pause=0.02)).frames)
+"""
+
+
+def test_standard_input_waits_for_the_search(clip, tmp_path):
+    stream = ffmpeg("-i", clip, "-c", "copy", "-an", "-f", "mpegts", "-")
+    command = [sys.executable, "-c", FROM_STDIN, tmp_path / "out.mp4"]
+    done = subprocess.run(command, input=stream, capture_output=True, check=True)
+    assert done.stdout == b"20\n"
+    assert frame_numbers(tmp_path / "out.mp4") == list(range(20))
+
+
+@contextlib.contextmanager
+def endless_pipe(path):
+    """A named pipe that a camera of 50 frames per second writes to, until its reader ends."""
+    os.mkfifo(path)
+    pattern = ["-re", "-f", "lavfi", "-i", "testsrc2=s=64x48:r=50", "-pix_fmt", "yuv420p", "-f", "matroska"]
+    options = ["-v", "quiet", "-y", *pattern, "-c:v", "libx264", "-preset", "ultrafast", "-g", "5", str(path)]
+    camera = subprocess.Popen([FFMPEG_BINARY, *options], stdin=subprocess.DEVNULL)
+    try:
+        yield camera
+    finally:
+        camera.kill()
+        camera.wait()
+
+
+def test_a_live_source_drops_frames_rather_than_lag(tmp_path):
+    class Slow(StubDetector):
+        def search(self, frame):
+            time.sleep(0.1)
+            return super().search(frame)
+
+        def search_interval(self, fps):
+            return 1
+
+        def skip(self, thumbnail):
+            self.index += 1
+
+    results = []
+    with endless_pipe(tmp_path / "pipe"), open_source(tmp_path / "pipe", live=True) as source:
+        started = time.monotonic()
+        report = process_video(
+            source, tmp_path / "out.mp4", Slow(), workers=1, end=1.5, on_result=results.append
+        )
+        seconds = time.monotonic() - started
+        with pytest.raises(InvalidInputError, match="can be read only once"):
+            source.read()
+    assert seconds < 4  # every frame would take 7.5 s
+    assert 3 < report.frames < 40
+    assert report.dropped > 20
+    assert f"{report.dropped} frames dropped" in str(report)
+    # Times are those of the source, and the video repeats frames in place of those that were dropped.
+    times = [result.time - results[0].time for result in results]
+    assert times == pytest.approx([result.index / 50 for result in results])
+    assert probe_video(tmp_path / "out.mp4").frames == report.frames + report.dropped == results[-1].index + 1
+
+
+def test_closing_a_live_source_leaves_no_process(tmp_path):
+    with endless_pipe(tmp_path / "pipe") as camera:
+        with open_source(tmp_path / "pipe", live=True) as source:
+            for index, _, _ in source:
+                if index > 3:
+                    break
+        camera.wait(5)  # its reader is gone
+
+
+LIVE = """
+import sys
+from tests.helpers import StubDetector
+from vehicle_detection.video import open_source, process_video
+with open_source(sys.argv[1], live=True) as source:
+    show = lambda result: print(result.index, flush=True)
+    report = process_video(source, sys.argv[2], StubDetector(), on_result=show)
+print("report", report.frames)
+"""
+
+
+def test_an_interrupt_completes_the_video_of_a_live_source(tmp_path):
+    with endless_pipe(tmp_path / "pipe"):
+        process = start_interruptible(sys.executable, "-c", LIVE, tmp_path / "pipe", tmp_path / "out.mp4")
+        for _ in range(5):
+            assert process.stdout.readline()
+        os.kill(process.pid, signal.SIGINT)
+        out, errors = process.communicate(timeout=20)
+    assert (process.returncode, errors) == (0, "")
+    assert int(out.split()[-1]) >= 5
+    assert probe_video(tmp_path / "out.mp4").frames >= 5
+
+
+# --- the network ---
+
+
+@contextlib.contextmanager
+def server(handle):
+    """Serve HTTP requests on the loopback interface with a function of the handler."""
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            with contextlib.suppress(ConnectionError):
+                handle(self)
+
+        def log_message(self, *_):
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as running:
+        running.daemon_threads = True
+        thread = threading.Thread(target=running.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{running.server_address[1]}"
+        finally:
+            running.shutdown()
+            thread.join()
+
+
+def test_a_file_on_a_web_server(folder):
+    path = write_clip(folder / "web.mp4", gray_frames(20), options=("-movflags", "+faststart"))
+
+    def serve(request):
+        data = path.read_bytes()
+        request.send_response(200 if request.path == "/web.mp4" else 404)
+        request.send_header("Content-Length", str(len(data)))
+        request.end_headers()
+        request.wfile.write(data)
+
+    with server(serve) as address:
+        index, _, seen = numbers(f"{address}/web.mp4")
+        with pytest.raises(VideoError, match="404"):
+            open_source(f"{address}/other.mp4")
+    assert index == seen == tuple(range(20))
+
+
+def test_a_stream_of_a_web_server_ends_with_it(clip, tmp_path):
+    data = ffmpeg("-stream_loop", 2, "-i", clip, "-c", "copy", "-an", "-f", "mpegts", "-")
+
+    def stream(request):
+        request.send_response(200)
+        request.send_header("Content-Type", "video/mp2t")
+        request.end_headers()
+        for start in range(0, len(data), 4096):
+            request.wfile.write(data[start : start + 4096])
+            time.sleep(0.01)
+
+    with server(stream) as address, open_source(f"{address}/live.ts") as source:
+        assert source.live
+        report = process_video(source, tmp_path / "out.mp4", StubDetector())
+    assert report.frames + report.dropped > 30
+    assert probe_video(tmp_path / "out.mp4").frames == report.frames + report.dropped

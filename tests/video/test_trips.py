@@ -1,0 +1,103 @@
+"""Trips of dash-cam files, from their names."""
+
+from datetime import datetime
+from pathlib import Path
+
+import pytest
+
+from vehicle_detection.video import find_trips
+from vehicle_detection.video.trips import is_video_file
+
+
+def summary(names, **options):
+    return [(trip.camera, [str(file) for file in trip.files]) for trip in find_trips(names, **options)]
+
+
+@pytest.mark.parametrize(
+    ("name", "camera"),
+    [
+        ("20260131_081500_F.MP4", "front"),
+        ("2026_0131_081500_0001R.MP4", "rear"),
+        ("20260131_081500_NF.mp4", "front"),
+        ("20260131_081500_PR.mp4", "rear"),
+        ("NO20260131-081500-000123B.MP4", "rear"),
+        ("REC_2026_01_31_08_15_00_F.MP4", "front"),
+        ("2026-01-31_08-15-00-front.mp4", "front"),
+        ("2026-01-31_08-15-00-left_repeater.mp4", "left"),
+        ("20260131081500_000001A.MP4", "unknown"),
+        ("DCIM/Movie_Rear/20260131_081500.mp4", "rear"),
+        ("20260131_081500.mp4", "unknown"),
+    ],
+)
+def test_the_camera_and_the_time_of_a_name(name, camera):
+    (trip,) = find_trips([name])
+    assert (trip.camera, trip.start) == (camera, datetime(2026, 1, 31, 8, 15))
+
+
+@pytest.mark.parametrize(
+    ("name", "camera"), [("drive.mp4", "unknown"), ("front.mp4", "front"), ("20269931_081500.mp4", "unknown")]
+)
+def test_a_name_without_a_time(name, camera):
+    (trip,) = find_trips([name])
+    assert (trip.camera, trip.start) == (camera, None)
+
+
+def test_segments_of_two_cameras_and_two_drives():
+    minutes = [f"2026013108{minute:02}00" for minute in (15, 16, 17, 18)]
+    evening = [f"2026013118{minute:02}02" for minute in (1, 2)]
+    names = [f"{time}_{camera}.mp4" for time in (*minutes, *evening) for camera in "RF"]
+    assert summary(reversed(names)) == [
+        (name, [f"{time}_{letter}.mp4" for time in times])
+        for name, letter in (("front", "F"), ("rear", "R"))
+        for times in (minutes, evening)
+    ]
+
+
+def test_folders_are_different_trips():
+    names = ["a/20260131_081500.mp4", "b/20260131_081600.mp4"]
+    assert [files for _, files in summary(names)] == [[names[0]], [names[1]]]
+
+
+def test_clocks_that_drift_by_a_second():
+    names = [f"20260131_08{time}_F.mp4" for time in ("1500", "1601", "1701", "1800", "1859")]
+    assert summary(names) == [("front", names)]
+
+
+def test_a_short_segment_is_probed():
+    names = [f"20260131_08{time}_F.mp4" for time in ("1500", "1600", "1700", "1720", "1900", "2000")]
+    seconds = {names[2]: 20.0}
+    joined = [names[:4], names[4:]]
+    assert [files for _, files in summary(names, duration=seconds.__getitem__)] == joined
+    seconds = {names[2]: 11.0}
+    assert len(find_trips(names, duration=seconds.__getitem__)) == 3
+    assert len(find_trips(names)) == 3
+
+
+@pytest.mark.parametrize(("seconds", "trips"), [(59.9, 1), (30.0, 2), (63.0, 1), (64.0, 2)])
+def test_two_segments_are_probed(seconds, trips):
+    names = ["20260131_081500_F.mp4", "20260131_081600_F.mp4"]
+    assert len(find_trips(names, duration=lambda name: seconds)) == trips
+
+
+def test_numbers_without_times():
+    assert summary([f"GRMN{n:04}.MP4" for n in (9, 10, 11, 13)]) == [
+        ("unknown", ["GRMN0009.MP4", "GRMN0010.MP4", "GRMN0011.MP4"]),
+        ("unknown", ["GRMN0013.MP4"]),
+    ]
+    assert summary(["GX020007.MP4", "GX010008.MP4", "GX010007.MP4"]) == [
+        ("unknown", ["GX010007.MP4", "GX020007.MP4"]),
+        ("unknown", ["GX010008.MP4"]),
+    ]
+    assert len(find_trips(["drive.mp4", "walk.mp4"])) == 2
+
+
+def test_paths_and_urls_keep_their_type():
+    (trip,) = find_trips([Path("a/20260131_081500.mp4")])
+    assert trip.files == (Path("a/20260131_081500.mp4"),)
+    (trip,) = find_trips(["s3://bucket/a/20260131_081500.mp4"])
+    assert trip.files == ("s3://bucket/a/20260131_081500.mp4",)
+    assert str(trip) == "1 file"
+
+
+def test_hidden_files_are_no_videos():
+    assert [is_video_file(Path(name)) for name in ("a.MP4", "._a.mp4", "a.thm")] == [True, False, False]

@@ -1,0 +1,204 @@
+"""`track`: the vehicles of any source, frame by frame."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection.boxes import Detections
+from vehicle_detection.confidence import Model
+from vehicle_detection.detector import FrameResult, VehicleDetector
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.tracking import Track
+from vehicle_detection.video import FrameSource, VideoRun
+
+Source = str | os.PathLike[str] | int | Sequence[str | os.PathLike[str]] | FrameSource
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedFrame:
+    """One frame of `track` with its vehicles.
+
+    It has the attributes of its `FrameResult`, so `TrackWriter` and the other functions that take results
+    accept it.
+
+    Attributes
+    ----------
+    frame
+        ``(H, W, 3)`` uint8 RGB.
+    result
+        Windows, detections and tracks of the frame.
+    """
+
+    frame: NDArray[np.uint8]
+    result: FrameResult
+    _detector: VehicleDetector
+
+    @property
+    def index(self) -> int:
+        """Number of the frame, from 0 at the first one that is processed."""
+        return self.result.index
+
+    @property
+    def time(self) -> float:
+        """Time of the frame in the source, in seconds."""
+        assert self.result.time is not None
+        return self.result.time
+
+    @property
+    def detections(self) -> Detections:
+        """Boxes of this frame before tracking; none if the frame was not searched."""
+        return self.result.detections
+
+    @property
+    def searched(self) -> bool:
+        """Whether the frame was searched; if not, its tracks are interpolated."""
+        return self.result.searched
+
+    @property
+    def tracks(self) -> tuple[Track, ...]:
+        """All tracks, including those not shown."""
+        return self.result.tracks
+
+    @property
+    def shown(self) -> tuple[Track, ...]:
+        """The tracks to draw."""
+        return self.result.shown
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Time spent per stage."""
+        return self.result.seconds
+
+    @cached_property
+    def picture(self) -> NDArray[np.uint8]:
+        """A copy of the frame with its vehicles, drawn when it is read first."""
+        return self._detector.annotate(self.frame, self.result)
+
+
+@overload
+def track(
+    source: Source,
+    model: str | os.PathLike[str] | Model | VehicleDetector = ...,
+    *,
+    stream: Literal[True],
+    start: float | None = ...,
+    end: float | None = ...,
+    workers: int | None = ...,
+    progress: bool = ...,
+    **options: Any,
+) -> Generator[TrackedFrame]: ...
+@overload
+def track(
+    source: Source,
+    model: str | os.PathLike[str] | Model | VehicleDetector = ...,
+    *,
+    stream: Literal[False] = ...,
+    start: float | None = ...,
+    end: float | None = ...,
+    workers: int | None = ...,
+    progress: bool = ...,
+    **options: Any,
+) -> list[FrameResult]: ...
+
+
+def track(
+    source: Source,
+    model: str | os.PathLike[str] | Model | VehicleDetector = "default",
+    *,
+    stream: bool = False,
+    start: float | None = None,
+    end: float | None = None,
+    workers: int | None = None,
+    progress: bool = False,
+    **options: Any,
+) -> Generator[TrackedFrame] | list[FrameResult]:
+    """Track the vehicles of a video or of any other source.
+
+    Parameters
+    ----------
+    source
+        A video file, a folder or pattern, ``"-"``, a camera, a URL, or what `open_source` returns.
+    model
+        A model as in `VehicleDetector`, or a detector, whose state is used.
+    stream
+        True: return a generator of frames, for long videos and live sources. False: process the whole source
+        and return the list of its results, without the frames.
+    start, end
+        Time range in seconds: frames with ``start <= time < end`` are processed. None: no limit.
+    workers
+        Number of frames searched in parallel; None: one per core, at most four. The results do not depend on
+        it.
+    progress
+        Show a progress bar if standard error is a terminal.
+    **options
+        Further arguments of `VehicleDetector`, such as ``horizon``, ``camera`` and ``every``.
+
+    Returns
+    -------
+    generator of TrackedFrame, or list of FrameResult
+        Every frame in order, the same as with `process_video`. Closing the generator, deleting it or leaving
+        its loop ends all processes and threads.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is invalid.
+    VideoError
+        If the source cannot be decoded; while reading, if it is incomplete.
+
+    Examples
+    --------
+    >>> for result in track("test_images/*.jpg", "highway", stream=True, end=0.08):
+    ...     print(result.index, result.time, result.picture.shape, len(result.detections))
+    0 0.0 (720, 1280, 3) 2
+    1 0.04 (720, 1280, 3) 0
+    """
+    given = isinstance(model, VehicleDetector)
+    if given and options:
+        raise InvalidInputError(
+            f"model is a detector, which has its options already; got {', '.join(options)} in addition, pass "
+            "them to the detector"
+        )
+    detector = model if isinstance(model, VehicleDetector) else VehicleDetector(model, **options)
+    try:
+        run = VideoRun(source, detector, start=start, end=end, workers=workers, with_frames=stream)
+    except BaseException:
+        if not given:
+            detector.close()
+        raise
+    frames = _frames(run, detector, close=not given, progress=progress)
+    next(frames)  # enter the generator: closing it now closes the source
+    if stream:
+        return frames  # type: ignore[return-value]
+    if run.source.live and end is None:
+        frames.close()
+        raise InvalidInputError(
+            f"source {run.source.name} has no end, so its results cannot be listed; pass stream=True, "
+            "or an end in seconds"
+        )
+    return [item.result for item in frames if item is not None]
+
+
+def _frames(
+    run: VideoRun, detector: VehicleDetector, *, close: bool, progress: bool
+) -> Generator[TrackedFrame | None]:
+    """Yield None once, then the frames; close everything at the end."""
+    try:
+        yield None
+        results = run.results(progress=progress)
+        try:
+            for frame, result in results:
+                yield TrackedFrame(frame, result, detector)  # type: ignore[arg-type]
+        finally:
+            results.close()
+    finally:
+        run.close()
+        if close:
+            detector.close()

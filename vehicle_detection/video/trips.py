@@ -1,0 +1,232 @@
+"""Groups the files of dash-cams, which write segments of one to ten minutes, into trips.
+
+A file name tells the camera and either the time of the first frame (``20260131_081500_F.MP4``,
+``2026-01-31_08-15-00-front.mp4``) or a running number (``GRMN0001.MP4``, ``GX010042.MP4``).
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path, PurePosixPath
+from typing import TypeVar
+
+File = TypeVar("File", Path, str)
+
+VIDEO_SUFFIXES = {
+    ".mp4", ".m4v", ".mov", ".mkv", ".avi", ".webm", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".3gp",
+}  # fmt: skip
+"""Suffixes of the videos that a folder is searched for."""
+
+# Seconds by which the start of a segment may differ from the end of the one before: names hold whole seconds.
+_TOLERANCE = 3.0
+# Maximum length of a segment in seconds, where its file cannot be probed.
+_MAX_SEGMENT = 660.0
+
+_TIME = re.compile(
+    r"(?<!\d)(20\d{2})[-_.]?(\d{2})[-_.]?(\d{2})[-_. T]{0,3}(\d{2})[-_.h]?(\d{2})[-_.m]?(\d{2})(?!\d{6})"
+)
+_GOPRO = re.compile(r"^G[HXLP](\d{2})(\d{4})$", re.IGNORECASE)
+_CAMERA_WORDS = {
+    "front": "front", "rear": "rear", "back": "rear", "left": "left", "right": "right",
+    "interior": "interior", "inside": "interior", "cabin": "interior", "in": "interior",
+    "f": "front", "r": "rear", "b": "rear", "i": "interior",
+    # BlackVue: an event letter before the camera's.
+    "nf": "front", "ef": "front", "pf": "front", "mf": "front",
+    "nr": "rear", "er": "rear", "pr": "rear", "mr": "rear",
+}  # fmt: skip
+# Folders with names of letters alone are not named after a camera.
+_CAMERA_FOLDERS = {word: camera for word, camera in _CAMERA_WORDS.items() if len(word) >= 4}
+UNKNOWN_CAMERA = "unknown"
+"""Camera of a file whose name does not tell it."""
+
+
+@dataclass(frozen=True)
+class _Segment:
+    """What the name of a file tells about it."""
+
+    camera: str
+    start: datetime | None
+    series: str  # name without time, number and camera; numbers of one series follow each other
+    number: int | None
+
+
+@dataclass(frozen=True)
+class Trip:
+    """Consecutive segments of one camera.
+
+    Attributes
+    ----------
+    files
+        Files in order: paths, or URLs.
+    camera
+        ``"front"``, ``"rear"``, ``"left"``, ``"right"``, ``"interior"`` or ``"unknown"``.
+    start
+        Time of the first frame by the camera's clock, if the name tells it.
+    """
+
+    files: tuple[Path | str, ...]
+    camera: str
+    start: datetime | None = None
+
+    def __str__(self) -> str:
+        camera = "" if self.camera == UNKNOWN_CAMERA else f"{self.camera}, "
+        count = len(self.files)
+        return f"{camera}{count} file{'s' * (count != 1)}"
+
+
+def is_video_file(file: Path | str) -> bool:
+    """Whether a name has the suffix of a video, and is not hidden."""
+    name = _posix(file)
+    return name.suffix.lower() in VIDEO_SUFFIXES and not name.name.startswith(".")
+
+
+def find_trips(
+    files: Iterable[Path | str], *, duration: Callable[[Path | str], float] | None = None
+) -> list[Trip]:
+    """Group files into trips, by their folders and names.
+
+    A segment follows another one of the same folder and camera if it starts when the other ends, by the times
+    in the names, or has the next number. Front and rear cameras are different trips.
+
+    Parameters
+    ----------
+    files
+        Paths or URLs of videos, in any order.
+    duration
+        Function that returns the length of a file in seconds; called only where the times in the names leave
+        open whether there is a gap. None: such segments are different trips.
+
+    Returns
+    -------
+    list of Trip
+        Ordered by folder, camera and time.
+
+    Examples
+    --------
+    >>> names = ["20260131_081500_F.MP4", "20260131_081600_F.MP4", "20260131_081700_F.MP4"]
+    >>> names += ["20260131_081500_R.MP4", "20260131_093000_F.MP4"]
+    >>> for trip in find_trips(names):
+    ...     print(trip.camera, trip.start, len(trip.files))
+    front 2026-01-31 08:15:00 3
+    front 2026-01-31 09:30:00 1
+    rear 2026-01-31 08:15:00 1
+    """
+    groups: defaultdict[tuple[str, str, str, bool], list[tuple[_Segment, Path | str]]] = defaultdict(list)
+    for file in files:
+        name = _posix(file)
+        segment = _parse_name(name)
+        # Folders named after cameras are told apart by their path already.
+        key = (str(name.parent), segment.camera, segment.series, segment.start is not None)
+        groups[key].append((segment, file))
+    trips = []
+    for key in sorted(groups):
+        members = sorted(
+            groups[key],
+            key=lambda pair: (pair[0].start or datetime.min, pair[0].number or 0, _posix(pair[1]).name),
+        )
+        trips += _split(members, duration)
+    return trips
+
+
+def _posix(file: Path | str) -> PurePosixPath:
+    return PurePosixPath(os.fspath(file))
+
+
+def _parse_name(name: PurePosixPath) -> _Segment:
+    """Read time, number and camera from the name of a file."""
+    stem = name.stem
+    gopro = _GOPRO.match(stem)
+    if gopro:  # the chapter comes before the number of the recording
+        return _Segment(_folder_camera(name), None, f"gopro {gopro[2]}", int(gopro[1]))
+    start, rest = None, stem
+    found = _TIME.search(stem)
+    if found:
+        try:
+            start = datetime(*(int(part) for part in found.groups()))  # type: ignore[arg-type]
+        except ValueError:  # not a time after all
+            start = None
+        else:
+            rest = stem[: found.start()] + " " + stem[found.end() :]
+    camera, rest = _take_camera(rest)
+    if camera is None:
+        camera = _folder_camera(name)
+    numbers = re.findall(r"\d+", rest)
+    number = int(numbers[-1]) if numbers else None
+    # With a time, the number that counts the files of a camera adds nothing.
+    series = re.sub(r"\d+", "", rest) if start else re.sub(r"\d+(?=\D*$)", "#", rest)
+    return _Segment(camera, start, series.strip(" _-.").lower(), number)
+
+
+def _take_camera(stem: str) -> tuple[str | None, str]:
+    """Find the camera's word in a name, the last one first, and return the name without it."""
+    for word in reversed(list(re.finditer(r"[A-Za-z]+", stem))):
+        camera = _CAMERA_WORDS.get(word[0].lower())
+        # A single letter means a camera at the end only.
+        if camera and (len(word[0]) >= 4 or not re.search(r"[A-Za-z0-9]", stem[word.end() :])):
+            return camera, stem[: word.start()] + stem[word.end() :]
+    return None, stem
+
+
+def _folder_camera(name: PurePosixPath) -> str:
+    """Camera that a file's folder is named after."""
+    for word in re.findall(r"[a-z]+", name.parent.name.lower()):
+        if word in _CAMERA_FOLDERS:
+            return _CAMERA_FOLDERS[word]
+    return UNKNOWN_CAMERA
+
+
+def _split(
+    members: Sequence[tuple[_Segment, Path | str]], duration: Callable[[Path | str], float] | None
+) -> list[Trip]:
+    """Split the sorted files of one camera where a segment does not follow the one before."""
+    steps = [_step(before, after) for (before, _), (after, _) in itertools.pairwise(members)]
+    usual = _usual_step([step for step in steps if step is not None])
+    trips: list[list[int]] = [[0]]
+    for number, step in enumerate(steps, start=1):
+        before, after = members[number - 1], members[number]
+        if step is None:
+            follows = _next_number(before[0], after[0])
+        elif step > _MAX_SEGMENT and duration is None:
+            follows = False
+        elif usual is not None and abs(step - usual) <= _TOLERANCE:
+            follows = True
+        elif usual is not None and step > usual:
+            follows = False
+        else:  # a shorter segment may be the last one of its trip
+            follows = duration is not None and abs(step - duration(before[1])) <= _TOLERANCE
+        if follows:
+            trips[-1].append(number)
+        else:
+            trips.append([number])
+    return [
+        Trip(tuple(members[row][1] for row in rows), members[rows[0]][0].camera, members[rows[0]][0].start)
+        for rows in trips
+    ]
+
+
+def _step(before: _Segment, after: _Segment) -> float | None:
+    """Seconds between the starts of two segments, if known."""
+    if before.start is None or after.start is None:
+        return None
+    return (after.start - before.start).total_seconds()
+
+
+def _usual_step(steps: Sequence[float]) -> float | None:
+    """Length of the camera's segments, if two steps agree on it: the most frequent step between starts."""
+    counts = Counter(round(step) for step in steps if 0 < step <= _MAX_SEGMENT)
+    agreeing = {
+        step: sum(counts[step + offset] for offset in (-1, 0, 1)) * 10 + count
+        for step, count in counts.items()
+    }
+    best = max(agreeing, key=lambda step: (agreeing[step], step), default=None)
+    return float(best) if best is not None and agreeing[best] >= 20 else None
+
+
+def _next_number(before: _Segment, after: _Segment) -> bool:
+    return before.number is not None and after.number == before.number + 1
