@@ -27,7 +27,7 @@ LAYERS = [
     "evaluation drawing privacy classifier sklearn_models",
     "windows search mixture training function_model events",
     "confidence course detector mixture_training report",
-    "tuning explorer explanation stream",
+    "tuning explorer explanation stream batch",
     "plotting",
     "cli",
 ]
@@ -44,6 +44,7 @@ UNSAFE = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marsh
 # Public names without an example in their docstring, and why.
 WITHOUT_EXAMPLE = {
     "Event": "a result of find_events",
+    "open_dask": "starts or needs a cluster",
     "FrameSource": "see open_source",
     "TrackedFrame": "a result of track",
     "Trip": "a result of find_trips",

@@ -1,4 +1,5 @@
 from . import course, plotting
+from .batch import BatchReport, BatchStatus, batch_status, open_dask, run_batch
 from .boxes import Detections, clip_boxes, iou_matrix, non_max_suppression
 from .camera import Camera, HorizonEstimate, estimate_horizon, read_camera, write_camera
 from .classifier import VehicleClassifier, load_classifier, train_classifier
@@ -111,6 +112,8 @@ from .windows import search_windows, slide_window
 
 __version__: str
 __all__ = [
+    "BatchReport",
+    "BatchStatus",
     "Camera",
     "DatasetError",
     "DetectionScores",
@@ -163,6 +166,7 @@ __all__ = [
     "VideoReport",
     "add_heat",
     "apply_threshold",
+    "batch_status",
     "bin_spatial",
     "blur_boxes",
     "bounding_boxes",
@@ -205,6 +209,7 @@ __all__ = [
     "load_training_patches",
     "mine_negatives",
     "non_max_suppression",
+    "open_dask",
     "open_source",
     "pareto_front",
     "plotting",
@@ -219,6 +224,7 @@ __all__ = [
     "render_drive",
     "render_patches",
     "render_scene",
+    "run_batch",
     "search_parameters",
     "search_windows",
     "single_img_features",

@@ -36,7 +36,7 @@ from vehicle_detection.params import DrawParams
 from vehicle_detection.synthetic import SceneVehicle, render_drive, render_patches, render_scene
 from vehicle_detection.video import probe_video, read_frames
 
-COMMANDS = ("demo", "detect", "video", "evaluate", "train", "train-frames", "tune", "fetch", "info")
+COMMANDS = ("demo", "detect", "video", "batch", "evaluate", "train", "train-frames", "tune", "fetch", "info")
 HEADER = "frame,track_id,x1,y1,x2,y2,score"
 
 

@@ -17,6 +17,7 @@ from typer import Argument, Option
 from typer.core import TyperArgument, TyperGroup
 
 from vehicle_detection import __version__
+from vehicle_detection.cli.batch import batch
 from vehicle_detection.cli.output import (
     capture_stderr,
     check_distinct_paths,
@@ -334,7 +335,7 @@ def video(
         str,
         Argument(
             metavar="SOURCE",
-            help="Video file; folder or quoted pattern of segments or images; URL; camera (0); or -.",
+            help="Video file; folder or quoted pattern of a trip's segments, or images; URL; camera; or -.",
         ),
     ],
     output: Annotated[
@@ -592,5 +593,5 @@ def evaluate(
             part.write_text(dumps(plain, indent=2) + "\n", encoding="utf-8")
 
 
-for _command in (train, train_frames, tune, fetch, info):
+for _command in (batch, train, train_frames, tune, fetch, info):
     app.command()(_command)

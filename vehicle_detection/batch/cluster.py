@@ -1,0 +1,62 @@
+"""A Dask cluster as the executor of a batch."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from concurrent.futures import Executor
+
+from vehicle_detection._common import available_cores
+from vehicle_detection.batch.workers import worker_environment
+from vehicle_detection.errors import InvalidInputError
+
+# Dask blames a lost worker on all its tasks; its default of 3 would fail innocent trips.
+_ALLOWED_FAILURES = 20
+
+
+@contextlib.contextmanager
+def open_dask(address: str, jobs: int | None = None) -> Iterator[tuple[Executor, str]]:
+    """Connect to a Dask scheduler, or start one with `jobs` worker processes of one thread for ``"local"``.
+
+    Yields the executor for `run_batch`, and the address of the dashboard.
+
+    Raises
+    ------
+    InvalidInputError
+        If distributed is missing, or the scheduler does not answer.
+    """
+    try:
+        import dask
+        import distributed
+    except ImportError:
+        raise InvalidInputError(
+            "dask needs dask[distributed]; pip install 'vehicle-detection[batch]', or omit it"
+        ) from None
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(
+            dask.config.set(
+                {
+                    "distributed.scheduler.allowed-failures": _ALLOWED_FAILURES,
+                    "distributed.scheduler.worker-saturation": 1.0,
+                }
+            )
+        )
+        target = address
+        if address == "local":
+            target = stack.enter_context(
+                distributed.LocalCluster(
+                    n_workers=jobs or available_cores(),
+                    threads_per_worker=1,
+                    processes=True,
+                    dashboard_address=":0",
+                    env=worker_environment(),
+                )
+            )
+        try:
+            client = stack.enter_context(distributed.Client(target, timeout=20))
+        except (OSError, ValueError) as error:
+            raise InvalidInputError(
+                f"dask must be local or the address of a scheduler such as tcp://host:8786, got {address!r}; "
+                f"{error}"
+            ) from None
+        yield client.get_executor(pure=False), client.dashboard_link

@@ -1,0 +1,151 @@
+"""The trips of a batch: sources expanded to files, grouped into trips, each with a key."""
+
+from __future__ import annotations
+
+import datetime
+import glob
+import hashlib
+import json
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from vehicle_detection import __version__
+from vehicle_detection._common import describe
+from vehicle_detection.errors import InvalidInputError, VideoError
+from vehicle_detection.video import Trip, find_trips, is_video_file, open_filesystem, probe_video
+
+_URL = re.compile(r"^[a-zA-Z][a-zA-Z0-9+.-]+://")
+_ID_DIGITS = _HASH_DIGITS = 12
+
+
+def list_videos(sources: Iterable[str | os.PathLike[str]]) -> list[str]:
+    """Expand files, folders, patterns and URLs to absolute paths and URLs, sorted, each once."""
+    found: set[str] = set()
+    for source in sources:
+        if not isinstance(source, (str, os.PathLike)):
+            raise InvalidInputError(
+                f"sources must be files, folders, patterns or URLs, got {describe(source)}; pass strings"
+            )
+        text = os.fspath(source)
+        files = list(_list_remote(text) if _URL.match(text) else _list_local(Path(text)))
+        if not files:
+            raise InvalidInputError(f"sources: {text} holds no videos; check the path")
+        found.update(files)
+    return sorted(found)
+
+
+def _list_local(path: Path) -> Iterator[str]:
+    if path.is_dir():
+        files: Iterable[Path] = (each for each in path.rglob("*") if is_video_file(each))
+    elif path.exists():
+        files = [path]
+    elif glob.has_magic(str(path)):
+        files = (Path(each) for each in glob.iglob(str(path), recursive=True))
+        files = (each for each in files if is_video_file(each))
+    else:
+        raise InvalidInputError(f"sources: {path} does not exist; check the path")
+    return (os.path.abspath(each) for each in files if each.is_file())
+
+
+def _list_remote(url: str) -> Iterator[str]:
+    if url.startswith(("http://", "https://")):
+        yield url
+        return
+    filesystem, path = open_filesystem(url)
+    try:
+        if glob.has_magic(path):
+            names = [name for name in filesystem.glob(path) if is_video_file(name)]
+        elif filesystem.isdir(path):
+            names = [name for name in filesystem.find(path) if is_video_file(name)]
+        else:
+            names = [path]
+    except OSError as error:
+        raise VideoError(f"{url} cannot be listed ({error}); check the connection") from error
+    for name in names:
+        yield str(filesystem.unstrip_protocol(name))
+
+
+def group_files(files: Sequence[str], group: str) -> list[Trip]:
+    """Group files into trips, or make each file a trip."""
+    if group == "file":
+        return [trip for file in files for trip in find_trips([file])]
+    return find_trips(files, duration=_duration)
+
+
+def _duration(file: Path | str) -> float:
+    """Length of a local video in seconds; 0 if it is unknown, so that a new trip begins after it."""
+    try:
+        return 0.0 if _URL.match(str(file)) else probe_video(file).duration
+    except (InvalidInputError, VideoError):  # reported when its trip is processed
+        return 0.0
+
+
+def trip_id(trip: Trip) -> str:
+    """Identity of a trip for any contents and parameters: that of its first file."""
+    return source_id(str(trip.files[0]))
+
+
+def source_id(uri: str) -> str:
+    """Identity of a file: a hash of its path or URL."""
+    return hashlib.sha256(uri.encode("utf-8", "surrogateescape")).hexdigest()[:_ID_DIGITS]
+
+
+def plan_trip(trip: Trip, settings: Mapping[str, Any], fingerprint: str) -> dict[str, Any]:
+    """Describe the work on a trip as plain values, for a worker on any machine.
+
+    Its ``key`` is the trip's identity and a hash of everything that the results depend on.
+    """
+    sources = [_identify(str(file)) for file in trip.files]
+    facts = [sources, dict(settings), fingerprint, __version__]
+    digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:_HASH_DIGITS]
+    return {
+        "key": f"{trip_id(trip)}-{digest}",
+        "sources": sources,
+        "camera": trip.camera,
+        "date": _date(trip, sources[0]),
+        "start": None if trip.start is None else trip.start.isoformat(),
+        "settings": dict(settings),
+    }
+
+
+def _identify(uri: str) -> dict[str, Any]:
+    """Path or URL of a file, its size, and its modification time or entity tag."""
+    if uri.startswith(("http://", "https://")):
+        return {"uri": uri, **_identify_http(uri)}
+    try:
+        if _URL.match(uri):
+            filesystem, path = open_filesystem(uri)
+            info = filesystem.info(path)
+            names = ("ETag", "etag", "md5Hash", "mtime", "LastModified", "last_modified", "created")
+            tag = next((str(info[name]) for name in names if info.get(name)), "")
+            return {"uri": uri, "size": info.get("size"), "tag": tag}
+        stat = os.stat(uri)
+    except OSError:  # reported when its trip is processed
+        return {"uri": uri, "size": None, "tag": ""}
+    return {"uri": uri, "size": stat.st_size, "tag": str(stat.st_mtime_ns)}
+
+
+def _identify_http(url: str) -> dict[str, Any]:
+    import requests
+
+    try:
+        headers = requests.head(url, timeout=10, allow_redirects=True).headers
+    except requests.RequestException:
+        return {"size": None, "tag": ""}
+    return {
+        "size": headers.get("Content-Length"),
+        "tag": headers.get("ETag") or headers.get("Last-Modified") or "",
+    }
+
+
+def _date(trip: Trip, source: Mapping[str, Any]) -> str:
+    """Day of a trip by its name, else that of its file's modification time (UTC)."""
+    if trip.start is not None:
+        return trip.start.date().isoformat()
+    tag = source["tag"]
+    if tag.isdecimal():
+        return datetime.datetime.fromtimestamp(int(tag) / 1e9, datetime.UTC).date().isoformat()
+    return "unknown"

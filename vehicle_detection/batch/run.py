@@ -1,0 +1,341 @@
+"""`run_batch`: process many trips in parallel, and do only what is missing or has changed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from dataclasses import dataclass
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any
+
+from vehicle_detection._common import (
+    available_cores,
+    check_choice,
+    check_integer,
+    describe,
+    progress_bar,
+)
+from vehicle_detection.batch.plan import group_files, list_videos, plan_trip, source_id, trip_id
+from vehicle_detection.batch.records import DONE, ERROR, FAILED, is_complete, read_record, write_record
+from vehicle_detection.batch.trip import BUSY, earlier_keys, run_trip, warm_up
+from vehicle_detection.batch.workers import WorkerPool
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.mixture import load_model
+
+# Attempts at a trip whose worker is lost.
+_ATTEMPTS = 3
+# Seconds between looks at a trip that another run is working on.
+_BUSY_INTERVAL = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchReport:
+    """What a run of `run_batch` did.
+
+    Attributes
+    ----------
+    trips
+        Number of trips of the sources (of this shard).
+    done, failed, errors
+        Number of trips that this run processed, whose source cannot be processed, and that the next run
+        repeats.
+    skipped
+        Number of trips that an earlier or another run completed or found to have failed.
+    frames
+        Number of frames that this run processed.
+    seconds
+        Elapsed time.
+    messages
+        Message of each failed trip and each error of this run, by its first source.
+
+    Examples
+    --------
+    >>> print(
+    ...     BatchReport(trips=4, done=2, failed=1, errors=0, skipped=1, frames=300, seconds=6.0, messages={})
+    ... )
+    4 trips: 2 done, 1 failed, 0 errors, 1 skipped; 300 frames in 6.0 s, 50.0 frames/s
+    """
+
+    trips: int
+    done: int
+    failed: int
+    errors: int
+    skipped: int
+    frames: int
+    seconds: float
+    messages: Mapping[str, str]
+
+    def __str__(self) -> str:
+        rate = self.frames / self.seconds if self.seconds else 0.0
+        return (
+            f"{self.trips} trips: {self.done} done, {self.failed} failed, {self.errors} errors, "
+            f"{self.skipped} skipped; {self.frames} frames in {self.seconds:.1f} s, {rate:.1f} frames/s"
+        )
+
+
+def run_batch(
+    sources: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    out: str | os.PathLike[str],
+    executor: Executor | None = None,
+    *,
+    model: str | os.PathLike[str] = "default",
+    options: Mapping[str, Any] | None = None,
+    jobs: int | None = None,
+    shard: str | None = None,
+    group: str = "trip",
+    tracks_only: bool = False,
+    audio: bool = True,
+    preset: str = "veryfast",
+    retry_failed: bool = False,
+    progress: bool = True,
+    on_record: Callable[[Mapping[str, Any]], object] | None = None,
+) -> BatchReport:
+    """Track the vehicles of many videos in parallel; a second run does what is missing or changed.
+
+    The folder `out` gets, for each trip, ``tracks/date=D/camera=C/KEY.parquet``, the annotated video
+    ``videos/date=D/camera=C/KEY.mp4``, and ``records/KEY.json``, which is written last. KEY depends on the
+    trip's files (path or URL, size, modification time or entity tag), the model, the parameters and the
+    version of the library. If one of them changes, the new results replace the old ones.
+
+    Parameters
+    ----------
+    sources
+        Video files, folders, patterns and URLs. Consecutive segments are one trip, see `find_trips`.
+    out
+        Folder to write. Several runs, also on several machines, may use one folder at the same time.
+    executor
+        A ``concurrent.futures`` executor, such as ``distributed.Client(...).get_executor(pure=False)``,
+        whose workers see the same files. None: worker processes of this machine.
+    model
+        A model's name or file.
+    options
+        Further arguments of `VehicleDetector` as JSON values, such as ``{"horizon": 0.55, "every": 2}``.
+    jobs
+        Number of worker processes with one thread each; None: one per core.
+    shard
+        ``"3/200"``: process the third of 200 parts, which depend on nothing but the paths.
+    group
+        ``"trip"`` or ``"file"``: make consecutive segments one trip, or each file.
+    tracks_only
+        Write no videos.
+    audio, preset
+        As in `process_video`.
+    retry_failed
+        Also process trips again whose source could not be processed.
+    progress
+        Show a progress bar if standard error is a terminal.
+    on_record
+        Function that is called with the record of each trip when it is finished.
+
+    Returns
+    -------
+    BatchReport
+        Numbers of trips. A bad source, a lost worker and a full disk are counted, not raised.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is invalid, or a source does not exist.
+
+    Examples
+    --------
+    >>> report = run_batch("card", "results", jobs=2)  # doctest: +SKIP
+    >>> tracks = pandas.read_parquet("results/tracks")  # doctest: +SKIP
+    """
+    started = time.perf_counter()
+    check_choice(group, "group", ("trip", "file"))
+    part = _parse_shard(shard)
+    workers = available_cores() if jobs is None else check_integer(jobs, "jobs", low=1, high=1024)
+    settings = _settings(model, options, tracks_only=tracks_only, audio=audio, preset=preset)
+    load_model(settings["model"])  # an error now, not in every worker
+    folder = _make_folder(out)
+    given = [sources] if isinstance(sources, (str, os.PathLike)) else sources
+    tasks = _plan(given, folder, settings, group, part)
+    pending, skipped = [], 0
+    for task in tasks:
+        record = read_record(folder, task["key"])
+        again = retry_failed and record is not None and record["status"] == FAILED
+        if is_complete(folder, record) and not again:
+            skipped += 1
+        else:
+            pending.append({**task, "again": again})
+    own = None
+    if executor is None and pending:
+        executor = own = WorkerPool(
+            min(workers, len(pending)), (warm_up, (settings["model"], settings["options"]))
+        )
+    counts = {DONE: 0, FAILED: 0, ERROR: 0}
+    frames = 0
+    messages: dict[str, str] = {}
+    try:
+        with progress_bar(progress, len(pending), unit="trip", terminal_only=True) as bar:
+            for made in _run(executor, pending, folder):
+                bar.update()
+                if not made["new"]:
+                    skipped += 1
+                    continue
+                counts[made["status"]] += 1
+                frames += made.get("frames", 0)
+                if made["status"] != DONE:
+                    messages[made["sources"][0]["uri"]] = made["message"]
+                if on_record is not None:
+                    on_record(made)
+    except BaseException:
+        if own is not None:
+            own.shutdown(cancel_futures=True)
+        raise
+    if own is not None:
+        own.shutdown()
+    return BatchReport(
+        trips=len(tasks),
+        done=counts[DONE],
+        failed=counts[FAILED],
+        errors=counts[ERROR],
+        skipped=skipped,
+        frames=frames,
+        seconds=time.perf_counter() - started,
+        messages=messages,
+    )
+
+
+def _parse_shard(shard: str | None) -> tuple[int, int]:
+    if shard is None:
+        return 1, 1
+    found = re.fullmatch(r"(\d+)/(\d+)", shard) if shard else None
+    if found is None or not 1 <= int(found[1]) <= int(found[2]):
+        raise InvalidInputError(
+            f"shard must be a number and a count, such as 3/200 for the third of 200; got {describe(shard)}"
+        )
+    return int(found[1]), int(found[2])
+
+
+def _settings(model: object, options: Mapping[str, Any] | None, **others: Any) -> dict[str, Any]:
+    """Parameters that the results depend on, as plain values."""
+    if not isinstance(model, (str, os.PathLike)):
+        raise InvalidInputError(
+            f"model must be a name or the path of a file that workers can load, got {describe(model)}; save "
+            "the model to a file"
+        )
+    name = os.fspath(model)
+    if not _shipped(name).is_file() and Path(name).exists():
+        name = os.path.abspath(name)
+    settings = {"model": name, "options": dict(options or {}), **others}
+    try:
+        json.dumps(settings)
+    except TypeError as error:
+        raise InvalidInputError(
+            f"options must hold numbers, strings, lists and None, got {describe(options)}; {error}"
+        ) from None
+    return settings
+
+
+def _shipped(model: str) -> Traversable:
+    """File of a shipped model, if `model` is its name."""
+    return resources.files("vehicle_detection") / "models" / f"{model}.safetensors"
+
+
+def _fingerprint(model: str) -> str:
+    """Hash of a model's file."""
+    shipped = _shipped(model)
+    data = shipped.read_bytes() if shipped.is_file() else Path(model).read_bytes()
+    return hashlib.sha256(data).hexdigest()
+
+
+def _make_folder(out: str | os.PathLike[str]) -> Path:
+    if not isinstance(out, (str, os.PathLike)):
+        raise InvalidInputError(f"out must be a folder, got {describe(out)}; pass its path")
+    if "://" in os.fspath(out):
+        raise InvalidInputError(f"out must be a folder, got the URL {out}; mount the storage, or copy later")
+    folder = Path(os.path.abspath(out))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInputError(
+            f"out must be a folder, {folder} cannot be created: {error.strerror}; choose another"
+        ) from error
+    return folder
+
+
+def _plan(
+    sources: Iterable[str | os.PathLike[str]],
+    out: Path,
+    settings: Mapping[str, Any],
+    group: str,
+    part: tuple[int, int],
+) -> list[dict[str, Any]]:
+    """Describe the work on each trip of this shard."""
+    files = [each for each in list_videos(sources) if not Path(each).is_relative_to(out)]
+    trips = group_files(files, group)
+    fingerprint = _fingerprint(settings["model"])
+    earlier = earlier_keys(out)
+    number, count = part
+    tasks = []
+    for trip in trips:
+        if int(trip_id(trip), 16) % count != number - 1:
+            continue
+        task = plan_trip(trip, settings, fingerprint) | {"out": str(out)}
+        # A trip replaces the earlier ones that began with one of its files.
+        ids = (source_id(str(file)) for file in trip.files)
+        task["replaces"] = [key for each in ids for key in earlier.get(each, ()) if key != task["key"]]
+        tasks.append(task)
+    return tasks
+
+
+def _run(
+    executor: Executor | None, pending: Iterable[dict[str, Any]], out: Path
+) -> Iterator[Mapping[str, Any]]:
+    """Yield the record of each trip."""
+    attempts: dict[str, int] = {}
+    running: dict[Future[Any], dict[str, Any]] = {}
+    busy: list[dict[str, Any]] = []
+
+    def submit(task: dict[str, Any]) -> None:
+        assert executor is not None
+        running[executor.submit(run_trip, task)] = task
+
+    for task in pending:
+        submit(task)
+    while running or busy:
+        if not running:  # only trips that other runs are working on are left
+            time.sleep(_BUSY_INTERVAL)
+            for task in busy:
+                submit(task)
+            busy = []
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            task = running.pop(future)
+            try:
+                record = future.result()
+            except BrokenExecutor:  # all other calls fail as well
+                raise
+            except Exception as error:
+                attempts[task["key"]] = attempts.get(task["key"], 0) + 1
+                if attempts[task["key"]] < _ATTEMPTS:
+                    submit(task)
+                    continue
+                record = _lost_record(task, error, out)
+            if record["status"] == BUSY:
+                busy.append(task)
+                continue
+            yield record
+
+
+def _lost_record(task: Mapping[str, Any], error: Exception, out: Path) -> dict[str, Any]:
+    """Record a trip that has ended its worker in every attempt."""
+    record = {
+        **{name: task[name] for name in ("key", "sources", "camera", "date", "start", "settings")},
+        "status": ERROR,
+        "message": f"{error}, {_ATTEMPTS} times",
+        "started": time.time(),
+    }
+    try:
+        write_record(out, record)
+    except OSError as full:
+        record["message"] += f"; {full}"
+    return record | {"new": True}

@@ -1,0 +1,62 @@
+"""The program of a worker process: calls functions that arrive as JSON lines, until its input ends."""
+
+from __future__ import annotations
+
+import _thread
+import importlib
+import json
+import os
+import queue
+import signal
+import sys
+import threading
+from typing import Any
+
+# Seconds that the current call has to clean up after the parent process has ended.
+_GRACE = 15.0
+
+
+def main() -> None:
+    """Answer each line ``{"call": "module:function", "args": [...]}`` with a line of JSON."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # whatever a library prints must not be taken for an answer
+    calls: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+    idle = threading.Event()
+    idle.set()
+    threading.Thread(target=_receive, args=(calls, idle), daemon=True).start()
+    try:
+        while (line := calls.get()) is not None:
+            answers.write(json.dumps(_call(json.loads(line))) + "\n")
+            answers.flush()
+            if calls.empty():
+                idle.set()
+    except (KeyboardInterrupt, BrokenPipeError):
+        os._exit(1)
+
+
+def _receive(calls: queue.SimpleQueue[str | None], idle: threading.Event) -> None:
+    """Queue the calls; interrupt the current one if the parent process is gone."""
+    for line in sys.stdin:
+        idle.clear()
+        calls.put(line)
+    calls.put(None)
+    if not idle.is_set():
+        if hasattr(signal, "pthread_kill"):
+            signal.pthread_kill(int(threading.main_thread().ident or 0), signal.SIGINT)
+        else:
+            _thread.interrupt_main()
+        threading.Timer(_GRACE, os._exit, (1,)).start()
+
+
+def _call(message: dict[str, Any]) -> dict[str, Any]:
+    module, name = message["call"].split(":")
+    try:
+        function = getattr(importlib.import_module(module), name)
+        return {"result": function(*message["args"])}
+    except Exception as error:
+        return {"error": f"{type(error).__name__}: {error}"}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,168 @@
+"""An executor of worker processes, one call at a time each, that survives the death of a worker.
+
+With ``ProcessPoolExecutor``, one killed process breaks the pool.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import getpass
+import json
+import os
+import queue
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from pathlib import Path
+from typing import Any
+
+from vehicle_detection._common import JOBS_VARIABLE
+
+
+class WorkerLost(Exception):  # noqa: N818 - named after what happened, as BrokenExecutor is
+    """The process of a call has ended before its result."""
+
+
+def worker_environment() -> dict[str, str]:
+    """Environment of a worker: one thread, and a kernel cache on a local disk.
+
+    A cache on shared storage is corrupted by processes of several machines.
+    """
+    threads = dict.fromkeys((JOBS_VARIABLE, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    with contextlib.suppress(OSError, KeyError):
+        user = getpass.getuser()
+        cache = Path(tempfile.gettempdir()) / f"vehicle-detection-kernels-{user}"
+        threads["NUMBA_CACHE_DIR"] = os.environ.get("NUMBA_CACHE_DIR", str(cache))
+    return threads
+
+
+class WorkerPool(Executor):
+    """Executor of `workers` processes. Functions are module-level ones, arguments and results JSON values.
+
+    `initializer` is called first in each process; the first process completes it before the others start,
+    so that they find compiled kernels.
+    """
+
+    def __init__(self, workers: int, initializer: tuple[Callable[..., Any], tuple[Any, ...]]) -> None:
+        self._calls: queue.SimpleQueue[tuple[Future[Any], str] | None] = queue.SimpleQueue()
+        self._initializer = _message(*initializer)
+        self._first_start = threading.Lock()
+        self._lock = threading.Lock()
+        self._stopped = False
+        self._processes: set[subprocess.Popen[str]] = set()
+        self._threads = [
+            threading.Thread(target=self._serve, name="vehicle-worker", daemon=True) for _ in range(workers)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Call a function in a worker process; `WorkerLost` if that ends before its result."""
+        assert not kwargs, "keyword arguments are not sent"
+        future: Future[Any] = Future()
+        self._calls.put((future, _message(fn, args)))
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the workers; with `cancel_futures` at once, interrupting their calls."""
+        if cancel_futures:
+            with self._lock:
+                self._stopped = True
+                for process in self._processes:
+                    with contextlib.suppress(OSError):
+                        assert process.stdin is not None
+                        process.stdin.close()
+            with contextlib.suppress(queue.Empty):
+                while item := self._calls.get_nowait():
+                    item[0].cancel()
+        for _ in self._threads:
+            self._calls.put(None)
+        if wait:
+            for thread in self._threads:
+                thread.join()
+
+    def _serve(self) -> None:
+        """Pass calls to one process, which is started again after its death."""
+        process: subprocess.Popen[str] | None = None
+        try:
+            while (item := self._calls.get()) is not None:
+                future, message = item
+                if not future.set_running_or_notify_cancel():
+                    continue
+                try:
+                    if process is None:
+                        process = self._start()
+                    answer = _ask(process, message)
+                except BaseException as error:
+                    self._end(process)
+                    process = None
+                    future.set_exception(error)
+                    continue
+                if "error" in answer:
+                    future.set_exception(RuntimeError(answer["error"]))
+                else:
+                    future.set_result(answer["result"])
+        finally:
+            self._end(process)
+
+    def _start(self) -> subprocess.Popen[str]:
+        group: dict[str, Any] = {
+            "process_group": 0
+        }  # Ctrl-C reaches this process only, which ends the workers
+        if sys.platform == "win32":
+            group = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+        with self._first_start:
+            with self._lock:
+                if self._stopped:
+                    raise WorkerLost("the batch has been stopped")
+                process = subprocess.Popen(
+                    [sys.executable, "-m", "vehicle_detection.batch.worker"],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    text=True,
+                    encoding="utf-8",
+                    env={**os.environ, **worker_environment()},
+                    **group,
+                )
+                self._processes.add(process)
+            answer = _ask(process, self._initializer)
+        if "error" in answer:
+            self._end(process)
+            raise RuntimeError(answer["error"])
+        return process
+
+    def _end(self, process: subprocess.Popen[str] | None) -> None:
+        if process is None:
+            return
+        with contextlib.suppress(OSError):
+            assert process.stdin is not None
+            process.stdin.close()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+        with self._lock:
+            self._processes.discard(process)
+
+
+def _message(function: Callable[..., Any], args: tuple[Any, ...]) -> str:
+    return json.dumps({"call": f"{function.__module__}:{function.__name__}", "args": args}) + "\n"
+
+
+def _ask(process: subprocess.Popen[str], message: str) -> dict[str, Any]:
+    """Send a call and wait for its answer."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    line = ""
+    with contextlib.suppress(OSError, ValueError):
+        process.stdin.write(message)
+        process.stdin.flush()
+        line = process.stdout.readline()
+    if not line.endswith("\n"):
+        code = process.wait()
+        reason = f"signal {-code}" if code < 0 else f"exit code {code}"
+        raise WorkerLost(f"the worker process ended ({reason})")
+    answer: dict[str, Any] = json.loads(line)
+    return answer

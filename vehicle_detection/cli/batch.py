@@ -1,0 +1,92 @@
+"""The command that processes many trips."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer import Argument, Option
+
+from vehicle_detection.cli.output import option_names, print_error
+from vehicle_detection.errors import InvalidInputError
+
+
+@option_names(out="--output", retry_failed="--retry-failed")
+def batch(
+    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder of the results.")],
+    sources: Annotated[
+        list[str] | None,
+        Argument(metavar="SOURCES...", help="Video files, folders, quoted patterns and URLs (s3://...)."),
+    ] = None,
+    model: Annotated[
+        str, Option(metavar="NAME|FILE", help='"default" (any road), "highway" (fastest), or a model file.')
+    ] = "default",
+    jobs: Annotated[
+        int | None, Option(metavar="N", help="Worker processes of one thread; default: one per core.")
+    ] = None,
+    shard: Annotated[
+        str | None, Option(metavar="I/N", help="Process the I-th of N parts, for job arrays; I from 1.")
+    ] = None,
+    dask: Annotated[
+        str | None, Option(metavar="ADDRESS|local", help="Use a Dask cluster, or start one here.")
+    ] = None,
+    group: Annotated[
+        str, Option(metavar="trip|file", help="Make consecutive segments one trip, or each file.")
+    ] = "trip",
+    tracks_only: Annotated[bool, Option("--tracks-only", help="Write no videos.")] = False,
+    horizon: Annotated[
+        float | None, Option(metavar="F", help="Height of the horizon as a fraction of the frame's height.")
+    ] = None,
+    every: Annotated[
+        int | None,
+        Option(metavar="N", help="Search every N-th frame, interpolate between; default: 12 a second."),
+    ] = None,
+    preset: Annotated[str, Option(metavar="P", help="Encoder speed, ultrafast to placebo.")] = "veryfast",
+    no_audio: Annotated[bool, Option("--no-audio", help="Write no sound.")] = False,
+    retry_failed: Annotated[
+        bool, Option("--retry-failed", help="Process trips again whose source could not be processed.")
+    ] = False,
+    status: Annotated[bool, Option("--status", help="Only show what has been done in DIR.")] = False,
+    quiet: Annotated[bool, Option("-q", "--quiet", help="Print errors only.")] = False,
+) -> None:
+    """Track the vehicles of many videos in parallel; run again to do what is missing or changed."""
+    if status:
+        from vehicle_detection.batch import batch_status
+
+        typer.echo(str(batch_status(output)))
+        return
+    if not sources:
+        raise InvalidInputError("SOURCES... must name at least one video, folder, pattern or URL")
+    from vehicle_detection.batch import open_dask, run_batch
+
+    options: dict[str, Any] = {"horizon": horizon, "every": every}
+    with contextlib.ExitStack() as stack:
+        executor = None
+        if dask is not None:
+            executor, dashboard = stack.enter_context(open_dask(dask, jobs))
+            if not quiet:
+                typer.echo(f"dashboard {dashboard}")
+        done = run_batch(
+            sources,
+            output,
+            executor,
+            model=model,
+            options={name: value for name, value in options.items() if value is not None},
+            jobs=jobs,
+            shard=shard,
+            group=group,
+            tracks_only=tracks_only,
+            audio=not no_audio,
+            preset=preset,
+            retry_failed=retry_failed,
+            progress=not quiet,
+        )
+    for source, message in done.messages.items():
+        print_error(f"warning: {source}: {message}")
+    if not quiet:
+        typer.echo(str(done))
+        typer.echo(f"wrote {output}")
+    if done.errors:  # the machine's fault: a job that is started again does the rest
+        raise typer.Exit(1)
