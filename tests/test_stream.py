@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.helpers import random_mixture
-from tests.video.clips import child_processes, running_threads
+from tests.video.clips import child_processes, ffmpeg, running_threads
 from vehicle_detection import TrackWriter, VehicleDetector, process_video, track
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.errors import InvalidInputError, VideoError
@@ -58,6 +58,18 @@ def test_the_frames_are_those_of_process_video(clip, detector, tmp_path):
             np.testing.assert_array_equal(result.frame, frame)
             np.testing.assert_array_equal(result.picture, detector.annotate(frame, result.result))
     assert found[0].picture is found[0].picture
+
+
+def test_identities_carry_over_from_segment_to_segment(clip, detector, tmp_path):
+    whole, card = tmp_path / "whole.mp4", tmp_path / "card"
+    card.mkdir()
+    ffmpeg("-i", clip, "-g", 4, "-bf", 0, "-video_track_timescale", 12800, whole)
+    split = ["-f", "segment", "-segment_time", "0.16", "-reset_timestamps", 1]
+    ffmpeg("-i", whole, "-c", "copy", *split, card / "GRMN%04d.mp4")
+    assert len(list(card.iterdir())) == 3
+    expected = boxes(track(whole, detector))
+    assert any(tracks for _, _, tracks in expected)
+    assert boxes(track(card, detector)) == expected
 
 
 @pytest.mark.parametrize("end", ["close", "delete", "break", "error", "unused"])

@@ -35,7 +35,14 @@ def test_the_camera_and_the_time_of_a_name(name, camera):
 
 
 @pytest.mark.parametrize(
-    ("name", "camera"), [("drive.mp4", "unknown"), ("front.mp4", "front"), ("20269931_081500.mp4", "unknown")]
+    ("name", "camera"),
+    [
+        ("drive.mp4", "unknown"),
+        ("drive b.mp4", "unknown"),
+        ("MOVI0001F.MP4", "front"),
+        ("front.mp4", "front"),
+        ("20269931_081500.mp4", "unknown"),
+    ],
 )
 def test_a_name_without_a_time(name, camera):
     (trip,) = find_trips([name])

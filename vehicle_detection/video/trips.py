@@ -153,7 +153,7 @@ def _parse_name(name: PurePosixPath) -> _Segment:
             start = None
         else:
             rest = stem[: found.start()] + " " + stem[found.end() :]
-    camera, rest = _take_camera(rest)
+    camera, rest = _take_camera(rest, codes=start is not None)
     if camera is None:
         camera = _folder_camera(name)
     numbers = re.findall(r"\d+", rest)
@@ -163,12 +163,16 @@ def _parse_name(name: PurePosixPath) -> _Segment:
     return _Segment(camera, start, series.strip(" _-.").lower(), number)
 
 
-def _take_camera(stem: str) -> tuple[str | None, str]:
-    """Find the camera's word in a name, the last one first, and return the name without it."""
+def _take_camera(stem: str, *, codes: bool) -> tuple[str | None, str]:
+    """Find the camera's word in a name, the last one first, and return the name without it.
+
+    One or two letters mean a camera at the end of a name only, with `codes` or after a digit.
+    """
     for word in reversed(list(re.finditer(r"[A-Za-z]+", stem))):
         camera = _CAMERA_WORDS.get(word[0].lower())
-        # A single letter means a camera at the end only.
-        if camera and (len(word[0]) >= 4 or not re.search(r"[A-Za-z0-9]", stem[word.end() :])):
+        at_end = not re.search(r"[A-Za-z0-9]", stem[word.end() :])
+        is_code = at_end and (codes or stem[word.start() - 1 : word.start()].isdecimal())
+        if camera and (len(word[0]) >= 4 or is_code):
             return camera, stem[: word.start()] + stem[word.end() :]
     return None, stem
 
