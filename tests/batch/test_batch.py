@@ -266,6 +266,30 @@ def test_remote_sources_are_listed():
     assert list_videos(["memory://fleet/day/*"]) == list_videos(["memory://fleet"]) == expected
 
 
+def test_storage_that_fails_every_other_request(clip, model, tmp_path, monkeypatch):
+    fsspec = pytest.importorskip("fsspec")
+    for name in "ab":
+        with fsspec.open(f"memory://unsteady/{name}.mp4", "wb") as file:
+            file.write(clip.read_bytes())
+    memory = type(fsspec.filesystem("memory"))
+    original, requests = memory.get_file, []
+
+    def get_file(*args, **kwargs):
+        requests.append(args)
+        if len(requests) % 2:
+            raise ConnectionResetError("connection reset by peer")
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr("vehicle_detection.video.sources._RETRY_DELAYS", (0, 0))
+    monkeypatch.setattr(memory, "get_file", get_file)
+    out = tmp_path / "out"
+    url = "memory://unsteady/*.mp4"
+    assert counts(run(url, out, model, tracks_only=True)) == (2, 0, 0, 0)
+    assert counts(run(url, out, model, tracks_only=True)) == (0, 0, 0, 2)
+    assert len(requests) == 4
+    check_whole(out, done=2, failed=0)
+
+
 def test_the_status_of_ten_thousand_trips(tmp_path):
     folder = tmp_path / "records"
     folder.mkdir()

@@ -1,5 +1,6 @@
 """Trips of dash-cam files, from their names."""
 
+import os
 from datetime import datetime
 from pathlib import Path
 
@@ -96,6 +97,29 @@ def test_numbers_without_times():
         ("unknown", ["GX010008.MP4"]),
     ]
     assert len(find_trips(["drive.mp4", "walk.mp4"])) == 2
+
+
+@pytest.mark.parametrize(
+    ("ends", "trips"),
+    [
+        ((0, 0.5, 1, 1.5, 2), [5]),  # copied without their times
+        ((0, 60, 120, 180, 200), [5]),  # the last one is short
+        ((0, 60, 120, 180, 3600), [4, 1]),
+        ((0, 60, 120, 170, 230), [3, 2]),  # 20 s long, 30 s later
+    ],
+)
+def test_numbers_with_modification_times(tmp_path, ends, trips):
+    files = [tmp_path / f"GRMN{number:04}.MP4" for number in range(5)]
+    for file, end in zip(files, ends, strict=True):
+        file.touch()
+        os.utime(file, (1.77e9 + end, 1.77e9 + end))
+    seconds = {files[3]: 20.0, files[4]: 20.0}
+    found = find_trips(files, duration=seconds.__getitem__)
+    assert [len(trip.files) for trip in found] == trips
+
+
+def test_other_numbers_do_not_make_a_trip():
+    assert len(find_trips(["drive1.mp4", "drive2.mp4", "drive3.mp4"])) == 3
 
 
 def test_paths_and_urls_keep_their_type():

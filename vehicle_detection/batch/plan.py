@@ -15,7 +15,14 @@ from typing import Any
 from vehicle_detection import __version__
 from vehicle_detection._common import describe
 from vehicle_detection.errors import InvalidInputError, VideoError
-from vehicle_detection.video import Trip, find_trips, is_video_file, open_filesystem, probe_video
+from vehicle_detection.video import (
+    Trip,
+    find_trips,
+    is_video_file,
+    open_filesystem,
+    probe_video,
+    with_retries,
+)
 
 _URL = re.compile(r"^[a-zA-Z][a-zA-Z0-9+.-]+://")
 _ID_DIGITS = _HASH_DIGITS = 12
@@ -57,9 +64,9 @@ def _list_remote(url: str) -> Iterator[str]:
     filesystem, path = open_filesystem(url)
     try:
         if glob.has_magic(path):
-            names = [name for name in filesystem.glob(path) if is_video_file(name)]
-        elif filesystem.isdir(path):
-            names = [name for name in filesystem.find(path) if is_video_file(name)]
+            names = [name for name in with_retries(lambda: filesystem.glob(path)) if is_video_file(name)]
+        elif with_retries(lambda: filesystem.isdir(path)):
+            names = [name for name in with_retries(lambda: filesystem.find(path)) if is_video_file(name)]
         else:
             names = [path]
     except OSError as error:
@@ -118,7 +125,7 @@ def _identify(uri: str) -> dict[str, Any]:
     try:
         if _URL.match(uri):
             filesystem, path = open_filesystem(uri)
-            info = filesystem.info(path)
+            info = with_retries(lambda: filesystem.info(path))
             names = ("ETag", "etag", "md5Hash", "mtime", "LastModified", "last_modified", "created")
             tag = next((str(info[name]) for name in names if info.get(name)), "")
             return {"uri": uri, "size": info.get("size"), "tag": tag}

@@ -12,6 +12,7 @@ from vehicle_detection.video.sources import (
     open_source,
     probe_video,
     read_frames,
+    with_retries,
 )
 from vehicle_detection.video.trips import UNKNOWN_CAMERA, Trip, find_trips, is_video_file
 
@@ -34,4 +35,5 @@ __all__ = [
     "probe_video",
     "process_video",
     "read_frames",
+    "with_retries",
 ]

@@ -10,11 +10,12 @@ import re
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,11 +28,15 @@ from vehicle_detection.video.live import LiveProcess, LiveReader
 from vehicle_detection.video.streams import AudioSource, FrameReader, Reader
 from vehicle_detection.video.trips import find_trips, is_video_file
 
+Result = TypeVar("Result")
+
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
 """Suffixes of the images that a folder is searched for."""
 
 _URL = re.compile(r"^([a-zA-Z][a-zA-Z0-9+.-]+)://")
 _STREAM_SCHEMES = ("rtsp", "rtsps", "rtmp", "rtmps", "udp", "rtp", "srt", "tcp")
+# Seconds before the second and the third attempt of a request.
+_RETRY_DELAYS = (0.2, 1.0)
 # Seconds without data after which a network source has ended.
 _NETWORK_TIMEOUT = 10
 _HTTP_OPTIONS = ("-rw_timeout", str(_NETWORK_TIMEOUT * 1_000_000))
@@ -439,7 +444,7 @@ def download(url: str, folder: Path) -> Path:
     path = folder / (url.rstrip("/").rpartition("/")[2] or "video")
     try:
         filesystem, remote = open_filesystem(url)
-        filesystem.get_file(remote, str(path))
+        with_retries(lambda: filesystem.get_file(remote, str(path)))
     except InvalidInputError:
         raise
     except FileNotFoundError:
@@ -447,6 +452,18 @@ def download(url: str, folder: Path) -> Path:
     except (OSError, ValueError) as error:
         raise VideoError(f"{url} cannot be copied ({error}); check the connection") from error
     return path
+
+
+def with_retries(request: Callable[[], Result]) -> Result:
+    """Call a function of remote storage again if it fails, up to three times in all."""
+    for delay in _RETRY_DELAYS:
+        try:
+            return request()
+        except FileNotFoundError:
+            raise
+        except OSError:
+            time.sleep(delay)
+    return request()
 
 
 def open_filesystem(url: str) -> tuple[Any, str]:

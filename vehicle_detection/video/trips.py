@@ -1,7 +1,8 @@
 """Groups the files of dash-cams, which write segments of one to ten minutes, into trips.
 
 A file name tells the camera and either the time of the first frame (``20260131_081500_F.MP4``,
-``2026-01-31_08-15-00-front.mp4``) or a running number (``GRMN0001.MP4``, ``GX010042.MP4``).
+``2026-01-31_08-15-00-front.mp4``) or a running number of four digits (``GRMN0001.MP4``, ``GX010042.MP4``).
+With a number, the modification times tell whether there is a gap, unless the files were copied without them.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
@@ -54,6 +55,7 @@ class _Segment:
     start: datetime | None
     series: str  # name without time, number and camera; numbers of one series follow each other
     number: int | None
+    end: float | None = None  # modification time, where the name has no time
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,8 @@ def find_trips(
     """Group files into trips, by their folders and names.
 
     A segment follows another one of the same folder and camera if it starts when the other ends, by the times
-    in the names, or has the next number. Front and rear cameras are different trips.
+    in the names; or if it has the next number of four digits, and the modification times leave no gap.
+    Front and rear cameras are different trips.
 
     Parameters
     ----------
@@ -121,6 +124,8 @@ def find_trips(
     for file in files:
         name = _posix(file)
         segment = _parse_name(name)
+        if segment.start is None and isinstance(file, Path):
+            segment = replace(segment, end=_modification_time(file))
         # Folders named after cameras are told apart by their path already.
         key = (str(name.parent), segment.camera, segment.series, segment.start is not None)
         groups[key].append((segment, file))
@@ -156,7 +161,7 @@ def _parse_name(name: PurePosixPath) -> _Segment:
     camera, rest = _take_camera(rest, codes=start is not None)
     if camera is None:
         camera = _folder_camera(name)
-    numbers = re.findall(r"\d+", rest)
+    numbers = re.findall(r"\d{4,}", rest)
     number = int(numbers[-1]) if numbers else None
     # With a time, the number that counts the files of a camera adds nothing.
     series = re.sub(r"\d+", "", rest) if start else re.sub(r"\d+(?=\D*$)", "#", rest)
@@ -191,11 +196,14 @@ def _split(
     """Split the sorted files of one camera where a segment does not follow the one before."""
     steps = [_step(before, after) for (before, _), (after, _) in itertools.pairwise(members)]
     usual = _usual_step([step for step in steps if step is not None])
+    by_number = members[0][0].start is None
     trips: list[list[int]] = [[0]]
     for number, step in enumerate(steps, start=1):
         before, after = members[number - 1], members[number]
-        if step is None:
-            follows = _next_number(before[0], after[0])
+        if by_number and not _next_number(before[0], after[0]):
+            follows = False
+        elif step is None or (by_number and abs(step) <= _TOLERANCE):  # copied without their times
+            follows = by_number
         elif step > _MAX_SEGMENT and duration is None:
             follows = False
         elif usual is not None and abs(step - usual) <= _TOLERANCE:
@@ -203,7 +211,8 @@ def _split(
         elif usual is not None and step > usual:
             follows = False
         else:  # a shorter segment may be the last one of its trip
-            follows = duration is not None and abs(step - duration(before[1])) <= _TOLERANCE
+            segment = after if by_number else before
+            follows = duration is not None and abs(step - duration(segment[1])) <= _TOLERANCE
         if follows:
             trips[-1].append(number)
         else:
@@ -215,10 +224,19 @@ def _split(
 
 
 def _step(before: _Segment, after: _Segment) -> float | None:
-    """Seconds between the starts of two segments, if known."""
-    if before.start is None or after.start is None:
+    """Seconds between the starts of two segments, or between their ends, if known."""
+    if before.start is not None and after.start is not None:
+        return (after.start - before.start).total_seconds()
+    if before.end is not None and after.end is not None:
+        return after.end - before.end
+    return None
+
+
+def _modification_time(file: Path) -> float | None:
+    try:
+        return file.stat().st_mtime
+    except OSError:
         return None
-    return (after.start - before.start).total_seconds()
 
 
 def _usual_step(steps: Sequence[float]) -> float | None:
