@@ -227,6 +227,21 @@ def test_the_segments_of_a_card_become_one_video(material, tmp_path):
     assert contents(tmp_path)[-2:] == ["t.csv", "trip.mp4"]
 
 
+def test_batch_refuses_bad_input_in_one_line(material, tmp_path):
+    out = tmp_path / "out"
+    for message, words in {
+        r"SOURCES\.\.\. must name at least one video": [],
+        r"SOURCES\.\.\. nothing does not exist; check the path": ["nothing"],
+        r"SOURCES\.\.\. \S+empty holds no videos": [material / "empty"],
+        r"--shard must be a number and a count, such as 3/200 .* got '9/3'": ["x", "--shard", "9/3"],
+        r"--group must be one of 'trip', 'file'": ["x", "--group", "day"],
+        r"--output \S+nothing is not a folder": ["--status", "-o", tmp_path / "nothing"],
+        r"model file nothing does not exist": ["x", "--model", "nothing"],
+    }.items():
+        assert re.search(message, refuse("batch", "-o", out, *words)), message
+    assert succeed("batch", "-o", tmp_path, "--status").startswith("0 trips done, 0 failed, 0 errors\n")
+
+
 def test_detect_writes_annotated_images_and_boxes(monkeypatch, picture, tmp_path):
     found = [
         Detections([[10, 20, 60.4, 70], [100, 50, 180, 120]], [1.5, 0.25], [0.82, 0.564]),

@@ -39,7 +39,7 @@ def list_videos(sources: Iterable[str | os.PathLike[str]]) -> list[str]:
         text = os.fspath(source)
         files = list(_list_remote(text) if _URL.match(text) else _list_local(Path(text)))
         if not files:
-            raise InvalidInputError(f"sources: {text} holds no videos; check the path")
+            raise InvalidInputError(f"sources {text} holds no videos; check the path")
         found.update(files)
     return sorted(found)
 
@@ -53,7 +53,7 @@ def _list_local(path: Path) -> Iterator[str]:
         files = (Path(each) for each in glob.iglob(str(path), recursive=True))
         files = (each for each in files if is_video_file(each))
     else:
-        raise InvalidInputError(f"sources: {path} does not exist; check the path")
+        raise InvalidInputError(f"sources {path} does not exist; check the path")
     return (os.path.abspath(each) for each in files if each.is_file())
 
 

@@ -75,8 +75,9 @@ class BatchReport:
     def __str__(self) -> str:
         rate = self.frames / self.seconds if self.seconds else 0.0
         return (
-            f"{self.trips} trips: {self.done} done, {self.failed} failed, {self.errors} errors, "
-            f"{self.skipped} skipped; {self.frames} frames in {self.seconds:.1f} s, {rate:.1f} frames/s"
+            f"{self.trips} trip{'s' * (self.trips != 1)}: {self.done} done, {self.failed} failed, "
+            f"{self.errors} errors, {self.skipped} skipped; {self.frames} frames in {self.seconds:.1f} s, "
+            f"{rate:.1f} frames/s"
         )
 
 

@@ -419,7 +419,7 @@ def video(
 
     draw_params = _draw_params(labels, line_width=line_width, color_by=color_by, panel=panel, units=units)
     outputs = {"--output": output, "--tracks": tracks, "--report": report, "--events": events}
-    check_distinct_paths(outputs, {"SOURCE": Path(source)} if Path(source).exists() else {})
+    check_distinct_paths(outputs, {"SOURCE": Path(source)})
     event_options = EventOptions(events, clips, own_speed)
     with contextlib.ExitStack() as stack:
         stack.enter_context(output_folder(clips, "--clips"))
