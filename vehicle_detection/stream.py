@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, overload
@@ -16,9 +16,7 @@ from vehicle_detection.confidence import Model
 from vehicle_detection.detector import FrameResult, VehicleDetector
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.tracking import Track
-from vehicle_detection.video import FrameSource, VideoRun
-
-Source = str | os.PathLike[str] | int | Sequence[str | os.PathLike[str]] | FrameSource
+from vehicle_detection.video import Source, VideoRun
 
 
 @dataclass(frozen=True, eq=False)

@@ -179,6 +179,27 @@ def test_shards_are_disjoint_and_complete(card, model, tmp_path):
     check_whole(tmp_path / "out", done=5, failed=0)
 
 
+def test_numbered_files_are_told_apart_by_their_times(clip, model, tmp_path):
+    for number, end in ((1, 0), (2, 60), (3, 120), (4, 7000)):
+        copy = shutil.copy(clip, tmp_path / f"GRMN000{number}.mp4")
+        os.utime(copy, (1.77e9 + end, 1.77e9 + end))
+    assert counts(run(tmp_path, tmp_path / "out", model, tracks_only=True)) == (2, 0, 0, 0)
+    assert sorted(each["frames"] for each in records(tmp_path / "out").values()) == [12, 36]
+
+
+def test_threads_do_not_share_a_detector(card, model, tmp_path):
+    options = {"model": model, "tracks_only": True, "group": "file", "progress": False}
+    with ThreadPoolExecutor(4) as executor:
+        run_batch(card, tmp_path / "threads", executor, **options)
+    run(card, tmp_path / "one", model, tracks_only=True, group="file")
+    tables = [
+        {path.name: path.read_bytes() for path in (tmp_path / name).rglob("*.parquet")}
+        for name in ("threads", "one")
+    ]
+    assert len(tables[0]) == 5
+    assert tables[0] == tables[1]
+
+
 def test_a_bad_file_is_recorded_once(many, model, tmp_path):
     source, out = str(many / "drive [de].mp4"), tmp_path / "out"
     report = run(source, out, model, tracks_only=True)
@@ -348,7 +369,7 @@ def check_numbers(printed):
 
 def test_a_killed_worker_is_replaced(many, model, tmp_path):
     out = tmp_path / "out"
-    process = start_batch(many, out, model)
+    process = start_batch(many, out, model, "--tracks-only")
     wait_for_records(out, 1)
     for worker in processes_below(process.pid):
         os.kill(worker, signal.SIGKILL)
@@ -419,7 +440,7 @@ def suicide(task):
 def test_a_dask_cluster_that_loses_a_worker(many, model, tmp_path):
     pytest.importorskip("distributed")
     out = tmp_path / "out"
-    process = start_batch(many, out, model, "--dask", "local")
+    process = start_batch(many, out, model, "--dask", "local", "--tracks-only")
     wait_for_records(out, 1)
     children = processes_below(process.pid)
     spawned = [pid for pid in children if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]

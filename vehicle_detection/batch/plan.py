@@ -77,9 +77,10 @@ def _list_remote(url: str) -> Iterator[str]:
 
 def group_files(files: Sequence[str], group: str) -> list[Trip]:
     """Group files into trips, or make each file a trip."""
+    named = [file if _URL.match(file) else Path(file) for file in files]
     if group == "file":
-        return [trip for file in files for trip in find_trips([file])]
-    return find_trips(files, duration=_duration)
+        return [trip for file in named for trip in find_trips([file])]
+    return find_trips(named, duration=_duration)
 
 
 def _duration(file: Path | str) -> float:

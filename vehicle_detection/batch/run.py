@@ -5,10 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import queue
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from concurrent.futures import BrokenExecutor, Executor, Future
 from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -295,11 +296,14 @@ def _run(
     """Yield the record of each trip."""
     attempts: dict[str, int] = {}
     running: dict[Future[Any], dict[str, Any]] = {}
+    finished: queue.SimpleQueue[Future[Any]] = queue.SimpleQueue()
     busy: list[dict[str, Any]] = []
 
     def submit(task: dict[str, Any]) -> None:
         assert executor is not None
-        running[executor.submit(run_trip, task)] = task
+        future = executor.submit(run_trip, task)
+        running[future] = task
+        future.add_done_callback(finished.put)
 
     for task in pending:
         submit(task)
@@ -309,22 +313,22 @@ def _run(
             for task in busy:
                 submit(task)
             busy = []
-        for future in wait(running, return_when=FIRST_COMPLETED).done:
-            task = running.pop(future)
-            try:
-                record = future.result()
-            except BrokenExecutor:  # all other calls fail as well
-                raise
-            except Exception as error:
-                attempts[task["key"]] = attempts.get(task["key"], 0) + 1
-                if attempts[task["key"]] < _ATTEMPTS:
-                    submit(task)
-                    continue
-                record = _lost_record(task, error, out)
-            if record["status"] == BUSY:
-                busy.append(task)
+        future = finished.get()
+        task = running.pop(future)
+        try:
+            record = future.result()
+        except BrokenExecutor:  # all other calls fail as well
+            raise
+        except Exception as error:
+            attempts[task["key"]] = attempts.get(task["key"], 0) + 1
+            if attempts[task["key"]] < _ATTEMPTS:
+                submit(task)
                 continue
-            yield record
+            record = _lost_record(task, error, out)
+        if record["status"] == BUSY:
+            busy.append(task)
+            continue
+        yield record
 
 
 def _lost_record(task: Mapping[str, Any], error: Exception, out: Path) -> dict[str, Any]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
 import os
 import platform
 import shutil
 import tempfile
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -44,12 +44,19 @@ _COLUMNS = {
 
 def warm_up(model: str, options: dict[str, Any]) -> None:
     """Load the model and compile the kernels in this process."""
-    _detector(model, tuple(sorted(options.items()))).warm_up((180, 320))
+    _detector({"model": model, "options": options}).warm_up((180, 320))
 
 
-@functools.lru_cache(maxsize=1)
-def _detector(model: str, options: tuple[tuple[str, Any], ...]) -> VehicleDetector:
-    return VehicleDetector(model, n_jobs=1, **dict(options))
+_of_thread = threading.local()
+
+
+def _detector(settings: Mapping[str, Any]) -> VehicleDetector:
+    """Detector of this thread, which keeps the last one: a detector holds the tracks of one video."""
+    wanted = settings["model"], settings["options"]
+    if getattr(_of_thread, "wanted", None) != wanted:
+        _of_thread.detector, _of_thread.wanted = VehicleDetector(wanted[0], n_jobs=1, **wanted[1]), wanted
+    detector: VehicleDetector = _of_thread.detector
+    return detector
 
 
 def run_trip(task: Mapping[str, Any]) -> dict[str, Any]:
@@ -97,7 +104,7 @@ def _failure(error: Exception) -> dict[str, Any]:
 def _process(out: Path, task: Mapping[str, Any]) -> dict[str, Any]:
     """Write the outputs of a trip; return the facts for its record."""
     settings, key = task["settings"], task["key"]
-    detector = _detector(settings["model"], tuple(sorted(settings["options"].items())))
+    detector = _detector(settings)
     place = f"date={task['date']}/camera={task['camera']}/{key}"
     with _scratch(out, key) as folder:
         video = None if settings["tracks_only"] else folder / "video.mp4"

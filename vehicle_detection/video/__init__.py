@@ -6,6 +6,7 @@ from vehicle_detection.video.pipeline import VideoDetector
 from vehicle_detection.video.process import VideoReport, VideoRun, cut_video, process_video
 from vehicle_detection.video.sources import (
     FrameSource,
+    Source,
     download,
     list_files,
     open_filesystem,
@@ -19,6 +20,7 @@ from vehicle_detection.video.trips import UNKNOWN_CAMERA, Trip, find_trips, is_v
 __all__ = [
     "UNKNOWN_CAMERA",
     "FrameSource",
+    "Source",
     "Trip",
     "VideoDetector",
     "VideoInfo",

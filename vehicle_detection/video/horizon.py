@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import HorizonEstimate, estimate_horizon
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video.ffmpeg import VideoInfo
-from vehicle_detection.video.sources import check_span, frame_range, open_source
+from vehicle_detection.video.sources import Source, check_span, frame_range, open_source
 
 _MAX_STD = 0.05  # as a fraction of the frame's height
 # Seconds between searched frames, their number at least (in a short video) and at most, and the number of
@@ -28,7 +28,7 @@ class ImageDetector(Protocol):
 
 
 def estimate_video_horizon(
-    source: Any, detector: ImageDetector, *, start: float | None = None, end: float | None = None
+    source: Source, detector: ImageDetector, *, start: float | None = None, end: float | None = None
 ) -> HorizonEstimate | None:
     """Estimate the horizon from the vehicles in two frames per second of the first 30 seconds after `start`.
 

@@ -35,7 +35,7 @@ from vehicle_detection._common import (
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video.ffmpeg import VideoInfo
 from vehicle_detection.video.pipeline import FramePipeline, VideoDetector
-from vehicle_detection.video.sources import FrameSource, check_span, frame_range, open_source
+from vehicle_detection.video.sources import FrameSource, Source, check_span, frame_range, open_source
 from vehicle_detection.video.streams import CONTAINERS, AudioSource, FrameWriter
 
 PRESETS = (
@@ -119,7 +119,7 @@ class VideoReport:
 
 
 def process_video(
-    source: Any,
+    source: Source,
     target: str | os.PathLike[str] | None,
     detector: VideoDetector,
     *,
@@ -212,7 +212,7 @@ class VideoRun:
 
     def __init__(
         self,
-        source: Any,
+        source: Source,
         detector: VideoDetector,
         *,
         target: str | os.PathLike[str] | None = None,

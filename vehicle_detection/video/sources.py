@@ -298,8 +298,12 @@ class _Stream(FrameSource):
         return LiveReader(self._process, drop=self.live, first=first, count=count)
 
 
+Source = str | os.PathLike[str] | int | Sequence[str | os.PathLike[str]] | FrameSource
+"""What `open_source` takes."""
+
+
 def open_source(
-    source: str | os.PathLike[str] | int | Sequence[str | os.PathLike[str]] | FrameSource,
+    source: Source,
     *,
     fps: float = 25.0,
     live: bool | None = None,
