@@ -147,7 +147,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("-o", "--output", metavar="DIR", type=Path, default=Path("docs"), help="folder")
     folder = parser.parse_args(arguments).output
     try:
-        with VehicleDetector() as detector:
+        with VehicleDetector(field_of_view=58) as detector:
             make_pictures(folder, detector)
     except VehicleDetectionError as error:
         parser.error(str(error))
