@@ -174,7 +174,7 @@ class _TrackTable:
     def __call__(self, result: Any) -> None:
         """Add the shown tracks of a frame's result."""
         for track in shown_tracks(result):
-            numbers = (*track.box, track.score, track.distance_m, track.speed_mps)
+            numbers = (*track.box, *(getattr(track, name) for name in tuple(DIGITS)[4:]))
             rounded = [
                 None if value is None else round(float(value), digits) + 0.0
                 for value, digits in zip(numbers, DIGITS.values(), strict=True)
