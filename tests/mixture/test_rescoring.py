@@ -96,11 +96,11 @@ def test_nms_uses_the_rescored_margins():
     corrected, rescored = model.rescorer.apply(pyramid, proposals, margins)
     rows = nms(corrected, rescored)
     assert len(rows) < len(proposals)
-    boxes, found = model.detect_vehicles(pyramid, windows, min_margin=-9.0)
+    boxes, found, _ = model.detect_vehicles(pyramid, windows, min_margin=-9.0)
     np.testing.assert_array_equal(boxes, corrected[rows])
     np.testing.assert_array_equal(found, rescored[rows])
     middle = float(np.median(found))
-    boxes, fewer = model.detect_vehicles(pyramid, windows, min_margin=middle)
+    boxes, fewer, _ = model.detect_vehicles(pyramid, windows, min_margin=middle)
     np.testing.assert_array_equal(fewer, found[found >= middle])
 
 

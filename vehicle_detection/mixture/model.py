@@ -154,18 +154,27 @@ class TemplateMixture:
         """Margin of a score: the inverse of `scores`."""
         return (score + self.threshold - self.offset) / self.slope
 
+    @property
+    def max_shift(self) -> float:
+        """What the number of candidates adds to a margin at most."""
+        return self.count_weight * math.log(_USUAL_COUNT)
+
     def detect_vehicles(
         self, pyramid: EdgePyramid, windows: ScoredWindows, *, min_margin: float
-    ) -> tuple[Floats, Floats]:
-        """Boxes and margins of the vehicles that the windows of a frame propose, best first."""
+    ) -> tuple[Floats, Floats, float]:
+        """Boxes and margins of the vehicles that the windows of a frame propose, best first.
+
+        Also returns what the number of candidates has added to each margin.
+        """
         boxes, margins = self.propose_boxes(pyramid, windows, min_margin=RESCORE_MIN)
         if self.rescorer is not None:
             boxes, margins = self.rescorer.apply(pyramid, boxes, margins)
         rows = nms(boxes, margins)
         count = np.count_nonzero(margins[rows] >= RESCORE_MIN)
-        margins = margins - self.count_weight * math.log((1 + count) / _USUAL_COUNT)
+        shift = -self.count_weight * math.log((1 + count) / _USUAL_COUNT)
+        margins = margins + shift
         rows = rows[(margins[rows] >= min_margin) & (box_areas(boxes[rows]) > 0)]
-        return boxes[rows], margins[rows]
+        return boxes[rows], margins[rows], shift
 
     def propose_boxes(
         self, pyramid: EdgePyramid, windows: ScoredWindows, *, min_margin: float

@@ -102,10 +102,10 @@ class MixtureSearch(FrameSearch):
         model = self.model
         with single_threaded_opencv():
             pyramid, found = self.score_windows(prepare(frame), params)
-            boxes, margins = model.detect_vehicles(
+            boxes, margins, shift = model.detect_vehicles(
                 pyramid, found, min_margin=model.margin_of(min_vehicle_score)
             )
-        scores = model.scores(found.margins)
+        scores = model.scores(found.margins + shift)
         shown = scores >= params.min_score
         return Detections(found.boxes[shown], scores[shown]), Detections(boxes, model.scores(margins))
 
@@ -117,7 +117,7 @@ class MixtureSearch(FrameSearch):
         Sensor noise and haze are not removed here. The pyramid is valid until the next search in the same
         thread.
         """
-        min_margin = min(MIN_MARGIN, self.model.margin_of(params.min_score))
+        min_margin = min(MIN_MARGIN, self.model.margin_of(params.min_score) - self.model.max_shift)
         plan = self._plan((image.shape[0], image.shape[1]), params, min_margin)
         with single_threaded_opencv():
             pyramid = EdgePyramid(image, plan.row_ranges, self.workspace, self._team)
