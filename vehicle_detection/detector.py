@@ -22,7 +22,14 @@ from vehicle_detection._common import (
     describe,
 )
 from vehicle_detection.boxes import Detections, ScoreScale
-from vehicle_detection.camera import GIVEN_LENS_STD, LENSES, UNKNOWN_LENS_STD, Camera, read_camera
+from vehicle_detection.camera import (
+    GIVEN_LENS_STD,
+    LENSES,
+    UNKNOWN_LENS_STD,
+    Camera,
+    check_shape,
+    read_camera,
+)
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.confidence import Model, calibration_of, with_confidence
 from vehicle_detection.drawing import TrackDrawer, draw_boxes, draw_diagnostics
@@ -294,12 +301,18 @@ class VehicleDetector:
         vehicles = found.vehicles
         if vehicles is None:
             assert isinstance(self.region_params, RegionParams)
-            camera = self._camera_of(found.shape)
+            camera = self.camera_of(found.shape)
             vehicles = find_vehicles(found.windows, camera, found.shape, self.region_params)
         assert self._calibration is not None
         return Detections(vehicles.boxes, vehicles.scores, self._calibration.probability(vehicles.scores))
 
-    def _camera_of(self, shape: tuple[int, int]) -> Camera:
+    def camera_of(self, shape: tuple[int, ...]) -> Camera:
+        """Return the camera for frames of ``(height, width, ...)``: as given, or what is assumed.
+
+        >>> round(VehicleDetector(field_of_view=90).camera_of((720, 1280)).focal_px)
+        640
+        """
+        shape = check_shape(shape)
         if isinstance(self.camera, Camera):
             return self.camera
         if shape not in self._cameras:
@@ -417,7 +430,7 @@ class VehicleDetector:
         if self._tracker is None:
             fps = self._fps or _USUAL_FPS
             self._tracker = Tracker(self.track_params, fps=fps, calibration=self._calibration)
-        self._tracker.set_camera(self._camera_of(found.shape))
+        self._tracker.set_camera(self.camera_of(found.shape))
         if self._is_cut(found.thumbnail):
             self._heat_history.clear()
             self._tracker.end_tracks()
@@ -460,7 +473,7 @@ class VehicleDetector:
             result.tracks,
             time=result.index / (self._fps or _USUAL_FPS) if result.time is None else result.time,
             searched=result.searched,
-            camera=self._camera_of(frame.shape[:2]),
+            camera=self.camera_of(frame.shape[:2]),
         )
 
     def annotated_shape(self, shape: tuple[int, ...]) -> tuple[int, int, int]:

@@ -38,9 +38,8 @@ class EventOptions:
         from vehicle_detection.events import find_events
 
         speed = None if self.own_speed is None else self.own_speed / 3.6
-        return find_events(
-            log, fps=float(report.fps), shape=report.shape, camera=detector.camera, own_speed_mps=speed
-        )
+        camera = detector.camera_of(report.shape)
+        return find_events(log, fps=float(report.fps), shape=report.shape, camera=camera, own_speed_mps=speed)
 
     def write(self, events: tuple[Event, ...], video: Path, report: VideoReport) -> None:
         """Write the file of events, and their clips."""

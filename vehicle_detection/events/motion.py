@@ -123,6 +123,9 @@ def _lateral(
     camera: Camera,
 ) -> tuple[Floats, Floats]:
     """Lateral position of the vehicle's near end, which lies at the outer edge of its box."""
+    if camera.fisheye:
+        boxes = camera.rectify_boxes(boxes, shape)
+        width = boxes[:, 2] - boxes[:, 0]
     middle = shape[1] / 2
     face = np.minimum(camera.focal_px * camera.vehicle_width_m / distance, width)
     right = (boxes[:, 0] + boxes[:, 2]) / 2 > middle

@@ -104,7 +104,8 @@ class ReportWriter:
         """
         check_type(report, "report", VideoReport, "pass what process_video returned")
         if events is None:
-            camera = getattr(self._detector, "camera", None)
+            camera_of = getattr(self._detector, "camera_of", lambda shape: None)
+            camera = camera_of(report.shape)
             events = find_events(self.log, fps=float(report.fps), shape=report.shape, camera=camera)
         options = {
             "events": list(events),
