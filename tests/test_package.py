@@ -24,7 +24,7 @@ LAYERS = [
     "_common",
     "params camera synthetic export images boxes units _kernels",
     "datasets regions tracking heatmap features video",
-    "evaluation drawing privacy classifier sklearn_models",
+    "evaluation drawing classifier sklearn_models",
     "windows search mixture training function_model events",
     "confidence course detector mixture_training report",
     "tuning explorer explanation stream batch",

@@ -20,7 +20,14 @@ from .datasets import (
     split_sources,
 )
 from .detector import FrameResult, VehicleDetector, detector_from
-from .drawing import draw_boxes, draw_detections, draw_diagnostics, draw_labeled_bboxes, draw_tracks
+from .drawing import (
+    blur_boxes,
+    draw_boxes,
+    draw_detections,
+    draw_diagnostics,
+    draw_labeled_bboxes,
+    draw_tracks,
+)
 from .errors import (
     DatasetError,
     DetectorError,
@@ -80,7 +87,6 @@ from .params import (
     SearchParams,
     TrackParams,
 )
-from .privacy import blur_boxes
 from .regions import find_vehicles
 from .report import ReportWriter
 from .search import SearchResult, find_cars

@@ -32,7 +32,13 @@ from vehicle_detection.camera import (
 )
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.confidence import Model, calibration_of, with_confidence
-from vehicle_detection.drawing import TrackDrawer, draw_boxes, draw_diagnostics
+from vehicle_detection.drawing import (
+    BLUR_REGIONS,
+    TrackDrawer,
+    blur_boxes,
+    draw_boxes,
+    draw_diagnostics,
+)
 from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.function_model import DetectorFunction, FunctionModel
 from vehicle_detection.heatmap import HeatHistory, frame_heat, label_heat
@@ -47,7 +53,6 @@ from vehicle_detection.params import (
     SearchParams,
     TrackParams,
 )
-from vehicle_detection.privacy import BLUR_REGIONS, blur_boxes
 from vehicle_detection.regions import find_vehicles
 from vehicle_detection.search import FrameSearch, SearchResult
 from vehicle_detection.tracking import Track, Tracker, interpolate_tracks

@@ -283,9 +283,8 @@ def _detect_each(
     """Detect the vehicles of each image, print them, and write the annotated image."""
     import cv2
 
-    from vehicle_detection.drawing import draw_detections
+    from vehicle_detection.drawing import blur_boxes, draw_detections
     from vehicle_detection.images import read_image, write_image
-    from vehicle_detection.privacy import blur_boxes
 
     for path in images:
         with capture_stderr() as messages:
@@ -517,7 +516,7 @@ def _warn_of_horizon(horizon: str | float, found: HorizonEstimate | None) -> Non
 def _parse_blur(text: str | None) -> Any:
     """Check the region to blur before a model is loaded."""
     from vehicle_detection._common import check_choice
-    from vehicle_detection.privacy import BLUR_REGIONS
+    from vehicle_detection.drawing import BLUR_REGIONS
 
     if text is not None:
         check_choice(text, "--blur", BLUR_REGIONS)

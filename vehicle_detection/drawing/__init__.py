@@ -1,4 +1,4 @@
-"""Drawing on images and video: boxes, labeled regions, detections, tracks with labels, bird's-eye views."""
+"""Drawing on images and video: boxes, regions, tracks with labels, bird's-eye views, blurred vehicles."""
 
 from vehicle_detection.drawing.birds_eye import (
     LANE_WIDTH_M,
@@ -9,6 +9,7 @@ from vehicle_detection.drawing.birds_eye import (
     Trails,
     road_position,
 )
+from vehicle_detection.drawing.blur import BLUR_REGIONS, blur_boxes
 from vehicle_detection.drawing.boxes import draw_boxes, draw_detections, draw_labeled_bboxes
 from vehicle_detection.drawing.diagnostics import draw_diagnostics, heat_image
 from vehicle_detection.drawing.primitives import blend
@@ -21,6 +22,7 @@ from vehicle_detection.drawing.tracks import (
 )
 
 __all__ = [
+    "BLUR_REGIONS",
     "LANE_WIDTH_M",
     "MAX_SPEED_STD",
     "TRACK_COLORS",
@@ -30,6 +32,7 @@ __all__ = [
     "TrackDrawer",
     "Trails",
     "blend",
+    "blur_boxes",
     "draw_boxes",
     "draw_detections",
     "draw_diagnostics",
