@@ -1,5 +1,6 @@
 import io
 import os
+import struct
 import zlib
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from vehicle_detection._common import image_size
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import decode_image, read_image, write_image
 
@@ -151,13 +153,77 @@ def test_a_damaged_png_is_refused(picture):
         decode_image(bytes(data), "damaged.png")
 
 
-def test_an_image_of_excessive_size_is_refused(picture):
-    # A header that asks for gigapixels: OpenCV raises instead of returning nothing.
-    data = bytearray(encoded(".png", bgr(picture)))
-    data[16:24] = (2**30).to_bytes(4, "big") * 2
-    data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
-    with pytest.raises(InvalidInputError, match="cannot be decoded"):
-        decode_image(bytes(data), "huge.png")
+def claim(data, width, height):
+    """Change the size that the header of a PNG or JPEG claims."""
+    data = bytearray(data)
+    if data.startswith(b"\x89PNG"):
+        data[16:24] = struct.pack(">II", width, height)
+        data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
+    else:
+        struct.pack_into(">HH", data, data.index(b"\xff\xc0") + 5, height, width)
+    return bytes(data)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("side", [30_000, 20_000, 11_000])
+def test_an_image_that_claims_to_be_huge_is_refused_before_it_is_decoded(picture, monkeypatch, suffix, side):
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    message = rf"huge has {side}x{side} pixels, more than 120,000,000; .* set VEHICLE_DETECTION_MAX_PIXELS"
+    with pytest.raises(InvalidInputError, match=message):
+        decode_image(claim(encoded(suffix, bgr(picture)), side, side), "huge")
+
+
+def test_the_limit_of_pixels_is_adjustable(picture, monkeypatch):
+    data = encoded(".png", bgr(picture))
+    monkeypatch.setenv("VEHICLE_DETECTION_MAX_PIXELS", str(picture.size // 3))
+    np.testing.assert_array_equal(decode_image(data, "a.png"), picture)
+    monkeypatch.setenv("VEHICLE_DETECTION_MAX_PIXELS", str(picture.size // 3 - 1))
+    with pytest.raises(InvalidInputError, match="pixels, more than"):
+        decode_image(data, "a.png")
+    for text in ("many", "0", "-1", "1" * 30):
+        monkeypatch.setenv("VEHICLE_DETECTION_MAX_PIXELS", text)
+        with pytest.raises(
+            InvalidInputError, match="VEHICLE_DETECTION_MAX_PIXELS must be a number of pixels"
+        ):
+            decode_image(data, "a.png")
+
+
+SUFFIXES = [".png", ".jpg", ".bmp", ".tiff", ".webp", ".gif", ".ppm", ".pgm", ".pbm", ".jp2"]
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_the_size_of_an_image_is_that_of_its_header(suffix):
+    if not cv2.haveImageWriter(f"image{suffix}"):
+        pytest.skip(f"this OpenCV writes no {suffix}")
+    image = np.zeros((37, 53) if suffix in (".pgm", ".pbm") else (37, 53, 3), np.uint8)
+    data = encoded(suffix, image)
+    assert image_size(data) == (53, 37)
+    for length in (0, 4, 12, 24):  # a header that is cut off has no size, or the right one
+        assert image_size(data[:length]) in (None, (53, 37))
+
+
+def test_the_size_of_other_kinds_of_header():
+    lossless = cv2.imencode(".webp", np.zeros((37, 53, 4), np.uint8), [cv2.IMWRITE_WEBP_QUALITY, 101])[1]
+    assert image_size(lossless.tobytes()) == (53, 37)
+    progressive = cv2.imencode(".jpg", np.zeros((37, 53, 3), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1]
+    assert image_size(progressive.tobytes()) == (53, 37)
+    # Two frame headers: the larger one counts, because the decoder allocates memory for it.
+    small = encoded(".jpg", np.zeros((37, 53, 3), np.uint8))
+    place = small.index(b"\xff\xc0")
+    header = small[place : place + 2 + int.from_bytes(small[place + 2 : place + 4], "big")]
+    twice = small[:2] + claim(b"\xff\xc0" + header[2:], 30_000, 20_000) + small[2:]
+    assert image_size(twice) == (30_000, 20_000)
+    extended = b"RIFF\0\0\0\0WEBPVP8X" + bytes(8) + (52).to_bytes(3, "little") + (36).to_bytes(3, "little")
+    assert image_size(extended) == (53, 37)
+    assert image_size(b"MM\0+" + bytes(40)) is None
+
+
+def test_a_pipe_or_device_is_no_image(tmp_path):
+    pipe = tmp_path / "pipe.png"
+    os.mkfifo(pipe)
+    for path in (pipe, os.devnull):
+        with pytest.raises(InvalidInputError, match="is a device or a pipe, which may never end"):
+            read_image(path)
 
 
 @pytest.mark.parametrize("content", [b"", b"not an image", b"\x89PNG\r\n\x1a\n", b"\xff\xd8", bytes(1000)])
@@ -176,10 +242,11 @@ def test_missing_file_and_folder(tmp_path):
 
 
 def test_an_unreadable_file(tmp_path, monkeypatch):
-    def refuse(self):
+    def refuse(self, mode):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "read_bytes", refuse)
+    (tmp_path / "a.png").touch()
+    monkeypatch.setattr(Path, "open", refuse)
     with pytest.raises(InvalidInputError, match=r"a.png cannot be read: Permission denied"):
         read_image(tmp_path / "a.png")
 

@@ -33,6 +33,7 @@ from .errors import (
     DetectorError,
     InvalidInputError,
     ModelFileError,
+    OutputError,
     VehicleDetectionError,
     VideoError,
 )
@@ -144,6 +145,7 @@ __all__ = [
     "LabelledFrames",
     "MixtureParams",
     "ModelFileError",
+    "OutputError",
     "PatchFeatures",
     "PatchSet",
     "PyramidParams",

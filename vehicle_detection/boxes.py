@@ -14,7 +14,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_boxes, check_choice, check_number, describe
+from vehicle_detection._common import (
+    check_array,
+    check_boxes,
+    check_choice,
+    check_number,
+    describe,
+)
 from vehicle_detection.errors import InvalidInputError
 
 Floats = NDArray[np.float64]
@@ -103,11 +109,13 @@ def clip_boxes(boxes: ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
     """
     array = check_boxes(boxes)
     given: object = shape
-    if not isinstance(given, (tuple, list)) or len(shape) < 2 or shape[0] < 1 or shape[1] < 1:
+    sides = given[:2] if isinstance(given, (tuple, list)) else ()
+    numbers = (int, float, np.integer, np.floating)
+    if len(sides) < 2 or not all(isinstance(side, numbers) and 1 <= side <= 2**31 for side in sides):
         raise InvalidInputError(
             f"shape must be (height, width, ...) of an image, got {describe(shape)}; pass image.shape"
         )
-    height, width = shape[:2]
+    height, width = sides
     limits = np.array([width, height, width, height])
     return np.asarray(np.clip(array, 0, limits), array.dtype)
 
@@ -174,7 +182,7 @@ def non_max_suppression(boxes: ArrayLike, scores: ArrayLike, *, threshold: float
     >>> non_max_suppression([[0, 0, 10, 10], [1, 0, 11, 10], [50, 0, 60, 10]], [0.5, 0.9, 0.1])
     array([1, 2])
     """
-    detections = Detections(check_boxes(boxes), np.asarray(scores))
+    detections = Detections(check_boxes(boxes), check_array(scores, "scores"))
     max_iou = check_number(threshold, "threshold", low=0, high=1)
     return greedy_nms(detections.boxes.astype(np.float64), detections.scores, max_iou=max_iou)
 
@@ -222,7 +230,7 @@ class Platt:
 
     def probability(self, scores: ArrayLike) -> Floats:
         """Probability of a vehicle for each score, float64 in [0, 1], of the same shape."""
-        values = np.asarray(scores)
+        values = check_array(scores, "scores")
         if values.dtype.kind not in "iuf" or np.isnan(values).any():
             raise InvalidInputError(f"scores must be numbers without NaN; got {describe(scores)}")
         exponent = np.asarray(self.a * values.astype(np.float64) + self.b)
@@ -258,7 +266,7 @@ def check_score_scale(score: object, threshold: float | None) -> ScoreScale:
 
 
 def _score_column(scores: ArrayLike) -> Floats:
-    array = np.asarray(scores)
+    array = check_array(scores, "scores")
     if array.size == 0:
         return np.empty(0)
     if array.ndim != 1 or array.dtype.kind not in "iuf":
@@ -301,7 +309,7 @@ class Detections:
 
     def __post_init__(self) -> None:
         boxes = check_boxes(self.boxes)
-        scores = np.asarray(self.scores)
+        scores = check_array(self.scores, "scores")
         if scores.size == 0:
             scores = scores.reshape(-1).astype(np.float64)
         if scores.shape != (len(boxes),) or scores.dtype.kind not in "iuf":

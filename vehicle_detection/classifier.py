@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -14,6 +15,7 @@ import vehicle_detection
 from vehicle_detection._common import (
     ModelData,
     blur_patches,
+    check_array,
     check_choice,
     check_integer,
     check_number,
@@ -72,8 +74,11 @@ class Template:
             object.__setattr__(self, name, column)
         if not (self.scale > 0).all():
             raise InvalidInputError("scale must be positive; a constant feature has scale 1")
-        if not np.isfinite(self.intercept):
-            raise InvalidInputError(f"intercept must be finite; got {self.intercept}")
+        check_number(self.intercept, "intercept")
+        with np.errstate(over="ignore", invalid="ignore"):
+            weights, bias = self.fold()
+        if not (np.isfinite(weights).all() and math.isfinite(bias)):
+            raise InvalidInputError("coef must be of the order of scale; their quotient is too large")
 
     def fold(self) -> tuple[NDArray[np.float64], float]:
         """Weights and bias of the equivalent affine function ``score = weights @ x + bias``."""
@@ -156,7 +161,7 @@ class VehicleClassifier:
 
     def score(self, X: ArrayLike, y: ArrayLike) -> float:
         """Accuracy: fraction of correct predictions for the labels `y`."""
-        labels, predicted = np.asarray(y), self.predict(X)
+        labels, predicted = check_array(y, "y"), self.predict(X)
         if labels.shape != predicted.shape or not labels.size:
             raise InvalidInputError(
                 f"y must hold one label for each of {len(predicted)} rows (at least one); "
@@ -166,7 +171,7 @@ class VehicleClassifier:
 
     def _features_of(self, X: ArrayLike) -> NDArray[Any]:
         """Check feature vectors, or extract those of patches: ``(N, length)``."""
-        array = np.asarray(X)
+        array = check_array(X, "X")
         if array.ndim == 4:
             return extract_features(check_patches(array, PATCH_SIZE, "X"), self.params)
         if array.ndim != 2 or array.shape[1] != self.params.length or array.dtype.kind not in "iuf":
@@ -416,7 +421,8 @@ def train_classifier(
     >>> train_classifier(patches, labels, params=FeatureParams(hog_channel=0)).score(patches, labels)
     1.0
     """
-    params = params or FeatureParams()
+    params = FeatureParams() if params is None else params
+    check_type(params, "params", FeatureParams, "omit it for the default")
     options = TrainingOptions(
         C=C, solver=solver, mirror=mirror, gamma=gamma, degraded=degraded, random_state=random_state
     )
@@ -506,7 +512,7 @@ def fit_features(
 
 def check_labels(labels: ArrayLike, count: int) -> NDArray[np.int64]:
     """Return `labels` as `count` integers 0 or 1, both of which must occur."""
-    array = np.asarray(labels)
+    array = check_array(labels, "labels")
     if array.shape != (count,) or array.dtype.kind not in "biuf":
         raise InvalidInputError(
             f"labels must hold one number for each of {count} patches; got {describe(array)}"
@@ -549,5 +555,5 @@ def build_classifier(model: ModelData) -> VehicleClassifier:
             )
             templates.append(Template(mean, scale, coef, float(intercept.reshape(()))))
         return VehicleClassifier(FeatureParams(**model.params), tuple(templates), model.metadata)
-    except (InvalidInputError, KeyError, TypeError, ValueError) as error:
+    except (InvalidInputError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise ModelFileError(f"{model.name} does not fit its own parameters: {error}") from error

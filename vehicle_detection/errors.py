@@ -23,5 +23,9 @@ class DetectorError(VehicleDetectionError):
     """A function passed to `detector_from` failed, or did not return boxes and scores."""
 
 
+class OutputError(VehicleDetectionError, OSError):
+    """An output cannot be written: the disk is full, or the folder has become read-only."""
+
+
 class VideoError(VehicleDetectionError):
     """A video cannot be read or written."""

@@ -60,7 +60,8 @@ def check_items(items: object) -> Iterator[Any]:
     """Iterate over results or rows; a pandas table gives its rows as mappings."""
     if hasattr(items, "to_dict") and hasattr(items, "columns"):
         return iter(items.to_dict("records"))
-    if isinstance(items, (str, bytes, Mapping)) or not isinstance(items, Iterable):
+    scalar = isinstance(items, (str, bytes, Mapping)) or getattr(items, "ndim", 1) == 0
+    if scalar or not isinstance(items, Iterable):
         raise InvalidInputError(
             f"results must be a list of results or rows, got {describe(items)}; wrap it in a list"
         )

@@ -10,7 +10,14 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_boxes, check_integer, check_number, check_type, describe
+from vehicle_detection._common import (
+    check_array,
+    check_boxes,
+    check_integer,
+    check_number,
+    check_type,
+    describe,
+)
 from vehicle_detection.boxes import Detections, clip_boxes
 from vehicle_detection.camera import check_shape
 from vehicle_detection.errors import InvalidInputError
@@ -20,7 +27,12 @@ Heat = TypeVar("Heat", bound=NDArray[Any])
 
 
 def _check_heat(heatmap: object) -> NDArray[Any]:
-    if not isinstance(heatmap, np.ndarray) or heatmap.ndim != 2 or heatmap.dtype.kind not in "iuf":
+    if (
+        not isinstance(heatmap, np.ndarray)
+        or heatmap.ndim != 2
+        or not heatmap.size
+        or heatmap.dtype.kind not in "iuf"
+    ):
         raise InvalidInputError(
             f"heatmap must be an (H, W) number array, got {describe(heatmap)}; start with "
             "numpy.zeros(image.shape[:2], numpy.float32)"
@@ -74,7 +86,9 @@ def add_heat(heatmap: Heat, boxes: ArrayLike, *, scores: ArrayLike | None = None
     """
     heat = _check_writable_heat(heatmap)
     windows = check_boxes(boxes)
-    weights = np.ones(len(windows)) if scores is None else Detections(windows, np.asarray(scores)).scores
+    weights = (
+        np.ones(len(windows)) if scores is None else Detections(windows, check_array(scores, "scores")).scores
+    )
     windows = clip_boxes(np.rint(windows), heat.shape).astype(np.int64)
     if not len(windows):
         return heatmap
@@ -215,7 +229,7 @@ def bounding_boxes(shape: tuple[int, ...], windows: Any, *, params: HeatParams |
     >>> bounding_boxes((20, 20), windows, params=HeatParams(threshold=1.0, peak_fraction=0)).boxes.tolist()
     [[0, 0, 12, 8]]
     """
-    params = params or HeatParams()
+    params = HeatParams() if params is None else params
     check_type(params, "params", HeatParams, "omit it for the default")
     if params.weighting == "count" and not isinstance(windows, Detections):
         boxes = check_boxes(windows, "windows")

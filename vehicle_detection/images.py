@@ -10,7 +10,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import atomic_write, check_image
+from vehicle_detection._common import (
+    Limit,
+    atomic_write,
+    check_image,
+    check_path,
+    image_size,
+    read_regular_file,
+)
 from vehicle_detection.errors import InvalidInputError
 
 _THUMBNAIL_SHAPE = (18, 32)
@@ -36,9 +43,15 @@ def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
 
     Gray becomes three equal channels, alpha is dropped, 16 bits become 8, and the EXIF rotation is applied.
     """
-    image = None
-    with contextlib.suppress(cv2.error):
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
+    size, image = image_size(data), None
+    if size is not None and size[0] * size[1] > Limit.PIXELS.current():
+        raise InvalidInputError(
+            f"{name} has {size[0]}x{size[1]} pixels, more than {Limit.PIXELS.current():,}; if it is meant to "
+            f"be so large, set {Limit.PIXELS.variable}"
+        )
+    # OpenCV's decoders of other formats are not used: nothing limits the memory that a file claims.
+    with contextlib.suppress(cv2.error, MemoryError):
+        image = None if size is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
     if image is None or _is_truncated(data):
         raise InvalidInputError(
             f"{name} must be a complete image file (PNG, JPEG, ...); it cannot be decoded"
@@ -60,7 +73,7 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
     Parameters
     ----------
     path
-        A PNG, JPEG, BMP, TIFF or WebP file. Gray, RGBA and 16-bit files are converted.
+        A PNG, JPEG, BMP, TIFF, WebP, GIF, PNM or JPEG 2000 file. Gray, RGBA and 16-bit files are converted.
 
     Returns
     -------
@@ -70,7 +83,8 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
     Raises
     ------
     InvalidInputError
-        If the file is missing, is a folder, or cannot be decoded completely.
+        If the file is missing, is a folder or a pipe, cannot be decoded completely, or has more than 120
+        million pixels; the environment variable ``VEHICLE_DETECTION_MAX_PIXELS`` sets another limit.
 
     Examples
     --------
@@ -79,16 +93,9 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
     ...
     vehicle_detection.errors.InvalidInputError: image file missing.png does not exist; check the path
     """
-    file = Path(path)
-    if file.is_dir():
-        raise InvalidInputError(f"image file {file} is a folder; choose a file in it")
-    try:
-        data = file.read_bytes()
-    except FileNotFoundError:
-        raise InvalidInputError(f"image file {file} does not exist; check the path") from None
-    except OSError as error:
-        raise InvalidInputError(f"image file {file} cannot be read: {error.strerror}") from error
-    return decode_image(data, f"image file {file}")
+    file = check_path(path)
+    name = f"image file {file}"
+    return decode_image(read_regular_file(file, name, Limit.IMAGE_BYTES), name)
 
 
 def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
@@ -102,6 +109,7 @@ def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
         If the image is malformed, the folder is missing or read-only, or the suffix is unknown.
     """
     rgb = check_image(image)
+    check_path(path)
     if not cv2.haveImageWriter(f"image{Path(path).suffix}"):
         raise InvalidInputError(
             f"path must end in .png, .jpg or another image suffix, got {Path(path).name!r}"

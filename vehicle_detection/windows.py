@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import (
+    check_array,
     check_boxes,
     check_choice,
     check_image,
@@ -124,7 +125,8 @@ def slide_window(
     height, width = check_image(image).shape[:2]
     x1, x2 = _check_range(x_start_stop, width, "x_start_stop")
     y1, y2 = _check_range(y_start_stop, height, "y_start_stop")
-    if np.shape(xy_window) != (2,) or np.shape(xy_overlap) != (2,):
+    given = {"xy_window": xy_window, "xy_overlap": xy_overlap}
+    if any(np.shape(check_array(pair, name)) != (2,) for name, pair in given.items()):
         raise InvalidInputError(f"xy_window and xy_overlap must be pairs; got {xy_window} and {xy_overlap}")
     steps = []
     for index, side in enumerate(xy_window):
@@ -149,7 +151,7 @@ def _check_range(limits: Range, size: int, name: str) -> tuple[int, int]:
     """Replace None by the image's border and check that the range is inside."""
     pair: Any = limits
     numbers = (int, np.integer, type(None))
-    if np.shape(pair) != (2,) or not all(isinstance(limit, numbers) for limit in pair):
+    if np.shape(check_array(pair, name)) != (2,) or not all(isinstance(limit, numbers) for limit in pair):
         raise InvalidInputError(f"{name} must be (start, stop), whole pixels or None; got {describe(limits)}")
     start = 0 if limits[0] is None else int(limits[0])
     stop = size if limits[1] is None else int(limits[1])

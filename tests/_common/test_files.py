@@ -1,12 +1,15 @@
+import errno
 import os
 import stat
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
 import pytest
 
-from vehicle_detection._common import atomic_write, check_target
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection._common import atomic_write, check_target, temporary_folder
+from vehicle_detection.errors import InvalidInputError, OutputError
 
 
 def names(folder):
@@ -83,7 +86,8 @@ def test_a_failed_rename_leaves_no_file(tmp_path, monkeypatch):
         raise PermissionError("not yours")
 
     monkeypatch.setattr(Path, "replace", refuse)
-    with pytest.raises(PermissionError, match="not yours"), atomic_write(tmp_path / "out.csv") as part:
+    message = r"out.csv cannot be written \(not yours\); check the folder, or choose another"
+    with pytest.raises(OutputError, match=message), atomic_write(tmp_path / "out.csv") as part:
         part.write_text("whole")
     assert names(tmp_path) == []
 
@@ -127,3 +131,113 @@ def test_concurrent_writers_of_one_file_do_not_mix(tmp_path):
     assert len(text) == 5000
     assert len(set(text)) == 1
     assert names(tmp_path) == ["out.txt"]
+
+
+FULL = OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("earlier", [None, "earlier"])
+def test_a_full_disk_names_the_output(tmp_path, earlier):
+    target = tmp_path / "out.csv"
+    if earlier:
+        target.write_text(earlier)
+    kept = "; the existing file is unchanged" if earlier else ""
+    message = rf"out.csv cannot be written \(No space left on device\); free some space{kept}$"
+    with pytest.raises(OutputError, match=message), atomic_write(target):
+        raise FULL
+    assert names(tmp_path) == (["out.csv"] if earlier else [])
+
+
+def test_no_space_for_a_new_file(tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise FULL
+
+    monkeypatch.setattr(os, "open", refuse)
+    monkeypatch.setattr(os, "mkdir", refuse)
+    with pytest.raises(OutputError, match=r"out.csv cannot be written"), atomic_write(tmp_path / "out.csv"):
+        pass
+    with pytest.raises(OutputError, match="demo cannot be written"), temporary_folder(tmp_path, "demo"):
+        pass
+
+
+def test_errors_of_other_files_are_not_those_of_the_output(tmp_path):
+    with pytest.raises(FileNotFoundError, match="other"), atomic_write(tmp_path / "out.csv"):
+        (tmp_path / "other").read_text()
+
+
+def test_a_target_that_becomes_a_folder(tmp_path):
+    target = tmp_path / "out.csv"
+
+    def write():
+        with atomic_write(target) as part:
+            part.touch()
+            target.mkdir()
+
+    with pytest.raises(OutputError, match=r"out.csv cannot be written"):
+        write()
+    assert names(tmp_path) == ["out.csv"]
+
+
+def test_a_folder_that_vanishes(tmp_path):
+    folder = tmp_path / "gone"
+    folder.mkdir()
+
+    def write():
+        with atomic_write(folder / "out.csv") as part:
+            part.unlink()
+            folder.rmdir()
+
+    with pytest.raises(OutputError, match=r"out.csv cannot be written"):
+        write()
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from vehicle_detection._common import atomic_write, temporary_folder
+with atomic_write(sys.argv[1]) as part, temporary_folder(Path(sys.argv[1]).parent, "demo") as folder:
+    part.write_text("half")
+    (folder / "clip.mp4").write_text("half")
+    print(part.name, folder.name, flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_the_next_run_removes_what_a_killed_one_has_left(tmp_path):
+    target = tmp_path / "out.csv"
+    command = [sys.executable, "-c", KILLED, str(target)]
+    (tmp_path / ".out.backup.csv").write_text("of the user")
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        part, folder = process.stdout.readline().split()
+        # A running process keeps its files, and a second run on its target works.
+        with atomic_write(target) as other, temporary_folder(tmp_path, "demo"):
+            other.write_text("second")
+            assert (tmp_path / part).read_text() == "half"
+            assert (tmp_path / folder / "clip.mp4").exists()
+        process.kill()
+    assert names(tmp_path) == sorted([".out.backup.csv", "out.csv", part, folder])
+    with atomic_write(target) as third, temporary_folder(tmp_path, "demo"):
+        assert third.read_text() == ""
+        third.write_text("third")
+    assert target.read_text() == "third"
+    assert names(tmp_path) == [".out.backup.csv", "out.csv"]
+
+
+def test_a_link_with_the_name_of_a_temporary_file_is_not_followed(tmp_path):
+    (tmp_path / "victim").write_text("whole")
+    (tmp_path / ".out.0.part.csv").symlink_to("victim")
+    with atomic_write(tmp_path / "out.csv") as part:
+        part.write_text("new")
+    assert (tmp_path / "victim").read_text() == "whole"
+    assert (tmp_path / "out.csv").read_text() == "new"
+
+
+def test_a_file_system_without_locks(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    with atomic_write(tmp_path / "out.csv") as part, temporary_folder(tmp_path, "demo") as folder:
+        part.write_text("new")
+        assert folder.is_dir()
+    assert names(tmp_path) == ["out.csv"]

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 
 import vehicle_detection
 from tests.helpers import SMALL_MIXTURE, drawn, start_interruptible, write_frame_set
-from tests.video.clips import write_clip
+from tests.video.clips import damage_sizes, write_clip
 from vehicle_detection import classifier, datasets, detector, mixture_training, training, video
 from vehicle_detection._common import files as _files
 from vehicle_detection.boxes import Detections
@@ -160,7 +160,7 @@ def test_ctrl_c_leaves_nothing_behind(tmp_path, material):
         "import vehicle_detection.{module} as module\n"
         "module.{name} = lambda *a, **k: (print('now', flush=True), time.sleep(60))\n"
         "sys.argv = ['vehicle-detection', *sys.argv[1:]]\n"
-        "from vehicle_detection.cli.app import main; main()"
+        "from vehicle_detection.cli import main; main()"
     )
     out, patches = tmp_path / "out", (material / "vehicles", material / "non-vehicles")
     runs = {
@@ -198,7 +198,7 @@ def test_a_full_disk_is_one_line(monkeypatch, picture, tmp_path):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "replace", fill)
-    assert "No space left" in refuse("detect", picture, "--boxes", tmp_path / "boxes.csv", code=1)
+    assert "No space left" in refuse("detect", picture, "--boxes", tmp_path / "boxes.csv")
     assert contents(tmp_path) == []
 
 
@@ -568,6 +568,21 @@ def test_video_writes_events_and_a_summary(clip, tmp_path):
     assert lines[-1] == f"wrote {target}, {events}, {clips}"
     found = json.loads(events.read_text())
     assert [path.suffix for path in clips.iterdir()] == [".mp4"] * len(found)
+
+
+def test_a_damaged_video_has_an_exit_code_of_its_own(clip, tmp_path):
+    lost, target = damage_sizes(clip, tmp_path / "lost.mp4", entry=3, byte=0, flip=64), tmp_path / "out.mp4"
+    result = run("video", lost, "-o", target, "-q")
+    assert result.exit_code == 3
+    assert (
+        result.stderr
+        == f"warning: {lost} is damaged: 7 of 10 frames cannot be decoded; copy or record it again\n"
+    )
+    with read_frames(target) as frames:
+        assert len(list(frames)) == 3
+    target.unlink()
+    assert "7 of 10 frames cannot be decoded" in refuse("video", lost, "-o", target, "--strict")
+    assert contents(tmp_path) == ["lost.mp4"]
 
 
 def test_video_can_be_quiet_and_take_a_part(clip, tmp_path):

@@ -123,7 +123,7 @@ def test_calibration_error_lies_between_0_and_1(pairs, bins):
         (["a"], [1], 15, "probabilities must be"),
         ([0.5], [1, 0], 15, "labels must be 0 or 1 for each of the 1 probabilities"),
         ([0.5], [-1], 15, "labels of -1 and 1 convert with labels > 0"),
-        ([0.5], [1], 0, "bins must be an integer at least 1"),
+        ([0.5], [1], 0, "bins must be an integer from 1 to 1000000"),
     ],
 )
 def test_invalid_arguments_of_calibration_error(probabilities, labels, bins, message):

@@ -243,7 +243,7 @@ def test_invalid_paths(tmp_path):
         InvalidInputError, match=r"format must be one of 'csv', 'jsonl', 'parquet', 'kitti', .*; got 'voc'"
     ):
         read_labels(written(tmp_path, CSV), format="voc")
-    with pytest.raises(InvalidInputError, match="path must be a str or PathLike, got None; pass the path"):
+    with pytest.raises(InvalidInputError, match="path must be a file or folder, got None; pass a path"):
         read_labels(None)
 
 

@@ -320,7 +320,7 @@ def test_frames_that_the_truth_does_not_have(tmp_path, kind):
         write_labels(
             boxes_of((3, 1, CAR, 0.5)), tmp_path / "t.json", format=kind, truth=tmp_path / "truth.json"
         )
-    with pytest.raises(DatasetError, match="cannot be read"):
+    with pytest.raises(DatasetError, match=r"none.json does not exist; check the path"):
         write_labels(boxes_of((0, 1, CAR, 0.5)), tmp_path / "t.json", truth=tmp_path / "none.json")
 
 

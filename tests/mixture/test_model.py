@@ -176,6 +176,19 @@ def test_the_files_of_these_tests_are_valid(tmp_path):
             "weights must be finite numbers",
         ),
         ({"1.weights": np.zeros((3, 4, 5), np.float32)}, {}, "weights must be finite numbers of shape"),
+        (
+            {"1.weights": np.full((3, 4, N_CHANNELS), 1e38, np.float32)},
+            {},
+            "1.weights must be finite numbers of at most 1e[+]12; train again",
+        ),
+        (
+            {"1.weights": np.ones((3, 4, N_CHANNELS), np.bool_)},
+            {},
+            "1.weights must be floating-point numbers, got bool",
+        ),
+        ({}, {"biases": [10**400, 0.0, 0.0]}, "int too large"),
+        ({}, {"biases": [1e38, 0.0, 0.0]}, "bias must be a number, at least -1e[+]09 and at most"),
+        ({}, {"offset": 1e300}, "offset must be a number, at least -1e[+]09"),
         ({"2.weights": None}, {}, "'2.weights'"),
         ({}, {"biases": None}, "'biases'"),
         ({}, {"biases": [0.0]}, "argument"),
@@ -206,6 +219,8 @@ def test_inconsistent_files_are_rejected(tmp_path, tensors, params, message):
         ({"sha256": "0"}, r"was changed after it was written \(checksum differs\)"),
         ({"params_text": "{"}, "has no readable parameters"),
         ({"metadata": "3"}, "has no readable parameters"),
+        ({"metadata": "[" * 100_000}, "has no readable parameters"),
+        ({"metadata": '{"a":' * 50_000 + "1" + "}" * 50_000}, "has no readable parameters"),
     ],
 )
 def test_invalid_headers_are_rejected(tmp_path, changes, message):

@@ -62,7 +62,7 @@ def test_matroska_comes_with_a_note(tmp_path):
 
 
 def test_rejects_paths_that_cannot_be_written(tmp_path):
-    with pytest.raises(InvalidInputError, match=r"path must be a file name, got 3; pass a name"):
+    with pytest.raises(InvalidInputError, match=r"path must be a file name, got 3; pass a path"):
         ReportWriter(3)
     with pytest.raises(InvalidInputError, match=r"video must be a file name, got 3"):
         ReportWriter(tmp_path / "report.html", video=3)

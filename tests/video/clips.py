@@ -63,3 +63,24 @@ def child_processes():
 
 def running_threads():
     return [thread for thread in threading.enumerate() if thread.name.startswith("vehicle-")]
+
+
+def damage_sizes(path, target, *, entry, byte=3, flip=0x7F):
+    """Copy an MP4 with one wrong size in the table of its frames' sizes, after which frames are lost."""
+    data = bytearray(path.read_bytes())
+    table = data.index(b"stsz") + 16
+    data[table + 4 * entry + byte] ^= flip
+    target.write_bytes(data)
+    return target
+
+
+def damage_frames(path, target):
+    """Copy an MP4 with flipped bits in its frames, but not in its index."""
+    data = bytearray(path.read_bytes())
+    start, stop = data.index(b"mdat") + 8, len(data)
+    if data.index(b"moov") > start:
+        stop = data.index(b"moov")
+    for place in range(start + (stop - start) // 3, stop, max((stop - start) // 9, 1)):
+        data[place] ^= 0x10
+    target.write_bytes(data)
+    return target

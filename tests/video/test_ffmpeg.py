@@ -3,15 +3,17 @@
 import os
 import shutil
 import sys
+import time
 from fractions import Fraction
+from pathlib import Path
 
 import pytest
 
-from tests.helpers import StubDetector
-from tests.video.clips import NTSC, ffmpeg, gray_frames, write_clip
+from tests.helpers import StubDetector, start_interruptible
+from tests.video.clips import NTSC, child_processes, ffmpeg, gray_frames, write_clip
 from vehicle_detection.errors import VideoError
 from vehicle_detection.video import probe_video, process_video, read_frames
-from vehicle_detection.video.ffmpeg import ffmpeg_binary, frame_rate
+from vehicle_detection.video.ffmpeg import Process, ffmpeg_binary, frame_rate
 
 
 @pytest.mark.parametrize("fps", [NTSC, Fraction(60000, 1001), Fraction(24000, 1001), 25, 30, Fraction(25, 2)])
@@ -118,3 +120,54 @@ def test_the_ffmpeg_of_moviepy_is_used_without_importing_it(monkeypatch, variabl
         monkeypatch.setenv("FFMPEG_BINARY", variable)
     assert ffmpeg_binary() == expected
     assert "moviepy.config" not in sys.modules
+
+
+@pytest.mark.skipif(sys.platform != "linux" or not shutil.which("setpriv"), reason="needs setpriv of Linux")
+def test_ffmpeg_ends_with_a_killed_python(tmp_path):
+    # An endless encoder that reads no pipe, as while ffmpeg writes the sound after the last frame.
+    code = f"""
+import signal, threading
+from vehicle_detection.video.ffmpeg import Process
+processes = []
+def start():
+    options = ("-nostdin", "-re", "-f", "lavfi", "-i", "testsrc", {str(tmp_path / "out.mkv")!r})
+    processes.append(Process(options))
+thread = threading.Thread(target=start)
+thread.start()
+thread.join()  # the end of this thread must not end ffmpeg
+print(processes[0]._popen.pid, flush=True)
+signal.pause()
+"""
+    process = start_interruptible(sys.executable, "-c", code)
+    child = int(process.stdout.readline())
+    time.sleep(0.1)
+    assert is_running(child)
+    process.kill()
+    process.communicate()
+    deadline = time.monotonic() + 5
+    while is_running(child) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not is_running(child)
+
+
+def is_running(number):
+    try:
+        state = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+    return state != "Z"
+
+
+def test_an_interrupt_while_ffmpeg_starts_leaves_no_process(clip, monkeypatch):
+    def interrupt(self, timeout=None):
+        monkeypatch.undo()
+        raise KeyboardInterrupt
+
+    probe_video(clip)
+    monkeypatch.setattr("concurrent.futures.Future.result", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        Process(("-nostdin", "-f", "lavfi", "-i", "testsrc", "-f", "null", "-"))
+    deadline = time.monotonic() + 5
+    while child_processes() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not child_processes()

@@ -104,7 +104,9 @@ def test_a_killed_encoder_is_an_error(clip, tmp_path, monkeypatch):
             os.kill(writers[0]._process._popen.pid, signal.SIGKILL)
             time.sleep(0.05)
 
-    with pytest.raises(VideoError, match="cannot be written: ffmpeg reports"):
+    with pytest.raises(
+        VideoError, match="cannot be written: another process ended ffmpeg by the signal SIGKILL"
+    ):
         process_video(clip, tmp_path / "out.mp4", StubDetector(), on_result=kill)
     assert os.listdir(tmp_path) == []
 

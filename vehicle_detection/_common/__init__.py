@@ -2,6 +2,7 @@
 
 from vehicle_detection._common.augment import blur_patches, degrade_patches, mirror_patches, relight
 from vehicle_detection._common.checks import (
+    check_array,
     check_boxes,
     check_channel,
     check_choice,
@@ -9,11 +10,16 @@ from vehicle_detection._common.checks import (
     check_integer,
     check_number,
     check_patches,
+    check_path,
+    check_sequence,
     check_type,
     describe,
     finite_array,
 )
-from vehicle_detection._common.files import atomic_write, check_target, write_parquet
+from vehicle_detection._common.environment import check_environment
+from vehicle_detection._common.files import atomic_write, check_target, temporary_folder, write_parquet
+from vehicle_detection._common.image_size import image_size
+from vehicle_detection._common.limits import Limit, check_regular_file, read_regular_file
 from vehicle_detection._common.model_file import FORMAT_VERSION, ModelData, read_model, write_model
 from vehicle_detection._common.progress import progress_bar
 from vehicle_detection._common.threads import (
@@ -25,16 +31,20 @@ from vehicle_detection._common.threads import (
 )
 from vehicle_detection._common.workspace import NEW_ARRAYS, Workspace
 
+check_environment()
+
 __all__ = [
     "FORMAT_VERSION",
     "JOBS_VARIABLE",
     "NEW_ARRAYS",
+    "Limit",
     "ModelData",
     "ThreadTeam",
     "Workspace",
     "atomic_write",
     "available_cores",
     "blur_patches",
+    "check_array",
     "check_boxes",
     "check_channel",
     "check_choice",
@@ -42,17 +52,23 @@ __all__ = [
     "check_integer",
     "check_number",
     "check_patches",
+    "check_path",
+    "check_regular_file",
+    "check_sequence",
     "check_target",
     "check_type",
     "degrade_patches",
     "describe",
     "finite_array",
+    "image_size",
     "mirror_patches",
     "progress_bar",
     "read_model",
+    "read_regular_file",
     "relight",
     "resolve_jobs",
     "single_threaded_opencv",
+    "temporary_folder",
     "write_model",
     "write_parquet",
 ]

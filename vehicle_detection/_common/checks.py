@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Collection
+import os
+from collections.abc import Collection, Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection.errors import InvalidInputError
+
+_MAX_INTEGER = 2**53
+"""Integers up to it are exact in every format; no count of anything is larger."""
+
+# Bytes of a path, and of each name in it: the limits of Linux, not lower than those of other systems.
+_MAX_PATH, _MAX_NAME = 4096, 255
 
 
 def describe(value: object) -> str:
@@ -27,6 +36,26 @@ def check_type(value: object, name: str, kind: type | tuple[type, ...], remedy: 
     if not isinstance(value, kind):
         names = " or ".join(each.__name__ for each in (kind if isinstance(kind, tuple) else (kind,)))
         raise InvalidInputError(f"{name} must be a {names}, got {describe(value)}; {remedy}")
+
+
+def check_path(path: object, name: str = "path", *, kind: str = "a file name") -> Path:
+    """Return a path, unless no file can have that name."""
+    if not isinstance(path, (str, os.PathLike)):
+        raise InvalidInputError(f"{name} must be {kind}, got {describe(path)}; pass a path")
+    text = os.fspath(path)
+    if not isinstance(text, str):
+        raise InvalidInputError(f"{name} must be {kind} as text, got {describe(path)}; use os.fsdecode")
+    try:
+        too_long = len(os.fsencode(text)) > _MAX_PATH
+    except UnicodeEncodeError:
+        raise InvalidInputError(
+            f"{name} must be {kind}, got {describe(path)} with a character that files cannot have"
+        ) from None
+    too_long |= any(len(os.fsencode(part)) > _MAX_NAME for part in Path(text).parts)
+    if too_long or "\0" in text:
+        problem = f"more than {_MAX_NAME} bytes" if too_long else "a null character"
+        raise InvalidInputError(f"{name} must be {kind}, got {describe(path)} with {problem}")
+    return Path(text)
 
 
 def check_image(image: object, name: str = "image") -> NDArray[np.uint8]:
@@ -99,6 +128,26 @@ def check_patches(patches: object, size: int, name: str = "patches") -> NDArray[
     )
 
 
+def check_array(values: object, name: str) -> NDArray[Any]:
+    """Return `values` as an array, unless they are ragged or otherwise no array."""
+    try:
+        return np.asarray(values)
+    except (ValueError, TypeError, OverflowError):
+        raise InvalidInputError(
+            f"{name} must be an array or a sequence of numbers of equal lengths, got {describe(values)}"
+        ) from None
+
+
+def check_sequence(values: object, name: str, of: str) -> tuple[Any, ...]:
+    """Return the items of a sequence or another iterable, but not the characters of a text."""
+    scalar = isinstance(values, (str, bytes)) or getattr(values, "ndim", 1) == 0
+    if scalar or not isinstance(values, Iterable):
+        raise InvalidInputError(
+            f"{name} must be a sequence of {of}, got {describe(values)}; wrap it in a list"
+        )
+    return tuple(values)
+
+
 def check_boxes(boxes: Any, name: str = "boxes") -> NDArray[Any]:
     """Return `boxes` as an ``(N, 4)`` array of finite boxes with ``x1 <= x2`` and ``y1 <= y2``.
 
@@ -137,7 +186,8 @@ def check_number(
     """Return `value` as a finite float in ``[low, high]`` and, if given, greater than `above`."""
     number = math.nan
     if isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool):
-        number = float(value)
+        with contextlib.suppress(OverflowError):  # an int of more than 308 digits
+            number = float(value)
     if not (math.isfinite(number) and low <= number <= high and number > above):
         bounds = [f"greater than {above:g}"] if above > -math.inf else []
         bounds += [f"at least {low:g}"] if low > -math.inf else []
@@ -150,7 +200,8 @@ def check_number(
 def check_integer(value: object, name: str, *, low: int, high: int | None = None) -> int:
     """Return `value` as an int in ``[low, high]``."""
     is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not is_integer or value < low or (high is not None and value > high):  # type: ignore[operator]
+    limit = _MAX_INTEGER if high is None else high
+    if not is_integer or value < low or value > limit:  # type: ignore[operator]
         expected = f"at least {low}" if high is None else f"from {low} to {high}"
         raise InvalidInputError(f"{name} must be an integer {expected}; got {describe(value)}")
     return int(value)  # type: ignore[call-overload, no-any-return]

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import shutil
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection._common.checks import check_path
+from vehicle_detection.errors import InvalidInputError, OutputError, VehicleDetectionError
+
+_FULL = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
+_DISK_ERRORS = (*_FULL, errno.EROFS, errno.EIO)
+# Processes that write one target at the same time, above which their leftovers are not removed.
+_MAX_PARTS = 100
 
 
 def check_target(target: str | os.PathLike[str], name: str = "target") -> Path:
     """Return the path of a file to write, after checking that its folder exists and is writable."""
-    path = Path(target)
+    path = check_path(target, name)
     if path.is_dir():
         raise InvalidInputError(f"{name} must be a file, got the folder {path}; add a file name to it")
     if not path.parent.is_dir():
@@ -28,23 +37,154 @@ def check_target(target: str | os.PathLike[str], name: str = "target") -> Path:
 def atomic_write(target: str | os.PathLike[str], name: str = "target") -> Iterator[Path]:
     """Yield a temporary path beside `target`, renamed to `target` if the block succeeds.
 
-    After an error or an interrupt, the temporary file is removed and an existing `target` is unchanged. The
-    temporary name has the suffix of `target`, which determines the format that many libraries write.
+    After an error or an interrupt, the temporary file is removed and an existing `target` is unchanged. That
+    of a killed process is used, and thereby removed, by the next one with the same target. The temporary name
+    has the suffix of `target`, which determines the format that many libraries write.
+
+    Raises
+    ------
+    OutputError
+        If the disk is full, or the target cannot be written for another reason.
     """
     path = check_target(target, name)
-    # The stem is shortened: with additions, it may exceed the limit for file names.
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.stem[:32]}.", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    part = Path(temporary)
+    with contextlib.ExitStack() as stack:
+        with _output_errors(path, every=True):
+            part = _open_part(path, stack)
+        stack.callback(_remove, part)
+        with _output_errors(path, part):
+            yield part
+        with _output_errors(path, every=True):
+            # The temporary file is private; give the output the permissions of any new file.
+            umask = os.umask(0)
+            os.umask(umask)
+            part.chmod(0o666 & ~umask)
+            part.replace(path)
+
+
+@contextlib.contextmanager
+def _output_errors(path: Path, part: Path | None = None, *, every: bool = False) -> Iterator[None]:
+    """Raise errors of the disk as an `OutputError` that names the output.
+
+    With `every`, these are all errors of the system; otherwise those that concern the temporary file `part`.
+    """
     try:
-        yield part
-        # mkstemp creates private files; give the output the permissions of any new file.
-        umask = os.umask(0)
-        os.umask(umask)
-        part.chmod(0o666 & ~umask)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+        yield
+    except VehicleDetectionError:
+        raise
+    except OSError as error:
+        concerned = error.errno in _DISK_ERRORS and error.filename in (None, str(part))
+        if not every and not concerned:
+            raise
+        kept = "; the existing file is unchanged" if path.is_file() else ""
+        reason = error.strerror or str(error) or type(error).__name__
+        remedy = "free some space" if error.errno in _FULL else "check the folder, or choose another"
+        raise OutputError(f"{path} cannot be written ({reason}); {remedy}{kept}") from error
+
+
+def _open_part(path: Path, stack: contextlib.ExitStack) -> Path:
+    """Create the temporary file of a target, locked until `stack` closes where the system has locks.
+
+    The names are numbered: a file that no process has locked is what a killed one has left.
+    """
+    # The stem is shortened: with additions, it may exceed the limit for file names.
+    prefix = f".{path.stem[:32]}."
+    if sys.platform != "win32":
+        for number in range(_MAX_PARTS):
+            part = path.parent / f"{prefix}{number}.part{path.suffix}"
+            try:
+                handle = _open_locked(part)
+            except BlockingIOError:
+                continue
+            if handle is None:
+                break
+            stack.callback(os.close, handle)
+            return part
+    handle, temporary = tempfile.mkstemp(prefix=prefix, suffix=f".part{path.suffix}", dir=path.parent)
+    os.close(handle)
+    return Path(temporary)
+
+
+def _open_locked(part: Path) -> int | None:
+    """Open and lock a new or abandoned file; None if the file system has no locks.
+
+    Raises BlockingIOError if another process uses the file, or it is not a file.
+    """
+    import fcntl
+
+    flags = os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC
+    while True:
+        created = False
+        try:
+            handle = os.open(part, flags | os.O_CREAT | os.O_EXCL, 0o600)
+            created = True
+        except FileExistsError:
+            try:
+                handle = os.open(part, flags)
+            except FileNotFoundError:  # renamed or removed in between
+                continue
+            except OSError as error:  # a link, a folder, or the file of another user
+                raise BlockingIOError(error.errno, error.strerror) from error
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with contextlib.suppress(FileNotFoundError):
+                # Another process may have renamed or removed the file before it was locked.
+                if os.path.samestat(os.stat(part), os.fstat(handle)):
+                    os.truncate(handle, 0)
+                    return handle
+        except BlockingIOError:
+            os.close(handle)
+            raise
+        except OSError:
+            os.close(handle)
+            if created:
+                part.unlink()
+            return None
+        os.close(handle)
+
+
+def _remove(part: Path) -> None:
+    # The first error is the one to report.
+    with contextlib.suppress(OSError):
+        part.unlink()
+
+
+@contextlib.contextmanager
+def temporary_folder(parent: Path, name: str) -> Iterator[Path]:
+    """Create a hidden folder in `parent`, removed after the block; also remove those of killed processes."""
+    prefix, suffix = f".{name}.", ".part"
+    with contextlib.ExitStack() as stack:
+        if sys.platform != "win32":
+            for old in parent.iterdir():
+                if old.name.startswith(prefix) and old.name.endswith(suffix) and old.is_dir():
+                    _remove_abandoned(old)
+        with _output_errors(parent / name, every=True):
+            folder = Path(tempfile.mkdtemp(prefix=prefix, suffix=suffix, dir=parent))
+        stack.callback(shutil.rmtree, folder, ignore_errors=True)
+        if sys.platform != "win32":
+            with contextlib.suppress(OSError):  # a file system without locks
+                stack.callback(os.close, _lock_folder(folder))
+        with _output_errors(parent / name):
+            yield folder
+
+
+def _lock_folder(folder: Path) -> int:
+    """Open and lock a folder; OSError if another process has locked it."""
+    import fcntl
+
+    handle = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(handle)
+        raise
+    return handle
+
+
+def _remove_abandoned(folder: Path) -> None:
+    with contextlib.suppress(OSError):  # in use
+        handle = _lock_folder(folder)
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(handle)
 
 
 def write_parquet(

@@ -8,14 +8,14 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common.checks import describe
+from vehicle_detection._common.checks import check_path, describe
 from vehicle_detection._common.files import atomic_write
+from vehicle_detection._common.limits import Limit, read_regular_file
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 
 FORMAT = "vehicle-detection-model"
@@ -23,6 +23,8 @@ FORMAT_VERSION = "3"
 
 SHIPPED = ("default", "highway")
 """Names of the models that the package ships."""
+
+_MAX_WEIGHT = 1e12
 
 Tensors = Mapping[str, NDArray[Any]]
 
@@ -92,23 +94,30 @@ def read_model(path: str | os.PathLike[str], kind: str | None = None) -> ModelDa
         raise InvalidInputError(
             f"path must be a model file or one of {', '.join(map(repr, SHIPPED))}; got {describe(path)}"
         )
-    if path in SHIPPED:
+    if str(path) in SHIPPED:
         resource = resources.files("vehicle_detection") / "models" / f"{path}.safetensors"
         if not resource.is_file():
             raise ModelFileError(f"the shipped model {path!r} is missing; install the package again")
         return _parse(resource.read_bytes(), f"the shipped model {path!r}", kind)
-    file = Path(path)
-    try:
-        data = file.read_bytes()
-    except FileNotFoundError:
+    file = check_path(path)
+    name = f"model file {file}"
+    if not os.path.lexists(file):
         raise ModelFileError(
-            f"model file {file} does not exist; check the path, or name a shipped model: {', '.join(SHIPPED)}"
-        ) from None
-    except IsADirectoryError:
-        raise ModelFileError(f"model file {file} is a folder; choose a file in it") from None
-    except OSError as error:
-        raise ModelFileError(f"model file {file} cannot be read: {error.strerror}") from error
-    return _parse(data, f"model file {file}", kind)
+            f"{name} does not exist; check the path, or name a shipped model: {', '.join(SHIPPED)}"
+        )
+    return _parse(read_regular_file(file, name, Limit.MODEL_BYTES, error=ModelFileError), name, kind)
+
+
+def _check_tensors(tensors: Tensors, name: str) -> None:
+    """Raise unless all tensors are floating-point numbers with which no score can overflow."""
+    for key, tensor in tensors.items():
+        if tensor.dtype.kind != "f":
+            problem = f"{key} must be floating-point numbers, got {tensor.dtype}"
+        elif not (np.abs(tensor) <= _MAX_WEIGHT).all():  # also false for NaN
+            problem = f"{key} must be finite numbers of at most {_MAX_WEIGHT:g}"
+        else:
+            continue
+        raise ModelFileError(f"{name} does not fit its own parameters: {problem}; train again")
 
 
 def _parse(data: bytes, name: str, kind: str | None) -> ModelData:
@@ -120,7 +129,7 @@ def _parse(data: bytes, name: str, kind: str | None) -> ModelData:
         tensors = load(data)
         length = int.from_bytes(data[:8], "little")
         header = json.loads(data[8 : 8 + length])["__metadata__"]
-    except (SafetensorError, ValueError, KeyError) as error:
+    except (SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ModelFileError(
             f"{name} is not a complete safetensors file ({error}); download it again or train a model"
         ) from error
@@ -137,8 +146,9 @@ def _parse(data: bytes, name: str, kind: str | None) -> ModelData:
         raise ModelFileError(
             f"{name} contains a model of kind {header.get('kind')!r}, not {kind!r}; load it with load_model"
         )
+    _check_tensors(tensors, name)
     try:
         params, metadata = json.loads(header["params"]), json.loads(header["metadata"])
         return ModelData(name, str(header["kind"]), dict(params), dict(metadata), tensors)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise ModelFileError(f"{name} has no readable parameters ({error}); download it again") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,8 +22,9 @@ def progress_bar(
 
     Nothing is shown if `show` is False or, with `terminal_only`, if standard error is not a terminal.
     """
-    if not show:
+    # Not left to tqdm, whose import takes a tenth of a second.
+    if not show or (terminal_only and not sys.stderr.isatty()):
         return contextlib.nullcontext(_HIDDEN)
     from tqdm.auto import tqdm
 
-    return tqdm(total=total, unit=unit, desc=desc, disable=None if terminal_only else False)
+    return tqdm(total=total, unit=unit, desc=desc, disable=False)

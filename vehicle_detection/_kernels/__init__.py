@@ -1,5 +1,6 @@
 """Compiled numba kernels: HOG, FHOG, color, correlation, matrix products and the SVM solver."""
 
+import vehicle_detection._common  # noqa: F401 - checks the environment variables of numba first
 from vehicle_detection._kernels.correlation import DenseLayer, Filter, PackedFilters, PackedSearch
 from vehicle_detection._kernels.fhog import cell_means
 from vehicle_detection._kernels.hog import (

@@ -132,6 +132,7 @@ def _process(out: Path, task: Mapping[str, Any]) -> dict[str, Any]:
         "tracks": report.tracks,
         "rows": write.rows,
         "outputs": outputs,
+        **({"damage": report.damage} if report.damage else {}),
     }
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,12 +20,15 @@ from vehicle_detection.cli.batch import batch
 from vehicle_detection.cli.output import (
     capture_stderr,
     check_distinct_paths,
+    name_kept_files,
     option_names,
     output_folder,
     print_error,
     print_facts,
+    print_warnings,
     rename_argument,
 )
+from vehicle_detection.cli.signals import raise_on_signals
 from vehicle_detection.cli.train import fetch, info, train, train_frames
 from vehicle_detection.cli.tune import tune
 from vehicle_detection.errors import DatasetError, InvalidInputError, VehicleDetectionError
@@ -37,7 +39,7 @@ if TYPE_CHECKING:
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.params import DrawParams
 
-FAILURE, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
+BAD_INPUT, DAMAGED, INTERRUPTED = 2, 3, 130  # exit codes
 _CHECKED_IMAGES = 20  # images that are searched again if no vehicle was found
 
 
@@ -46,7 +48,8 @@ class _Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         try:
-            return super().invoke(ctx)
+            with raise_on_signals(), print_warnings():
+                return super().invoke(ctx)
         except (InvalidInputError, DatasetError) as error:
             print_error(f"error: {rename_argument(str(error), self._option_names(ctx))}")
             raise typer.Exit(BAD_INPUT) from None
@@ -58,10 +61,10 @@ class _Commands(TyperGroup):
                 raise
             reason = error.strerror or str(error)
             print_error(f"error: {error.filename}: {reason}" if error.filename else f"error: {reason}")
-            raise typer.Exit(FAILURE) from None
-        except KeyboardInterrupt:
+            raise typer.Exit(BAD_INPUT) from None
+        except KeyboardInterrupt as error:
             print_error("interrupted")
-            raise typer.Exit(INTERRUPTED) from None
+            raise typer.Exit(getattr(error, "code", INTERRUPTED)) from None
 
     def _option_names(self, ctx: Any) -> dict[str, str]:
         """Map the arguments of the command's function to the names that its user knows."""
@@ -80,15 +83,6 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-
-
-def main() -> None:
-    """Run the command line."""
-    try:
-        app(prog_name="vehicle-detection")
-    except KeyboardInterrupt:  # before or after a command
-        print_error("interrupted")
-        sys.exit(INTERRUPTED)
 
 
 def _show_version(wanted: bool) -> None:
@@ -404,23 +398,28 @@ def video(
         bool, Option("--live", help="Drop frames of a pipe rather than lag; default for cameras and streams.")
     ] = False,
     no_audio: Annotated[bool, Option("--no-audio", help="Write no sound.")] = False,
-    quiet: Annotated[bool, Option("-q", "--quiet", help="Print errors only.")] = False,
+    strict: Annotated[
+        bool, Option("--strict", help="Fail, and write nothing, if the source is damaged.")
+    ] = False,
+    quiet: Annotated[bool, Option("-q", "--quiet", help="Print errors and warnings of damage only.")] = False,
     profile: Annotated[bool, Option("--profile", help="Print the time of each stage.")] = False,
 ) -> None:
-    """Track the vehicles of a video and write an annotated copy; speeds are relative to the camera."""
+    """Track the vehicles of a video and write an annotated copy; speeds are relative to the camera.
+
+    Exit code 3: the source is damaged, and the copy lacks what cannot be decoded.
+    """
     from vehicle_detection.cli.events import EventOptions, print_summary
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.events import TrackLog
     from vehicle_detection.export import TrackWriter
     from vehicle_detection.mixture import load_model
-    from vehicle_detection.report import ReportWriter
     from vehicle_detection.video import estimate_video_horizon, open_source, process_video
 
     draw_params = _draw_params(labels, line_width=line_width, color_by=color_by, panel=panel, units=units)
     outputs = {"--output": output, "--tracks": tracks, "--report": report, "--events": events}
     check_distinct_paths(outputs, {"SOURCE": Path(source)})
     event_options = EventOptions(events, clips, own_speed)
-    with contextlib.ExitStack() as stack:
+    with name_kept_files(outputs.values()), contextlib.ExitStack() as stack:
         stack.enter_context(output_folder(clips, "--clips"))
         writers: list[Callable[[Any], object]] = []
         if tracks is not None:
@@ -448,6 +447,8 @@ def video(
         )
         page = None
         if report is not None:
+            from vehicle_detection.report import ReportWriter
+
             with option_names(path="--report"):
                 page = ReportWriter(
                     report, video=output, source=source, detector=detector, units=draw_params.units
@@ -464,12 +465,15 @@ def video(
             preset=preset,
             workers=jobs,
             progress=not quiet,
+            strict=strict,
             on_result=lambda result: [write(result) for write in writers],
         )
         found = event_options.find(log, done, detector)
         event_options.write(found, output, done)
-    if page is not None:
-        page.finish(done, events=found)
+        if page is not None:
+            # After the tracks, whose file is complete when its writer closes.
+            stack.close()
+            page.finish(done, events=found)
     if not done.tracks and horizon not in (None, "auto") and not quiet and Path(source).exists():
         with _everywhere(loaded, conf) as detector:
             _warn_of_horizon(horizon, estimate_video_horizon(source, detector, start=start, end=end))
@@ -485,6 +489,8 @@ def video(
         print_summary(log, found, done)
         written = [path for path in (*outputs.values(), clips) if path is not None]
         typer.echo(f"wrote {', '.join(map(str, written))}")
+    if done.damage:
+        raise typer.Exit(DAMAGED)
 
 
 def _draw_params(labels: str, **options: Any) -> DrawParams:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import progress_bar
+from vehicle_detection._common import progress_bar, temporary_folder
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.evaluation import TrackScores, evaluate_tracks, read_labels
 from vehicle_detection.export import TrackWriter
@@ -38,9 +37,9 @@ def run_demo(
 ) -> tuple[VideoReport, TrackScores]:
     """Draw a drive, annotate and score it, oncoming vehicles too; an error leaves no file in the folder."""
     drive = render_drive(frames=frames, random_state=random_state)
-    with tempfile.TemporaryDirectory(prefix=".demo.", dir=folder) as temporary:
-        clip, annotated, tracks, labels, sheet = (Path(temporary) / name for name in FILES)
-        page = ReportWriter(Path(temporary) / REPORT, video=annotated, source=clip, detector=detector)
+    with temporary_folder(folder, "demo") as temporary:
+        clip, annotated, tracks, labels, sheet = (temporary / name for name in FILES)
+        page = ReportWriter(temporary / REPORT, video=annotated, source=clip, detector=detector)
         draw_clip(drive, clip, labels, progress=True)
         # Compile the kernels now, so that the reported speed does not include it.
         detector.warm_up(drive.shape)
@@ -54,7 +53,7 @@ def run_demo(
         if report:
             page.finish(done)
         for name in (*FILES, REPORT) if report else FILES:
-            (Path(temporary) / name).replace(folder / name)
+            (temporary / name).replace(folder / name)
     return done, scores
 
 

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, TypeVar
 
 import typer
 
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
 
 Result = TypeVar("Result")
 
@@ -25,6 +26,31 @@ _PIPE_WIDTH = 120
 def print_error(message: str) -> None:
     """Print one line to standard error, without the line breaks of the message."""
     typer.echo(" ".join(message.split()), err=True)
+
+
+class _WarningPrinter(logging.Handler):
+    """Prints the library's warnings, each text once."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self._printed: set[str] = set()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        message = record.getMessage()
+        if message not in self._printed:
+            self._printed.add(message)
+            print_error(f"warning: {message}")
+
+
+@contextlib.contextmanager
+def print_warnings() -> Iterator[None]:
+    """Print the warnings that the library logs in the block, one line each."""
+    logger, printer = logging.getLogger("vehicle_detection"), _WarningPrinter()
+    logger.addHandler(printer)
+    try:
+        yield
+    finally:
+        logger.removeHandler(printer)
 
 
 def rename_argument(message: str, options: Mapping[str, str]) -> str:
@@ -69,13 +95,37 @@ def print_facts(title: str, facts: Mapping[str, Any]) -> None:
 
 def check_distinct_paths(targets: Mapping[str, Path | None], sources: Mapping[str, Path]) -> None:
     """Refuse a target that is also a source or another target."""
-    seen = {path.resolve(): f"{name} {path}" for name, path in sources.items()}
+    # Not Path.resolve, which raises RuntimeError for a loop of links.
+    seen = {os.path.realpath(path): f"{name} {path}" for name, path in sources.items()}
     for name, path in targets.items():
         if path is None:
             continue
-        other = seen.setdefault(path.resolve(), f"{name} {path}")
+        other = seen.setdefault(os.path.realpath(path), f"{name} {path}")
         if other != f"{name} {path}":
             raise InvalidInputError(f"{name} {path} is also {other}; choose another name")
+
+
+@contextlib.contextmanager
+def name_kept_files(outputs: Iterable[Path | None]) -> Iterator[None]:
+    """Add to an error in the block which of the output files the block has completed."""
+    before = {path: _identity(path) for path in outputs if path is not None}
+    try:
+        yield
+    except VehicleDetectionError as error:
+        kept = [str(path) for path, identity in before.items() if _identity(path) not in (None, identity)]
+        if not kept:
+            raise
+        verb = "is" if len(kept) == 1 else "are"
+        raise type(error)(f"{error}; {' and '.join(kept)} {verb} complete and kept") from error
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Values that differ after a file was replaced; None without a file."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return (status.st_ino, status.st_mtime_ns) if path.is_file() else None
 
 
 @contextlib.contextmanager

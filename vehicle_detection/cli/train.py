@@ -15,6 +15,7 @@ from typer import Argument, Option
 from vehicle_detection.cli.output import (
     capture_stderr,
     check_distinct_paths,
+    name_kept_files,
     option_names,
     output_folder,
     print_facts,
@@ -90,24 +91,25 @@ def train(
     others = [other for _, other in rest]
     for each in (evaluated, *others):
         _print_report(each)
-    classifier.save(output)
-    if report is not None:
-        plain = evaluated.to_dict() | {"others": [other.to_dict() for other in others]}
-        with atomic_write(report) as part:
-            part.write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
-    if card is not None:
-        words = ["--vehicles", vehicles.name, "--non-vehicles", non_vehicles.name, "--features", features]
-        words += ["--split", split, "--C", f"{C:g}", "--seed", str(seed)] + ["--no-mirror"] * no_mirror
-        words += ["--gamma", f"{gamma:g}", "--degraded", f"{degraded:g}"]
-        words += ["--solver", solver] if solver != "dual" else []
-        words += [word for name in compare or () for word in ("--compare", name)]
-        words += ["-o", output.name, "--card", card.name]
-        command = shlex.join(["vehicle-detection", "train", *words])
-        with atomic_write(card) as part:
-            part.write_text(
-                model_card(classifier, evaluated, name=output.stem, others=others, command=command),
-                encoding="utf-8",
-            )
+    with name_kept_files(targets.values()):
+        classifier.save(output)
+        if report is not None:
+            plain = evaluated.to_dict() | {"others": [other.to_dict() for other in others]}
+            with atomic_write(report) as part:
+                part.write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
+        if card is not None:
+            words = ["--vehicles", vehicles.name, "--non-vehicles", non_vehicles.name, "--features", features]
+            words += ["--split", split, "--C", f"{C:g}", "--seed", str(seed)] + ["--no-mirror"] * no_mirror
+            words += ["--gamma", f"{gamma:g}", "--degraded", f"{degraded:g}"]
+            words += ["--solver", solver] if solver != "dual" else []
+            words += [word for name in compare or () for word in ("--compare", name)]
+            words += ["-o", output.name, "--card", card.name]
+            command = shlex.join(["vehicle-detection", "train", *words])
+            with atomic_write(card) as part:
+                part.write_text(
+                    model_card(classifier, evaluated, name=output.stem, others=others, command=command),
+                    encoding="utf-8",
+                )
     typer.echo(f"wrote {', '.join(map(str, targets.values()))}")
 
 
@@ -233,8 +235,9 @@ def train_frames(
         sources, extra_sources=extra, patches=vehicles, random_state=seed, on_step=typer.echo
     )
     metadata = training_metadata(scores, [*sources, *extra], seed, len(vehicles))
-    model.with_metadata(metadata).save(output)
-    if curves is not None:
-        write_curves(curves, folds)
+    with name_kept_files(targets.values()):
+        model.with_metadata(metadata).save(output)
+        if curves is not None:
+            write_curves(curves, folds)
     print_fold_scores({score.name: score.to_dict() for score in scores})
     typer.echo(f"wrote {', '.join(map(str, targets.values()))}")

@@ -20,7 +20,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import atomic_write, check_integer, describe, progress_bar
+from vehicle_detection._common import (
+    Limit,
+    atomic_write,
+    check_integer,
+    check_path,
+    check_regular_file,
+    progress_bar,
+)
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import decode_image
 
@@ -37,6 +44,8 @@ ARCHIVES: dict[str, dict[str, int]] = {
 }  # fmt: skip
 # Labels by folder name, without hyphens and underscores.
 CLASS_FOLDERS = {"vehicles": True, "cars": True, "nonvehicles": False, "notcars": False}
+# Of all members, unpacked; the course's have 60 MB each.
+_MAX_ARCHIVE_BYTES = 1_000_000_000
 STALE_SECONDS = 3600.0  # age from which a partial download counts as left behind by a killed process
 # Errors of zipfile on a damaged archive; RuntimeError if it is encrypted.
 _ZIP_ERRORS = (
@@ -67,6 +76,7 @@ def is_image(name: str) -> bool:
 
 def open_archive(path: Path, shown: str | None = None) -> zipfile.ZipFile:
     """Open a zip for reading, or raise a DatasetError that says what the file is instead."""
+    check_regular_file(path, shown or str(path), error=DatasetError)
     try:
         return zipfile.ZipFile(path)
     except _ZIP_ERRORS as error:
@@ -99,14 +109,24 @@ class Listing:
             yield lambda member: (self.path / member).read_bytes()
         else:
             with open_archive(self.path) as archive:
-                yield archive.read
+                yield lambda member: _read_member(archive, member)
+
+
+def _read_member(archive: zipfile.ZipFile, member: str) -> bytes:
+    """Read a member of limited size, whatever size the archive states for it."""
+    limit = Limit.IMAGE_BYTES.current()
+    with archive.open(member) as file:
+        data = file.read(limit + 1)
+    if len(data) > limit:
+        raise ValueError(
+            f"larger than {limit:,} bytes; set {Limit.IMAGE_BYTES.variable} if it is meant to be"
+        )
+    return data
 
 
 def list_patches(source: str | os.PathLike[str], name: str) -> Listing:
     """List the images in a folder or zip; `name` is the argument's name in error messages."""
-    if not isinstance(source, (str, os.PathLike)):
-        raise InvalidInputError(f"{name} must be the path of a folder or zip, got {describe(source)}")
-    path = Path(source)
+    path = check_path(source, name, kind="the path of a folder or zip")
     if not path.exists():
         raise DatasetError(f"{name} {path} does not exist; check the path, or download the course's patches")
     found = _list_folder(path) if path.is_dir() else _list_zip(path)
@@ -207,6 +227,9 @@ def verify_archive(path: Path, counts: dict[str, int], *, shown: str) -> None:
     """Raise a DatasetError unless the zip holds exactly the number of PNGs per folder, all undamaged."""
     remedy = "pass the url of a folder with the course's archives"
     with open_archive(path, shown) as archive:
+        size = sum(member.file_size for member in archive.infolist())
+        if size > _MAX_ARCHIVE_BYTES:
+            raise DatasetError(f"{shown} holds {size:,} bytes, more than the course's patches; {remedy}")
         found: Counter[str] = Counter()
         for name in sorted({member.replace("\\", "/") for member in archive.namelist()}):
             # The file is not unpacked here, but a user may unpack it later.

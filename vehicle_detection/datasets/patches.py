@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_choice, check_patches, describe
+from vehicle_detection._common import check_array, check_choice, check_patches, check_sequence, describe
 from vehicle_detection.datasets.archives import (
     decode_listings,
     infer_labels,
@@ -59,7 +59,7 @@ class PatchSet:
         given: object = self.patches
         side = given.shape[1] if isinstance(given, np.ndarray) and given.ndim == 4 else PATCH_SIZE
         patches = check_patches(given, side)
-        labels, names = check_labels(self.labels, "labels"), tuple(self.names)
+        labels, names = check_labels(self.labels, "labels"), check_sequence(self.names, "names", "file names")
         if not all(isinstance(name, str) for name in names):
             raise InvalidInputError("names must be strings like 'vehicles/GTI_Far/image0000.png'")
         columns: dict[str, Any] = {"patches": patches, "labels": labels, "names": names}
@@ -138,7 +138,7 @@ class PatchSet:
 
 def check_labels(labels: ArrayLike, name: str) -> NDArray[np.bool_]:
     """Return `labels` as a one-dimensional boolean array."""
-    array = np.asarray(labels)
+    array = check_array(labels, name)
     if array.size == 0:
         array = np.empty(0, np.bool_)
     if array.ndim != 1 or array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():

@@ -7,7 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_boxes, check_image, check_integer, check_type, describe
+from vehicle_detection._common import (
+    check_array,
+    check_boxes,
+    check_image,
+    check_integer,
+    check_type,
+    describe,
+)
 from vehicle_detection.boxes import Detections
 from vehicle_detection.drawing.labels import LabelPlacer, LabelRequest, draw_labels
 from vehicle_detection.drawing.primitives import Color, Image, draw_outline, line_width_for, round_box
@@ -45,7 +52,7 @@ def draw_boxes(image: Image, boxes: ArrayLike, *, color: Color = (0, 0, 255), th
     ([0, 0, 255], [0, 0, 255], 76)
     """
     result = check_image(image).copy()
-    if np.shape(color) != (3,):
+    if np.shape(check_array(color, "color")) != (3,):
         raise InvalidInputError(f"color must be (red, green, blue), 0-255 each; got {describe(color)}")
     red, green, blue = (check_integer(value, "color", low=0, high=255) for value in color)
     width = check_integer(thickness, "thickness", low=1, high=10_000)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Collection, Iterable
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -220,7 +220,9 @@ def track_fields(track: Track, fields: Collection[str], units: str = "metric") -
 
 def check_tracks(tracks: object) -> list[Track]:
     """Return tracks as a list."""
-    listed = list(tracks) if isinstance(tracks, Iterable) else None
+    listed: list[Any] | None = None
+    if isinstance(tracks, Iterable) and getattr(tracks, "ndim", 1) > 0:
+        listed = list(tracks)
     if listed is None or not all(isinstance(track, Track) for track in listed):
         raise InvalidInputError(
             f"tracks must be Track objects, got {describe(tracks)}; pass what update returns"

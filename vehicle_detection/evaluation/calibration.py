@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_integer, describe
+from vehicle_detection._common import check_array, check_integer, check_type, describe
 from vehicle_detection.boxes import Platt
 from vehicle_detection.errors import InvalidInputError
 
@@ -44,7 +44,8 @@ def calibrate_scores(scores: ArrayLike, labels: ArrayLike, *, prior: bool = True
     >>> bool(platt.probability(1.5) > 0.5 > platt.probability(-1.5))
     True
     """
-    values, truth = np.asarray(scores), np.asarray(labels)
+    check_type(prior, "prior", bool, "pass True or False")
+    values, truth = check_array(scores, "scores"), check_array(labels, "labels")
     if values.ndim != 1 or not values.size or values.dtype.kind not in "iuf":
         raise InvalidInputError(f"scores must be a one-dimensional array of numbers; got {describe(values)}")
     if not np.isfinite(values).all():
@@ -104,7 +105,7 @@ def calibration_error(probabilities: ArrayLike, labels: ArrayLike, *, bins: int 
     >>> round(calibration_error([0.9, 0.9, 0.1, 0.1], [1, 1, 0, 1]), 3)
     0.25
     """
-    values, truth = np.asarray(probabilities), np.asarray(labels)
+    values, truth = check_array(probabilities, "probabilities"), check_array(labels, "labels")
     inside = values.dtype.kind in "iuf" and bool(((values >= 0) & (values <= 1)).all())
     if values.ndim != 1 or not values.size or not inside:
         raise InvalidInputError(
@@ -112,7 +113,7 @@ def calibration_error(probabilities: ArrayLike, labels: ArrayLike, *, bins: int 
             "convert scores with calibrate_scores(...).probability"
         )
     _check_truth(truth, values, "probabilities")
-    count = check_integer(bins, "bins", low=1)
+    count = check_integer(bins, "bins", low=1, high=10**6)
     chosen = np.minimum((values * count).astype(np.intp), count - 1)
     gaps = np.bincount(chosen, weights=truth.astype(np.float64) - values, minlength=count)
     return float(np.abs(gaps).sum() / len(values))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_boxes, check_type, describe
+from vehicle_detection._common import check_array, check_boxes, check_sequence, check_type, describe
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.export import check_items, is_result, shown_tracks
@@ -41,11 +41,8 @@ _ROW_COLUMNS = ("tracks", "boxes", "occluded", "truncated", "ignore", "scores", 
 
 def check_keys(values: object, name: str) -> tuple[FrameKey, ...]:
     """Return frame keys as Python values that are all int or all str."""
-    if isinstance(values, (str, bytes)) or not isinstance(values, Iterable):
-        raise InvalidInputError(
-            f"{name} must be a sequence of frame keys (int or str), got {describe(values)}"
-        )
-    keys = tuple(key.item() if isinstance(key, np.generic) else key for key in values)
+    given = check_sequence(values, name, "frame keys (int or str)")
+    keys = tuple(key.item() if isinstance(key, np.generic) else key for key in given)
     kinds = {type(key) for key in keys}
     if kinds - {int} and kinds - {str}:
         listed = ", ".join(sorted(kind.__name__ for kind in kinds))
@@ -64,7 +61,7 @@ def frame_order(key: FrameKey) -> tuple[tuple[int, str], ...]:
 def _column(values: ArrayLike | None, name: str, rows: int, kinds: str, default: Any) -> NDArray[Any]:
     """Check one value per row of one of the dtype `kinds`; returned with the dtype of `default`."""
     filled = np.full(rows, default)
-    column = filled if values is None else np.asarray(values)
+    column = filled if values is None else check_array(values, name)
     if column.size == 0:
         column = column.reshape(-1).astype(filled.dtype)
     if column.shape != (rows,) or column.dtype.kind not in kinds:

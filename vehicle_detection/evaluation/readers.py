@@ -14,7 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vehicle_detection._common import check_choice, check_type
+from vehicle_detection._common import (
+    Limit,
+    check_choice,
+    check_path,
+    check_regular_file,
+    read_regular_file,
+)
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation.frame_boxes import (
@@ -60,11 +66,9 @@ Rows = tuple[list[Row], list[FrameKey]]
 
 def _read_text(file: Path) -> str:
     try:
-        return file.read_bytes().decode("utf-8-sig")
+        return read_regular_file(file, str(file), Limit.TEXT_BYTES, error=DatasetError).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise DatasetError(f"{file} is not UTF-8 text; save it as UTF-8") from None
-    except OSError as error:
-        raise DatasetError(f"{file} cannot be read: {error.strerror}") from error
 
 
 def _read_lines(file: Path) -> Iterator[tuple[str, str]]:
@@ -135,8 +139,9 @@ def _read_json_lines(source: Path) -> Rows:
         if line.strip():
             try:
                 records.append((where, json.loads(line)))
-            except json.JSONDecodeError as error:
-                raise DatasetError(f"{where}: not a JSON object ({error.msg})") from None
+            except (json.JSONDecodeError, RecursionError) as error:
+                reason = getattr(error, "msg", "nested too deeply")
+                raise DatasetError(f"{where}: not a JSON object ({reason})") from None
             if not isinstance(records[-1][1], dict):
                 raise DatasetError(f"{where}: expected a JSON object, found {line.strip()[:40]!r}")
     return _typed_rows(source, records)
@@ -150,6 +155,7 @@ def _read_parquet(source: Path) -> Rows:
         raise InvalidInputError(
             "a .parquet file needs pyarrow; pip install 'vehicle-detection[parquet]', or convert it to .csv"
         ) from None
+    check_regular_file(source, str(source), Limit.TEXT_BYTES, error=DatasetError)
     try:
         table = pyarrow.parquet.read_table(source)
     except (pyarrow.ArrowException, OSError) as error:
@@ -287,6 +293,8 @@ def read_coco_file(source: Path, truth: Path | None = None) -> CocoFile:
         data = json.loads(_read_text(source))
     except json.JSONDecodeError as error:
         raise DatasetError(f"{source} line {error.lineno}: not JSON text ({error.msg})") from None
+    except RecursionError:
+        raise DatasetError(f"{source}: not a COCO file, because its JSON is nested too deeply") from None
     if isinstance(data, list) and all(isinstance(entry, dict) and "image_id" in entry for entry in data):
         if truth is None:
             raise DatasetError(
@@ -423,8 +431,7 @@ def read_labels(
     ...
     vehicle_detection.errors.DatasetError: labels/missing.csv does not exist; check the path
     """
-    check_type(path, "path", (str, os.PathLike), "pass the path of a file or folder")
-    source = Path(path)
+    source = check_path(path, "path", kind="a file or folder")
     if format is not None:
         check_choice(format, "format", ("csv", "jsonl", "parquet", "kitti", "mot", "coco", "coco_results"))
     if not source.exists():
@@ -438,7 +445,7 @@ def read_labels(
     if kind in ("csv", "jsonl", "parquet"):  # these files hold vehicles only
         found = {"csv": _read_csv, "jsonl": _read_json_lines, "parquet": _read_parquet}[kind](source)
     elif kind in ("coco", "coco_results"):  # told apart by their content
-        found = _read_coco(source, chosen, None if truth is None else Path(truth))
+        found = _read_coco(source, chosen, None if truth is None else check_path(truth, "truth"))
     else:
         found = {"kitti": _read_kitti, "mot": _read_mot}[kind](source, chosen)
     return _assemble(*found, shape)

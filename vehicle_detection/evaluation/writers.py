@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import math
 import os
-import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
-from vehicle_detection._common import atomic_write, check_type, describe, write_parquet
+from vehicle_detection._common import atomic_write, check_type, describe, temporary_folder, write_parquet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.frame_boxes import NO_TRACK, FrameBoxes, FrameKey
 from vehicle_detection.evaluation.readers import FRAME_NUMBER, read_coco_file, vehicle_categories
@@ -87,8 +86,7 @@ def write_labels(
 
     Examples
     --------
-    >>> import tempfile
-    >>> from vehicle_detection import read_labels
+    >>>     >>> from vehicle_detection import read_labels
     >>> file = Path(tempfile.mkdtemp()) / "labels.txt"
     >>> write_labels(FrameBoxes([0, 2], [1, 1], [[0, 0, 50, 40], [4, 0, 54, 40]]), file)
     2
@@ -231,8 +229,8 @@ def _write_kitti(labels: FrameBoxes, folder: Path) -> None:
         raise InvalidInputError(
             f"path needs an existing folder, {describe(str(folder.parent))} is not one; create it first"
         )
-    with tempfile.TemporaryDirectory(prefix=".kitti.", dir=folder.parent) as temporary:
-        part = Path(temporary) / "label_2"
+    with temporary_folder(folder.parent, folder.name[:32]) as temporary:
+        part = temporary / "label_2"
         part.mkdir()
         for key in labels.frame_keys:
             with (part / f"{key}.txt").open("w", encoding="utf-8", newline="") as file:

@@ -101,8 +101,8 @@ class TemplateMixture:
         if self.rescorer is not None:
             check_type(self.rescorer, "rescorer", Rescorer, "pass None, or train with train_mixture")
         check_number(self.slope, "slope", above=0, high=1e9)
-        check_number(self.offset, "offset")
-        check_number(self.threshold, "threshold")
+        check_number(self.offset, "offset", low=-1e9, high=1e9)
+        check_number(self.threshold, "threshold", low=-1e9, high=1e9)
         check_number(self.size_prior_weight, "size_prior_weight", low=0)
         check_number(self.vote_weight, "vote_weight", low=0)
         check_number(self.count_weight, "count_weight", low=0)
@@ -260,5 +260,5 @@ def load_model(path: str | os.PathLike[str] = "default") -> TemplateMixture | Ve
         numbers = {name: float(params[name]) for name in names}
         rescorer = Rescorer.build(tensors, params["rescorer"]) if "rescorer" in params else None
         return TemplateMixture(templates, **numbers, rescorer=rescorer, metadata=data.metadata)
-    except (InvalidInputError, KeyError, IndexError, TypeError, ValueError) as error:
+    except (InvalidInputError, KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
         raise ModelFileError(f"{data.name} does not fit its own parameters: {error}") from error

@@ -32,7 +32,7 @@ class MixtureTemplate:
 
     def __post_init__(self) -> None:
         weights = finite_array(self.weights, "weights", (None, None, N_CHANNELS))
-        check_number(self.bias, "bias")
+        check_number(self.bias, "bias", low=-1e9, high=1e9)
         rows, columns = weights.shape[:2]
         padding: object = self.padding
         if not isinstance(padding, tuple) or len(padding) != 2:

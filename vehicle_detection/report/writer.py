@@ -12,9 +12,9 @@ from vehicle_detection._common import (
     atomic_write,
     check_choice,
     check_integer,
+    check_path,
     check_target,
     check_type,
-    describe,
 )
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events import Event, TrackLog, find_events
@@ -72,8 +72,10 @@ class ReportWriter:
         self._units = units
         given: dict[str, Any] = {"path": path, "video": video, "source": source}
         for name, value in given.items():
-            if not isinstance(value, (str, os.PathLike)) and (value is not None or name == "path"):
-                raise InvalidInputError(f"{name} must be a file name, got {describe(value)}; pass a name")
+            # A URL may have longer parts than a path.
+            is_url = name == "source" and isinstance(value, str) and "://" in value
+            if (value is not None or name == "path") and not is_url:
+                check_path(value, name)
         self._path = Path(path)
         if self._path.suffix.lower() not in (".html", ".htm"):
             raise InvalidInputError(
@@ -81,7 +83,7 @@ class ReportWriter:
             )
         check_target(self._path, "path")
         for name, value in (("video", video), ("source", source)):
-            if value is not None and Path(value).resolve() == self._path.resolve():
+            if value is not None and os.path.realpath(value) == os.path.realpath(self._path):
                 raise InvalidInputError(f"path {self._path} is also the {name}; choose another name")
         self._video = None if video is None else Path(video)
         self._source = None if source is None else Path(source).name

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_choice, check_integer, check_number, describe
+from vehicle_detection._common import check_choice, check_integer, check_number, check_sequence, describe
 from vehicle_detection.camera import Camera
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.synthetic.camera_light import LIGHTS, SceneConfig, Sensor, make_light
@@ -190,7 +190,7 @@ def render_scene(
     if isinstance(vehicles, (int, np.integer)):
         vehicles = _random_vehicles(road, check_integer(vehicles, "vehicles", low=0, high=60), rng)
     poses = []
-    for track, vehicle in enumerate(vehicles, start=1):
+    for track, vehicle in enumerate(check_sequence(vehicles, "vehicles", "SceneVehicle"), start=1):
         if not isinstance(vehicle, SceneVehicle):
             raise InvalidInputError(
                 f"vehicles[{track - 1}] must be a SceneVehicle, got {describe(vehicle)}; "

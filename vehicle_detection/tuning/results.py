@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import atomic_write, check_target, describe, write_parquet
+from vehicle_detection._common import atomic_write, check_path, check_target, describe, write_parquet
 from vehicle_detection.errors import DatasetError, InvalidInputError
 
 if TYPE_CHECKING:
@@ -144,8 +144,8 @@ def read_results(path: str | os.PathLike[str]) -> DataFrame:
       configuration  accuracy
     0             a      0.98
     """
+    file = check_path(path)
     suffix = _check_suffix(path, (".csv", ".jsonl"), "path")
-    file = Path(path)
     if not file.is_file():
         raise DatasetError(f"results file {file} does not exist; check the path")
     columns, rows = _parse(_complete_lines(file), file, suffix)

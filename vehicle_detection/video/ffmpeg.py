@@ -7,21 +7,24 @@ videos. This one reads the log of ffmpeg's filter graph, which has the exact rat
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import IO, Any
 
+from vehicle_detection._common import Limit
 from vehicle_detection.errors import VideoError
 from vehicle_detection.video.yuv import ColorEncoding
 
@@ -99,9 +102,13 @@ def probe(path: Path | str) -> VideoInfo:
 def _probe(path: Path | str) -> VideoInfo:
     # "V" excludes cover pictures. Only the showinfo filter prints the exact frame rate.
     options = ("-map", "0:V:0", "-frames:v", "1", "-vf", "showinfo", "-f", "null", "-")
-    with contextlib.closing(Process(("-nostdin", *input_options(path), *options), level="info")) as process:
-        process.wait()
+    source = ("-nostdin", *pixel_limit(), *input_options(path))
+    with contextlib.closing(Process((*source, *options), level="info")) as process:
+        code = process.wait()
         log = process.log()
+    if code < 0:
+        raise VideoError(f"{path} cannot be read: {exit_reason(code, log)}")
+    check_frame_size(str(path), log)
     header, mapped, decoded = log.partition("Stream mapping:")
     if not re.search(r"^Input #0", header, re.MULTILINE):
         truncated = "moov atom not found" in log
@@ -188,6 +195,21 @@ def _resampling_rate(rate: Fraction, mean: Fraction) -> Fraction:
     return mean.limit_denominator(1001) if rate > 60 and rate > 2 * mean else rate
 
 
+def pixel_limit() -> tuple[str, str]:
+    """Options that limit the size of decoded frames."""
+    return "-max_pixels", str(min(Limit.PIXELS.current(), 2**31 - 1))
+
+
+def check_frame_size(name: str, log: str) -> None:
+    """Raise a VideoError if ffmpeg has refused frames because of `pixel_limit`."""
+    too_large = re.search(r"Picture size (\d+)x(\d+) exceeds specified max pixel count", log)
+    if too_large:
+        raise VideoError(
+            f"{name} has frames of {too_large[1]}x{too_large[2]} pixels, more than "
+            f"{Limit.PIXELS.current():,}; if they are meant to be so large, set {Limit.PIXELS.variable}"
+        )
+
+
 def ffmpeg_binary() -> str:
     """Return the ffmpeg that moviepy uses, without importing moviepy, which takes half a second."""
     config = sys.modules.get("moviepy.config")
@@ -201,6 +223,69 @@ def ffmpeg_binary() -> str:
     from imageio_ffmpeg import get_ffmpeg_exe
 
     return str(get_ffmpeg_exe())
+
+
+@functools.cache
+def _death_signal() -> tuple[str, ...]:
+    """Return a command prefix that makes Linux kill the command when the thread that started it ends.
+
+    A killed Python cannot end its ffmpeg: one that reads frames from it would first write the whole sound.
+    ``setpriv`` is part of util-linux. Where it is missing, ffmpeg ends when its pipe does.
+    """
+    program = shutil.which("setpriv") if sys.platform == "linux" else None
+    if program is None:
+        return ()
+    command = (program, "--pdeathsig", "KILL")
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        # BusyBox has a setpriv without this option.
+        if subprocess.run((*command, "true"), capture_output=True, timeout=10).returncode == 0:
+            return command
+    return ()
+
+
+class _Starter:
+    """Starts processes in one thread that lives as long as Python.
+
+    The death signal follows the end of the thread that started a process, not that of Python.
+    """
+
+    def __init__(self) -> None:
+        self._pool: ThreadPoolExecutor | None = None
+        self._lock = threading.Lock()
+
+    def start(self, command: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
+        """Start a process, which is killed when Python ends in whatever way."""
+        with self._lock:
+            self._pool = self._pool or ThreadPoolExecutor(1, thread_name_prefix="ffmpeg-starter")
+            future = self._pool.submit(self._start, command, options)
+        try:
+            return future.result()
+        except BaseException:  # also KeyboardInterrupt: nobody else knows the process
+            future.add_done_callback(_kill_started)
+            raise
+
+    @staticmethod
+    def _start(command: Sequence[str], options: Mapping[str, Any]) -> subprocess.Popen[bytes]:
+        program = shutil.which(command[0]) or command[0]
+        # setpriv would report a missing program by its exit code only.
+        prefix = _death_signal() if os.access(program, os.X_OK) else ()
+        return subprocess.Popen([*prefix, program, *command[1:]], **options)
+
+
+def _kill_started(future: Future[subprocess.Popen[bytes]]) -> None:
+    if not future.cancelled() and future.exception() is None:
+        process = future.result()
+        process.kill()
+        process.wait()
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
+                pipe.close()
+
+
+_STARTER = _Starter()
+if hasattr(os, "register_at_fork"):
+    # The thread does not exist in a forked child.
+    os.register_at_fork(after_in_child=_STARTER.__init__)  # type: ignore[misc]
 
 
 class Process:
@@ -226,7 +311,7 @@ class Process:
         with contextlib.ExitStack() as on_error:
             self._log = on_error.enter_context(tempfile.TemporaryFile())
             try:
-                self._popen: subprocess.Popen[bytes] = subprocess.Popen(
+                self._popen: subprocess.Popen[bytes] = _STARTER.start(
                     [ffmpeg_binary(), "-hide_banner", "-loglevel", level, *options],
                     stdin=(subprocess.PIPE if stdin else subprocess.DEVNULL)
                     if isinstance(stdin, bool)
@@ -236,7 +321,7 @@ class Process:
                     bufsize=0,
                     **group,
                 )
-            except OSError as error:
+            except (OSError, ValueError) as error:
                 raise VideoError(
                     f"ffmpeg cannot be started ({error}); reinstall imageio-ffmpeg or unset FFMPEG_BINARY"
                 ) from error
@@ -291,6 +376,16 @@ def _enlarge(pipe: IO[bytes] | None) -> None:
 
         with contextlib.suppress(OSError):  # limited for unprivileged users; the default of 64 KiB works too
             fcntl.fcntl(pipe.fileno(), fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+
+
+def exit_reason(code: int, log: str) -> str:
+    """Say why ffmpeg has ended, from its exit code and its log."""
+    if code < 0:
+        name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
+        hint = ", perhaps because memory ran out" if name == "SIGKILL" else ""
+        return f"another process ended ffmpeg by the signal {name}{hint}"
+    hint = "; free some disk space" if "No space left" in log else ""
+    return f"ffmpeg reports {last_line(log)!r}{hint}"
 
 
 def last_line(log: str) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection.errors import VideoError
-from vehicle_detection.video.ffmpeg import Process, VideoInfo, last_line
+from vehicle_detection.video.ffmpeg import Process, VideoInfo, check_frame_size, last_line, pixel_limit
 from vehicle_detection.video.yuv import ColorEncoding, rgb_from_planes
 
 _MAX_HEADER_BYTES = 4096
@@ -33,7 +33,7 @@ class LiveProcess:
         output = ("-map", "0:V:0", "-vf", filters, "-pix_fmt", "yuv420p", "-f", "yuv4mpegpipe", "pipe:1")
         nostdin = () if stdin is not None else ("-nostdin",)
         descriptor: bool | int = False if stdin is None else stdin
-        self.process = Process((*nostdin, *options, *output), stdin=descriptor, stdout=True)
+        self.process = Process((*nostdin, *pixel_limit(), *options, *output), stdin=descriptor, stdout=True)
         try:
             self.info = self._read_header()
         except BaseException:
@@ -45,9 +45,10 @@ class LiveProcess:
         size = re.match(rb"YUV4MPEG2 W(\d+) H(\d+) F(\d+):(\d+)", header)
         if size is None:
             self.process.wait()
+            log = self.process.log()
+            check_frame_size(self.name, log)
             raise VideoError(
-                f"{self.name} is not a video that ffmpeg can read ({last_line(self.process.log())}); "
-                "check the source"
+                f"{self.name} is not a video that ffmpeg can read ({last_line(log)}); check the source"
             )
         width, height, numerator, denominator = (int(number) for number in size.groups())
         return VideoInfo(
@@ -87,6 +88,8 @@ class LiveReader:
     With `drop`, a thread reads all frames, and the iterator returns the newest one: a slow consumer sees
     gaps in the indices. Without, ffmpeg and the sender wait for the consumer.
     """
+
+    damage = ""
 
     def __init__(self, process: LiveProcess, *, drop: bool, first: int = 0, count: int | None = None) -> None:
         self.info = process.info

@@ -168,6 +168,8 @@ class FramePipeline:
         self._streams: list[Reader | FrameWriter] = []
         self._lock = threading.Lock()
         self._aborted = False
+        self.damage = ""
+        """What is damaged in the source; known after the last frame."""
 
     @property
     def stage_seconds(self) -> dict[str, float]:
@@ -264,6 +266,7 @@ class FramePipeline:
             for thread in threads:
                 if thread.ident is not None:
                     thread.join()
+        self.damage = reader.damage
         self._seconds["decode"] += reader.cpu_seconds
         if writer is not None:
             self._seconds["encode"] += writer.cpu_seconds

@@ -27,6 +27,7 @@ from vehicle_detection._common import (
     available_cores,
     check_choice,
     check_integer,
+    check_path,
     check_target,
     describe,
     progress_bar,
@@ -66,6 +67,8 @@ class VideoReport:
         Number of different tracks shown.
     dropped
         Number of frames of a live source that were dropped because the search was busy.
+    damage
+        What is damaged in the source, such as missing frames; empty if nothing is.
 
     Examples
     --------
@@ -90,6 +93,7 @@ class VideoReport:
     stages: Mapping[str, float]
     tracks: int
     dropped: int = 0
+    damage: str = ""
 
     @property
     def frames_per_second(self) -> float:
@@ -129,6 +133,7 @@ def process_video(
     preset: str = "veryfast",
     workers: int | None = None,
     progress: bool = True,
+    strict: bool = False,
     on_result: Callable[[Any], object] | None = None,
 ) -> VideoReport:
     """Detect and track the vehicles of a video, and write a copy with their boxes.
@@ -165,6 +170,10 @@ def process_video(
         not depend on it.
     progress
         Show a progress bar if standard error is a terminal.
+    strict
+        Raise an error, and write nothing, if a file of the source is damaged: frames are missing, or ffmpeg
+        reports decoding errors. Otherwise a warning is logged, and ``damage`` of the result says it. Streams
+        are not checked.
     on_result
         Function that is called with each frame's result, in frame order, in the calling thread.
 
@@ -178,7 +187,8 @@ def process_video(
     InvalidInputError
         If an argument is invalid.
     VideoError
-        If the source is not a video or is incomplete, or the target cannot be written.
+        If the source is not a video or is incomplete, or is damaged and `strict` is set, or the target cannot
+        be written.
 
     Examples
     --------
@@ -196,6 +206,7 @@ def process_video(
         audio=audio,
         preset=preset,
         workers=workers,
+        strict=strict,
     ) as run:
         with _stop_on_interrupt(run), contextlib.closing(run.results(progress=progress)) as results:
             for _, result in results:
@@ -222,6 +233,7 @@ class VideoRun:
         preset: str = "veryfast",
         workers: int | None = None,
         with_frames: bool = False,
+        strict: bool = False,
     ) -> None:
         check_span(start, end)
         check_choice(preset, "preset", PRESETS)
@@ -238,7 +250,7 @@ class VideoRun:
         try:
             if output is not None:
                 _check_not_a_source(output, self.source.files)
-            self._set_up(output, detector, start, end, audio, preset, n_workers, with_frames)
+            self._set_up(output, detector, start, end, audio, preset, n_workers, with_frames, strict)
         except BaseException:
             self.close()
             raise
@@ -253,6 +265,7 @@ class VideoRun:
         preset: str,
         workers: int,
         with_frames: bool,
+        strict: bool,
     ) -> None:
         info = self.info = self.source.info
         first, count = frame_range(info, start, end)
@@ -263,7 +276,7 @@ class VideoRun:
         self._frames, self._seconds, self._track_ids = 0, 0.0, set[int]()
         self._detector = detector
         self._pipeline = FramePipeline(
-            functools.partial(self.source.read, first, count),
+            functools.partial(self.source.read, first, count, strict=strict),
             None if output is None else functools.partial(_open_writer, output, drawn, preset, sound),
             detector,
             workers,
@@ -304,6 +317,7 @@ class VideoRun:
             stages=self._pipeline.stage_seconds,
             tracks=len(self._track_ids),
             dropped=self._pipeline.missed_frames,
+            damage=self._pipeline.damage,
         )
 
     def stop(self) -> None:
@@ -386,11 +400,7 @@ def _open_writer(
 
 
 def _check_video_target(target: object) -> Path:
-    if not isinstance(target, (str, os.PathLike)):
-        raise InvalidInputError(
-            f"target must be the path of a video file, got {describe(target)}; pass a file name"
-        )
-    path = check_target(target)
+    path = check_target(check_path(target, "target", kind="the path of a video file"))
     if path.suffix.lower() not in CONTAINERS:
         raise InvalidInputError(
             f"target must end in {', '.join(CONTAINERS)}; got {path.name!r}, use {path.stem + '.mp4'!r}"

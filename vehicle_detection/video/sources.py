@@ -20,7 +20,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_number, describe
+from vehicle_detection._common import check_number, check_path, describe
 from vehicle_detection.errors import InvalidInputError, VideoError
 from vehicle_detection.images import read_image
 from vehicle_detection.video.ffmpeg import VideoInfo, input_options, probe
@@ -67,8 +67,11 @@ class FrameSource:
         self.name, self.info, self.files = name, info, tuple(files)
         self._on_close = contextlib.ExitStack()
 
-    def read(self, first: int = 0, count: int | None = None) -> Reader:
-        """Open a reader of `count` frames from number `first` on; None: to the end."""
+    def read(self, first: int = 0, count: int | None = None, *, strict: bool = False) -> Reader:
+        """Open a reader of `count` frames from number `first` on; None: to the end.
+
+        With `strict`, the reader raises an error after the last frame of a damaged file.
+        """
         raise NotImplementedError
 
     def audio(self, first: int = 0, length: float | None = None) -> AudioSource | None:
@@ -97,8 +100,8 @@ class _VideoFile(FrameSource):
         super().__init__(str(path), info, () if isinstance(path, str) else (path,))
         self._path = path
 
-    def read(self, first: int = 0, count: int | None = None) -> FrameReader:
-        return FrameReader(self._path, self.info, first=first, count=count)
+    def read(self, first: int = 0, count: int | None = None, *, strict: bool = False) -> FrameReader:
+        return FrameReader(self._path, self.info, first=first, count=count, strict=strict)
 
     def audio(self, first: int = 0, length: float | None = None) -> AudioSource | None:
         if not self.info.has_audio:
@@ -140,8 +143,9 @@ class _VideoSegments(FrameSource):
             paths,
         )
 
-    def read(self, first: int = 0, count: int | None = None) -> Reader:
-        return _SegmentReader(self.info, list(zip(self.files, self._infos, strict=True)), first, count)
+    def read(self, first: int = 0, count: int | None = None, *, strict: bool = False) -> Reader:
+        segments = list(zip(self.files, self._infos, strict=True))
+        return _SegmentReader(self.info, segments, first, count, strict=strict)
 
     def audio(self, first: int = 0, length: float | None = None) -> AudioSource | None:
         if not self.info.has_audio:
@@ -165,9 +169,17 @@ class _SegmentReader:
     """Reader of the frames of several files, one after the other."""
 
     def __init__(
-        self, info: VideoInfo, segments: Sequence[tuple[Path, VideoInfo]], first: int, count: int | None
+        self,
+        info: VideoInfo,
+        segments: Sequence[tuple[Path, VideoInfo]],
+        first: int,
+        count: int | None,
+        *,
+        strict: bool,
     ) -> None:
         self.info = info
+        self.damage = ""
+        self._strict = strict
         self.cpu_seconds = 0.0
         self._segments = list(segments)
         self._index = first
@@ -198,7 +210,7 @@ class _SegmentReader:
             if self._killed or not self._segments:
                 raise StopIteration
             path, info = self._segments.pop(0)
-            self._reader = FrameReader(path, info, first=self._first)
+            self._reader = FrameReader(path, info, first=self._first, strict=self._strict)
             self._first = 0
             return self._reader
 
@@ -207,6 +219,7 @@ class _SegmentReader:
             if self._reader is not None:
                 self._reader.close()
                 self.cpu_seconds += self._reader.cpu_seconds
+                self.damage = "; ".join(filter(None, (self.damage, self._reader.damage)))
                 self._reader = None
 
     def kill(self) -> None:
@@ -237,7 +250,7 @@ class _ImageSequence(FrameSource):
         )
         super().__init__(f"{paths[0]} to {paths[-1].name}", info, paths)
 
-    def read(self, first: int = 0, count: int | None = None) -> Reader:
+    def read(self, first: int = 0, count: int | None = None, *, strict: bool = False) -> Reader:
         return _ImageReader(self.info, self.files, first, count)
 
 
@@ -245,6 +258,7 @@ class _ImageReader:
     """Reader of image files."""
 
     cpu_seconds = 0.0
+    damage = ""
 
     def __init__(self, info: VideoInfo, paths: Sequence[Path], first: int, count: int | None) -> None:
         self.info = info
@@ -291,7 +305,7 @@ class _Stream(FrameSource):
         self.live, self._read = live, False
         self._on_close.callback(self._process.close)
 
-    def read(self, first: int = 0, count: int | None = None) -> Reader:
+    def read(self, first: int = 0, count: int | None = None, *, strict: bool = False) -> Reader:
         if self._read:
             raise InvalidInputError(f"source {self.name} can be read only once; open it again")
         self._read = True
@@ -362,13 +376,13 @@ def open_source(
             f"source must be the path of a video file, a folder, a pattern, a list of files, a URL, '-' or a "
             f"camera's number, got {describe(source)}; pass a file name"
         )
-    text = os.fspath(source)
+    text = os.fsdecode(source)
     scheme = _URL.match(text)
     if text == "-":
         return _open_stdin(bool(live))
     if scheme is not None:
         return _open_url(text, scheme[1].lower(), live)
-    path = Path(text)
+    path = check_path(text, "source", kind="the path of a video file")
     if (text.isdecimal() and not path.exists()) or text.startswith("/dev/video"):
         return _open_camera(text, live is not False)
     if path.is_fifo():
@@ -519,11 +533,7 @@ def _natural_order(path: Path) -> list[Any]:
 
 def _check_file(path: str | os.PathLike[str]) -> Path:
     """Return the path of a readable regular file."""
-    if not isinstance(path, (str, os.PathLike)):
-        raise InvalidInputError(
-            f"source must be the path of a video file, got {describe(path)}; pass a file name"
-        )
-    path = Path(path)
+    path = check_path(path, "source", kind="the path of a video file")
     if path.is_dir():
         raise InvalidInputError(f"source {path} is a folder; choose a video file in it")
     if not path.exists():
@@ -566,7 +576,11 @@ def probe_video(path: str | os.PathLike[str]) -> VideoInfo:
 
 
 def read_frames(
-    source: str | os.PathLike[str], *, start: float | None = None, end: float | None = None
+    source: str | os.PathLike[str],
+    *,
+    start: float | None = None,
+    end: float | None = None,
+    strict: bool = False,
 ) -> FrameReader:
     """Read the frames of a video file, one at a time; for other sources see `open_source`.
 
@@ -576,6 +590,9 @@ def read_frames(
         A file that ffmpeg can read.
     start, end
         Time range in seconds: frames with ``start <= time < end`` are read. None: no limit.
+    strict
+        Raise an error after the last frame if the file is damaged: frames are missing, or ffmpeg reports
+        decoding errors. Otherwise a warning is logged, and the reader's ``damage`` says it.
 
     Returns
     -------
@@ -603,7 +620,7 @@ def read_frames(
     check_span(start, end)
     info = probe(path)
     first, count = frame_range(info, start, end)
-    return FrameReader(path, info, first=first, count=count)
+    return FrameReader(path, info, first=first, count=count, strict=strict)
 
 
 def check_span(start: float | None, end: float | None) -> None:

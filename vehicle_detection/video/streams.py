@@ -5,6 +5,7 @@ moviepy's reader and writer copy each frame twice and round the frame rate to tw
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 from collections.abc import Iterator
@@ -17,8 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection.errors import VideoError
-from vehicle_detection.video.ffmpeg import Process, VideoInfo, input_options, last_line
+from vehicle_detection.video.damage import find_damage
+from vehicle_detection.video.ffmpeg import Process, VideoInfo, exit_reason, input_options, pixel_limit
 from vehicle_detection.video.yuv import FORMATS, planes_from_rgb, rgb_from_planes
+
+_LOGGER = logging.getLogger(__name__)
 
 CONTAINERS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
 """ffmpeg's name of the container for each suffix that can be written."""
@@ -37,6 +41,8 @@ class Reader(Protocol):
     """Frames of a source, in order: an iterator of ``(index, time, frame)`` and a context manager."""
 
     info: VideoInfo
+    damage: str
+    """What is damaged in the source; known after the last frame, and empty if nothing is."""
 
     @property
     def cpu_seconds(self) -> float:
@@ -86,13 +92,31 @@ class FrameReader(_FfmpegStream):
     ``index`` is the frame's number in the file from 0, ``time`` its time in seconds, ``frame`` a new
     ``(H, W, 3)`` uint8 RGB array. ffmpeg ends after the last frame, on :meth:`close`, at the end of a
     ``with`` block, and when the reader is deleted.
+
+    Attributes
+    ----------
+    info
+        Properties of the file.
+    frames_read
+        Number of frames read so far.
+    damage
+        Known after the last frame: what is damaged, such as missing frames, which is also logged as a
+        warning; empty if nothing is. With ``strict`` it is raised as an error instead.
     """
 
     def __init__(
-        self, path: Path | str, info: VideoInfo, *, first: int = 0, count: int | None = None
+        self,
+        path: Path | str,
+        info: VideoInfo,
+        *,
+        first: int = 0,
+        count: int | None = None,
+        strict: bool = False,
     ) -> None:
         self.info = info
         self.frames_read = 0
+        self.damage = ""
+        self._strict = strict
         self._killed = False
         self._path, self._first, self._count = path, first, count
         # A stream may change its frame size; all frames get the size of the first one.
@@ -104,7 +128,8 @@ class FrameReader(_FfmpegStream):
             seek = float((first - early) / info.fps)
             filters = [f"fps={info.fps}:start_time=0", f"trim=start_frame={early}", *filters]
         options = ["-ss", f"{seek:.6f}"] if seek else []
-        options += ["-threads", _DECODER_THREADS, *input_options(path)]
+        self._sought = bool(seek)
+        options += ["-threads", _DECODER_THREADS, *pixel_limit(), *input_options(path)]
         options += ["-map", "0:V:0", "-vf", ",".join(filters)]
         if count is not None:
             options += ["-frames:v", str(count)]
@@ -146,22 +171,32 @@ class FrameReader(_FfmpegStream):
         code = self._process.wait()
         log = self._process.log()
         self.close()
-        if self._killed or (self._count is not None and self.frames_read >= self._count):
+        if self._killed:
             return
         end = self._first + self.frames_read
-        if end < self.info.frames - 1 and _TRUNCATED.search(log):
+        complete = self._count is not None and self.frames_read >= self._count
+        if not complete and end < self.info.frames - 1 and _TRUNCATED.search(log):
             seconds = math.floor(end / self.info.fps * 100) / 100
             raise VideoError(
                 f"{self._path} is incomplete: {end} of about {self.info.frames} frames can be decoded; "
                 f"copy the file again, or end at {seconds:g} s to process the readable part"
             )
-        if code:
+        if code and not complete:
             raise VideoError(
-                f"{self._path} cannot be decoded after frame {end} ({last_line(log)}); copy the file again"
+                f"{self._path} cannot be decoded after frame {end}: {exit_reason(code, log)}; "
+                "if this happens again, copy the file again"
             )
         if not self.frames_read:
             start = float(self._first / self.info.fps)
             raise VideoError(f"{self._path} has no frame after {start:g} s; choose an earlier start")
+        # After a jump into the file, the first frames may refer to frames before it, which is no damage.
+        errors = "" if self._sought else log
+        stop = None if self._count is None else self._first + self._count
+        self.damage = find_damage(self._path, self.info, end, errors, stop=stop)
+        if self.damage and self._strict:
+            raise VideoError(self.damage)
+        if self.damage:
+            _LOGGER.warning("%s", self.damage)
 
     def kill(self) -> None:
         """End ffmpeg at once, from any thread; a thread that reads sees the end of the video."""
@@ -243,6 +278,5 @@ class FrameWriter(_FfmpegStream):
             raise self._error()
 
     def _error(self) -> VideoError:
-        self._process.wait()
-        reason = last_line(self._process.log())
-        return VideoError(f"the video cannot be written: ffmpeg reports {reason!r}; is the disk full?")
+        reason = exit_reason(self._process.wait(), self._process.log())
+        return VideoError(f"the video cannot be written: {reason}; nothing of it was kept")

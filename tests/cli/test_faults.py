@@ -1,0 +1,288 @@
+"""Faults while a command runs: signals, a full disk, targets that vanish, and unusual environments."""
+
+import errno
+import itertools
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from tests.helpers import ROOT, start_interruptible
+from tests.video.clips import gray_frames, write_clip
+from vehicle_detection import detector, export, report
+from vehicle_detection._common import files
+from vehicle_detection.cli.app import app
+from vehicle_detection.cli.signals import raise_on_signals
+from vehicle_detection.errors import OutputError
+from vehicle_detection.video import probe_video
+
+FULL = OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    # A size in which the default model is fast.
+    noise = np.random.default_rng(0).integers(0, 40, (120, 160, 3), dtype=np.uint8)
+    frames = [frame + noise for frame in gray_frames(10, width=160, height=120)]
+    return write_clip(tmp_path_factory.mktemp("faults") / "clip.mp4", frames)
+
+
+def run(*words):
+    return CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
+
+
+def contents(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+# --- signals ---
+
+# A command that reports when it writes, and then waits.
+PAUSED = """
+import sys, time
+from vehicle_detection.video import pipeline
+emit = pipeline.FramePipeline._emit
+def pause(self, *args, **kwargs):
+    emit(self, *args, **kwargs)
+    print("now", flush=True)
+    time.sleep(0.2)
+pipeline.FramePipeline._emit = pause
+sys.argv = ["vehicle-detection", *sys.argv[1:]]
+from vehicle_detection.cli import main
+main()
+"""
+
+
+def start_video(clip, folder):
+    words = ["video", clip, "-o", folder / "out.mp4", "--tracks", folder / "out.csv", "--model", "highway"]
+    process = start_interruptible(sys.executable, "-c", PAUSED, *words)
+    line = process.stdout.readline()
+    assert line == "now\n", process.communicate()
+    return process
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_signal_ends_a_video_and_leaves_nothing(clip, tmp_path, name):
+    number = getattr(signal, name)
+    (tmp_path / "out.mp4").write_bytes(b"old")
+    process = start_video(clip, tmp_path)
+    process.send_signal(number)
+    process.send_signal(number)  # does not interrupt the cleanup
+    out, errors = process.communicate(timeout=30)
+    assert (process.returncode, errors) == (128 + number, "interrupted\n")
+    assert set(out.split()) <= {"now"}
+    assert contents(tmp_path) == ["out.mp4"]
+    assert (tmp_path / "out.mp4").read_bytes() == b"old"
+
+
+def test_a_killed_run_leaves_no_process_and_the_next_one_removes_its_files(clip, tmp_path):
+    process = start_video(clip, tmp_path)
+    process.kill()
+    process.communicate()
+    parts = contents(tmp_path)
+    assert parts == [".out.0.part.csv", ".out.0.part.mp4"]
+    deadline = time.monotonic() + 10
+    while processes_with(tmp_path) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not processes_with(tmp_path)
+    words = ["-o", tmp_path / "out.mp4", "--tracks", tmp_path / "out.csv", "--model", "highway", "-q"]
+    assert run("video", clip, *words).exit_code == 0
+    assert contents(tmp_path) == ["out.csv", "out.mp4"]
+
+
+def processes_with(folder):
+    """Processes that name a folder in their command."""
+    found = []
+    for line in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            found += [line.parent.name] * (str(folder).encode() in line.read_bytes())
+        except OSError:  # it has ended
+            continue
+    return found
+
+
+@pytest.mark.parametrize("delay", [0.1, 0.3])
+def test_an_early_interrupt_has_no_traceback(delay):
+    code = (
+        "import sys\n"
+        "print('now', flush=True)\n"  # Python has started; what it prints before is not ours
+        "sys.argv = ['vehicle-detection', 'info']\n"
+        "from vehicle_detection.cli import main\n"
+        "main()"
+    )
+    process = start_interruptible(sys.executable, "-c", code)
+    process.stdout.readline()
+    time.sleep(0.02 + delay)  # until the handlers are set
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) in ((130, "interrupted\n"), (0, ""))
+
+
+def test_an_interrupt_while_the_commands_are_imported():
+    code = (
+        "import os, signal, sys\n"
+        "class Interrupt:\n"
+        "    def find_spec(self, name, *rest):\n"
+        "        if name == 'typer':\n"
+        "            os.kill(os.getpid(), signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Interrupt())\n"
+        "from vehicle_detection.cli import main; main()"
+    )
+    process = start_interruptible(sys.executable, "-c", code)
+    assert process.communicate(timeout=60) == ("", "interrupted\n")
+    assert process.returncode == 130
+
+
+def test_an_interrupt_after_a_command_changes_nothing():
+    code = (
+        "import atexit, os, signal, sys\n"
+        "atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))\n"
+        "sys.argv = ['vehicle-detection', 'info']\n"
+        "from vehicle_detection.cli import main; main()"
+    )
+    process = start_interruptible(sys.executable, "-c", code)
+    out, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (0, "")
+    assert out.startswith("default: ")
+
+
+def test_an_ignored_signal_stays_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    try:
+        with raise_on_signals():
+            assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+            assert signal.getsignal(signal.SIGTERM) != signal.SIG_DFL
+        assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+# --- outputs that cannot be written ---
+
+
+def fill_after(monkeypatch, number):
+    """Fill the disk at the rename of an output."""
+    count = itertools.count(1)
+    replace = Path.replace
+
+    def fill(self, target):
+        if next(count) == number:
+            raise FULL
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", fill)
+
+
+@pytest.mark.parametrize(
+    ("number", "failed", "kept"),
+    [(1, "out.mp4", []), (2, "out.csv", ["out.mp4"]), (3, "out.html", ["out.mp4", "out.csv"])],
+)
+def test_a_full_disk_names_the_output_and_what_was_kept(clip, tmp_path, monkeypatch, number, failed, kept):
+    fill_after(monkeypatch, number)
+    outputs = {"-o": "out.mp4", "--tracks": "out.csv", "--report": "out.html"}
+    words = [word for option, name in outputs.items() for word in (option, tmp_path / name)]
+    result = run("video", clip, *words, "--model", "highway", "-q")
+    assert result.exit_code == 2
+    names = " and ".join(str(tmp_path / name) for name in kept)
+    end = f"; {names} {'is' if len(kept) == 1 else 'are'} complete and kept" if kept else ""
+    assert result.stderr == (
+        f"error: {tmp_path / failed} cannot be written (No space left on device); free some space{end}\n"
+    )
+    assert contents(tmp_path) == sorted(kept)
+
+
+def test_a_disk_that_is_full_while_tracks_are_written(clip, tmp_path, monkeypatch):
+    def fill(self, result):
+        raise FULL
+
+    monkeypatch.setattr(export.TrackWriter, "__call__", fill)
+    words = ["-o", tmp_path / "out.mp4", "--tracks", tmp_path / "out.csv", "--model", "highway"]
+    result = run("video", clip, *words, "-q")
+    assert result.exit_code == 2
+    assert result.stderr.endswith("out.csv cannot be written (No space left on device); free some space\n")
+    assert contents(tmp_path) == []
+
+
+def test_a_target_that_becomes_a_folder_while_the_video_is_made(clip, tmp_path, monkeypatch):
+    add = report.ReportWriter.write
+
+    def replace(self, *args):
+        (tmp_path / "out.csv").mkdir(exist_ok=True)
+        add(self, *args)
+
+    monkeypatch.setattr(report.ReportWriter, "write", replace)
+    words = ["-o", tmp_path / "out.mp4", "--tracks", tmp_path / "out.csv", "--report", tmp_path / "out.html"]
+    result = run("video", clip, *words, "--model", "highway", "-q")
+    assert result.exit_code == 2
+    assert re.search(
+        r"out.csv cannot be written \(.*\); check the folder, .*out.mp4 is complete", result.stderr
+    )
+    assert contents(tmp_path) == ["out.csv", "out.mp4"]
+
+
+def test_a_demo_folder_that_is_read_only(tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise OSError(errno.EROFS, "Read-only file system", str(tmp_path / ".demo.x"))
+
+    monkeypatch.setattr(files.tempfile, "mkdtemp", refuse)
+    result = run("demo", "-o", tmp_path)
+    assert result.exit_code == 2
+    assert "cannot be written (Read-only file system); check the folder, or choose another" in result.stderr
+
+
+def test_an_output_error_is_an_error_of_the_system():
+    assert issubclass(OutputError, OSError)
+
+
+# --- arguments and environment ---
+
+
+def test_loops_of_links(clip, tmp_path):
+    loop = tmp_path / "loop.mp4"
+    loop.symlink_to(loop)
+    result = run("video", loop, "-o", tmp_path / "out.mp4")
+    assert (result.exit_code, "loop.mp4 does not exist; check the path" in result.stderr) == (2, True)
+    # As a target it is replaced, like any link.
+    assert run("video", clip, "-o", loop, "--model", "highway", "-q").exit_code == 0
+    assert probe_video(loop).frames == 10
+
+
+@pytest.mark.parametrize(
+    "option", [["--model", "/dev/zero"], ["--tracks", "/dev/full/x.csv"], ["--model", "a" * 5000]]
+)
+def test_devices_as_arguments(clip, tmp_path, option):
+    result = run("video", clip, "-o", tmp_path / "out.mp4", *option)
+    assert result.exit_code == 2
+    assert result.stderr.startswith("error: ")
+    assert result.stderr.count("\n") == 1
+    assert contents(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("variable", "value"),
+    [("NUMBA_NUM_THREADS", "0"), ("NUMBA_NUM_THREADS", "many"), ("NUMBA_DISABLE_JIT", "1")],
+)
+def test_variables_that_numba_fails_with(variable, value):
+    command = [sys.executable, "-m", "vehicle_detection", "info"]
+    options = {"cwd": ROOT, "env": {**os.environ, variable: value}, "capture_output": True, "text": True}
+    done = subprocess.run(command, **options)
+    assert done.returncode == 2
+    assert re.search(rf"^error: {variable} must be unset or .*; got '{value}'$", done.stderr, re.MULTILINE)
+    assert "Traceback" not in done.stderr
+
+
+def test_other_errors_of_the_system_are_one_line(monkeypatch, clip, tmp_path):
+    def fail(*_, **__):
+        raise OSError(errno.EIO, "Input/output error", "disk")
+
+    monkeypatch.setattr(detector.VehicleDetector, "search", fail)
+    result = run("video", clip, "-o", tmp_path / "out.mp4", "--model", "highway")
+    assert (result.exit_code, result.stderr) == (2, "error: disk: Input/output error\n")
+    assert contents(tmp_path) == []

@@ -1,0 +1,88 @@
+"""Limits on files from elsewhere; an environment variable adjusts each."""
+
+from __future__ import annotations
+
+import os
+import stat
+from enum import Enum
+from pathlib import Path
+
+from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
+
+
+class Limit(Enum):
+    """A limit: its environment variable, its default, and its unit."""
+
+    PIXELS = "VEHICLE_DETECTION_MAX_PIXELS", 120_000_000, "pixels"
+    """Pixels of an image or of a video's frame, as stated in the header: checked before decoding."""
+
+    MODEL_BYTES = "VEHICLE_DETECTION_MAX_MODEL_BYTES", 256_000_000, "bytes"
+    """Size of a model file."""
+
+    TEXT_BYTES = "VEHICLE_DETECTION_MAX_TEXT_BYTES", 1_000_000_000, "bytes"
+    """Size of a file of labels or predictions."""
+
+    IMAGE_BYTES = "VEHICLE_DETECTION_MAX_IMAGE_BYTES", 500_000_000, "bytes"
+    """Size of an image file, and of a member of a zip archive after unpacking."""
+
+    @property
+    def variable(self) -> str:
+        """Name of the environment variable."""
+        return str(self.value[0])
+
+    @property
+    def unit(self) -> str:
+        """What is counted."""
+        return str(self.value[2])
+
+    def current(self) -> int:
+        """Value of the environment variable, else the default."""
+        text = os.environ.get(self.variable, "")
+        if not text:
+            return int(self.value[1])
+        if not text.isascii() or not text.isdecimal() or not 1 <= int(text[:16]) <= 10**15:
+            raise InvalidInputError(
+                f"{self.variable} must be a number of {self.unit}, at least 1; got {text!r}"
+            )
+        return int(text)
+
+
+def read_regular_file(
+    path: Path, name: str, limit: Limit, *, error: type[VehicleDetectionError] = InvalidInputError
+) -> bytes:
+    """Read a whole file; raise an `error` that starts with `name` if it is missing, endless or too large."""
+    check_regular_file(path, name, limit, error=error)
+    try:
+        with path.open("rb") as file:
+            data = file.read(limit.current() + 1)
+    except OSError as problem:
+        raise error(f"{name} cannot be read: {problem.strerror}") from problem
+    if len(data) > limit.current():  # it has grown
+        raise error(_too_large(name, limit))
+    return data
+
+
+def check_regular_file(
+    path: Path,
+    name: str,
+    limit: Limit | None = None,
+    *,
+    error: type[VehicleDetectionError] = InvalidInputError,
+) -> None:
+    """Raise an `error` unless `path` is a file of limited size: not a folder, a device or a pipe."""
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        raise error(f"{name} does not exist; check the path") from None
+    except (OSError, ValueError) as problem:  # ValueError: a null byte or a lone surrogate
+        raise error(f"{name} cannot be read: {getattr(problem, 'strerror', None) or problem}") from problem
+    if stat.S_ISDIR(status.st_mode):
+        raise error(f"{name} is a folder; choose a file in it")
+    if not stat.S_ISREG(status.st_mode):
+        raise error(f"{name} is a device or a pipe, which may never end; copy it to a file first")
+    if limit is not None and status.st_size > limit.current():
+        raise error(_too_large(name, limit))
+
+
+def _too_large(name: str, limit: Limit) -> str:
+    return f"{name} is larger than {limit.current():,} bytes; if it is meant to be, set {limit.variable}"

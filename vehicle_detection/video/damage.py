@@ -1,0 +1,82 @@
+"""Damage of a video file: missing frames, and errors of the decoder.
+
+ffmpeg skips what it cannot decode and ends with exit code 0, so its frames and its log must be checked.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+import sys
+from fractions import Fraction
+from pathlib import Path
+
+from vehicle_detection.video.ffmpeg import Process, VideoInfo, input_options, last_line
+
+# Error of a frame rate that ffmpeg has derived from the file's times.
+_RATE_ERROR = Fraction(6, 1000)
+_REPEATED = re.compile(r"Last message repeated (\d+) times")
+
+
+def find_damage(path: Path | str, info: VideoInfo, end: int, log: str, *, stop: int | None = None) -> str:
+    """Say what is damaged, or return an empty text.
+
+    `end` is the number of the file's frames up to the last decoded one, `stop` that up to the last one
+    wanted, which may lie after the file's end. `log` holds ffmpeg's errors.
+    """
+    parts = []
+    count, message = _decode_errors(log)
+    announced = end if end == stop else _announced_frames(path, info, end, exact=count > 0)
+    expected = min(announced, stop or sys.maxsize)
+    if expected > end:
+        parts.append(f"{expected - end} of {expected} frames cannot be decoded")
+    if count:
+        parts.append(f"ffmpeg reports {count} decoding error{'s' * (count > 1)} ({message})")
+    return f"{path} is damaged: {', and '.join(parts)}; copy or record it again" if parts else ""
+
+
+def _decode_errors(log: str) -> tuple[int, str]:
+    """Count the decoder's errors, and return the last one; the demuxer's concern other streams, too."""
+    count, last = 0, ""
+    for line in log.splitlines():
+        repeated = _REPEATED.search(line)
+        if repeated:
+            count += int(repeated[1]) if last else 0
+        elif line.startswith("[") and not line.startswith("[in#"):
+            count, last = count + 1, line
+    return count, last_line(last)
+
+
+def _announced_frames(path: Path | str, info: VideoInfo, end: int, *, exact: bool) -> int:
+    """Return the number of frames that a file announces; `end` if unknown, or if only rounding differs.
+
+    `exact` allows for no rounding.
+    """
+    if info.frames <= end + (0 if exact else 1):
+        return end
+    # The file's duration is that of its longest stream, which may be the sound.
+    duration = _stream_duration(path)
+    if duration is None:
+        duration = 0.0 if info.has_audio else info.duration
+    expected = round(duration * info.fps)
+    # With a varying rate, the duration of the last frame is unknown.
+    tolerance = (0 if exact else 1) + duration * float(_RATE_ERROR)
+    tolerance += 0 if info.constant_rate else float(info.fps)
+    return expected if expected - end > math.floor(tolerance) else end
+
+
+def _stream_duration(path: Path | str) -> float | None:
+    """Duration of the video stream in seconds; None if the file does not state it."""
+    options = ("-nostdin", *input_options(path), "-map", "0:V:0", "-c", "copy", "-frames:v", "1")
+    with contextlib.closing(Process((*options, "-f", "null", "-"), level="trace")) as process:
+        process.wait()
+        log = process.log()
+    mapped = re.search(r"Stream #0:(\d+) -> #0:0", log)
+    index = mapped[1] if mapped else "0"
+    exact = re.search(rf"stream {index}: start_time: \S+ duration: ([\d.]+)", log)
+    if exact:
+        return float(exact[1])
+    # Matroska states it in a tag, which the log repeats for the output.
+    tag = re.findall(r"DURATION +: (\d+):(\d+):([\d.]+)", log)
+    return int(tag[-1][0]) * 3600 + int(tag[-1][1]) * 60 + float(tag[-1][2]) if tag else None
