@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.helpers import ROOT, random_mixture, start_interruptible
-from tests.video.clips import child_processes
+from tests.video.clips import child_processes, damage_sizes
 from vehicle_detection import batch_status, open_dask, process_video, run_batch
 from vehicle_detection.batch import trip as trip_module
 from vehicle_detection.batch import workers
@@ -213,6 +213,13 @@ def test_a_bad_file_is_recorded_once(many, model, tmp_path):
     status = batch_status(out)
     assert (status.done, status.failed, status.frames) == (1, 1, 12)
     assert "drive e.mp4: " in str(status)
+
+
+def test_the_record_of_a_damaged_file_says_what_is_missing(clip, model, tmp_path):
+    source = damage_sizes(clip, tmp_path / "lost.mp4", entry=3, byte=0, flip=64)
+    assert counts(run(str(source), tmp_path / "out", model, tracks_only=True)) == (1, 0, 0, 0)
+    (record,) = records(tmp_path / "out").values()
+    assert "lost.mp4 is damaged: 9 of 12 frames cannot be decoded" in record["damage"]
 
 
 def test_a_full_disk_is_an_error_that_the_next_run_repeats(card, model, tmp_path, monkeypatch):

@@ -3,6 +3,7 @@
 import contextlib
 import http.server
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import pytest
 from moviepy.config import FFMPEG_BINARY
 
 from tests.helpers import StubDetector, start_interruptible
-from tests.video.clips import ffmpeg, frame_numbers, gray_frames, sound_seconds, write_clip
+from tests.video.clips import damage_sizes, ffmpeg, frame_numbers, gray_frames, sound_seconds, write_clip
 from vehicle_detection.errors import InvalidInputError, VideoError
 from vehicle_detection.images import write_image
 from vehicle_detection.video import open_source, probe_video, process_video, sources
@@ -86,6 +87,24 @@ def test_a_damaged_segment_is_named(card, tmp_path):
     cut.write_bytes(files[1].read_bytes()[:1000])
     with pytest.raises(VideoError, match=r"cut\.mp4 is not a video"):
         open_source([files[0], cut])
+
+
+def test_missing_frames_of_a_segment_are_reported(card, tmp_path):
+    files = sorted(card.glob("2*F.mp4"))
+    lost = damage_sizes(files[1], tmp_path / "lost.mp4", entry=3, byte=0, flip=64)
+    segments = [files[0], lost, files[2]]
+    report = process_video(segments, None, StubDetector())
+    assert report.frames == 8 + 3 + 4
+    assert re.fullmatch(r".*lost.mp4 is damaged: 5 of 8 frames cannot be decoded; .*", report.damage)
+    with pytest.raises(VideoError, match=r"lost.mp4 is damaged: 5 of 8 frames"):
+        process_video(segments, tmp_path / "out.mp4", StubDetector(), strict=True)
+    assert os.listdir(tmp_path) == ["lost.mp4"]
+
+
+@pytest.mark.parametrize("source", ["a\0b", "a" * 5000, "\ud800"])
+def test_names_that_no_file_can_have(source):
+    with pytest.raises(InvalidInputError, match="source must be the path of a video file, got"):
+        open_source(source)
 
 
 def test_images_in_natural_order(tmp_path):

@@ -55,7 +55,7 @@ class DrawParams:
 
     def __post_init__(self) -> None:
         given: object = self.labels
-        if not isinstance(given, Collection):
+        if not isinstance(given, Collection) or getattr(given, "ndim", 1) == 0:
             raise InvalidInputError(
                 f"labels must be a list of fields, got {describe(given)}; pass some of {LABEL_FIELDS}"
             )

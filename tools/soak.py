@@ -1,0 +1,109 @@
+"""Run the detector for very many frames: memory, speed and identities must stay as they are.
+
+``python -m tools.soak --frames 100000`` renders a short drive once and repeats it. The last tenth of the
+frames is compared with the first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import vehicle_detection as vd
+
+
+@dataclass(frozen=True)
+class Sample:
+    """State after a tenth of the frames."""
+
+    frames: int
+    memory_mb: float
+    frames_per_second: float
+    tracks: int
+    mean_distance_m: float
+
+
+def soak(
+    model: str, *, frames: int, length: int = 100, shape: tuple[int, int] = (270, 480), seed: int = 0
+) -> list[Sample]:
+    """Track the vehicles of `frames` frames, and measure after each tenth of them."""
+    scenes = [scene.image for scene in vd.render_drive(frames=length, shape=shape, random_state=seed)]
+    samples: list[Sample] = []
+    distances: list[float] = []
+    start, before = time.perf_counter(), 0
+    with vd.VehicleDetector(model) as detector:
+        detector.reset(fps=25.0)
+        for number in range(frames):
+            result = detector.track(detector.search(scenes[number % length]), time=number / 25.0)
+            distances += [track.distance_m for track in result.tracks if track.distance_m is not None]
+            if (number + 1) % max(frames // 10, 1) == 0:
+                elapsed = time.perf_counter() - start
+                samples.append(
+                    Sample(
+                        frames=number + 1,
+                        memory_mb=_memory_mb(),
+                        frames_per_second=(number + 1 - before) / elapsed,
+                        tracks=len(result.tracks),
+                        mean_distance_m=float(np.mean(distances)) if distances else 0.0,
+                    )
+                )
+                distances.clear()
+                start, before = time.perf_counter(), number + 1
+    return samples
+
+
+def _memory_mb() -> float:
+    """Memory of this process now, in MB; 0 where the system does not tell it."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return 0.0
+    return pages * 4096 / 1e6
+
+
+def judge(samples: list[Sample]) -> list[str]:
+    """Name what has grown or slowed down since the first sample."""
+    first, last, problems = samples[0], samples[-1], []
+    if last.memory_mb > first.memory_mb + 20:
+        problems.append(f"memory grew from {first.memory_mb:.0f} to {last.memory_mb:.0f} MB")
+    speeds = [sample.frames_per_second for sample in samples[1:]]
+    if speeds and np.median(speeds[len(speeds) // 2 :]) < 0.8 * first.frames_per_second:
+        problems.append(f"speed fell from {first.frames_per_second:.0f} to {speeds[-1]:.0f} frames/s")
+    if max(sample.tracks for sample in samples) > 30:
+        problems.append("the number of tracks is not bounded")
+    if abs(last.mean_distance_m - first.mean_distance_m) > 0.1 * first.mean_distance_m + 1:
+        problems.append(f"distances drifted from {first.mean_distance_m:.1f} to {last.mean_distance_m:.1f} m")
+    return problems
+
+
+def main() -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--frames", type=int, default=100_000)
+    parser.add_argument("--models", nargs="+", default=["default", "highway"])
+    options = parser.parse_args()
+    failed = False
+    for model in options.models:
+        samples = soak(model, frames=options.frames)
+        for sample in samples:
+            print(
+                f"{model}: {sample.frames} frames, {sample.memory_mb:.0f} MB, "
+                f"{sample.frames_per_second:.1f} frames/s, {sample.tracks} tracks, "
+                f"mean distance {sample.mean_distance_m:.1f} m",
+                flush=True,
+            )
+        problems = judge(samples)
+        failed |= bool(problems)
+        print(f"{model}: {'; '.join(problems) or 'steady'}")
+    sys.exit(failed)
+
+
+if __name__ == "__main__":
+    main()
