@@ -1089,3 +1089,8 @@ def test_the_course_clip_by_command(real_data, tmp_path):
     track_scores = json.loads(scores.read_text())["tracks"]
     assert track_scores["f1"] == 1.0
     assert track_scores["mean_iou"] >= 0.7
+
+
+def test_help_has_a_short_option():
+    for words in ((), ("video",), ("train",)):
+        assert "Show this message and exit" in succeed(*words, "-h")
