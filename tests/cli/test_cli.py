@@ -108,6 +108,11 @@ def clip(material):
 # --- the program ---
 
 
+def test_help_has_a_short_option():
+    for words in ((), ("video",), ("train",)):
+        assert "Show this message and exit" in succeed(*words, "-h")
+
+
 def test_every_command_has_help_that_loads_no_heavy_library():
     code = (
         "import sys, json\n"
@@ -1089,8 +1094,3 @@ def test_the_course_clip_by_command(real_data, tmp_path):
     track_scores = json.loads(scores.read_text())["tracks"]
     assert track_scores["f1"] == 1.0
     assert track_scores["mean_iou"] >= 0.7
-
-
-def test_help_has_a_short_option():
-    for words in ((), ("video",), ("train",)):
-        assert "Show this message and exit" in succeed(*words, "-h")
