@@ -86,7 +86,8 @@ def write_labels(
 
     Examples
     --------
-    >>>     >>> from vehicle_detection import read_labels
+    >>> import tempfile
+    >>> from vehicle_detection import read_labels
     >>> file = Path(tempfile.mkdtemp()) / "labels.txt"
     >>> write_labels(FrameBoxes([0, 2], [1, 1], [[0, 0, 50, 40], [4, 0, 54, 40]]), file)
     2

@@ -154,11 +154,6 @@ class TemplateMixture:
         """Margin of a score: the inverse of `scores`."""
         return (score + self.threshold - self.offset) / self.slope
 
-    @property
-    def max_shift(self) -> float:
-        """What the number of candidates adds to a margin at most."""
-        return self.count_weight * math.log(_USUAL_COUNT)
-
     def detect_vehicles(
         self, pyramid: EdgePyramid, windows: ScoredWindows, *, min_margin: float
     ) -> tuple[Floats, Floats, float]:

@@ -117,7 +117,7 @@ class MixtureSearch(FrameSearch):
         Sensor noise and haze are not removed here. The pyramid is valid until the next search in the same
         thread.
         """
-        min_margin = min(MIN_MARGIN, self.model.margin_of(params.min_score) - self.model.max_shift)
+        min_margin = min(MIN_MARGIN, self.model.margin_of(params.min_score))
         plan = self._plan((image.shape[0], image.shape[1]), params, min_margin)
         with single_threaded_opencv():
             pyramid = EdgePyramid(image, plan.row_ranges, self.workspace, self._team)
