@@ -9,7 +9,7 @@ from vehicle_detection._kernels.hog import (
     orientation_cotangents,
     sqrt_gradients,
 )
-from vehicle_detection._kernels.linear_svm import fit_svm
+from vehicle_detection._kernels.linear_svm import fit_svm, hinge_loss
 from vehicle_detection._kernels.suppression import suppress, vote
 from vehicle_detection._kernels.vector import PackedFormat
 from vehicle_detection._kernels.yuv import channels_from_planes, planes_from_channels
@@ -25,6 +25,7 @@ __all__ = [
     "channels_from_planes",
     "degree_bounds",
     "fit_svm",
+    "hinge_loss",
     "orientation_cotangents",
     "planes_from_channels",
     "sqrt_gradients",

@@ -62,11 +62,14 @@ class MixtureTemplate:
     def _strip_filter(self) -> Filter:
         return Filter(self.weights.transpose(0, 2, 1).reshape(1, len(self.weights), -1))
 
+    def window_counts(self, channels: NDArray[np.float32]) -> tuple[int, int]:
+        """Count the windows of FHOG channels below and beside each other; 0 if no window fits."""
+        rows, columns = self.weights.shape[:2]
+        return max(channels.shape[1] - rows + 1, 0), max(channels.shape[2] - columns + 1, 0)
+
     def margins(self, channels: NDArray[np.float32]) -> NDArray[np.float32]:
         """Margin of every window of FHOG channels, ``(rows, columns)``; empty if no window fits."""
-        rows, columns = self.weights.shape[:2]
-        shape = max(channels.shape[1] - rows + 1, 0), max(channels.shape[2] - columns + 1, 0)
-        margins = np.full(shape, self.bias, np.float32)
+        margins = np.full(self.window_counts(channels), self.bias, np.float32)
         if margins.shape[1] == 1:
             # A strip as wide as the template: place its windows side by side, which vectorizes better.
             line = np.ascontiguousarray(channels.transpose(0, 2, 1)).reshape(-1, 1, channels.shape[1])

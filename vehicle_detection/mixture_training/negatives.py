@@ -27,6 +27,8 @@ from vehicle_detection.params import MixtureParams
 Floats = NDArray[np.float64]
 Choice = Callable[[NDArray[np.float32]], NDArray[np.intp]]
 """Chooses windows by their margins; returns indices."""
+Margins = Callable[[MixtureTemplate, NDArray[np.float32]], NDArray[np.float32]]
+"""Margins of a template's windows over FHOG channels, as `MixtureTemplate.margins`."""
 Block = tuple[tuple[int, ...], NDArray[np.float32]]
 """Position and features, ``(20, rows, columns)``, of a window."""
 
@@ -87,7 +89,10 @@ def random_windows(
     def choose(margins: NDArray[np.float32]) -> NDArray[np.intp]:
         return rng.permutation(margins.size)[: rng.poisson(_RANDOM_PER_LEVEL)]
 
-    return _negatives(frame, views, params, choose)
+    def equal(template: MixtureTemplate, channels: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.zeros(template.window_counts(channels), np.float32)
+
+    return _negatives(frame, views, params, choose, equal)
 
 
 def mine_windows(frame: TrainingFrame, views: Sequence[View], params: MixtureParams) -> list[HardNegative]:
@@ -103,7 +108,11 @@ def mine_windows(frame: TrainingFrame, views: Sequence[View], params: MixturePar
 
 
 def _negatives(
-    frame: TrainingFrame, views: Sequence[View], params: MixtureParams, choose: Choice
+    frame: TrainingFrame,
+    views: Sequence[View],
+    params: MixtureParams,
+    choose: Choice,
+    margins: Margins = MixtureTemplate.margins,
 ) -> list[HardNegative]:
     """Negatives of a frame among the windows that `choose` takes, for each view."""
     shape = frame.image.shape[:2]
@@ -114,31 +123,41 @@ def _negatives(
     found = []
     for number, view in enumerate(views):
         blocks = _border_blocks if view.template.border else _inner_blocks
-        for place, block in blocks(frame, maps, view, params, choose):
+        for place, block in blocks(frame, maps, view, params, choose, margins):
             found.append(HardNegative(view.index, (number, *place), block.transpose(1, 2, 0).ravel()))
     return found
 
 
 def _inner_blocks(
-    frame: TrainingFrame, maps: Sequence[FeatureMap], view: View, params: MixtureParams, choose: Choice
+    frame: TrainingFrame,
+    maps: Sequence[FeatureMap],
+    view: View,
+    params: MixtureParams,
+    choose: Choice,
+    margins: Margins,
 ) -> Iterator[Block]:
     """Negatives of one view anywhere in a frame."""
-    places, boxes, margins = [], [], []
+    places, boxes, scores = [], [], []
     for size, features in enumerate(maps):
-        grid = view.template.margins(features.channels)
+        grid = margins(view.template, features.channels)
         rows, columns = np.divmod(choose(grid.ravel()), max(grid.shape[1], 1))
         places += [(size, row, column) for row, column in zip(rows.tolist(), columns.tolist())]
         boxes.append(view.template.boxes(features.grid, rows, columns))
-        margins.append(grid[rows, columns].astype(np.float64))
+        scores.append(grid[rows, columns].astype(np.float64))
     height, width = view.template.weights.shape[:2]
-    for chosen in _select(frame, np.concatenate(boxes), np.concatenate(margins), params.max_per_frame):
+    for chosen in _select(frame, np.concatenate(boxes), np.concatenate(scores), params.max_per_frame):
         size, top, left = places[chosen]
         block = maps[size].channels[:, top : top + height, left : left + width]
         yield places[chosen], mirror_channels(block) if view.mirrored else block
 
 
 def _border_blocks(
-    frame: TrainingFrame, maps: Sequence[FeatureMap], view: View, params: MixtureParams, choose: Choice
+    frame: TrainingFrame,
+    maps: Sequence[FeatureMap],
+    view: View,
+    params: MixtureParams,
+    choose: Choice,
+    margins: Margins,
 ) -> Iterator[Block]:
     """Negatives of one border template at the actual borders of a frame and at simulated ones."""
     template, width = view.template, frame.image.shape[1]
@@ -147,20 +166,20 @@ def _border_blocks(
     for left, fraction in itertools.product((False, True), (1.0, *params.simulated_borders)):
         end = round(width * (1 - fraction if left else fraction))
         strips = {}
-        places, boxes, margins = [], [np.empty((0, 4))], [np.empty(0)]
+        places, boxes, scores = [], [np.empty((0, 4))], [np.empty(0)]
         for size, features in enumerate(maps):
             strip = template.border_strip(features, end, left=left)
             if strip is None or template.box_cells[0] * features.grid.step_x <= 0.999 * narrowest:
                 continue
             strips[size] = strip
-            line = template.margins(strip).ravel()
+            line = margins(template, strip).ravel()
             rows = choose(line)
             places += [(size, row) for row in rows.tolist()]
             boxes.append(template.border_boxes(features.grid, rows, end, left=left))
-            margins.append(line[rows].astype(np.float64))
+            scores.append(line[rows].astype(np.float64))
         visible = truncate_labels(frame, end, left=left)
         max_count = max(1, params.max_per_frame // 5)
-        for chosen in _select(visible, np.concatenate(boxes), np.concatenate(margins), max_count):
+        for chosen in _select(visible, np.concatenate(boxes), np.concatenate(scores), max_count):
             size, top = places[chosen]
             yield (size, top, 2 * end + left), strips[size][:, top : top + height]
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_image, check_integer, check_type, resolve_jobs
+from vehicle_detection._kernels import hinge_loss
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture import (
     N_CHANNELS,
@@ -207,15 +208,12 @@ def _fit_svm(
     classes = (positives, 1.0, positive_weight / len(positives)), (negatives, -1.0, 1.0)
 
     def loss(vector: Floats) -> tuple[float, Floats]:
-        weights, bias = vector[:-1].astype(np.float32), vector[-1]
-        gradient = np.append(vector[:-1], 0.0)
-        value = 0.5 * float(vector[:-1] @ vector[:-1])
+        weights, bias = vector[:-1].astype(np.float32), float(vector[-1])
+        value, gradient = 0.5 * float(vector[:-1] @ vector[:-1]), np.append(vector[:-1], 0.0)
         for rows, sign, weight in classes:
-            slack = np.maximum(1 - sign * ((rows @ weights).astype(np.float64) + bias), 0)
-            value += C * weight * float(slack @ slack)
-            factors = (-2 * C * weight * sign * slack).astype(np.float32)
-            gradient[:-1] += factors @ rows
-            gradient[-1] += float(factors.sum())
+            slope = np.zeros_like(vector)
+            value += C * weight * hinge_loss(rows, weights, bias, sign, slope)
+            gradient += C * weight * slope
         return value, gradient
 
     found = minimize(loss, start, jac=True, method="L-BFGS-B", options={"maxiter": iterations})
