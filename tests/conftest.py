@@ -1,3 +1,4 @@
+import dataclasses
 import os
 from pathlib import Path
 
@@ -31,4 +32,6 @@ def drawn_source():
 
 @pytest.fixture(scope="session")
 def small_mixture(drawn_source):
-    return train_mixture([drawn_source], SMALL_MIXTURE, n_jobs=1)
+    """A mixture with a rescorer, whose training takes most of the time."""
+    params = dataclasses.replace(SMALL_MIXTURE, blend_weight=0.1)
+    return train_mixture([drawn_source], params, n_jobs=1)

@@ -64,7 +64,8 @@ def test_gradients_are_the_derivatives_of_the_loss():
             np.testing.assert_allclose(gradient[place], slope, atol=1e-4)
 
 
-def test_training_reduces_the_loss_and_repeats_itself():
+def test_training_reduces_the_loss_and_repeats_itself(monkeypatch):
+    monkeypatch.setattr(training, "_EPOCHS", 2)
     batch = random_samples(96)
     start = training._initial_values(np.random.default_rng(5))
     layers = training.fit_network(batch, np.random.default_rng(5))
