@@ -20,23 +20,23 @@ class Units:
     speed_name: str
 
     def distance_text(self, meters: float, std_m: float | None, *, with_std: bool = False) -> str:
-        """Format a distance, such as "17 m"; "~17 m" if its error exceeds 20%, "17 +-3 m" with the error.
+        """Format a distance, such as "17 m"; "~17 m" if its error exceeds 20%, "17 ± 3 m" with the error.
 
         >>> UNITS["metric"].distance_text(17.3, 4.0)
         '~17 m'
         >>> UNITS["imperial"].distance_text(17.3, 2.0, with_std=True)
-        '57 +-7 ft'
+        '57 ± 7 ft'
         """
         value, symbol = self.distance * meters, self.distance_symbol
         if with_std and std_m is not None:
-            return f"{value:.0f} +-{self.distance * std_m:.0f} {symbol}"
+            return f"{value:.0f} ± {self.distance * std_m:.0f} {symbol}"
         rough = std_m is not None and std_m > _ROUGH * meters
         return f"{'~' * rough}{value:.0f} {symbol}"
 
     def speed_text(self, speed_mps: float, std_mps: float | None, *, with_std: bool = False) -> str:
-        """Format a speed relative to the camera, such as "-6 km/h", or "-6 +-2 km/h" with its error."""
+        """Format a speed relative to the camera, such as "-6 km/h", or "-6 ± 2 km/h" with its error."""
         value = round(self.speed * speed_mps) + 0.0  # + 0.0 turns -0.0 into 0.0
-        error = f" +-{self.speed * std_mps:.0f}" if with_std and std_mps is not None else ""
+        error = f" ± {self.speed * std_mps:.0f}" if with_std and std_mps is not None else ""
         return f"{value:+.0f}{error} {self.speed_symbol}"
 
 

@@ -190,8 +190,8 @@ class TestTracks:
 class TestText:
     def test_shows_the_requested_and_known_fields(self):
         assert track_text(track(), ("id", "distance", "speed")) == "#1  24 m  -6 km/h"
-        assert track_text(track(), ("distance", "std")) == "24 +-2 m"
-        assert track_text(track(), LABEL_FIELDS) == "#1  1.2  24 +-2 m  -6 +-2 km/h"
+        assert track_text(track(), ("distance", "std")) == "24 ± 2 m"
+        assert track_text(track(), LABEL_FIELDS) == "#1  1.2  24 ± 2 m  -6 ± 2 km/h"
         assert track_text(track(), ()) == ""
         assert track_text(track(), ("distance", "speed"), "imperial") == "77 ft  -4 mph"
         assert track_text(track(confidence=0.876), ("score",)) == "88%"
@@ -201,18 +201,18 @@ class TestText:
         unknown = track(distance_m=None, distance_std_m=None, speed_mps=None, speed_std_mps=None)
         assert track_text(unknown, LABEL_FIELDS) == "#1  1.2"
 
-    def test_is_ascii_as_the_font_has_no_other_characters(self):
-        assert track_text(track(), LABEL_FIELDS).isascii()
+    def test_holds_only_characters_that_are_drawn(self):
+        assert track_text(track(), LABEL_FIELDS).replace("±", "").isascii()
 
     def test_the_font_has_a_plus_minus_sign(self):
         drawn = []
-        for text in ("+", "\u00b1"):
+        for text in ("+", "±"):
             image = blank(40, 60)
             draw_text(image, [text], 5, 5, 1.0, (255, 255, 255))
             drawn.append((image != 90).any(axis=2))
         assert drawn[1][drawn[0]].all()
         assert drawn[1].sum() > drawn[0].sum()
-        assert text_size(["\u00b1"], 1.0) == text_size(["+"], 1.0)
+        assert text_size(["±"], 1.0) == text_size(["+"], 1.0)
 
 
 class TestDrawer:

@@ -80,9 +80,9 @@ def draw_text(image: Image, lines: list[str], x: int, y: int, scale: float, ink:
     for number, line in enumerate(lines):
         baseline = y + margin + cap_height(scale) + number * pitch
         # The font has no plus-minus sign: it is a plus over a line.
-        ascii_line, origin = line.replace("\u00b1", "+"), (x + margin, baseline)
+        ascii_line, origin = line.replace("±", "+"), (x + margin, baseline)
         cv2.putText(image, ascii_line, origin, _FONT, scale, ink, thickness, cv2.LINE_AA)
-        for column in (index for index, letter in enumerate(line) if letter == "\u00b1"):
+        for column in (index for index, letter in enumerate(line) if letter == "±"):
             left = x + margin + _line_width(line[:column], scale)
             right = left + _line_width("+", scale)
             cv2.line(image, (left + 1, baseline), (right - 1, baseline), ink, thickness)
@@ -123,7 +123,7 @@ def _line_pitch(scale: float) -> int:
 def _line_width(line: str, scale: float) -> int:
     if not line:
         return 0
-    (width, _), _ = cv2.getTextSize(line.replace("\u00b1", "+"), _FONT, scale, text_thickness(scale))
+    (width, _), _ = cv2.getTextSize(line.replace("±", "+"), _FONT, scale, text_thickness(scale))
     return int(width)
 
 
