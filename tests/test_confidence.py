@@ -15,7 +15,7 @@ from vehicle_detection import (
     load_model,
     render_scene,
 )
-from vehicle_detection.confidence import calibration_of, with_confidence
+from vehicle_detection.confidence import with_confidence
 from vehicle_detection.synthetic import SceneVehicle
 
 
@@ -30,7 +30,7 @@ def scene():
 def test_the_threshold_of_the_default_model_has_its_probability():
     model = load_model()
     at_threshold = 1 / (1 + np.exp(-model.threshold))
-    assert calibration_of(model).probability(0.0) == pytest.approx(at_threshold)
+    assert model.calibration.probability(0.0) == pytest.approx(at_threshold)
     assert with_confidence(model, None, 0.5)[0].threshold == 0.0
 
 

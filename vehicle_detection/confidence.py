@@ -1,4 +1,4 @@
-"""Confidence of boxes: calibrated probabilities of scores, and the threshold that a probability implies."""
+"""Confidence of boxes: the threshold that a calibrated probability implies."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import dataclasses
 import math
 
 from vehicle_detection._common import check_number
-from vehicle_detection.boxes import Platt
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.function_model import FunctionModel
@@ -17,13 +16,6 @@ Model = VehicleClassifier | TemplateMixture | FunctionModel
 
 # Probabilities beyond these have no useful threshold.
 _MIN_CONF, _MAX_CONF = 0.001, 0.999
-
-
-def calibration_of(model: Model) -> Platt:
-    """Sigmoid that turns the scores of a model's boxes into probabilities of a vehicle."""
-    if isinstance(model, TemplateMixture):  # its scores are log-odds above its threshold
-        return Platt(-1.0, -model.threshold)
-    return model.calibration
 
 
 def with_confidence(

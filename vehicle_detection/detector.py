@@ -31,7 +31,7 @@ from vehicle_detection.camera import (
     read_camera,
 )
 from vehicle_detection.classifier import VehicleClassifier
-from vehicle_detection.confidence import Model, calibration_of, with_confidence
+from vehicle_detection.confidence import Model, with_confidence
 from vehicle_detection.drawing import (
     BLUR_REGIONS,
     TrackDrawer,
@@ -235,7 +235,7 @@ class VehicleDetector:
         self._search: FrameSearch = self.model.open_search(n_jobs, method)
         self._heat_params = region_params if isinstance(region_params, HeatParams) else None
         # The heat of a region is no log-odds.
-        self._calibration = calibration_of(self.model) if self._heat_params is None else None
+        self._calibration = self.model.calibration if self._heat_params is None else None
         self._speed_warning = True
         self.reset()
 

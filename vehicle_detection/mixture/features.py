@@ -40,9 +40,9 @@ _EPS = np.float32(2)
 # Smallest cell of every octave but the first, in pixels of the resized frame: cells have 1.5 to 3 squares a
 # side. And the shortest side of a resized frame.
 _MIN_CELL, _MIN_SIDE = 6.0, 16
-# Largest values of an orientation and of a texture sum: four and sixteen terms of 0.2, weighted.
 # Rows of squares that one thread computes at a time.
 _PART_ROWS = 24
+# Largest values of an orientation and of a texture sum: four and sixteen terms of 0.2, weighted.
 _LARGEST = np.where(np.arange(N_CHANNELS) < 16, 0.4, 0.2357 * 16 * 0.2)
 
 CHANNEL_SCALES = (255 / _LARGEST).astype(np.float32)

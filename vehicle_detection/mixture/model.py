@@ -3,8 +3,8 @@
 A car from behind, a car from the side and a bus do not fit one square window. Each template has its own shape
 and is a linear SVM over the same FHOG channels, so one pyramid of a frame serves them all. Their windows
 become boxes by voting, rescoring with box correction, and non-maximum suppression. Felzenszwalb et al. (PAMI
-2010) for the mixture; Ohn-Bar and Trivedi, "Learning to
-detect vehicles by clustering appearance patterns" (IEEE T-ITS 2015) for vehicles.
+2010) for the mixture; Ohn-Bar and Trivedi, "Learning to detect vehicles by clustering appearance patterns"
+(IEEE T-ITS 2015) for vehicles.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_number, check_type, read_model, write_model
-from vehicle_detection.boxes import box_areas, clip_boxes
+from vehicle_detection.boxes import Platt, box_areas, clip_boxes
 from vehicle_detection.classifier import KIND as PATCH_KIND
 from vehicle_detection.classifier import VehicleClassifier, build_classifier
 from vehicle_detection.errors import InvalidInputError, ModelFileError
@@ -107,6 +107,11 @@ class TemplateMixture:
         check_number(self.vote_weight, "vote_weight", low=0)
         check_number(self.count_weight, "count_weight", low=0)
         object.__setattr__(self, "templates", templates)
+
+    @property
+    def calibration(self) -> Platt:
+        """Probability that a box contains a vehicle, by its score: the log-odds above the threshold."""
+        return Platt(-1.0, -self.threshold)
 
     def open_search(
         self, n_jobs: int | None = None, method: Literal["shared", "windows"] = "shared"
