@@ -278,7 +278,7 @@ def _detect_each(
     """Detect the vehicles of each image, print them, and write the annotated image."""
     import cv2
 
-    from vehicle_detection.drawing import blur_boxes, draw_detections
+    from vehicle_detection.drawing import blur_boxes, draw_detections, score_texts
     from vehicle_detection.images import read_image, write_image
 
     for path in images:
@@ -287,11 +287,9 @@ def _detect_each(
         for message in messages:
             print_error(f"warning: {path}: {message}")
         found = detector.detect(image)
-        known = found.confidences
-        values = [f"{score:.2f}" for score in found.scores] if known is None else [f"{p:.0%}" for p in known]
         listed = "".join(
-            f"  [{' '.join(f'{side:.0f}' for side in box)}] {value}"
-            for box, value in zip(found.boxes.tolist(), values)
+            f"  [{' '.join(f'{side:.0f}' for side in box)}] {text}"
+            for box, text in zip(found.boxes.tolist(), score_texts(found))
         )
         typer.echo(f"{path}: {len(found)} vehicle{'s' * (len(found) != 1)}{listed}")
         shown = image

@@ -10,7 +10,7 @@ from vehicle_detection.drawing.birds_eye import (
     road_position,
 )
 from vehicle_detection.drawing.blur import BLUR_REGIONS, blur_boxes
-from vehicle_detection.drawing.boxes import draw_boxes, draw_detections, draw_labeled_bboxes
+from vehicle_detection.drawing.boxes import draw_boxes, draw_detections, draw_labeled_bboxes, score_texts
 from vehicle_detection.drawing.diagnostics import draw_diagnostics, heat_image
 from vehicle_detection.drawing.primitives import blend
 from vehicle_detection.drawing.tracks import (
@@ -40,6 +40,7 @@ __all__ = [
     "draw_tracks",
     "heat_image",
     "road_position",
+    "score_texts",
     "track_color",
     "track_text",
 ]

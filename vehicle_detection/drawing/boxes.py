@@ -61,8 +61,8 @@ def draw_boxes(image: Image, boxes: ArrayLike, *, color: Color = (0, 0, 255), th
     return result
 
 
-def _score_texts(detections: Detections) -> list[str]:
-    """Confidence of each detection, or its score where that is unknown."""
+def score_texts(detections: Detections) -> list[str]:
+    """Confidence of each detection, such as "87%"; or its score if the confidence is unknown."""
     known = detections.confidences
     return [f"{score:.2f}" for score in detections.scores] if known is None else [f"{p:.0%}" for p in known]
 
@@ -162,7 +162,7 @@ def draw_detections(
     if scores:
         requests = [
             LabelRequest(row, (text,), round_box(box))
-            for row, (box, text) in enumerate(zip(detections.boxes, _score_texts(detections)))
+            for row, (box, text) in enumerate(zip(detections.boxes, score_texts(detections)))
         ]
         placed = LabelPlacer().place(requests, shape)
         draw_labels(result, placed, [color] * len(placed), width)
