@@ -28,7 +28,7 @@ from vehicle_detection.params import (
 )
 from vehicle_detection.synthetic import SceneVehicle, render_scene
 from vehicle_detection.tracking import Tracker
-from vehicle_detection.video import process_video
+from vehicle_detection.video import OwnSpeed, process_video
 
 HEIGHT, WIDTH = 180, 320
 SIDES = (160, 200, 250)  # of windows in a 1280 wide frame: 40, 50 and 62 pixels in these
@@ -268,6 +268,31 @@ def test_drawing_as_asked():
     assert mosaic.annotate(frame, mosaic.process(frame)).shape == mosaic.annotated_shape(frame.shape)
     with pytest.raises(InvalidInputError, match="draw_params must be a DrawParams, got 3"):
         make(draw_params=3)
+
+
+def test_labels_state_speeds_over_ground_where_the_own_speed_is_known():
+    detector = make(own_speed=OwnSpeed([0.0, 0.5], [25.0, 25.0]))
+    detector.reset(fps=25)
+    for frame in drive(20):
+        result = detector.process(frame)
+    fast, unknown = (
+        dataclasses.replace(
+            result,
+            time=time,
+            tracks=tuple(
+                dataclasses.replace(track, speed_mps=40.0, speed_std_mps=0.5) for track in result.shown
+            ),
+        )
+        for time in (0.5, 0.6)
+    )
+    assert fast.tracks
+    relative = draw_tracks(frame, fast.tracks)
+    assert (detector.annotate(frame, fast) != relative).any()
+    np.testing.assert_array_equal(make().annotate(frame, fast), relative)
+    detector.reset(fps=25)
+    np.testing.assert_array_equal(detector.annotate(frame, unknown), relative)
+    with pytest.raises(InvalidInputError, match=r"own_speed must be a OwnSpeed, got 25.0"):
+        make(own_speed=25.0)
 
 
 def test_boxes_between_searches_are_not_dashed():

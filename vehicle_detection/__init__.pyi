@@ -58,6 +58,7 @@ from .events import (
     cut_clips,
     find_events,
     write_events,
+    write_subtitles,
 )
 from .explanation import Explanation, explain
 from .explorer import Explorer
@@ -106,6 +107,7 @@ from .tuning import (
 )
 from .video import (
     FrameSource,
+    OwnSpeed,
     Trip,
     VideoInfo,
     VideoReport,
@@ -114,6 +116,7 @@ from .video import (
     probe_video,
     process_video,
     read_frames,
+    read_own_speed,
 )
 from .windows import search_windows, slide_window
 
@@ -146,6 +149,7 @@ __all__ = [
     "MixtureParams",
     "ModelFileError",
     "OutputError",
+    "OwnSpeed",
     "PatchFeatures",
     "PatchSet",
     "PyramidParams",
@@ -228,6 +232,7 @@ __all__ = [
     "read_frames",
     "read_image",
     "read_labels",
+    "read_own_speed",
     "read_results",
     "render_drive",
     "render_patches",
@@ -251,5 +256,6 @@ __all__ = [
     "write_events",
     "write_image",
     "write_labels",
+    "write_subtitles",
     "write_tracks",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import os
 import time as clock
 import warnings
@@ -56,6 +57,7 @@ from vehicle_detection.params import (
 from vehicle_detection.regions import find_vehicles
 from vehicle_detection.search import FrameSearch, SearchResult
 from vehicle_detection.tracking import Track, Tracker, interpolate_tracks
+from vehicle_detection.video import OwnSpeed
 
 Path = str | os.PathLike[str]
 Clip = TypeVar("Clip")
@@ -158,6 +160,9 @@ class VehicleDetector:
         Search every n-th frame of a video, to save time. The tracks of the frames between are interpolated
         by `process_video`, and predicted by `process`. None: `process_video` searches at least 12 frames per
         second, but every frame for heat maps, `diagnostics` and functions; `process` searches every frame.
+    own_speed
+        Speed of the camera's own vehicle over the time of the video (`read_own_speed`). Where it is known,
+        labels state speeds over ground, without a sign; otherwise speeds relative to the camera.
     diagnostics
         `annotate` shows the frame, its positive windows, the heat map and the tracks side by side.
     blur
@@ -201,6 +206,7 @@ class VehicleDetector:
         horizon: float | None = None,
         n_jobs: int | None = None,
         every: int | None = None,
+        own_speed: OwnSpeed | None = None,
         diagnostics: bool = False,
         blur: Literal["vehicles", "plates"] | None = None,
     ) -> None:
@@ -211,6 +217,7 @@ class VehicleDetector:
             ("track_params", track_params, TrackParams),
             ("draw_params", draw_params, DrawParams),
             ("camera", camera, (Camera, str, os.PathLike)),
+            ("own_speed", own_speed, OwnSpeed),
         ):
             if value is not None:
                 check_type(value, name, kind, "omit it for the default")
@@ -227,6 +234,7 @@ class VehicleDetector:
         self._lens = _check_lens(camera, field_of_view, camera_height_m)
         self._cameras: dict[tuple[int, int], Camera] = {}
         self._horizon_given = horizon is not None
+        self.own_speed = own_speed
         self.diagnostics = diagnostics
         if blur is not None:
             check_choice(blur, "blur", BLUR_REGIONS)
@@ -473,12 +481,15 @@ class VehicleDetector:
         if self.diagnostics:
             heat = frame_heat(frame.shape, result.windows, self._heat_params or HeatParams())
             return draw_diagnostics(frame, result.windows, heat, result.tracks)
+        time = result.index / (self._fps or _USUAL_FPS) if result.time is None else result.time
+        own_mps = math.nan if self.own_speed is None else float(self.own_speed.at(time))
         return self._drawer.draw(
             frame,
             result.tracks,
-            time=result.index / (self._fps or _USUAL_FPS) if result.time is None else result.time,
+            time=time,
             searched=result.searched,
             camera=self.camera_of(frame.shape[:2]),
+            own_mps=own_mps if math.isfinite(own_mps) else None,
         )
 
     def annotated_shape(self, shape: tuple[int, ...]) -> tuple[int, int, int]:

@@ -33,11 +33,16 @@ class Units:
         rough = std_m is not None and std_m > _ROUGH * meters
         return f"{'~' * rough}{value:.0f} {symbol}"
 
-    def speed_text(self, speed_mps: float, std_mps: float | None, *, with_std: bool = False) -> str:
-        """Format a speed relative to the camera, such as "-6 km/h", or "-6 ± 2 km/h" with its error."""
+    def speed_text(
+        self, speed_mps: float, std_mps: float | None, *, with_std: bool = False, signed: bool = True
+    ) -> str:
+        """Format a speed relative to the camera, such as "-6 km/h", or "-6 ± 2 km/h" with its error.
+
+        Speeds over ground are not `signed`: "94 km/h".
+        """
         value = round(self.speed * speed_mps) + 0.0  # + 0.0 turns -0.0 into 0.0
         error = f" ± {self.speed * std_mps:.0f}" if with_std and std_mps is not None else ""
-        return f"{value:+.0f}{error} {self.speed_symbol}"
+        return f"{value:{'+' if signed else ''}.0f}{error} {self.speed_symbol}"
 
 
 UNITS = {

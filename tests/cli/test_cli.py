@@ -113,6 +113,22 @@ def test_help_has_a_short_option():
         assert "Show this message and exit" in succeed(*words, "-h")
 
 
+def test_options_are_listed_in_panels():
+    page = succeed("video", "--help")
+    titles = re.findall(r"^╭─ (\w+) ─", page, re.MULTILINE)
+    assert titles == ["Arguments", "Options", "Output", "Input", "Camera", "Search", "Drawing"]
+    assert re.search(r"--live\s+Drop frames", page), "an option without a value has no type"
+
+
+def test_shells_complete_commands_and_options():
+    words = {"vehicle-detection ev": ["evaluate"], "vehicle-detection video --pa": ["--panel"]}
+    for typed, expected in words.items():
+        variables = {"COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
+        variables["_VEHICLE_DETECTION_COMPLETE"] = "complete_bash"
+        process = start(env={**os.environ, **variables})
+        assert finish(process) == (0, "\n".join(expected) + "\n", "")
+
+
 def test_every_command_has_help_that_loads_no_heavy_library():
     code = (
         "import sys, json\n"
@@ -575,6 +591,18 @@ def test_video_writes_events_and_a_summary(clip, tmp_path):
     assert [path.suffix for path in clips.iterdir()] == [".mp4"] * len(found)
 
 
+def test_video_writes_subtitles_with_the_own_speed(clip, tmp_path):
+    target, subtitles, speed = tmp_path / "out.mp4", tmp_path / "out.srt", tmp_path / "speed.csv"
+    speed.write_text("time_s,speed_kmh\n100,90\n101,90\n")
+    words = ["video", clip, "-o", target, "--srt", subtitles, "--gpx", speed, "--preset", "ultrafast"]
+    assert run(*words, "--gpx-offset", 100).stderr.count("own speed") == 0
+    assert "own speed 90 km/h" in subtitles.read_text()
+    warning = "warning: the own speed is known for 0% of the video; check --gpx-offset"
+    result = run(*words, "--units", "imperial")
+    assert (result.exit_code, warning in result.stderr) == (0, True)
+    assert "own speed" not in subtitles.read_text()
+
+
 def test_a_damaged_video_has_an_exit_code_of_its_own(clip, tmp_path):
     lost, target = damage_sizes(clip, tmp_path / "lost.mp4", entry=3, byte=0, flip=64), tmp_path / "out.mp4"
     result = run("video", lost, "-o", target, "-q")
@@ -680,6 +708,11 @@ def bad_videos(material, tmp):
         r"--blur must be one of 'vehicles', 'plates'; got 'faces'": [clip, "-o", target, "--blur", "faces"],
         r"--events must end in .csv or .json, got 'e.txt'": [clip, "-o", target, "--events", tmp / "e.txt"],
         r"--own-speed must be a number, at least 0": [clip, "-o", target, "--own-speed", -1],
+        r"--srt must end in .srt or .ass, got 's.txt'": [clip, "-o", target, "--srt", tmp / "s.txt"],
+        r"--gpx must end in .gpx or .csv, got 'clip.mp4'": [clip, "-o", target, "--gpx", clip],
+        r"--gpx \S+none.gpx does not exist": [clip, "-o", target, "--gpx", tmp / "none.gpx"],
+        r"--own-speed and --gpx both state": [clip, "-o", target, "--own-speed", 9, "--gpx", tmp / "a.gpx"],
+        r"--gpx-offset needs --gpx": [clip, "-o", target, "--gpx-offset", 9],
         r"--clips must be a folder": [clip, "-o", target, "--clips", clip],
         r"--tracks \S+ is also SOURCE \S+;": [tmp / "a.csv", "-o", target, "--tracks", tmp / "a.csv"],
     }

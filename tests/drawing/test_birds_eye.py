@@ -76,6 +76,13 @@ class TestPanel:
         assert (bottom, right - left) == BirdsEyePanel.corner_size(SHAPE)
         assert bottom < 0.45 * 720
 
+    def test_distances_in_feet(self):
+        """Lines at 75, 150 and 225 ft instead of 20, 40 and 60 m."""
+        drawn = TrackDrawer(DrawParams(panel="side", labels=(), units="imperial")).draw(blank(), [])
+        lines = [round((80 - feet * 0.3048) * 720 / 86) for feet in (75, 150, 225)]
+        rows = (drawn[:, -4:] == drawn[lines[0], -4:]).all(axis=(1, 2))
+        assert np.flatnonzero(rows).tolist() == sorted(lines)
+
     def test_labels_stay_outside_the_corner(self):
         _, width = BirdsEyePanel.corner_size(SHAPE)
         left = 1280 - width

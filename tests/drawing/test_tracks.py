@@ -197,6 +197,10 @@ class TestText:
         assert track_text(track(confidence=0.876), ("score",)) == "88%"
         assert track_text(track(distance_std_m=6.0), ("distance",)) == "~24 m"
 
+    def test_the_own_speed_gives_speeds_over_ground(self):
+        assert track_text(track(), ("speed",), own_mps=25.0) == "84 km/h"
+        assert track_text(track(speed_mps=-45.0), ("speed", "std"), "imperial", 25.0) == "45 ± 1 mph"
+
     def test_omits_unknown_values(self):
         unknown = track(distance_m=None, distance_std_m=None, speed_mps=None, speed_std_mps=None)
         assert track_text(unknown, LABEL_FIELDS) == "#1  1.2"

@@ -13,6 +13,7 @@ from tests.events.drives import CAMERA, FPS, SHAPE, cut_in_times, passing_times,
 from vehicle_detection import Event, TrackLog, find_events
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events import TrackHistory, estimate_motion
+from vehicle_detection.units import UNITS
 
 SEEDS = (0, 1, 2)
 simulated = functools.cache(simulate)
@@ -120,6 +121,30 @@ def test_the_own_speed_tells_standing_from_moving_vehicles():
         event for event in events_of("passing", 0, own_speed_mps=0.0) if event.track_id == slow.track_id
     )
     assert oncoming.kind == "met"
+
+
+def test_speeds_over_ground_where_the_own_speed_is_known():
+    (vehicle,), _ = simulated("closing", 0)
+    own = np.full(200, 30.0)
+    own[60:] = np.nan
+    for event in events_of("closing", 0, own_speed_mps=own):
+        if event.closing_mps is None or event.frame >= 60:
+            assert event.speed_mps is None
+        else:
+            assert event.speed_mps == pytest.approx(30.0 - event.closing_mps, abs=0.011)
+            true = 30.0 + vehicle.relative_speed(event.time_s)
+            assert abs(event.speed_mps - true) < max(3 * event.closing_std_mps, 2.0)
+    assert any(event.speed_mps is not None for event in events_of("closing", 0, own_speed_mps=own))
+    unknown = events_of("closing", 0, own_speed_mps=np.full(200, np.nan))
+    assert unknown == events_of("closing", 0)
+
+
+def test_an_event_is_described_in_units():
+    event = Event(kind="closest_approach", track_id=3, frame=10, start_frame=10, end_frame=10, time_s=0.4,
+                  distance_m=8.0, distance_std_m=1.0)  # fmt: skip
+    text = "vehicle 3 closest approach, distance 26.2 ± 3.3 ft"
+    assert event.text(UNITS["imperial"], with_time=False) == text
+    assert event.text(UNITS["imperial"]) == f"0.4 s: {text}"
 
 
 def test_what_is_stated_is_known_and_in_order():

@@ -342,6 +342,18 @@ def test_events_and_counts_are_listed_with_buttons_that_seek(tmp_path):
     assert re.findall("<td>(.*?)</td>", row) == ["0", "1", "0", "0", "1.2", "2"]
 
 
+def test_events_are_in_the_units_of_the_page(tmp_path):
+    event = Event(kind="met", track_id=2, frame=12, start_frame=8, end_frame=14, time_s=0.48, side="left",
+                  distance_m=12.5, distance_std_m=1.5, closing_std_mps=1.0, speed_mps=-20.0)  # fmt: skip
+    writer = ReportWriter(tmp_path / "report.html", units="imperial")
+    for index, tracks in enumerate(FRAMES):
+        writer.write(index, index / FPS, tracks)
+    writer.finish(video_report(len(FRAMES)), events=[event])
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<td>41.0 ± 4.9 ft</td>\n<td>45 ± 2 mph, oncoming</td>" in page
+    assert "distance 41.0 ± 4.9 ft: show in the video" in page
+
+
 def test_a_page_without_certain_events_says_so(tmp_path):
     assert "No event is certain." in write_report(tmp_path, FRAMES)
     assert "No event is certain." not in write_report(tmp_path, [[]])

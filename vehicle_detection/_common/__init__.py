@@ -17,7 +17,13 @@ from vehicle_detection._common.checks import (
     finite_array,
 )
 from vehicle_detection._common.environment import check_environment
-from vehicle_detection._common.files import atomic_write, check_target, temporary_folder, write_parquet
+from vehicle_detection._common.files import (
+    atomic_write,
+    check_suffix,
+    check_target,
+    temporary_folder,
+    write_parquet,
+)
 from vehicle_detection._common.image_size import image_size
 from vehicle_detection._common.limits import Limit, check_regular_file, read_regular_file
 from vehicle_detection._common.model_file import FORMAT_VERSION, ModelData, read_model, write_model
@@ -55,6 +61,7 @@ __all__ = [
     "check_path",
     "check_regular_file",
     "check_sequence",
+    "check_suffix",
     "check_target",
     "check_type",
     "degrade_patches",

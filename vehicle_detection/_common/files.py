@@ -8,7 +8,7 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,15 @@ def check_target(target: str | os.PathLike[str], name: str = "target") -> Path:
         raise InvalidInputError(f"{name} needs an existing folder, {path.parent} is not one; create it first")
     if not os.access(path.parent, os.W_OK | os.X_OK):
         raise InvalidInputError(f"{name} needs a writable folder, {path.parent} is read-only; choose another")
+    return path
+
+
+def check_suffix(target: str | os.PathLike[str], name: str, suffixes: Sequence[str]) -> Path:
+    """Return the path of a file to write, after checking its suffix and folder."""
+    path = check_target(target, name)
+    if path.suffix.lower() not in suffixes:
+        allowed, example = " or ".join(suffixes), path.stem + suffixes[0]
+        raise InvalidInputError(f"{name} must end in {allowed}, got {path.name!r}; write {example!r}")
     return path
 
 

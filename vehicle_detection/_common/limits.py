@@ -22,6 +22,9 @@ class Limit(Enum):
     TEXT_BYTES = "VEHICLE_DETECTION_MAX_TEXT_BYTES", 1_000_000_000, "bytes"
     """Size of a file of labels or predictions."""
 
+    RECORD_BYTES = "VEHICLE_DETECTION_MAX_RECORD_BYTES", 100_000_000, "bytes"
+    """Size of a GPX track or a table of speeds."""
+
     IMAGE_BYTES = "VEHICLE_DETECTION_MAX_IMAGE_BYTES", 500_000_000, "bytes"
     """Size of an image file, and of a member of a zip archive after unpacking."""
 

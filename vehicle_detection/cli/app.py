@@ -17,6 +17,23 @@ from typer.core import TyperArgument, TyperGroup
 
 from vehicle_detection import __version__
 from vehicle_detection.cli.batch import batch
+from vehicle_detection.cli.options import (
+    CAMERA,
+    DRAWING,
+    HORIZON_HELP,
+    INPUT,
+    OUTPUT,
+    SEARCH,
+    Blur,
+    Confidence,
+    Every,
+    Horizon,
+    LineWidth,
+    Model,
+    NoAudio,
+    Preset,
+    flag,
+)
 from vehicle_detection.cli.output import (
     capture_stderr,
     check_distinct_paths,
@@ -80,7 +97,6 @@ app = typer.Typer(
     cls=_Commands,
     help="Detect and track vehicles in dash-cam images and video.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -101,48 +117,13 @@ def _global_options(
     pass
 
 
-Model = Annotated[
-    str, Option(metavar="NAME|FILE", help='"default" (any road), "highway" (fastest), or a model file.')
-]
-LineWidth = Annotated[
-    int | None,
-    Option("--line-width", metavar="N", help="Width of the boxes in pixels; default: by size of the frame."),
-]
-Confidence = Annotated[
-    float | None,
-    Option(
-        metavar="P", help="Minimum confidence, a probability from 0 to 1; default: the model's threshold."
-    ),
-]
-CameraFile = Annotated[
-    str | None,
-    Option(
-        metavar="NAME|FILE",
-        help="standard-58, wide-90, fisheye-120, fisheye-140, fisheye-170 (typical lenses), or a JSON file.",
-    ),
-]
-FieldOfView = Annotated[
-    float | None,
-    Option("--fov", metavar="DEG", help="Horizontal field of view in degrees, such as 90; default: 58."),
-]
-CameraHeight = Annotated[
-    float | None,
-    Option("--camera-height", metavar="M", help="Height of the lens above the road in meters; default: 1.3."),
-]
-Blur = Annotated[
-    str | None,
-    Option(metavar="R", help='Blur "vehicles" or the region of their "plates" in what is written.'),
-]
-HORIZON_HELP = "Height of the horizon as a fraction of the frame's height, 0 at the top."
-
-
 @app.command()
 @option_names(random_state="--seed")
 def demo(
     output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder to write.")] = Path("demo"),
     frames: Annotated[int, Option(metavar="N", help="Number of frames.")] = 120,
     seed: Annotated[int, Option(metavar="N", help="Random seed of the scene.")] = 0,
-    report: Annotated[bool, Option("--report", help="Write a page with the video and its tracks.")] = False,
+    report: Annotated[bool, flag("--report", help="Write a page with the video and its tracks.")] = False,
 ) -> None:
     """Draw a drive, annotate it with the default model and score it against the ground truth.
 
@@ -171,20 +152,38 @@ def demo(
 
 @app.command()
 def detect(
-    images: Annotated[list[Path], Argument(metavar="IMAGE...", help="Image files.")],
-    output: Annotated[Path | None, Option("-o", "--output", metavar="DIR", help="Annotated images.")] = None,
-    boxes: Annotated[Path | None, Option(metavar="FILE.csv", help="Boxes by file name.")] = None,
+    images: Annotated[list[Path], Argument(metavar="IMAGE...", help="Image files, such as frames/*.jpg.")],
+    output: Annotated[
+        Path | None,
+        Option("-o", "--output", metavar="DIR", help="Annotated images.", rich_help_panel=OUTPUT),
+    ] = None,
+    boxes: Annotated[
+        Path | None,
+        Option(
+            metavar="FILE",
+            help="Boxes by file name: .csv, .jsonl, .parquet or .json (COCO).",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
+    why: Annotated[
+        Path | None,
+        Option(
+            metavar="DIR",
+            help="Pictures that explain each box: the share of each cell in its score.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
     model: Model = "default",
     conf: Confidence = None,
-    horizon: Annotated[float | None, Option(metavar="F", help=HORIZON_HELP)] = None,
+    horizon: Horizon = None,
     labels: Annotated[
-        str, Option(metavar="score|none", help="Labels of the boxes in annotated images.")
+        str,
+        Option(
+            metavar="score|none", help="Labels of the boxes in annotated images.", rich_help_panel=DRAWING
+        ),
     ] = "score",
     line_width: LineWidth = None,
     blur: Blur = None,
-    why: Annotated[
-        Path | None, Option(metavar="DIR", help="Pictures that explain each box: the share of each cell.")
-    ] = None,
 ) -> None:
     """Detect the vehicles of images."""
     from vehicle_detection._common import check_choice, check_integer
@@ -331,93 +330,206 @@ def video(
         ),
     ],
     output: Annotated[
-        Path, Option("-o", "--output", metavar="TARGET", help="Video to write: .mp4, .m4v, .mov or .mkv.")
+        Path,
+        Option(
+            "-o",
+            "--output",
+            metavar="TARGET",
+            help="Video to write: .mp4, .m4v, .mov or .mkv.",
+            rich_help_panel=OUTPUT,
+        ),
     ],
     tracks: Annotated[
-        Path | None, Option(metavar="FILE.csv", help="Tracks: .csv, .jsonl or .txt (MOT).")
+        Path | None,
+        Option(metavar="FILE", help="Tracks: .csv, .jsonl or .txt (MOT).", rich_help_panel=OUTPUT),
     ] = None,
     report: Annotated[
-        Path | None, Option(metavar="FILE.html", help="Page with the video and its tracks.")
+        Path | None,
+        Option(metavar="FILE.html", help="Page with the video and its tracks.", rich_help_panel=OUTPUT),
     ] = None,
     events: Annotated[
-        Path | None, Option(metavar="FILE", help="Events, such as cut-ins and overtaking: .csv or .json.")
+        Path | None,
+        Option(
+            metavar="FILE",
+            help="Events, such as cut-ins and overtaking: .csv or .json.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = None,
     clips: Annotated[
-        Path | None, Option(metavar="DIR", help="Folder for a short annotated clip of each event.")
+        Path | None,
+        Option(
+            metavar="DIR", help="Folder for a short annotated clip of each event.", rich_help_panel=OUTPUT
+        ),
+    ] = None,
+    srt: Annotated[
+        Path | None,
+        Option(
+            metavar="FILE",
+            help="Subtitles with vehicles, nearest distance and events, second by second: .srt or .ass.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
+    preset: Preset = "veryfast",
+    no_audio: NoAudio = False,
+    quiet: Annotated[
+        bool, flag("-q", "--quiet", panel=OUTPUT, help="Print errors and warnings of damage only.")
+    ] = False,
+    profile: Annotated[bool, flag("--profile", panel=OUTPUT, help="Print the time of each stage.")] = False,
+    start: Annotated[
+        float | None,
+        Option(metavar="S", help="Start time in seconds, such as 12.5.", rich_help_panel=INPUT),
+    ] = None,
+    end: Annotated[
+        float | None, Option(metavar="S", help="End time in seconds, such as 30.", rich_help_panel=INPUT)
     ] = None,
     own_speed: Annotated[
         float | None,
-        Option(metavar="KM/H", help="Speed of the own vehicle, for headways in seconds. Example: 100."),
+        Option(
+            metavar="KM/H",
+            help="Speed of the own vehicle, such as 100, for headways and speeds over ground.",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
-    blur: Blur = None,
-    diagnostics: Annotated[
-        bool, Option("--diagnostics", help="Show frame, positive windows, heat map and tracks side by side.")
+    gpx: Annotated[
+        Path | None,
+        Option(
+            metavar="FILE",
+            help="Own speed over time: a GPX track, or a .csv table with the columns time_s and speed_kmh.",
+            rich_help_panel=INPUT,
+        ),
+    ] = None,
+    gpx_offset: Annotated[
+        float,
+        Option(
+            metavar="S",
+            help="Seconds from the first point of --gpx to the start of the video, such as 12.5 or -3.",
+            rich_help_panel=INPUT,
+        ),
+    ] = 0.0,
+    live: Annotated[
+        bool,
+        flag(
+            "--live",
+            panel=INPUT,
+            help="Drop frames of a pipe rather than lag; default for cameras and streams.",
+        ),
     ] = False,
+    strict: Annotated[
+        bool, flag("--strict", panel=INPUT, help="Fail, and write nothing, if the source is damaged.")
+    ] = False,
+    camera: Annotated[
+        str | None,
+        Option(
+            metavar="NAME|FILE",
+            help="Lens: standard-58, wide-90, fisheye-120, fisheye-140 or fisheye-170; or a JSON file.",
+            rich_help_panel=CAMERA,
+        ),
+    ] = None,
+    fov: Annotated[
+        float | None,
+        Option(
+            "--fov",
+            metavar="DEG",
+            help="Horizontal field of view in degrees, such as 90; default: 58, with a warning.",
+            rich_help_panel=CAMERA,
+        ),
+    ] = None,
+    camera_height: Annotated[
+        float | None,
+        Option(
+            "--camera-height",
+            metavar="M",
+            help="Height of the lens above the road in meters, such as 1.5; default: 1.3.",
+            rich_help_panel=CAMERA,
+        ),
+    ] = None,
+    horizon: Annotated[
+        str | None,
+        Option(
+            metavar="F|auto",
+            help=f'{HORIZON_HELP} "auto": estimated from vehicles in a sample of frames.',
+            rich_help_panel=CAMERA,
+        ),
+    ] = None,
     model: Model = "default",
     conf: Confidence = None,
-    start: Annotated[float | None, Option(metavar="S", help="Start time in seconds.")] = None,
-    end: Annotated[float | None, Option(metavar="S", help="End time in seconds.")] = None,
+    every: Every = None,
+    jobs: Annotated[
+        int | None,
+        Option(
+            metavar="N",
+            help="Frames searched in parallel; default: one per core, at most 4.",
+            rich_help_panel=SEARCH,
+        ),
+    ] = None,
     labels: Annotated[
         str,
-        Option(metavar="LIST", help="Fields of the labels: some of id,distance,speed,score,std, or none."),
+        Option(
+            metavar="LIST",
+            help="Fields of the labels: some of id,distance,speed,score,std, such as id,distance; or none.",
+            rich_help_panel=DRAWING,
+        ),
     ] = "id,distance,speed",
     line_width: LineWidth = None,
     color_by: Annotated[
-        str, Option(metavar="id|distance", help="What the colors of the boxes stand for.")
+        str,
+        Option(
+            metavar="id|distance", help="What the colors of the boxes stand for.", rich_help_panel=DRAWING
+        ),
     ] = "id",
     panel: Annotated[
         str,
-        Option(metavar="corner|side|none", help="Bird's-eye view in the frame's corner, or beside it."),
+        Option(
+            metavar="corner|side|none",
+            help="Bird's-eye view in the frame's corner, or beside it.",
+            rich_help_panel=DRAWING,
+        ),
     ] = "none",
     units: Annotated[
         str,
         Option(
             metavar="metric|imperial",
-            help="Labels and report in m and km/h, or ft and mph; speeds are relative to the camera.",
+            help="Labels, subtitles and report in m and km/h, or ft and mph.",
+            rich_help_panel=DRAWING,
         ),
     ] = "metric",
-    preset: Annotated[str, Option(metavar="P", help="Encoder speed, ultrafast to placebo.")] = "veryfast",
-    horizon: Annotated[
-        str | None,
-        Option(
-            metavar="F|auto", help=f'{HORIZON_HELP} "auto": estimated from vehicles in a sample of frames.'
+    blur: Blur = None,
+    diagnostics: Annotated[
+        bool,
+        flag(
+            "--diagnostics",
+            panel=DRAWING,
+            help="Show frame, positive windows, heat map and tracks side by side.",
         ),
-    ] = None,
-    camera: CameraFile = None,
-    fov: FieldOfView = None,
-    camera_height: CameraHeight = None,
-    every: Annotated[
-        int | None,
-        Option(metavar="N", help="Search every N-th frame, interpolate between; default: 12 a second."),
-    ] = None,
-    jobs: Annotated[
-        int | None, Option(metavar="N", help="Frames searched in parallel; default: one per core, at most 4.")
-    ] = None,
-    live: Annotated[
-        bool, Option("--live", help="Drop frames of a pipe rather than lag; default for cameras and streams.")
     ] = False,
-    no_audio: Annotated[bool, Option("--no-audio", help="Write no sound.")] = False,
-    strict: Annotated[
-        bool, Option("--strict", help="Fail, and write nothing, if the source is damaged.")
-    ] = False,
-    quiet: Annotated[bool, Option("-q", "--quiet", help="Print errors and warnings of damage only.")] = False,
-    profile: Annotated[bool, Option("--profile", help="Print the time of each stage.")] = False,
 ) -> None:
-    """Track the vehicles of a video and write an annotated copy; speeds are relative to the camera.
+    """Track the vehicles of a video and write an annotated copy.
+
+    Speeds are relative to the camera, and over ground where its own speed is known (--gpx, --own-speed).
 
     Exit code 3: the source is damaged, and the copy lacks what cannot be decoded.
     """
-    from vehicle_detection.cli.events import EventOptions, print_summary
+    from vehicle_detection.cli.events import SideOutputs, print_summary, read_speed
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.events import TrackLog
     from vehicle_detection.export import TrackWriter
     from vehicle_detection.mixture import load_model
     from vehicle_detection.video import estimate_video_horizon, open_source, process_video
 
-    draw_params = _draw_params(labels, line_width=line_width, color_by=color_by, panel=panel, units=units)
-    outputs = {"--output": output, "--tracks": tracks, "--report": report, "--events": events}
-    check_distinct_paths(outputs, {"SOURCE": Path(source)})
-    event_options = EventOptions(events, clips, own_speed)
+    outputs = {
+        "--output": output, "--tracks": tracks, "--report": report, "--events": events, "--srt": srt,
+    }  # fmt: skip
+    sources = {"SOURCE": Path(source)} | ({} if gpx is None else {"--gpx": gpx})
+    check_distinct_paths(outputs, sources)
+    draw_params = _draw_params(
+        labels,
+        line_width=line_width,
+        color_by=color_by,
+        panel=panel,
+        units=units,
+    )
+    speed = read_speed(own_speed, gpx, gpx_offset)
+    side_outputs = SideOutputs(events, clips, srt)
     with name_kept_files(outputs.values()), contextlib.ExitStack() as stack:
         stack.enter_context(output_folder(clips, "--clips"))
         writers: list[Callable[[Any], object]] = []
@@ -439,6 +551,7 @@ def video(
                 camera_height_m=camera_height,
                 horizon=fraction,
                 every=every,
+                own_speed=speed,
                 diagnostics=diagnostics,
                 draw_params=draw_params,
                 blur=_parse_blur(blur),
@@ -467,8 +580,8 @@ def video(
             strict=strict,
             on_result=lambda result: [write(result) for write in writers],
         )
-        found = event_options.find(log, done, detector)
-        event_options.write(found, output, done)
+        found = side_outputs.find_events(log, done, detector)
+        side_outputs.write(log, found, output, done, detector)
         if page is not None:
             # After the tracks, whose file is complete when its writer closes.
             stack.close()
@@ -571,7 +684,7 @@ def evaluate(
     ],
     iou: Annotated[float, Option(metavar="F", help="Minimum IoU of a correct box.")] = 0.5,
     ignored_as_regions: Annotated[
-        bool, Option("--ignored-as-regions", help="Ignore boxes of which half lies in an ignored box.")
+        bool, flag("--ignored-as-regions", help="Ignore boxes of which half lies in an ignored box.")
     ] = False,
     json: Annotated[Path | None, Option(metavar="FILE", help="File for all scores.")] = None,
 ) -> None:

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from vehicle_detection.cli.options import Every, Horizon, Model, NoAudio, Preset, flag
 from vehicle_detection.cli.output import option_names, print_error
 from vehicle_detection.errors import InvalidInputError
 
@@ -20,9 +21,7 @@ def batch(
         list[str] | None,
         Argument(metavar="SOURCES...", help="Video files, folders, quoted patterns and URLs (s3://...)."),
     ] = None,
-    model: Annotated[
-        str, Option(metavar="NAME|FILE", help='"default" (any road), "highway" (fastest), or a model file.')
-    ] = "default",
+    model: Model = "default",
     jobs: Annotated[
         int | None, Option(metavar="N", help="Worker processes of one thread; default: one per core.")
     ] = None,
@@ -35,21 +34,16 @@ def batch(
     group: Annotated[
         str, Option(metavar="trip|file", help="Make consecutive segments one trip, or each file.")
     ] = "trip",
-    tracks_only: Annotated[bool, Option("--tracks-only", help="Write no videos.")] = False,
-    horizon: Annotated[
-        float | None, Option(metavar="F", help="Height of the horizon as a fraction of the frame's height.")
-    ] = None,
-    every: Annotated[
-        int | None,
-        Option(metavar="N", help="Search every N-th frame, interpolate between; default: 12 a second."),
-    ] = None,
-    preset: Annotated[str, Option(metavar="P", help="Encoder speed, ultrafast to placebo.")] = "veryfast",
-    no_audio: Annotated[bool, Option("--no-audio", help="Write no sound.")] = False,
+    tracks_only: Annotated[bool, flag("--tracks-only", help="Write no videos.")] = False,
+    horizon: Horizon = None,
+    every: Every = None,
+    preset: Preset = "veryfast",
+    no_audio: NoAudio = False,
     retry_failed: Annotated[
-        bool, Option("--retry-failed", help="Process trips again whose source could not be processed.")
+        bool, flag("--retry-failed", help="Process trips again whose source could not be processed.")
     ] = False,
-    status: Annotated[bool, Option("--status", help="Only show what has been done in DIR.")] = False,
-    quiet: Annotated[bool, Option("-q", "--quiet", help="Print errors only.")] = False,
+    status: Annotated[bool, flag("--status", help="Only show what has been done in DIR.")] = False,
+    quiet: Annotated[bool, flag("-q", "--quiet", help="Print errors only.")] = False,
 ) -> None:
     """Track the vehicles of many videos in parallel; run again to do what is missing or changed."""
     if status:

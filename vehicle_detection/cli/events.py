@@ -1,55 +1,98 @@
-"""Events and counts of the command ``video``: files, clips and the summary."""
+"""Events of the command ``video`` and what follows from them: files, clips, subtitles and the summary."""
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
-from vehicle_detection.cli.output import option_names
+from vehicle_detection.cli.output import option_names, print_error
+from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
+    from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.events import Event, TrackLog
-    from vehicle_detection.video import VideoReport
+    from vehicle_detection.video import OwnSpeed, VideoReport
+
+# Fraction of the frames without a known own speed from which on a warning is printed.
+_MAX_UNKNOWN = 0.05
+
+
+def read_speed(own_speed: float | None, gpx: Path | None, offset: float) -> OwnSpeed | None:
+    """Speed of the own vehicle: constant (km/h), from a file, or unknown."""
+    from vehicle_detection._common import check_number
+    from vehicle_detection.video import OwnSpeed, read_own_speed
+
+    if gpx is not None:
+        if own_speed is not None:
+            raise InvalidInputError("--own-speed and --gpx both state the own speed; give one of them")
+        with option_names(path="--gpx", offset="--gpx-offset"):
+            return read_own_speed(gpx, offset=offset)
+    if offset:
+        raise InvalidInputError("--gpx-offset needs --gpx; give the file, or omit the offset")
+    if own_speed is None:
+        return None
+    return OwnSpeed.constant(check_number(own_speed, "--own-speed", low=0, high=500) / 3.6)
 
 
 @dataclass(frozen=True)
-class EventOptions:
-    """Options of ``video`` about events: checked before the work starts."""
+class SideOutputs:
+    """Files of ``video`` beside the video and its tracks, checked before the work starts."""
 
-    path: Path | None  # file of the events
-    clips: Path | None  # existing folder for their clips
-    own_speed: float | None  # km/h
+    events: Path | None
+    clips: Path | None  # existing folder for clips of the events
+    subtitles: Path | None
 
     def __post_init__(self) -> None:
-        from vehicle_detection._common import check_number
-        from vehicle_detection.events import check_event_file
+        from vehicle_detection._common import check_suffix
+        from vehicle_detection.events import EVENT_SUFFIXES, SUBTITLE_SUFFIXES
 
-        if self.path is not None:
-            check_event_file(self.path, "--events")
-        if self.own_speed is not None:
-            check_number(self.own_speed, "--own-speed", low=0, high=500)
+        if self.events is not None:
+            check_suffix(self.events, "--events", EVENT_SUFFIXES)
+        if self.subtitles is not None:
+            check_suffix(self.subtitles, "--srt", SUBTITLE_SUFFIXES)
 
-    def find(self, log: TrackLog, report: VideoReport, detector: Any) -> tuple[Event, ...]:
+    def find_events(self, log: TrackLog, report: VideoReport, detector: VehicleDetector) -> tuple[Event, ...]:
         """Find the events of a processed video."""
+        import numpy as np
+
         from vehicle_detection.events import find_events
 
-        speed = None if self.own_speed is None else self.own_speed / 3.6
+        speeds = None if detector.own_speed is None else log.own_speeds(detector.own_speed, float(report.fps))
+        if speeds is not None and len(speeds) and np.isnan(speeds).mean() > _MAX_UNKNOWN:
+            known = float(np.isfinite(speeds).mean())
+            print_error(f"warning: the own speed is known for {known:.0%} of the video; check --gpx-offset")
         camera = detector.camera_of(report.shape)
-        return find_events(log, fps=float(report.fps), shape=report.shape, camera=camera, own_speed_mps=speed)
+        return find_events(
+            log, fps=float(report.fps), shape=report.shape, camera=camera, own_speed_mps=speeds
+        )
 
-    def write(self, events: tuple[Event, ...], video: Path, report: VideoReport) -> None:
-        """Write the file of events, and their clips."""
-        from vehicle_detection.events import cut_clips, write_events
+    def write(
+        self,
+        log: TrackLog,
+        events: tuple[Event, ...],
+        video: Path,
+        report: VideoReport,
+        detector: VehicleDetector,
+    ) -> None:
+        """Write the file of events, their clips, and the subtitles."""
+        from vehicle_detection.events import cut_clips, write_events, write_subtitles
 
-        if self.path is not None:
+        fps = float(report.fps)
+        if self.events is not None:
             with option_names(path="--events"):
-                write_events(events, self.path)
+                write_events(events, self.events)
         if self.clips is not None:
-            cut_clips(events, video, self.clips, fps=float(report.fps))
+            cut_clips(events, video, self.clips, fps=fps)
+        if self.subtitles is not None:
+            units = detector.draw_params.units
+            with option_names(path="--srt"):
+                write_subtitles(
+                    log, self.subtitles, fps=fps, events=events, own_speed=detector.own_speed, units=units
+                )
 
 
 def print_summary(log: TrackLog, events: tuple[Event, ...], report: VideoReport) -> None:

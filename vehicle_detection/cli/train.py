@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
+from vehicle_detection.cli.options import flag
 from vehicle_detection.cli.output import (
     capture_stderr,
     check_distinct_paths,
@@ -43,7 +44,7 @@ def train(
     ] = "random",
     C: Annotated[float, Option("--C", metavar="F", help="Inverse regularization strength.")] = 1e-4,
     seed: Annotated[int, Option(metavar="N", help="Random seed of solver and first split.")] = 0,
-    no_mirror: Annotated[bool, Option("--no-mirror", help="Train without mirrored copies.")] = False,
+    no_mirror: Annotated[bool, flag("--no-mirror", help="Train without mirrored copies.")] = False,
     gamma: Annotated[
         float | None,
         Option(metavar="F", help="Brightness range of mirrored copies; default: 0.4, without mirroring 0."),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Option
 
+from vehicle_detection.cli.options import flag
 from vehicle_detection.cli.output import check_distinct_paths, option_names, print_table, run_interruptible
 from vehicle_detection.errors import InvalidInputError
 
@@ -42,7 +43,7 @@ def tune(
     plot: Annotated[Path | None, Option(metavar="FILE.png", help="Accuracy against search time.")] = None,
     split: Annotated[str, Option(metavar="sequences|groups|random", help="Held-out patches.")] = "sequences",
     halving: Annotated[
-        bool, Option("--halving", help="Eliminate poor configurations on few patches (successive halving).")
+        bool, flag("--halving", help="Eliminate poor configurations on few patches (successive halving).")
     ] = False,
     finalists: Annotated[
         int, Option(metavar="N", help="Configurations to measure fully after --halving.")

@@ -21,6 +21,7 @@ from vehicle_detection.drawing.primitives import (
     text_size,
 )
 from vehicle_detection.tracking import Track
+from vehicle_detection.units import UNITS
 
 Point = tuple[int, int]
 Trail = deque[tuple[float, Point]]
@@ -35,9 +36,10 @@ MAX_SPEED_STD = 3.0
 TRAIL_SECONDS = 1.5
 """Time that a trail covers."""
 
-# Distance that the view covers ahead of the camera and behind it (m), and distances with a line and a number.
+# Distances with a line and a number, by units; and distance (m) that the view covers ahead of the camera and
+# behind it.
+_RANGES = {"metric": (20, 40, 60), "imperial": (75, 150, 225)}
 _AHEAD_M, _BEHIND_M = 80.0, 6.0
-_RANGES_M = (20, 40, 60)
 _OWN_COLOR, _GRID_COLOR, _TEXT_COLOR = (235, 235, 235), (72, 78, 86), (170, 176, 184)
 _BACKGROUND, _BACKGROUND_ALPHA, _ELLIPSE_ALPHA = (26, 29, 33), 0.78, 0.4
 # Sides of the view as fractions of the frame's height, and of its own height.
@@ -112,15 +114,22 @@ class BirdsEyePanel:
     ----------
     shape, place
         ``(height, width, ...)`` of the frames, and where to draw.
+    units
+        Units of the distances, ``"metric"`` or ``"imperial"``.
     """
 
-    def __init__(self, shape: tuple[int, ...], place: Literal["corner", "side"]) -> None:
+    def __init__(
+        self,
+        shape: tuple[int, ...],
+        place: Literal["corner", "side"],
+        units: Literal["metric", "imperial"] = "metric",
+    ) -> None:
         self._shape, self._place = shape[:2], place
         height, width = self.side_size(shape) if place == "side" else self.corner_size(shape)
         self._width = width
         self._scale = height / (_AHEAD_M + _BEHIND_M)  # pixels per meter
         self._text_scale = max(0.3, min(0.4 * math.sqrt(height / 300), 4.0))
-        self._grid = self._draw_grid(height, width)
+        self._grid = self._draw_grid(height, width, units)
         self._dark = (self._grid * _BACKGROUND_ALPHA).astype(np.uint8)
         self._trails = Trails()
 
@@ -173,18 +182,20 @@ class BirdsEyePanel:
             self._write_number(view, track, position)
         return left, 0, left + width, height
 
-    def _draw_grid(self, height: int, width: int) -> Image:
+    def _draw_grid(self, height: int, width: int, units: str) -> Image:
         """Draw lanes, lines across the road with their distances, and the own car."""
         grid = np.full((height, width, 3), _BACKGROUND, np.uint8)
         lanes = int(width / 2 / self._scale / LANE_WIDTH_M + 0.5)
         for number in range(-lanes, lanes):
             x = self._column((number + 0.5) * LANE_WIDTH_M)
             cv2.line(grid, (x, 0), (x, height), _GRID_COLOR, 1)
-        for distance in _RANGES_M:
-            y = self._row(distance)
+        chosen = UNITS[units]
+        for distance in _RANGES[units]:
+            y = self._row(distance / chosen.distance)
             cv2.line(grid, (0, y), (width, y), _GRID_COLOR, 1)
             scale = self._text_scale
-            draw_text(grid, [f"{distance} m"], 0, y - cap_height(scale) - 6, scale, _TEXT_COLOR)
+            text = f"{distance} {chosen.distance_symbol}"
+            draw_text(grid, [text], 0, y - cap_height(scale) - 6, scale, _TEXT_COLOR)
         length, half = 4.2, 0.9
         corners = [(-half, -length), (half, -length), (half, -1.2), (0.0, 0.3), (-half, -1.2)]
         cv2.fillPoly(grid, [self._pixels(corners)], _OWN_COLOR, cv2.LINE_AA, _SHIFT)

@@ -121,6 +121,7 @@ class TrackDrawer:
         time: float | None = None,
         searched: bool = True,
         camera: Camera | None = None,
+        own_mps: float | None = None,
     ) -> Image:
         """Draw tracks on a copy of the next frame.
 
@@ -135,6 +136,8 @@ class TrackDrawer:
             detected in the last searched one.
         camera
             The camera, for the bird's-eye view; by default a typical dash-cam.
+        own_mps
+            Speed of the camera's vehicle in m/s: labels then state speeds over ground. None: unknown.
         """
         shape = check_image(image).shape
         shown = sorted((track for track in check_tracks(tracks) if track.shown), key=lambda track: track.id)
@@ -150,7 +153,7 @@ class TrackDrawer:
         blocked: list[Rectangle] = []
         if params.panel != "none":
             if self._panel is None or not self._panel.fits(shape):
-                self._panel = BirdsEyePanel(shape, params.panel)
+                self._panel = BirdsEyePanel(shape, params.panel, params.units)
             view = camera or Camera.for_frame(shape)
             blocked.append(self._panel.draw(result, shown, colors, view, shape, self._time))
         frame = result[:, : shape[1]]
@@ -161,7 +164,9 @@ class TrackDrawer:
             draw_outline(frame, round_box(track.box), color, width, dashed=track.id in dashed)
         requests = [
             LabelRequest(
-                track.id, tuple(track_fields(track, params.labels, params.units)), round_box(track.box)
+                track.id,
+                tuple(track_fields(track, params.labels, params.units, own_mps)),
+                round_box(track.box),
             )
             for track in shown
         ]
@@ -200,13 +205,20 @@ def _distance_color(distance_m: float | None) -> Color:
     return _DISTANCE_COLORS[-1]
 
 
-def track_text(track: Track, fields: Collection[str], units: str = "metric") -> str:
+def track_text(
+    track: Track, fields: Collection[str], units: str = "metric", own_mps: float | None = None
+) -> str:
     """Text of a track's label, such as "#3  24 m  -6 km/h"; empty if no field is known."""
-    return "  ".join(track_fields(track, fields, units))
+    return "  ".join(track_fields(track, fields, units, own_mps))
 
 
-def track_fields(track: Track, fields: Collection[str], units: str = "metric") -> list[str]:
-    """Texts of the known fields of a track's label, such as ["#3", "24 m", "-6 km/h"]."""
+def track_fields(
+    track: Track, fields: Collection[str], units: str = "metric", own_mps: float | None = None
+) -> list[str]:
+    """Texts of the known fields of a track's label, such as ["#3", "24 m", "-6 km/h"].
+
+    With the own speed the speed is that over ground, such as "94 km/h".
+    """
     with_std, chosen = "std" in fields, UNITS[units]
     parts = [f"#{track.id}"] if "id" in fields else []
     if "score" in fields:
@@ -214,7 +226,9 @@ def track_fields(track: Track, fields: Collection[str], units: str = "metric") -
     if "distance" in fields and track.distance_m is not None and track.distance_std_m is not None:
         parts.append(chosen.distance_text(track.distance_m, track.distance_std_m, with_std=with_std))
     if "speed" in fields and track.speed_mps is not None and (track.speed_std_mps or 0) <= MAX_SPEED_STD:
-        parts.append(chosen.speed_text(track.speed_mps, track.speed_std_mps, with_std=with_std))
+        relative = own_mps is None
+        speed = track.speed_mps if own_mps is None else abs(own_mps + track.speed_mps)
+        parts.append(chosen.speed_text(speed, track.speed_std_mps, with_std=with_std, signed=relative))
     return parts
 
 

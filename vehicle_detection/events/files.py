@@ -9,23 +9,15 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from vehicle_detection._common import atomic_write, check_number, check_target, check_type
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection._common import atomic_write, check_number, check_suffix, check_type
 from vehicle_detection.events.find import EVENT_COLUMNS, Event
 from vehicle_detection.video import cut_video
 
+EVENT_SUFFIXES = (".csv", ".json")
+"""Suffixes of files of events."""
+
 # Longest time (s) that a clip shows before and after an event.
 _MAX_EXTENT = 5.0
-
-
-def check_event_file(path: str | os.PathLike[str], name: str = "path") -> Path:
-    """Return the path of a file of events, after checking its suffix and folder."""
-    target = check_target(path, name)
-    if target.suffix.lower() not in (".csv", ".json"):
-        raise InvalidInputError(
-            f"{name} must end in .csv or .json, got {target.name!r}; write {target.stem + '.csv'!r}"
-        )
-    return target
 
 
 def write_events(events: Iterable[Event], path: str | os.PathLike[str]) -> int:
@@ -57,9 +49,9 @@ def write_events(events: Iterable[Event], path: str | os.PathLike[str]) -> int:
     >>> write_events([event], file)
     1
     >>> print(file.read_text().splitlines()[1])
-    met,3,50,40,52,2.0,,,,,,,,,
+    met,3,50,40,52,2.0,,,,,,,,,,
     """
-    target = check_event_file(path)
+    target = check_suffix(path, "path", EVENT_SUFFIXES)
     rows = []
     for event in events:
         check_type(event, "events", Event, "pass what find_events returned")

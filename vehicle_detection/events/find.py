@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import Literal
@@ -14,6 +15,7 @@ from vehicle_detection.camera import Camera, check_shape
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events.history import Floats, TrackHistory, TrackLog, split_runs
 from vehicle_detection.events.motion import LANE_HALF_WIDTH_M, Bools, Motion, estimate_motion
+from vehicle_detection.units import UNITS, Units
 
 Kind = Literal[
     "headway",
@@ -97,6 +99,9 @@ class Event:
         Distance over own speed, where the own speed is known.
     ttc_s, ttc_std_s
         Smallest time to collision at constant speeds, for the closing kinds.
+    speed_mps
+        Speed of the vehicle over ground in the camera's direction, negative when oncoming: own speed minus
+        `closing_mps`, where both are known.
     """
 
     kind: Kind
@@ -114,18 +119,23 @@ class Event:
     headway_std_s: float | None = None
     ttc_s: float | None = None
     ttc_std_s: float | None = None
+    speed_mps: float | None = None
 
     def __str__(self) -> str:
-        parts = [f"{self.time_s:.1f} s: vehicle {self.track_id} {KINDS[self.kind]}"]
+        return self.text(UNITS["metric"])
+
+    def text(self, units: Units, *, with_time: bool = True) -> str:
+        """Describe the event in a line, with its known values in the given units."""
+        parts = [f"{self.time_s:.1f} s: " * with_time + f"vehicle {self.track_id} {KINDS[self.kind]}"]
         parts += [f"on the {self.side}"] if self.side else []
         listed = (
-            ("time to collision", self.ttc_s, self.ttc_std_s, "s"),
-            ("headway", self.headway_s, self.headway_std_s, "s"),
-            ("distance", self.distance_m, self.distance_std_m, "m"),
+            ("time to collision", self.ttc_s, self.ttc_std_s, 1.0, "s"),
+            ("headway", self.headway_s, self.headway_std_s, 1.0, "s"),
+            ("distance", self.distance_m, self.distance_std_m, units.distance, units.distance_symbol),
         )
-        for name, value, std, unit in listed:
+        for name, value, std, factor, unit in listed:
             if value is not None:
-                parts.append(f"{name} {value:.1f} ± {std or 0:.1f} {unit}")
+                parts.append(f"{name} {factor * value:.1f} ± {factor * (std or 0):.1f} {unit}")
         return ", ".join(parts)
 
 
@@ -155,8 +165,8 @@ def find_events(
     camera
         The camera, whose focal length converts columns to meters; None: a typical dash-cam.
     own_speed_mps
-        Speed of the camera's vehicle in m/s, a number or one for each frame; None: unknown. Headways in
-        seconds need it, and it tells oncoming from overtaken vehicles.
+        Speed of the camera's vehicle in m/s, a number or one for each frame, NaN where it is unknown; None:
+        unknown. Headways in seconds need it, and it tells oncoming from overtaken vehicles.
 
     Returns
     -------
@@ -206,13 +216,13 @@ def find_events(
     return tuple(sorted(events, key=lambda event: (event.frame, event.track_id, event.kind)))
 
 
-def _check_speed(speed: float | ArrayLike | None, length: int) -> Floats | None:
-    """Own speed in each frame."""
+def _check_speed(speed: float | ArrayLike | None, length: int) -> Floats:
+    """Own speed in each frame, NaN where it is unknown."""
     if speed is None:
-        return None
+        return np.full(length, np.nan)
     array = np.asarray(speed)
     shaped = array.ndim == 0 or (array.ndim == 1 and len(array) >= length)
-    if not shaped or array.dtype.kind not in "iuf" or not np.isfinite(array).all() or (array < 0).any():
+    if not shaped or array.dtype.kind not in "iuf" or np.isinf(array).any() or (array < 0).any():
         raise InvalidInputError(
             "own_speed_mps must be a number of at least 0, or one for each frame, "
             f"got {describe(speed)}; pass meters per second"
@@ -226,7 +236,7 @@ class _Finder:
 
     motion: Motion
     fps: float
-    own_speed: Floats | None
+    own_speed: Floats  # in each frame; NaN where it is unknown
 
     def following(self) -> Iterable[Event]:
         """Yield each time that the vehicle was followed, at the smallest distance."""
@@ -342,8 +352,8 @@ class _Finder:
             )
 
     def _passing_kind(self, closing: float, std: float, frame: int) -> Kind:
-        if self.own_speed is not None:
-            speed = float(self.own_speed[frame]) - closing  # over the road, in the camera's direction
+        speed = float(self.own_speed[frame]) - closing  # over the road, in the camera's direction
+        if math.isfinite(speed):
             if abs(speed) > max(_MOVING, std):
                 return "overtaken" if speed > 0 else "met"
         elif closing - std > _SLOWEST_ONCOMING:
@@ -383,18 +393,19 @@ class _Finder:
     ) -> Event:
         """Describe an event at a row, whose speed is that at `speed_row`, by default the same."""
         motion, frames = self.motion, self.motion.track.frames
-        frame = int(frames[row])
+        frame, own_speed = int(frames[row]), self.own_speed[frames[row]]
         values: dict[str, float | None] = dict.fromkeys(EVENT_COLUMNS[7:])
         distance, std = motion.distance[row], motion.distance_std[row]
         if std <= _MAX_STD * distance:
             values |= {"distance_m": distance, "distance_std_m": std}
-            if kind == "headway" and self.own_speed is not None and self.own_speed[frame] > _MOVING:
-                speed = self.own_speed[frame]
-                values |= {"headway_s": distance / speed, "headway_std_s": std / speed}
+            if kind == "headway" and own_speed > _MOVING:
+                values |= {"headway_s": distance / own_speed, "headway_std_s": std / own_speed}
         speed_row = row if speed_row is None else speed_row
         if motion.closing_std[speed_row] <= _MAX_SPEED_STD:
             closing = motion.closing[speed_row], motion.closing_std[speed_row]
             values |= dict(zip(("closing_mps", "closing_std_mps"), closing))
+            if math.isfinite(own_speed):
+                values["speed_mps"] = own_speed - closing[0]
         if kind in ("closing", "hard_closing"):
             values |= {
                 "ttc_s": motion.time_to_collision[row],

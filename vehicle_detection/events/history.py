@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from vehicle_detection._common import check_integer, check_number, describe
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.video import OwnSpeed
 
 Floats = NDArray[np.float64]
 
@@ -133,6 +134,10 @@ class TrackLog:
         for track_id, values in rows:
             for column, value in zip(self._tracks[track_id], (expected, *values)):
                 column.append(value)
+
+    def own_speeds(self, speed: OwnSpeed, fps: float) -> Floats:
+        """Speed of the own vehicle (m/s) in each frame; NaN where it is unknown."""
+        return speed.at((self.first_time or 0.0) + np.arange(len(self.counts)) / fps)
 
     def histories(self) -> list[TrackHistory]:
         """Return the tracks in the order of their first frames."""

@@ -39,7 +39,7 @@ class DrawParams:
         Bird's-eye view of the tracks in a video: ``"corner"``, in the frame's upper right corner; ``"side"``,
         to the right of the frame, which makes the video wider; or ``"none"``.
     units
-        Units of the labels: ``"metric"`` (m and km/h) or ``"imperial"`` (ft and mph).
+        Units of labels and bird's-eye view: ``"metric"`` (m and km/h) or ``"imperial"`` (ft and mph).
 
     Examples
     --------

@@ -107,8 +107,10 @@ class ReportWriter:
         check_type(report, "report", VideoReport, "pass what process_video returned")
         if events is None:
             camera_of = getattr(self._detector, "camera_of", lambda shape: None)
-            camera = camera_of(report.shape)
-            events = find_events(self.log, fps=float(report.fps), shape=report.shape, camera=camera)
+            camera, fps = camera_of(report.shape), float(report.fps)
+            own = getattr(self._detector, "own_speed", None)
+            speeds = None if own is None else self.log.own_speeds(own, fps)
+            events = find_events(self.log, fps=fps, shape=report.shape, camera=camera, own_speed_mps=speeds)
         options = {
             "events": list(events),
             "video": self._embed(),

@@ -1,7 +1,8 @@
-"""Reading and writing video: sources, trips, ffmpeg, the threaded pipeline and the annotated video."""
+"""Reading and writing video: sources, trips, own speed, ffmpeg, the pipeline and the annotated video."""
 
 from vehicle_detection.video.ffmpeg import VideoInfo
 from vehicle_detection.video.horizon import estimate_video_horizon
+from vehicle_detection.video.own_speed import OwnSpeed, read_own_speed
 from vehicle_detection.video.pipeline import VideoDetector
 from vehicle_detection.video.process import VideoReport, VideoRun, cut_video, process_video
 from vehicle_detection.video.sources import (
@@ -20,6 +21,7 @@ from vehicle_detection.video.trips import UNKNOWN_CAMERA, Trip, find_trips, is_v
 __all__ = [
     "UNKNOWN_CAMERA",
     "FrameSource",
+    "OwnSpeed",
     "Source",
     "Trip",
     "VideoDetector",
@@ -37,5 +39,6 @@ __all__ = [
     "probe_video",
     "process_video",
     "read_frames",
+    "read_own_speed",
     "with_retries",
 ]

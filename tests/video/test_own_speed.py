@@ -1,0 +1,189 @@
+"""Speed of the own vehicle: GPX tracks, tables, and their refusal."""
+
+import math
+import os
+import string
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vehicle_detection import InvalidInputError, OwnSpeed, read_own_speed
+
+POINT = '<trkpt lat="{lat}" lon="{lon}"><ele>5</ele><time>{time}</time>{speed}</trkpt>'
+GPX = (
+    '<?xml version="1.0"?><gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>{}</trkseg></trk></gpx>'
+)
+DEGREE_M = 6_371_009 * math.pi / 180
+
+
+def write_gpx(path, points):
+    """Write a track of (latitude, longitude, time, speed element)."""
+    rows = [POINT.format(lat=lat, lon=lon, time=time, speed=speed) for lat, lon, time, speed in points]
+    path.write_text(GPX.format("".join(rows)))
+    return path
+
+
+def time_of(second):
+    return f"2024-05-01T08:{second // 60:02d}:{second % 60:02d}.000Z"
+
+
+class TestGpx:
+    @pytest.mark.parametrize(
+        "speed", ["<speed>{}</speed>", "<x:extensions><t:speed>{}</t:speed></x:extensions>"]
+    )
+    def test_stated_speeds(self, tmp_path, speed):
+        points = [(50, 10, time_of(second), speed.format(20 + second)) for second in range(5)]
+        found = read_own_speed(write_gpx(tmp_path / "a.gpx", points))
+        np.testing.assert_allclose(found.at([0, 1.5, 4]), [20, 21.5, 24])
+        assert np.isnan(found.at([-0.1, 4.1])).all()
+
+    def test_positions_give_speeds(self, tmp_path):
+        """25 m/s to the east at 60 degrees north, across the date line."""
+        step = 25 / DEGREE_M / math.cos(math.radians(60))
+        longitude = [(179.9999 + step * second + 180) % 360 - 180 for second in range(20)]
+        points = [(60, lon, time_of(second), "") for second, lon in enumerate(longitude)]
+        found = read_own_speed(write_gpx(tmp_path / "a.gpx", points))
+        np.testing.assert_allclose(found.at(np.arange(20)), 25, rtol=1e-4)
+
+    def test_a_standing_receiver_has_a_small_speed(self, tmp_path):
+        rng = np.random.default_rng(0)
+        places = np.cumsum(rng.normal(scale=0.3 / DEGREE_M, size=(60, 2)), axis=0) * 0.3
+        points = [(50 + lat, lon, time_of(second), "") for second, (lat, lon) in enumerate(places)]
+        assert read_own_speed(write_gpx(tmp_path / "a.gpx", points)).at(np.arange(60)).max() < 0.3
+
+    def test_the_offset_is_the_start_of_the_video(self, tmp_path):
+        points = [(50, 10, time_of(second), f"<speed>{second}</speed>") for second in range(9)]
+        path = write_gpx(tmp_path / "a.gpx", points)
+        assert read_own_speed(path, offset=3.5).at([0.0]).tolist() == [3.5]
+        assert np.isnan(read_own_speed(path, offset=-2).at([1.0]))
+        assert read_own_speed(path, offset=-2).at([2.0]).tolist() == [0.0]
+
+    def test_a_gap_is_unknown(self, tmp_path):
+        points = [(50, 10, time_of(second), "<speed>9</speed>") for second in (0, 1, 30, 31)]
+        found = read_own_speed(write_gpx(tmp_path / "a.gpx", points)).at([1, 2, 20, 30, 30.5])
+        np.testing.assert_array_equal(found, [9, np.nan, np.nan, 9, 9])
+
+    def test_repeated_unsorted_and_untimed_points(self, tmp_path):
+        known = (time_of(2), 3), (time_of(0), 1), (time_of(0), 7), ("noon", 90)
+        points = [(50, 10, time, f"<speed>{speed}</speed>") for time, speed in known]
+        assert read_own_speed(write_gpx(tmp_path / "a.gpx", points)).at([0, 2]).tolist() == [1, 3]
+
+    def test_declarations_are_refused(self, tmp_path):
+        """An entity of ten nested levels would expand to gigabytes."""
+        entities = '<!ENTITY a0 "ha">' + "".join(
+            f'<!ENTITY {name} "{f"&{before};" * 10}">'
+            for before, name in zip(("a0", *string.ascii_lowercase), string.ascii_lowercase[:10])
+        )
+        for number, declared in enumerate((entities, '<!ENTITY x SYSTEM "file:///etc/passwd">')):
+            text = f'<?xml version="1.0"?><!DOCTYPE gpx [{declared}]><gpx>&j;</gpx>'
+            for encoding in ("utf-8", "utf-16"):
+                path = tmp_path / f"{number}{encoding}.gpx"
+                path.write_bytes(text.encode(encoding))
+                with pytest.raises(InvalidInputError, match="gpx is refused: it has a document type decl"):
+                    read_own_speed(path)
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("no XML", "a.gpx is no GPX file: .*; export it again"),
+            ("", "a.gpx is no GPX file"),
+            ("<gpx><trk>", "a.gpx is no GPX file"),
+            (GPX.format(""), "a.gpx must have at least two track points with times, got 0"),
+            (GPX.format('<trkpt lat="500" lon="x"><time>2024-05-01T08:00:00Z</time></trkpt>'
+                        '<trkpt><time>2024-05-01T08:00:01</time></trkpt>'), "a.gpx has no speeds"),
+        ],
+    )  # fmt: skip
+    def test_other_files_are_refused(self, tmp_path, text, message):
+        path = tmp_path / "a.gpx"
+        path.write_text(text)
+        with pytest.raises(InvalidInputError, match=message):
+            read_own_speed(path)
+
+
+class TestTable:
+    @pytest.mark.parametrize(("unit", "factor"), [("mps", 1), ("kmh", 1 / 3.6), ("mph", 1609.344 / 3600)])
+    def test_units(self, tmp_path, unit, factor):
+        path = tmp_path / "speed.csv"
+        path.write_text(f"\ufefftime_s,name,speed_{unit}\n0,a,50\n\n2,b,60\n")
+        np.testing.assert_allclose(read_own_speed(path).at([0, 1, 2]), np.array([50, 55, 60]) * factor)
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("", "must have the columns time_s and one of speed_mps, speed_kmh, speed_mph; got no header"),
+            ("time,speed\n", "must have the columns .*; got time, speed"),
+            ("time_s,speed_mps\n", "has no rows below its header"),
+            ("time_s,speed_mps\n0,fast\n", "line 2: time_s and speed_mps must be numbers"),
+            ("time_s,speed_mps\n0\n", "line 2: time_s and speed_mps must be numbers"),
+            ("time_s,speed_mps\n0,-1\n", "line 2: the speed must be from 0 to 150 m/s"),
+            ("time_s,speed_kmh\nnan,5\n", "line 2: the speed must be from 0 to 150 m/s at a finite time"),
+        ],
+    )
+    def test_other_tables_are_refused(self, tmp_path, text, message):
+        path = tmp_path / "a.csv"
+        path.write_text(text)
+        with pytest.raises(InvalidInputError, match=message):
+            read_own_speed(path)
+
+    def test_other_bytes_are_refused(self, tmp_path):
+        path = tmp_path / "a.csv"
+        path.write_bytes(b"time_s,\xff")
+        with pytest.raises(InvalidInputError, match="is no CSV table"):
+            read_own_speed(path)
+
+
+def test_other_paths_are_refused(tmp_path, monkeypatch):
+    with pytest.raises(InvalidInputError, match=r"path must end in .gpx or .csv, got 'a.kml'"):
+        read_own_speed(tmp_path / "a.kml")
+    with pytest.raises(InvalidInputError, match=r"a.gpx does not exist; check the path"):
+        read_own_speed(tmp_path / "a.gpx")
+    with pytest.raises(InvalidInputError, match="offset must be a number"):
+        read_own_speed(tmp_path / "a.gpx", offset="1")
+    os.mkfifo(tmp_path / "pipe.gpx")
+    with pytest.raises(InvalidInputError, match="is a device or a pipe"):
+        read_own_speed(tmp_path / "pipe.gpx")
+    (tmp_path / "large.csv").write_text("time_s,speed_mps\n" + "0,1\n" * 100)
+    monkeypatch.setenv("VEHICLE_DETECTION_MAX_RECORD_BYTES", "200")
+    with pytest.raises(InvalidInputError, match=r"larger than 200 bytes; .*MAX_RECORD_BYTES"):
+        read_own_speed(tmp_path / "large.csv")
+
+
+@given(
+    st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=20, unique=True).map(sorted),
+    st.floats(0, 100),
+    st.lists(st.floats(-2e6, 2e6), max_size=10),
+)
+def test_a_speed_lies_between_those_around_it(seconds, speed, times):
+    speeds = speed + np.arange(len(seconds))
+    own = OwnSpeed(seconds, speeds)
+    np.testing.assert_allclose(own.at(seconds), speeds)
+    for time, found in zip(times, own.at(times).tolist()):
+        after = int(np.searchsorted(seconds, time))
+        if not seconds[0] <= time <= seconds[-1]:
+            assert math.isnan(found)
+        elif not math.isnan(found):
+            assert speeds[max(after - 1, 0)] - 1e-6 <= found <= speeds[after] + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([], []), "seconds must be a list of numbers, got .*; pass at least one"),
+        (([0], [[1]]), "speeds_mps must be a list of numbers"),
+        (([0, 1], [1]), "speeds_mps must have one value for each of the 2 seconds, got 1"),
+        (([1, 1], [1, 2]), "seconds must ascend"),
+        (([0, np.nan], [1, 2]), "seconds must be finite"),
+        (([0, 1], [1, -2]), "speeds_mps must be at least 0, got -2"),
+        (([0, 1], [1, 2], 0), "max_gap must be a number"),
+    ],
+)
+def test_malformed_speeds_are_refused(arguments, message):
+    with pytest.raises(InvalidInputError, match=message):
+        OwnSpeed(*arguments)
+
+
+def test_a_constant_speed_is_checked():
+    with pytest.raises(InvalidInputError, match="speed_mps must be a number, at least 0 and at most 150"):
+        OwnSpeed.constant(-1)

@@ -1,0 +1,70 @@
+"""Options that several commands share, and the panels of their help."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from typer import Option
+
+INPUT, CAMERA, SEARCH, DRAWING, OUTPUT = "Input", "Camera", "Search", "Drawing", "Output"
+"""Panels of the options in ``--help``."""
+
+HORIZON_HELP = "Row of the horizon as a fraction of the frame's height, 0 at the top, such as 0.55."
+
+
+def flag(*names: str, panel: str | None = None, help: str) -> Any:  # noqa: A002 - typer's name
+    """Option without a value; the help shows no type for it."""
+    return Option(*names, metavar="", help=help, rich_help_panel=panel)
+
+
+Model = Annotated[
+    str,
+    Option(
+        metavar="NAME|FILE",
+        help='"default" (any road), "highway" (fastest), or a model file, such as own.safetensors.',
+        rich_help_panel=SEARCH,
+    ),
+]
+Confidence = Annotated[
+    float | None,
+    Option(
+        metavar="P",
+        help="Minimum confidence, a probability from 0 to 1, such as 0.5; default: the model's threshold.",
+        rich_help_panel=SEARCH,
+    ),
+]
+Every = Annotated[
+    int | None,
+    Option(
+        metavar="N",
+        help="Search every N-th frame, and interpolate between; 1: every frame; default: 12 a second.",
+        rich_help_panel=SEARCH,
+    ),
+]
+Horizon = Annotated[float | None, Option(metavar="F", help=HORIZON_HELP, rich_help_panel=CAMERA)]
+LineWidth = Annotated[
+    int | None,
+    Option(
+        "--line-width",
+        metavar="N",
+        help="Width of the boxes' lines in pixels, such as 3; default: by size of the frame.",
+        rich_help_panel=DRAWING,
+    ),
+]
+Blur = Annotated[
+    str | None,
+    Option(
+        metavar="vehicles|plates",
+        help="Blur the vehicles, or the region of their plates, in what is written.",
+        rich_help_panel=DRAWING,
+    ),
+]
+Preset = Annotated[
+    str,
+    Option(
+        metavar="NAME",
+        help="Speed of the encoder, from ultrafast (large files) to placebo (small ones).",
+        rich_help_panel=OUTPUT,
+    ),
+]
+NoAudio = Annotated[bool, flag("--no-audio", panel=OUTPUT, help="Write no sound.")]

@@ -1,0 +1,318 @@
+"""Speed of the camera's own vehicle over time, from a GPX track or a CSV table."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vehicle_detection._common import Limit, check_number, check_path, describe, read_regular_file
+from vehicle_detection.errors import InvalidInputError
+
+Floats = NDArray[np.float64]
+
+# Gap (s) between two values from which on the speed between them is unknown.
+_MAX_GAP = 5.0
+# Span (s) of the positions that give a speed: single positions have errors of some meters.
+_SPAN = 3.0
+_EARTH_RADIUS = 6_371_009.0  # m
+_MAX_SPEED = 150.0  # m/s
+# Factors from the columns of a table to m/s.
+_SPEED_COLUMNS = {"speed_mps": 1.0, "speed_kmh": 1 / 3.6, "speed_mph": 0.44704}
+
+
+@dataclass(frozen=True, eq=False)
+class OwnSpeed:
+    """Speed of the camera's own vehicle over the time of a video.
+
+    Attributes
+    ----------
+    seconds
+        ``(N,)`` ascending times; 0 is the start of the video.
+    speeds_mps
+        ``(N,)`` speeds over ground in m/s, at least 0.
+    max_gap
+        Seconds between two times from which on the speed between them is unknown.
+
+    Raises
+    ------
+    InvalidInputError
+        If the arrays are empty, of different lengths or not finite, the times do not ascend, or a speed is
+        negative.
+
+    Examples
+    --------
+    >>> speed = OwnSpeed([0.0, 2.0], [10.0, 14.0])
+    >>> speed.at([1.0, 3.0])
+    array([12., nan])
+    """
+
+    seconds: Floats
+    speeds_mps: Floats
+    max_gap: float = _MAX_GAP
+
+    def __post_init__(self) -> None:
+        for name in ("seconds", "speeds_mps"):
+            values = np.asarray(getattr(self, name))
+            if values.ndim != 1 or not len(values) or values.dtype.kind not in "iuf":
+                raise InvalidInputError(
+                    f"{name} must be a list of numbers, got {describe(getattr(self, name))}; "
+                    "pass at least one"
+                )
+            if not np.isfinite(values).all():
+                raise InvalidInputError(f"{name} must be finite, got NaN or infinity; drop these values")
+            object.__setattr__(self, name, values.astype(np.float64))
+        if len(self.seconds) != len(self.speeds_mps):
+            raise InvalidInputError(
+                f"speeds_mps must have one value for each of the {len(self.seconds)} seconds, "
+                f"got {len(self.speeds_mps)}"
+            )
+        if (np.diff(self.seconds) <= 0).any():
+            raise InvalidInputError("seconds must ascend; sort them and drop repeated ones")
+        if (self.speeds_mps < 0).any():
+            raise InvalidInputError(
+                f"speeds_mps must be at least 0, got {self.speeds_mps.min():g}; pass speeds, not velocities"
+            )
+        check_number(self.max_gap, "max_gap", above=0)
+
+    @classmethod
+    def constant(cls, speed_mps: float) -> OwnSpeed:
+        """Return a speed that does not change.
+
+        >>> OwnSpeed.constant(25.0).at([0.0, 3600.0])
+        array([25., 25.])
+        """
+        speed = check_number(speed_mps, "speed_mps", low=0, high=_MAX_SPEED)
+        return cls(np.array([-1e12, 1e12]), np.array([speed, speed]), max_gap=1e13)
+
+    def at(self, seconds: ArrayLike) -> Floats:
+        """Speed in m/s at each time: interpolated; NaN before, after and in long gaps of the record."""
+        times = np.asarray(seconds, np.float64)
+        speeds = np.interp(times, self.seconds, self.speeds_mps, left=np.nan, right=np.nan)
+        after = np.clip(np.searchsorted(self.seconds, times), 1, max(len(self.seconds) - 1, 1))
+        if len(self.seconds) > 1:
+            in_gap = self.seconds[after] - self.seconds[after - 1] > self.max_gap
+            exact = np.isin(times, self.seconds)
+            speeds = np.where(in_gap & ~exact, np.nan, speeds)
+        return speeds
+
+
+def read_own_speed(path: str | os.PathLike[str], *, offset: float = 0.0) -> OwnSpeed:
+    r"""Read the speed of the camera's own vehicle.
+
+    Parameters
+    ----------
+    path
+        ``.gpx``: a GPS track with times. Its speeds are used if it holds them, otherwise they are computed
+        from positions 3 s apart. ``.csv``: a table with a header and the columns ``time_s`` and one of
+        ``speed_mps``, ``speed_kmh`` and ``speed_mph``; other columns are ignored.
+    offset
+        Time of the video's start in the record: seconds after the first point of a track, or the value of
+        ``time_s``. Negative if the record starts later than the video.
+
+    Returns
+    -------
+    OwnSpeed
+        Its times count from the start of the video.
+
+    Raises
+    ------
+    InvalidInputError
+        If the file is missing, too large or malformed, has another suffix, or holds no speed.
+
+    Notes
+    -----
+    A GPX file with a document type declaration is refused: GPX needs none, and entities declared there can
+    expand to any size.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "speed.csv"
+    >>> _ = file.write_text("time_s,speed_kmh\n0,90\n1,93.6\n")
+    >>> read_own_speed(file).at([0.5])
+    array([25.5])
+    """
+    check_path(path, "path")
+    file = Path(path)
+    shift = check_number(offset, "offset", low=-1e9, high=1e9)
+    readers: dict[str, Callable[[bytes, str], tuple[Floats, Floats]]] = {".gpx": _read_gpx, ".csv": _read_csv}
+    reader = readers.get(file.suffix.lower())
+    if reader is None:
+        raise InvalidInputError(f"path must end in .gpx or .csv, got {file.name!r}; convert the record")
+    seconds, speeds = reader(read_regular_file(file, f"path {file}", Limit.RECORD_BYTES), str(file))
+    order = np.argsort(seconds, kind="stable")
+    seconds, speeds = seconds[order], speeds[order]
+    new = np.diff(seconds, prepend=-np.inf) > 0
+    return OwnSpeed(seconds[new] - shift, speeds[new])
+
+
+def _read_csv(data: bytes, name: str) -> tuple[Floats, Floats]:
+    """Read times (s) and speeds (m/s) of a table."""
+    try:
+        table = list(csv.reader(io.StringIO(data.decode("utf-8-sig"), newline="")))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InvalidInputError(f"path {name} is no CSV table: {error}; write it as UTF-8") from None
+    header = [cell.strip() for cell in table[0]] if table else []
+    unit = next((column for column in _SPEED_COLUMNS if column in header), None)
+    if "time_s" not in header or unit is None:
+        raise InvalidInputError(
+            f"path {name} must have the columns time_s and one of {', '.join(_SPEED_COLUMNS)}; "
+            f"got {', '.join(header) or 'no header'}"
+        )
+    columns = header.index("time_s"), header.index(unit)
+    rows = []
+    for number, row in enumerate(table[1:], start=2):
+        if not any(cell.strip() for cell in row):
+            continue
+        try:
+            time, speed = (float(row[column]) for column in columns)
+        except (ValueError, IndexError):
+            raise InvalidInputError(
+                f"path {name}, line {number}: time_s and {unit} must be numbers; correct the line"
+            ) from None
+        speed *= _SPEED_COLUMNS[unit]
+        if not math.isfinite(time) or not 0 <= speed <= _MAX_SPEED:
+            raise InvalidInputError(
+                f"path {name}, line {number}: the speed must be from 0 to {_MAX_SPEED:g} m/s at a finite "
+                f"time; got {','.join(row)}"
+            )
+        rows.append((time, speed))
+    if not rows:
+        raise InvalidInputError(f"path {name} has no rows below its header")
+    times, speeds = np.array(rows).T
+    return times, speeds
+
+
+@dataclass
+class _TrackPoint:
+    """Point of a GPX track; what is unknown is NaN."""
+
+    latitude: float
+    longitude: float
+    time: float = math.nan
+    speed: float = math.nan
+
+
+class _GpxParser:
+    """Collects the points of all tracks of a GPX document, whose elements may have any namespace."""
+
+    def __init__(self) -> None:
+        self.points: list[_TrackPoint] = []
+        self._point: _TrackPoint | None = None
+        self._text: list[str] | None = None
+        self._parser = expat.ParserCreate()
+        self._parser.StartDoctypeDeclHandler = self._refuse_doctype
+        self._parser.StartElementHandler = self._start
+        self._parser.EndElementHandler = self._end
+        self._parser.CharacterDataHandler = self._add_text
+
+    def parse(self, data: bytes) -> None:
+        self._parser.Parse(data, True)
+
+    def _refuse_doctype(self, *_: Any) -> None:
+        raise InvalidInputError("it has a document type declaration, which GPX does not need; remove it")
+
+    def _start(self, tag: str, attributes: dict[str, str]) -> None:
+        name = tag.rpartition(":")[2]
+        if name == "trkpt":
+            self._point = _TrackPoint(
+                _parse_float(attributes.get("lat"), 90), _parse_float(attributes.get("lon"), 180)
+            )
+        elif self._point is not None and name in ("time", "speed"):
+            self._text = []
+
+    def _add_text(self, text: str) -> None:
+        if self._text is not None:
+            self._text.append(text)
+
+    def _end(self, tag: str) -> None:
+        name = tag.rpartition(":")[2]
+        point, text = self._point, self._text
+        if name == "trkpt" and point is not None:
+            if math.isfinite(point.time):
+                self.points.append(point)
+            self._point = None
+        elif point is not None and text is not None and name in ("time", "speed"):
+            joined = "".join(text).strip()
+            if name == "time":
+                point.time = _parse_time(joined)
+            else:
+                point.speed = _parse_float(joined, _MAX_SPEED)
+                point.speed = point.speed if point.speed >= 0 else math.nan
+            self._text = None
+
+
+def _parse_float(text: str | None, limit: float) -> float:
+    """Return a number of at most this absolute value; NaN for anything else."""
+    try:
+        value = float(text or "nan")
+    except ValueError:
+        return math.nan
+    return value if abs(value) <= limit else math.nan
+
+
+def _parse_time(text: str) -> float:
+    """Return an ISO 8601 time as seconds since 1970; NaN for anything else. Without a zone it is UTC."""
+    # Python 3.11 accepts up to 6 decimals, but any number is allowed.
+    try:
+        time = datetime.fromisoformat(re.sub(r"(\.\d{6})\d+", r"\1", text))
+        return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
+    except (ValueError, OverflowError):
+        return math.nan
+
+
+def _read_gpx(data: bytes, name: str) -> tuple[Floats, Floats]:
+    """Read times (s) since the first point, and speeds (m/s), of the points of a GPX document."""
+    parser = _GpxParser()
+    try:
+        parser.parse(data)
+    except expat.ExpatError as error:
+        raise InvalidInputError(f"path {name} is no GPX file: {error}; export it again") from None
+    except InvalidInputError as error:
+        raise InvalidInputError(f"path {name} is refused: {error}") from None
+    points = np.array(
+        [(each.time, each.speed, each.latitude, each.longitude) for each in parser.points]
+    ).reshape(-1, 4)
+    points = points[np.argsort(points[:, 0], kind="stable")]
+    points = points[np.diff(points[:, 0], prepend=-np.inf) > 0]
+    if len(points) < 2:
+        raise InvalidInputError(
+            f"path {name} must have at least two track points with times, got {len(points)}; export a "
+            "recorded track, not a route"
+        )
+    times, speeds = points[:, 0] - points[0, 0], points[:, 1]
+    if np.isfinite(speeds).mean() < 0.5:
+        speeds = _speeds_of(times, *np.deg2rad(points[:, 2:]).T)
+    known = np.isfinite(speeds)
+    if not known.any():
+        raise InvalidInputError(f"path {name} has no speeds, and too few positions to compute them")
+    return times[known], np.minimum(speeds[known], _MAX_SPEED)
+
+
+def _speeds_of(times: Floats, latitude: Floats, longitude: Floats) -> Floats:
+    """Speeds (m/s) from positions (radians): distance along the great circle between positions 3 s apart."""
+    known = np.isfinite(latitude) & np.isfinite(longitude)
+    if known.sum() < 2:
+        return np.full(len(times), np.nan)
+    first = np.clip(times - _SPAN / 2, times[0], max(times[-1] - _SPAN, times[0]))
+    last = np.minimum(first + _SPAN, times[-1])
+    # A track that crosses the date line has no jump in its unwrapped longitude.
+    columns = latitude[known], np.unwrap(longitude[known])
+    (lat_1, lat_2), (lon_1, lon_2) = (
+        [np.interp(each, times[known], column) for each in (first, last)] for column in columns
+    )
+    half = np.sin((lat_2 - lat_1) / 2) ** 2
+    half += np.cos(lat_1) * np.cos(lat_2) * np.sin((lon_2 - lon_1) / 2) ** 2
+    return np.asarray(2 * _EARTH_RADIUS * np.arcsin(np.sqrt(np.minimum(half, 1.0))) / (last - first))
