@@ -242,7 +242,7 @@ class Explorer:
     def detector(self, **options: Any) -> VehicleDetector:
         """Create a detector with the current parameters, for a script or a video.
 
-        `options` are further arguments of `VehicleDetector`, such as ``track_params``. An `InvalidInputError`
+        `options` are further arguments of `VehicleDetector`, such as ``field_of_view``. An `InvalidInputError`
         is raised if no band is selected.
         """
         params: Any = self.search_params
@@ -250,7 +250,7 @@ class Explorer:
             params = dataclasses.replace(
                 params, bands=tuple(self._all_bands[number] for number in self.bands)
             )
-        options |= {"region_params": self.region_params, "camera": self._camera}
+        options = {"camera": self._camera} | options | {"region_params": self.region_params}
         return VehicleDetector(self.model, search_params=params, **options)
 
     def render(self) -> Image:
