@@ -3,7 +3,7 @@ import pytest
 
 from tests.drawing.cases import blank, track
 from vehicle_detection.boxes import Detections
-from vehicle_detection.drawing import TRACK_COLORS, draw_diagnostics
+from vehicle_detection.drawing import TRACK_COLORS, draw_cell_shares, draw_diagnostics
 from vehicle_detection.errors import InvalidInputError
 
 
@@ -43,3 +43,16 @@ class TestDiagnostics:
             draw_diagnostics(blank(), [], blank(), [])
         with pytest.raises(InvalidInputError, match="heat must be finite"):
             draw_diagnostics(blank(), [], np.full((9, 16), np.nan), [])
+
+
+def test_shares_of_cells_are_drawn_by_sign_and_amount():
+    image = np.full((40, 60, 3), 90, np.uint8)
+    drawn = draw_cell_shares(image, [10, 10, 50, 30], np.array([[1.0, -1.0], [0.5, 0.0]]))
+    assert (image == 90).all()
+    orange, blue, weak, none = drawn[12, 15], drawn[12, 45], drawn[28, 15], drawn[28, 45]
+    assert orange[0] > orange[2]
+    assert blue[2] > blue[0]
+    assert 90 < weak[0] < orange[0]
+    assert (none == 90).all()
+    outside = draw_cell_shares(image, [-20, -20, 200, 100], np.zeros((3, 3)))
+    np.testing.assert_array_equal(outside, image)

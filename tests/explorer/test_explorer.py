@@ -1,5 +1,6 @@
 import dataclasses
 import sys
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -8,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.helpers import random_classifier
-from vehicle_detection.boxes import Detections
+from vehicle_detection.boxes import Detections, iou_matrix
 from vehicle_detection.camera import Camera
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.detector import VehicleDetector
@@ -413,7 +414,7 @@ def test_the_controls_start_with_the_parameters(explorer, panel):
     controls, text, image = panel
     groups, heat = RegionParams(), HeatParams().for_search(SearchParams.preset())
     assert {name: control.value for name, control in controls.items()} == {
-        "frame": "frame 0", "show": "windows", "min. score": 0.0, "horizon": 0.56,
+        "frame": "frame 0", "show": "windows", "explain box": 0, "min. score": 0.0, "horizon": 0.56,
         "windows (px)": tuple(range(8)), "boxes from": "groups", "min. peak": groups.min_peak,
         "min. evidence": groups.min_evidence, "min. heat": heat.threshold,
         "peak fraction": heat.peak_fraction, "heat is": "score",
@@ -467,7 +468,8 @@ def test_a_mixture_has_no_controls_for_bands_and_groups(scenes):
     explorer = Explorer(scenes, search_params=PyramidParams(horizon=None))
     controls, text, _ = open_panel(explorer)
     assert list(controls) == [
-        "frame", "show", "min. score", "horizon", "boxes from", "min. heat", "peak fraction", "heat is",
+        "frame", "show", "explain box", "min. score", "horizon", "boxes from", "min. heat", "peak fraction",
+        "heat is",
     ]  # fmt: skip
     controls["min. score"].value = 0.5
     # Only changed controls are applied: the horizon is still unknown.
@@ -487,6 +489,54 @@ def test_an_error_is_shown_and_the_image_stays(scenes, tmp_path):
     assert image.value == before
     controls["frame"].value = "frame 0"
     assert text.value == explorer.summary()
+
+
+@pytest.mark.parametrize("model", ["default", "highway"])
+def test_a_box_is_explained(scenes, model):
+    explorer = Explorer(scenes, model, width=SHAPE[1] // 2)
+    controls, text, _ = open_panel(explorer)
+    assert explorer.explanation() is None
+    plain = explorer.render()
+    controls["explain box"].value = 1
+    explanation = explorer.explanation()
+    best = explorer.boxes().boxes[explorer.boxes().scores.argmax()]
+    overlap = iou_matrix(best[None], explanation.box[None])[0, 0]
+    assert overlap > 0.5
+    assert text.value == explorer.summary()
+    assert f"; box 1: score {explanation.score:.2f}" in text.value
+    changed = np.argwhere((explorer.render() != plain).any(axis=2))[:, ::-1]
+    left, top, right, bottom = explanation.window / 2
+    assert (changed >= (left - 1, top - 1)).all()
+    assert (changed <= (right + 1, bottom + 1)).all()
+    controls["explain box"].value = 99
+    assert explorer.explanation() is None
+    with pytest.raises(InvalidInputError, match="number must be an integer at least 0"):
+        explorer.set_box(-1)
+
+
+def test_a_click_explains_the_box(scenes, monkeypatch):
+    handlers = []
+
+    class Event:
+        def __init__(self, source, watched_events):
+            assert watched_events == ["click"]
+
+        def on_dom_event(self, handler):
+            handlers.append(handler)
+
+    monkeypatch.setitem(sys.modules, "ipyevents", SimpleNamespace(Event=Event))
+    explorer = Explorer(scenes, width=SHAPE[1] // 2)
+    controls, *_ = open_panel(explorer)
+    (click,) = handlers
+    for row in range(len(explorer.boxes())):
+        x1, y1, x2, y2 = explorer.boxes().boxes[row] / 2
+        click({"dataX": (x1 + x2) / 2, "dataY": (y1 + y2) / 2})
+        number = controls["explain box"].value
+        order = np.argsort(-explorer.boxes().scores, kind="stable")
+        assert order[number - 1] == row
+        assert explorer.explanation() is not None
+    click({"dataX": 0, "dataY": 0})
+    assert (explorer.box, explorer.explanation()) == (0, None)
 
 
 def test_values_outside_the_usual_range_widen_the_slider(scenes):

@@ -11,7 +11,7 @@ from vehicle_detection.drawing.birds_eye import (
 )
 from vehicle_detection.drawing.blur import BLUR_REGIONS, blur_boxes
 from vehicle_detection.drawing.boxes import draw_boxes, draw_detections, draw_labeled_bboxes, score_texts
-from vehicle_detection.drawing.diagnostics import draw_diagnostics, heat_image
+from vehicle_detection.drawing.diagnostics import draw_cell_shares, draw_diagnostics, heat_image
 from vehicle_detection.drawing.primitives import blend
 from vehicle_detection.drawing.tracks import (
     TRACK_COLORS,
@@ -34,6 +34,7 @@ __all__ = [
     "blend",
     "blur_boxes",
     "draw_boxes",
+    "draw_cell_shares",
     "draw_detections",
     "draw_diagnostics",
     "draw_labeled_bboxes",

@@ -26,6 +26,9 @@ from vehicle_detection.drawing.tracks import TRACK_COLORS, check_tracks, draw_tr
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.tracking import Track
 
+# Colors of cells that speak for and against a vehicle, and opacity of the one with the largest share.
+_FOR_COLOR, _AGAINST_COLOR, _MAX_ALPHA = TRACK_COLORS[5], TRACK_COLORS[4], 0.75
+
 
 def draw_diagnostics(
     frame: Image, windows: Detections | ArrayLike, heat: NDArray[Any], tracks: Iterable[Track]
@@ -78,6 +81,24 @@ def draw_diagnostics(
         fill_rectangle(view, (0, 0, title_width, title_height), BLACK, 0.6)
         draw_text(view, [title], 0, 0, scale, WHITE)
     return mosaic
+
+
+def draw_cell_shares(image: Image, window: ArrayLike, cells: NDArray[Any]) -> Image:
+    """Draw the shares of a window's cells in its score on a copy of an image, as `Explanation` holds them.
+
+    Orange cells speak for a vehicle and blue ones against one, the stronger the more. `window` is
+    ``[x1, y1, x2, y2]`` in pixels, and `cells` are ``(rows, columns)``.
+    """
+    result = check_image(image).copy()
+    x1, y1, x2, y2 = check_boxes([window], "window")[0].astype(np.float64).tolist()
+    rows, columns = cells.shape
+    peak = float(np.abs(cells).max()) or 1.0
+    xs, ys = np.linspace(x1, x2, columns + 1).round(), np.linspace(y1, y2, rows + 1).round()
+    for (row, column), share in np.ndenumerate(cells):
+        place = int(xs[column]), int(ys[row]), int(xs[column + 1]), int(ys[row + 1])
+        color = _FOR_COLOR if share > 0 else _AGAINST_COLOR
+        fill_rectangle(result, place, color, _MAX_ALPHA * abs(float(share)) / peak)
+    return result
 
 
 def heat_image(heat: NDArray[Any]) -> Image:

@@ -18,13 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_choice, check_image, check_integer, describe
-from vehicle_detection.boxes import Detections
+from vehicle_detection.boxes import Detections, box_areas
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.drawing import TRACK_COLORS, blend, draw_boxes, heat_image
+from vehicle_detection.drawing import TRACK_COLORS, blend, draw_boxes, draw_cell_shares, heat_image
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
+from vehicle_detection.explanation import Explanation, explain
 from vehicle_detection.explorer.widgets import METHOD_CONTROLS, Panel, build_widgets
 from vehicle_detection.heatmap import frame_heat, label_heat
 from vehicle_detection.images import read_image
@@ -67,8 +68,7 @@ def _cached(method: Callable[[Explorer], Value]) -> Callable[[Explorer], Value]:
 
     @functools.wraps(method)
     def cached(self: Explorer) -> Value:
-        state = (self.frame, self.search_params, self.bands, self.region_params)
-        result: Value = self._compute(method, state)
+        result: Value = self._compute(method, self._state)
         return result
 
     return cached
@@ -77,7 +77,8 @@ def _cached(method: Callable[[Explorer], Value]) -> Callable[[Explorer], Value]:
 class Explorer:
     """Run the detector on a few frames and change its parameters one by one.
 
-    In a notebook, an explorer as the value of a cell shows sliders.
+    In a notebook, an explorer as the value of a cell shows sliders, and a click on a box explains it (needs
+    ipyevents; without it, the control "explain box" takes its number).
 
     Parameters
     ----------
@@ -89,8 +90,9 @@ class Explorer:
 
     Attributes
     ----------
-    model, names, frame, view
-        The model; names of the frames and of the current one; and what images show.
+    model, names, frame, view, box
+        The model; names of the frames and of the current one; what images show; and the number of the box
+        that they explain, from 1 for the best one, 0 for none.
     search_params, bands
         Current search parameters; for a classifier of patches with all bands, of which those numbered in
         `bands` are searched.
@@ -132,11 +134,12 @@ class Explorer:
         self._search = detector.model.open_search()
         self._read_frame = functools.lru_cache(_CACHED_FRAMES)(lambda name: self._readers[name]())
         self._search_frame = functools.lru_cache(_CACHED_SEARCHES)(self._search_frame_uncached)
-        self._compute = functools.lru_cache(3)(lambda method, state: method(self))
+        self._compute = functools.lru_cache(4)(lambda method, state: method(self))
         self.model = detector.model
         self.names = tuple(self._readers)
         self.frame = self.names[0]
         self.view: View = "windows"
+        self.box = 0
         self.search_params = detector.search_params
         self.bands = tuple(range(len(self._all_bands)))
         given = detector.region_params
@@ -149,6 +152,11 @@ class Explorer:
     def region_params(self) -> RegionParams | HeatParams:
         """Parameters of the current method."""
         return self.heat_params if self.method == "heat" else self.group_params
+
+    @property
+    def _state(self) -> tuple[Any, ...]:
+        """What the cached results depend on."""
+        return self.frame, self.search_params, self.bands, self.region_params
 
     @property
     def _all_bands(self) -> tuple[Any, ...]:
@@ -165,6 +173,10 @@ class Explorer:
         """Select what images show, one of `VIEWS`."""
         check_choice(view, "view", VIEWS)
         self.view = view
+
+    def set_box(self, number: int) -> None:
+        """Select the box that images explain, from 1 for the one with the highest score; 0: none."""
+        self.box = check_integer(number, "number", low=0)
 
     def set_search(
         self,
@@ -239,11 +251,37 @@ class Explorer:
         camera = self._camera or Camera.for_frame(shape, horizon=params.horizon)
         return find_vehicles(self.windows(), camera, shape, self.group_params)
 
+    def explanation(self) -> Explanation | None:
+        """Explain the selected box with `explain`; None if there is none."""
+        if not 1 <= self.box <= len(self.boxes()):
+            return None
+        found: Explanation = self._compute(Explorer._explain, (*self._state, self.box))
+        return found
+
+    def _explain(self) -> Explanation:
+        box = self.boxes().boxes[self._best_first()[self.box - 1]]
+        with self.detector() as detector:
+            return explain(detector, self._read_frame(self.frame), box)
+
+    def _best_first(self) -> list[int]:
+        """Rows of the boxes by their scores."""
+        return list(np.argsort(-self.boxes().scores, kind="stable").tolist())
+
+    def box_at(self, x: float, y: float) -> int:
+        """Return the number of the smallest box that holds a point of the frame; 0 if none does."""
+        boxes = self.boxes().boxes
+        left, top, right, bottom = boxes.T
+        inside = (left <= x) & (x < right) & (top <= y) & (y < bottom)
+        if not inside.any():
+            return 0
+        smallest = int(np.argmin(np.where(inside, box_areas(boxes), np.inf)))
+        return self._best_first().index(smallest) + 1
+
     def detector(self, **options: Any) -> VehicleDetector:
         """Create a detector with the current parameters, for a script or a video.
 
-        `options` are further arguments of `VehicleDetector`, such as ``field_of_view``. An `InvalidInputError`
-        is raised if no band is selected.
+        `options` are further arguments of `VehicleDetector`, such as ``field_of_view``. An
+        `InvalidInputError` is raised if no band is selected.
         """
         params: Any = self.search_params
         if self._all_bands:
@@ -269,23 +307,28 @@ class Explorer:
             image[row, ::4] = _HORIZON_COLOR
         if self.view == "windows":
             _draw_windows(image, self.windows(), scale)
+        explanation = self.explanation()
+        if explanation is not None:
+            image = draw_cell_shares(image, explanation.window * scale, explanation.cells)
         return draw_boxes(image, self.boxes().boxes * scale, color=_BOX_COLOR, thickness=3)
 
     def summary(self) -> str:
-        """Describe in a line what was found."""
+        """Describe in a line what was found, and the explained box."""
         height, width = self._read_frame(self.frame).shape[:2]
         found = self._find()
         total = "" if found.bands is None else f" of {len(found.windows):,}"
         windows, boxes = len(self.windows()), len(self.boxes())
+        explanation = self.explanation()
         return (
             f"{self.frame}, {width}x{height}: {windows:,}{total} windows above "
             f"{self.search_params.min_score:g}, {boxes} box{'es' * (boxes != 1)}"
+            + ("" if explanation is None else f"; box {self.box}: {explanation}")
         )
 
     def widget(self) -> Any:
         """Create the sliders and the image, an ``ipywidgets.HBox``; ipywidgets must be installed."""
         horizon = self.search_params.horizon
-        values: dict[str, Any] = {"frame": self.frame, "view": self.view}
+        values: dict[str, Any] = {"frame": self.frame, "view": self.view, "box": self.box}
         values |= {"min_score": self.search_params.min_score, "horizon": 0.5 if horizon is None else horizon}
         sizes = [tuple(map(round, band.window)) for band in self._all_bands]
         bands = [(f"{number}: {width}x{height}", number) for number, (width, height) in enumerate(sizes)]
@@ -299,6 +342,7 @@ class Explorer:
         options["bands"] = tuple(bands)
         panel = build_widgets(values, options)
         panel.watch(lambda changes: self._update(panel, changes))
+        panel.on_click(lambda x, y: self._click(panel, x, y))
         return panel.root
 
     def _ipython_display_(self) -> None:
@@ -315,12 +359,18 @@ class Explorer:
         try:
             self.set_frame(changes.get("frame", self.frame))
             self.set_view(changes.get("view", self.view))
+            self.set_box(changes.get("box", self.box))
             self.set_search(**changed("min_score", "horizon", "bands"))
             self.set_regions(**changed("method", *METHOD_CONTROLS["groups"], *METHOD_CONTROLS["heat"]))
             panel.show(self.render(), self.summary())
         except VehicleDetectionError as error:
             # ipywidgets does not display exceptions of callbacks.
             panel.show_error(str(error))
+
+    def _click(self, panel: Panel, x: float, y: float) -> None:
+        """Explain the box at a point of the displayed image."""
+        scale = min(self._width / self._read_frame(self.frame).shape[1], 1.0)
+        panel.controls["box"].value = self.box_at(x / scale, y / scale)
 
     def _find(self) -> _FrameWindows:
         """Search the current frame with a low threshold, which serves all higher ones."""

@@ -24,7 +24,13 @@ _SLIDERS = {
     "threshold": ("min. heat", 0.0, 30.0, 0.25),
     "peak_fraction": ("peak fraction", 0.0, 0.95, 0.05),
 }
-_LABELS = {"view": "show", "bands": "windows (px)", "method": "boxes from", "weighting": "heat is"}
+_LABELS = {
+    "view": "show",
+    "box": "explain box",
+    "bands": "windows (px)",
+    "method": "boxes from",
+    "weighting": "heat is",
+}
 
 METHOD_CONTROLS = {
     "groups": ("min_peak", "min_evidence"),
@@ -57,6 +63,15 @@ class Panel:
         for control in self.controls.values():
             control.observe(on_change, names="value")
         on_change()
+
+    def on_click(self, action: Callable[[float, float], None]) -> None:
+        """Call `action` with the pixel of the image that is clicked; nothing happens without ipyevents."""
+        try:
+            events: Any = importlib.import_module("ipyevents")
+        except ImportError:
+            return
+        event = events.Event(source=self.image, watched_events=["click"])
+        event.on_dom_event(lambda click: action(float(click["dataX"]), float(click["dataY"])))
 
     def _values(self) -> dict[str, Any]:
         return {name: control.value for name, control in self.controls.items()}
@@ -91,6 +106,8 @@ def build_widgets(values: Mapping[str, Any], options: Mapping[str, Sequence[Any]
             # A value outside the usual range widens the range, so that the slider does not change it.
             ends = {"min": min(low, value), "max": max(high, value), "step": step}
             control = widgets.FloatSlider(description=label, readout_format=".2f", **ends, **common)
+        elif name == "box":
+            control = widgets.BoundedIntText(description=_LABELS[name], min=0, max=999, **common)
         else:
             common |= {"description": _LABELS.get(name, name), "options": options[name]}
             if name == "frame":
