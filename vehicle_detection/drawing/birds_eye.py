@@ -179,6 +179,7 @@ class BirdsEyePanel:
             trail = [*(point for _, point in trails[track.id]), points[track.id]]
             cv2.polylines(view, [np.array(trail, np.int32)], False, color, 1, cv2.LINE_AA, _SHIFT)
             self._draw_vehicle(view, track, position, color, camera)
+        for position, track, _ in shown:
             self._write_number(view, track, position)
         return left, 0, left + width, height
 
