@@ -19,7 +19,7 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.explanation import patch_cell_shares
 from vehicle_detection.features import part_slices
 from vehicle_detection.function_model import FunctionModel
-from vehicle_detection.mixture import MixtureSearch, denoise
+from vehicle_detection.mixture import MixtureSearch, denoise, prepare
 from vehicle_detection.synthetic import SceneVehicle
 
 CARS = [SceneVehicle(distance_m=14.0, kind="sedan"), SceneVehicle(distance_m=9.0, lateral_m=4.2, kind="suv")]
@@ -44,6 +44,18 @@ def test_each_found_vehicle_is_explained(detector):
         rows, columns = detector.model.templates[explanation.template].weights.shape[:2]
         assert explanation.cells.shape == (rows, columns)
         assert f"score {score:.2f}" in str(explanation)
+        # The terms are those of the search: their sum gives the score.
+        assert detector.model.scores(explanation.margin) == pytest.approx(score, abs=1e-5)
+
+
+def test_a_hazy_frame_is_explained_as_it_is_searched(detector):
+    hazy = cv2.addWeighted(SCENE.image, 0.15, np.full_like(SCENE.image, 190), 0.85, 0)
+    assert (prepare(hazy) != denoise(hazy)).any()
+    found = detector.detect(hazy)
+    assert len(found)
+    for box, score in zip(found.boxes, found.scores):
+        explanation = explain(detector, hazy, box)
+        assert detector.model.scores(explanation.margin) == pytest.approx(score, abs=1e-5)
 
 
 def test_cells_and_bias_are_the_margin_of_a_window_of_the_search(detector):

@@ -21,11 +21,12 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import extract_features, part_slices, sum_blocks
 from vehicle_detection.mixture import (
     MIRROR_ORDER,
+    RESCORE_MIN,
     CellGrid,
     EdgePyramid,
     MixtureTemplate,
     TemplateMixture,
-    denoise,
+    prepare,
     window_grid,
 )
 from vehicle_detection.params import PATCH_SIZE, FeatureParams
@@ -34,8 +35,6 @@ from vehicle_detection.params import PATCH_SIZE, FeatureParams
 _MIN_IOU = 0.5
 # Windows of a classifier of patches are larger than the boxes of vehicles.
 _MIN_WINDOW_IOU = 0.2
-# Smallest margin of a box before the second stage.
-_MIN_MARGIN = -1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +52,8 @@ class Explanation:
         ``(rows, columns)`` share of each cell in the linear score, positive where it speaks for a vehicle.
     terms
         Named amounts whose sum is `margin`: ``"cells"``, the sum of `cells`; ``"bias"``; for classifiers of
-        patches ``"color histogram"``, which has no position; for mixtures ``"votes and size"`` and
-        ``"second stage"``, if there are.
+        patches ``"color histogram"``, which has no position; for mixtures ``"votes and size"``,
+        ``"second stage"`` and ``"candidates"``, if there are.
     template
         Number of the template with the best window, from 0.
     score
@@ -67,7 +66,7 @@ class Explanation:
     >>> scene = render_scene(shape=(360, 640), vehicles=[SceneVehicle(distance_m=15.0)], random_state=1)
     >>> found = explain(VehicleDetector(), scene.image, scene.boxes[0])
     >>> found.found, list(found.terms)
-    (True, ['cells', 'bias', 'votes and size', 'second stage'])
+    (True, ['cells', 'bias', 'votes and size', 'second stage', 'candidates'])
     """
 
     box: Floats
@@ -156,8 +155,12 @@ def _explain_mixture(
     assert vehicles is not None
     row = _best_overlap(box, vehicles.boxes, _MIN_IOU)
     with model.open_search() as search:
-        pyramid, windows = search.score_windows(denoise(image), params)
-        proposals, margins = model.propose_boxes(pyramid, windows, min_margin=_MIN_MARGIN)
+        pyramid, windows = search.score_windows(prepare(image), params)
+        candidates = {}
+        if model.count_weight:
+            shift = model.detect_vehicles(pyramid, windows, min_margin=RESCORE_MIN)[2]
+            candidates = {"candidates": shift}
+        proposals, margins = model.propose_boxes(pyramid, windows, min_margin=RESCORE_MIN)
         corrected, final = proposals, margins
         if model.rescorer is not None:
             corrected, final = model.rescorer.apply(pyramid, proposals, margins)
@@ -174,11 +177,12 @@ def _explain_mixture(
                 terms["votes and size"] = float(margins[proposal]) - sum(terms.values())
                 if model.rescorer is not None:
                     terms["second stage"] = float(final[proposal] - margins[proposal])
+                terms |= candidates
                 score = float(vehicles.scores[row])
                 found = vehicles.boxes[row].astype(np.float64)
                 return Explanation(found, True, _window_of(grid), cells, terms, number, score)
     # Not found: place each template on the box itself.
-    pyramid = EdgePyramid(denoise(image))
+    pyramid = EdgePyramid(prepare(image))
     placed = []
     for number, template in enumerate(model.templates):
         if not template.border:
@@ -192,6 +196,7 @@ def _explain_mixture(
     if model.rescorer is not None:
         margin = np.array([sum(terms.values())])
         terms["second stage"] = float((model.rescorer.apply(pyramid, box[None], margin)[1] - margin)[0])
+    terms |= candidates
     return Explanation(box, False, _window_of(grid), cells, terms, number, None)
 
 

@@ -23,6 +23,7 @@ from vehicle_detection.mixture.model import TemplateMixture, load_model
 from vehicle_detection.mixture.rescoring import (
     KERNEL,
     N_INPUTS,
+    RESCORE_MIN,
     STRIDES,
     Layer,
     Rescorer,
@@ -42,6 +43,7 @@ __all__ = [
     "N_COLOR_FEATURES",
     "N_EDGE_FEATURES",
     "N_INPUTS",
+    "RESCORE_MIN",
     "STRIDES",
     "CellGrid",
     "EdgePyramid",
