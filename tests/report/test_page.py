@@ -251,6 +251,16 @@ class TestSettingsAndModel:
             assert f"{scores['f1']:.6g}" in text
         assert "inherits the terms of the data" in text
 
+    @pytest.mark.parametrize(
+        ("options", "focal"), [({"field_of_view": 90}, "640"), ({"camera": "fisheye-120"}, "611.155")]
+    )
+    def test_of_a_lens(self, tmp_path, options, focal):
+        """The camera is the one that the distances are computed with."""
+        with VehicleDetector(n_jobs=1, **options) as detector:
+            text = write_report(tmp_path, FRAMES, detector=detector)
+        assert "<summary>Camera</summary>" in text
+        assert f"<dt>focal px</dt><dd>{focal}</dd>" in text
+
     def test_of_the_heat_map_of_the_course(self, tmp_path):
         with VehicleDetector(n_jobs=1, region_params=HeatParams(), horizon=0.5) as detector:
             text = write_report(tmp_path, FRAMES, detector=detector)

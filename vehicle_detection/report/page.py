@@ -17,7 +17,6 @@ import numpy as np
 
 import vehicle_detection
 from vehicle_detection.boxes import Floats
-from vehicle_detection.camera import Camera
 from vehicle_detection.drawing import MAX_SPEED_STD
 from vehicle_detection.events import (
     KINDS,
@@ -265,8 +264,8 @@ def _script_data(tracks: Sequence[TrackHistory], axis: TimeAxis) -> dict[str, An
 
 def _settings(detector: Any, shape: tuple[int, ...]) -> list[Group]:
     """Parameters of a detector, a group for each dataclass of them."""
-    search, regions, tracks, camera = (
-        getattr(detector, name, None) for name in ("search_params", "region_params", "track_params", "camera")
+    search, regions, tracks = (
+        getattr(detector, name, None) for name in ("search_params", "region_params", "track_params")
     )
     bands = getattr(search, "bands", ())
     groups = {"Search": search}
@@ -274,11 +273,10 @@ def _settings(detector: Any, shape: tuple[int, ...]) -> list[Group]:
         groups["Regions (heat map)"] = regions
     elif bands:  # without bands, the model itself predicts boxes
         groups["Regions (fitted boxes)"] = regions
-    groups |= {"Tracks": tracks, "Camera": camera}
-    if camera is None and dataclasses.is_dataclass(search):
-        horizon = getattr(search, "horizon", None)
-        known = {} if horizon is None else {"horizon": horizon}
-        groups["Camera (assumed)"] = Camera.for_frame(shape, **known)
+    groups["Tracks"] = tracks
+    if hasattr(detector, "camera_of"):
+        title = "Camera" if getattr(detector, "lens_is_known", False) else "Camera (assumed)"
+        groups[title] = detector.camera_of(shape)
     found = []
     for title, params in groups.items():
         if dataclasses.is_dataclass(params):
