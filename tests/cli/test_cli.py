@@ -555,7 +555,7 @@ def test_detect_explains_each_box(tmp_path):
     write_image(image, scene.image)
     out = succeed("detect", image, "--why", why)
     assert re.search(
-        r"^  1: score \S+, template \d: margin \S+ = .* cells .* second stage$", out, re.MULTILINE
+        r"^  1: score \S+, template \d: margin \S+ = .* cells .* candidates$", out, re.MULTILINE
     )
     assert contents(why) == ["road.png_1.png"]
     assert "--why must be a folder" in refuse("detect", image, "--why", image)
@@ -589,6 +589,19 @@ def test_video_writes_events_and_a_summary(clip, tmp_path):
     assert lines[-1] == f"wrote {target}, {events}, {clips}"
     found = json.loads(events.read_text())
     assert [path.suffix for path in clips.iterdir()] == [".mp4"] * len(found)
+
+
+def test_video_explains_each_vehicle_in_the_report(tmp_path):
+    drive, page = tmp_path / "drive.mp4", tmp_path / "page.html"
+    draw_clip(render_drive(frames=25, shape=(360, 640), scenario="traffic"), drive, tmp_path / "labels.csv")
+    words = ["video", drive, "-o", tmp_path / "out.mp4", "--report", page, "--preset", "ultrafast"]
+    succeed(*words, "--start", 0.2, "--why", "--blur", "vehicles")
+    text = page.read_text()
+    listed = re.findall(r'<th scope="row"><span class="dot c\d"></span>#(\d+)', text)
+    explained = re.findall(r"<h3>#(\d+) at 0:0[\d.]+</h3><p>score [\d.]+, template \d: margin", text)
+    assert sorted(explained) == sorted(listed) != []
+    succeed(*words)
+    assert "Why these boxes" not in page.read_text()
 
 
 def test_video_writes_subtitles_with_the_own_speed(clip, tmp_path):
@@ -713,6 +726,7 @@ def bad_videos(material, tmp):
         r"--gpx \S+none.gpx does not exist": [clip, "-o", target, "--gpx", tmp / "none.gpx"],
         r"--own-speed and --gpx both state": [clip, "-o", target, "--own-speed", 9, "--gpx", tmp / "a.gpx"],
         r"--gpx-offset needs --gpx": [clip, "-o", target, "--gpx-offset", 9],
+        r"--why needs --report and a source that can be read again": [clip, "-o", target, "--why"],
         r"--clips must be a folder": [clip, "-o", target, "--clips", clip],
         r"--tracks \S+ is also SOURCE \S+;": [tmp / "a.csv", "-o", target, "--tracks", tmp / "a.csv"],
     }

@@ -9,7 +9,7 @@ from vehicle_detection.report import ReportWriter
 from vehicle_detection.video import VideoReport
 
 FPS = 25
-VOID_ELEMENTS = {"meta", "link", "source"}
+VOID_ELEMENTS = {"meta", "link", "source", "img"}
 
 
 def track(number, *, distance=20.0, distance_std=2.0, speed=1.5, speed_std=0.5, confidence=1.0, shown=True):

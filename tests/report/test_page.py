@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -32,7 +33,7 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events import Event
 from vehicle_detection.mixture import load_model
 from vehicle_detection.params import HeatParams, TrackParams
-from vehicle_detection.report import ReportWriter, page
+from vehicle_detection.report import ReportWriter, TrackPicture, page
 
 UNSAFE_NAME = "\"><img src=x onerror=alert(1)>&amp;'</title><script>.mp4"
 
@@ -362,6 +363,22 @@ def test_events_are_in_the_units_of_the_page(tmp_path):
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "<td>41.0 ± 4.9 ft</td>\n<td>45 ± 2 mph, oncoming</td>" in page
     assert "distance 41.0 ± 4.9 ft: show in the video" in page
+
+
+def test_pictures_are_part_of_the_page(tmp_path):
+    writer = ReportWriter(tmp_path / "report.html")
+    for index, tracks in enumerate(FRAMES):
+        writer.write(index, index / FPS, tracks)
+    image = np.full((180, 320, 3), (200, 90, 0), np.uint8)
+    picture = TrackPicture(2, 25, image, "score 3.10, template 1: <margin> 0.50")
+    writer.finish(video_report(len(FRAMES)), pictures=[picture])
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    (shown,) = (each for each in StrictParser(page).all("img") if each["class"] == "why")
+    data = base64.b64decode(shown["src"].removeprefix("data:image/jpeg;base64,"))
+    decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
+    assert np.abs(decoded.astype(int) - image).max() < 10
+    assert "<h3>#2 at 0:01.0</h3><p>score 3.10, template 1: &lt;margin&gt; 0.50</p>" in page
+    assert "Why these boxes" not in write_report(tmp_path, FRAMES)
 
 
 def test_a_page_without_certain_events_says_so(tmp_path):

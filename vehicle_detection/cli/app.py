@@ -347,6 +347,12 @@ def video(
         Path | None,
         Option(metavar="FILE.html", help="Page with the video and its tracks.", rich_help_panel=OUTPUT),
     ] = None,
+    why: Annotated[
+        bool,
+        flag(
+            "--why", panel=OUTPUT, help="Explain a box of each vehicle in --report: the share of each cell."
+        ),
+    ] = False,
     events: Annotated[
         Path | None,
         Option(
@@ -509,7 +515,7 @@ def video(
 
     Exit code 3: the source is damaged, and the copy lacks what cannot be decoded.
     """
-    from vehicle_detection.cli.events import SideOutputs, print_summary, read_speed
+    from vehicle_detection.cli.events import SideOutputs, explain_vehicles, print_summary, read_speed
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.events import TrackLog
     from vehicle_detection.export import TrackWriter
@@ -528,6 +534,8 @@ def video(
         panel=panel,
         units=units,
     )
+    if why and (report is None or not Path(source).exists()):
+        raise InvalidInputError("--why needs --report and a source that can be read again, such as a file")
     speed = read_speed(own_speed, gpx, gpx_offset)
     side_outputs = SideOutputs(events, clips, srt)
     with name_kept_files(outputs.values()), contextlib.ExitStack() as stack:
@@ -585,7 +593,7 @@ def video(
         if page is not None:
             # After the tracks, whose file is complete when its writer closes.
             stack.close()
-            page.finish(done, events=found)
+            page.finish(done, events=found, pictures=explain_vehicles(detector, source, log) if why else ())
     if not done.tracks and horizon not in (None, "auto") and not quiet and Path(source).exists():
         with _everywhere(loaded, conf) as detector:
             _warn_of_horizon(horizon, estimate_video_horizon(source, detector, start=start, end=end))

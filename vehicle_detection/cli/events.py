@@ -1,4 +1,4 @@
-"""Events of the command ``video`` and what follows from them: files, clips, subtitles and the summary."""
+"""What ``video`` derives from the tracks: events, clips, subtitles, explanations and the summary."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from vehicle_detection.errors import InvalidInputError
 if TYPE_CHECKING:
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.events import Event, TrackLog
+    from vehicle_detection.report import TrackPicture
     from vehicle_detection.video import OwnSpeed, VideoReport
 
 # Fraction of the frames without a known own speed from which on a warning is printed.
@@ -93,6 +94,17 @@ class SideOutputs:
                 write_subtitles(
                     log, self.subtitles, fps=fps, events=events, own_speed=detector.own_speed, units=units
                 )
+
+
+def explain_vehicles(detector: VehicleDetector, source: str, log: TrackLog) -> list[TrackPicture]:
+    """Explain a box of each vehicle of a video, for its report."""
+    from vehicle_detection.explanation import explain_tracks
+    from vehicle_detection.report import TrackPicture
+
+    return [
+        TrackPicture(track_id, found.frame, found.picture, str(found.explanation))
+        for track_id, found in explain_tracks(detector, source, log).items()
+    ]
 
 
 def print_summary(log: TrackLog, events: tuple[Event, ...], report: VideoReport) -> None:

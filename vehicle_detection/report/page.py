@@ -13,7 +13,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 import vehicle_detection
 from vehicle_detection.boxes import Floats
@@ -45,6 +47,7 @@ from vehicle_detection.units import UNITS, Units
 from vehicle_detection.video import VideoReport
 
 _COUNT_SECONDS = (1, 2, 5, 10, 15, 30, 60, 120, 300)  # durations of a bar in the chart of counts
+_JPEG_QUALITY = 82
 _CHUNK = 3 << 18  # bytes; a multiple of 3, so that the chunks' base64 texts can be joined
 
 
@@ -62,6 +65,21 @@ class VideoEmbed:
         with self.path.open("rb") as video:
             while chunk := video.read(_CHUNK):
                 yield base64.b64encode(chunk).decode("ascii")
+
+
+class TrackPicture(NamedTuple):
+    """A picture of a track, with its frame and a text about it."""
+
+    track: int
+    frame: int
+    image: NDArray[np.uint8]  # (H, W, 3) RGB
+    text: str
+
+    def data_url(self) -> str:
+        """Encode the picture as a JPEG in a URL."""
+        bgr = cv2.cvtColor(self.image, cv2.COLOR_RGB2BGR)
+        _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+        return f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
 
 
 class Figure(NamedTuple):
@@ -98,6 +116,7 @@ def render_page(
     source: str | None,
     detector: Any,
     units: str = "metric",
+    pictures: Sequence[TrackPicture] = (),
 ) -> Iterator[str]:
     """Render the page in pieces; `detector` may lack settings or a model, which are then left out."""
     from jinja2 import Environment, StrictUndefined
@@ -126,6 +145,7 @@ def render_page(
         figures=_figures(tracks, log, events, axis, chosen) if tracks else [],
         events=events,
         event_kinds=KINDS,
+        pictures=pictures,
         minutes=_minute_table(count_vehicles(events, log, fps=axis.fps)) if tracks else None,
         fraction_bar=fraction_bar,
         settings=_settings(detector, report.shape),

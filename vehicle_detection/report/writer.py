@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import urllib.parse
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +18,7 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events import Event, TrackLog, find_events
-from vehicle_detection.report.page import VideoEmbed, render_page
+from vehicle_detection.report.page import TrackPicture, VideoEmbed, render_page
 from vehicle_detection.units import UNITS
 from vehicle_detection.video import VideoReport
 
@@ -99,10 +99,17 @@ class ReportWriter:
         """Add the shown tracks of the next frame, numbered from 0; `time` is that in the source (s)."""
         self.log.add(frame_index, time, tracks)
 
-    def finish(self, report: VideoReport, *, events: Iterable[Event] | None = None) -> None:
+    def finish(
+        self,
+        report: VideoReport,
+        *,
+        events: Iterable[Event] | None = None,
+        pictures: Sequence[TrackPicture] = (),
+    ) -> None:
         """Write the page, completely or not at all, with the `report` that `process_video` returned.
 
-        `events` are those that `find_events` found in `log`; None: they are found here.
+        `events` are those that `find_events` found in `log`; None: they are found here. `pictures` are
+        listed below the tracks.
         """
         check_type(report, "report", VideoReport, "pass what process_video returned")
         if events is None:
@@ -117,6 +124,7 @@ class ReportWriter:
             "source": self._source,
             "detector": self._detector,
             "units": self._units,
+            "pictures": pictures,
         }
         pieces = render_page(self.log, report, **options)
         with (
