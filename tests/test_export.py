@@ -239,7 +239,7 @@ def test_the_format_may_be_named(tmp_path):
 
 
 def test_a_stream_is_the_same_file(tmp_path):
-    for name in ("t.csv", "t.jsonl", "t.txt"):
+    for name in ("t.csv", "t.jsonl", "t.txt", "t.parquet", "t.json"):
         write_tracks(RESULTS, tmp_path / f"whole_{name}")
         with TrackWriter(tmp_path / name) as write:
             for result in RESULTS:
@@ -248,9 +248,10 @@ def test_a_stream_is_the_same_file(tmp_path):
         assert (tmp_path / name).read_bytes() == (tmp_path / f"whole_{name}").read_bytes()
 
 
+@pytest.mark.parametrize("name", ["t.csv", "t.json"])
 @pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt])
-def test_a_stream_appears_whole_or_not_at_all(tmp_path, error):
-    path = tmp_path / "t.csv"
+def test_a_stream_appears_whole_or_not_at_all(tmp_path, error, name):
+    path = tmp_path / name
     path.write_text("an earlier file")
 
     def run():
@@ -262,7 +263,7 @@ def test_a_stream_appears_whole_or_not_at_all(tmp_path, error):
     with pytest.raises(error):
         run()
     assert path.read_text() == "an earlier file"
-    assert os.listdir(tmp_path) == ["t.csv"]
+    assert os.listdir(tmp_path) == [name]
 
 
 def test_an_error_in_the_rows_leaves_the_earlier_file(tmp_path):
@@ -393,13 +394,10 @@ def test_bad_arguments(tmp_path, monkeypatch, items, options, message):
     assert os.listdir(tmp_path) == []
 
 
-def test_formats_that_do_not_stream(tmp_path):
-    with pytest.raises(
-        InvalidInputError, match=r"path must end in .csv, .jsonl, .ndjson, .txt, got 't.parquet'"
-    ):
+def test_a_missing_pyarrow_is_reported_before_the_video(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(InvalidInputError, match=r"a .parquet file needs pyarrow; pip install"):
         TrackWriter(tmp_path / "t.parquet")
-    with pytest.raises(InvalidInputError, match="format must be one of 'csv', 'jsonl', 'mot'"):
-        TrackWriter(tmp_path / "t.csv", format="coco")
 
 
 def test_stills_have_no_mot_and_no_frame_numbers(tmp_path):

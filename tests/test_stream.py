@@ -112,5 +112,5 @@ def test_bad_arguments(clip, detector, tmp_path):
     with pytest.raises(InvalidInputError, match=r"source missing\.mp4 does not exist"):
         track("missing.mp4", random_mixture(), stream=True)
     (tmp_path / "text.mp4").write_text("no video")
-    with pytest.raises(VideoError, match="is not a video"):
+    with pytest.raises(VideoError, match="is a text file, not a video"):
         track(tmp_path / "text.mp4", detector, stream=True)

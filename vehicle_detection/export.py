@@ -24,6 +24,7 @@ from vehicle_detection._common import (
     check_number,
     check_target,
     describe,
+    import_pyarrow,
     write_parquet,
 )
 from vehicle_detection.errors import InvalidInputError
@@ -219,18 +220,10 @@ def write_tracks(
     0,1,10.00,20.00,50.13,60.00,1.5000,,,,,
     1,1,12.00,20.00,52.00,60.00,1.2500,31.40,-0.50,,,
     """
-    kind = check_format(path, format, FORMATS.values())
-    if kind in ("csv", "jsonl", "mot"):
-        with TrackWriter(path, format=kind) as write:
-            for item in check_items(results):
-                write(item)
-        return write.rows
-    rows: list[Row] = []
-    frames: list[int | str] = []  # a COCO file also lists the frames without a vehicle
-    for item in check_items(results):
-        frames += [int(item.index)] if is_result(item) else []
-        rows += _rows_of(item, len(rows))
-    return _write_rows(rows, frames, path, kind, TRACK_COLUMNS, shape)
+    with TrackWriter(path, format=format, shape=shape) as write:
+        for item in check_items(results):
+            write(item)
+    return write.rows
 
 
 def write_boxes(
@@ -295,14 +288,15 @@ def _confidences(found: Any) -> Sequence[float | None]:
 
 
 class TrackWriter:
-    """Write the tracks of a video while it is processed, in constant memory.
+    """Write the tracks of a video while it is processed.
 
-    The file appears when the ``with`` block ends without an error; otherwise an existing file is kept.
+    The file appears when the ``with`` block ends without an error; otherwise an existing file is kept. CSV,
+    JSON Lines and MOT need constant memory; the rows of Parquet and COCO files are kept until the end.
 
     Parameters
     ----------
-    path, format
-        As in `write_tracks`; only ``"csv"``, ``"jsonl"`` and ``"mot"``.
+    path, format, shape
+        As in `write_tracks`.
 
     Attributes
     ----------
@@ -312,7 +306,7 @@ class TrackWriter:
     Raises
     ------
     InvalidInputError
-        If the format is another one, or the folder is missing or read-only.
+        If the format is unknown, or the folder is missing or read-only.
 
     Examples
     --------
@@ -325,20 +319,34 @@ class TrackWriter:
 "distance_m": null, "speed_mps": null, "confidence": null, "distance_std_m": null, "speed_std_mps": null}
     """
 
-    def __init__(self, path: str | os.PathLike[str], *, format: str | None = None) -> None:  # noqa: A002
-        self._kind = check_format(path, format, ("csv", "jsonl", "mot"))
-        self._path = path
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        format: str | None = None,  # noqa: A002
+        shape: tuple[int, ...] | None = None,
+    ) -> None:
+        self._kind = check_format(path, format, FORMATS.values())
+        if self._kind == "parquet":
+            import_pyarrow()  # now, rather than after the video
+        self._path, self._shape = path, shape
+        self._kept: list[Row] = []  # rows of formats that are written at the end
+        self._frames: list[int | str] = []  # a COCO file also lists the frames without a vehicle
         self._stack = contextlib.ExitStack()
         self._write_row: Callable[[Row], object] | None = None
         self.rows = 0
 
     def __enter__(self) -> TrackWriter:
+        self.rows = 0
+        if self._kind in ("parquet", "coco"):
+            self._kept, self._frames = [], []
+            self._write_row = self._kept.append
+            return self
         with contextlib.ExitStack() as stack:
             part = stack.enter_context(atomic_write(self._path, "path"))
             file = stack.enter_context(part.open("w", encoding="utf-8", newline=""))
             self._write_row = _row_writer(file, self._kind, TRACK_COLUMNS)
             self._stack = stack.pop_all()
-        self.rows = 0
         return self
 
     def __call__(self, result: Any) -> None:
@@ -347,12 +355,17 @@ class TrackWriter:
             raise InvalidInputError(
                 "TrackWriter must be called inside its with block; use with TrackWriter(path) as write: ..."
             )
+        if self._kind == "coco" and is_result(result):
+            self._frames.append(int(result.index))
         for row in _rows_of(result, self.rows):
             self._write_row(row)
             self.rows += 1
 
     def __exit__(self, *error: Any) -> None:
         self._write_row = None
+        if self._kind in ("parquet", "coco") and error[0] is None:
+            _write_rows(self._kept, self._frames, self._path, self._kind, TRACK_COLUMNS, self._shape)
+        self._kept, self._frames = [], []
         self._stack.__exit__(*error)
 
 

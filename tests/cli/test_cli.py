@@ -554,9 +554,7 @@ def test_detect_explains_each_box(tmp_path):
     scene = render_scene(shape=(360, 640), vehicles=[SceneVehicle(distance_m=14.0)], lane=1, random_state=1)
     write_image(image, scene.image)
     out = succeed("detect", image, "--why", why)
-    assert re.search(
-        r"^  1: score \S+, template \d: margin \S+ = .* cells .* candidates$", out, re.MULTILINE
-    )
+    assert re.search(r"^  1: score \S+, template \d: margin \S+ = .* cells .* candidates$", out, re.MULTILINE)
     assert contents(why) == ["road.png_1.png"]
     assert "--why must be a folder" in refuse("detect", image, "--why", image)
 
@@ -688,7 +686,7 @@ def bad_videos(material, tmp):
     return {
         r"SOURCE \S+missing.mp4 does not exist": [tmp / "missing.mp4", "-o", target],
         r"SOURCE \S+empty holds no videos and no images": [material / "empty", "-o", target],
-        r"text.mp4 is not a video that ffmpeg can read": [material / "text.mp4", "-o", target],
+        r"text.mp4 is a text file, not a video": [material / "text.mp4", "-o", target],
         r"cut_clip.mp4 is not a video .*its index is missing": [material / "cut_clip.mp4", "-o", target],
         r"none.mp4 (has no|is not a video)": [tmp / "none.mp4", "-o", target],
         r"image of 32x32 pixels holds no search window": [tiny, "-o", target, "--model", "highway"],

@@ -21,6 +21,7 @@ from vehicle_detection._common.files import (
     atomic_write,
     check_suffix,
     check_target,
+    import_pyarrow,
     temporary_folder,
     write_parquet,
 )
@@ -68,6 +69,7 @@ __all__ = [
     "describe",
     "finite_array",
     "image_size",
+    "import_pyarrow",
     "mirror_patches",
     "progress_bar",
     "read_model",

@@ -203,6 +203,14 @@ def write_parquet(
 
     `types` names the Arrow type of each column, such as ``"int64"``; None infers them from the values.
     """
+    pyarrow = import_pyarrow()
+    schema = None if types is None else pyarrow.schema(list(types.items()))
+    with atomic_write(path, "path") as part:
+        pyarrow.parquet.write_table(pyarrow.table(table, schema=schema), part)
+
+
+def import_pyarrow() -> Any:
+    """Return pyarrow, which writes Parquet files."""
     try:
         import pyarrow
         import pyarrow.parquet
@@ -210,6 +218,4 @@ def write_parquet(
         raise InvalidInputError(
             "a .parquet file needs pyarrow; pip install 'vehicle-detection[parquet]', or write .csv"
         ) from None
-    schema = None if types is None else pyarrow.schema(list(types.items()))
-    with atomic_write(path, "path") as part:
-        pyarrow.parquet.write_table(pyarrow.table(table, schema=schema), part)
+    return pyarrow

@@ -341,7 +341,11 @@ def video(
     ],
     tracks: Annotated[
         Path | None,
-        Option(metavar="FILE", help="Tracks: .csv, .jsonl or .txt (MOT).", rich_help_panel=OUTPUT),
+        Option(
+            metavar="FILE",
+            help="Tracks: .csv, .jsonl, .parquet, .txt (MOT) or .json (COCO).",
+            rich_help_panel=OUTPUT,
+        ),
     ] = None,
     report: Annotated[
         Path | None,

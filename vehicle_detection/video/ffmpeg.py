@@ -111,6 +111,8 @@ def _probe(path: Path | str) -> VideoInfo:
     check_frame_size(str(path), log)
     header, mapped, decoded = log.partition("Stream mapping:")
     if not re.search(r"^Input #0", header, re.MULTILINE):
+        if _is_text(Path(path)):
+            raise VideoError(f"{path} is a text file, not a video; choose the video")
         truncated = "moov atom not found" in log
         reason = "its index is missing: the recording or copy is incomplete" if truncated else last_line(log)
         raise VideoError(f"{path} is not a video that ffmpeg can read ({reason}); record or copy it again")
@@ -149,6 +151,18 @@ def _probe(path: Path | str) -> VideoInfo:
         audio_track=track,
         audio_codec=None if track is None else codecs[track],
     )
+
+
+def _is_text(path: Path) -> bool:
+    """Whether a file starts with UTF-8 text, such as a saved web page or a pointer to large-file storage."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(512)
+    except OSError:
+        return False
+    text = start.decode("utf-8", "ignore")
+    control = sum(ord(letter) < 32 and letter not in "\t\n\r\f" for letter in text)
+    return bool(start) and not control and len(text.encode()) >= len(start) - 3
 
 
 def _stream_lines(header: str, index: int) -> str:
