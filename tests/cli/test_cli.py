@@ -472,7 +472,10 @@ def test_detect_refuses_bad_input_and_changes_no_file(material, tmp_path):
 def test_one_bad_image_prevents_the_table(picture, material, tmp_path):
     (tmp_path / "boxes.csv").write_text("earlier")
     result = run("detect", picture, material / "cut_road.png", "--boxes", tmp_path / "boxes.csv")
-    assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
+    note, error = result.stderr.splitlines()
+    assert result.exit_code == 2
+    assert note.startswith("note: ")
+    assert error.startswith("error: ")
     assert (tmp_path / "boxes.csv").read_text() == "earlier"
     assert contents(tmp_path) == ["boxes.csv"]
 
@@ -612,6 +615,15 @@ def test_video_writes_subtitles_with_the_own_speed(clip, tmp_path):
     result = run(*words, "--units", "imperial")
     assert (result.exit_code, warning in result.stderr) == (0, True)
     assert "own speed" not in subtitles.read_text()
+
+
+def test_existing_files_are_replaced_with_a_note(clip, picture, tmp_path):
+    target, boxes = tmp_path / "out.mp4", tmp_path / "boxes.csv"
+    runs = [["video", clip, "-o", target, "--end", 0.1], ["detect", picture, "--boxes", boxes]]
+    for words, path in zip(runs, (target, boxes)):
+        notes = [run(*words).stderr.count(f"note: {path} will be replaced when") for _ in range(2)]
+        assert notes == [0, 1]
+    assert "note" not in run(*runs[0], "--quiet").stderr
 
 
 def test_a_damaged_video_has_an_exit_code_of_its_own(clip, tmp_path):

@@ -76,7 +76,8 @@ def test_a_signal_ends_a_video_and_leaves_nothing(clip, tmp_path, name):
     process.send_signal(number)
     process.send_signal(number)  # does not interrupt the cleanup
     out, errors = process.communicate(timeout=30)
-    assert (process.returncode, errors) == (128 + number, "interrupted\n")
+    note = f"note: {tmp_path / 'out.mp4'} will be replaced when the new file is complete\n"
+    assert (process.returncode, errors) == (128 + number, f"{note}interrupted\n")
     assert set(out.split()) <= {"now"}
     assert contents(tmp_path) == ["out.mp4"]
     assert (tmp_path / "out.mp4").read_bytes() == b"old"

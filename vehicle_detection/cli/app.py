@@ -35,6 +35,7 @@ from vehicle_detection.cli.options import (
     flag,
 )
 from vehicle_detection.cli.output import (
+    announce_replaced,
     capture_stderr,
     check_distinct_paths,
     name_kept_files,
@@ -194,6 +195,7 @@ def detect(
     if line_width is not None:
         check_integer(line_width, "line_width", low=1, high=1000)
     _check_images(images, output, boxes)
+    announce_replaced([boxes])
     with (
         VehicleDetector(model, conf=conf, horizon=horizon, blur=_parse_blur(blur)) as detector,
         output_folder(output, "--output"),
@@ -542,6 +544,8 @@ def video(
         raise InvalidInputError("--why needs --report and a source that can be read again, such as a file")
     speed = read_speed(own_speed, gpx, gpx_offset)
     side_outputs = SideOutputs(events, clips, srt)
+    if not quiet:
+        announce_replaced(outputs.values())
     with name_kept_files(outputs.values()), contextlib.ExitStack() as stack:
         stack.enter_context(output_folder(clips, "--clips"))
         writers: list[Callable[[Any], object]] = []

@@ -105,6 +105,13 @@ def check_distinct_paths(targets: Mapping[str, Path | None], sources: Mapping[st
             raise InvalidInputError(f"{name} {path} is also {other}; choose another name")
 
 
+def announce_replaced(targets: Iterable[Path | None]) -> None:
+    """Print which targets exist, before the work starts: there is time to interrupt it."""
+    existing = [str(path) for path in targets if path is not None and path.is_file()]
+    if existing:
+        print_error(f"note: {' and '.join(existing)} will be replaced when the new file is complete")
+
+
 @contextlib.contextmanager
 def name_kept_files(outputs: Iterable[Path | None]) -> Iterator[None]:
     """Add to an error in the block which of the output files the block has completed."""
