@@ -34,6 +34,7 @@ from .errors import (
     InvalidInputError,
     ModelFileError,
     OutputError,
+    TransientVideoError,
     VehicleDetectionError,
     VideoError,
 )
@@ -163,6 +164,7 @@ __all__ = [
     "TrackWriter",
     "TrackedFrame",
     "Tracker",
+    "TransientVideoError",
     "TrialOptions",
     "Trip",
     "VehicleClassifier",

@@ -21,7 +21,7 @@ from vehicle_detection.batch import workers
 from vehicle_detection.batch.plan import list_videos
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.errors import InvalidInputError, OutputError, TransientVideoError, VideoError
 from vehicle_detection.export import TrackWriter
 from vehicle_detection.synthetic import render_drive
 from vehicle_detection.video import probe_video
@@ -239,6 +239,41 @@ def test_a_full_disk_is_an_error_that_the_next_run_repeats(card, model, tmp_path
     assert not list((tmp_path / "scratch").iterdir())
 
 
+@pytest.mark.parametrize(
+    ("number", "status"), [("KILL", "error"), ("XCPU", "error"), ("SEGV", "failed"), (None, "failed")]
+)
+def test_a_killed_ffmpeg_is_an_error_and_a_crashed_one_a_failure(
+    card, model, tmp_path, monkeypatch, number, status
+):
+    """A stand-in for ffmpeg ends by a signal, or with an error about the file."""
+    program = tmp_path / "ffmpeg"
+    program.write_text(f"#!/bin/sh\n{f'kill -{number} $$' if number else 'exit 1'}\n")
+    program.chmod(0o755)
+    monkeypatch.setattr("vehicle_detection.video.ffmpeg.ffmpeg_binary", lambda: str(program))
+    report = run(str(card / "*0930*"), tmp_path / "out", model)
+    assert [record["status"] for record in records(tmp_path / "out").values()] == [status]
+    assert counts(report) == (0, status == "failed", status == "error", 0)
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (VideoError("cut"), "failed"),
+        (InvalidInputError("no such file"), "failed"),
+        (TransientVideoError("no answer"), "error"),
+        (OutputError("the disk is full"), "error"),
+        (MemoryError(), "error"),
+    ],
+)
+def test_what_the_machine_is_to_blame_for_is_an_error(card, model, tmp_path, monkeypatch, error, status):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(trip_module, "process_video", fail)
+    run(str(card / "*0930*"), tmp_path / "out", model)
+    assert [record["status"] for record in records(tmp_path / "out").values()] == [status]
+
+
 def test_a_trip_that_another_run_is_working_on_is_awaited(card, model, tmp_path):
     import fcntl
     import threading
@@ -310,7 +345,7 @@ def test_storage_that_fails_every_other_request(clip, model, tmp_path, monkeypat
             raise ConnectionResetError("connection reset by peer")
         return original(*args, **kwargs)
 
-    monkeypatch.setattr("vehicle_detection.video.sources._RETRY_DELAYS", (0, 0))
+    monkeypatch.setattr("vehicle_detection.video.remote._RETRY_DELAYS", (0, 0))
     monkeypatch.setattr(memory, "get_file", get_file)
     out = tmp_path / "out"
     url = "memory://unsteady/*.mp4"

@@ -27,7 +27,7 @@ from vehicle_detection.batch.records import (
     write_record,
 )
 from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.errors import VehicleDetectionError
+from vehicle_detection.errors import TransientVideoError, VehicleDetectionError
 from vehicle_detection.export import DIGITS, shown_tracks
 from vehicle_detection.video import FrameSource, download, open_source, process_video
 
@@ -96,9 +96,10 @@ def run_trip(task: Mapping[str, Any]) -> dict[str, Any]:
 def _failure(error: Exception) -> dict[str, Any]:
     """Status and message of an error: of the source, or of the machine, which may go away."""
     message = " ".join(str(error).split())
-    if isinstance(error, VehicleDetectionError) and "cannot be written" not in message:
-        return {"status": FAILED, "message": message}
-    return {"status": ERROR, "message": f"{type(error).__name__}: {message}"}
+    if not isinstance(error, VehicleDetectionError):
+        return {"status": ERROR, "message": f"{type(error).__name__}: {message}"}
+    passing = isinstance(error, (TransientVideoError, OSError))  # an OutputError is an OSError
+    return {"status": ERROR if passing else FAILED, "message": message}
 
 
 def _process(out: Path, task: Mapping[str, Any]) -> dict[str, Any]:

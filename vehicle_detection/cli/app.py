@@ -398,6 +398,9 @@ def video(
     live: Annotated[
         bool, Option("--live", help="Drop frames of a pipe rather than lag; default for cameras and streams.")
     ] = False,
+    no_reconnect: Annotated[
+        bool, Option("--no-reconnect", help="End with a network stream that breaks off.")
+    ] = False,
     no_audio: Annotated[bool, Option("--no-audio", help="Write no sound.")] = False,
     strict: Annotated[
         bool, Option("--strict", help="Fail, and write nothing, if the source is damaged.")
@@ -457,7 +460,7 @@ def video(
         log = page.log if page else TrackLog()
         writers.append(page or log)
         done = process_video(
-            stack.enter_context(open_source(source, live=True)) if live else source,
+            stack.enter_context(open_source(source, live=live or None, reconnect=not no_reconnect)),
             output,
             detector,
             start=start,

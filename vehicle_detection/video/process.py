@@ -35,8 +35,10 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video.ffmpeg import VideoInfo
+from vehicle_detection.video.frame_source import FrameSource
 from vehicle_detection.video.pipeline import FramePipeline, VideoDetector
-from vehicle_detection.video.sources import FrameSource, Source, check_span, frame_range, open_source
+from vehicle_detection.video.reading import check_span, frame_range
+from vehicle_detection.video.sources import Source, open_source
 from vehicle_detection.video.streams import CONTAINERS, AudioSource, FrameWriter
 
 PRESETS = (
