@@ -78,22 +78,19 @@ def shown_tracks(result: Any) -> list[Any]:
     return [track for track in result.tracks if getattr(track, "shown", True)]
 
 
-def _rows_of(item: Any, number: int) -> list[Row]:
-    """Rows of a frame's result, one per shown track; a row stays one row."""
-    rows = [item]
-    if is_result(item):
-        optional = TRACK_COLUMNS[len(BOX_COLUMNS) :]
-        rows = [
-            (
-                item.index,
-                track.id,
-                *track.box,
-                track.score,
-                *(getattr(track, name, None) for name in optional),
-            )
-            for track in shown_tracks(item)
-        ]
+def track_rows(result: Any, number: int = 0) -> list[Row]:
+    """Rows of a frame's result, one per shown track; `number` is that of the first one in error messages."""
+    optional = TRACK_COLUMNS[len(BOX_COLUMNS) :]
+    rows = (
+        (result.index, track.id, *track.box, track.score, *(getattr(track, name, None) for name in optional))
+        for track in shown_tracks(result)
+    )
     return [_check_row(row, number + place) for place, row in enumerate(rows)]
+
+
+def _rows_of(item: Any, number: int) -> list[Row]:
+    """Rows of a frame's result; a row stays one row."""
+    return track_rows(item, number) if is_result(item) else [_check_row(item, number)]
 
 
 def _check_row(item: Any, number: int, *, stills: bool = False) -> Row:

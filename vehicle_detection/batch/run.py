@@ -24,8 +24,17 @@ from vehicle_detection._common import (
     progress_bar,
 )
 from vehicle_detection.batch.plan import group_files, list_videos, plan_trip, source_id, trip_id
-from vehicle_detection.batch.records import DONE, ERROR, FAILED, is_complete, read_record, write_record
-from vehicle_detection.batch.trip import BUSY, earlier_keys, run_trip, warm_up
+from vehicle_detection.batch.records import (
+    DONE,
+    ERROR,
+    FAILED,
+    is_complete,
+    read_records,
+    record_keys,
+    write_record,
+)
+from vehicle_detection.batch.store import Store, open_store
+from vehicle_detection.batch.trip import BUSY, run_trip, warm_up
 from vehicle_detection.batch.workers import WorkerPool
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture import load_model
@@ -101,7 +110,7 @@ def run_batch(
 ) -> BatchReport:
     """Track the vehicles of many videos in parallel; a second run does what is missing or changed.
 
-    The folder `out` gets, for each trip, ``tracks/date=D/camera=C/KEY.parquet``, the annotated video
+    `out` gets, for each trip, ``tracks/date=D/camera=C/KEY.parquet``, the annotated video
     ``videos/date=D/camera=C/KEY.mp4``, and ``records/KEY.json``, which is written last. KEY depends on the
     trip's files (path or URL, size, modification time or entity tag), the model, the parameters and the
     version of the library. If one of them changes, the new results replace the old ones.
@@ -111,7 +120,9 @@ def run_batch(
     sources
         Video files, folders, patterns and URLs. Consecutive segments are one trip, see `find_trips`.
     out
-        Folder to write. Several runs, also on several machines, may use one folder at the same time.
+        Folder to write, or a URL of storage that fsspec knows, such as ``"s3://bucket/results"``. Several
+        runs, also on several machines, may use one folder at the same time; at a URL, which has no locks, two
+        of them may both process a trip.
     executor
         A ``concurrent.futures`` executor, such as ``distributed.Client(...).get_executor(pure=False)``,
         whose workers see the same files. None: worker processes of this machine.
@@ -145,6 +156,8 @@ def run_batch(
     ------
     InvalidInputError
         If an argument is invalid, or a source does not exist.
+    TransientVideoError, OutputError
+        If remote sources, or the storage of `out`, do not answer when the batch starts.
 
     Examples
     --------
@@ -157,17 +170,11 @@ def run_batch(
     workers = available_cores() if jobs is None else check_integer(jobs, "jobs", low=1, high=1024)
     settings = _settings(model, options, tracks_only=tracks_only, audio=audio, preset=preset)
     load_model(settings["model"])  # an error now, not in every worker
-    folder = _make_folder(out)
+    store = open_store(out, create=True)
     given = [sources] if isinstance(sources, (str, os.PathLike)) else sources
-    tasks = _plan(given, folder, settings, group, part)
-    pending, skipped = [], 0
-    for task in tasks:
-        record = read_record(folder, task["key"])
-        again = retry_failed and record is not None and record["status"] == FAILED
-        if is_complete(folder, record) and not again:
-            skipped += 1
-        else:
-            pending.append({**task, "again": again})
+    tasks = _plan(given, store, settings, group, part)
+    pending = _pending(tasks, store, retry_failed)
+    skipped = len(tasks) - len(pending)
     own = None
     if executor is None and pending:
         executor = own = WorkerPool(
@@ -178,7 +185,7 @@ def run_batch(
     messages: dict[str, str] = {}
     try:
         with progress_bar(progress, len(pending), unit="trip", terminal_only=True) as bar:
-            for made in _run(executor, pending, folder):
+            for made in _run(executor, pending, store):
                 bar.update()
                 if not made["new"]:
                     skipped += 1
@@ -250,48 +257,51 @@ def _fingerprint(model: str) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _make_folder(out: str | os.PathLike[str]) -> Path:
-    if not isinstance(out, (str, os.PathLike)):
-        raise InvalidInputError(f"out must be a folder, got {describe(out)}; pass its path")
-    if "://" in os.fspath(out):
-        raise InvalidInputError(f"out must be a folder, got the URL {out}; mount the storage, or copy later")
-    folder = Path(os.path.abspath(out))
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InvalidInputError(
-            f"out must be a folder, {folder} cannot be created: {error.strerror}; choose another"
-        ) from error
-    return folder
-
-
 def _plan(
     sources: Iterable[str | os.PathLike[str]],
-    out: Path,
+    store: Store,
     settings: Mapping[str, Any],
     group: str,
     part: tuple[int, int],
 ) -> list[dict[str, Any]]:
     """Describe the work on each trip of this shard."""
-    files = [each for each in list_videos(sources) if not Path(each).is_relative_to(out)]
+    listed = list_videos(sources)
+    files = [each for each in listed if not each.startswith((f"{store.name}/", f"{store.name}{os.sep}"))]
     trips = group_files(files, group)
     fingerprint = _fingerprint(settings["model"])
-    earlier = earlier_keys(out)
+    earlier: dict[str, list[str]] = {}  # keys of records by the identity of their trip
+    for key in record_keys(store):
+        earlier.setdefault(key.partition("-")[0], []).append(key)
     number, count = part
     tasks = []
     for trip in trips:
         if int(trip_id(trip), 16) % count != number - 1:
             continue
-        task = plan_trip(trip, settings, fingerprint) | {"out": str(out)}
+        task = plan_trip(trip, listed, settings, fingerprint) | {"out": store.name}
         # A trip replaces the earlier ones that began with one of its files.
         ids = (source_id(str(file)) for file in trip.files)
-        task["replaces"] = [key for each in ids for key in earlier.get(each, ()) if key != task["key"]]
+        keys = [key for each in ids for key in earlier.get(each, ())]
+        task["recorded"] = task["key"] in keys
+        task["replaces"] = [key for key in keys if key != task["key"]]
         tasks.append(task)
     return tasks
 
 
+def _pending(tasks: Iterable[dict[str, Any]], store: Store, retry_failed: bool) -> list[dict[str, Any]]:
+    """Trips that are missing, incomplete or, with `retry_failed`, have failed."""
+    records = read_records(store, (task["key"] for task in tasks if task["recorded"]))
+    outputs = {path for kind in ("tracks", "videos") for path in store.list(kind)} if records else set()
+    pending = []
+    for task in tasks:
+        record = records.get(task["key"])
+        again = retry_failed and record is not None and record["status"] == FAILED
+        if again or not is_complete(record, outputs.__contains__):
+            pending.append({**task, "again": again})
+    return pending
+
+
 def _run(
-    executor: Executor | None, pending: Iterable[dict[str, Any]], out: Path
+    executor: Executor | None, pending: Iterable[dict[str, Any]], store: Store
 ) -> Iterator[Mapping[str, Any]]:
     """Yield the record of each trip."""
     attempts: dict[str, int] = {}
@@ -324,14 +334,14 @@ def _run(
             if attempts[task["key"]] < _ATTEMPTS:
                 submit(task)
                 continue
-            record = _lost_record(task, error, out)
+            record = _lost_record(task, error, store)
         if record["status"] == BUSY:
             busy.append(task)
             continue
         yield record
 
 
-def _lost_record(task: Mapping[str, Any], error: Exception, out: Path) -> dict[str, Any]:
+def _lost_record(task: Mapping[str, Any], error: Exception, store: Store) -> dict[str, Any]:
     """Record a trip that has ended its worker in every attempt."""
     record = {
         **{name: task[name] for name in ("key", "sources", "camera", "date", "start", "settings")},
@@ -340,7 +350,7 @@ def _lost_record(task: Mapping[str, Any], error: Exception, out: Path) -> dict[s
         "started": time.time(),
     }
     try:
-        write_record(out, record)
+        write_record(store, record)
     except OSError as full:
         record["message"] += f"; {full}"
     return record | {"new": True}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -15,7 +14,9 @@ from vehicle_detection.errors import InvalidInputError
 
 @option_names(out="--output", retry_failed="--retry-failed")
 def batch(
-    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder of the results.")],
+    output: Annotated[
+        str, Option("-o", "--output", metavar="DIR|URL", help="Folder or URL (s3://...) of the results.")
+    ],
     sources: Annotated[
         list[str] | None,
         Argument(metavar="SOURCES...", help="Video files, folders, quoted patterns and URLs (s3://...)."),
@@ -48,7 +49,7 @@ def batch(
     retry_failed: Annotated[
         bool, Option("--retry-failed", help="Process trips again whose source could not be processed.")
     ] = False,
-    status: Annotated[bool, Option("--status", help="Only show what has been done in DIR.")] = False,
+    status: Annotated[bool, Option("--status", help="Only show what has been done.")] = False,
     quiet: Annotated[bool, Option("-q", "--quiet", help="Print errors only.")] = False,
 ) -> None:
     """Track the vehicles of many videos in parallel; run again to do what is missing or changed."""
