@@ -76,6 +76,15 @@ def test_a_second_run_does_what_is_missing_or_changed(card, model, tmp_path):
     check_whole(out, done=3, failed=0)
 
 
+def test_another_camera_file_changes_the_results(card, model, tmp_path):
+    camera, one = tmp_path / "camera.json", str(card / "*0930*")
+    options = {"tracks_only": True, "options": {"camera": str(camera)}}
+    for angle, done in ((60, 1), (60, 0), (120, 1)):
+        camera.write_text(json.dumps({"field_of_view": angle}))
+        assert counts(run(one, tmp_path / "out", model, **options)) == (done, 0, 0, 1 - done)
+    check_whole(tmp_path / "out", done=1, failed=0)
+
+
 def test_shards_are_disjoint_and_complete(card, model, tmp_path):
     options = {"tracks_only": True, "group": "file"}
     reports = [run(card, tmp_path / "out", model, shard=f"{n}/3", **options) for n in (1, 2, 3)]
@@ -212,6 +221,10 @@ def trip_module_id(pattern):
         ({"jobs": 0}, "jobs must be an integer"),
         ({"model": object()}, "model must be a name or the path of a file"),
         ({"options": {"camera": object()}}, "options must hold numbers, strings, lists and None"),
+        ({"options": {"evry": 2}}, "options must be arguments of VehicleDetector; .* 'evry'"),
+        ({"options": {"every": 0}}, "every must be an integer"),
+        ({"preset": "quick"}, "preset must be one of 'ultrafast'"),
+        ({"sources": []}, "sources must name at least one video, got none"),
         ({"out": 3}, "out must be a folder or a URL, got"),
         ({"out": "warp://bucket/out"}, "out warp://bucket/out cannot be opened"),
     ],

@@ -242,6 +242,10 @@ def test_batch_refuses_bad_input_in_one_line(material, tmp_path):
         r"--group must be one of 'trip', 'file'": ["x", "--group", "day"],
         r"--output \S+nothing is not a folder": ["--status", "-o", tmp_path / "nothing"],
         r"model file nothing does not exist": ["x", "--model", "nothing"],
+        r"--preset must be one of": ["x", "--preset", "quick"],
+        r"--every must be an integer": ["x", "--every", "0"],
+        r"--fov must be a number": ["x", "--fov", "999"],
+        r"--blur must be one of": ["x", "--blur", "faces"],
     }.items():
         assert re.search(message, refuse("batch", "-o", out, *words)), message
     assert succeed("batch", "-o", tmp_path, "--status").startswith("0 trips done, 0 failed, 0 errors\n")

@@ -36,8 +36,9 @@ from vehicle_detection.batch.records import (
 from vehicle_detection.batch.store import Store, open_store
 from vehicle_detection.batch.trip import BUSY, run_trip, warm_up
 from vehicle_detection.batch.workers import WorkerPool
+from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture import load_model
+from vehicle_detection.video import PRESETS
 
 # Attempts at a trip whose worker is lost.
 _ATTEMPTS = 3
@@ -168,8 +169,8 @@ def run_batch(
     check_choice(group, "group", ("trip", "file"))
     part = _parse_shard(shard)
     workers = available_cores() if jobs is None else check_integer(jobs, "jobs", low=1, high=1024)
+    check_choice(preset, "preset", PRESETS)
     settings = _settings(model, options, tracks_only=tracks_only, audio=audio, preset=preset)
-    load_model(settings["model"])  # an error now, not in every worker
     store = open_store(out, create=True)
     given = [sources] if isinstance(sources, (str, os.PathLike)) else sources
     tasks = _plan(given, store, settings, group, part)
@@ -235,13 +236,20 @@ def _settings(model: object, options: Mapping[str, Any] | None, **others: Any) -
     name = os.fspath(model)
     if not _shipped(name).is_file() and Path(name).exists():
         name = os.path.abspath(name)
-    settings = {"model": name, "options": dict(options or {}), **others}
+    given = dict(options or {})
+    if os.path.isfile(str(given.get("camera"))):
+        given["camera"] = os.path.abspath(given["camera"])
+    settings = {"model": name, "options": given, **others}
     try:
         json.dumps(settings)
     except TypeError as error:
         raise InvalidInputError(
             f"options must hold numbers, strings, lists and None, got {describe(options)}; {error}"
         ) from None
+    try:
+        VehicleDetector(name, n_jobs=1, **given).close()  # an error now, not in every worker
+    except TypeError as error:
+        raise InvalidInputError(f"options must be arguments of VehicleDetector; {error}") from None
     return settings
 
 
@@ -250,10 +258,12 @@ def _shipped(model: str) -> Traversable:
     return resources.files("vehicle_detection") / "models" / f"{model}.safetensors"
 
 
-def _fingerprint(model: str) -> str:
-    """Hash of a model's file."""
-    shipped = _shipped(model)
-    data = shipped.read_bytes() if shipped.is_file() else Path(model).read_bytes()
+def _fingerprint(settings: Mapping[str, Any]) -> str:
+    """Hash of the model's file, and of the camera's if there is one."""
+    shipped, camera = _shipped(settings["model"]), settings["options"].get("camera")
+    data = shipped.read_bytes() if shipped.is_file() else Path(settings["model"]).read_bytes()
+    if os.path.isfile(str(camera)):
+        data += Path(camera).read_bytes()
     return hashlib.sha256(data).hexdigest()
 
 
@@ -268,7 +278,7 @@ def _plan(
     listed = list_videos(sources)
     files = [each for each in listed if not each.startswith((f"{store.name}/", f"{store.name}{os.sep}"))]
     trips = group_files(files, group)
-    fingerprint = _fingerprint(settings["model"])
+    fingerprint = _fingerprint(settings)
     earlier: dict[str, list[str]] = {}  # keys of records by the identity of their trip
     for key in record_keys(store):
         earlier.setdefault(key.partition("-")[0], []).append(key)

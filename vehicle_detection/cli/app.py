@@ -17,6 +17,19 @@ from typer.core import TyperArgument, TyperGroup
 
 from vehicle_detection import __version__
 from vehicle_detection.cli.batch import batch
+from vehicle_detection.cli.options import (
+    HORIZON_HELP,
+    Blur,
+    CameraFile,
+    CameraHeight,
+    Confidence,
+    Every,
+    FieldOfView,
+    LineWidth,
+    Model,
+    NoAudio,
+    Preset,
+)
 from vehicle_detection.cli.output import (
     capture_stderr,
     check_distinct_paths,
@@ -99,41 +112,6 @@ def _global_options(
     ] = False,
 ) -> None:
     pass
-
-
-Model = Annotated[
-    str, Option(metavar="NAME|FILE", help='"default" (any road), "highway" (fastest), or a model file.')
-]
-LineWidth = Annotated[
-    int | None,
-    Option("--line-width", metavar="N", help="Width of the boxes in pixels; default: by size of the frame."),
-]
-Confidence = Annotated[
-    float | None,
-    Option(
-        metavar="P", help="Minimum confidence, a probability from 0 to 1; default: the model's threshold."
-    ),
-]
-CameraFile = Annotated[
-    str | None,
-    Option(
-        metavar="NAME|FILE",
-        help="standard-58, wide-90, fisheye-120, fisheye-140, fisheye-170 (typical lenses), or a JSON file.",
-    ),
-]
-FieldOfView = Annotated[
-    float | None,
-    Option("--fov", metavar="DEG", help="Horizontal field of view in degrees, such as 90; default: 58."),
-]
-CameraHeight = Annotated[
-    float | None,
-    Option("--camera-height", metavar="M", help="Height of the lens above the road in meters; default: 1.3."),
-]
-Blur = Annotated[
-    str | None,
-    Option(metavar="R", help='Blur "vehicles" or the region of their "plates" in what is written.'),
-]
-HORIZON_HELP = "Height of the horizon as a fraction of the frame's height, 0 at the top."
 
 
 @app.command()
@@ -378,7 +356,7 @@ def video(
             help="Labels and report in m and km/h, or ft and mph; speeds are relative to the camera.",
         ),
     ] = "metric",
-    preset: Annotated[str, Option(metavar="P", help="Encoder speed, ultrafast to placebo.")] = "veryfast",
+    preset: Preset = "veryfast",
     horizon: Annotated[
         str | None,
         Option(
@@ -388,10 +366,7 @@ def video(
     camera: CameraFile = None,
     fov: FieldOfView = None,
     camera_height: CameraHeight = None,
-    every: Annotated[
-        int | None,
-        Option(metavar="N", help="Search every N-th frame, interpolate between; default: 12 a second."),
-    ] = None,
+    every: Every = None,
     jobs: Annotated[
         int | None, Option(metavar="N", help="Frames searched in parallel; default: one per core, at most 4.")
     ] = None,
@@ -401,7 +376,7 @@ def video(
     no_reconnect: Annotated[
         bool, Option("--no-reconnect", help="End with a network stream that breaks off.")
     ] = False,
-    no_audio: Annotated[bool, Option("--no-audio", help="Write no sound.")] = False,
+    no_audio: NoAudio = False,
     strict: Annotated[
         bool, Option("--strict", help="Fail, and write nothing, if the source is damaged.")
     ] = False,

@@ -8,11 +8,28 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from vehicle_detection.cli.options import (
+    HORIZON_HELP,
+    Blur,
+    CameraFile,
+    CameraHeight,
+    Confidence,
+    Every,
+    FieldOfView,
+    Model,
+    NoAudio,
+    Preset,
+)
 from vehicle_detection.cli.output import option_names, print_error
 from vehicle_detection.errors import InvalidInputError
 
 
-@option_names(out="--output", retry_failed="--retry-failed")
+@option_names(
+    out="--output",
+    retry_failed="--retry-failed",
+    field_of_view="--fov",
+    camera_height_m="--camera-height",
+)
 def batch(
     output: Annotated[
         str, Option("-o", "--output", metavar="DIR|URL", help="Folder or URL (s3://...) of the results.")
@@ -21,9 +38,8 @@ def batch(
         list[str] | None,
         Argument(metavar="SOURCES...", help="Video files, folders, quoted patterns and URLs (s3://...)."),
     ] = None,
-    model: Annotated[
-        str, Option(metavar="NAME|FILE", help='"default" (any road), "highway" (fastest), or a model file.')
-    ] = "default",
+    model: Model = "default",
+    conf: Confidence = None,
     jobs: Annotated[
         int | None, Option(metavar="N", help="Worker processes of one thread; default: one per core.")
     ] = None,
@@ -37,15 +53,14 @@ def batch(
         str, Option(metavar="trip|file", help="Make consecutive segments one trip, or each file.")
     ] = "trip",
     tracks_only: Annotated[bool, Option("--tracks-only", help="Write no videos.")] = False,
-    horizon: Annotated[
-        float | None, Option(metavar="F", help="Height of the horizon as a fraction of the frame's height.")
-    ] = None,
-    every: Annotated[
-        int | None,
-        Option(metavar="N", help="Search every N-th frame, interpolate between; default: 12 a second."),
-    ] = None,
-    preset: Annotated[str, Option(metavar="P", help="Encoder speed, ultrafast to placebo.")] = "veryfast",
-    no_audio: Annotated[bool, Option("--no-audio", help="Write no sound.")] = False,
+    horizon: Annotated[float | None, Option(metavar="F", help=HORIZON_HELP)] = None,
+    camera: CameraFile = None,
+    fov: FieldOfView = None,
+    camera_height: CameraHeight = None,
+    every: Every = None,
+    blur: Blur = None,
+    preset: Preset = "veryfast",
+    no_audio: NoAudio = False,
     retry_failed: Annotated[
         bool, Option("--retry-failed", help="Process trips again whose source could not be processed.")
     ] = False,
@@ -62,7 +77,15 @@ def batch(
         raise InvalidInputError("SOURCES... must name at least one video, folder, pattern or URL")
     from vehicle_detection.batch import open_dask, run_batch
 
-    options: dict[str, Any] = {"horizon": horizon, "every": every}
+    options: dict[str, Any] = {
+        "conf": conf,
+        "horizon": horizon,
+        "camera": camera,
+        "field_of_view": fov,
+        "camera_height_m": camera_height,
+        "every": every,
+        "blur": blur,
+    }
     with contextlib.ExitStack() as stack:
         executor = None
         if dask is not None:

@@ -4,13 +4,14 @@ from vehicle_detection.video.ffmpeg import VideoInfo
 from vehicle_detection.video.frame_source import FrameSource
 from vehicle_detection.video.horizon import estimate_video_horizon
 from vehicle_detection.video.pipeline import VideoDetector
-from vehicle_detection.video.process import VideoReport, VideoRun, cut_video, process_video
+from vehicle_detection.video.process import PRESETS, VideoReport, VideoRun, cut_video, process_video
 from vehicle_detection.video.reading import probe_video, read_frames
 from vehicle_detection.video.remote import download, open_filesystem, with_retries
 from vehicle_detection.video.sources import Source, open_source
 from vehicle_detection.video.trips import UNKNOWN_CAMERA, Trip, find_trips, is_video_file
 
 __all__ = [
+    "PRESETS",
     "UNKNOWN_CAMERA",
     "FrameSource",
     "Source",
