@@ -314,7 +314,8 @@ def video(
         Path, Option("-o", "--output", metavar="TARGET", help="Video to write: .mp4, .m4v, .mov or .mkv.")
     ],
     tracks: Annotated[
-        Path | None, Option(metavar="FILE.csv", help="Tracks: .csv, .jsonl or .txt (MOT).")
+        Path | None,
+        Option(metavar="FILE.csv", help="Tracks: .csv, .jsonl, .parquet, .txt (MOT), .zip (CVAT) or .json."),
     ] = None,
     report: Annotated[
         Path | None, Option(metavar="FILE.html", help="Page with the video and its tracks.")
@@ -390,7 +391,7 @@ def video(
     from vehicle_detection.cli.events import EventOptions, print_summary
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.events import TrackLog
-    from vehicle_detection.export import TrackWriter
+    from vehicle_detection.export import FORMATS, TrackWriter, check_format
     from vehicle_detection.mixture import load_model
     from vehicle_detection.video import estimate_video_horizon, open_source, process_video
 
@@ -403,7 +404,7 @@ def video(
         writers: list[Callable[[Any], object]] = []
         if tracks is not None:
             with option_names(path="--tracks"):
-                writers.append(stack.enter_context(TrackWriter(tracks)))
+                check_format(tracks, None, FORMATS.values())
         loaded = load_model(model)
         if horizon == "auto":
             with _everywhere(loaded, conf) as detector:
@@ -434,8 +435,12 @@ def video(
                 )
         log = page.log if page else TrackLog()
         writers.append(page or log)
+        opened = stack.enter_context(open_source(source, live=live or None, reconnect=not no_reconnect))
+        if tracks is not None:
+            with option_names(path="--tracks"):
+                writers.append(stack.enter_context(TrackWriter(tracks, shape=opened.info.shape)))
         done = process_video(
-            stack.enter_context(open_source(source, live=live or None, reconnect=not no_reconnect)),
+            opened,
             output,
             detector,
             start=start,
