@@ -311,8 +311,12 @@ def video(
         ),
     ],
     output: Annotated[
-        Path, Option("-o", "--output", metavar="TARGET", help="Video to write: .mp4, .m4v, .mov or .mkv.")
-    ],
+        Path | None,
+        Option("-o", "--output", metavar="TARGET", help="Video to write: .mp4, .m4v, .mov or .mkv."),
+    ] = None,
+    show: Annotated[
+        bool, Option("--show", help="Show the annotated frames in a window; Escape ends the run.")
+    ] = False,
     tracks: Annotated[
         Path | None,
         Option(metavar="FILE.csv", help="Tracks: .csv, .jsonl, .parquet, .txt (MOT), .zip (CVAT) or .json."),
@@ -384,7 +388,7 @@ def video(
     quiet: Annotated[bool, Option("-q", "--quiet", help="Print errors and warnings of damage only.")] = False,
     profile: Annotated[bool, Option("--profile", help="Print the time of each stage.")] = False,
 ) -> None:
-    """Track the vehicles of a video and write an annotated copy; speeds are relative to the camera.
+    """Track the vehicles of a video, and write or show an annotated copy; speeds are relative to the camera.
 
     Exit code 3: the source is damaged, and the copy lacks what cannot be decoded.
     """
@@ -398,6 +402,12 @@ def video(
     draw_params = _draw_params(labels, line_width=line_width, color_by=color_by, panel=panel, units=units)
     outputs = {"--output": output, "--tracks": tracks, "--report": report, "--events": events}
     check_distinct_paths(outputs, {"SOURCE": Path(source)})
+    if output is None and (report or clips):
+        raise InvalidInputError(
+            f"--output must name a video for {'--report' if report else '--clips'}, which contains it; add it"
+        )
+    if not any((output, show, tracks, events)):
+        raise InvalidInputError("--output must name the video to write; or use --show, --tracks or --events")
     event_options = EventOptions(events, clips, own_speed)
     with name_kept_files(outputs.values()), contextlib.ExitStack() as stack:
         stack.enter_context(output_folder(clips, "--clips"))
@@ -426,7 +436,7 @@ def video(
             )
         )
         page = None
-        if report is not None:
+        if report is not None and output is not None:
             from vehicle_detection.report import ReportWriter
 
             with option_names(path="--report"):
@@ -450,6 +460,7 @@ def video(
             workers=jobs,
             progress=not quiet,
             strict=strict,
+            show=show,
             on_result=lambda result: [write(result) for write in writers],
         )
         found = event_options.find(log, done, detector)
@@ -472,7 +483,8 @@ def video(
     if not quiet:
         print_summary(log, found, done)
         written = [path for path in (*outputs.values(), clips) if path is not None]
-        typer.echo(f"wrote {', '.join(map(str, written))}")
+        if written:
+            typer.echo(f"wrote {', '.join(map(str, written))}")
     if done.damage:
         raise typer.Exit(DAMAGED)
 

@@ -41,14 +41,14 @@ class EventOptions:
         camera = detector.camera_of(report.shape)
         return find_events(log, fps=float(report.fps), shape=report.shape, camera=camera, own_speed_mps=speed)
 
-    def write(self, events: tuple[Event, ...], video: Path, report: VideoReport) -> None:
+    def write(self, events: tuple[Event, ...], video: Path | None, report: VideoReport) -> None:
         """Write the file of events, and their clips."""
         from vehicle_detection.events import cut_clips, write_events
 
         if self.path is not None:
             with option_names(path="--events"):
                 write_events(events, self.path)
-        if self.clips is not None:
+        if self.clips is not None and video is not None:
             cut_clips(events, video, self.clips, fps=float(report.fps))
 
 

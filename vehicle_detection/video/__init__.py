@@ -9,6 +9,7 @@ from vehicle_detection.video.reading import probe_video, read_frames
 from vehicle_detection.video.remote import download, open_filesystem, with_retries
 from vehicle_detection.video.sources import Source, open_source
 from vehicle_detection.video.trips import UNKNOWN_CAMERA, Trip, find_trips, is_video_file
+from vehicle_detection.video.viewer import Viewer, open_viewer
 
 __all__ = [
     "PRESETS",
@@ -20,6 +21,7 @@ __all__ = [
     "VideoInfo",
     "VideoReport",
     "VideoRun",
+    "Viewer",
     "cut_video",
     "download",
     "estimate_video_horizon",
@@ -27,6 +29,7 @@ __all__ = [
     "is_video_file",
     "open_filesystem",
     "open_source",
+    "open_viewer",
     "probe_video",
     "process_video",
     "read_frames",
