@@ -3,6 +3,7 @@
 import os
 import shutil
 import signal
+import subprocess
 import sys
 
 import pytest
@@ -75,9 +76,10 @@ def start(tmp_path):
     for process in started:
         if process.poll() is None:  # a test has failed: end its workers as well
             process.send_signal(signal.SIGTERM)
+        if not process.stdout.closed:
             try:
                 process.communicate(timeout=20)
-            except TimeoutError:
+            except subprocess.TimeoutExpired:
                 process.kill()
                 process.communicate()
 

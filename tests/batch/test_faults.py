@@ -1,6 +1,7 @@
 """Faults of batches: real processes that are killed, and what the next run does."""
 
 import contextlib
+import json
 import os
 import re
 import signal
@@ -23,11 +24,15 @@ def finish(process):
     return process.returncode, out, errors
 
 
-def wait_for_records(out, number):
+def wait_until(condition):
     deadline = time.monotonic() + 60
-    while len(records(out) if (out / "records").is_dir() else ()) < number:
+    while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.02)
+
+
+def wait_for_records(out, number):
+    wait_until(lambda: len(records(out)) >= number)
 
 
 def processes_below(pid):
@@ -132,6 +137,33 @@ def test_a_dask_cluster_that_loses_a_worker(many, model, tmp_path, start_batch):
     assert printed.startswith("dashboard http")
     check_numbers(printed)
     check_whole(out, done=TRIPS - 1, failed=1)
+
+
+def test_a_killed_scheduler_ends_the_run_and_the_next_one_does_the_rest(
+    many, model, tmp_path, start, start_batch, monkeypatch
+):
+    pytest.importorskip("distributed")
+    monkeypatch.setenv("DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT", "3s")
+    monkeypatch.setenv("VEHICLE_DETECTION_JOBS", "1")
+    file, out = tmp_path / "scheduler.json", tmp_path / "out"
+    words = ["--scheduler-file", file, "--no-dashboard"]
+    scheduler = start("-m", "distributed.cli.dask_scheduler", "--port", 0, *words)
+    worker = start("-m", "distributed.cli.dask_worker", *words, "--nthreads", 1, "--death-timeout", 20)
+    wait_until(lambda: file.exists() and file.read_text().endswith("}"))
+    address = json.loads(file.read_text())["address"]
+    process = start_batch(many, out, model, "--tracks-only", "--dask", address)
+    wait_for_records(out, 1)
+    scheduler.kill()
+    code, _, errors = finish(process)
+    assert code == 1, errors
+    assert "the Dask scheduler does not answer any more" in errors
+    assert "Traceback" not in errors
+    worker.terminate()
+    before = files(out / "records", "[!.]*.json")
+    code, _, errors = finish(start_batch(many, out, model, "--tracks-only"))
+    assert code == 0, errors
+    check_whole(out, done=TRIPS - 1, failed=1)
+    assert before.items() <= files(out / "records").items(), "a trip was done twice"
 
 
 def test_a_scheduler_that_does_not_answer(monkeypatch):

@@ -8,6 +8,7 @@ import os
 import queue
 import re
 import time
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future
 from dataclasses import dataclass
@@ -125,8 +126,8 @@ def run_batch(
         runs, also on several machines, may use one folder at the same time; at a URL, which has no locks, two
         of them may both process a trip.
     executor
-        A ``concurrent.futures`` executor, such as ``distributed.Client(...).get_executor(pure=False)``,
-        whose workers see the same files. None: worker processes of this machine.
+        A ``concurrent.futures`` executor, such as that of `open_dask`, whose workers see the same files.
+        None: worker processes of this machine.
     model
         A model's name or file.
     options
@@ -151,7 +152,7 @@ def run_batch(
     Returns
     -------
     BatchReport
-        Numbers of trips. A bad source, a lost worker and a full disk are counted, not raised.
+        Numbers of trips. A bad source, a lost worker or scheduler and a full disk are counted, not raised.
 
     Raises
     ------
@@ -314,7 +315,7 @@ def _run(
     executor: Executor | None, pending: Iterable[dict[str, Any]], store: Store
 ) -> Iterator[Mapping[str, Any]]:
     """Yield the record of each trip."""
-    attempts: dict[str, int] = {}
+    attempts: Counter[str] = Counter()
     running: dict[Future[Any], dict[str, Any]] = {}
     finished: queue.SimpleQueue[Future[Any]] = queue.SimpleQueue()
     busy: list[dict[str, Any]] = []
@@ -325,42 +326,63 @@ def _run(
         running[future] = task
         future.add_done_callback(finished.put)
 
-    for task in pending:
-        submit(task)
-    while running or busy:
-        if not running:  # only trips that other runs are working on are left
-            time.sleep(_BUSY_INTERVAL)
-            for task in busy:
+    waiting = deque(pending)  # not submitted; what is left if the executor breaks has an error
+    try:
+        while waiting:
+            submit(waiting[0])
+            waiting.popleft()
+        while running or busy:
+            if not running:  # only trips that other runs are working on are left
+                time.sleep(_BUSY_INTERVAL)
+                waiting, busy = deque(busy), []
+                while waiting:
+                    submit(waiting[0])
+                    waiting.popleft()
+            future = finished.get()
+            task = running.pop(future)
+            waiting.append(task)
+            record = _outcome(future, task, attempts, store)
+            if record is None:
                 submit(task)
-            busy = []
-        future = finished.get()
-        task = running.pop(future)
-        try:
-            record = future.result()
-        except BrokenExecutor:  # all other calls fail as well
-            raise
-        except Exception as error:
-            attempts[task["key"]] = attempts.get(task["key"], 0) + 1
-            if attempts[task["key"]] < _ATTEMPTS:
-                submit(task)
-                continue
-            record = _lost_record(task, error, store)
-        if record["status"] == BUSY:
-            busy.append(task)
-            continue
-        yield record
+            elif record["status"] == BUSY:
+                busy.append(task)
+            else:
+                yield record
+            waiting.pop()
+    except BrokenExecutor as error:  # such as a scheduler that was killed: the next run does the rest
+        for task in (*waiting, *running.values(), *busy):
+            yield _basic_record(task, f"{error}") | {"new": True}
+
+
+def _outcome(
+    future: Future[Any], task: Mapping[str, Any], attempts: Counter[str], store: Store
+) -> dict[str, Any] | None:
+    """Record of a call that has ended; None to try again after it has lost its worker."""
+    try:
+        record: dict[str, Any] = future.result()
+    except BrokenExecutor:  # all other calls fail as well
+        raise
+    except Exception as error:
+        attempts[task["key"]] += 1
+        return None if attempts[task["key"]] < _ATTEMPTS else _lost_record(task, error, store)
+    return record
 
 
 def _lost_record(task: Mapping[str, Any], error: Exception, store: Store) -> dict[str, Any]:
     """Record a trip that has ended its worker in every attempt."""
-    record = {
-        **{name: task[name] for name in ("key", "sources", "camera", "date", "start", "settings")},
-        "status": ERROR,
-        "message": f"{error}, {_ATTEMPTS} times",
-        "started": time.time(),
-    }
+    record = _basic_record(task, f"{error}, {_ATTEMPTS} times")
     try:
         write_record(store, record)
     except OSError as full:
         record["message"] += f"; {full}"
     return record | {"new": True}
+
+
+def _basic_record(task: Mapping[str, Any], message: str) -> dict[str, Any]:
+    """Record of a trip without a result."""
+    return {
+        **{name: task[name] for name in ("key", "sources", "camera", "date", "start", "settings")},
+        "status": ERROR,
+        "message": message,
+        "started": time.time(),
+    }
