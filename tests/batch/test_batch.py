@@ -6,14 +6,17 @@ import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import pandas
 import pytest
+from typer.testing import CliRunner
 
 from tests.batch.helpers import check_whole, counts, files, records, run
 from tests.video.clips import damage_sizes
-from vehicle_detection import batch_status, process_video, run_batch
+from vehicle_detection import batch_status, batch_summary, process_video, run_batch
 from vehicle_detection.batch import store
 from vehicle_detection.batch import trip as trip_module
 from vehicle_detection.batch.plan import list_videos
+from vehicle_detection.cli.app import app
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError, OutputError, TransientVideoError, VideoError
 from vehicle_detection.export import TrackWriter
@@ -125,6 +128,22 @@ def test_a_bad_file_is_recorded_once(many, model, tmp_path):
     status = batch_status(out)
     assert (status.done, status.failed, status.frames) == (1, 1, 12)
     assert "drive e.mp4: " in str(status)
+
+
+def test_the_summary_has_a_row_for_each_trip(many, card, model, tmp_path):
+    out = tmp_path / "out"
+    run([many / "drive a.mp4", many / "drive e.mp4", card], out, model, tracks_only=True)
+    table = batch_summary(out)
+    assert table["status"].value_counts().to_dict() == {"done": 4, "failed": 1}
+    front = table[(table["camera"] == "front") & (table["files"] == 2)].iloc[0]
+    assert (front["frames"], front["video_seconds"], front["start"]) == (24, 0.96, "2026-01-31T08:15:00")
+    assert front["first_file"] == str(card / "20260131_081500_F.mp4")
+    assert (out / front["tracks_file"]).is_file()
+    (failed,) = table[table["status"] == "failed"].to_dict("records")
+    assert "is not a video" in failed["message"]
+    command = ["batch", "-o", str(out), "--status", "--summary", str(tmp_path / "trips.csv")]
+    assert CliRunner().invoke(app, command).output.startswith("4 trips done, 1 failed")
+    assert len(pandas.read_csv(tmp_path / "trips.csv")) == 5
 
 
 def test_the_record_of_a_damaged_file_says_what_is_missing(clip, model, tmp_path):

@@ -11,12 +11,19 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vehicle_detection.batch.store import Store, open_store
 
+if TYPE_CHECKING:
+    import pandas
+
 DONE, FAILED, ERROR = "done", "failed", "error"
 _FOLDER = "records"
+_SUMMARY_COLUMNS = (
+    "key", "status", "camera", "date", "start", "first_file", "files", "frames", "video_seconds", "tracks",
+    "work_seconds", "message", "damage", "tracks_file", "video_file",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,3 +162,53 @@ def batch_status(out: str | os.PathLike[str]) -> BatchStatus:
         work_seconds=float(sums["seconds"]),
         messages=dict(sorted(messages.items())),
     )
+
+
+def batch_summary(out: str | os.PathLike[str]) -> pandas.DataFrame:
+    """Summarize each trip of a batch in a row of a table, also while it runs.
+
+    Parameters
+    ----------
+    out
+        Folder or URL of the batch.
+
+    Returns
+    -------
+    pandas.DataFrame
+        In the order of date, camera and first file: ``key, status, camera, date, start, first_file, files,
+        frames, video_seconds, tracks, work_seconds, message, damage, tracks_file, video_file``. Values that a
+        trip does not have are missing.
+
+    Raises
+    ------
+    InvalidInputError
+        If the folder does not exist.
+    OutputError
+        If the storage of the URL does not answer.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> len(batch_summary(tempfile.mkdtemp()))
+    0
+    """
+    import pandas
+
+    store = open_store(out)
+    rows = [_summary_row(key, record) for key, record in read_records(store, record_keys(store)).items()]
+    rows.sort(key=lambda row: (row["date"] or "", row["camera"] or "", row["first_file"]))
+    return pandas.DataFrame(rows, columns=_SUMMARY_COLUMNS)
+
+
+def _summary_row(key: str, record: Mapping[str, Any]) -> dict[str, Any]:
+    sources, outputs = record["sources"], record.get("outputs", {})
+    same = ("status", "camera", "date", "start", "frames", "video_seconds", "tracks", "message", "damage")
+    return {
+        "key": key,
+        "first_file": sources[0]["uri"],
+        "files": len(sources),
+        "work_seconds": record.get("seconds"),
+        "tracks_file": outputs.get("tracks"),
+        "video_file": outputs.get("video"),
+        **{name: record.get(name) for name in same},
+    }

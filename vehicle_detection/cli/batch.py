@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -65,13 +66,21 @@ def batch(
         bool, Option("--retry-failed", help="Process trips again whose source could not be processed.")
     ] = False,
     status: Annotated[bool, Option("--status", help="Only show what has been done.")] = False,
+    summary: Annotated[
+        Path | None, Option(metavar="FILE.csv", help="Table with a row for each trip that has been done.")
+    ] = None,
     quiet: Annotated[bool, Option("-q", "--quiet", help="Print errors only.")] = False,
 ) -> None:
     """Track the vehicles of many videos in parallel; run again to do what is missing or changed."""
+    if summary is not None:
+        from vehicle_detection._common import check_target
+
+        check_target(summary, "--summary")
     if status:
         from vehicle_detection.batch import batch_status
 
         typer.echo(str(batch_status(output)))
+        _write_summary(output, summary)
         return
     if not sources:
         raise InvalidInputError("SOURCES... must name at least one video, folder, pattern or URL")
@@ -109,8 +118,21 @@ def batch(
         )
     for source, message in done.messages.items():
         print_error(f"warning: {source}: {message}")
+    _write_summary(output, summary)
     if not quiet:
         typer.echo(str(done))
-        typer.echo(f"wrote {output}")
+        typer.echo(f"wrote {output}" + (f", {summary}" if summary else ""))
     if done.errors:  # the machine's fault: a job that is started again does the rest
         raise typer.Exit(1)
+
+
+def _write_summary(output: str, summary: Path | None) -> None:
+    """Write the table of all trips of a batch."""
+    if summary is None:
+        return
+    from vehicle_detection._common import atomic_write
+    from vehicle_detection.batch import batch_summary
+
+    table = batch_summary(output)
+    with atomic_write(summary, "--summary") as part:
+        table.to_csv(part, index=False)
