@@ -121,17 +121,17 @@ def test_a_store_is_the_same_for_a_folder_and_a_url(tmp_path, bucket):
         opened = open_store(out, create=True)
         assert not opened.exists("tracks/x")
         assert opened.read("tracks/x") is None
-        assert opened.list("tracks") == []
+        assert opened.list_files("tracks") == []
         opened.publish(file, "tracks/day/ab-1.txt")
         opened.write("tracks/day/cd-2.txt", b"small")
         opened.write("tracks/day/cd-2.txt", b"smaller")
-        assert sorted(opened.list("tracks")) == ["tracks/day/ab-1.txt", "tracks/day/cd-2.txt"]
-        assert opened.list("tracks/day", "ab-") == ["tracks/day/ab-1.txt"]
+        assert sorted(opened.list_files("tracks")) == ["tracks/day/ab-1.txt", "tracks/day/cd-2.txt"]
+        assert opened.list_files("tracks/day", "ab-") == ["tracks/day/ab-1.txt"]
         paths = ["tracks/day/ab-1.txt", "tracks/missing", "tracks/day/cd-2.txt"]
         assert dict(opened.read_many(paths)) == {paths[0]: b"whole", paths[2]: b"smaller"}
         assert dict(opened.read_many([])) == {}
         opened.remove("tracks/day/ab-1.txt")
         opened.remove("tracks/missing")
-        assert opened.list("tracks") == ["tracks/day/cd-2.txt"]
+        assert opened.list_files("tracks") == ["tracks/day/cd-2.txt"]
         with opened.lock("ab") as locked:
             assert locked

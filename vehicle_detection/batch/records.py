@@ -116,7 +116,7 @@ def is_complete(record: Mapping[str, Any] | None, exists: Callable[[str], bool])
 
 def record_keys(store: Store) -> list[str]:
     """Keys of all records."""
-    return [_key(path) for path in store.list(_FOLDER) if path.endswith(".json")]
+    return [_key(path) for path in store.list_files(_FOLDER) if path.endswith(".json")]
 
 
 def batch_status(out: str | os.PathLike[str]) -> BatchStatus:

@@ -301,7 +301,7 @@ def _plan(
 def _pending(tasks: Iterable[dict[str, Any]], store: Store, retry_failed: bool) -> list[dict[str, Any]]:
     """Trips that are missing, incomplete or, with `retry_failed`, have failed."""
     records = read_records(store, (task["key"] for task in tasks if task["recorded"]))
-    outputs = {path for kind in ("tracks", "videos") for path in store.list(kind)} if records else set()
+    outputs = {path for kind in ("tracks", "videos") for path in store.list_files(kind)} if records else set()
     pending = []
     for task in tasks:
         record = records.get(task["key"])

@@ -35,7 +35,7 @@ class Store(Protocol):
     def read_many(self, paths: Iterable[str]) -> Iterator[tuple[str, bytes]]:
         """Yield paths and contents of files; files that have gone are left out."""
 
-    def list(self, folder: str, prefix: str = "") -> list[str]:
+    def list_files(self, folder: str, prefix: str = "") -> list[str]:
         """Paths of the files in a folder and below, whose names start with `prefix`."""
 
     def publish(self, file: Path, path: str) -> None:
@@ -100,7 +100,7 @@ class LocalStore:
             if data is not None:
                 yield path, data
 
-    def list(self, folder: str, prefix: str = "") -> list[str]:
+    def list_files(self, folder: str, prefix: str = "") -> list[str]:
         """Paths of the files in a folder and below, whose names start with `prefix`."""
         found = []
         for parent, _, names in os.walk(self.folder / folder):
@@ -218,7 +218,7 @@ class RemoteStore:
             if data is not None:
                 yield path, data
 
-    def list(self, folder: str, prefix: str = "") -> list[str]:
+    def list_files(self, folder: str, prefix: str = "") -> list[str]:
         """Paths of the files in a folder and below, whose names start with `prefix`."""
 
         def find() -> list[str]:

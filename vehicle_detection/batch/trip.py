@@ -196,5 +196,5 @@ def _remove_earlier(store: Store, task: Mapping[str, Any]) -> None:
     # Outputs whose record a killed process did not write any more.
     identity, place = task["key"].partition("-")[0], f"date={task['date']}/camera={task['camera']}"
     for kind in ("tracks", "videos"):
-        for path in store.list(f"{kind}/{place}", f"{identity}-"):
+        for path in store.list_files(f"{kind}/{place}", f"{identity}-"):
             store.remove(path)
