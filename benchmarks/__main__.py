@@ -12,6 +12,7 @@ from rich.console import Console
 
 from benchmarks import (
     _accuracy,
+    _batch,
     _compare,
     _drives,
     _features,
@@ -36,6 +37,7 @@ BENCHMARKS: dict[str, Callable[[Context], list[Row]]] = {
     "accuracy": _accuracy.run,
     "frames": _frames.run,
     "drives": _drives.run,
+    "batch": _batch.run,
     "scaling": _scaling.run,
     "wrappers": _wrappers.run,
     "peers": _peers.run,

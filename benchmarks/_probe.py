@@ -1,7 +1,7 @@
 """Measurements in a process of their own, which print one line of JSON.
 
-``python -m benchmarks._probe startup FRAME.npy [--kernels]`` and ``... memory VIDEO TARGET``. Only the
-standard library is imported before the measurement starts.
+``python -m benchmarks._probe startup FRAME.npy [--kernels]``, ``... memory VIDEO TARGET`` and
+``... videos|trips FOLDER OUTPUT``. Only the standard library is imported before the measurement starts.
 """
 
 from __future__ import annotations
@@ -84,6 +84,36 @@ def memory(source: str, target: str) -> dict[str, Any]:
     return {"frames": len(times), "peak": peak_memory(), "memory": sampled, "times": times}
 
 
+def videos(folder: str, out: str) -> dict[str, Any]:
+    """Process each video of a folder with one thread, as a worker of a batch does."""
+    import vehicle_detection
+
+    frames = 0
+    with vehicle_detection.VehicleDetector(n_jobs=1) as detector:
+        for path in sorted(Path(folder).iterdir()):
+            target = Path(out) / path.name
+            with vehicle_detection.TrackWriter(target.with_suffix(".parquet")) as write:
+                done = vehicle_detection.process_video(
+                    path, target, detector, workers=1, progress=False, on_result=write
+                )
+                frames += done.frames
+    return {"frames": frames}
+
+
+def trips(folder: str, out: str) -> dict[str, Any]:
+    """Process the trips of a batch in this process, and sample its memory after each."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    import vehicle_detection
+
+    sampled: list[int] = []
+    with ThreadPoolExecutor(1) as executor:
+        vehicle_detection.run_batch(
+            folder, out, executor, progress=False, on_record=lambda _: sampled.append(current_memory())
+        )
+    return {"memory": sampled}
+
+
 def peak_memory() -> int:
     """Peak resident memory of this process in bytes.
 
@@ -112,7 +142,10 @@ def current_memory() -> int:
 def main(arguments: list[str]) -> None:
     """Run the named measurement."""
     kind, *rest = arguments
-    found = startup(rest[0], kernels="--kernels" in rest) if kind == "startup" else memory(*rest)
+    if kind == "startup":
+        found = startup(rest[0], kernels="--kernels" in rest)
+    else:
+        found = {"memory": memory, "videos": videos, "trips": trips}[kind](*rest)
     print(json.dumps(found))
 
 

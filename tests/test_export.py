@@ -2,6 +2,7 @@ import csv
 import json
 import os
 import sys
+import zipfile
 from types import SimpleNamespace
 
 import numpy as np
@@ -232,7 +233,7 @@ def test_the_format_may_be_named(tmp_path):
     with TrackWriter(tmp_path / "t.json", format="jsonl") as write:
         write(ROWS[0])
     assert len(read_jsonl(tmp_path / "t.json")) == 1
-    assert set(FORMATS.values()) == {"csv", "jsonl", "parquet", "mot", "coco"}
+    assert set(FORMATS.values()) == {"csv", "jsonl", "parquet", "mot", "mot_zip", "coco"}
 
 
 # --- streaming ---
@@ -375,7 +376,7 @@ def test_bad_rows(tmp_path, row, message):
         (
             ROWS,
             {"path": "t.xlsx"},
-            r"path must end in .csv, .jsonl, .ndjson, .parquet, .txt, .json, got 't.xlsx'",
+            r"path must end in .csv, .jsonl, .ndjson, .parquet, .txt, .json, .zip, got 't.xlsx'",
         ),
         (ROWS, {"path": "t"}, r"path must end in"),
         (ROWS, {"format": "excel"}, "format must be one of 'csv', 'jsonl', 'parquet', 'mot', 'coco'"),
@@ -397,7 +398,58 @@ def test_bad_arguments(tmp_path, monkeypatch, items, options, message):
 def test_a_missing_pyarrow_is_reported_before_the_video(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(InvalidInputError, match=r"a .parquet file needs pyarrow; pip install"):
-        TrackWriter(tmp_path / "t.parquet")
+        TrackWriter(tmp_path / "t.parquet").__enter__()
+    assert os.listdir(tmp_path) == []
+
+
+def test_yolo_needs_the_shape_and_a_new_folder(tmp_path):
+    with pytest.raises(InvalidInputError, match=r"shape must be \(height, width\) of the frames for YOLO"):
+        write_tracks(ROWS, tmp_path / "yolo", format="yolo")
+    (tmp_path / "file").touch()
+    with pytest.raises(InvalidInputError, match="path must be a new or empty folder for YOLO"):
+        write_tracks(ROWS, tmp_path, format="yolo", shape=(720, 1280))
+    with pytest.raises(InvalidInputError, match="row 0 must be a FrameResult"):
+        write_tracks([3], tmp_path / "yolo", format="yolo", shape=(720, 1280))
+    assert os.listdir(tmp_path) == ["file"]
+
+
+def test_the_archive_for_cvat(tmp_path):
+    write_tracks(RESULTS, tmp_path / "t.zip")
+    with zipfile.ZipFile(tmp_path / "t.zip") as archive:
+        assert sorted(archive.namelist()) == ["gt/gt.txt", "gt/labels.txt"]
+        assert archive.read("gt/labels.txt") == b"vehicle\n"
+        lines = archive.read("gt/gt.txt").decode().splitlines()
+    track = next(track for track in RESULTS[0].tracks if track.shown)
+    # Frames count from 1 and pixels from 0; the flag, the class and the visible fraction are 1.
+    x1, y1, x2, y2 = (round(float(side), 2) for side in track.box)
+    sides = ",".join(str(round(value, 9)) for value in (x1, y1, x2 - x1, y2 - y1))
+    assert lines[0] == f"{RESULTS[0].index + 1},{track.id},{sides},1,1,1.0"
+    assert len(lines) == 3
+
+
+def test_a_yolo_folder_has_a_file_for_each_frame(tmp_path):
+    rows = [(0, 7, 10, 20, 50, 60, 0.0), (0, 8, 0, 0, 100, 100, 3.0, None, None, 0.9)]
+    write_tracks(rows, tmp_path / "yolo", format="yolo", shape=(100, 200, 3))
+    (file,) = (tmp_path / "yolo" / "labels").iterdir()
+    assert file.name == "000000.txt"
+    assert file.read_text().splitlines() == [
+        "0 0.150000 0.400000 0.200000 0.400000 0.500000 7",
+        "0 0.250000 0.500000 0.500000 1.000000 0.900000 8",
+    ]
+    found = Detections([[10, 20, 50, 60]], [0.0])
+    boxes = [("a.jpg", found), ("b.jpg", Detections.empty())]
+    assert write_boxes(boxes, tmp_path / "boxes", format="yolo", shape=(100, 200)) == 1
+    texts = {path.name: path.read_text() for path in (tmp_path / "boxes" / "labels").iterdir()}
+    assert texts == {"a.txt": "0 0.150000 0.400000 0.200000 0.400000 0.500000\n", "b.txt": ""}
+
+
+def test_memory_does_not_grow_with_the_number_of_parquet_rows(tmp_path, monkeypatch):
+    monkeypatch.setattr("vehicle_detection._common.parquet._ROWS_PER_GROUP", 2)
+    write_tracks([(frame, 1, 0, 0, 5, 5, 1.0) for frame in range(5)], tmp_path / "t.parquet")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    file = parquet.ParquetFile(tmp_path / "t.parquet")
+    assert file.num_row_groups == 3
+    assert file.read()["frame"].to_pylist() == [0, 1, 2, 3, 4]
 
 
 def test_stills_have_no_mot_and_no_frame_numbers(tmp_path):

@@ -191,7 +191,7 @@ def test_unknown_names():
 
 def test_every_exception_is_one_of_the_library():
     kinds = [value for value in vars(errors).values() if inspect.isclass(value)]
-    assert len(kinds) == 7
+    assert len(kinds) == 8
     assert all(issubclass(kind, errors.VehicleDetectionError) for kind in kinds)
     assert {kind.__name__ for kind in kinds} <= set(vehicle_detection.__all__)
 

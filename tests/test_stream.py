@@ -60,6 +60,13 @@ def test_the_frames_are_those_of_process_video(clip, detector, tmp_path):
     assert found[0].picture is found[0].picture
 
 
+def test_the_number_of_threads_changes_nothing(clip, detector):
+    expected = boxes(track(clip, detector, workers=1))
+    assert any(tracks for _, _, tracks in expected)
+    for workers in (2, 3, 7):
+        assert boxes(track(clip, detector, workers=workers)) == expected
+
+
 def test_identities_carry_over_from_segment_to_segment(clip, detector, tmp_path):
     whole, card = tmp_path / "whole.mp4", tmp_path / "card"
     card.mkdir()

@@ -1,5 +1,5 @@
 from . import course, plotting
-from .batch import BatchReport, BatchStatus, batch_status, open_dask, run_batch
+from .batch import BatchReport, BatchStatus, batch_status, batch_summary, open_dask, run_batch
 from .boxes import Detections, clip_boxes, iou_matrix, non_max_suppression
 from .camera import Camera, HorizonEstimate, estimate_horizon, read_camera, write_camera
 from .classifier import VehicleClassifier, load_classifier, train_classifier
@@ -34,6 +34,7 @@ from .errors import (
     InvalidInputError,
     ModelFileError,
     OutputError,
+    TransientVideoError,
     VehicleDetectionError,
     VideoError,
 )
@@ -167,6 +168,7 @@ __all__ = [
     "TrackWriter",
     "TrackedFrame",
     "Tracker",
+    "TransientVideoError",
     "TrialOptions",
     "Trip",
     "VehicleClassifier",
@@ -179,6 +181,7 @@ __all__ = [
     "add_heat",
     "apply_threshold",
     "batch_status",
+    "batch_summary",
     "bin_spatial",
     "blur_boxes",
     "bounding_boxes",

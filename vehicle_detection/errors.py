@@ -29,3 +29,10 @@ class OutputError(VehicleDetectionError, OSError):
 
 class VideoError(VehicleDetectionError):
     """A video cannot be read or written."""
+
+
+class TransientVideoError(VideoError):
+    """A video cannot be read or written for a reason outside the file; the next attempt may succeed.
+
+    Such reasons are an ffmpeg that was killed, a full disk, and a network or storage that does not answer.
+    """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Generator
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from vehicle_detection.confidence import Model
 from vehicle_detection.detector import FrameResult, VehicleDetector
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.tracking import Track
-from vehicle_detection.video import Source, VideoRun
+from vehicle_detection.video import Source, VideoRun, open_viewer
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +90,7 @@ def track(
     start: float | None = ...,
     end: float | None = ...,
     workers: int | None = ...,
+    show: bool = ...,
     progress: bool = ...,
     **options: Any,
 ) -> Generator[TrackedFrame]: ...
@@ -101,6 +103,7 @@ def track(
     start: float | None = ...,
     end: float | None = ...,
     workers: int | None = ...,
+    show: bool = ...,
     progress: bool = ...,
     **options: Any,
 ) -> list[FrameResult]: ...
@@ -114,6 +117,7 @@ def track(
     start: float | None = None,
     end: float | None = None,
     workers: int | None = None,
+    show: bool = False,
     progress: bool = False,
     **options: Any,
 ) -> Generator[TrackedFrame] | list[FrameResult]:
@@ -133,6 +137,9 @@ def track(
     workers
         Number of frames searched in parallel; None: one per core, at most four. The results do not depend on
         it.
+    show
+        Show the annotated frames in a window, or in a notebook below the cell. Closing the window, or the key
+        Escape, ends the results.
     progress
         Show a progress bar if standard error is a terminal.
     **options
@@ -165,38 +172,41 @@ def track(
             "them to the detector"
         )
     detector = model if isinstance(model, VehicleDetector) else VehicleDetector(model, **options)
+    frames: Literal["none", "plain"] = "plain" if stream or show else "none"
     try:
-        run = VideoRun(source, detector, start=start, end=end, workers=workers, with_frames=stream)
+        run = VideoRun(source, detector, start=start, end=end, workers=workers, frames=frames)
     except BaseException:
         if not given:
             detector.close()
         raise
-    frames = _frames(run, detector, close=not given, progress=progress)
-    next(frames)  # enter the generator: closing it now closes the source
+    results = _frames(run, detector, close=not given, show=show, progress=progress)
+    next(results)  # enter the generator: closing it now closes the source
     if stream:
-        return frames  # type: ignore[return-value]
+        return results  # type: ignore[return-value]
     if run.source.live and end is None:
-        frames.close()
+        results.close()
         raise InvalidInputError(
             f"source {run.source.name} has no end, so its results cannot be listed; pass stream=True, "
             "or an end in seconds"
         )
-    return [item.result for item in frames if item is not None]
+    return [item.result for item in results if item is not None]
 
 
 def _frames(
-    run: VideoRun, detector: VehicleDetector, *, close: bool, progress: bool
+    run: VideoRun, detector: VehicleDetector, *, close: bool, show: bool, progress: bool
 ) -> Generator[TrackedFrame | None]:
     """Yield None once, then the frames; close everything at the end."""
-    try:
-        yield None
-        results = run.results(progress=progress)
-        try:
-            for frame, result in results:
-                yield TrackedFrame(frame, result, detector)  # type: ignore[arg-type]
-        finally:
-            results.close()
-    finally:
-        run.close()
+    with contextlib.ExitStack() as stack:
         if close:
-            detector.close()
+            stack.callback(detector.close)
+        stack.callback(run.close)
+        yield None
+        viewer = stack.enter_context(contextlib.closing(open_viewer(run.source.name))) if show else None
+        results = stack.enter_context(contextlib.closing(run.results(progress=progress)))
+        for frame, result in results:
+            tracked = TrackedFrame(frame, result, detector)  # type: ignore[arg-type]
+            if viewer is not None:
+                viewer.show(tracked.picture)
+            yield tracked
+            if viewer is not None and viewer.closed:
+                break

@@ -1,121 +1,27 @@
-"""Batches: outputs, resuming, and what happens when files, workers or runs fail."""
+"""Batches: outputs, resuming, and trips that fail."""
 
-import contextlib
 import json
 import os
-import re
 import shutil
-import signal
-import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
+import pandas
 import pytest
+from typer.testing import CliRunner
 
-from tests.helpers import ROOT, random_mixture, start_interruptible
-from tests.video.clips import child_processes, damage_sizes
-from vehicle_detection import batch_status, open_dask, process_video, run_batch
+from tests.batch.helpers import check_whole, counts, files, records, run
+from tests.video.clips import damage_sizes
+from vehicle_detection import batch_status, batch_summary, process_video, run_batch
+from vehicle_detection.batch import store
 from vehicle_detection.batch import trip as trip_module
-from vehicle_detection.batch import workers
 from vehicle_detection.batch.plan import list_videos
-from vehicle_detection.cli.demo import draw_clip
+from vehicle_detection.cli.app import app
 from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.errors import InvalidInputError, OutputError, TransientVideoError, VideoError
 from vehicle_detection.export import TrackWriter
-from vehicle_detection.synthetic import render_drive
-from vehicle_detection.video import probe_video
 
 parquet = pytest.importorskip("pyarrow.parquet")
-
-TRIPS = 10
-CUT = 4  # the trip with a damaged file
-
-
-@pytest.fixture(scope="module")
-def clip(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("batch")
-    drive = render_drive(frames=12, shape=(180, 320), scenario="overtaking")
-    draw_clip(drive, folder / "clip.mp4", folder / "labels.csv")
-    return folder / "clip.mp4"
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory):
-    path = tmp_path_factory.mktemp("model") / "small.safetensors"
-    random_mixture().save(path)
-    return path
-
-
-@pytest.fixture(autouse=True)
-def private_scratch(tmp_path, monkeypatch):
-    (tmp_path / "scratch").mkdir()
-    # `tempfile` reads the variable once.
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "scratch"))
-    monkeypatch.setenv("TMPDIR", str(tmp_path / "scratch"))
-    if "NUMBA_CACHE_DIR" not in os.environ:
-        monkeypatch.setenv("NUMBA_CACHE_DIR", str(ROOT / ".pytest_cache" / "kernels"))
-
-
-@pytest.fixture
-def card(clip, tmp_path):
-    """Two cameras with one trip of two segments each, and another drive."""
-    folder = tmp_path / "card"
-    folder.mkdir()
-    seconds = probe_video(clip).duration
-    for name in ("081500_F", "081501_F", "081500_R", "081501_R", "093000_F"):
-        shutil.copy(clip, folder / f"20260131_{name}.mp4")
-    assert round(seconds, 1) == 0.5
-    return folder
-
-
-@pytest.fixture
-def many(clip, tmp_path):
-    """Ten files, of which one is cut."""
-    folder = tmp_path / "many"
-    folder.mkdir()
-    for number in range(TRIPS):
-        shutil.copy(clip, folder / f"drive {chr(97 + number)}.mp4")
-    cut = folder / f"drive {chr(97 + CUT)}.mp4"
-    cut.write_bytes(cut.read_bytes()[:4000])
-    return folder
-
-
-def run(sources, out, model, **options):
-    with ThreadPoolExecutor(1) as executor:
-        return run_batch(sources, out, executor, model=model, progress=False, **options)
-
-
-def counts(report):
-    return report.done, report.failed, report.errors, report.skipped
-
-
-def files(folder, pattern="*"):
-    return {path: path.stat().st_mtime_ns for path in folder.rglob(pattern) if path.is_file()}
-
-
-def records(out):
-    return {path.stem: json.loads(path.read_text()) for path in (out / "records").glob("*.json")}
-
-
-def check_whole(out, *, done, failed):
-    """Assert that every record is complete, and that there is nothing else."""
-    found = records(out)
-    by_status = {status: [key for key, each in found.items() if each["status"] == status] for status in
-                 ("done", "failed", "error")}  # fmt: skip
-    assert {status: len(keys) for status, keys in by_status.items()} == {
-        "done": done, "failed": failed, "error": 0
-    }  # fmt: skip
-    expected = {out / path for each in found.values() for path in each.get("outputs", {}).values()}
-    expected |= {out / "records" / f"{key}.json" for key in found}
-    assert set(files(out)) == expected
-    for key in by_status["done"]:
-        table = parquet.read_table(out / found[key]["outputs"]["tracks"], partitioning=None)
-        assert table.num_rows == found[key]["rows"] > 0
-        assert set(table["trip"].to_pylist()) == {key}
-        if "video" in found[key]["outputs"]:
-            assert probe_video(out / found[key]["outputs"]["video"]).frames == found[key]["frames"]
-    return found
 
 
 def test_outputs_are_partitioned_and_equal_process_video(card, model, tmp_path):
@@ -173,6 +79,15 @@ def test_a_second_run_does_what_is_missing_or_changed(card, model, tmp_path):
     check_whole(out, done=3, failed=0)
 
 
+def test_another_camera_file_changes_the_results(card, model, tmp_path):
+    camera, one = tmp_path / "camera.json", str(card / "*0930*")
+    options = {"tracks_only": True, "options": {"camera": str(camera)}}
+    for angle, done in ((60, 1), (60, 0), (120, 1)):
+        camera.write_text(json.dumps({"field_of_view": angle}))
+        assert counts(run(one, tmp_path / "out", model, **options)) == (done, 0, 0, 1 - done)
+    check_whole(tmp_path / "out", done=1, failed=0)
+
+
 def test_shards_are_disjoint_and_complete(card, model, tmp_path):
     options = {"tracks_only": True, "group": "file"}
     reports = [run(card, tmp_path / "out", model, shard=f"{n}/3", **options) for n in (1, 2, 3)]
@@ -215,6 +130,22 @@ def test_a_bad_file_is_recorded_once(many, model, tmp_path):
     assert "drive e.mp4: " in str(status)
 
 
+def test_the_summary_has_a_row_for_each_trip(many, card, model, tmp_path):
+    out = tmp_path / "out"
+    run([many / "drive a.mp4", many / "drive e.mp4", card], out, model, tracks_only=True)
+    table = batch_summary(out)
+    assert table["status"].value_counts().to_dict() == {"done": 4, "failed": 1}
+    front = table[(table["camera"] == "front") & (table["files"] == 2)].iloc[0]
+    assert (front["frames"], front["video_seconds"], front["start"]) == (24, 0.96, "2026-01-31T08:15:00")
+    assert front["first_file"] == str(card / "20260131_081500_F.mp4")
+    assert (out / front["tracks_file"]).is_file()
+    (failed,) = table[table["status"] == "failed"].to_dict("records")
+    assert "is not a video" in failed["message"]
+    command = ["batch", "-o", str(out), "--status", "--summary", str(tmp_path / "trips.csv")]
+    assert CliRunner().invoke(app, command).output.startswith("4 trips done, 1 failed")
+    assert len(pandas.read_csv(tmp_path / "trips.csv")) == 5
+
+
 def test_the_record_of_a_damaged_file_says_what_is_missing(clip, model, tmp_path):
     source = damage_sizes(clip, tmp_path / "lost.mp4", entry=3, byte=0, flip=64)
     assert counts(run(str(source), tmp_path / "out", model, tracks_only=True)) == (1, 0, 0, 0)
@@ -229,7 +160,7 @@ def test_a_full_disk_is_an_error_that_the_next_run_repeats(card, model, tmp_path
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(trip_module, "_publish", fill)
+        patch.setattr(store.LocalStore, "publish", fill)
         report = run(source, out, model)
     assert counts(report) == (0, 0, 1, 0)
     assert "No space left" in next(iter(report.messages.values()))
@@ -237,6 +168,41 @@ def test_a_full_disk_is_an_error_that_the_next_run_repeats(card, model, tmp_path
     assert counts(run(source, out, model)) == (1, 0, 0, 0)
     check_whole(out, done=1, failed=0)
     assert not list((tmp_path / "scratch").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("number", "status"), [("KILL", "error"), ("XCPU", "error"), ("SEGV", "failed"), (None, "failed")]
+)
+def test_a_killed_ffmpeg_is_an_error_and_a_crashed_one_a_failure(
+    card, model, tmp_path, monkeypatch, number, status
+):
+    """A stand-in for ffmpeg ends by a signal, or with an error about the file."""
+    program = tmp_path / "ffmpeg"
+    program.write_text(f"#!/bin/sh\n{f'kill -{number} $$' if number else 'exit 1'}\n")
+    program.chmod(0o755)
+    monkeypatch.setattr("vehicle_detection.video.ffmpeg.ffmpeg_binary", lambda: str(program))
+    report = run(str(card / "*0930*"), tmp_path / "out", model)
+    assert [record["status"] for record in records(tmp_path / "out").values()] == [status]
+    assert counts(report) == (0, status == "failed", status == "error", 0)
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (VideoError("cut"), "failed"),
+        (InvalidInputError("no such file"), "failed"),
+        (TransientVideoError("no answer"), "error"),
+        (OutputError("the disk is full"), "error"),
+        (MemoryError(), "error"),
+    ],
+)
+def test_what_the_machine_is_to_blame_for_is_an_error(card, model, tmp_path, monkeypatch, error, status):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(trip_module, "process_video", fail)
+    run(str(card / "*0930*"), tmp_path / "out", model)
+    assert [record["status"] for record in records(tmp_path / "out").values()] == [status]
 
 
 def test_a_trip_that_another_run_is_working_on_is_awaited(card, model, tmp_path):
@@ -259,7 +225,7 @@ def test_a_trip_that_another_run_is_working_on_is_awaited(card, model, tmp_path)
 def trip_module_id(pattern):
     from vehicle_detection.batch.plan import source_id
 
-    return source_id(list_videos([pattern])[0])
+    return source_id(next(iter(list_videos([pattern]))))
 
 
 @pytest.mark.parametrize(
@@ -274,7 +240,12 @@ def trip_module_id(pattern):
         ({"jobs": 0}, "jobs must be an integer"),
         ({"model": object()}, "model must be a name or the path of a file"),
         ({"options": {"camera": object()}}, "options must hold numbers, strings, lists and None"),
-        ({"out": "s3://bucket/out"}, "out must be a folder, got the URL"),
+        ({"options": {"evry": 2}}, "options must be arguments of VehicleDetector; .* 'evry'"),
+        ({"options": {"every": 0}}, "every must be an integer"),
+        ({"preset": "quick"}, "preset must be one of 'ultrafast'"),
+        ({"sources": []}, "sources must name at least one video, got none"),
+        ({"out": 3}, "out must be a folder or a URL, got"),
+        ({"out": "warp://bucket/out"}, "out warp://bucket/out cannot be opened"),
     ],
 )
 def test_bad_arguments(card, model, tmp_path, monkeypatch, options, message):
@@ -285,39 +256,6 @@ def test_bad_arguments(card, model, tmp_path, monkeypatch, options, message):
         run_batch([sources] if sources == 3 else sources, given.pop("out"), progress=False, **given)
     with pytest.raises(InvalidInputError, match="out nowhere is not a folder"):
         batch_status("nowhere")
-
-
-def test_remote_sources_are_listed():
-    fsspec = pytest.importorskip("fsspec")
-    for name in ("a.mp4", "b.MP4", "c.txt"):
-        with fsspec.open(f"memory://fleet/day/{name}", "wb") as file:
-            file.write(b"x")
-    expected = ["memory:///fleet/day/a.mp4", "memory:///fleet/day/b.MP4"]
-    assert list_videos(["memory://fleet/day/*"]) == list_videos(["memory://fleet"]) == expected
-
-
-def test_storage_that_fails_every_other_request(clip, model, tmp_path, monkeypatch):
-    fsspec = pytest.importorskip("fsspec")
-    for name in "ab":
-        with fsspec.open(f"memory://unsteady/{name}.mp4", "wb") as file:
-            file.write(clip.read_bytes())
-    memory = type(fsspec.filesystem("memory"))
-    original, requests = memory.get_file, []
-
-    def get_file(*args, **kwargs):
-        requests.append(args)
-        if len(requests) % 2:
-            raise ConnectionResetError("connection reset by peer")
-        return original(*args, **kwargs)
-
-    monkeypatch.setattr("vehicle_detection.video.sources._RETRY_DELAYS", (0, 0))
-    monkeypatch.setattr(memory, "get_file", get_file)
-    out = tmp_path / "out"
-    url = "memory://unsteady/*.mp4"
-    assert counts(run(url, out, model, tracks_only=True)) == (2, 0, 0, 0)
-    assert counts(run(url, out, model, tracks_only=True)) == (0, 0, 0, 2)
-    assert len(requests) == 4
-    check_whole(out, done=2, failed=0)
 
 
 def test_the_status_of_ten_thousand_trips(tmp_path):
@@ -334,144 +272,3 @@ def test_the_status_of_ten_thousand_trips(tmp_path):
     assert time.process_time() - started < 2
     assert (status.done, status.frames, status.tracks) == (10_000, 15_000_000, 70_000)
     assert "166.7 hours of video" in str(status)
-
-
-# --- real processes ---
-
-
-def start_batch(sources, out, model, *words, jobs=2):
-    command = ["-m", "vehicle_detection", "batch", sources, "-o", out, "--model", model, "--jobs", jobs]
-    return start_interruptible(sys.executable, *command, *words)
-
-
-def finish(process):
-    out, errors = process.communicate(timeout=120)
-    return process.returncode, out, errors
-
-
-def wait_for_records(out, number):
-    deadline = time.monotonic() + 60
-    while len(records(out) if (out / "records").is_dir() else ()) < number:
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
-def processes_below(pid):
-    """Worker processes that a batch has started."""
-    tasks = Path(f"/proc/{pid}/task")
-    if not tasks.is_dir():
-        pytest.skip("processes cannot be listed without /proc")
-    found = []
-    for task in tasks.iterdir():
-        with contextlib.suppress(FileNotFoundError):
-            found += [int(child) for child in (task / "children").read_text().split()]
-    return found
-
-
-def check_numbers(printed):
-    """A worker that is killed between its record and its answer leaves a trip that is not done again."""
-    found = re.search(rf"{TRIPS} trips: (\d+) done, 1 failed, 0 errors, (\d+) skipped", printed)
-    assert found, printed
-    assert int(found[1]) + int(found[2]) == TRIPS - 1
-
-
-def test_a_killed_worker_is_replaced(many, model, tmp_path):
-    out = tmp_path / "out"
-    process = start_batch(many, out, model, "--tracks-only")
-    wait_for_records(out, 1)
-    for worker in processes_below(process.pid):
-        os.kill(worker, signal.SIGKILL)
-    code, printed, errors = finish(process)
-    assert code == 0, errors
-    check_numbers(printed)
-    assert "warning: " in errors
-    assert "drive e.mp4: " in errors
-    check_whole(out, done=TRIPS - 1, failed=1)
-    assert not list((tmp_path / "scratch").glob("vehicle-batch*"))
-
-
-def test_a_killed_batch_is_resumed_by_the_same_command(many, model, tmp_path):
-    out = tmp_path / "out"
-    process = start_batch(many, out, model)
-    wait_for_records(out, 2)
-    os.kill(process.pid, signal.SIGKILL)
-    process.communicate()
-    before = {path: stamp for path, stamp in files(out / "records", "*.json").items() if path.name[0] != "."}
-    code, printed, errors = finish(start_batch(many, out, model))
-    assert code == 0, errors
-    check_whole(out, done=TRIPS - 1, failed=1)
-    after = files(out / "records")
-    assert before.items() <= after.items(), "a trip was done twice"
-    assert len(before) < TRIPS
-    skipped = int(printed.split(" skipped")[0].rpartition(" ")[2])
-    assert skipped >= len(before)
-    assert not list((tmp_path / "scratch").glob("vehicle-batch*"))
-
-
-def test_two_batches_on_one_folder_share_the_work(many, model, tmp_path):
-    out = tmp_path / "out"
-    started = [start_batch(many, out, model, "--tracks-only", jobs=1) for _ in range(2)]
-    printed = [finish(process) for process in started]
-    assert [code for code, _, _ in printed] == [0, 0]
-    check_whole(out, done=TRIPS - 1, failed=1)
-    done = [int(text.split(" done")[0].rpartition(" ")[2]) for _, text, _ in printed]
-    assert sum(done) == TRIPS - 1
-
-
-def test_an_interrupt_ends_the_workers(many, model, tmp_path):
-    out = tmp_path / "out"
-    process = start_batch(many, out, model)
-    wait_for_records(out, 1)
-    children = processes_below(process.pid)
-    os.kill(process.pid, signal.SIGINT)
-    code, _, errors = finish(process)
-    assert (code, errors) == (130, "interrupted\n")
-    assert children
-    assert not any(Path(f"/proc/{child}").exists() for child in children)
-    assert not list((tmp_path / "scratch").glob("vehicle-batch*"))
-
-
-def test_a_worker_that_dies_in_every_attempt_is_an_error(card, model, tmp_path, monkeypatch):
-    before = child_processes()
-    monkeypatch.setattr("vehicle_detection.batch.run.run_trip", suicide)
-    report = run_batch(card / "20260131_093000_F.mp4", tmp_path / "out", model=model, jobs=1, progress=False)
-    assert counts(report) == (0, 0, 1, 0)
-    assert "the worker process ended (signal 9), 3 times" in next(iter(report.messages.values()))
-    assert batch_status(tmp_path / "out").errors == 1
-    assert child_processes() == before
-
-
-def suicide(task):
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def test_a_dask_cluster_that_loses_a_worker(many, model, tmp_path):
-    pytest.importorskip("distributed")
-    out = tmp_path / "out"
-    process = start_batch(many, out, model, "--dask", "local", "--tracks-only")
-    wait_for_records(out, 1)
-    children = processes_below(process.pid)
-    spawned = [pid for pid in children if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
-    os.kill(spawned[0], signal.SIGKILL)
-    code, printed, errors = finish(process)
-    assert code == 0, errors
-    assert printed.startswith("dashboard http")
-    check_numbers(printed)
-    check_whole(out, done=TRIPS - 1, failed=1)
-
-
-def test_a_scheduler_that_does_not_answer(monkeypatch):
-    pytest.importorskip("distributed")
-    message = "dask must be local or the address of a scheduler"
-    with pytest.raises(InvalidInputError, match=message), open_dask("nonsense://127.0.0.1:9"):
-        pass
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(InvalidInputError, match=r"dask needs dask\[distributed\]"), open_dask("local"):
-        pass
-
-
-def test_workers_keep_kernels_on_a_local_disk(monkeypatch, tmp_path):
-    monkeypatch.delenv("NUMBA_CACHE_DIR")
-    assert Path(workers.worker_environment()["NUMBA_CACHE_DIR"]).parent == tmp_path / "scratch"
-    monkeypatch.setenv("NUMBA_CACHE_DIR", "/elsewhere")
-    assert workers.worker_environment()["NUMBA_CACHE_DIR"] == "/elsewhere"

@@ -248,6 +248,18 @@ def test_the_segments_of_a_card_become_one_video(material, tmp_path):
     assert contents(tmp_path)[-2:] == ["t.csv", "trip.mp4"]
 
 
+def test_video_needs_something_to_do(material, tmp_path):
+    clip = material / "clip.mp4"
+    assert "--output must name the video to write; or use --show" in refuse("video", clip)
+    assert "--output must name a video for --report" in refuse("video", clip, "--report", tmp_path / "r.html")
+    assert "--output must name a video for --clips" in refuse(
+        "video", clip, "--show", "--clips", tmp_path / "clips"
+    )
+    out = succeed("video", clip, "--tracks", tmp_path / "t.parquet", "--model", "highway")
+    assert out.endswith(f"wrote {tmp_path / 't.parquet'}\n")
+    assert contents(tmp_path) == ["t.parquet"]
+
+
 def test_batch_refuses_bad_input_in_one_line(material, tmp_path):
     out = tmp_path / "out"
     for message, words in {
@@ -258,6 +270,10 @@ def test_batch_refuses_bad_input_in_one_line(material, tmp_path):
         r"--group must be one of 'trip', 'file'": ["x", "--group", "day"],
         r"--output \S+nothing is not a folder": ["--status", "-o", tmp_path / "nothing"],
         r"model file nothing does not exist": ["x", "--model", "nothing"],
+        r"--preset must be one of": ["x", "--preset", "quick"],
+        r"--every must be an integer": ["x", "--every", "0"],
+        r"--fov must be a number": ["x", "--fov", "999"],
+        r"--blur must be one of": ["x", "--blur", "faces"],
     }.items():
         assert re.search(message, refuse("batch", "-o", out, *words)), message
     assert succeed("batch", "-o", tmp_path, "--status").startswith("0 trips done, 0 failed, 0 errors\n")

@@ -1,5 +1,6 @@
 import contextlib
 import json
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -240,7 +241,8 @@ def test_invalid_paths(tmp_path):
     with pytest.raises(DatasetError, match="is a folder, and csv labels are one file"):
         read_labels(tmp_path, format="csv")
     with pytest.raises(
-        InvalidInputError, match=r"format must be one of 'csv', 'jsonl', 'parquet', 'kitti', .*; got 'voc'"
+        InvalidInputError,
+        match=r"format must be one of 'csv', 'jsonl', 'parquet', .*, 'kitti', 'yolo'; got 'voc'",
     ):
         read_labels(written(tmp_path, CSV), format="voc")
     with pytest.raises(InvalidInputError, match="path must be a file or folder, got None; pass a path"):
@@ -318,3 +320,89 @@ def test_real_labels(real_data: Path, name, frames, usable, shape):
     if name in ("project_clip", "test_video"):
         tracked = evaluate_tracks(labels, labels)
         assert (tracked.mota, tracked.jitter, tracked.vehicles) == (1, 0, 2)
+
+
+# --- archives of CVAT, YOLO ---
+
+
+def write_zip(path, text, names=None):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        if text is not None:
+            archive.writestr("gt/gt.txt", text)
+        if names is not None:
+            archive.writestr("gt/labels.txt", names)
+    return path
+
+
+def test_an_archive_of_cvat(tmp_path):
+    text = "1,3,10,20,30,40,1,2,1.0\n2,4,10,20,30,40,0,2,0.5\n2,5,1,1,2,2,1,1,1.0\n"
+    found = read_labels(write_zip(tmp_path / "t.zip", text, "person\nCar\n"))
+    assert found.frames == (0, 1)
+    assert found.tracks.tolist() == [3, 4]
+    assert found.boxes.tolist() == [[10, 20, 40, 60]] * 2
+    assert found.ignore.tolist() == [False, True]
+    assert len(read_labels(tmp_path / "t.zip", classes=["Person"])) == 1
+    assert len(read_labels(write_zip(tmp_path / "u.zip", text))) == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "names", "message"),
+    [
+        (None, "car", "is not an archive of CVAT: it lacks gt/gt.txt; export MOT 1.1"),
+        ("1,3,10,20,30,40,1,2,1.0", "car", "line 1: class must be at most 1, as in gt/labels.txt, got 2"),
+        ("1,3", "car", "line 1: expected frame, id"),
+    ],
+)
+def test_invalid_archives(tmp_path, text, names, message):
+    with pytest.raises(DatasetError, match=message):
+        read_labels(write_zip(tmp_path / "t.zip", text, names))
+    (tmp_path / "t.zip").write_bytes(b"PK no zip")
+    with pytest.raises(DatasetError, match="is not a zip archive that can be read"):
+        read_labels(tmp_path / "t.zip")
+
+
+def test_an_archive_with_too_large_a_file(tmp_path, monkeypatch):
+    path = write_zip(tmp_path / "t.zip", "1,3,10,20,30,40,1,1,1.0\n" * 1000)
+    monkeypatch.setenv("VEHICLE_DETECTION_MAX_TEXT_BYTES", "5000")
+    with pytest.raises(DatasetError, match=r"gt/gt.txt is larger than 5,000 bytes; .* set VEHICLE"):
+        read_labels(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("data.yaml", "nc: 2\nnames:\n  0: person\n  1: car\n"),
+        ("data.yaml", "names: ['person', \"car\"]\nnc: 2\n"),
+        ("data.yaml", "names:\n- person\n- car\n"),
+        ("classes.txt", "person\ncar\n"),
+    ],
+)
+def test_a_yolo_folder(tmp_path, name, text):
+    (tmp_path / "labels").mkdir()
+    (tmp_path / name).write_text(text)
+    (tmp_path / "labels" / "a.txt").write_text("1 0.5 0.5 0.2 0.4\n0 0.5 0.5 0.1 0.1\n")
+    (tmp_path / "labels" / "b.txt").write_text("")
+    found = read_labels(tmp_path, shape=(100, 200))
+    assert found.frame_keys == ("a", "b")
+    np.testing.assert_allclose(found.boxes, [[80, 30, 120, 70]])
+    assert found.scores is None
+    assert len(read_labels(tmp_path, shape=(100, 200), classes=["person", "car"])) == 2
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1 0.5 0.5", r"a\.txt line 1: expected class, center and size, .*, found 3 values"),
+        ("1 0.5 0.5 x 0.1", "side of the box must be a finite number, got 'x'"),
+        ("1 0.5 0.5 0.1 0.1 1.5", "confidence must be at most 1"),
+    ],
+)
+def test_invalid_yolo_files(tmp_path, line, message):
+    (tmp_path / "a.txt").write_text(line)
+    with pytest.raises(DatasetError, match=message):
+        read_labels(tmp_path, format="yolo", shape=(100, 200))
+    with pytest.raises(InvalidInputError, match=r"shape must be \(height, width\) of the frames for YOLO"):
+        read_labels(tmp_path, format="yolo")
+    (tmp_path / "a.txt").unlink()
+    with pytest.raises(DatasetError, match=r"holds no \.txt file; name a folder of YOLO labels"):
+        read_labels(tmp_path, format="yolo", shape=(100, 200))

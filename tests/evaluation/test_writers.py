@@ -119,6 +119,35 @@ def test_coco_results_are_read_with_their_truth(tmp_path_factory, boxes):
         assert read.frame_keys == boxes.frame_keys
 
 
+@given(frame_boxes(numbers))
+def test_archives_for_cvat_hold_tracks_and_flags(tmp_path_factory, boxes):
+    path = tmp_path_factory.mktemp("cvat") / "t.zip"
+    write_labels(boxes, path)
+    read = read_labels(path)
+    assert read.scores is None
+    assert_equal(read, boxes, ("tracks", "ignore"), tolerance=1e-8)
+
+
+@given(frame_boxes(st.integers(0, 999_999)))
+def test_yolo_folders_hold_frames_and_confidences(tmp_path_factory, boxes):
+    path = tmp_path_factory.mktemp("yolo") / "t"
+    boxes = boxes[~boxes.ignore]
+    # Inside the frame, and larger than the six decimals resolve.
+    boxes.boxes[:, :2] = np.abs(boxes.boxes[:, :2])
+    boxes.boxes[:, 2:] = np.add(boxes.boxes[:, :2], (1.0, 9.5))
+    shape = (10_010, 10_010)
+    write_labels(boxes, path, format="yolo", shape=shape)
+    if not boxes.frame_keys:
+        return
+    read = read_labels(path, format="yolo", shape=shape)
+    assert read.frame_keys == tuple(sorted(boxes.frame_keys))
+    boxes = boxes[[row for key in read.frame_keys for row in boxes.rows(key)]]
+    np.testing.assert_allclose(read.boxes, boxes.boxes, atol=0.1)
+    if boxes.scores is not None and len(boxes):
+        assert read.tracks.tolist() == boxes.tracks.tolist()
+        np.testing.assert_allclose(1 / (1 + np.exp(-read.scores)), 1 / (1 + np.exp(-boxes.scores)), atol=2e-6)
+
+
 @given(frame_boxes(file_names))
 def test_kitti_folders_hold_frames_and_what_is_visible(tmp_path_factory, boxes):
     path = tmp_path_factory.mktemp("kitti") / "label_2"
@@ -303,6 +332,20 @@ def test_results_take_the_ids_of_a_foreign_ground_truth(tmp_path):
         ),
         (boxes_of((0, 1, CAR)), "t.json", {"format": "coco_results"}, "labels need scores for COCO results"),
         (boxes_of((0, 1, CAR, 0.5)), "t.json", {"format": "coco_results"}, "truth must name the COCO ground"),
+        (boxes_of(("a", 1, CAR)), "t.zip", {}, "labels must have numbered frames for MOT, got 'a'"),
+        (boxes_of((0, 1, CAR)), "t", {"format": "yolo"}, "shape must be .* for YOLO"),
+        (
+            boxes_of((0, 1, CAR), ignore=[True]),
+            "t",
+            {"format": "yolo", "shape": (9, 9)},
+            "labels hold boxes marked ignore, which YOLO cannot mark",
+        ),
+        (
+            boxes_of(("a.jpg", 1, CAR), ("a.png", 1, CAR)),
+            "t",
+            {"format": "yolo", "shape": (9, 9)},
+            "frames 'a.jpg' and 'a.png', which are one file in YOLO",
+        ),
         (boxes_of((0, 1, CAR)), "t.csv", {"truth": "x.json"}, "truth must be None for the format 'csv'"),
     ],
 )

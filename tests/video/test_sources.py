@@ -15,10 +15,19 @@ import pytest
 from moviepy.config import FFMPEG_BINARY
 
 from tests.helpers import StubDetector, start_interruptible
-from tests.video.clips import damage_sizes, ffmpeg, frame_numbers, gray_frames, sound_seconds, write_clip
-from vehicle_detection.errors import InvalidInputError, VideoError
+from tests.video.clips import (
+    child_processes,
+    damage_sizes,
+    ffmpeg,
+    frame_numbers,
+    gray_frames,
+    running_threads,
+    sound_seconds,
+    write_clip,
+)
+from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection.images import write_image
-from vehicle_detection.video import open_source, probe_video, process_video, sources
+from vehicle_detection.video import live, open_source, probe_video, process_video, remote
 
 
 def numbers(source, **options):
@@ -158,7 +167,7 @@ def test_a_file_on_other_storage(clip):
 def test_without_fsspec(monkeypatch):
     monkeypatch.setitem(sys.modules, "fsspec", None)
     with pytest.raises(InvalidInputError, match=r"needs fsspec; pip install 'vehicle-detection\[batch\]'"):
-        sources.open_filesystem("s3://bucket/x.mp4")
+        remote.open_filesystem("s3://bucket/x.mp4")
 
 
 # --- standard input and pipes ---
@@ -299,8 +308,8 @@ def test_a_file_on_a_web_server(folder):
     assert index == seen == tuple(range(20))
 
 
-def test_a_stream_of_a_web_server_ends_with_it(clip, tmp_path):
-    data = ffmpeg("-stream_loop", 2, "-i", clip, "-c", "copy", "-an", "-f", "mpegts", "-")
+def stream_of(data):
+    """A function that sends a video as a stream of unknown length."""
 
     def stream(request):
         request.send_response(200)
@@ -310,8 +319,80 @@ def test_a_stream_of_a_web_server_ends_with_it(clip, tmp_path):
             request.wfile.write(data[start : start + 4096])
             time.sleep(0.01)
 
-    with server(stream) as address, open_source(f"{address}/live.ts") as source:
+    return stream
+
+
+def test_a_stream_of_a_web_server_ends_with_it(clip, tmp_path):
+    data = ffmpeg("-stream_loop", 2, "-i", clip, "-c", "copy", "-an", "-f", "mpegts", "-")
+    with (
+        server(stream_of(data)) as address,
+        open_source(f"{address}/live.ts", reconnect=False) as source,
+    ):
         assert source.live
         report = process_video(source, tmp_path / "out.mp4", StubDetector())
     assert report.frames + report.dropped > 30
     assert probe_video(tmp_path / "out.mp4").frames == report.frames + report.dropped
+
+
+@pytest.fixture
+def quick_reconnects(monkeypatch):
+    monkeypatch.setattr(live, "_RECONNECT_DELAYS", (0.05, 0.1, 0.1))
+
+
+@pytest.mark.parametrize("fault", ["ends", "stalls"])
+def test_a_network_stream_that_breaks_off_is_opened_again(
+    clip, tmp_path, monkeypatch, caplog, quick_reconnects, fault
+):
+    monkeypatch.setattr(live, "NETWORK_TIMEOUT", 1.0)
+    # ffmpeg reads seconds of a stream before it yields a frame.
+    frames = 20 if fault == "ends" else 240
+    loop = ("-stream_loop", frames // 20 - 1)
+    data = ffmpeg(*loop, "-i", clip, "-c", "copy", "-an", "-f", "mpegts", "-")
+    requests, over = [], threading.Event()
+
+    def unsteady(request):
+        requests.append(request.path)
+        if len(requests) > 3:
+            request.send_error(503)
+            return
+        stream_of(data)(request)
+        if fault == "stalls":
+            over.wait(20)
+
+    results = []
+    with server(unsteady) as address:
+        with open_source(f"{address}/live.ts", live=True) as source:
+            report = process_video(source, tmp_path / "out.mp4", StubDetector(), on_result=results.append)
+        over.set()
+    times = [result.time for result in results]
+    # Three connections, with gaps for the time without one; then three attempts in vain.
+    assert sorted(set(times)) == times
+    assert times[-1] >= (3 * frames - 1) / source.info.fps
+    assert probe_video(tmp_path / "out.mp4").frames == report.frames + report.dropped
+    assert len([text for text in caplog.messages if text.endswith("opening it again")]) >= 2
+    assert re.search(r"opening it again has failed 3 times \(.*\)$", caplog.messages[-1])
+
+
+def test_closing_a_stream_ends_its_attempts_to_reconnect(clip, monkeypatch):
+    monkeypatch.setattr(live, "_RECONNECT_DELAYS", (60.0,))
+    data = ffmpeg("-i", clip, "-c", "copy", "-an", "-f", "mpegts", "-")
+    before = child_processes()
+    with server(stream_of(data)) as address, open_source(f"{address}/live.ts", live=True) as source:
+        with source.read() as reader:
+            assert next(reader)[0] >= 0
+            time.sleep(0.3)
+        started = time.monotonic()
+    assert time.monotonic() - started < 10
+    assert child_processes() == before
+    assert not running_threads()
+
+
+def test_messages_do_not_show_passwords():
+    with pytest.raises(VideoError, match=r"http://\*\*\*@127\.0\.0\.1:9/x\.ts is not a video") as error:
+        open_source("http://user:secret@127.0.0.1:9/x.ts", live=True)
+    assert "secret" not in str(error.value)
+
+
+def test_a_server_that_is_away_is_a_transient_error():
+    with pytest.raises(TransientVideoError, match="Connection refused"):
+        open_source("http://127.0.0.1:9/x.mp4")

@@ -17,17 +17,11 @@ from vehicle_detection._common.checks import (
     finite_array,
 )
 from vehicle_detection._common.environment import check_environment
-from vehicle_detection._common.files import (
-    atomic_write,
-    check_suffix,
-    check_target,
-    import_pyarrow,
-    temporary_folder,
-    write_parquet,
-)
+from vehicle_detection._common.files import atomic_write, check_suffix, check_target, temporary_folder
 from vehicle_detection._common.image_size import image_size
 from vehicle_detection._common.limits import Limit, check_regular_file, read_regular_file
 from vehicle_detection._common.model_file import FORMAT_VERSION, ModelData, read_model, write_model
+from vehicle_detection._common.parquet import ParquetRows, write_parquet
 from vehicle_detection._common.progress import progress_bar
 from vehicle_detection._common.threads import (
     JOBS_VARIABLE,
@@ -46,6 +40,7 @@ __all__ = [
     "NEW_ARRAYS",
     "Limit",
     "ModelData",
+    "ParquetRows",
     "ThreadTeam",
     "Workspace",
     "atomic_write",
@@ -69,7 +64,6 @@ __all__ = [
     "describe",
     "finite_array",
     "image_size",
-    "import_pyarrow",
     "mirror_patches",
     "progress_bar",
     "read_model",

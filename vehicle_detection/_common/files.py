@@ -8,9 +8,8 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from vehicle_detection._common.checks import check_path
 from vehicle_detection.errors import InvalidInputError, OutputError, VehicleDetectionError
@@ -194,28 +193,3 @@ def _remove_abandoned(folder: Path) -> None:
         handle = _lock_folder(folder)
         shutil.rmtree(folder, ignore_errors=True)
         os.close(handle)
-
-
-def write_parquet(
-    path: str | os.PathLike[str], table: Any, *, types: Mapping[str, str] | None = None
-) -> None:
-    """Write a pandas table, or a mapping of column names to lists of values, as a Parquet file.
-
-    `types` names the Arrow type of each column, such as ``"int64"``; None infers them from the values.
-    """
-    pyarrow = import_pyarrow()
-    schema = None if types is None else pyarrow.schema(list(types.items()))
-    with atomic_write(path, "path") as part:
-        pyarrow.parquet.write_table(pyarrow.table(table, schema=schema), part)
-
-
-def import_pyarrow() -> Any:
-    """Return pyarrow, which writes Parquet files."""
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise InvalidInputError(
-            "a .parquet file needs pyarrow; pip install 'vehicle-detection[parquet]', or write .csv"
-        ) from None
-    return pyarrow

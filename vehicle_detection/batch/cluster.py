@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
-from concurrent.futures import Executor
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
+from typing import Any
 
 from vehicle_detection._common import available_cores
 from vehicle_detection.batch.workers import worker_environment
@@ -53,10 +54,44 @@ def open_dask(address: str, jobs: int | None = None) -> Iterator[tuple[Executor,
                 )
             )
         try:
-            client = stack.enter_context(distributed.Client(target, timeout=20))
+            client = stack.enter_context(distributed.Client(target))
         except (OSError, ValueError) as error:
             raise InvalidInputError(
                 f"dask must be local or the address of a scheduler such as tcp://host:8786, got {address!r}; "
                 f"{error}"
             ) from None
-        yield client.get_executor(pure=False), client.dashboard_link
+        yield _DaskExecutor(client), client.dashboard_link
+
+
+class _DaskExecutor(Executor):
+    """Executor of a Dask client, whose futures also end when the scheduler does.
+
+    Those of ``client.get_executor()`` wait forever for a result that was lost on the way.
+    """
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Call a function on a worker; `BrokenExecutor` if the scheduler is gone."""
+        future: Future[Any] = Future()
+        try:
+            remote = self._client.submit(fn, *args, **kwargs, pure=False)
+        except Exception as error:
+            raise self._translate(error) from error
+        future.set_running_or_notify_cancel()
+
+        def finish(done: Any) -> None:
+            try:
+                future.set_result(done.result())
+            except BaseException as error:
+                future.set_exception(self._translate(error))
+
+        remote.add_done_callback(finish)
+        return future
+
+    def _translate(self, error: BaseException) -> BaseException:
+        """Tell the loss of the scheduler from errors of a call."""
+        if self._client.status == "running":
+            return RuntimeError(str(error)) if isinstance(error, CancelledError) else error
+        return BrokenExecutor("the Dask scheduler does not answer any more")

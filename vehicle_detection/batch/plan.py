@@ -14,7 +14,7 @@ from typing import Any
 
 from vehicle_detection import __version__
 from vehicle_detection._common import describe
-from vehicle_detection.errors import InvalidInputError, VideoError
+from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection.video import (
     Trip,
     find_trips,
@@ -28,23 +28,29 @@ _URL = re.compile(r"^[a-zA-Z][a-zA-Z0-9+.-]+://")
 _ID_DIGITS = _HASH_DIGITS = 12
 
 
-def list_videos(sources: Iterable[str | os.PathLike[str]]) -> list[str]:
+Facts = Mapping[str, Any]
+"""What storage tells about a file when it lists it, such as its size and entity tag; empty if unknown."""
+
+
+def list_videos(sources: Iterable[str | os.PathLike[str]]) -> dict[str, Facts]:
     """Expand files, folders, patterns and URLs to absolute paths and URLs, sorted, each once."""
-    found: set[str] = set()
+    found: dict[str, Facts] = {}
     for source in sources:
         if not isinstance(source, (str, os.PathLike)):
             raise InvalidInputError(
                 f"sources must be files, folders, patterns or URLs, got {describe(source)}; pass strings"
             )
         text = os.fspath(source)
-        files = list(_list_remote(text) if _URL.match(text) else _list_local(Path(text)))
+        files = dict(_list_remote(text) if _URL.match(text) else _list_local(Path(text)))
         if not files:
             raise InvalidInputError(f"sources {text} holds no videos; check the path")
         found.update(files)
-    return sorted(found)
+    if not found:
+        raise InvalidInputError("sources must name at least one video, got none; pass files or folders")
+    return dict(sorted(found.items()))
 
 
-def _list_local(path: Path) -> Iterator[str]:
+def _list_local(path: Path) -> Iterator[tuple[str, Facts]]:
     if path.is_dir():
         files: Iterable[Path] = (each for each in path.rglob("*") if is_video_file(each))
     elif path.exists():
@@ -54,25 +60,28 @@ def _list_local(path: Path) -> Iterator[str]:
         files = (each for each in files if is_video_file(each))
     else:
         raise InvalidInputError(f"sources {path} does not exist; check the path")
-    return (os.path.abspath(each) for each in files if each.is_file())
+    return ((os.path.abspath(each), {}) for each in files if each.is_file())
 
 
-def _list_remote(url: str) -> Iterator[str]:
+def _list_remote(url: str) -> Iterator[tuple[str, Facts]]:
     if url.startswith(("http://", "https://")):
-        yield url
+        yield url, {}
         return
     filesystem, path = open_filesystem(url)
+    filesystem.invalidate_cache()
     try:
         if glob.has_magic(path):
-            names = [name for name in with_retries(lambda: filesystem.glob(path)) if is_video_file(name)]
+            found = with_retries(lambda: filesystem.glob(path, detail=True))
         elif with_retries(lambda: filesystem.isdir(path)):
-            names = [name for name in with_retries(lambda: filesystem.find(path)) if is_video_file(name)]
+            found = with_retries(lambda: filesystem.find(path, detail=True))
         else:
-            names = [path]
-    except OSError as error:
-        raise VideoError(f"{url} cannot be listed ({error}); check the connection") from error
-    for name in names:
-        yield str(filesystem.unstrip_protocol(name))
+            yield str(filesystem.unstrip_protocol(path)), {}
+            return
+    except Exception as error:  # each storage has its own
+        raise TransientVideoError(f"{url} cannot be listed ({error}); check the connection") from error
+    for name, facts in found.items():
+        if is_video_file(name) and facts.get("type") != "directory":
+            yield str(filesystem.unstrip_protocol(name)), facts
 
 
 def group_files(files: Sequence[str], group: str) -> list[Trip]:
@@ -101,12 +110,15 @@ def source_id(uri: str) -> str:
     return hashlib.sha256(uri.encode("utf-8", "surrogateescape")).hexdigest()[:_ID_DIGITS]
 
 
-def plan_trip(trip: Trip, settings: Mapping[str, Any], fingerprint: str) -> dict[str, Any]:
+def plan_trip(
+    trip: Trip, known: Mapping[str, Facts], settings: Mapping[str, Any], fingerprint: str
+) -> dict[str, Any]:
     """Describe the work on a trip as plain values, for a worker on any machine.
 
-    Its ``key`` is the trip's identity and a hash of everything that the results depend on.
+    Its ``key`` is the trip's identity and a hash of everything that the results depend on. `known` are the
+    facts of `list_videos`.
     """
-    sources = [_identify(str(file)) for file in trip.files]
+    sources = [_identify(str(file), known.get(str(file), {})) for file in trip.files]
     facts = [sources, dict(settings), fingerprint, __version__]
     digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:_HASH_DIGITS]
     return {
@@ -119,19 +131,19 @@ def plan_trip(trip: Trip, settings: Mapping[str, Any], fingerprint: str) -> dict
     }
 
 
-def _identify(uri: str) -> dict[str, Any]:
+def _identify(uri: str, facts: Facts) -> dict[str, Any]:
     """Path or URL of a file, its size, and its modification time or entity tag."""
-    if uri.startswith(("http://", "https://")):
-        return {"uri": uri, **_identify_http(uri)}
     try:
+        if uri.startswith(("http://", "https://")):
+            return {"uri": uri, **with_retries(lambda: _identify_http(uri))}
         if _URL.match(uri):
             filesystem, path = open_filesystem(uri)
-            info = with_retries(lambda: filesystem.info(path))
+            info = facts or with_retries(lambda: filesystem.info(path))
             names = ("ETag", "etag", "md5Hash", "mtime", "LastModified", "last_modified", "created")
             tag = next((str(info[name]) for name in names if info.get(name)), "")
             return {"uri": uri, "size": info.get("size"), "tag": tag}
         stat = os.stat(uri)
-    except OSError:  # reported when its trip is processed
+    except Exception:  # each storage has its own; reported when its trip is processed
         return {"uri": uri, "size": None, "tag": ""}
     return {"uri": uri, "size": stat.st_size, "tag": str(stat.st_mtime_ns)}
 
@@ -139,10 +151,12 @@ def _identify(uri: str) -> dict[str, Any]:
 def _identify_http(url: str) -> dict[str, Any]:
     import requests
 
-    try:
-        headers = requests.head(url, timeout=10, allow_redirects=True).headers
-    except requests.RequestException:
+    answer = requests.head(url, timeout=10, allow_redirects=True)
+    if answer.status_code >= 500:
+        answer.raise_for_status()
+    if not answer.ok:
         return {"size": None, "tag": ""}
+    headers = answer.headers
     return {
         "size": headers.get("Content-Length"),
         "tag": headers.get("ETag") or headers.get("Last-Modified") or "",
@@ -154,6 +168,6 @@ def _date(trip: Trip, source: Mapping[str, Any]) -> str:
     if trip.start is not None:
         return trip.start.date().isoformat()
     tag = source["tag"]
-    if tag.isdecimal():
+    if tag and not _URL.match(source["uri"]):
         return datetime.datetime.fromtimestamp(int(tag) / 1e9, datetime.UTC).date().isoformat()
     return "unknown"

@@ -6,20 +6,24 @@ before it changes; or ``"error"`` if the machine failed (disk full, lost worker)
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from vehicle_detection._common import atomic_write
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.batch.store import Store, open_store
+
+if TYPE_CHECKING:
+    import pandas
 
 DONE, FAILED, ERROR = "done", "failed", "error"
 _FOLDER = "records"
+_SUMMARY_COLUMNS = (
+    "key", "status", "camera", "date", "start", "first_file", "files", "frames", "video_seconds", "tracks",
+    "work_seconds", "message", "damage", "tracks_file", "video_file",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,46 +72,51 @@ class BatchStatus:
         return "\n".join([*lines, *(f"{source}: {text}" for source, text in self.messages.items())])
 
 
-def record_path(out: Path, key: str) -> Path:
-    """Path of the record of a trip."""
-    return out / _FOLDER / f"{key}.json"
+def record_path(key: str) -> str:
+    """Path of the record of a trip in its store."""
+    return f"{_FOLDER}/{key}.json"
 
 
-def read_record(out: Path, key: str) -> dict[str, Any] | None:
+def read_record(store: Store, key: str) -> dict[str, Any] | None:
     """Read the record of a trip; None if there is none, or if it is damaged."""
-    return _read(record_path(out, key))
+    data = store.read(record_path(key))
+    return None if data is None else _parse(data)
 
 
-def _read(path: Path | str) -> dict[str, Any] | None:
+def read_records(store: Store, keys: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Read the records of trips by their keys; those that are missing or damaged are left out."""
+    found = store.read_many(record_path(key) for key in keys)
+    parsed = ((_key(path), _parse(data)) for path, data in found)
+    return {key: record for key, record in parsed if record is not None}
+
+
+def _parse(data: bytes) -> dict[str, Any] | None:
     try:
-        with open(path, "rb") as file:
-            record = json.loads(file.read())
-    except (OSError, ValueError):
+        record = json.loads(data)
+    except ValueError:
         return None
     return record if isinstance(record, dict) and "status" in record else None
 
 
-def write_record(out: Path, record: Mapping[str, Any]) -> None:
+def _key(path: str) -> str:
+    return path.rpartition("/")[2].removesuffix(".json")
+
+
+def write_record(store: Store, record: Mapping[str, Any]) -> None:
     """Write the record of a trip."""
-    path = record_path(out, record["key"])
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as part:
-        part.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    store.write(record_path(record["key"]), (json.dumps(record, indent=1) + "\n").encode())
 
 
-def is_complete(out: Path, record: Mapping[str, Any] | None) -> bool:
+def is_complete(record: Mapping[str, Any] | None, exists: Callable[[str], bool]) -> bool:
     """Whether a trip need not be processed again: its outputs exist, or its source is known to be bad."""
     if record is None or record["status"] == ERROR:
         return False
-    return all((out / path).exists() for path in record.get("outputs", {}).values())
+    return all(map(exists, record.get("outputs", {}).values()))
 
 
-def record_names(out: Path) -> Iterator[str]:
+def record_keys(store: Store) -> list[str]:
     """Keys of all records."""
-    with contextlib.suppress(FileNotFoundError), os.scandir(out / _FOLDER) as entries:
-        for entry in entries:
-            if entry.name.endswith(".json") and not entry.name.startswith("."):
-                yield entry.name.removesuffix(".json")
+    return [_key(path) for path in store.list_files(_FOLDER) if path.endswith(".json")]
 
 
 def batch_status(out: str | os.PathLike[str]) -> BatchStatus:
@@ -116,12 +125,14 @@ def batch_status(out: str | os.PathLike[str]) -> BatchStatus:
     Parameters
     ----------
     out
-        Folder of the batch.
+        Folder or URL of the batch.
 
     Raises
     ------
     InvalidInputError
         If the folder does not exist.
+    OutputError
+        If the storage of the URL does not answer.
 
     Examples
     --------
@@ -130,16 +141,11 @@ def batch_status(out: str | os.PathLike[str]) -> BatchStatus:
     0 trips done, 0 failed, 0 errors
     0.0 hours of video, 0 frames, 0 vehicles, 0.0 frames/s per worker
     """
-    folder = Path(out)
-    if not folder.is_dir():
-        raise InvalidInputError(f"out {folder} is not a folder; pass the folder of a batch")
+    store = open_store(out)
     counts: Counter[str] = Counter()
     sums: Counter[str] = Counter()
     messages = {}
-    for key in record_names(folder):
-        record = _read(f"{folder}/{_FOLDER}/{key}.json")
-        if record is None:
-            continue
+    for record in read_records(store, record_keys(store)).values():
         counts[record["status"]] += 1
         if record["status"] == DONE:
             for name in ("frames", "tracks", "video_seconds", "seconds"):
@@ -156,3 +162,53 @@ def batch_status(out: str | os.PathLike[str]) -> BatchStatus:
         work_seconds=float(sums["seconds"]),
         messages=dict(sorted(messages.items())),
     )
+
+
+def batch_summary(out: str | os.PathLike[str]) -> pandas.DataFrame:
+    """Summarize each trip of a batch in a row of a table, also while it runs.
+
+    Parameters
+    ----------
+    out
+        Folder or URL of the batch.
+
+    Returns
+    -------
+    pandas.DataFrame
+        In the order of date, camera and first file: ``key, status, camera, date, start, first_file, files,
+        frames, video_seconds, tracks, work_seconds, message, damage, tracks_file, video_file``. Values that a
+        trip does not have are missing.
+
+    Raises
+    ------
+    InvalidInputError
+        If the folder does not exist.
+    OutputError
+        If the storage of the URL does not answer.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> len(batch_summary(tempfile.mkdtemp()))
+    0
+    """
+    import pandas
+
+    store = open_store(out)
+    rows = [_summary_row(key, record) for key, record in read_records(store, record_keys(store)).items()]
+    rows.sort(key=lambda row: (row["date"] or "", row["camera"] or "", row["first_file"]))
+    return pandas.DataFrame(rows, columns=_SUMMARY_COLUMNS)
+
+
+def _summary_row(key: str, record: Mapping[str, Any]) -> dict[str, Any]:
+    sources, outputs = record["sources"], record.get("outputs", {})
+    same = ("status", "camera", "date", "start", "frames", "video_seconds", "tracks", "message", "damage")
+    return {
+        "key": key,
+        "first_file": sources[0]["uri"],
+        "files": len(sources),
+        "work_seconds": record.get("seconds"),
+        "tracks_file": outputs.get("tracks"),
+        "video_file": outputs.get("video"),
+        **{name: record.get(name) for name in same},
+    }

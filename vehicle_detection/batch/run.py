@@ -8,6 +8,7 @@ import os
 import queue
 import re
 import time
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future
 from dataclasses import dataclass
@@ -24,11 +25,21 @@ from vehicle_detection._common import (
     progress_bar,
 )
 from vehicle_detection.batch.plan import group_files, list_videos, plan_trip, source_id, trip_id
-from vehicle_detection.batch.records import DONE, ERROR, FAILED, is_complete, read_record, write_record
-from vehicle_detection.batch.trip import BUSY, earlier_keys, run_trip, warm_up
+from vehicle_detection.batch.records import (
+    DONE,
+    ERROR,
+    FAILED,
+    is_complete,
+    read_records,
+    record_keys,
+    write_record,
+)
+from vehicle_detection.batch.store import Store, open_store
+from vehicle_detection.batch.trip import BUSY, run_trip, warm_up
 from vehicle_detection.batch.workers import WorkerPool
+from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture import load_model
+from vehicle_detection.video import PRESETS
 
 # Attempts at a trip whose worker is lost.
 _ATTEMPTS = 3
@@ -101,7 +112,7 @@ def run_batch(
 ) -> BatchReport:
     """Track the vehicles of many videos in parallel; a second run does what is missing or changed.
 
-    The folder `out` gets, for each trip, ``tracks/date=D/camera=C/KEY.parquet``, the annotated video
+    `out` gets, for each trip, ``tracks/date=D/camera=C/KEY.parquet``, the annotated video
     ``videos/date=D/camera=C/KEY.mp4``, and ``records/KEY.json``, which is written last. KEY depends on the
     trip's files (path or URL, size, modification time or entity tag), the model, the parameters and the
     version of the library. If one of them changes, the new results replace the old ones.
@@ -111,10 +122,12 @@ def run_batch(
     sources
         Video files, folders, patterns and URLs. Consecutive segments are one trip, see `find_trips`.
     out
-        Folder to write. Several runs, also on several machines, may use one folder at the same time.
+        Folder to write, or a URL of storage that fsspec knows, such as ``"s3://bucket/results"``. Several
+        runs, also on several machines, may use one folder at the same time; at a URL, which has no locks, two
+        of them may both process a trip.
     executor
-        A ``concurrent.futures`` executor, such as ``distributed.Client(...).get_executor(pure=False)``,
-        whose workers see the same files. None: worker processes of this machine.
+        A ``concurrent.futures`` executor, such as that of `open_dask`, whose workers see the same files.
+        None: worker processes of this machine.
     model
         A model's name or file.
     options
@@ -139,12 +152,14 @@ def run_batch(
     Returns
     -------
     BatchReport
-        Numbers of trips. A bad source, a lost worker and a full disk are counted, not raised.
+        Numbers of trips. A bad source, a lost worker or scheduler and a full disk are counted, not raised.
 
     Raises
     ------
     InvalidInputError
         If an argument is invalid, or a source does not exist.
+    TransientVideoError, OutputError
+        If remote sources, or the storage of `out`, do not answer when the batch starts.
 
     Examples
     --------
@@ -155,19 +170,13 @@ def run_batch(
     check_choice(group, "group", ("trip", "file"))
     part = _parse_shard(shard)
     workers = available_cores() if jobs is None else check_integer(jobs, "jobs", low=1, high=1024)
+    check_choice(preset, "preset", PRESETS)
     settings = _settings(model, options, tracks_only=tracks_only, audio=audio, preset=preset)
-    load_model(settings["model"])  # an error now, not in every worker
-    folder = _make_folder(out)
+    store = open_store(out, create=True)
     given = [sources] if isinstance(sources, (str, os.PathLike)) else sources
-    tasks = _plan(given, folder, settings, group, part)
-    pending, skipped = [], 0
-    for task in tasks:
-        record = read_record(folder, task["key"])
-        again = retry_failed and record is not None and record["status"] == FAILED
-        if is_complete(folder, record) and not again:
-            skipped += 1
-        else:
-            pending.append({**task, "again": again})
+    tasks = _plan(given, store, settings, group, part)
+    pending = _pending(tasks, store, retry_failed)
+    skipped = len(tasks) - len(pending)
     own = None
     if executor is None and pending:
         executor = own = WorkerPool(
@@ -178,7 +187,7 @@ def run_batch(
     messages: dict[str, str] = {}
     try:
         with progress_bar(progress, len(pending), unit="trip", terminal_only=True) as bar:
-            for made in _run(executor, pending, folder):
+            for made in _run(executor, pending, store):
                 bar.update()
                 if not made["new"]:
                     skipped += 1
@@ -228,13 +237,20 @@ def _settings(model: object, options: Mapping[str, Any] | None, **others: Any) -
     name = os.fspath(model)
     if not _shipped(name).is_file() and Path(name).exists():
         name = os.path.abspath(name)
-    settings = {"model": name, "options": dict(options or {}), **others}
+    given = dict(options or {})
+    if os.path.isfile(str(given.get("camera"))):
+        given["camera"] = os.path.abspath(given["camera"])
+    settings = {"model": name, "options": given, **others}
     try:
         json.dumps(settings)
     except TypeError as error:
         raise InvalidInputError(
             f"options must hold numbers, strings, lists and None, got {describe(options)}; {error}"
         ) from None
+    try:
+        VehicleDetector(name, n_jobs=1, **given).close()  # an error now, not in every worker
+    except TypeError as error:
+        raise InvalidInputError(f"options must be arguments of VehicleDetector; {error}") from None
     return settings
 
 
@@ -243,58 +259,63 @@ def _shipped(model: str) -> Traversable:
     return resources.files("vehicle_detection") / "models" / f"{model}.safetensors"
 
 
-def _fingerprint(model: str) -> str:
-    """Hash of a model's file."""
-    shipped = _shipped(model)
-    data = shipped.read_bytes() if shipped.is_file() else Path(model).read_bytes()
+def _fingerprint(settings: Mapping[str, Any]) -> str:
+    """Hash of the model's file, and of the camera's if there is one."""
+    shipped, camera = _shipped(settings["model"]), settings["options"].get("camera")
+    data = shipped.read_bytes() if shipped.is_file() else Path(settings["model"]).read_bytes()
+    if os.path.isfile(str(camera)):
+        data += Path(camera).read_bytes()
     return hashlib.sha256(data).hexdigest()
-
-
-def _make_folder(out: str | os.PathLike[str]) -> Path:
-    if not isinstance(out, (str, os.PathLike)):
-        raise InvalidInputError(f"out must be a folder, got {describe(out)}; pass its path")
-    if "://" in os.fspath(out):
-        raise InvalidInputError(f"out must be a folder, got the URL {out}; mount the storage, or copy later")
-    folder = Path(os.path.abspath(out))
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InvalidInputError(
-            f"out must be a folder, {folder} cannot be created: {error.strerror}; choose another"
-        ) from error
-    return folder
 
 
 def _plan(
     sources: Iterable[str | os.PathLike[str]],
-    out: Path,
+    store: Store,
     settings: Mapping[str, Any],
     group: str,
     part: tuple[int, int],
 ) -> list[dict[str, Any]]:
     """Describe the work on each trip of this shard."""
-    files = [each for each in list_videos(sources) if not Path(each).is_relative_to(out)]
+    listed = list_videos(sources)
+    files = [each for each in listed if not each.startswith((f"{store.name}/", f"{store.name}{os.sep}"))]
     trips = group_files(files, group)
-    fingerprint = _fingerprint(settings["model"])
-    earlier = earlier_keys(out)
+    fingerprint = _fingerprint(settings)
+    earlier: dict[str, list[str]] = {}  # keys of records by the identity of their trip
+    for key in record_keys(store):
+        earlier.setdefault(key.partition("-")[0], []).append(key)
     number, count = part
     tasks = []
     for trip in trips:
         if int(trip_id(trip), 16) % count != number - 1:
             continue
-        task = plan_trip(trip, settings, fingerprint) | {"out": str(out)}
+        task = plan_trip(trip, listed, settings, fingerprint) | {"out": store.name}
         # A trip replaces the earlier ones that began with one of its files.
         ids = (source_id(str(file)) for file in trip.files)
-        task["replaces"] = [key for each in ids for key in earlier.get(each, ()) if key != task["key"]]
+        keys = [key for each in ids for key in earlier.get(each, ())]
+        task["recorded"] = task["key"] in keys
+        task["replaces"] = [key for key in keys if key != task["key"]]
         tasks.append(task)
     return tasks
 
 
+def _pending(tasks: Iterable[dict[str, Any]], store: Store, retry_failed: bool) -> list[dict[str, Any]]:
+    """Trips that are missing, incomplete or, with `retry_failed`, have failed."""
+    records = read_records(store, (task["key"] for task in tasks if task["recorded"]))
+    outputs = {path for kind in ("tracks", "videos") for path in store.list_files(kind)} if records else set()
+    pending = []
+    for task in tasks:
+        record = records.get(task["key"])
+        again = retry_failed and record is not None and record["status"] == FAILED
+        if again or not is_complete(record, outputs.__contains__):
+            pending.append({**task, "again": again})
+    return pending
+
+
 def _run(
-    executor: Executor | None, pending: Iterable[dict[str, Any]], out: Path
+    executor: Executor | None, pending: Iterable[dict[str, Any]], store: Store
 ) -> Iterator[Mapping[str, Any]]:
     """Yield the record of each trip."""
-    attempts: dict[str, int] = {}
+    attempts: Counter[str] = Counter()
     running: dict[Future[Any], dict[str, Any]] = {}
     finished: queue.SimpleQueue[Future[Any]] = queue.SimpleQueue()
     busy: list[dict[str, Any]] = []
@@ -305,42 +326,63 @@ def _run(
         running[future] = task
         future.add_done_callback(finished.put)
 
-    for task in pending:
-        submit(task)
-    while running or busy:
-        if not running:  # only trips that other runs are working on are left
-            time.sleep(_BUSY_INTERVAL)
-            for task in busy:
-                submit(task)
-            busy = []
-        future = finished.get()
-        task = running.pop(future)
-        try:
-            record = future.result()
-        except BrokenExecutor:  # all other calls fail as well
-            raise
-        except Exception as error:
-            attempts[task["key"]] = attempts.get(task["key"], 0) + 1
-            if attempts[task["key"]] < _ATTEMPTS:
-                submit(task)
-                continue
-            record = _lost_record(task, error, out)
-        if record["status"] == BUSY:
-            busy.append(task)
-            continue
-        yield record
-
-
-def _lost_record(task: Mapping[str, Any], error: Exception, out: Path) -> dict[str, Any]:
-    """Record a trip that has ended its worker in every attempt."""
-    record = {
-        **{name: task[name] for name in ("key", "sources", "camera", "date", "start", "settings")},
-        "status": ERROR,
-        "message": f"{error}, {_ATTEMPTS} times",
-        "started": time.time(),
-    }
+    waiting = deque(pending)  # not submitted; what is left if the executor breaks has an error
     try:
-        write_record(out, record)
+        while waiting:
+            submit(waiting[0])
+            waiting.popleft()
+        while running or busy:
+            if not running:  # only trips that other runs are working on are left
+                time.sleep(_BUSY_INTERVAL)
+                waiting, busy = deque(busy), []
+                while waiting:
+                    submit(waiting[0])
+                    waiting.popleft()
+            future = finished.get()
+            task = running.pop(future)
+            waiting.append(task)
+            record = _outcome(future, task, attempts, store)
+            if record is None:
+                submit(task)
+            elif record["status"] == BUSY:
+                busy.append(task)
+            else:
+                yield record
+            waiting.pop()
+    except BrokenExecutor as error:  # such as a scheduler that was killed: the next run does the rest
+        for task in (*waiting, *running.values(), *busy):
+            yield _basic_record(task, f"{error}") | {"new": True}
+
+
+def _outcome(
+    future: Future[Any], task: Mapping[str, Any], attempts: Counter[str], store: Store
+) -> dict[str, Any] | None:
+    """Record of a call that has ended; None to try again after it has lost its worker."""
+    try:
+        record: dict[str, Any] = future.result()
+    except BrokenExecutor:  # all other calls fail as well
+        raise
+    except Exception as error:
+        attempts[task["key"]] += 1
+        return None if attempts[task["key"]] < _ATTEMPTS else _lost_record(task, error, store)
+    return record
+
+
+def _lost_record(task: Mapping[str, Any], error: Exception, store: Store) -> dict[str, Any]:
+    """Record a trip that has ended its worker in every attempt."""
+    record = _basic_record(task, f"{error}, {_ATTEMPTS} times")
+    try:
+        write_record(store, record)
     except OSError as full:
         record["message"] += f"; {full}"
     return record | {"new": True}
+
+
+def _basic_record(task: Mapping[str, Any], message: str) -> dict[str, Any]:
+    """Record of a trip without a result."""
+    return {
+        **{name: task[name] for name in ("key", "sources", "camera", "date", "start", "settings")},
+        "status": ERROR,
+        "message": message,
+        "started": time.time(),
+    }

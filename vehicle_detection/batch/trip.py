@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
 import platform
 import shutil
 import tempfile
@@ -15,27 +14,26 @@ from pathlib import Path
 from typing import Any
 
 from vehicle_detection import __version__
-from vehicle_detection._common import atomic_write
+from vehicle_detection._common import ParquetRows
 from vehicle_detection.batch.records import (
     DONE,
     ERROR,
     FAILED,
     is_complete,
     read_record,
-    record_names,
+    read_records,
     record_path,
     write_record,
 )
+from vehicle_detection.batch.store import Store, open_store
 from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.errors import VehicleDetectionError
-from vehicle_detection.export import DIGITS, shown_tracks
+from vehicle_detection.errors import InvalidInputError, TransientVideoError, VehicleDetectionError
+from vehicle_detection.export import DIGITS, TRACK_COLUMNS, track_rows
 from vehicle_detection.video import FrameSource, download, open_source, process_video
 
 BUSY = "busy"
 """Status of a trip that another process is working on; it is not recorded."""
 
-# Rows per group of the Parquet file, which bounds the memory.
-_ROWS_PER_GROUP = 50_000
 _COLUMNS = {
     "trip": "string", "frame": "int64", "time_s": "double", "track_id": "int64",
     **dict.fromkeys(DIGITS, "double"),
@@ -65,13 +63,12 @@ def run_trip(task: Mapping[str, Any]) -> dict[str, Any]:
     Only one process works on a trip at a time. Outputs are complete or absent, and the record is written
     last.
     """
-    out, key = Path(task["out"]), task["key"]
-    identity = key.partition("-")[0]
-    with _lock(out / "locks" / f"{identity}.lock") as locked:
+    store, key = open_store(task["out"], create=True), task["key"]
+    with store.lock(key.partition("-")[0]) as locked:
         if not locked:
             return {"key": key, "status": BUSY, "sources": task["sources"]}
-        record = read_record(out, key)
-        if record is not None and is_complete(out, record) and not task.get("again"):
+        record = read_record(store, key)
+        if record is not None and is_complete(record, store.exists) and not task.get("again"):
             return record | {"new": False}
         started = time.time()
         record = {
@@ -81,13 +78,13 @@ def run_trip(task: Mapping[str, Any]) -> dict[str, Any]:
             "started": started,
         }
         try:
-            _remove_earlier(out, task)
-            record |= _process(out, task)
+            _remove_earlier(store, task)
+            record |= _process(store, task)
         except Exception as error:
             record |= _failure(error)
         record["seconds"] = round(time.time() - started, 3)
         try:
-            write_record(out, record)
+            write_record(store, record)
         except OSError as error:  # the disk is full: the trip is missing, and the next run repeats it
             record |= {"status": ERROR, "message": str(error)}
     return record | {"new": True}
@@ -96,17 +93,18 @@ def run_trip(task: Mapping[str, Any]) -> dict[str, Any]:
 def _failure(error: Exception) -> dict[str, Any]:
     """Status and message of an error: of the source, or of the machine, which may go away."""
     message = " ".join(str(error).split())
-    if isinstance(error, VehicleDetectionError) and "cannot be written" not in message:
-        return {"status": FAILED, "message": message}
-    return {"status": ERROR, "message": f"{type(error).__name__}: {message}"}
+    if not isinstance(error, VehicleDetectionError):
+        return {"status": ERROR, "message": f"{type(error).__name__}: {message}"}
+    passing = isinstance(error, (TransientVideoError, OSError))  # an OutputError is an OSError
+    return {"status": ERROR if passing else FAILED, "message": message}
 
 
-def _process(out: Path, task: Mapping[str, Any]) -> dict[str, Any]:
+def _process(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
     """Write the outputs of a trip; return the facts for its record."""
     settings, key = task["settings"], task["key"]
     detector = _detector(settings)
     place = f"date={task['date']}/camera={task['camera']}/{key}"
-    with _scratch(out, key) as folder:
+    with _scratch(store, key) as folder:
         video = None if settings["tracks_only"] else folder / "video.mp4"
         with _open(task, folder) as source, _TrackTable(folder / "tracks.parquet", key) as write:
             report = process_video(
@@ -120,10 +118,10 @@ def _process(out: Path, task: Mapping[str, Any]) -> dict[str, Any]:
                 on_result=write,
             )
         outputs = {"tracks": f"tracks/{place}.parquet"}
-        _publish(folder / "tracks.parquet", out / outputs["tracks"])
+        store.publish(folder / "tracks.parquet", outputs["tracks"])
         if video is not None:
             outputs["video"] = f"videos/{place}.mp4"
-            _publish(video, out / outputs["video"])
+            store.publish(video, outputs["video"])
     return {
         "status": DONE,
         "frames": report.frames,
@@ -152,124 +150,51 @@ def _open(task: Mapping[str, Any], folder: Path) -> FrameSource:
 
 
 class _TrackTable:
-    """Writer of the shown tracks as a Parquet file, in groups of rows."""
+    """Writer of the shown tracks of a trip as a Parquet file."""
 
     def __init__(self, path: Path, key: str) -> None:
-        self._path, self._key = path, key
-        self._waiting: dict[str, list[Any]] = {name: [] for name in _COLUMNS}
+        try:
+            self._table = ParquetRows(path, _COLUMNS)
+        except InvalidInputError as error:  # not the fault of the source
+            raise OSError(f"this worker cannot write tracks: {error}") from None
+        self._key = key
         self.rows = 0
 
     def __enter__(self) -> _TrackTable:
-        try:
-            import pyarrow
-            import pyarrow.parquet
-        except ImportError:
-            raise OSError(
-                "a batch needs pyarrow on every worker; pip install 'vehicle-detection[batch]'"
-            ) from None
-        self._arrow = pyarrow
-        self._schema = pyarrow.schema(list(_COLUMNS.items()))
-        self._writer = pyarrow.parquet.ParquetWriter(self._path, self._schema)
+        self._table.__enter__()
         return self
 
     def __call__(self, result: Any) -> None:
         """Add the shown tracks of a frame's result."""
-        for track in shown_tracks(result):
-            numbers = (*track.box, *(getattr(track, name) for name in tuple(DIGITS)[4:]))
-            rounded = [
-                None if value is None else round(float(value), digits) + 0.0
-                for value, digits in zip(numbers, DIGITS.values(), strict=True)
-            ]
-            values = (self._key, result.index, round(result.time, 4), track.id, *rounded)
-            for column, value in zip(self._waiting.values(), values, strict=True):
-                column.append(value)
+        for row in track_rows(result):
+            self._table.write((self._key, row.frame, round(result.time, 4), *row[1 : len(TRACK_COLUMNS)]))
             self.rows += 1
-        if len(self._waiting["frame"]) >= _ROWS_PER_GROUP:
-            self._flush()
-
-    def _flush(self) -> None:
-        self._writer.write_table(self._arrow.table(self._waiting, schema=self._schema))
-        for column in self._waiting.values():
-            column.clear()
 
     def __exit__(self, *error: Any) -> None:
-        try:
-            if error[0] is None:
-                self._flush()
-        finally:
-            self._writer.close()
+        self._table.__exit__(*error)
 
 
 @contextlib.contextmanager
-def _scratch(out: Path, key: str) -> Iterator[Path]:
+def _scratch(store: Store, key: str) -> Iterator[Path]:
     """Empty folder on a local disk, where ffmpeg writes; what a killed process left there is removed."""
-    batch = hashlib.sha256(str(out.resolve()).encode()).hexdigest()[:8]
+    batch = hashlib.sha256(store.name.encode("utf-8", "surrogateescape")).hexdigest()[:8]
     folder = Path(tempfile.gettempdir()) / f"vehicle-batch-{batch}-{key}"
     shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
+    folder.mkdir(mode=0o700)
     try:
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _publish(path: Path, target: Path) -> None:
-    """Copy a complete file to its place."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    # What a killed process left beside it.
-    for left in target.parent.glob(f".{target.stem}.*"):
-        left.unlink(missing_ok=True)
-    with atomic_write(target) as part:
-        shutil.copyfile(path, part)
-
-
-def _remove_earlier(out: Path, task: Mapping[str, Any]) -> None:
+def _remove_earlier(store: Store, task: Mapping[str, Any]) -> None:
     """Remove the results of this trip's files for other contents, parameters or trips."""
-    for key in task.get("replaces", ()):
-        record = read_record(out, key)
-        if record is not None and key != task["key"]:
-            for path in record.get("outputs", {}).values():
-                (out / path).unlink(missing_ok=True)
-            record_path(out, key).unlink(missing_ok=True)
+    for key, record in read_records(store, task.get("replaces", ())).items():
+        for path in record.get("outputs", {}).values():
+            store.remove(path)
+        store.remove(record_path(key))
     # Outputs whose record a killed process did not write any more.
     identity, place = task["key"].partition("-")[0], f"date={task['date']}/camera={task['camera']}"
     for kind in ("tracks", "videos"):
-        for path in (out / kind / place).glob(f"{identity}-*"):
-            path.unlink(missing_ok=True)
-
-
-def earlier_keys(out: Path) -> dict[str, list[str]]:
-    """Keys of all records by the identity of their trip."""
-    found: dict[str, list[str]] = {}
-    for key in record_names(out):
-        found.setdefault(key.partition("-")[0], []).append(key)
-    return found
-
-
-@contextlib.contextmanager
-def _lock(path: Path) -> Iterator[bool]:
-    """Lock a file, which the system unlocks when the process ends in any way; yield whether it succeeded."""
-    try:
-        import fcntl
-    except ImportError:  # Windows: two runs on one folder may do a trip twice
-        yield True
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    while True:
-        with path.open("w") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                yield False
-                return
-            except OSError:  # storage without locks: outputs are atomic, only work may be done twice
-                yield True
-                return
-            with contextlib.suppress(FileNotFoundError):
-                if os.fstat(file.fileno()).st_ino == path.stat().st_ino:
-                    try:
-                        yield True
-                    finally:
-                        path.unlink(missing_ok=True)
-                    return
-        # Another process has removed the file between opening and locking: try again.
+        for path in store.list_files(f"{kind}/{place}", f"{identity}-"):
+            store.remove(path)

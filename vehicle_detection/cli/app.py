@@ -25,8 +25,11 @@ from vehicle_detection.cli.options import (
     OUTPUT,
     SEARCH,
     Blur,
+    CameraHeight,
+    CameraName,
     Confidence,
     Every,
+    FieldOfView,
     Horizon,
     LineWidth,
     Model,
@@ -332,7 +335,7 @@ def video(
         ),
     ],
     output: Annotated[
-        Path,
+        Path | None,
         Option(
             "-o",
             "--output",
@@ -340,12 +343,16 @@ def video(
             help="Video to write: .mp4, .m4v, .mov or .mkv.",
             rich_help_panel=OUTPUT,
         ),
-    ],
+    ] = None,
+    show: Annotated[
+        bool,
+        flag("--show", panel=OUTPUT, help="Show the annotated frames in a window; Escape ends the run."),
+    ] = False,
     tracks: Annotated[
         Path | None,
         Option(
             metavar="FILE",
-            help="Tracks: .csv, .jsonl, .parquet, .txt (MOT) or .json (COCO).",
+            help="Tracks: .csv, .jsonl, .parquet, .txt (MOT), .zip (CVAT) or .json (COCO).",
             rich_help_panel=OUTPUT,
         ),
     ] = None,
@@ -426,35 +433,15 @@ def video(
             help="Drop frames of a pipe rather than lag; default for cameras and streams.",
         ),
     ] = False,
+    no_reconnect: Annotated[
+        bool, flag("--no-reconnect", panel=INPUT, help="End with a network stream that breaks off.")
+    ] = False,
     strict: Annotated[
         bool, flag("--strict", panel=INPUT, help="Fail, and write nothing, if the source is damaged.")
     ] = False,
-    camera: Annotated[
-        str | None,
-        Option(
-            metavar="NAME|FILE",
-            help="Lens: standard-58, wide-90, fisheye-120, fisheye-140 or fisheye-170; or a JSON file.",
-            rich_help_panel=CAMERA,
-        ),
-    ] = None,
-    fov: Annotated[
-        float | None,
-        Option(
-            "--fov",
-            metavar="DEG",
-            help="Horizontal field of view in degrees, such as 90; default: 58, with a warning.",
-            rich_help_panel=CAMERA,
-        ),
-    ] = None,
-    camera_height: Annotated[
-        float | None,
-        Option(
-            "--camera-height",
-            metavar="M",
-            help="Height of the lens above the road in meters, such as 1.5; default: 1.3.",
-            rich_help_panel=CAMERA,
-        ),
-    ] = None,
+    camera: CameraName = None,
+    fov: FieldOfView = None,
+    camera_height: CameraHeight = None,
     horizon: Annotated[
         str | None,
         Option(
@@ -515,7 +502,7 @@ def video(
         ),
     ] = False,
 ) -> None:
-    """Track the vehicles of a video and write an annotated copy.
+    """Track the vehicles of a video, and write or show an annotated copy.
 
     Speeds are relative to the camera, and over ground where its own speed is known (--gpx, --own-speed).
 
@@ -524,7 +511,7 @@ def video(
     from vehicle_detection.cli.events import SideOutputs, explain_vehicles, print_summary, read_speed
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.events import TrackLog
-    from vehicle_detection.export import TrackWriter
+    from vehicle_detection.export import FORMATS, TrackWriter, check_format
     from vehicle_detection.mixture import load_model
     from vehicle_detection.video import estimate_video_horizon, open_source, process_video
 
@@ -533,6 +520,14 @@ def video(
     }  # fmt: skip
     sources = {"SOURCE": Path(source)} | ({} if gpx is None else {"--gpx": gpx})
     check_distinct_paths(outputs, sources)
+    if output is None and (report or clips):
+        raise InvalidInputError(
+            f"--output must name a video for {'--report' if report else '--clips'}, which contains it; add it"
+        )
+    if not any((output, show, tracks, events, srt)):
+        raise InvalidInputError(
+            "--output must name the video to write; or use --show, --tracks, --events or --srt"
+        )
     draw_params = _draw_params(
         labels,
         line_width=line_width,
@@ -551,7 +546,7 @@ def video(
         writers: list[Callable[[Any], object]] = []
         if tracks is not None:
             with option_names(path="--tracks"):
-                writers.append(stack.enter_context(TrackWriter(tracks)))
+                check_format(tracks, None, FORMATS.values())
         loaded = load_model(model)
         if horizon == "auto":
             with _everywhere(loaded, conf) as detector:
@@ -574,7 +569,7 @@ def video(
             )
         )
         page = None
-        if report is not None:
+        if report is not None and output is not None:
             from vehicle_detection.report import ReportWriter
 
             with option_names(path="--report"):
@@ -583,8 +578,12 @@ def video(
                 )
         log = page.log if page else TrackLog()
         writers.append(page or log)
+        opened = stack.enter_context(open_source(source, live=live or None, reconnect=not no_reconnect))
+        if tracks is not None:
+            with option_names(path="--tracks"):
+                writers.append(stack.enter_context(TrackWriter(tracks, shape=opened.info.shape)))
         done = process_video(
-            stack.enter_context(open_source(source, live=True)) if live else source,
+            opened,
             output,
             detector,
             start=start,
@@ -594,6 +593,7 @@ def video(
             workers=jobs,
             progress=not quiet,
             strict=strict,
+            show=show,
             on_result=lambda result: [write(result) for write in writers],
         )
         found = side_outputs.find_events(log, done, detector)
@@ -616,7 +616,8 @@ def video(
     if not quiet:
         print_summary(log, found, done)
         written = [path for path in (*outputs.values(), clips) if path is not None]
-        typer.echo(f"wrote {', '.join(map(str, written))}")
+        if written:
+            typer.echo(f"wrote {', '.join(map(str, written))}")
     if done.damage:
         raise typer.Exit(DAMAGED)
 

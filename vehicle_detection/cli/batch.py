@@ -9,19 +9,39 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from vehicle_detection.cli.options import Every, Horizon, Model, NoAudio, Preset, flag
+from vehicle_detection.cli.options import (
+    Blur,
+    CameraHeight,
+    CameraName,
+    Confidence,
+    Every,
+    FieldOfView,
+    Horizon,
+    Model,
+    NoAudio,
+    Preset,
+    flag,
+)
 from vehicle_detection.cli.output import option_names, print_error
 from vehicle_detection.errors import InvalidInputError
 
 
-@option_names(out="--output", retry_failed="--retry-failed")
+@option_names(
+    out="--output",
+    retry_failed="--retry-failed",
+    field_of_view="--fov",
+    camera_height_m="--camera-height",
+)
 def batch(
-    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder of the results.")],
+    output: Annotated[
+        str, Option("-o", "--output", metavar="DIR|URL", help="Folder or URL (s3://...) of the results.")
+    ],
     sources: Annotated[
         list[str] | None,
         Argument(metavar="SOURCES...", help="Video files, folders, quoted patterns and URLs (s3://...)."),
     ] = None,
     model: Model = "default",
+    conf: Confidence = None,
     jobs: Annotated[
         int | None, Option(metavar="N", help="Worker processes of one thread; default: one per core.")
     ] = None,
@@ -36,26 +56,46 @@ def batch(
     ] = "trip",
     tracks_only: Annotated[bool, flag("--tracks-only", help="Write no videos.")] = False,
     horizon: Horizon = None,
+    camera: CameraName = None,
+    fov: FieldOfView = None,
+    camera_height: CameraHeight = None,
     every: Every = None,
+    blur: Blur = None,
     preset: Preset = "veryfast",
     no_audio: NoAudio = False,
     retry_failed: Annotated[
         bool, flag("--retry-failed", help="Process trips again whose source could not be processed.")
     ] = False,
-    status: Annotated[bool, flag("--status", help="Only show what has been done in DIR.")] = False,
+    status: Annotated[bool, flag("--status", help="Only show what has been done.")] = False,
+    summary: Annotated[
+        Path | None, Option(metavar="FILE.csv", help="Table with a row for each trip that has been done.")
+    ] = None,
     quiet: Annotated[bool, flag("-q", "--quiet", help="Print errors only.")] = False,
 ) -> None:
     """Track the vehicles of many videos in parallel; run again to do what is missing or changed."""
+    if summary is not None:
+        from vehicle_detection._common import check_target
+
+        check_target(summary, "--summary")
     if status:
         from vehicle_detection.batch import batch_status
 
         typer.echo(str(batch_status(output)))
+        _write_summary(output, summary)
         return
     if not sources:
         raise InvalidInputError("SOURCES... must name at least one video, folder, pattern or URL")
     from vehicle_detection.batch import open_dask, run_batch
 
-    options: dict[str, Any] = {"horizon": horizon, "every": every}
+    options: dict[str, Any] = {
+        "conf": conf,
+        "horizon": horizon,
+        "camera": camera,
+        "field_of_view": fov,
+        "camera_height_m": camera_height,
+        "every": every,
+        "blur": blur,
+    }
     with contextlib.ExitStack() as stack:
         executor = None
         if dask is not None:
@@ -79,8 +119,21 @@ def batch(
         )
     for source, message in done.messages.items():
         print_error(f"warning: {source}: {message}")
+    _write_summary(output, summary)
     if not quiet:
         typer.echo(str(done))
-        typer.echo(f"wrote {output}")
+        typer.echo(f"wrote {output}" + (f", {summary}" if summary else ""))
     if done.errors:  # the machine's fault: a job that is started again does the rest
         raise typer.Exit(1)
+
+
+def _write_summary(output: str, summary: Path | None) -> None:
+    """Write the table of all trips of a batch."""
+    if summary is None:
+        return
+    from vehicle_detection._common import atomic_write
+    from vehicle_detection.batch import batch_summary
+
+    table = batch_summary(output)
+    with atomic_write(summary, "--summary") as part:
+        table.to_csv(part, index=False)

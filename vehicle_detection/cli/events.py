@@ -75,7 +75,7 @@ class SideOutputs:
         self,
         log: TrackLog,
         events: tuple[Event, ...],
-        video: Path,
+        video: Path | None,
         report: VideoReport,
         detector: VehicleDetector,
     ) -> None:
@@ -86,7 +86,7 @@ class SideOutputs:
         if self.events is not None:
             with option_names(path="--events"):
                 write_events(events, self.events)
-        if self.clips is not None:
+        if self.clips is not None and video is not None:
             cut_clips(events, video, self.clips, fps=fps)
         if self.subtitles is not None:
             units = detector.draw_params.units

@@ -42,6 +42,32 @@ Every = Annotated[
     ),
 ]
 Horizon = Annotated[float | None, Option(metavar="F", help=HORIZON_HELP, rich_help_panel=CAMERA)]
+CameraName = Annotated[
+    str | None,
+    Option(
+        metavar="NAME|FILE",
+        help="Lens: standard-58, wide-90, fisheye-120, fisheye-140 or fisheye-170; or a JSON file.",
+        rich_help_panel=CAMERA,
+    ),
+]
+FieldOfView = Annotated[
+    float | None,
+    Option(
+        "--fov",
+        metavar="DEG",
+        help="Horizontal field of view in degrees, such as 90; default: 58, with a warning.",
+        rich_help_panel=CAMERA,
+    ),
+]
+CameraHeight = Annotated[
+    float | None,
+    Option(
+        "--camera-height",
+        metavar="M",
+        help="Height of the lens above the road in meters, such as 1.5; default: 1.3.",
+        rich_help_panel=CAMERA,
+    ),
+]
 LineWidth = Annotated[
     int | None,
     Option(

@@ -1,4 +1,4 @@
-"""Read label and prediction files: CSV, JSON Lines, Parquet, KITTI, MOTChallenge and COCO."""
+"""Read label and prediction files: CSV, JSON Lines, Parquet, KITTI, MOTChallenge, COCO and YOLO."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ import json
 import math
 import os
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import zipfile
+import zlib
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,7 +32,7 @@ from vehicle_detection.evaluation.frame_boxes import (
     frame_order,
     none_if_unknown,
 )
-from vehicle_detection.export import BOX_COLUMNS, FORMATS
+from vehicle_detection.export import BOX_COLUMNS, FOLDER_FORMATS, FORMATS
 
 LABEL_COLUMNS = ("frame", "track", "x1", "y1", "x2", "y2", "occluded", "truncated", "ignore")
 
@@ -43,6 +45,12 @@ PERSON_CLASSES = ("pedestrian", "person_sitting", "cyclist")
 
 # The project's labels do not score vehicles that are largely hidden, truncated by more, or narrower (px).
 _HIDDEN, _MAX_TRUNCATED, _MIN_WIDTH = 2, 0.7, 40.0
+
+# Confidences of 0 and 1 have infinite log-odds.
+_MIN_CONFIDENCE = 1e-6
+
+
+_READ_FORMATS = (*dict.fromkeys(FORMATS.values()), "coco_results", *FOLDER_FORMATS)
 
 
 class Row(NamedTuple):
@@ -259,23 +267,126 @@ def _kitti_row(
 
 
 def _read_mot(source: Path, classes: Collection[str] | None) -> Rows:
-    rows: list[Row] = []
-    for where, line in _read_lines(source):
+    return [row for row, number in _mot_rows(_read_lines(source)) if classes is None or number in classes], []
+
+
+def _mot_rows(lines: Iterable[tuple[str, str]], *, first_pixel: int = 1) -> Iterator[tuple[Row, str | None]]:
+    """Yield each row of MOTChallenge text with its class number; predictions have none."""
+    for where, line in lines:
         words = _split_words(line.rstrip(","))
         if len(words) < 6:
             raise DatasetError(f"{where}: expected frame, id, x, y, width, height, found {len(words)} values")
         frame = _integer(words[0], "frame (counted from 1)", where, low=1) - 1
         track = _integer(words[1], "id", where, low=NO_TRACK)
         x, y, width, height = (_number(word, "side of the box", where) for word in words[2:6])
-        box = (x - 1, y - 1, x - 1 + width, y - 1 + height)  # the first pixel is number 1
+        x, y = x - first_pixel, y - first_pixel
+        box = (x, y, x + width, y + height)
         # Ground truth has nine columns, the last ones flag, class, visibility. Results have class -1 or ten.
         if len(words) == 9 and words[7] != "-1":
-            if classes is None or words[7] in classes:
-                rows.append(Row(where, frame, track, box, ignore=_number(words[6], "flag", where) == 0))
+            yield Row(where, frame, track, box, ignore=_number(words[6], "flag", where) == 0), words[7]
         else:
             score = _number(words[6], "score", where) if len(words) > 6 else math.nan
-            rows.append(Row(where, frame, track, box, score=score))
+            yield Row(where, frame, track, box, score=score), None
+
+
+def _read_mot_zip(source: Path, classes: Collection[str] | None) -> Rows:
+    """Read an archive of CVAT: MOTChallenge text whose pixels count from 0, and the names of the classes."""
+    text, names = _read_members(source, "gt/gt.txt", "gt/labels.txt")
+    if text is None:
+        raise DatasetError(f"{source} is not an archive of CVAT: it lacks gt/gt.txt; export MOT 1.1 there")
+    wanted = VEHICLE_CLASSES if classes is None else classes
+    labels = None if names is None else [name.strip().lower() for name in names.splitlines() if name.strip()]
+    lines = ((f"{source} line {n}", line) for n, line in enumerate(text.splitlines(), 1) if line.strip(", "))
+    rows = []
+    for row, number in _mot_rows(lines, first_pixel=0):
+        if labels is not None and number is not None:
+            index = _integer(number, "class", row.where, low=1)
+            if index > len(labels):
+                raise DatasetError(
+                    f"{row.where}: class must be at most {len(labels)}, as in gt/labels.txt, got {index}"
+                )
+            if labels[index - 1] not in wanted:
+                continue
+        rows.append(row)
     return rows, []
+
+
+def _read_members(source: Path, *names: str) -> list[str | None]:
+    """Read text files of an archive; None for each that it lacks."""
+    check_regular_file(source, str(source), Limit.TEXT_BYTES, error=DatasetError)
+    try:
+        with zipfile.ZipFile(source) as archive:
+            known = {info.filename: info for info in archive.infolist()}
+            texts: list[str | None] = []
+            for name in names:
+                if name in known and known[name].file_size > Limit.TEXT_BYTES.current():
+                    raise DatasetError(
+                        f"{source}: {name} is larger than {Limit.TEXT_BYTES.current():,} bytes; if it is "
+                        f"meant to be so large, set {Limit.TEXT_BYTES.variable}"
+                    )
+                texts.append(archive.read(name).decode("utf-8-sig") if name in known else None)
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, EOFError, RuntimeError, OSError) as error:
+        raise DatasetError(f"{source} is not a zip archive that can be read ({error})") from None
+    except UnicodeDecodeError:
+        raise DatasetError(f"{source} does not hold UTF-8 text; save it as UTF-8") from None
+    return texts
+
+
+def _read_yolo(source: Path, classes: Collection[str] | None, shape: tuple[int, ...] | None) -> Rows:
+    """Read a text file for each frame; the names of the classes are beside their folder, or unknown."""
+    if shape is None:
+        raise InvalidInputError("shape must be (height, width) of the frames for YOLO, got None; pass it")
+    folder = source / "labels" if (source / "labels").is_dir() else source
+    files = [file for file in folder.glob("*.txt") if file.name != "classes.txt"]
+    if not files:
+        raise DatasetError(f"{folder} holds no .txt file; name a folder of YOLO labels")
+    names = _yolo_names(source)
+    wanted = VEHICLE_CLASSES if classes is None else classes
+    numbered = all(file.stem.isdecimal() and file.stem == f"{int(file.stem):06d}" for file in files)
+    keys: list[FrameKey] = []
+    rows: list[Row] = []
+    for file in sorted(files, key=lambda file: frame_order(file.name)):
+        keys.append(int(file.stem) if numbered else file.stem)
+        for where, line in _read_lines(file):
+            name, row = _yolo_row(where, keys[-1], line.split(), shape)
+            if not names or names.get(name, name) in wanted:
+                rows.append(row)
+    return rows, keys
+
+
+def _yolo_row(where: str, frame: FrameKey, words: list[str], shape: tuple[int, ...]) -> tuple[str, Row]:
+    """Class and row of a line: class, center, size and, for predictions, confidence and track."""
+    if not 5 <= len(words) <= 7:
+        raise DatasetError(
+            f"{where}: expected class, center and size, and perhaps confidence and track, found {len(words)} "
+            "values"
+        )
+    x, y, width, height = (_number(word, "side of the box", where) for word in words[1:5])
+    x, width, y, height = x * shape[1], width * shape[1], y * shape[0], height * shape[0]
+    score = math.nan
+    if len(words) > 5:
+        confidence = _number(words[5], "confidence", where, low=0, high=1)
+        confidence = min(max(confidence, _MIN_CONFIDENCE), 1 - _MIN_CONFIDENCE)
+        score = math.log(confidence / (1 - confidence))
+    track = _integer(words[6], "track", where, low=NO_TRACK) if len(words) > 6 else NO_TRACK
+    box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
+    return words[0], Row(where, frame, track, box, score=score)
+
+
+def _yolo_names(source: Path) -> dict[str, str]:
+    """Lower-case name of each class number, from ``data.yaml`` or ``classes.txt``; empty if unknown."""
+    for folder in (source, source.parent):
+        if (folder / "data.yaml").is_file():
+            block = _read_text(folder / "data.yaml").partition("names:")[2]
+            numbered = re.findall(r"^\s+(\d+)\s*:\s*(.+?)\s*$", block, re.MULTILINE)
+            listed = re.match(r"\s*\[(.*?)\]", block, re.DOTALL)
+            items = listed[1].split(",") if listed else re.findall(r"^\s*-\s*(.+?)\s*$", block, re.MULTILINE)
+            pairs = numbered or [(str(number), name) for number, name in enumerate(items)]
+            return {number: name.strip(" \"'\n").lower() for number, name in pairs}
+        if (folder / "classes.txt").is_file():
+            lines = _read_text(folder / "classes.txt").splitlines()
+            return {str(number): name.strip().lower() for number, name in enumerate(lines)}
+    return {}
 
 
 class CocoFile(NamedTuple):
@@ -390,15 +501,18 @@ def read_labels(
         A CSV file (``frame,track,x1,y1,x2,y2,occluded,truncated,ignore`` or, for predictions,
         ``frame,track_id,x1,y1,x2,y2,score[,distance_m,speed_mps]``, separated by commas, semicolons or tabs),
         a JSON Lines or Parquet (needs pyarrow) file with these columns, a KITTI ``label_2`` folder, a
-        MOTChallenge text file, a COCO JSON file, or a list of COCO results.
+        MOTChallenge text file, the MOT archive of CVAT, a COCO JSON file, a list of COCO results, or a YOLO
+        folder: ``labels/*.txt``, with class names in ``data.yaml`` or ``classes.txt``.
     format
-        ``"csv"``, ``"jsonl"``, ``"parquet"``, ``"kitti"``, ``"mot"``, ``"coco"`` or ``"coco_results"``; None
-        chooses by suffix and content.
+        ``"csv"``, ``"jsonl"``, ``"parquet"``, ``"kitti"``, ``"mot"``, ``"mot_zip"``, ``"coco"``,
+        ``"coco_results"`` or ``"yolo"``; None chooses by suffix and content.
     classes
-        KITTI types, COCO category names or MOT class numbers that are vehicles, in upper or lower case.
+        KITTI types, COCO category names, class names of CVAT and YOLO, or MOT class numbers that are
+        vehicles, in upper or lower case.
         None takes car, van, truck, bus and vehicle, and every row of a MOT file.
     shape
-        ``(height, width, ...)`` of the frames, to which boxes are clipped. None does not clip them.
+        ``(height, width, ...)`` of the frames, to which boxes are clipped. None does not clip them. YOLO
+        needs it.
     truth
         The COCO data set whose image and category ids a list of COCO results has; not read otherwise.
 
@@ -407,7 +521,8 @@ def read_labels(
     FrameBoxes
         CSV frames are int if all of them are whole numbers, else str. KITTI frames are the files' names
         without ``.txt``, COCO frames the images' ``file_name``. Frames and pixels of MOT files count from 1
-        and are returned from 0.
+        and are returned from 0. YOLO frames are the files' names without ``.txt``, or numbers if all have six
+        digits; a confidence becomes its log-odds.
 
     Raises
     ------
@@ -433,11 +548,11 @@ def read_labels(
     """
     source = check_path(path, "path", kind="a file or folder")
     if format is not None:
-        check_choice(format, "format", ("csv", "jsonl", "parquet", "kitti", "mot", "coco", "coco_results"))
+        check_choice(format, "format", _READ_FORMATS)
     if not source.exists():
         raise DatasetError(f"{source} does not exist; check the path")
     kind = format or _guess_format(source)
-    if source.is_dir() and kind != "kitti":
+    if source.is_dir() and kind not in FOLDER_FORMATS:
         raise DatasetError(
             f"{source} is a folder, and {kind} labels are one file; pass the path of that file"
         )
@@ -446,8 +561,10 @@ def read_labels(
         found = {"csv": _read_csv, "jsonl": _read_json_lines, "parquet": _read_parquet}[kind](source)
     elif kind in ("coco", "coco_results"):  # told apart by their content
         found = _read_coco(source, chosen, None if truth is None else check_path(truth, "truth"))
+    elif kind == "yolo":
+        found = _read_yolo(source, chosen, shape)
     else:
-        found = {"kitti": _read_kitti, "mot": _read_mot}[kind](source, chosen)
+        found = {"kitti": _read_kitti, "mot": _read_mot, "mot_zip": _read_mot_zip}[kind](source, chosen)
     return _assemble(*found, shape)
 
 
@@ -497,7 +614,8 @@ def _assemble(rows: list[Row], keys: list[FrameKey], shape: tuple[int, ...] | No
 def _guess_format(source: Path) -> str:
     """Choose the format by the suffix or else by the first line."""
     if source.is_dir():
-        return "kitti"
+        named = ("labels", "data.yaml", "classes.txt")
+        return "yolo" if any((source / name).exists() for name in named) else "kitti"
     suffix = source.suffix.lower()
     if suffix == ".tsv" or (suffix in FORMATS and suffix != ".txt"):
         return FORMATS.get(suffix, "csv")

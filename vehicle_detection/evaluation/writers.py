@@ -9,12 +9,14 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
-from vehicle_detection._common import atomic_write, check_type, describe, temporary_folder, write_parquet
+from vehicle_detection._common import atomic_write, check_type, write_parquet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.frame_boxes import NO_TRACK, FrameBoxes, FrameKey
 from vehicle_detection.evaluation.readers import FRAME_NUMBER, read_coco_file, vehicle_categories
 from vehicle_detection.export import (
+    FOLDER_FORMATS,
     FORMATS,
+    TRACK_COLUMNS,
     CocoImages,
     Row,
     check_format,
@@ -22,6 +24,8 @@ from vehicle_detection.export import (
     coco_images,
     coco_result,
     mot_line,
+    new_folder,
+    open_row_file,
 )
 
 
@@ -46,11 +50,13 @@ def write_labels(
         - ``"mot"``: MOTChallenge text, ground truth for labels and results for predictions.
         - ``"coco"``: a COCO data set with all frames as images, also those without boxes.
         - ``"coco_results"``: the list of predictions that ``COCO.loadRes`` of pycocotools takes.
+        - ``"mot_zip"``: the archive that CVAT imports as tracks.
         - ``"kitti"``: a new folder with one ``label_2`` file for each frame.
+        - ``"yolo"``: a new folder with ``data.yaml`` and one file in ``labels`` for each frame.
 
-        None chooses by the suffix: .csv, .jsonl, .ndjson, .parquet, .txt (MOT) or .json (data set).
+        None chooses by the suffix: .csv, .jsonl, .ndjson, .parquet, .txt or .zip (MOT), or .json (data set).
     shape
-        ``(height, width, ...)`` of the images, which some viewers of COCO data sets need.
+        ``(height, width, ...)`` of the images, which YOLO and some viewers of COCO data sets need.
     truth
         A COCO data set whose image ids are used; required for results. Frames are found by file name, or by
         number in data sets written here. A data set has its images, too.
@@ -69,7 +75,8 @@ def write_labels(
 
     Notes
     -----
-    No format but KITTI loses a box's score, track or ``ignore`` without an error. What else each cannot hold:
+    No format but KITTI, YOLO (tracks of labels) and the archive for CVAT (scores) loses a box's score, track
+    or ``ignore`` without an error. What else each cannot hold:
 
     - CSV, JSON Lines, Parquet: frames without boxes. CSV also reads names that are all whole numbers as
       numbers, and rejects them.
@@ -78,6 +85,7 @@ def write_labels(
     - COCO: occlusion and truncation. Ignored boxes are crowds, which pycocotools ignores as
       `evaluate_detections` does with ``ignored_as_regions=True``.
     - COCO results: the same, and predictions marked ``ignore`` (an error).
+    - YOLO: ignored boxes (an error), suffixes of file names, distance and speed. Scores become confidences.
     - KITTI: numbered frames (an error), tracks, distance and speed. Ignored boxes become regions, and
       `read_labels` ignores labels that are narrow, hidden or truncated.
 
@@ -98,15 +106,22 @@ def write_labels(
     (0, 2)
     """
     check_type(labels, "labels", FrameBoxes, "collect the boxes of each frame in one")
-    if format == "kitti":
+    kind = check_format(path, format, (*FORMATS.values(), "coco_results", *FOLDER_FORMATS))
+    if kind == "kitti":
         _write_kitti(labels, Path(path))
         return len(labels)
-    kind = check_format(path, format, (*FORMATS.values(), "coco_results", "kitti"))
     if truth is not None and not kind.startswith("coco"):
         raise InvalidInputError(f"truth must be None for the format {kind!r}; only COCO files have image ids")
     _check_holds(labels, kind)
     if kind == "parquet":
         _write_parquet(labels, path)
+        return len(labels)
+    if kind in ("mot_zip", "yolo"):
+        with open_row_file(path, kind, TRACK_COLUMNS, shape) as rows:
+            for key in labels.frame_keys:
+                rows.add_frame(key)
+            for row in _rows(labels):
+                rows.write(row)
         return len(labels)
     if kind.startswith("coco"):
         content = _coco_content(labels, kind, shape, truth)
@@ -137,10 +152,12 @@ def _check_holds(labels: FrameBoxes, kind: str) -> None:
             raise InvalidInputError(
                 f"labels name a frame {padded!r}; CSV drops the spaces around a name, so write .jsonl"
             )
-    if kind == "mot" and names:
+    if kind in ("mot", "mot_zip") and names:
         raise InvalidInputError(
             f"labels must have numbered frames for MOT, got {names[0]!r}; number them with labels.renamed"
         )
+    if kind == "yolo":
+        _check_yolo(labels)
     if kind in ("mot", "coco_results") and labels.scores is not None and labels.ignore.any():
         raise InvalidInputError(
             f"labels hold predictions marked ignore, which the format {kind!r} cannot mark; drop them with "
@@ -148,6 +165,20 @@ def _check_holds(labels: FrameBoxes, kind: str) -> None:
         )
     if kind == "coco_results" and labels.scores is None and len(labels):
         raise InvalidInputError("labels need scores for COCO results; write labels as a data set ('coco')")
+
+
+def _check_yolo(labels: FrameBoxes) -> None:
+    if labels.ignore.any():
+        raise InvalidInputError(
+            "labels hold boxes marked ignore, which YOLO cannot mark; drop them with labels[~labels.ignore]"
+        )
+    stems: dict[str, str] = {}
+    for key in labels.frame_keys:
+        if isinstance(key, str) and stems.setdefault(Path(key).stem, key) != key:
+            raise InvalidInputError(
+                f"labels hold frames {stems[Path(key).stem]!r} and {key!r}, which are one file in YOLO; "
+                "rename them with labels.renamed"
+            )
 
 
 def _records(labels: FrameBoxes) -> Iterator[dict[str, Any]]:
@@ -224,21 +255,10 @@ def _write_kitti(labels: FrameBoxes, folder: Path) -> None:
                 f"labels must have frames that are file names for KITTI, got {key!r}; "
                 "name them with labels.renamed(lambda frame: f'{frame:06d}')"
             )
-    if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
-        raise InvalidInputError(f"path must be a new or empty folder for KITTI, got {folder}; choose another")
-    if not folder.parent.is_dir():
-        raise InvalidInputError(
-            f"path needs an existing folder, {describe(str(folder.parent))} is not one; create it first"
-        )
-    with temporary_folder(folder.parent, folder.name[:32]) as temporary:
-        part = temporary / "label_2"
-        part.mkdir()
+    with new_folder(folder, "KITTI") as part:
         for key in labels.frame_keys:
             with (part / f"{key}.txt").open("w", encoding="utf-8", newline="") as file:
                 _write_kitti_file(labels.frame(key), file)
-        if folder.is_dir():
-            folder.rmdir()
-        part.replace(folder)
 
 
 def _write_kitti_file(labels: FrameBoxes, file: IO[str]) -> None:

@@ -25,10 +25,19 @@ from pathlib import Path
 from typing import IO, Any
 
 from vehicle_detection._common import Limit
-from vehicle_detection.errors import VideoError
+from vehicle_detection.errors import TransientVideoError, VideoError
 from vehicle_detection.video.yuv import ColorEncoding
 
 _PIPE_BYTES = 1 << 18
+# Signals by which ffmpeg ends itself, because of the file.
+_CRASHES = {signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGILL}
+# Messages of ffmpeg about a server or connection, rather than about the video.
+_NETWORK_FAULT = re.compile(
+    r"Connection (refused|reset|timed out)|Operation timed out|Server returned 5|Failed to resolve"
+    r"|Network is unreachable|No route to host|Input/output error|ends prematurely|Broken pipe"
+)
+NETWORK_TIMEOUT = 10.0
+"""Seconds without data after which a server has failed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,8 +97,11 @@ class VideoInfo:
 
 
 def input_options(path: Path | str) -> tuple[str, ...]:
-    """Return the options of ffmpeg that open a file, or the URL of one."""
-    return ("-i", path) if isinstance(path, str) else ("-i", f"file:{path}")
+    """Return the options of ffmpeg that open a file, or a URL, whose connection is repaired if it breaks."""
+    if isinstance(path, Path):
+        return ("-i", f"file:{path}")
+    limit = ("-rw_timeout", f"{NETWORK_TIMEOUT * 1e6:.0f}")
+    return (*limit, "-reconnect", "1", "-reconnect_delay_max", "4", "-i", path)
 
 
 def probe(path: Path | str) -> VideoInfo:
@@ -107,7 +119,7 @@ def _probe(path: Path | str) -> VideoInfo:
         code = process.wait()
         log = process.log()
     if code < 0:
-        raise VideoError(f"{path} cannot be read: {exit_reason(code, log)}")
+        raise video_error(f"{path} cannot be read: {exit_reason(code, log)}", path, code, log)
     check_frame_size(str(path), log)
     header, mapped, decoded = log.partition("Stream mapping:")
     if not re.search(r"^Input #0", header, re.MULTILINE):
@@ -115,12 +127,14 @@ def _probe(path: Path | str) -> VideoInfo:
             raise VideoError(f"{path} is a text file, not a video; choose the video")
         truncated = "moov atom not found" in log
         reason = "its index is missing: the recording or copy is incomplete" if truncated else last_line(log)
-        raise VideoError(f"{path} is not a video that ffmpeg can read ({reason}); record or copy it again")
+        message = f"{path} is not a video that ffmpeg can read ({reason}); record or copy it again"
+        raise video_error(message, path, code, log)
     if not mapped:
         raise VideoError(f"{path} has no video track; choose a file with one")
     frame = re.search(r"n: *0 .*?pts_time:(\S+).*? sar:(\d+)/(\d+) s:(\d+)x(\d+)", decoded)
     if frame is None:
-        raise VideoError(f"{path} has no frame that can be decoded ({last_line(log)}); copy it again")
+        message = f"{path} has no frame that can be decoded ({last_line(log)}); copy it again"
+        raise video_error(message, path, code, log)
     start_time, width, height = frame[1], int(frame[4]), int(frame[5])
     aspect = int(frame[2]), int(frame[3])
     pixel_format = re.search(r"n: *0 .*? fmt:(\w+)", decoded)
@@ -336,7 +350,7 @@ class Process:
                     **group,
                 )
             except (OSError, ValueError) as error:
-                raise VideoError(
+                raise TransientVideoError(
                     f"ffmpeg cannot be started ({error}); reinstall imageio-ffmpeg or unset FFMPEG_BINARY"
                 ) from error
             on_error.pop_all()
@@ -396,10 +410,19 @@ def exit_reason(code: int, log: str) -> str:
     """Say why ffmpeg has ended, from its exit code and its log."""
     if code < 0:
         name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
+        if -code in _CRASHES:
+            return f"ffmpeg has crashed ({name})"
         hint = ", perhaps because memory ran out" if name == "SIGKILL" else ""
         return f"another process ended ffmpeg by the signal {name}{hint}"
     hint = "; free some disk space" if "No space left" in log else ""
     return f"ffmpeg reports {last_line(log)!r}{hint}"
+
+
+def video_error(message: str, source: Path | str, code: int, log: str) -> VideoError:
+    """Return the error of a failed ffmpeg: transient if it was killed, or a server did not answer."""
+    killed = code < 0 and -code not in _CRASHES
+    offline = isinstance(source, str) and _NETWORK_FAULT.search(log) is not None
+    return TransientVideoError(message) if killed or offline else VideoError(message)
 
 
 def last_line(log: str) -> str:

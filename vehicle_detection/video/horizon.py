@@ -12,7 +12,8 @@ from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import HorizonEstimate, estimate_horizon
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video.ffmpeg import VideoInfo
-from vehicle_detection.video.sources import Source, check_span, frame_range, open_source
+from vehicle_detection.video.reading import check_span, frame_range
+from vehicle_detection.video.sources import Source, open_source
 
 _MAX_STD = 0.05  # as a fraction of the frame's height
 # Seconds between searched frames, their number at least (in a short video) and at most, and the number of

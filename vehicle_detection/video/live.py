@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import math
 import re
+import select
+import sys
 import threading
+import time
 from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any, Self
@@ -13,77 +17,228 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection.errors import VideoError
-from vehicle_detection.video.ffmpeg import Process, VideoInfo, check_frame_size, last_line, pixel_limit
+from vehicle_detection.errors import TransientVideoError, VideoError
+from vehicle_detection.video.ffmpeg import (
+    NETWORK_TIMEOUT,
+    Process,
+    VideoInfo,
+    check_frame_size,
+    last_line,
+    pixel_limit,
+    video_error,
+)
 from vehicle_detection.video.yuv import ColorEncoding, rgb_from_planes
 
+_LOGGER = logging.getLogger(__name__)
+
 _MAX_HEADER_BYTES = 4096
+# Seconds that a network stream has to send enough for ffmpeg to recognize it.
+_OPEN_TIMEOUT = 30.0
+# Seconds before each attempt to open a network stream again.
+_RECONNECT_DELAYS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+# Seconds of frames after which the attempts are counted from the start again.
+_STEADY_SECONDS = 10.0
 
 
-class LiveProcess:
-    """An ffmpeg that decodes a stream from its first frame on; the stream is opened only once.
+class _LiveProcess:
+    """An ffmpeg that decodes a stream from its first frame on.
 
     ffmpeg writes YUV4MPEG2, whose header states the frame size and rate, at a constant rate: the times of
-    the frames are those of the stream.
+    the frames are those of the stream. With `like`, frames get the size and rate of another process. With
+    `timed`, a stream without data for some seconds has ended.
     """
 
-    def __init__(self, name: str, options: Sequence[str], *, stdin: int | None = None) -> None:
-        self.name = name
+    def __init__(
+        self, name: str, options: Sequence[str], *, stdin: int | None, like: VideoInfo | None, timed: bool
+    ) -> None:
+        self.name, self._input, self._timed = name, options[-1], timed
+        self._stalled = False
         filters = "crop=trunc(iw/2)*2:trunc(ih/2)*2,scale=out_color_matrix=bt601:out_range=tv"
-        output = ("-map", "0:V:0", "-vf", filters, "-pix_fmt", "yuv420p", "-f", "yuv4mpegpipe", "pipe:1")
+        rate: tuple[str, ...] = ()
+        if like is not None:
+            filters = f"scale={like.width}:{like.height}:out_color_matrix=bt601:out_range=tv"
+            rate = ("-r", str(like.fps))
+        output = ("-map", "0:V:0", "-vf", filters, *rate, "-pix_fmt", "yuv420p", "-f", "yuv4mpegpipe")
         nostdin = () if stdin is not None else ("-nostdin",)
         descriptor: bool | int = False if stdin is None else stdin
-        self.process = Process((*nostdin, *pixel_limit(), *options, *output), stdin=descriptor, stdout=True)
-        try:
-            self.info = self._read_header()
-        except BaseException:
-            self.process.close()
-            raise
+        command = (*nostdin, *pixel_limit(), *options, *output, "pipe:1")
+        self.process = Process(command, stdin=descriptor, stdout=True)
 
-    def _read_header(self) -> VideoInfo:
-        header = self.read_line()
+    def read_info(self) -> VideoInfo:
+        """Read the header of the stream."""
+        header = self._read_line(_OPEN_TIMEOUT)
         size = re.match(rb"YUV4MPEG2 W(\d+) H(\d+) F(\d+):(\d+)", header)
         if size is None:
-            self.process.wait()
-            log = self.process.log()
-            check_frame_size(self.name, log)
-            raise VideoError(
-                f"{self.name} is not a video that ffmpeg can read ({last_line(log)}); check the source"
-            )
+            if self._stalled:
+                raise TransientVideoError(f"{self.name} sends no video within {_OPEN_TIMEOUT:g} s; check it")
+            code = self.process.wait()
+            check_frame_size(self.name, self.process.log())
+            message = f"{self.name} is not a video that ffmpeg can read ({self.reason()}); check the source"
+            raise video_error(message, self.name, code, self.process.log())
         width, height, numerator, denominator = (int(number) for number in size.groups())
         return VideoInfo(
             width=width, height=height, fps=Fraction(numerator, denominator or 1), frames=0, duration=0.0
         )
 
-    def read_line(self) -> bytes:
-        """Read a line of a header; empty at the end of the stream."""
-        line = bytearray()
-        while not line.endswith(b"\n"):
-            byte = self.process.stdout.read(1)
-            if not byte or len(line) > _MAX_HEADER_BYTES:
-                return b""
-            line += byte
-        return bytes(line)
+    def reason(self) -> str:
+        """Last message of ffmpeg, without the password that a URL may hold."""
+        return last_line(self.process.log().replace(self._input, self.name))
 
     def read_planes(self, planes: NDArray[np.uint8]) -> bool:
         """Read the next frame into `planes`; False at the end of the stream."""
-        if not self.read_line():
+        if not self._read_line(NETWORK_TIMEOUT):
             return False
         view, done = planes.data.cast("B"), 0
         while done < len(view):
-            size = self.process.stdout.readinto(view[done:])
+            size = self.process.stdout.readinto(view[done:]) if self._has_data(NETWORK_TIMEOUT) else 0
             if not size:
                 return False
             done += size
         return True
 
+    def _read_line(self, timeout: float) -> bytes:
+        """Read a line of a header; empty at the end of the stream."""
+        line = bytearray()
+        while not line.endswith(b"\n"):
+            byte = self.process.stdout.read(1) if line or self._has_data(timeout) else b""
+            if not byte or len(line) > _MAX_HEADER_BYTES:
+                return b""
+            line += byte
+        return bytes(line)
+
+    def _has_data(self, timeout: float) -> bool:
+        """Wait for data or the end of the pipe."""
+        if not self._timed or sys.platform == "win32":  # where pipes cannot be polled
+            return True
+        poll = select.poll()
+        poll.register(self.process.stdout, select.POLLIN)
+        self._stalled = not poll.poll(timeout * 1000)
+        return not self._stalled
+
+
+class LiveStream:
+    """A stream that is read once, from its first frame on.
+
+    With `reconnect`, a network stream that breaks off or stalls is opened again, a limited number of times
+    in a row; the frames that were missed leave a gap in the numbers.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        options: Sequence[str],
+        *,
+        stdin: int | None = None,
+        network: bool = False,
+        reconnect: bool = False,
+    ) -> None:
+        self.name = name
+        self._options, self._stdin, self._network = tuple(options), stdin, network
+        self._delays = _RECONNECT_DELAYS if network and reconnect else ()
+        self._attempts = 0
+        self._lock = threading.Lock()
+        self._killed = threading.Event()
+        self._process: _LiveProcess | None = None
+        self._ended_cpu_seconds = 0.0
+        self._number = -1  # of the last frame
+        self.info = self._open(None)
+        self._opened = self._last_read = time.monotonic()
+
+    @property
+    def cpu_seconds(self) -> float:
+        """Processor time of ffmpeg, known after it has ended."""
+        current = 0.0 if self._process is None else self._process.process.cpu_seconds
+        return self._ended_cpu_seconds + current
+
+    def _open(self, like: VideoInfo | None) -> VideoInfo:
+        """Start ffmpeg, in place of one that has ended."""
+        with self._lock:
+            if self._killed.is_set():
+                raise VideoError(f"{self.name} has been closed")
+            self._end_process()
+            process = self._process = _LiveProcess(
+                self.name, self._options, stdin=self._stdin, like=like, timed=self._network
+            )
+        try:
+            return process.read_info()
+        except ValueError as error:  # closed by another thread
+            raise VideoError(f"{self.name} has been closed") from error
+        except BaseException:
+            with self._lock:
+                self._end_process()
+            raise
+
+    def _end_process(self) -> None:
+        if self._process is not None:
+            self._process.process.close()
+            self._ended_cpu_seconds += self._process.process.cpu_seconds
+            self._process = None
+
+    def read(self, planes: NDArray[np.uint8]) -> int | None:
+        """Read the next frame into `planes` and return its number from 0; None at the end."""
+        step = 1
+        while not self._read_planes(planes):
+            if not self._reconnect():
+                return None
+            step = max(1, round((time.monotonic() - self._last_read) * self.info.fps))
+        self._number += step
+        self._last_read = time.monotonic()
+        return self._number
+
+    def _read_planes(self, planes: NDArray[np.uint8]) -> bool:
+        process = self._process
+        try:
+            return process is not None and process.read_planes(planes)
+        except ValueError:  # closed by another thread
+            return False
+
+    def _reconnect(self) -> bool:
+        """Open the stream again; False if it does not answer any more, or does not reconnect."""
+        if self._killed.is_set() or not self._delays:
+            return False
+        if self._last_read - self._opened > _STEADY_SECONDS:
+            self._attempts = 0
+        place = f"{self.name} broke off after {float((self._number + 1) / self.info.fps):.1f} s"
+        reason = "it sends no frames"
+        if self._attempts < len(self._delays):
+            _LOGGER.warning("%s; opening it again", place)
+        while self._attempts < len(self._delays):
+            delay = self._delays[self._attempts]
+            self._attempts += 1
+            if self._killed.wait(delay):
+                return False
+            try:
+                self._open(self.info)
+            except VideoError as error:
+                if self._killed.is_set():
+                    return False
+                reason = str(error)
+                continue
+            self._opened = time.monotonic()
+            return True
+        _LOGGER.warning("%s, and opening it again has failed %d times (%s)", place, self._attempts, reason)
+        return False
+
+    def reason(self) -> str:
+        """Last message of ffmpeg."""
+        return "no reason given" if self._process is None else self._process.reason()
+
+    def kill(self) -> None:
+        """End ffmpeg at once, from any thread; a thread that reads sees the end."""
+        self._killed.set()
+        with self._lock:
+            if self._process is not None:
+                self._process.process.kill()
+
     def close(self) -> None:
         """End ffmpeg."""
-        self.process.close()
+        self.kill()
+        with self._lock, contextlib.suppress(OSError):
+            self._end_process()
 
 
 class LiveReader:
-    """Frames of a `LiveProcess`, in order: an iterator of ``(index, time, frame)`` and a context manager.
+    """Frames of a `LiveStream`, in order: an iterator of ``(index, time, frame)`` and a context manager.
 
     With `drop`, a thread reads all frames, and the iterator returns the newest one: a slow consumer sees
     gaps in the indices. Without, ffmpeg and the sender wait for the consumer.
@@ -91,9 +246,9 @@ class LiveReader:
 
     damage = ""
 
-    def __init__(self, process: LiveProcess, *, drop: bool, first: int = 0, count: int | None = None) -> None:
-        self.info = process.info
-        self._process = process
+    def __init__(self, stream: LiveStream, *, drop: bool, first: int = 0, count: int | None = None) -> None:
+        self.info = stream.info
+        self._stream = stream
         self._first, self._end = first, math.inf if count is None else first + count
         self._number = -1  # of the last frame read
         height, width = self.info.shape[:2]
@@ -110,7 +265,7 @@ class LiveReader:
     @property
     def cpu_seconds(self) -> float:
         """Processor time of ffmpeg, known after it has ended."""
-        return self._process.process.cpu_seconds
+        return self._stream.cpu_seconds
 
     def __iter__(self) -> Self:
         return self
@@ -137,45 +292,43 @@ class LiveReader:
         """Read the next frame of the range; None at its end."""
         while not self._killed and self._number + 1 < self._end:
             planes = np.empty(self._planes_shape, np.uint8)
-            try:
-                if not self._process.read_planes(planes):
-                    return None
-            except ValueError:  # closed by another thread
+            number = self._stream.read(planes)
+            if number is None:
                 return None
-            self._number += 1
-            if self._number >= self._first:
-                return self._number, planes
+            self._number = number
+            if self._first <= number < self._end:
+                return number, planes
         return None
 
     def _read_all(self) -> None:
         """Read until the end of the stream, and keep the newest frame."""
-        while (item := self._read()) is not None:
+        try:
+            while (item := self._read()) is not None:
+                with self._changed:
+                    self._newest = item
+                    self._changed.notify_all()
+        finally:
             with self._changed:
-                self._newest = item
+                self._finished = True
                 self._changed.notify_all()
-        with self._changed:
-            self._finished = True
-            self._changed.notify_all()
 
     def _finish(self) -> None:
         """Raise an error if the stream had no frame of the range."""
         if not self._killed and self._number < self._first:
-            log = last_line(self._process.process.log())
             start = float(self._first / self.info.fps)
-            raise VideoError(f"{self._process.name} has no frame after {start:g} s ({log})")
+            raise VideoError(f"{self._stream.name} has no frame after {start:g} s ({self._stream.reason()})")
 
     def kill(self) -> None:
         """End ffmpeg at once, from any thread; a thread that reads sees the end."""
         self._killed = True
-        self._process.process.kill()
+        self._stream.kill()
 
     def close(self) -> None:
         """End ffmpeg and the thread."""
         self.kill()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
-        with contextlib.suppress(OSError):
-            self._process.close()
+        self._stream.close()
 
     def __enter__(self) -> Self:
         return self

@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ from vehicle_detection.video.streams import FrameWriter, Reader
 
 Item = TypeVar("Item")
 Frame = NDArray[np.uint8]
+Frames = Literal["none", "plain", "drawn"]
+"""Which frames come with the results."""
 
 
 class VideoDetector(Protocol):
@@ -152,13 +154,13 @@ class FramePipeline:
         interval: int = 1,
         drawn_shape: tuple[int, ...] | None = None,
         *,
-        with_frames: bool = False,
+        frames: Frames = "none",
     ) -> None:
         self._seconds: defaultdict[str, float] = defaultdict(float)
         self._open_reader, self._open_writer = open_reader, open_writer
         self._detector: Any = detector
         self._workers, self._interval, self._drawn_shape = workers, interval, drawn_shape
-        self._with_frames = with_frames
+        self._frames = frames
         self.missed_frames = 0
         """Number of frames that a live source dropped."""
         self._searched: ClosableQueue[_QueuedFrame] = ClosableQueue(workers * interval + 1)
@@ -178,7 +180,7 @@ class FramePipeline:
         return dict(sorted(self._seconds.items(), key=lambda stage: order.get(stage[0], 0)))
 
     def run(self) -> Generator[tuple[Frame | None, Any]]:
-        """Yield the frame (None without `with_frames`) and the result of each frame, in order.
+        """Yield the plain or drawn frame (None unless `frames` asks for it) and the result of each frame.
 
         Closing the generator stops all threads.
         """
@@ -298,9 +300,10 @@ class FramePipeline:
         for name, seconds in result.seconds.items():
             if name != "search":  # measured here, because a detector may omit it
                 self._seconds[name] += seconds
-        if draw:
-            self._drawn.put((self._draw(item.frame, result), item.missed))
-        self._results.put((item.frame if self._with_frames else None, result))
+        drawn = self._draw(item.frame, result) if draw or self._frames == "drawn" else None
+        if draw and drawn is not None:
+            self._drawn.put((drawn, item.missed))
+        self._results.put(({"none": None, "plain": item.frame, "drawn": drawn}[self._frames], result))
 
     def _decode(self, reader: Reader, pool: ThreadPoolExecutor) -> None:
         try:

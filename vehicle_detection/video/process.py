@@ -35,9 +35,12 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video.ffmpeg import VideoInfo
-from vehicle_detection.video.pipeline import FramePipeline, VideoDetector
-from vehicle_detection.video.sources import FrameSource, Source, check_span, frame_range, open_source
+from vehicle_detection.video.frame_source import FrameSource
+from vehicle_detection.video.pipeline import FramePipeline, Frames, VideoDetector
+from vehicle_detection.video.reading import check_span, frame_range
+from vehicle_detection.video.sources import Source, open_source
 from vehicle_detection.video.streams import CONTAINERS, AudioSource, FrameWriter
+from vehicle_detection.video.viewer import Viewer, open_viewer
 
 PRESETS = (
     "ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow", "placebo",
@@ -134,6 +137,7 @@ def process_video(
     workers: int | None = None,
     progress: bool = True,
     strict: bool = False,
+    show: bool = False,
     on_result: Callable[[Any], object] | None = None,
 ) -> VideoReport:
     """Detect and track the vehicles of a video, and write a copy with their boxes.
@@ -174,6 +178,9 @@ def process_video(
         Raise an error, and write nothing, if a file of the source is damaged: frames are missing, or ffmpeg
         reports decoding errors. Otherwise a warning is logged, and ``damage`` of the result says it. Streams
         are not checked.
+    show
+        Show the annotated frames in a window, or in a notebook below the cell. Closing the window, or the key
+        Escape, ends the run and completes the target.
     on_result
         Function that is called with each frame's result, in frame order, in the calling thread.
 
@@ -207,12 +214,31 @@ def process_video(
         preset=preset,
         workers=workers,
         strict=strict,
+        frames="drawn" if show else "none",
     ) as run:
-        with _stop_on_interrupt(run), contextlib.closing(run.results(progress=progress)) as results:
-            for _, result in results:
+        with (
+            _stop_on_interrupt(run),
+            _viewer(show, run.source.name) as viewer,
+            contextlib.closing(run.results(progress=progress)) as results,
+        ):
+            for drawn, result in results:
                 if on_result is not None:
                     on_result(result)
+                if viewer is not None and drawn is not None:
+                    viewer.show(drawn)
+                    if viewer.closed:
+                        run.stop()
         return run.report()
+
+
+@contextlib.contextmanager
+def _viewer(show: bool, title: str) -> Iterator[Viewer | None]:
+    """Open a viewer for a block, if one is asked for."""
+    if not show:
+        yield None
+        return
+    with contextlib.closing(open_viewer(title)) as viewer:
+        yield viewer
 
 
 class VideoRun:
@@ -232,7 +258,7 @@ class VideoRun:
         audio: bool = True,
         preset: str = "veryfast",
         workers: int | None = None,
-        with_frames: bool = False,
+        frames: Frames = "none",
         strict: bool = False,
     ) -> None:
         check_span(start, end)
@@ -250,7 +276,7 @@ class VideoRun:
         try:
             if output is not None:
                 _check_not_a_source(output, self.source.files)
-            self._set_up(output, detector, start, end, audio, preset, n_workers, with_frames, strict)
+            self._set_up(output, detector, start, end, audio, preset, n_workers, frames, strict)
         except BaseException:
             self.close()
             raise
@@ -264,7 +290,7 @@ class VideoRun:
         audio: bool,
         preset: str,
         workers: int,
-        with_frames: bool,
+        frames: Frames,
         strict: bool,
     ) -> None:
         info = self.info = self.source.info
@@ -282,11 +308,11 @@ class VideoRun:
             workers,
             drawn_shape=drawn_shape,
             interval=getattr(detector, "search_interval", lambda fps: 1)(float(info.fps)),
-            with_frames=with_frames,
+            frames=frames,
         )
 
     def results(self, *, progress: bool = False) -> Generator[tuple[NDArray[np.uint8] | None, Any]]:
-        """Yield each frame, None without `with_frames`, and its result; closing it stops everything."""
+        """Yield each frame, None unless `frames` asks for it, and its result; closing it stops everything."""
         self._detector.reset(fps=float(self.info.fps))
         started = time.perf_counter()
         try:

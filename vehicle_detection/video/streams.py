@@ -17,9 +17,16 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection.errors import VideoError
+from vehicle_detection.errors import TransientVideoError, VideoError
 from vehicle_detection.video.damage import find_damage
-from vehicle_detection.video.ffmpeg import Process, VideoInfo, exit_reason, input_options, pixel_limit
+from vehicle_detection.video.ffmpeg import (
+    Process,
+    VideoInfo,
+    exit_reason,
+    input_options,
+    pixel_limit,
+    video_error,
+)
 from vehicle_detection.video.yuv import FORMATS, planes_from_rgb, rgb_from_planes
 
 _LOGGER = logging.getLogger(__name__)
@@ -177,15 +184,17 @@ class FrameReader(_FfmpegStream):
         complete = self._count is not None and self.frames_read >= self._count
         if not complete and end < self.info.frames - 1 and _TRUNCATED.search(log):
             seconds = math.floor(end / self.info.fps * 100) / 100
-            raise VideoError(
+            message = (
                 f"{self._path} is incomplete: {end} of about {self.info.frames} frames can be decoded; "
                 f"copy the file again, or end at {seconds:g} s to process the readable part"
             )
+            raise video_error(message, self._path, code, log)
         if code and not complete:
-            raise VideoError(
+            message = (
                 f"{self._path} cannot be decoded after frame {end}: {exit_reason(code, log)}; "
                 "if this happens again, copy the file again"
             )
+            raise video_error(message, self._path, code, log)
         if not self.frames_read:
             start = float(self._first / self.info.fps)
             raise VideoError(f"{self._path} has no frame after {start:g} s; choose an earlier start")
@@ -277,6 +286,6 @@ class FrameWriter(_FfmpegStream):
         if self._process.wait():
             raise self._error()
 
-    def _error(self) -> VideoError:
+    def _error(self) -> TransientVideoError:
         reason = exit_reason(self._process.wait(), self._process.log())
-        return VideoError(f"the video cannot be written: {reason}; nothing of it was kept")
+        return TransientVideoError(f"the video cannot be written: {reason}; nothing of it was kept")

@@ -1,0 +1,145 @@
+"""Frames that are shown while they are processed."""
+
+import sys
+import types
+
+import numpy as np
+import pytest
+
+from tests.helpers import StubDetector, random_mixture
+from tests.video.clips import child_processes, frame_numbers, running_threads
+from vehicle_detection import VehicleDetector, stream, track
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.video import process, process_video, viewer
+
+
+class Recorder:
+    """A window that its user closes after some frames."""
+
+    def __init__(self, last=1000):
+        self.frames, self.last, self.closed, self.ended = [], last, False, False
+
+    def show(self, frame):
+        self.frames.append(frame)
+        self.closed = len(self.frames) >= self.last
+
+    def close(self):
+        self.ended = True
+
+
+@pytest.mark.parametrize("written", [True, False])
+def test_the_shown_frames_are_those_that_are_written(clip, tmp_path, monkeypatch, written):
+    window = Recorder()
+    monkeypatch.setattr(process, "open_viewer", lambda title: window)
+    target = tmp_path / "out.mp4" if written else None
+    report = process_video(clip, target, StubDetector(), show=True)
+    assert len(window.frames) == report.frames == 20
+    assert all((frame[:6, :6] == 255).all() for frame in window.frames)
+    assert [round((frame[8:-8, 8:-8].mean() - 10) / 10) for frame in window.frames] == list(range(20))
+    assert window.ended
+    assert not written or frame_numbers(target) == list(range(20))
+
+
+def test_closing_the_window_ends_the_run_and_completes_the_video(clip, tmp_path, monkeypatch):
+    before = child_processes()
+    window = Recorder(last=3)
+    monkeypatch.setattr(process, "open_viewer", lambda title: window)
+    report = process_video(clip, tmp_path / "out.mp4", StubDetector(pause=0.02), show=True, workers=1)
+    assert 3 <= report.frames <= 20
+    assert frame_numbers(tmp_path / "out.mp4") == list(range(report.frames))
+    assert child_processes() == before
+    assert not running_threads()
+
+
+@pytest.mark.parametrize("as_stream", [True, False])
+def test_results_end_when_the_window_is_closed(clip, monkeypatch, as_stream):
+    window = Recorder(last=4)
+    monkeypatch.setattr(stream, "open_viewer", lambda title: window)
+    with VehicleDetector(random_mixture(), n_jobs=1, every=1) as detector:
+        results = list(track(clip, detector, stream=as_stream, show=True))
+        assert [result.index for result in results] == [0, 1, 2, 3]
+        if as_stream:
+            np.testing.assert_array_equal(results[2].picture, window.frames[2])
+    assert window.ended
+    assert not running_threads()
+
+
+def test_without_a_display_or_tkinter(clip, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    if sys.platform == "linux":
+        with pytest.raises(InvalidInputError, match=r"show needs (a display|tkinter)"):
+            process_video(clip, None, StubDetector(), show=True)
+    monkeypatch.setitem(sys.modules, "tkinter", None)
+    with pytest.raises(InvalidInputError, match="show needs tkinter, which this Python lacks"):
+        track(clip, random_mixture(), show=True)
+    assert not running_threads()
+
+
+def test_a_window_scales_large_frames_down_and_can_be_closed(monkeypatch):
+    shown, bound = [], {}
+
+    class Widget:
+        def __init__(self, *_):
+            pass
+
+        def protocol(self, name, function):
+            bound[name] = function
+
+        def bind(self, key, function):
+            bound[key] = function
+
+        def winfo_screenwidth(self):
+            return 1000
+
+        def winfo_screenheight(self):
+            return 500
+
+        def title(self, text):
+            bound["title"] = text
+
+        def configure(self, image):
+            shown.append(image)
+
+        def pack(self):
+            pass
+
+        update = destroy = pack
+
+    fake = types.SimpleNamespace(Tk=Widget, Label=Widget, TclError=RuntimeError, PhotoImage=lambda data: data)
+    monkeypatch.setitem(sys.modules, "tkinter", fake)
+    monkeypatch.setattr(viewer, "_WINDOW_INTERVAL", 0)
+    monkeypatch.setitem(sys.modules, "IPython", None)
+    window = viewer.open_viewer("drive.mp4")
+    window.show(np.full((100, 200, 3), 7, np.uint8))
+    window.show(np.zeros((900, 1000, 3), np.uint8))
+    assert bound["title"] == "drive.mp4"
+    assert shown[0] == b"P6 200 100 255 " + b"\7" * 60_000
+    assert shown[1].startswith(b"P6 500 450 255 ")
+    bound["<Escape>"](None)
+    assert window.closed
+    window.show(np.zeros((9, 9, 3), np.uint8))
+    window.close()
+    assert len(shown) == 2
+
+
+def test_a_notebook_shows_one_picture_that_changes(monkeypatch):
+    display = pytest.importorskip("IPython.display")
+    pictures = []
+    handle = types.SimpleNamespace(update=pictures.append)
+    monkeypatch.setattr(display, "display", lambda picture, display_id: pictures.append(picture) or handle)
+    shell = types.SimpleNamespace(kernel=object())
+    monkeypatch.setattr(sys.modules["IPython"], "get_ipython", lambda: shell)
+    monkeypatch.setattr(viewer, "_NOTEBOOK_INTERVAL", 0)
+    view = viewer.open_viewer("drive.mp4")
+    for value in (0, 255):
+        view.show(np.full((720, 1280, 3), value, np.uint8))
+    view.close()
+    assert len(pictures) == 2
+    assert all(picture.data[:2] == b"\xff\xd8" for picture in pictures)
+    assert not view.closed
+    # A plain interpreter has no kernel.
+    monkeypatch.setattr(sys.modules["IPython"], "get_ipython", lambda: None)
+    monkeypatch.setitem(sys.modules, "tkinter", None)
+    with pytest.raises(InvalidInputError, match="show needs tkinter"):
+        viewer.open_viewer("drive.mp4")

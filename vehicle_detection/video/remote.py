@@ -1,0 +1,63 @@
+"""Files on storage that fsspec knows, such as S3."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from vehicle_detection.errors import InvalidInputError, TransientVideoError
+
+Result = TypeVar("Result")
+
+# Seconds before the second and the third attempt of a request.
+_RETRY_DELAYS = (0.2, 1.0)
+_FINAL_ERRORS = (FileNotFoundError, PermissionError, NotImplementedError, TypeError, AttributeError)
+
+
+def download(url: str, folder: Path) -> Path:
+    """Copy a file from storage that fsspec knows to a folder."""
+    path = folder / (url.rstrip("/").rpartition("/")[2] or "video")
+    try:
+        filesystem, remote = open_filesystem(url)
+        with_retries(lambda: filesystem.get_file(remote, str(path)))
+    except InvalidInputError:
+        raise
+    except FileNotFoundError:
+        raise InvalidInputError(f"source {url} does not exist; check the URL") from None
+    except PermissionError as error:
+        raise InvalidInputError(f"source {url} is not readable ({error}); check its permissions") from None
+    except Exception as error:  # each storage has its own
+        raise TransientVideoError(f"{url} cannot be copied ({error}); check the connection") from error
+    return path
+
+
+def with_retries(request: Callable[[], Result]) -> Result:
+    """Call a function of remote storage again if it fails, up to three times in all.
+
+    Not all storages raise an OSError for a failed request.
+    """
+    for delay in _RETRY_DELAYS:
+        try:
+            return request()
+        except _FINAL_ERRORS:
+            raise
+        except Exception:
+            time.sleep(delay)
+    return request()
+
+
+def open_filesystem(url: str, name: str = "source") -> tuple[Any, str]:
+    """Return the fsspec file system of a URL, and the path in it; `name` is the argument in errors."""
+    try:
+        import fsspec
+    except ImportError:
+        raise InvalidInputError(
+            f"{name} {url} needs fsspec; pip install 'vehicle-detection[batch]', or use a local path"
+        ) from None
+    try:
+        filesystem, path = fsspec.core.url_to_fs(url)
+    except (ImportError, ValueError) as error:  # an unknown scheme, or a missing package such as s3fs
+        raise InvalidInputError(f"{name} {url} cannot be opened ({error})") from None
+    return filesystem, str(path)

@@ -1,0 +1,148 @@
+"""Consecutive video files that are read as one video."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection.video.ffmpeg import VideoInfo, probe
+from vehicle_detection.video.frame_source import FrameSource
+from vehicle_detection.video.streams import AudioSource, FrameReader, Reader
+
+
+class VideoSegments(FrameSource):
+    """Consecutive video files as one video, with the frame size and rate of the first one."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        infos = [probe(path) for path in paths]
+        first = infos[0]
+        self._infos = [
+            replace(
+                info,
+                width=first.width,
+                height=first.height,
+                fps=first.fps,
+                frames=round(info.duration * first.fps),
+                constant_rate=info.constant_rate and info.fps == first.fps,
+            )
+            for info in infos
+        ]
+        duration = sum(info.duration for info in infos)
+        sound = all(info.has_audio for info in infos)
+        super().__init__(
+            f"{paths[0]} to {paths[-1].name}",
+            replace(
+                first,
+                frames=sum(info.frames for info in self._infos),
+                duration=duration,
+                audio_track=first.audio_track if sound else None,
+                audio_codec=first.audio_codec if sound else None,
+                start_time=0.0,
+            ),
+            paths,
+        )
+
+    def read(self, first: int = 0, count: int | None = None, *, strict: bool = False) -> Reader:
+        """Open a reader of `count` frames from number `first` on, whichever segments hold them."""
+        segments = list(zip(self.files, self._infos, strict=True))
+        return _SegmentReader(self.info, segments, first, count, strict=strict)
+
+    def audio(self, first: int = 0, length: float | None = None) -> AudioSource | None:
+        """Join the sound of the segments; None if one of them has none."""
+        if not self.info.has_audio:
+            return None
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="vehicle-segments-", suffix=".txt", encoding="utf-8", delete=False
+        ) as file:
+            self._on_close.callback(Path(file.name).unlink, missing_ok=True)
+            for path, info in zip(self.files, self._infos, strict=True):
+                quoted = str(path.resolve()).replace("'", r"'\''")
+                # Sound may be longer than the frames, which would add up.
+                seconds = float(info.frames / info.fps)
+                file.write(f"file '{quoted}'\noutpoint {seconds:.6f}\nduration {seconds:.6f}\n")
+        options = ("-f", "concat", "-safe", "0", "-i", f"file:{file.name}")
+        if not first and length is None:
+            return AudioSource(input=options)
+        return AudioSource(input=options, start=float(first / self.info.fps), length=length)
+
+
+class _SegmentReader:
+    """Reader of the frames of several files, one after the other."""
+
+    def __init__(
+        self,
+        info: VideoInfo,
+        segments: Sequence[tuple[Path, VideoInfo]],
+        first: int,
+        count: int | None,
+        *,
+        strict: bool,
+    ) -> None:
+        self.info = info
+        self.damage = ""
+        self._strict = strict
+        self.cpu_seconds = 0.0
+        self._segments = list(segments)
+        self._index = first
+        self._end = math.inf if count is None else first + count
+        self._lock = threading.Lock()
+        self._killed = False
+        self._reader: FrameReader | None = None
+        # Lengths of skipped segments are known from their headers only.
+        while len(self._segments) > 1 and first >= self._segments[0][1].frames:
+            first -= self._segments.pop(0)[1].frames
+        self._first = first
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
+        while self._index < self._end:
+            reader = self._reader or self._open_next()
+            for _, _, frame in reader:
+                index = self._index
+                self._index += 1
+                return index, float(index / self.info.fps), frame
+            self._close_reader()
+        raise StopIteration
+
+    def _open_next(self) -> FrameReader:
+        with self._lock:
+            if self._killed or not self._segments:
+                raise StopIteration
+            path, info = self._segments.pop(0)
+            self._reader = FrameReader(path, info, first=self._first, strict=self._strict)
+            self._first = 0
+            return self._reader
+
+    def _close_reader(self) -> None:
+        with self._lock:
+            if self._reader is not None:
+                self._reader.close()
+                self.cpu_seconds += self._reader.cpu_seconds
+                self.damage = "; ".join(filter(None, (self.damage, self._reader.damage)))
+                self._reader = None
+
+    def kill(self) -> None:
+        with self._lock:
+            self._killed = True
+            if self._reader is not None:
+                self._reader.kill()
+
+    def close(self) -> None:
+        self.kill()
+        self._close_reader()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
