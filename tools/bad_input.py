@@ -1,0 +1,458 @@
+"""Call every public function with bad values of every argument: only the library's errors may come back.
+
+The functions are found by introspection: those of `vehicle_detection`, `vehicle_detection.course` and
+`vehicle_detection.plotting`, with the constructors and methods of their classes. A new one is covered as soon as
+`valid_arguments` knows valid values for its arguments. ``python -m tools.bad_input`` tries every value;
+``--write`` also writes the table of `docs/bad_input.md`; ``--functions NAME`` limits the run. The tests try one
+value of every kind for each argument.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import inspect
+import itertools
+import signal
+import sys
+import tempfile
+import warnings
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import partial
+from pathlib import Path
+from types import FrameType
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+import vehicle_detection as vd
+from vehicle_detection.errors import VehicleDetectionError
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "bad_input.md"
+MAX_SECONDS = 20
+"""Time limit of one call."""
+
+NOT_CALLED = {
+    "open_dask": "starts a cluster",
+    "fetch_patches": "downloads; its arguments are tested in tests/datasets/test_archives.py",
+    "train_mixture": "trains for minutes; tests/mixture_training/test_train.py",
+    "Detections.to_supervision": "needs the package supervision; tests/test_boxes.py",
+    "cross_validate_mixture": "trains for minutes; tests/mixture_training/test_cross_validation.py",
+}
+"""Public functions that are not called, and why."""
+
+RESULTS = {
+    "BatchReport", "BatchStatus", "DetectionScores", "Event", "Explanation", "FrameResult", "FrameSet", "FrameSource",
+    "HorizonEstimate", "SearchResult", "Track", "TrackScores", "TrackedFrame", "Trip", "VehicleCounts",
+    "VideoInfo", "VideoReport", "plotting.ImageDescription",
+}  # fmt: skip
+"""Classes whose instances the library makes, and whose constructors therefore check nothing."""
+
+
+def bad_values(folder: Path) -> dict[str, tuple[Any, ...]]:
+    """Return bad values of every kind. Some of them are valid for some arguments."""
+    # A link: a function that replaced the device itself would do harm.
+    zero = folder / "zero"
+    if not zero.is_symlink():
+        zero.symlink_to("/dev/zero")
+        for suffix in (".csv", ".png", ".mp4", ".json"):
+            zero.with_suffix(suffix).symlink_to("/dev/zero")
+    full, image = np.full((2, 4), np.nan), np.zeros((5, 5, 3), np.uint8)
+    return {
+        "`None`": (None,),
+        "negative number": (-1, 0, np.int8(-5), -0.5),
+        "huge integer": (10**400, -(10**400), 2**63),
+        "NaN, infinity": (float("nan"), float("inf"), 1e308, np.float32("nan")),
+        "empty": ("", (), {}, [], np.zeros((0, 4))),
+        "text": ("x", ["x", "y"], "frame,x1\n0,1"),
+        "wrong type": (object(), print, True, b"x", {"a": 1}, {1, 2}, 1j, 1.5, range(3), np.datetime64("now")),
+        "ragged list": ([1, [2, 3]], [[1, 2], [3]], [None], [(0, 0, 1, 1), "x"], [[10**400, 0, 1, 1]]),
+        "wrong number of items": ((1,), (1, 2, 3, 4, 5), (10**400, 10**400), np.array(3)),
+        "wrong shape": (np.zeros((2, 3)), np.zeros((2, 2, 3)), image[..., 0], image[None], np.zeros((2, 4))),
+        "wrong dtype": (np.array(["x"]), np.array([object()]), np.zeros((70, 70, 3), np.int64),
+                        np.zeros((5, 5, 3)), np.zeros((64, 64, 4), np.uint8)),
+        "invalid boxes": (full, np.array([[5, 5, 1, 1]]), [(1e308, 0, 1e308, 1)]),
+        "tiny image": (image, image[:0], np.zeros((1, 1, 3), np.uint8)),
+        "impossible name": ("\ud800", "a" * 5000, "a\0b", "b" * 300 + ".csv"),
+        "missing file": (Path("missing"), "missing/missing.mp4", folder / "missing.csv"),
+        "folder": (folder, str(folder)),
+        "device": (zero, *(zero.with_suffix(suffix) for suffix in (".csv", ".png", ".mp4", ".json"))),
+    }  # fmt: skip
+
+
+def public_callables() -> dict[str, Callable[..., Any]]:
+    """Return the public functions, the constructors of public classes and their methods, by name."""
+    found: dict[str, Callable[..., Any]] = {}
+    for module in (vd, vd.course, vd.plotting):
+        prefix = "" if module is vd else module.__name__.rpartition(".")[2] + "."
+        for name in module.__all__:
+            value = getattr(module, name)
+            if inspect.ismodule(value) or (inspect.isclass(value) and issubclass(value, Exception)):
+                continue
+            if prefix and value is getattr(vd, name, None):  # public in the package, too
+                continue
+            if prefix + name not in RESULTS:
+                found[prefix + name] = value
+            if inspect.isclass(value):
+                found.update((f"{prefix}{name}.{each}", method) for each, method in _methods(value))
+    return {name: value for name, value in found.items() if name not in NOT_CALLED}
+
+
+def _methods(kind: type) -> Iterator[tuple[str, Callable[..., Any]]]:
+    """Yield the public methods that a class of this library defines, and that have arguments."""
+    for name, member in inspect.getmembers(kind):
+        if name.startswith("_") or not inspect.isroutine(member):
+            continue
+        public_bases = [base for base in kind.__mro__[1:] if base.__name__ in vd.__all__]
+        inherited = name not in vars(kind) and any(hasattr(base, name) for base in public_bases)
+        own = str(getattr(member, "__module__", "")).startswith("vehicle_detection")
+        if own and not inherited and _parameters(member):
+            yield name, member
+
+
+def _parameters(function: Callable[..., Any]) -> list[inspect.Parameter]:
+    """Return the arguments of a function, without ``self`` and those of any number."""
+    many = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    parameters = inspect.signature(function).parameters.values()
+    return [each for each in parameters if each.name != "self" and each.kind not in many]
+
+
+INTERNAL = {
+    "FeatureParams.spatial_planes", "FunctionParams.heat_range", "HeatParams.for_search",
+    "PyramidParams.heat_range", "PyramidParams.rows", "PyramidParams.sizes", "PyramidParams.smallest_width",
+    "SearchBand.place", "SearchParams.heat_range", "SearchParams.place", "TemplateMixture.detect_vehicles",
+    "TemplateMixture.margin_of", "TemplateMixture.propose_boxes", "TemplateMixture.scores",
+    "VehicleDetector.interpolate", "VehicleDetector.skip",
+}  # fmt: skip
+"""Methods that only the library calls, with its own results."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A public function, and valid values of its arguments."""
+
+    name: str
+    call: Callable[..., Any]
+    arguments: Mapping[str, Any]
+
+
+def targets(folder: Path) -> dict[str, Target]:
+    """Return the public functions with valid arguments.
+
+    Raises
+    ------
+    LookupError
+        If a valid value of an argument is not known.
+    """
+    valid = _Valid(folder)
+    found: dict[str, Target] = {}
+    missing: list[str] = []
+    for name, function in public_callables().items():
+        if name in INTERNAL:
+            continue
+        owner, _, method = name.removeprefix("course.").removeprefix("plotting.").rpartition(".")
+        call = function if not owner or inspect.ismethod(function) else getattr(valid.instances[owner], method)
+        known = valid.by_name | valid.by_function.get(name.partition(".")[0] + ".", {})
+        known |= valid.by_function.get(name, {})
+        arguments = dict(valid.by_function.get(name, {}))
+        for each in _parameters(call):
+            if each.default is not each.empty:
+                arguments.setdefault(each.name, each.default)
+            elif each.name in known:
+                arguments[each.name] = known[each.name]
+            else:
+                missing.append(f"{each.name} of {name}")
+        found[name] = Target(name, call, arguments)
+    if missing:
+        raise LookupError(f"add valid values to {__name__} for {', '.join(missing)}")
+    return found
+
+
+class _Valid:
+    """Valid values of arguments, by the argument's name or by the function's and the argument's."""
+
+    def __init__(self, folder: Path) -> None:
+        import moviepy
+
+        from vehicle_detection.cli.demo import draw_clip
+        from vehicle_detection.tuning import write_results
+
+        scene = vd.render_scene(shape=(180, 320), vehicles=1, random_state=0)
+        image = scene.image
+        boxes, scores = np.array([[1, 2, 30, 40], [5, 6, 50, 60]]), np.array([1.0, 0.5])
+        windows = vd.Detections(boxes, scores)
+        heat = np.zeros((180, 320), np.float32)
+        patches, labels = vd.render_patches(20)
+        names = tuple(f"{'ab'[number // 2 % 2]}/{number}.png" for number in range(20))
+        patch_set = vd.PatchSet(patches, labels, names)
+        params = vd.FeatureParams(hog_channel=0, spatial_feat=False, hist_feat=False, orient=4)
+        classifier = vd.train_classifier(patches, labels, params=params)
+        truth = vd.FrameBoxes([0, 1], np.array([1, 1]), boxes)
+        predicted = vd.FrameBoxes([0, 1], np.array([1, 1]), boxes, scores=scores)
+        frames = vd.LabelledFrames("a", [image, image], truth)
+        camera = vd.Camera(focal_px=500.0, horizon_px=40.0)
+        band = vd.SearchBand(window=(64, 64), y=(0.0, 256.0))
+        search = vd.SearchParams(bands=(band,))
+        detector = vd.VehicleDetector(classifier, n_jobs=1)
+        result = detector.process(image)
+        tracker, log = vd.Tracker(), vd.TrackLog()
+        report = vd.VideoReport(
+            frames=1, fps=Fraction(25), shape=image.shape, seconds=1.0, stages={"search": 1.0}, tracks=0
+        )
+        clip = folder / "valid.mp4"
+        draw_clip(vd.render_drive(frames=3, shape=(64, 96)), clip, folder / "valid.csv")
+        vd.write_image(folder / "valid.png", image)
+        vd.write_camera(camera, folder / "camera.json", (180, 320))
+        (folder / "patches").mkdir()
+        vd.write_image(folder / "patches" / "vehicle.png", patches[0])
+        scores_of = vd.evaluate_detections(predicted, truth)
+        _, scaler, svc = (step for _, step in classifier.to_pipeline().steps)
+        quick = vd.TrialOptions(time_search=False, n_jobs=1)
+        table = _table()
+        write_results(table, folder / "results.csv")
+        lesson_only = {"spatial_feat": False, "hist_feat": False, "hog_channel": 0, "color_space": "YCrCb"}
+        lesson = {"img": image, "svc": svc, "X_scaler": scaler, "clf": svc, "scaler": scaler,
+                  "orient": 4, "pix_per_cell": 8, "cell_per_block": 2,
+                  "spatial_size": (16, 16), "hist_bins": 16, "windows": [((0, 0), (64, 64))], "ystart": 0,
+                  "ystop": 96, "scale": 1.0}  # fmt: skip
+        self.instances: dict[str, Any] = {
+            "Camera": camera, "Detections": windows, "Explorer": vd.Explorer([image], classifier),
+            "FrameBoxes": predicted, "FunctionParams": vd.FunctionParams(), "HeatHistory": vd.HeatHistory(),
+            "FrameSource": vd.open_source(clip), "HeatmapDetector": vd.HeatmapDetector(classifier),
+            "PatchFeatures": vd.PatchFeatures(n_jobs=1), "PatchSet": patch_set,
+            "PyramidParams": vd.PyramidParams(), "ReportWriter": vd.ReportWriter(folder / "writer.html"),
+            "SearchParams": search, "TemplateMixture": vd.load_model("default"), "TrackLog": log,
+            "Tracker": tracker, "VehicleClassifier": classifier, "VehicleDetector": detector,
+        }  # fmt: skip
+        self.by_name: dict[str, Any] = {
+            "image": image, "img": image, "frame": image, "patches": patches, "labels": labels, "boxes": boxes,
+            "scores": scores, "windows": windows, "detections": windows, "shape": (180, 320),
+            "camera": camera, "patch_set": patch_set, "classifier": classifier, "predictions": predicted,
+            "heatmap": heat, "heat": heat, "tracks": [], "fps": 25.0, "folder": folder / "patches",
+            "detector": detector, "threshold": 0.5, "box": boxes[0], "explanation": None, "table": table,
+            "source": patches, "params": params, "result": result, "results": [result], "n": 2,
+            "random_state": 0, "path": folder / "out.csv", "log": log, "events": [], "video": clip,
+            "focal_px": 500.0, "horizon_px": 40.0, "first": boxes, "second": boxes, "bboxes": boxes,
+            "X": patches, "y": labels, "metadata": {}, "horizon": 0.5, "images": [image], "index": 0,
+            "time": 0.0, "name": "a", "bbox_list": boxes, "files": [clip], "model": classifier,
+            "key": 0, "sets": [patch_set], "frames": [image], "clip": moviepy.VideoClip(lambda time: image, duration=0.1),
+            "before": result, "after": None, "times": [], "thumbnail": np.zeros((9, 16), np.float32),
+            "report": report, "on_result": None, "view": "heat", "rename": int, "templates": classifier.templates,
+            "fast": scores, "reference": scores, "seconds": {"a": 1.0, "b": 2.0}, "pairs": np.array([[0, 1]]),
+            "parameter": "orient", "methods": {"a": [windows]}, "curves": (scores, scores, scores),
+            "runs": {"a": [result]}, "out": folder / "out", "target": folder / "out.mp4",
+            "pipeline": classifier.to_pipeline(), "lateral_px": 10.0, "frame_index": 0, "imgs": [image],
+            "split": vd.Split(np.arange(10), np.arange(10, 20)),
+        }  # fmt: skip
+        self.by_function: dict[str, dict[str, Any]] = {
+            "course.": lesson,
+            "LabelledFrames": {"frames": [image, image], "labels": truth},
+            "LabelledFrames.from_video": {"path": clip, "labels": truth},
+            "FrameBoxes": {"frames": [0, 1], "tracks": np.array([1, 1])},
+            "FrameBoxes.from_detections": {"detections": {0: windows}},
+            "FrameBoxes.from_pandas": {"table": predicted.to_pandas()},
+            "Detections.from_supervision": {"detections": SimpleNamespace(xyxy=boxes, confidence=scores, class_id=None)},
+            "FrameDataset": {"sets": (frames,)},
+            "PatchSet": {"names": names},
+            "SearchBand": {"window": (64, 64), "y": (0.0, 256.0)},
+            "SearchParams": {"bands": (band,)},
+            "Explorer": {"frames": [image], "model": classifier},
+            "Explorer.set_frame": {"frame": 0},
+            "Tracker": {"fps": 25.0},
+            "TemplateMixture": {"templates": vd.load_model("default").templates},
+            "Split": {"train": np.arange(3), "test": np.arange(3, 5)},
+            "HeatmapDetector": {"clf": classifier},
+            "ReportWriter": {"path": folder / "out.html"},
+            "VehicleDetector": {"model": classifier},
+            "FeatureParams.preset": {"name": "lab-8460"},
+            "SearchParams.preset": {"name": "default"},
+            "PatchFeatures.fit": {"y": labels},
+            "VehicleClassifier": {"params": params},
+            "VehicleClassifier.from_pipeline": {"params": params},
+            "VehicleClassifier.save": {"path": folder / "out.safetensors"},
+            "TemplateMixture.save": {"path": folder / "out.safetensors"},
+            "VehicleDetector.track": {"found": detector.search(image)},
+            "batch_status": {"out": folder},
+            "bin_spatial": {"size": 16},
+            "bounding_boxes": {"params": None},
+            "calibrate_scores": {"labels": [1, 0]},
+            "calibration_error": {"probabilities": [0.2, 0.5], "labels": [0, 1], "bins": 5},
+            "compare_classifiers": {"classifiers": {"a": _small_tree()}, "params": params, "n_jobs": 1},
+            "compare_configurations": {"configurations": {"a": params}, "options": quick},
+            "detector_from": {"function": lambda image: (boxes, scores)},
+            "draw_labeled_bboxes": {"labels": (heat.astype(np.int32), 0)},
+            "course.find_car_windows": lesson_only,
+            "course.find_cars": lesson_only,
+            "course.search_windows": lesson_only,
+            "course.draw_labeled_bboxes": {"labels": (heat.astype(np.int32), 0)},
+            "course.get_hog_features": {"img": image[..., 0]},
+            "estimate_horizon": {"boxes": [[40 * n, 60, 30 + 40 * n + n, 90 + n] for n in range(1, 7)]},
+            "evaluate_detections": {"labels": truth},
+            "evaluate_tracks": {"labels": truth},
+            "extract_features": {"n_jobs": 1},
+            "find_cars": {"params": search, "n_jobs": 1},
+            "find_vehicles": {"params": None},
+            "get_hog_features": {"img": image[..., 0]},
+            "hog_image": {"img": image[..., 0]},
+            "load_classifier": {"path": "highway"},
+            "load_patches": {"source": folder / "patches", "label": 1, "n_jobs": 1},
+            "load_training_patches": {"vehicles": folder / "patches", "non_vehicles": folder / "patches"},
+            "mine_negatives": {"labels": truth, "search_params": search, "n_jobs": 1},
+            "open_source": {"source": clip},
+            "precision_recall_curve": {"labels": truth},
+            "probe_video": {"path": clip},
+            "process_video": {"source": clip, "progress": False, "workers": 1},
+            "read_camera": {"path": folder / "camera.json"},
+            "read_frames": {"source": clip},
+            "read_image": {"path": folder / "valid.png"},
+            "read_labels": {"path": folder / "valid.csv"},
+            "read_results": {"path": folder / "results.csv"},
+            "render_drive": {"frames": 2, "shape": (64, 96)},
+            "render_scene": {"shape": (64, 64), "vehicles": 1},
+            "run_batch": {"sources": [], "progress": False},
+            "search_parameters": {"grid": {"orient": [4]}, "n_folds": 2, "options": quick},
+            "search_windows": {"windows": boxes, "n_jobs": 1},
+            "single_img_features": {"image": patches[0]},
+            "split_random": {"patches_or_labels": labels},
+            "split_sources": {"train": ("a",), "test": ("b",)},
+            "track": {"source": clip, "model": detector},
+            "train_and_evaluate": {"params": params, "seeds": 1, "n_jobs": 1},
+            "train_classifier": {"labels": labels, "params": params, "n_jobs": 1},
+            "write_boxes": {"boxes": [("a.png", windows)]},
+            "write_camera": {"path": folder / "out.json"},
+            "write_image": {"path": folder / "out.png"},
+            "write_labels": {"labels": truth},
+            "write_tracks": {"results": [(0, 1, 10, 20, 30, 40, 1.5)]},
+            "plotting.plot_errors": {"frames": frames},
+            "plotting.plot_explanation": {"explanation": vd.explain(detector, image, boxes[0])},
+            "plotting.plot_f1": {"scores": {"a": scores_of}},
+            "plotting.plot_features": {"model": classifier},
+            "plotting.plot_scores": {"labels": [0, 1]},
+            "plotting.plot_tracks": {"results": predicted},
+            "plotting.plot_weights": {"classifier": vd.load_classifier("highway")},
+        }
+
+
+def _table() -> Any:
+    """Return a small table of tuning results."""
+    import pandas as pd
+
+    return pd.DataFrame({"orient": [4, 9], "accuracy": [0.9, 0.95], "search_ms": [1.0, 2.0],
+                         "configuration": ["a", "b"]})  # fmt: skip
+
+
+def _small_tree() -> Any:
+    """Return a classifier of scikit-learn that trains quickly."""
+    from sklearn.tree import DecisionTreeClassifier
+
+    return DecisionTreeClassifier(max_depth=1)
+
+
+@dataclass
+class Outcome:
+    """What happened to the values of one kind in one function."""
+
+    refused: int = 0
+    accepted: int = 0
+    problems: list[str] = field(default_factory=list)
+
+
+def cases(
+    functions: Mapping[str, Target], values: Mapping[str, tuple[Any, ...]], *, every: bool
+) -> Iterator[tuple[str, str, str, Callable[[], Any]]]:
+    """Yield function, kind, description and call: every value, or one of each kind for each argument."""
+    for name, target in functions.items():
+        for argument, (kind, choices) in itertools.product(target.arguments, values.items()):
+            # Not hash(), which differs from run to run.
+            first = zlib.crc32(f"{name} {argument} {kind}".encode()) % len(choices)
+            for number in range(len(choices)) if every else [first]:
+                text = f"{name}({argument}={' '.join(repr(choices[number]).split())[:60]})"
+                yield name, kind, text, partial(target.call, **{**target.arguments, argument: choices[number]})
+
+
+@contextlib.contextmanager
+def time_limit(seconds: float) -> Iterator[None]:
+    """Raise TimeoutError in the main thread after some seconds, where the system has alarms."""
+    if not hasattr(signal, "setitimer"):
+        yield
+        return
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise TimeoutError(f"no result after {seconds:g} s")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def run(
+    *, every: bool = False, functions: list[str] | None = None
+) -> tuple[dict[str, dict[str, Outcome]], list[str]]:
+    """Call the functions; return the outcomes by function and kind, and all problems.
+
+    Problems are errors of other classes, calls without an end, files written although the call failed, and
+    files outside the folder of the valid files.
+    """
+    outcomes: dict[str, dict[str, Outcome]] = {}
+    with tempfile.TemporaryDirectory(prefix="bad_input.") as outer, contextlib.chdir(outer):
+        folder = Path(outer) / "in"
+        folder.mkdir()
+        values = bad_values(folder)
+        found = {name: target for name, target in targets(folder).items() if not functions or name in functions}
+        before = _files(outer)
+        for name, kind, text, call in cases(found, values, every=every):
+            outcome = outcomes.setdefault(name, {}).setdefault(kind, Outcome())
+            error = call_quietly(call)
+            written = _files(outer) - before
+            if error is None:
+                outcome.accepted += 1
+            elif isinstance(error, VehicleDetectionError):
+                outcome.refused += 1
+                if written:
+                    outcome.problems.append(f"{text}: left {sorted(written)}")
+            else:
+                shown = " ".join(f"{type(error).__name__}: {error}".split())[:150]
+                outcome.problems.append(f"{text}: {shown}")
+            outside = [path for path in written if not path.startswith("in")]
+            if outside:
+                outcome.problems.append(f"{text}: wrote {outside}")
+            for path in sorted(written, reverse=True):
+                remove = Path(outer, path)
+                remove.rmdir() if remove.is_dir() else remove.unlink()
+    return outcomes, [text for row in outcomes.values() for each in row.values() for text in each.problems]
+
+
+def call_quietly(call: Callable[[], Any]) -> BaseException | None:
+    """Call without warnings and open figures, and return the error if there is one."""
+    try:
+        with np.errstate(all="ignore"), warnings.catch_warnings(), time_limit(MAX_SECONDS):
+            warnings.simplefilter("ignore")
+            result = call()
+            if inspect.isgenerator(result):
+                result.close()
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        return error
+    finally:
+        if "matplotlib.pyplot" in sys.modules:
+            sys.modules["matplotlib.pyplot"].close("all")
+    return None
+
+
+def _files(folder: str) -> set[str]:
+    return {str(path.relative_to(folder)) for path in Path(folder).rglob("*")}
+
+
+if __name__ == "__main__":
+    pass
