@@ -1,10 +1,10 @@
 """Call every public function with bad values of every argument: only the library's errors may come back.
 
 The functions are found by introspection: those of `vehicle_detection`, `vehicle_detection.course` and
-`vehicle_detection.plotting`, with the constructors and methods of their classes. A new one is covered as soon as
-`valid_arguments` knows valid values for its arguments. ``python -m tools.bad_input`` tries every value;
-``--write`` also writes the table of `docs/bad_input.md`; ``--functions NAME`` limits the run. The tests try one
-value of every kind for each argument.
+`vehicle_detection.plotting`, with the constructors and methods of their classes. A new one is covered as
+soon as `_Valid` knows valid values for its arguments. ``python -m tools.bad_input`` tries every value, also
+of the commands' options; ``--write`` writes the tables of ``docs/bad_input.md``, too. The tests try one value
+of each kind for each argument.
 """
 
 from __future__ import annotations
@@ -18,20 +18,19 @@ import sys
 import tempfile
 import warnings
 import zlib
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
-from types import FrameType
-from types import SimpleNamespace
+from types import FrameType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 import vehicle_detection as vd
-from vehicle_detection.errors import VehicleDetectionError
+from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "bad_input.md"
@@ -48,9 +47,9 @@ NOT_CALLED = {
 """Public functions that are not called, and why."""
 
 RESULTS = {
-    "BatchReport", "BatchStatus", "DetectionScores", "Event", "Explanation", "FrameResult", "FrameSet", "FrameSource",
-    "HorizonEstimate", "SearchResult", "Track", "TrackScores", "TrackedFrame", "Trip", "VehicleCounts",
-    "VideoInfo", "VideoReport", "plotting.ImageDescription",
+    "BatchReport", "BatchStatus", "DetectionScores", "Event", "Explanation", "FrameResult", "FrameSet",
+    "FrameSource", "HorizonEstimate", "SearchResult", "Track", "TrackScores", "TrackedFrame", "Trip",
+    "VehicleCounts", "VideoInfo", "VideoReport", "plotting.ImageDescription",
 }  # fmt: skip
 """Classes whose instances the library makes, and whose constructors therefore check nothing."""
 
@@ -71,7 +70,8 @@ def bad_values(folder: Path) -> dict[str, tuple[Any, ...]]:
         "NaN, infinity": (float("nan"), float("inf"), 1e308, np.float32("nan")),
         "empty": ("", (), {}, [], np.zeros((0, 4))),
         "text": ("x", ["x", "y"], "frame,x1\n0,1"),
-        "wrong type": (object(), print, True, b"x", {"a": 1}, {1, 2}, 1j, 1.5, range(3), np.datetime64("now")),
+        "wrong type": (object(), print, True, b"x", {"a": 1}, {1, 2}, 1j, 1.5, range(3),
+                       np.datetime64("now")),
         "ragged list": ([1, [2, 3]], [[1, 2], [3]], [None], [(0, 0, 1, 1), "x"], [[10**400, 0, 1, 1]]),
         "wrong number of items": ((1,), (1, 2, 3, 4, 5), (10**400, 10**400), np.array(3)),
         "wrong shape": (np.zeros((2, 3)), np.zeros((2, 2, 3)), image[..., 0], image[None], np.zeros((2, 4))),
@@ -157,7 +157,9 @@ def targets(folder: Path) -> dict[str, Target]:
         if name in INTERNAL:
             continue
         owner, _, method = name.removeprefix("course.").removeprefix("plotting.").rpartition(".")
-        call = function if not owner or inspect.ismethod(function) else getattr(valid.instances[owner], method)
+        call = (
+            function if not owner or inspect.ismethod(function) else getattr(valid.instances[owner], method)
+        )
         known = valid.by_name | valid.by_function.get(name.partition(".")[0] + ".", {})
         known |= valid.by_function.get(name, {})
         arguments = dict(valid.by_function.get(name, {}))
@@ -195,7 +197,7 @@ class _Valid:
         classifier = vd.train_classifier(patches, labels, params=params)
         truth = vd.FrameBoxes([0, 1], np.array([1, 1]), boxes)
         predicted = vd.FrameBoxes([0, 1], np.array([1, 1]), boxes, scores=scores)
-        frames = vd.LabelledFrames("a", [image, image], truth)
+        frames = vd.LabelledFrames("a", {0: image, 1: image}, truth)
         camera = vd.Camera(focal_px=500.0, horizon_px=40.0)
         band = vd.SearchBand(window=(64, 64), y=(0.0, 256.0))
         search = vd.SearchParams(bands=(band,))
@@ -213,6 +215,8 @@ class _Valid:
         vd.write_image(folder / "patches" / "vehicle.png", patches[0])
         scores_of = vd.evaluate_detections(predicted, truth)
         _, scaler, svc = (step for _, step in classifier.to_pipeline().steps)
+        moving = moviepy.VideoClip(lambda time: image, duration=0.1)
+        theirs = SimpleNamespace(xyxy=boxes, confidence=scores, class_id=None)
         quick = vd.TrialOptions(time_search=False, n_jobs=1)
         table = _table()
         write_results(table, folder / "results.csv")
@@ -231,8 +235,8 @@ class _Valid:
             "Tracker": tracker, "VehicleClassifier": classifier, "VehicleDetector": detector,
         }  # fmt: skip
         self.by_name: dict[str, Any] = {
-            "image": image, "img": image, "frame": image, "patches": patches, "labels": labels, "boxes": boxes,
-            "scores": scores, "windows": windows, "detections": windows, "shape": (180, 320),
+            "image": image, "img": image, "frame": image, "patches": patches, "labels": labels,
+            "boxes": boxes, "scores": scores, "windows": windows, "detections": windows, "shape": (180, 320),
             "camera": camera, "patch_set": patch_set, "classifier": classifier, "predictions": predicted,
             "heatmap": heat, "heat": heat, "tracks": [], "fps": 25.0, "folder": folder / "patches",
             "detector": detector, "threshold": 0.5, "box": boxes[0], "explanation": None, "table": table,
@@ -241,10 +245,12 @@ class _Valid:
             "focal_px": 500.0, "horizon_px": 40.0, "first": boxes, "second": boxes, "bboxes": boxes,
             "X": patches, "y": labels, "metadata": {}, "horizon": 0.5, "images": [image], "index": 0,
             "time": 0.0, "name": "a", "bbox_list": boxes, "files": [clip], "model": classifier,
-            "key": 0, "sets": [patch_set], "frames": [image], "clip": moviepy.VideoClip(lambda time: image, duration=0.1),
+            "key": 0, "sets": [patch_set], "frames": [image], "clip": moving,
             "before": result, "after": None, "times": [], "thumbnail": np.zeros((9, 16), np.float32),
-            "report": report, "on_result": None, "view": "heat", "rename": int, "templates": classifier.templates,
-            "fast": scores, "reference": scores, "seconds": {"a": 1.0, "b": 2.0}, "pairs": np.array([[0, 1]]),
+            "report": report, "on_result": None, "view": "heat", "rename": int,
+            "templates": classifier.templates, "fast": scores, "reference": scores,
+            "seconds": {"a": 1.0, "b": 2.0},
+            "pairs": np.array([[0, 1]]),
             "parameter": "orient", "methods": {"a": [windows]}, "curves": (scores, scores, scores),
             "runs": {"a": [result]}, "out": folder / "out", "target": folder / "out.mp4",
             "pipeline": classifier.to_pipeline(), "lateral_px": 10.0, "frame_index": 0, "imgs": [image],
@@ -257,7 +263,7 @@ class _Valid:
             "FrameBoxes": {"frames": [0, 1], "tracks": np.array([1, 1])},
             "FrameBoxes.from_detections": {"detections": {0: windows}},
             "FrameBoxes.from_pandas": {"table": predicted.to_pandas()},
-            "Detections.from_supervision": {"detections": SimpleNamespace(xyxy=boxes, confidence=scores, class_id=None)},
+            "Detections.from_supervision": {"detections": theirs},
             "FrameDataset": {"sets": (frames,)},
             "PatchSet": {"names": names},
             "SearchBand": {"window": (64, 64), "y": (0.0, 256.0)},
@@ -289,7 +295,7 @@ class _Valid:
             "draw_labeled_bboxes": {"labels": (heat.astype(np.int32), 0)},
             "course.find_car_windows": lesson_only,
             "course.find_cars": lesson_only,
-            "course.search_windows": lesson_only,
+            "course.search_windows": {**lesson_only, "color_space": "RGB", "hog_channel": 0},
             "course.draw_labeled_bboxes": {"labels": (heat.astype(np.int32), 0)},
             "course.get_hog_features": {"img": image[..., 0]},
             "estimate_horizon": {"boxes": [[40 * n, 60, 30 + 40 * n + n, 90 + n] for n in range(1, 7)]},
@@ -315,7 +321,14 @@ class _Valid:
             "read_results": {"path": folder / "results.csv"},
             "render_drive": {"frames": 2, "shape": (64, 96)},
             "render_scene": {"shape": (64, 64), "vehicles": 1},
-            "run_batch": {"sources": [], "progress": False},
+            "run_batch": {
+                "sources": [clip],
+                "executor": ThreadPoolExecutor(1),
+                "model": "highway",
+                "progress": False,
+                "tracks_only": True,
+                "options": {"n_jobs": 1},
+            },
             "search_parameters": {"grid": {"orient": [4]}, "n_folds": 2, "options": quick},
             "search_windows": {"windows": boxes, "n_jobs": 1},
             "single_img_features": {"image": patches[0]},
@@ -362,10 +375,21 @@ class Outcome:
     accepted: int = 0
     problems: list[str] = field(default_factory=list)
 
+    def add(self, text: str, error: BaseException | None, written: set[str]) -> None:
+        """Add a call, its error and the files that it wrote."""
+        if error is None:
+            self.accepted += 1
+        elif isinstance(error, VehicleDetectionError):
+            self.refused += 1
+            if written:
+                self.problems.append(f"{text}: failed, but left {sorted(written)}")
+        else:
+            self.problems.append(f"{text}: {' '.join(f'{type(error).__name__}: {error}'.split())[:150]}")
+
 
 def cases(
     functions: Mapping[str, Target], values: Mapping[str, tuple[Any, ...]], *, every: bool
-) -> Iterator[tuple[str, str, str, Callable[[], Any]]]:
+) -> Iterator[Case]:
     """Yield function, kind, description and call: every value, or one of each kind for each argument."""
     for name, target in functions.items():
         for argument, (kind, choices) in itertools.product(target.arguments, values.items()):
@@ -373,7 +397,12 @@ def cases(
             first = zlib.crc32(f"{name} {argument} {kind}".encode()) % len(choices)
             for number in range(len(choices)) if every else [first]:
                 text = f"{name}({argument}={' '.join(repr(choices[number]).split())[:60]})"
-                yield name, kind, text, partial(target.call, **{**target.arguments, argument: choices[number]})
+                yield (
+                    name,
+                    kind,
+                    text,
+                    partial(target.call, **{**target.arguments, argument: choices[number]}),
+                )
 
 
 @contextlib.contextmanager
@@ -395,10 +424,14 @@ def time_limit(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
+Case = tuple[str, str, str, Callable[[], Any]]
+"""Function or command, kind of the value, description of the call, and the call."""
+
+
 def run(
-    *, every: bool = False, functions: list[str] | None = None
+    *, every: bool = False, functions: Iterable[str] = (), commands: bool = True
 ) -> tuple[dict[str, dict[str, Outcome]], list[str]]:
-    """Call the functions; return the outcomes by function and kind, and all problems.
+    """Call the functions and commands; return the outcomes by name and kind, and all problems.
 
     Problems are errors of other classes, calls without an end, files written although the call failed, and
     files outside the folder of the valid files.
@@ -407,25 +440,17 @@ def run(
     with tempfile.TemporaryDirectory(prefix="bad_input.") as outer, contextlib.chdir(outer):
         folder = Path(outer) / "in"
         folder.mkdir()
-        values = bad_values(folder)
-        found = {name: target for name, target in targets(folder).items() if not functions or name in functions}
+        values, found = bad_values(folder), targets(folder)
+        chosen = {name: found[name] for name in functions or found}
+        tried: Iterator[Case] = cases(chosen, values, every=every)
+        if commands:
+            tried = itertools.chain(tried, command_cases(folder))
         before = _files(outer)
-        for name, kind, text, call in cases(found, values, every=every):
+        for name, kind, text, call in tried:
             outcome = outcomes.setdefault(name, {}).setdefault(kind, Outcome())
             error = call_quietly(call)
             written = _files(outer) - before
-            if error is None:
-                outcome.accepted += 1
-            elif isinstance(error, VehicleDetectionError):
-                outcome.refused += 1
-                if written:
-                    outcome.problems.append(f"{text}: left {sorted(written)}")
-            else:
-                shown = " ".join(f"{type(error).__name__}: {error}".split())[:150]
-                outcome.problems.append(f"{text}: {shown}")
-            outside = [path for path in written if not path.startswith("in")]
-            if outside:
-                outcome.problems.append(f"{text}: wrote {outside}")
+            outcome.add(text, error, written)
             for path in sorted(written, reverse=True):
                 remove = Path(outer, path)
                 remove.rmdir() if remove.is_dir() else remove.unlink()
@@ -454,5 +479,143 @@ def _files(folder: str) -> set[str]:
     return {str(path.relative_to(folder)) for path in Path(folder).rglob("*")}
 
 
+COMMANDS = {
+    "demo": ("-o", "demo", "--frames", "1"),
+    "detect": ("in/valid.png", "-o", "out", "--model", "highway"),
+    "video": ("in/valid.mp4", "-o", "out.mp4", "--model", "highway", "-q"),
+    "evaluate": ("in/valid.csv", "in/valid.csv"),
+    "batch": ("missing.mp4", "-o", "out", "--model", "highway", "-q"),
+    "train": ("--vehicles", "in/patches", "--non-vehicles", "in/patches", "-o", "out.safetensors"),
+    "train-frames": ("in/patches", "-o", "out.safetensors"),
+    "tune": (
+        "--vehicles",
+        "in/patches",
+        "--non-vehicles",
+        "in/patches",
+        "--grid",
+        "orient=4",
+        "-o",
+        "out.csv",
+    ),
+    "info": (),
+}
+"""Arguments of the commands. The slow ones fail after all options were checked."""
+
+COMMANDS_NOT_CALLED = {"fetch": "downloads"}
+"""Commands that are not called, and why."""
+
+
+def command_options() -> dict[str, list[str | None]]:
+    """Return the options of each command that take a value; None stands for its positional arguments."""
+    import typer
+
+    from vehicle_detection.cli.app import app
+
+    group: Any = typer.main.get_command(app)
+    return {
+        name: [
+            None if each.param_type_name == "argument" else each.opts[-1]
+            for each in command.params
+            if not getattr(each, "is_flag", False) and each.name != "help"
+        ]
+        for name, command in group.commands.items()
+        if name not in COMMANDS_NOT_CALLED
+    }
+
+
+def command_cases(folder: Path) -> Iterator[Case]:
+    """Yield the commands with one value of each kind for each option and argument."""
+    values = {
+        "negative number": "-1", "huge integer": "9" * 400, "NaN, infinity": "nan", "empty": "", "text": "x",
+        "impossible name": "a" * 5000, "missing file": "missing/missing.mp4", "folder": str(folder),
+        "device": str(folder / "zero.csv"), "wrong type": "\udc80.csv",
+    }  # fmt: skip
+    for name, options in command_options().items():
+        for option, (kind, value) in itertools.product(options, values.items()):
+            words = [*COMMANDS[name], option, value] if option else [value, *COMMANDS[name][1:]]
+            yield (
+                f"`{name}`",
+                kind,
+                f"{name} {option or ''} {value[:60]!r}",
+                partial(_run_command, name, words),
+            )
+
+
+def _run_command(name: str, words: list[str]) -> None:
+    """Run a command in this process; an error that it reports in one line counts as one of the library's."""
+    from typer.testing import CliRunner
+
+    from vehicle_detection.cli.app import app
+
+    result = CliRunner().invoke(app, [name, *words])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    if "Traceback" in result.output:
+        raise AssertionError("the output holds a traceback")
+    if result.exit_code in (1, 2):
+        raise InvalidInputError(result.output[-200:])
+    if result.exit_code:
+        raise AssertionError(f"exit code {result.exit_code}")
+
+
+def table(outcomes: Mapping[str, Mapping[str, Outcome]]) -> str:
+    """Return a Markdown table: values that were refused, of those that were tried."""
+    kinds = list(dict.fromkeys(kind for row in outcomes.values() for kind in row))
+    lines = [f"| function | {' | '.join(kinds)} |", f"|---{'|---' * len(kinds)}|"]
+    for name, row in outcomes.items():
+        cells = [
+            f"{row[kind].refused} of {row[kind].refused + row[kind].accepted}" if kind in row else ""
+            for kind in kinds
+        ]
+        lines.append(f"| {name if name.startswith('`') else f'`{name}`'} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def page(outcomes: Mapping[str, Mapping[str, Outcome]]) -> str:
+    """Return the text of ``docs/bad_input.md``."""
+    functions = {name: row for name, row in outcomes.items() if not name.startswith("`")}
+    commands = {name: row for name, row in outcomes.items() if name.startswith("`")}
+    cells = [each for row in outcomes.values() for each in row.values()]
+    refused, accepted = sum(each.refused for each in cells), sum(each.accepted for each in cells)
+    skipped = "".join(f"- `{name}`: {why}\n" for name, why in {**NOT_CALLED, **COMMANDS_NOT_CALLED}.items())
+    return f"""# Bad input, function by function
+
+Written by `python -m tools.bad_input --write`. Every argument of every public function, constructor and
+method, and every option of the commands, was given values of each kind, all other arguments being valid.
+A cell states how many values were refused, of those tried; the others are valid for that argument, such as
+`None` for an optional one. Of {refused + accepted:,} calls, {refused:,} ended with an error of
+`vehicle_detection.errors` or exit code 2; {accepted:,} were valid. None raised another error, took longer
+than {MAX_SECONDS} s, or left a file after an error. `tests/tools/test_bad_input.py` tries one value of each
+kind, and fails if a new public function is not called.
+
+Not called:
+
+{skipped}
+## Functions
+
+{table(functions)}
+## Commands
+
+{table(commands)}"""
+
+
+def main() -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--functions", nargs="+", default=(), help="functions to call; default: all")
+    parser.add_argument("--write", action="store_true", help=f"write {PAGE.relative_to(ROOT)}")
+    options = parser.parse_args()
+    outcomes, problems = run(every=True, functions=options.functions, commands=not options.functions)
+    for problem in problems:
+        print(problem)
+    cells = [each for row in outcomes.values() for each in row.values()]
+    print(f"{sum(each.refused for each in cells)} refused, {sum(each.accepted for each in cells)} accepted")
+    if options.write and not problems:
+        PAGE.write_text(page(outcomes))
+    sys.exit(bool(problems))
+
+
 if __name__ == "__main__":
-    pass
+    main()

@@ -15,7 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vehicle_detection._common import atomic_write
+from vehicle_detection._common import (
+    atomic_write,
+    check_path,
+)
 from vehicle_detection.errors import InvalidInputError
 
 DONE, FAILED, ERROR = "done", "failed", "error"
@@ -130,7 +133,7 @@ def batch_status(out: str | os.PathLike[str]) -> BatchStatus:
     0 trips done, 0 failed, 0 errors
     0.0 hours of video, 0 frames, 0 vehicles, 0.0 frames/s per worker
     """
-    folder = Path(out)
+    folder = check_path(out, "out", kind="a folder")
     if not folder.is_dir():
         raise InvalidInputError(f"out {folder} is not a folder; pass the folder of a batch")
     counts: Counter[str] = Counter()

@@ -19,7 +19,10 @@ from typing import Any
 from vehicle_detection._common import (
     available_cores,
     check_choice,
+    check_flags,
     check_integer,
+    check_sequence,
+    check_type,
     describe,
     progress_bar,
 )
@@ -154,12 +157,23 @@ def run_batch(
     started = time.perf_counter()
     check_choice(group, "group", ("trip", "file"))
     part = _parse_shard(shard)
+    check_flags(tracks_only=tracks_only, audio=audio, retry_failed=retry_failed, progress=progress)
+    if executor is not None and not hasattr(executor, "submit"):
+        raise InvalidInputError(
+            f"executor must be an executor of concurrent.futures, got {describe(executor)}; omit it"
+        )
+    if on_record is not None and not callable(on_record):
+        raise InvalidInputError(f"on_record must be a function of a record; got {describe(on_record)}")
+    if options is not None:
+        check_type(options, "options", Mapping, "pass a dictionary")
     workers = available_cores() if jobs is None else check_integer(jobs, "jobs", low=1, high=1024)
     settings = _settings(model, options, tracks_only=tracks_only, audio=audio, preset=preset)
     load_model(settings["model"])  # an error now, not in every worker
+    single = isinstance(sources, (str, os.PathLike))
+    given = (sources,) if single else check_sequence(sources, "sources", "files, folders, patterns or URLs")
+    found = list_videos(given)
     folder = _make_folder(out)
-    given = [sources] if isinstance(sources, (str, os.PathLike)) else sources
-    tasks = _plan(given, folder, settings, group, part)
+    tasks = _plan(found, folder, settings, group, part)
     pending, skipped = [], 0
     for task in tasks:
         record = read_record(folder, task["key"])
@@ -207,10 +221,10 @@ def run_batch(
     )
 
 
-def _parse_shard(shard: str | None) -> tuple[int, int]:
+def _parse_shard(shard: object) -> tuple[int, int]:
     if shard is None:
         return 1, 1
-    found = re.fullmatch(r"(\d+)/(\d+)", shard) if shard else None
+    found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", shard) if isinstance(shard, str) else None
     if found is None or not 1 <= int(found[1]) <= int(found[2]):
         raise InvalidInputError(
             f"shard must be a number and a count, such as 3/200 for the third of 200; got {describe(shard)}"
@@ -266,14 +280,14 @@ def _make_folder(out: str | os.PathLike[str]) -> Path:
 
 
 def _plan(
-    sources: Iterable[str | os.PathLike[str]],
+    found: Iterable[str],
     out: Path,
     settings: Mapping[str, Any],
     group: str,
     part: tuple[int, int],
 ) -> list[dict[str, Any]]:
     """Describe the work on each trip of this shard."""
-    files = [each for each in list_videos(sources) if not Path(each).is_relative_to(out)]
+    files = [each for each in found if not Path(each).is_relative_to(out)]
     trips = group_files(files, group)
     fingerprint = _fingerprint(settings["model"])
     earlier = earlier_keys(out)

@@ -9,7 +9,13 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
-from vehicle_detection._common import atomic_write, check_type, describe, temporary_folder, write_parquet
+from vehicle_detection._common import (
+    atomic_write,
+    check_type,
+    describe,
+    temporary_folder,
+    write_parquet,
+)
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.frame_boxes import NO_TRACK, FrameBoxes, FrameKey
 from vehicle_detection.evaluation.readers import FRAME_NUMBER, read_coco_file, vehicle_categories
@@ -98,7 +104,7 @@ def write_labels(
     (0, 2)
     """
     check_type(labels, "labels", FrameBoxes, "collect the boxes of each frame in one")
-    if format == "kitti":
+    if isinstance(format, str) and format == "kitti":
         _write_kitti(labels, Path(path))
         return len(labels)
     kind = check_format(path, format, (*FORMATS.values(), "coco_results", "kitti"))

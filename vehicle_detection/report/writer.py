@@ -13,6 +13,7 @@ from vehicle_detection._common import (
     check_choice,
     check_integer,
     check_path,
+    check_sequence,
     check_target,
     check_type,
 )
@@ -110,7 +111,7 @@ class ReportWriter:
             camera = camera_of(report.shape)
             events = find_events(self.log, fps=float(report.fps), shape=report.shape, camera=camera)
         options = {
-            "events": list(events),
+            "events": list(check_sequence(events, "events", "Event")),
             "video": self._embed(),
             "source": self._source,
             "detector": self._detector,
