@@ -1,6 +1,7 @@
 """Files that are endless, too large or no files."""
 
 import os
+import tracemalloc
 import zipfile
 
 import pytest
@@ -66,6 +67,17 @@ def test_a_file_that_grows_while_it_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr(type(path), "open", grow)
     with pytest.raises(InvalidInputError, match="log is larger than 8 bytes"):
         read_regular_file(path, "log", Limit.TEXT_BYTES)
+
+
+def test_a_small_file_takes_little_memory(tmp_path):
+    path = tmp_path / "small.csv"
+    path.write_bytes(b"1234")
+    tracemalloc.start()
+    try:
+        assert read_regular_file(path, "small", Limit.TEXT_BYTES) == b"1234"
+        assert tracemalloc.get_traced_memory()[1] < 1_000_000  # not the limit of 1 GB
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_member_larger_than_the_limit_is_refused(tmp_path, monkeypatch):

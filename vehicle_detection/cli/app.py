@@ -62,6 +62,9 @@ class _Commands(TyperGroup):
             reason = error.strerror or str(error)
             print_error(f"error: {error.filename}: {reason}" if error.filename else f"error: {reason}")
             raise typer.Exit(BAD_INPUT) from None
+        except MemoryError:
+            print_error("error: memory ran out; close other programs, or use fewer --jobs and smaller files")
+            raise typer.Exit(BAD_INPUT) from None
         except KeyboardInterrupt as error:
             print_error("interrupted")
             raise typer.Exit(getattr(error, "code", INTERRUPTED)) from None
