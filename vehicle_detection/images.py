@@ -119,4 +119,4 @@ def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
     if not done:
         raise InvalidInputError(f"image cannot be encoded as {Path(path).suffix}; choose another format")
     with atomic_write(path, "path") as part:
-        part.write_bytes(data)
+        part.write_bytes(data.tobytes())

@@ -282,6 +282,13 @@ def test_variables_that_numba_fails_with(variable, value):
     assert "Traceback" not in done.stderr
 
 
+def test_a_name_that_cannot_be_printed(tmp_path):
+    image = tmp_path / os.fsdecode(b"\xff.png")
+    write_image(image, render_scene(shape=(180, 320), vehicles=0, random_state=0).image)
+    result = run("detect", image, "--model", "highway")
+    assert (result.exit_code, "/?.png: 0 vehicles" in result.stdout) == (0, True)
+
+
 def test_memory_that_runs_out(monkeypatch, clip, tmp_path):
     def fail(*_, **__):
         raise MemoryError

@@ -27,6 +27,7 @@ from vehicle_detection.cli.output import (
     print_facts,
     print_warnings,
     rename_argument,
+    replace_unprintable,
 )
 from vehicle_detection.cli.signals import raise_on_signals
 from vehicle_detection.cli.train import fetch, info, train, train_frames
@@ -47,6 +48,7 @@ class _Commands(TyperGroup):
     """Commands whose expected errors become one line on standard error."""
 
     def invoke(self, ctx: Any) -> Any:
+        replace_unprintable()
         try:
             with raise_on_signals(), print_warnings():
                 return super().invoke(ctx)
