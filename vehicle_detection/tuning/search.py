@@ -118,7 +118,7 @@ def compare_configurations(
     if not values:
         raise InvalidInputError("C must be a number or several; got none")
     for value in values:
-        check_number(value, "C", above=0, high=1e12)
+        check_number(value, "C")
     checked_seeds = check_seeds(seeds)
     check_flags(mirror=mirror)
     check_number(positive_weight, "positive_weight", above=0, high=1e6)
@@ -375,7 +375,8 @@ def make_splits(
 
 def check_seeds(seeds: object) -> tuple[int, ...]:
     """Return the seeds if they are different integers."""
-    listed = check_sequence(seeds, "seeds", "integers")
+    scalar = isinstance(seeds, (str, bytes)) or getattr(seeds, "ndim", 1) == 0
+    listed = tuple(seeds) if isinstance(seeds, Iterable) and not scalar else ()
     checked = tuple(check_integer(seed, "seeds", low=0, high=2**32 - 1) for seed in listed)
     if not checked or len(set(checked)) < len(checked):
         raise InvalidInputError(
