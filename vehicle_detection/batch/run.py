@@ -21,6 +21,7 @@ from vehicle_detection._common import (
     check_choice,
     check_flags,
     check_integer,
+    check_path,
     check_sequence,
     check_type,
     describe,
@@ -269,7 +270,7 @@ def _make_folder(out: str | os.PathLike[str]) -> Path:
         raise InvalidInputError(f"out must be a folder, got {describe(out)}; pass its path")
     if "://" in os.fspath(out):
         raise InvalidInputError(f"out must be a folder, got the URL {out}; mount the storage, or copy later")
-    folder = Path(os.path.abspath(out))
+    folder = Path(os.path.abspath(check_path(out, "out", kind="a folder")))
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
