@@ -257,5 +257,5 @@ def test_invalid_camera_files(tmp_path, text, message):
 
 
 def test_a_missing_camera_file(tmp_path):
-    with pytest.raises(InvalidInputError, match=r"camera file \S+ cannot be read: No such file"):
+    with pytest.raises(InvalidInputError, match=r"camera file \S+ does not exist; check the path"):
         read_camera(tmp_path / "camera.json", SHAPE)

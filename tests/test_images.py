@@ -1,3 +1,4 @@
+import errno
 import io
 import os
 import struct
@@ -10,7 +11,7 @@ import pytest
 from PIL import Image
 
 from vehicle_detection._common import image_size
-from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.errors import InvalidInputError, OutputError
 from vehicle_detection.images import decode_image, read_image, write_image
 
 LOSSLESS = [".png", ".bmp", ".tiff"]
@@ -71,6 +72,14 @@ def test_gray_becomes_three_equal_channels(picture, suffix):
     assert (image == image[..., :1]).all()
     if suffix != ".jpg":
         np.testing.assert_array_equal(image[..., 0], gray)
+
+
+def test_a_name_that_is_not_utf8(tmp_path):
+    path = tmp_path / os.fsdecode(b"\xff.png")
+    image = np.full((4, 5, 3), 7, np.uint8)
+    write_image(path, image)
+    assert os.listdir(os.fsencode(tmp_path)) == [b"\xff.png"]
+    np.testing.assert_array_equal(read_image(path), image)
 
 
 def test_alpha_is_dropped(picture):
@@ -273,8 +282,16 @@ def test_writing_needs_a_folder_and_an_image(tmp_path, picture, monkeypatch):
 
 def test_a_failed_write_keeps_the_earlier_file(tmp_path, picture, monkeypatch):
     write_image(tmp_path / "a.png", picture)
-    monkeypatch.setattr(cv2, "imwrite", lambda *_: False)
-    with pytest.raises(InvalidInputError, match=r"a.png could not be written; is the disk full"):
+    monkeypatch.setattr(cv2, "imencode", lambda *_: (False, None))
+    with pytest.raises(InvalidInputError, match=r"image cannot be encoded as .png; choose another format"):
+        write_image(tmp_path / "a.png", 255 - picture)
+
+    def fill(self, data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.undo()
+    monkeypatch.setattr(Path, "write_bytes", fill)
+    with pytest.raises(OutputError, match=r"a.png cannot be written \(No space left on device\); free some"):
         write_image(tmp_path / "a.png", 255 - picture)
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), picture)

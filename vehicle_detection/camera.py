@@ -21,13 +21,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import (
+    Limit,
     atomic_write,
+    check_array,
     check_boxes,
     check_choice,
     check_integer,
     check_number,
+    check_path,
     check_type,
     describe,
+    read_regular_file,
 )
 from vehicle_detection.errors import InvalidInputError
 
@@ -210,7 +214,10 @@ class Camera:
         A vehicle in another lane shows its side too. Its box starts with the near face at the outer edge and
         ends with the far end of the side at the inner edge, `lateral_px` from the middle of the frame.
         """
-        return self.focal_px * self.vehicle_width_m + self.vehicle_length_m * lateral_px
+        lateral = check_array(lateral_px, "lateral_px")
+        if lateral.dtype.kind not in "iuf":
+            raise InvalidInputError(f"lateral_px must be numbers of pixels; got {describe(lateral_px)}")
+        return np.asarray(self.focal_px * self.vehicle_width_m + self.vehicle_length_m * lateral)
 
     def rectify_boxes(self, boxes: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
         """Convert ``(N, 4)`` boxes to those of a pinhole camera with the same focal length.
@@ -319,7 +326,8 @@ def read_camera(path: str | os.PathLike[str], shape: tuple[int, ...]) -> Camera:
     (598, 1.4)
     """
     height, width = check_shape(shape)
-    values = _read_json(Path(path))
+    path = check_path(path)
+    values = _read_json(path)
     size = values.pop("image_size", None)
     scale = 1.0
     if size is not None:
@@ -346,11 +354,7 @@ def read_camera(path: str | os.PathLike[str], shape: tuple[int, ...]) -> Camera:
 def _read_json(path: Path) -> dict[str, Any]:
     """Read the object in a JSON file, and check its names."""
     try:
-        values: Any = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InvalidInputError(
-            f"camera file {path} cannot be read: {error.strerror}; check the path"
-        ) from error
+        values: Any = json.loads(read_regular_file(path, f"camera file {path}", Limit.TEXT_BYTES))
     except ValueError as error:
         raise InvalidInputError(f"camera file {path} is not JSON: {error}; see read_camera") from None
     known = {"image_size", "field_of_view", "lens", "horizon", *Camera.__dataclass_fields__}

@@ -20,6 +20,7 @@ from vehicle_detection._common import (
     check_integer,
     check_number,
     check_patches,
+    check_sequence,
     check_type,
     degrade_patches,
     describe,
@@ -114,6 +115,8 @@ class VehicleClassifier:
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        check_type(self.params, "params", FeatureParams, CLASSIFIER_REMEDY)
+        object.__setattr__(self, "templates", check_sequence(self.templates, "templates", "Template"))
         if not self.templates:
             raise InvalidInputError("templates must hold at least one template; got none")
         for template in self.templates:
@@ -230,7 +233,9 @@ class VehicleClassifier:
         from vehicle_detection.sklearn_models import check_equal_scores, fold_estimators, split_pipeline
 
         known, steps = split_pipeline(pipeline)
-        params = params or known
+        params = known if params is None else params
+        if metadata is not None:
+            check_type(metadata, "metadata", Mapping, "pass a dictionary")
         if not isinstance(params, FeatureParams):
             raise InvalidInputError(
                 f"params must be the FeatureParams of the pipeline's features; got {describe(params)}"
@@ -426,6 +431,8 @@ def train_classifier(
     options = TrainingOptions(
         C=C, solver=solver, mirror=mirror, gamma=gamma, degraded=degraded, random_state=random_state
     )
+    if metadata is not None:
+        check_type(metadata, "metadata", Mapping, "pass a dictionary")
     images, targets = _read_training_set(patches, labels)
     features = patch_features(images, params, options, n_jobs=n_jobs)
     return fit_features(features, targets, params, options, estimator=estimator, metadata=metadata)

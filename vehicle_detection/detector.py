@@ -359,6 +359,7 @@ class VehicleDetector:
             return self.every
         if self._heat_params or self.diagnostics or isinstance(self.model, FunctionModel):
             return 1
+        fps = check_number(fps, "fps", above=0, high=1e6)
         return max(1, int(fps / _MIN_SEARCH_RATE + 0.01))  # 23.976 counts as 24
 
     def process(self, frame: NDArray[np.uint8], time: float | None = None) -> FrameResult:
@@ -379,6 +380,7 @@ class VehicleDetector:
             If the detector is a function that fails; the message names the frame.
         """
         start = clock.perf_counter()
+        _check_time(time)
         thumbnail = make_thumbnail(check_image(frame, "frame"))
         follows = frame.shape[:2] == self._shape and not self._is_cut(thumbnail)
         if time is not None and self._time is not None:
@@ -439,6 +441,8 @@ class VehicleDetector:
         A cut to another scene, a frame of another size and a time that goes backwards end all tracks.
         """
         start = clock.perf_counter()
+        check_type(found, "found", SearchResult, "pass what search returns")
+        _check_time(time)
         self._shape, self._time = found.shape, time
         if self._tracker is None:
             fps = self._fps or _USUAL_FPS
@@ -474,6 +478,8 @@ class VehicleDetector:
         Drawn in their order, the frames of a video have labels that keep their places, and trails in the
         bird's-eye view.
         """
+        check_image(frame, "frame")
+        check_type(result, "result", FrameResult, "pass what process or track returns")
         if self.blur is not None:
             tracked = np.array([track.box for track in result.tracks]).reshape(-1, 4)
             boxes = np.concatenate([tracked, result.detections.boxes])
@@ -494,8 +500,9 @@ class VehicleDetector:
 
     def annotated_shape(self, shape: tuple[int, ...]) -> tuple[int, int, int]:
         """Shape of what `annotate` returns for a frame of this shape; a view beside it adds columns."""
+        height, width = check_shape(shape)
         if self.diagnostics:
-            return shape[0], shape[1], 3
+            return height, width, 3
         return self._drawer.output_shape(shape)
 
     def __call__(self, frame: NDArray[np.uint8] | Path) -> NDArray[np.uint8]:
@@ -585,7 +592,7 @@ class VehicleDetector:
 
         Compiled kernels are cached on disk: only the first use after an installation takes seconds.
         """
-        self.detect(np.zeros((*shape, 3), np.uint8))
+        self.detect(np.zeros((*check_shape(shape), 3), np.uint8))
 
     def close(self) -> None:
         """Stop the search's threads; the detector starts them again when it is used."""
@@ -622,6 +629,11 @@ class _ClipAnnotator:
             if self._on_result is not None:
                 self._on_result(result)
         return self._picture.copy()
+
+
+def _check_time(time: object) -> None:
+    if time is not None:
+        check_number(time, "time", low=-1e12, high=1e12)
 
 
 def detector_from(

@@ -51,6 +51,8 @@ class FunctionModel:
                 "and scores"
             )
         check_type(self.thread_safe, "thread_safe", bool, "pass True or False")
+        if self.name is not None:
+            check_type(self.name, "name", str, "omit it for the function's name")
         name = self.name or getattr(self.function, "__name__", type(self.function).__name__)
         object.__setattr__(self, "score", check_score_scale(self.score, self.threshold))
         object.__setattr__(self, "name", name)

@@ -114,6 +114,9 @@ def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
         raise InvalidInputError(
             f"path must end in .png, .jpg or another image suffix, got {Path(path).name!r}"
         )
+    # Not cv2.imwrite: it ends Python if the name is not UTF-8, and does not say why it failed.
+    done, data = cv2.imencode(Path(path).suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+    if not done:
+        raise InvalidInputError(f"image cannot be encoded as {Path(path).suffix}; choose another format")
     with atomic_write(path, "path") as part:
-        if not cv2.imwrite(str(part), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)):
-            raise InvalidInputError(f"{path} could not be written; is the disk full?")
+        part.write_bytes(data.tobytes())

@@ -61,7 +61,7 @@ def find_vehicles(
     >>> find_vehicles(windows, camera, (720, 1280)).boxes.round().astype(int)
     array([[608, 385, 676, 448]])
     """
-    params = params or RegionParams()
+    params = RegionParams() if params is None else params
     check_type(windows, "windows", Detections, "pass Detections(boxes, scores)")
     check_type(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
     check_type(params, "params", RegionParams, "omit it for the default")

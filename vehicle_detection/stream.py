@@ -12,6 +12,7 @@ from typing import Any, Literal, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection._common import check_flags
 from vehicle_detection.boxes import Detections
 from vehicle_detection.confidence import Model
 from vehicle_detection.detector import FrameResult, VehicleDetector
@@ -165,6 +166,7 @@ def track(
     0 0.0 (720, 1280, 3) 2
     1 0.04 (720, 1280, 3) 0
     """
+    check_flags(stream=stream, progress=progress)
     given = isinstance(model, VehicleDetector)
     if given and options:
         raise InvalidInputError(

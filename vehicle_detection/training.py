@@ -160,7 +160,8 @@ def train_and_evaluate(
     """
     check_type(patch_set, "patch_set", PatchSet, "read one with load_training_patches")
     labels = check_labels(patch_set.labels, len(patch_set))
-    params = params or FeatureParams()
+    params = FeatureParams() if params is None else params
+    check_type(params, "params", FeatureParams, "omit it for the default")
     options = TrainingOptions(
         C=C, solver=solver, mirror=mirror, gamma=gamma, degraded=degraded, random_state=random_state
     )

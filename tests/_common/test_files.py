@@ -36,6 +36,14 @@ def test_check_target_refuses_a_missing_folder(tmp_path):
         check_target(tmp_path / "file" / "out.csv")
 
 
+def test_check_target_refuses_devices_and_pipes(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "null").symlink_to(os.devnull)  # the device itself would be lost if the check failed
+    for name in ("pipe", "null"):
+        with pytest.raises(InvalidInputError, match="target must be a file, got the device or pipe"):
+            check_target(tmp_path / name)
+
+
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere")
 def test_check_target_refuses_a_read_only_folder(tmp_path):
     tmp_path.chmod(0o500)

@@ -1,11 +1,13 @@
 """Files that are endless, too large or no files."""
 
 import os
+import tracemalloc
 import zipfile
 
 import pytest
 
 from vehicle_detection._common import Limit, check_path, read_regular_file
+from vehicle_detection.camera import read_camera
 from vehicle_detection.datasets import load_patches
 from vehicle_detection.errors import DatasetError, InvalidInputError, ModelFileError
 from vehicle_detection.evaluation import read_labels
@@ -14,6 +16,7 @@ from vehicle_detection.mixture import load_model
 READERS = [
     (load_model, ModelFileError, "VEHICLE_DETECTION_MAX_MODEL_BYTES"),
     (read_labels, DatasetError, "VEHICLE_DETECTION_MAX_TEXT_BYTES"),
+    (lambda path: read_camera(path, (720, 1280)), InvalidInputError, "VEHICLE_DETECTION_MAX_TEXT_BYTES"),
     (lambda path: load_patches(path, label=1), DatasetError, None),
 ]
 
@@ -34,7 +37,13 @@ def test_devices_and_pipes_are_refused_at_once(read, error, variable, pipe):
             read(path)
 
 
-@pytest.mark.parametrize(("read", "error", "variable"), READERS[:2])
+def test_a_device_in_a_folder_of_patches_is_refused(tmp_path):
+    (tmp_path / "endless.png").symlink_to("/dev/zero")
+    with pytest.raises(DatasetError, match=r"endless.png of \S+ is a device or a pipe, which may never end"):
+        load_patches(tmp_path, label=1)
+
+
+@pytest.mark.parametrize(("read", "error", "variable"), READERS[:3])
 def test_files_larger_than_the_limit_are_refused(read, error, variable, tmp_path, monkeypatch):
     path = tmp_path / "large.csv"
     path.write_bytes(b"frame\n" * 100)
@@ -58,6 +67,17 @@ def test_a_file_that_grows_while_it_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr(type(path), "open", grow)
     with pytest.raises(InvalidInputError, match="log is larger than 8 bytes"):
         read_regular_file(path, "log", Limit.TEXT_BYTES)
+
+
+def test_a_small_file_takes_little_memory(tmp_path):
+    path = tmp_path / "small.csv"
+    path.write_bytes(b"1234")
+    tracemalloc.start()
+    try:
+        assert read_regular_file(path, "small", Limit.TEXT_BYTES) == b"1234"
+        assert tracemalloc.get_traced_memory()[1] < 1_000_000  # not the limit of 1 GB
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_member_larger_than_the_limit_is_refused(tmp_path, monkeypatch):

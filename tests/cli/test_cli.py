@@ -446,7 +446,8 @@ def bad_images(material, tmp):
         r"text.png must be a complete image file": [material / "text.png"],
         r"cut_road.png must be a complete image file": [material / "cut_road.png"],
         r"nothing.png must be a complete image file": [tmp / "nothing.png"],
-        r"floats.tiff must be a complete image file": [floats],
+        # OpenCV 4 converts floating-point numbers.
+        **({} if cv2.__version__ < "5" else {r"floats.tiff must be a complete image file": [floats]}),
         r"image of 12x12 pixels holds no search window": [tiny, "--model", "highway"],
         r"--horizon must be a number, at least 0 and at most 1; got 2": [road, "--horizon", 2],
         r"--conf must be a number, at least 0 and at most 1; got 7": [road, "--conf", 7],
@@ -646,10 +647,9 @@ def test_a_damaged_video_has_an_exit_code_of_its_own(clip, tmp_path):
     lost, target = damage_sizes(clip, tmp_path / "lost.mp4", entry=3, byte=0, flip=64), tmp_path / "out.mp4"
     result = run("video", lost, "-o", target, "-q")
     assert result.exit_code == 3
-    assert (
-        result.stderr
-        == f"warning: {lost} is damaged: 7 of 10 frames cannot be decoded; copy or record it again\n"
-    )
+    # Some versions of ffmpeg also report an error.
+    assert result.stderr.startswith(f"warning: {lost} is damaged: 7 of 10 frames cannot be decoded")
+    assert result.stderr.endswith("; copy or record it again\n")
     with read_frames(target) as frames:
         assert len(list(frames)) == 3
     target.unlink()

@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -18,9 +19,12 @@ from tests.helpers import ROOT, start_interruptible
 from tests.video.clips import gray_frames, write_clip
 from vehicle_detection import detector, export, report
 from vehicle_detection._common import files
+from vehicle_detection._kernels.jit import jit
 from vehicle_detection.cli.app import app
 from vehicle_detection.cli.signals import raise_on_signals
 from vehicle_detection.errors import OutputError
+from vehicle_detection.images import write_image
+from vehicle_detection.synthetic import render_scene
 from vehicle_detection.video import probe_video
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
@@ -277,6 +281,51 @@ def test_variables_that_numba_fails_with(variable, value):
     assert done.returncode == 2
     assert re.search(rf"^error: {variable} must be unset or .*; got '{value}'$", done.stderr, re.MULTILINE)
     assert "Traceback" not in done.stderr
+
+
+def test_a_name_that_cannot_be_printed(tmp_path):
+    image = tmp_path / os.fsdecode(b"\xff.png")
+    write_image(image, render_scene(shape=(180, 320), vehicles=0, random_state=0).image)
+    result = run("detect", image, "--model", "highway")
+    assert (result.exit_code, "/?.png: 0 vehicles" in result.stdout) == (0, True)
+
+
+def test_memory_that_runs_out(monkeypatch, clip, tmp_path):
+    def fail(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr(detector.VehicleDetector, "search", fail)
+    result = run("video", clip, "-o", tmp_path / "out.mp4", "--model", "highway")
+    assert result.exit_code == 2
+    assert result.stderr.startswith("error: memory ran out; close other programs")
+    assert contents(tmp_path) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ulimit")
+def test_no_home_no_terminal_an_ascii_locale_and_a_gigabyte_of_memory(tmp_path):
+    write_image(tmp_path / "é.png", render_scene(shape=(180, 320), vehicles=0, random_state=0).image)
+    variables = {"HOME": "/nonexistent", "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    variables |= {"TERM": "dumb", "PYTHONPATH": str(ROOT)}
+    words = ["-m", "vehicle_detection", "detect", tmp_path / "é.png", "-o", tmp_path / "out"]
+    limit = ["bash", "-c", 'ulimit -v 1200000; exec "$@"', "bash"]
+    done = subprocess.run(
+        [*limit, sys.executable, *words, "--model", "highway"],
+        cwd="/",
+        env={**os.environ, **variables},
+        capture_output=True,
+        stdin=subprocess.DEVNULL,
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert done.stdout.split(b": ")[0].endswith(b"/??.png")
+    assert contents(tmp_path / "out") == ["é.png"]
+
+
+def test_a_cache_of_kernels_that_is_not_writable(monkeypatch):
+    def refuse(*_, **__):
+        raise RuntimeError("cannot cache function 'add': no locator available for file 'kernels.py'")
+
+    monkeypatch.setattr(numba.core.caching.FunctionCache, "__init__", refuse)
+    assert jit(lambda x: x + 1)(2) == 3
 
 
 def test_other_errors_of_the_system_are_one_line(monkeypatch, clip, tmp_path):

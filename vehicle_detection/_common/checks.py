@@ -138,6 +138,13 @@ def check_array(values: object, name: str) -> NDArray[Any]:
         ) from None
 
 
+def check_flags(**flags: object) -> None:
+    """Raise unless each value, named by its argument, is a bool, or an integer in place of one."""
+    for name, value in flags.items():
+        if not isinstance(value, (bool, int, np.bool_, np.integer)):
+            raise InvalidInputError(f"{name} must be True or False; got {describe(value)}")
+
+
 def check_sequence(values: object, name: str, of: str) -> tuple[Any, ...]:
     """Return the items of a sequence or another iterable, but not the characters of a text."""
     scalar = isinstance(values, (str, bytes)) or getattr(values, "ndim", 1) == 0

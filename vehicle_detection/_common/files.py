@@ -21,10 +21,12 @@ _MAX_PARTS = 100
 
 
 def check_target(target: str | os.PathLike[str], name: str = "target") -> Path:
-    """Return the path of a file to write, after checking that its folder exists and is writable."""
+    """Return the path of a file to write, after checking that it is no device, and its folder is writable."""
     path = check_path(target, name)
     if path.is_dir():
         raise InvalidInputError(f"{name} must be a file, got the folder {path}; add a file name to it")
+    if os.path.exists(path) and not path.is_file():  # it would be replaced by a file
+        raise InvalidInputError(f"{name} must be a file, got the device or pipe {path}; choose another name")
     if not path.parent.is_dir():
         raise InvalidInputError(f"{name} needs an existing folder, {path.parent} is not one; create it first")
     if not os.access(path.parent, os.W_OK | os.X_OK):

@@ -57,7 +57,11 @@ def read_regular_file(
     check_regular_file(path, name, limit, error=error)
     try:
         with path.open("rb") as file:
-            data = file.read(limit.current() + 1)
+            # As much as it holds: Python would allocate the whole limit first.
+            size = os.fstat(file.fileno()).st_size
+            data = file.read(size + 1)
+            if len(data) > size:
+                data += file.read(limit.current())
     except OSError as problem:
         raise error(f"{name} cannot be read: {problem.strerror}") from problem
     if len(data) > limit.current():  # it has grown

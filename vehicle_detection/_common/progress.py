@@ -7,6 +7,8 @@ import sys
 from types import SimpleNamespace
 from typing import Any
 
+from vehicle_detection._common.checks import check_flags
+
 _HIDDEN = SimpleNamespace(update=lambda n=1: None, set_description=lambda text: None)
 
 
@@ -22,6 +24,7 @@ def progress_bar(
 
     Nothing is shown if `show` is False or, with `terminal_only`, if standard error is not a terminal.
     """
+    check_flags(progress=show)
     # Not left to tqdm, whose import takes a tenth of a second.
     if not show or (terminal_only and not sys.stderr.isatty()):
         return contextlib.nullcontext(_HIDDEN)

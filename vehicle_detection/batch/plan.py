@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from vehicle_detection import __version__
-from vehicle_detection._common import describe
+from vehicle_detection._common import check_path, describe
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection.video import (
     Trip,
@@ -41,6 +41,8 @@ def list_videos(sources: Iterable[str | os.PathLike[str]]) -> dict[str, Facts]:
                 f"sources must be files, folders, patterns or URLs, got {describe(source)}; pass strings"
             )
         text = os.fspath(source)
+        if not _URL.match(text):
+            check_path(text, "sources", kind="a file, folder or pattern")
         files = dict(_list_remote(text) if _URL.match(text) else _list_local(Path(text)))
         if not files:
             raise InvalidInputError(f"sources {text} holds no videos; check the path")

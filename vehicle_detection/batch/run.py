@@ -20,7 +20,10 @@ from typing import Any
 from vehicle_detection._common import (
     available_cores,
     check_choice,
+    check_flags,
     check_integer,
+    check_sequence,
+    check_type,
     describe,
     progress_bar,
 )
@@ -169,12 +172,23 @@ def run_batch(
     started = time.perf_counter()
     check_choice(group, "group", ("trip", "file"))
     part = _parse_shard(shard)
+    check_flags(tracks_only=tracks_only, audio=audio, retry_failed=retry_failed, progress=progress)
+    if executor is not None and not hasattr(executor, "submit"):
+        raise InvalidInputError(
+            f"executor must be an executor of concurrent.futures, got {describe(executor)}; omit it"
+        )
+    if on_record is not None and not callable(on_record):
+        raise InvalidInputError(f"on_record must be a function of a record; got {describe(on_record)}")
+    if options is not None:
+        check_type(options, "options", Mapping, "pass a dictionary")
     workers = available_cores() if jobs is None else check_integer(jobs, "jobs", low=1, high=1024)
     check_choice(preset, "preset", PRESETS)
     settings = _settings(model, options, tracks_only=tracks_only, audio=audio, preset=preset)
+    single = isinstance(sources, (str, os.PathLike))
+    given = (sources,) if single else check_sequence(sources, "sources", "files, folders, patterns or URLs")
+    listed = list_videos(given)
     store = open_store(out, create=True)
-    given = [sources] if isinstance(sources, (str, os.PathLike)) else sources
-    tasks = _plan(given, store, settings, group, part)
+    tasks = _plan(listed, store, settings, group, part)
     pending = _pending(tasks, store, retry_failed)
     skipped = len(tasks) - len(pending)
     own = None
@@ -216,10 +230,10 @@ def run_batch(
     )
 
 
-def _parse_shard(shard: str | None) -> tuple[int, int]:
+def _parse_shard(shard: object) -> tuple[int, int]:
     if shard is None:
         return 1, 1
-    found = re.fullmatch(r"(\d+)/(\d+)", shard) if shard else None
+    found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", shard) if isinstance(shard, str) else None
     if found is None or not 1 <= int(found[1]) <= int(found[2]):
         raise InvalidInputError(
             f"shard must be a number and a count, such as 3/200 for the third of 200; got {describe(shard)}"
@@ -269,14 +283,13 @@ def _fingerprint(settings: Mapping[str, Any]) -> str:
 
 
 def _plan(
-    sources: Iterable[str | os.PathLike[str]],
+    listed: Mapping[str, Mapping[str, Any]],
     store: Store,
     settings: Mapping[str, Any],
     group: str,
     part: tuple[int, int],
 ) -> list[dict[str, Any]]:
     """Describe the work on each trip of this shard."""
-    listed = list_videos(sources)
     files = [each for each in listed if not each.startswith((f"{store.name}/", f"{store.name}{os.sep}"))]
     trips = group_files(files, group)
     fingerprint = _fingerprint(settings)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 from urllib.parse import unquote
 
-from vehicle_detection._common import atomic_write, describe
+from vehicle_detection._common import atomic_write, check_path, describe
 from vehicle_detection.errors import InvalidInputError, OutputError, VehicleDetectionError
 from vehicle_detection.video import open_filesystem, with_retries
 
@@ -60,7 +60,7 @@ def open_store(out: str | os.PathLike[str], *, create: bool = False) -> Store:
         text = unquote(text.removeprefix("file://"))
     if "://" in text:
         return RemoteStore(text)
-    folder = Path(os.path.abspath(text))
+    folder = Path(os.path.abspath(check_path(text, "out", kind="a folder or a URL")))
     if create:
         try:
             folder.mkdir(parents=True, exist_ok=True)

@@ -48,6 +48,7 @@ from vehicle_detection.cli.output import (
     print_facts,
     print_warnings,
     rename_argument,
+    replace_unprintable,
 )
 from vehicle_detection.cli.signals import raise_on_signals
 from vehicle_detection.cli.train import fetch, info, train, train_frames
@@ -68,6 +69,7 @@ class _Commands(TyperGroup):
     """Commands whose expected errors become one line on standard error."""
 
     def invoke(self, ctx: Any) -> Any:
+        replace_unprintable()
         try:
             with raise_on_signals(), print_warnings():
                 return super().invoke(ctx)
@@ -82,6 +84,9 @@ class _Commands(TyperGroup):
                 raise
             reason = error.strerror or str(error)
             print_error(f"error: {error.filename}: {reason}" if error.filename else f"error: {reason}")
+            raise typer.Exit(BAD_INPUT) from None
+        except MemoryError:
+            print_error("error: memory ran out; close other programs, or use fewer --jobs and smaller files")
             raise typer.Exit(BAD_INPUT) from None
         except KeyboardInterrupt as error:
             print_error("interrupted")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import logging
 import os
 import sys
@@ -21,6 +22,12 @@ Result = TypeVar("Result")
 
 # Width of tables that are not printed to a terminal; fits a fingerprint in one line.
 _PIPE_WIDTH = 120
+
+
+def replace_unprintable() -> None:
+    """Print ``?`` for what standard output cannot encode, such as a file name that is not UTF-8."""
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="replace")
 
 
 def print_error(message: str) -> None:

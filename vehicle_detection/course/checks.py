@@ -7,7 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_integer, check_number, describe
+from vehicle_detection._common import (
+    check_array,
+    check_integer,
+    check_number,
+    describe,
+)
 from vehicle_detection.errors import InvalidInputError
 
 Image = NDArray[Any]
@@ -28,7 +33,7 @@ def check_lesson_image(img: Any, name: str = "img") -> Image:
 
 def check_size(size: Any, name: str) -> tuple[int, int]:
     """Return ``(width, height)`` of a pair or of one number."""
-    pair = (size, size) if np.ndim(size) == 0 else tuple(size)
+    pair = (size, size) if check_array(size, name).ndim == 0 else tuple(size)
     if len(pair) != 2:
         raise InvalidInputError(f"{name} must be (width, height); got {describe(size)}")
     return check_integer(pair[0], name, low=1), check_integer(pair[1], name, low=1)
@@ -38,7 +43,7 @@ def check_range(limits: Any, name: str) -> tuple[float, float] | None:
     """Return the range of a histogram; None stands for the range of the values."""
     if limits is None:
         return None
-    if np.shape(limits) != (2,):
+    if check_array(limits, name).shape != (2,):
         raise InvalidInputError(f"{name} must be (low, high) or None; got {describe(limits)}")
     low = check_number(limits[0], name)
     return low, check_number(limits[1], name, above=low)

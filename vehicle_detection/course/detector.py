@@ -9,7 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_integer, check_number, describe
+from vehicle_detection._common import (
+    check_integer,
+    check_number,
+    check_sequence,
+    check_type,
+    describe,
+)
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.course.heat import draw_boxes
 from vehicle_detection.course.windows import find_car_windows
@@ -84,6 +90,7 @@ class HeatmapDetector(VehicleDetector):
         n_frames: int = 5,
         **options: Any,
     ) -> None:
+        scales = check_sequence(scales, "scales", "numbers")
         search = _search_params(ystart, ystop, scales, cells_per_step)
         heat = HeatParams(weighting="count", frames=n_frames, threshold=threshold, peak_fraction=0)
         if isinstance(clf, (str, os.PathLike, VehicleClassifier)):
@@ -125,6 +132,7 @@ class HeatmapDetector(VehicleDetector):
         """Draw the boxes of the hot regions on a copy of the frame, in the course's style."""
         if self.diagnostics:
             return super().annotate(frame, result)
+        check_type(result, "result", FrameResult, "pass what process or track returns")
         return draw_boxes(frame, result.detections)
 
 

@@ -9,7 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_choice, check_integer, describe
+from vehicle_detection._common import (
+    check_choice,
+    check_flags,
+    check_integer,
+    check_type,
+    describe,
+)
 from vehicle_detection._kernels import degree_bounds, orientation_cotangents, sqrt_gradients
 from vehicle_detection._kernels import histogram as _histogram_kernels
 from vehicle_detection._kernels import hog as _hog_kernels
@@ -115,6 +121,8 @@ def get_hog_features(
         raise InvalidInputError(
             f"img must be one (H, W) channel of numbers, got {describe(img)}; pick one with image[..., 0]"
         )
+    check_flags(vis=vis, visualise=visualise, visualize=visualize, feature_vec=feature_vec)
+    check_flags(transform_sqrt=transform_sqrt)
     channel = img if img.dtype in (np.uint8, np.float32) else img.astype(np.float64)
     blocks = hog_blocks(channel[..., None], orient, pix_per_cell, cell_per_block, transform_sqrt)[0]
     blocks = np.ascontiguousarray(blocks, np.float32 if channel.dtype == np.float32 else np.float64)
@@ -166,6 +174,7 @@ def bin_spatial(
     """
     image = check_lesson_image(img)
     check_choice(order, "order", SPATIAL_ORDERS)
+    check_type(color_space, "color_space", str, "pass a name such as 'YCrCb'")
     if isinstance(size, str) and len(last_size) <= 1:
         color_space, size = size, last_size[0] if last_size else (32, 32)
     elif last_size:

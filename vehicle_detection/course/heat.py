@@ -10,7 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection import heatmap as library
-from vehicle_detection._common import check_integer, describe
+from vehicle_detection._common import (
+    check_array,
+    check_integer,
+    describe,
+)
 from vehicle_detection.course.checks import Image, check_lesson_image, corner_array
 from vehicle_detection.errors import InvalidInputError
 
@@ -132,7 +136,7 @@ def draw_labeled_bboxes(img: Image, labels: Any) -> Image:
 
 
 def _draw(image: Image, corners: NDArray[np.int64], color: Sequence[float], thick: int) -> None:
-    if np.shape(color) != (3,):
+    if check_array(color, "color").shape != (3,):
         raise InvalidInputError(f"color must be (red, green, blue); got {describe(color)}")
     check_integer(thick, "thick", low=-1)
     for x1, y1, x2, y2 in corners.tolist():

@@ -14,7 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection import features as library
-from vehicle_detection._common import check_choice, check_integer, describe
+from vehicle_detection._common import (
+    check_choice,
+    check_flags,
+    check_integer,
+    describe,
+)
 from vehicle_detection.course.checks import Image, check_lesson_image, check_range, check_size
 from vehicle_detection.course.features import (
     Size,
@@ -158,7 +163,9 @@ def extract_features(
     options = FeatureOptions.of(locals())
     if isinstance(imgs, (str, os.PathLike)) or not isinstance(imgs, Iterable):
         raise InvalidInputError(f"imgs must be a list of file names or images; got {describe(imgs)}")
-    read = imread or _read_like_lesson
+    if imread is not None and not callable(imread):
+        raise InvalidInputError(f"imread must be a function of a file name; got {describe(imread)}")
+    read = _read_like_lesson if imread is None else imread
     if isinstance(imgs, np.ndarray) and are_uint8_patches(imgs):
         return options.compute(imgs)
     items: list[Any] = list(imgs)
@@ -207,6 +214,7 @@ class FeatureOptions:
         for name in ("hist_bins", "orient", "pix_per_cell", "cell_per_block"):
             object.__setattr__(self, name, check_integer(getattr(self, name), name, low=1))
         for name in ("spatial_feat", "hist_feat", "hog_feat", "transform_sqrt"):
+            check_flags(**{name: getattr(self, name)})
             object.__setattr__(self, name, bool(getattr(self, name)))
         if not (self.spatial_feat or self.hist_feat or self.hog_feat):
             raise InvalidInputError("spatial_feat, hist_feat and hog_feat are all False; switch one on")

@@ -12,7 +12,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_choice, check_integer, check_number, describe
+from vehicle_detection._common import (
+    check_array,
+    check_choice,
+    check_integer,
+    check_number,
+    describe,
+)
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.course.checks import Image, box_rows, check_lesson_image, corner_array
 from vehicle_detection.course.features import (
@@ -89,7 +95,7 @@ def slide_window(
         raise InvalidInputError(f"img must be an image array; got {describe(img)}")
     check_choice(formula, "formula", _FORMULAS)
     for name, pair in (("xy_window", xy_window), ("xy_overlap", xy_overlap)):
-        if np.shape(pair) != (2,):
+        if check_array(pair, name).shape != (2,):
             raise InvalidInputError(f"{name} must be a pair of numbers; got {describe(pair)}")
     width, height = (check_integer(side, "xy_window", low=1) for side in xy_window)
     x1, x2 = _check_span(x_start_stop, img.shape[1], "x_start_stop")
@@ -102,7 +108,7 @@ def slide_window(
 def _check_span(limits: Any, size: int, name: str) -> tuple[int, int]:
     """Return the pixel range ``[start, stop]`` with None replaced by the image's border."""
     whole = (int, np.integer, type(None))
-    if np.shape(limits) != (2,) or not all(isinstance(limit, whole) for limit in limits):
+    if check_array(limits, name).shape != (2,) or not all(isinstance(limit, whole) for limit in limits):
         raise InvalidInputError(f"{name} must be [start, stop], whole pixels or None; got {describe(limits)}")
     start = 0 if limits[0] is None else int(limits[0])
     stop = size if limits[1] is None else int(limits[1])
@@ -350,7 +356,7 @@ def find_car_windows(
     True
     """
     options = FeatureOptions.of(locals())
-    check_number(scale, "scale", above=0)
+    check_number(scale, "scale", above=0, high=1e6)
     check_integer(cells_per_step, "cells_per_step", low=1)
     check_choice(resize, "resize", ("after conversion", "before conversion"))
     check_choice(formula, "formula", _FORMULAS)

@@ -27,6 +27,7 @@ from vehicle_detection._common import (
     check_path,
     check_regular_file,
     progress_bar,
+    read_regular_file,
 )
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import decode_image
@@ -106,7 +107,9 @@ class Listing:
     def reader(self) -> Iterator[Callable[[str], bytes]]:
         """Yield a function that reads a member's bytes. It is not thread-safe: open one per thread."""
         if self.path.is_dir():
-            yield lambda member: (self.path / member).read_bytes()
+            yield lambda member: read_regular_file(
+                self.path / member, f"{member} of {self.path}", Limit.IMAGE_BYTES, error=DatasetError
+            )
         else:
             with open_archive(self.path) as archive:
                 yield lambda member: _read_member(archive, member)

@@ -14,7 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_array, check_choice, check_patches, check_sequence, describe
+from vehicle_detection._common import (
+    check_array,
+    check_choice,
+    check_patches,
+    check_sequence,
+    check_type,
+    describe,
+)
 from vehicle_detection.datasets.archives import (
     decode_listings,
     infer_labels,
@@ -73,6 +80,9 @@ class PatchSet:
     @classmethod
     def concatenate(cls, sets: Sequence[PatchSet]) -> PatchSet:
         """Join several sets of the same patch size, in the given order."""
+        sets = check_sequence(sets, "sets", "PatchSet")
+        for each in sets:
+            check_type(each, "sets", PatchSet, "read each one with load_patches")
         shapes = [each.patches.shape[1:] for each in sets]
         if len(set(shapes)) != 1:
             raise InvalidInputError(f"sets must be one or more sets of the same patch size; got {shapes}")

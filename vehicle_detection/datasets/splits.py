@@ -9,7 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_integer, check_number, check_patches, check_type, describe
+from vehicle_detection._common import (
+    check_array,
+    check_integer,
+    check_number,
+    check_patches,
+    check_sequence,
+    check_type,
+    describe,
+)
 from vehicle_detection.datasets.archives import natural_key, parent_folder
 from vehicle_detection.datasets.patches import PatchSet, check_labels
 from vehicle_detection.errors import InvalidInputError
@@ -33,7 +41,7 @@ class Split:
 
     def __post_init__(self) -> None:
         for name in ("train", "test"):
-            rows = np.asarray(getattr(self, name))
+            rows = check_array(getattr(self, name), name)
             if rows.ndim != 1 or not rows.size or rows.dtype.kind not in "iu" or rows.min() < 0:
                 raise InvalidInputError(f"{name} must be a list of row numbers, got {describe(rows)}")
             object.__setattr__(self, name, rows.astype(np.intp, copy=False))
@@ -217,8 +225,9 @@ def split_sources(
     known = ", ".join(patch_set.counts()) or "none"
     masks = []
     for side, prefixes in (("train", train), ("test", test)):
-        prefixes = (prefixes,) if isinstance(prefixes, str) else tuple(prefixes)
+        prefixes = (prefixes,) if isinstance(prefixes, str) else check_sequence(prefixes, side, "names")
         for prefix in prefixes:
+            check_type(prefix, side, str, "name the sources by the beginnings of their names")
             if not prefix or not np.char.startswith(patch_set.sources, prefix).any():
                 raise InvalidInputError(f"{side} must name sources of patch_set ({known}); got {prefix!r}")
         mask = np.array([source.startswith(prefixes) for source in patch_set.sources], np.bool_)

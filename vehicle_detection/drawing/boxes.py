@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from vehicle_detection._common import (
     check_array,
     check_boxes,
+    check_flags,
     check_image,
     check_integer,
     check_type,
@@ -155,6 +156,7 @@ def draw_detections(
     """
     check_type(detections, "detections", Detections, "pass what detect returns")
     shape = check_image(image).shape
+    check_flags(scores=scores)
     if line_width is not None:
         check_integer(line_width, "line_width", low=1, high=1000)
     width = line_width or line_width_for(shape)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_boxes, check_image, describe
+from vehicle_detection._common import check_array, check_boxes, check_image, describe
 from vehicle_detection.boxes import Detections
 from vehicle_detection.drawing.boxes import draw_boxes
 from vehicle_detection.drawing.primitives import (
@@ -103,7 +103,7 @@ def draw_cell_shares(image: Image, window: ArrayLike, cells: NDArray[Any]) -> Im
 
 def heat_image(heat: NDArray[Any]) -> Image:
     """Color an ``(h, w)`` heat map from black (0) to yellow (its maximum), as ``(h, w, 3)`` uint8 RGB."""
-    values = np.asarray(heat)
+    values = check_array(heat, "heat")
     if values.ndim != 2 or not values.size or values.dtype.kind not in "iufb":
         raise InvalidInputError(
             f"heat must be an (h, w) array of numbers, got {describe(heat)}; pass a heat map"

@@ -240,6 +240,7 @@ class FrameBoxes:
 
     def rows(self, key: FrameKey) -> NDArray[np.intp]:
         """Row numbers of a frame's boxes; empty for a frame without boxes."""
+        check_type(key, "key", (int, str, np.integer), "pass the key of one frame")
         return self._rows.get(key, np.empty(0, np.intp))
 
     def frame(self, key: FrameKey) -> FrameBoxes:
@@ -248,6 +249,8 @@ class FrameBoxes:
 
     def renamed(self, rename: Callable[[Any], FrameKey]) -> FrameBoxes:
         """Return a copy in which ``rename(key)`` replaces every frame key."""
+        if not callable(rename):
+            raise InvalidInputError(f"rename must be a function of a frame key; got {describe(rename)}")
         frames, keys = ([rename(key) for key in each] for each in (self.frames, self.frame_keys))
         return dataclasses.replace(self, frames=frames, frame_keys=keys)
 

@@ -10,7 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_image, check_integer, check_number, check_type, describe
+from vehicle_detection._common import (
+    check_image,
+    check_integer,
+    check_number,
+    check_type,
+    describe,
+)
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.frame_boxes import FrameBoxes, FrameKey, count_noun
@@ -128,4 +134,4 @@ class LabelledFrames:
             chosen: dict[FrameKey, NDArray[np.uint8]] = {
                 index: frame for index, _, frame in reader if index % step == 0
             }
-        return cls(name or Path(path).stem, chosen, labels, horizon)
+        return cls(Path(path).stem if name is None else name, chosen, labels, horizon)

@@ -21,6 +21,7 @@ from vehicle_detection._common import (
     check_choice,
     check_path,
     check_regular_file,
+    check_sequence,
     read_regular_file,
 )
 from vehicle_detection.boxes import clip_boxes
@@ -556,7 +557,9 @@ def read_labels(
         raise DatasetError(
             f"{source} is a folder, and {kind} labels are one file; pass the path of that file"
         )
-    chosen = None if classes is None else frozenset(str(name).lower() for name in classes)
+    chosen = None
+    if classes is not None:
+        chosen = frozenset(str(name).lower() for name in check_sequence(classes, "classes", "names"))
     if kind in ("csv", "jsonl", "parquet"):  # these files hold vehicles only
         found = {"csv": _read_csv, "jsonl": _read_json_lines, "parquet": _read_parquet}[kind](source)
     elif kind in ("coco", "coco_results"):  # told apart by their content

@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from vehicle_detection._common import atomic_write, check_number, check_suffix, check_type
+from vehicle_detection._common import atomic_write, check_number, check_sequence, check_suffix, check_type
 from vehicle_detection.events.find import EVENT_COLUMNS, Event
 from vehicle_detection.video import cut_video
 
@@ -53,7 +53,7 @@ def write_events(events: Iterable[Event], path: str | os.PathLike[str]) -> int:
     """
     target = check_suffix(path, "path", EVENT_SUFFIXES)
     rows = []
-    for event in events:
+    for event in check_sequence(events, "events", "Event"):
         check_type(event, "events", Event, "pass what find_events returned")
         rows.append(dataclasses.asdict(event))
     with atomic_write(target, "path") as part, part.open("w", encoding="utf-8", newline="") as file:
@@ -108,7 +108,7 @@ def cut_clips(
     rate = check_number(fps, "fps", above=0, high=1e6)
     check_number(margin, "margin", low=0, high=3600)
     paths = []
-    for event in events:
+    for event in check_sequence(events, "events", "Event"):
         check_type(event, "events", Event, "pass what find_events returned")
         start = max(event.start_frame / rate - margin, event.time_s - _MAX_EXTENT, 0.0)
         end = min((event.end_frame + 1) / rate + margin, event.time_s + _MAX_EXTENT)

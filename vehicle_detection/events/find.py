@@ -10,7 +10,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_number, check_type, describe
+from vehicle_detection._common import (
+    check_array,
+    check_number,
+    check_sequence,
+    check_type,
+    describe,
+)
 from vehicle_detection.camera import Camera, check_shape
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events.history import Floats, TrackHistory, TrackLog, split_runs
@@ -199,7 +205,9 @@ def find_events(
     if camera is None:
         camera = Camera.for_frame(frame_shape)
     check_type(camera, "camera", Camera, "omit it for a typical dash-cam")
-    histories = log.histories() if isinstance(log, TrackLog) else list(log)
+    histories = log.histories() if isinstance(log, TrackLog) else check_sequence(log, "log", "TrackHistory")
+    for each in histories:
+        check_type(each, "log", TrackHistory, "pass a TrackLog, or what its histories() returns")
     length = max((track.last + 1 for track in histories), default=0)
     own_speed = _check_speed(own_speed_mps, length)
     motions = [
@@ -220,7 +228,7 @@ def _check_speed(speed: float | ArrayLike | None, length: int) -> Floats:
     """Own speed in each frame, NaN where it is unknown."""
     if speed is None:
         return np.full(length, np.nan)
-    array = np.asarray(speed)
+    array = check_array(speed, "own_speed_mps")
     shaped = array.ndim == 0 or (array.ndim == 1 and len(array) >= length)
     if not shaped or array.dtype.kind not in "iuf" or np.isinf(array).any() or (array < 0).any():
         raise InvalidInputError(

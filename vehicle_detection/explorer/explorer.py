@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_choice, check_image, check_integer, describe
+from vehicle_detection._common import check_choice, check_image, check_integer, check_sequence, describe
 from vehicle_detection.boxes import Detections, box_areas
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import VehicleClassifier
@@ -198,7 +198,8 @@ class Explorer:
             if not self._all_bands:
                 raise InvalidInputError("bands must be None for this model; its search has no bands")
             last = len(self._all_bands) - 1
-            self.bands = tuple(sorted({check_integer(band, "bands", low=0, high=last) for band in bands}))
+            given = check_sequence(bands, "bands", "band numbers")
+            self.bands = tuple(sorted({check_integer(band, "bands", low=0, high=last) for band in given}))
         self.search_params = params
 
     def set_regions(

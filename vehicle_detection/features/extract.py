@@ -67,6 +67,10 @@ def convert_color(
     check_image(image)
     space = str(color_space).removeprefix("RGB2")
     check_choice(space, "color_space", COLOR_SPACES)
+    if out is not None:
+        check_image(out, "out")
+        if out.shape != image.shape:
+            raise InvalidInputError(f"out must have the shape of image, {image.shape}; got {out.shape}")
     if space != "RGB":
         return np.asarray(cv2.cvtColor(image, getattr(cv2, f"COLOR_RGB2{space}"), dst=out), np.uint8)
     if out is None:

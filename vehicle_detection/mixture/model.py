@@ -18,7 +18,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_number, check_type, read_model, write_model
+from vehicle_detection._common import (
+    check_choice,
+    check_number,
+    check_sequence,
+    check_type,
+    read_model,
+    write_model,
+)
 from vehicle_detection.boxes import Platt, box_areas, clip_boxes
 from vehicle_detection.classifier import KIND as PATCH_KIND
 from vehicle_detection.classifier import VehicleClassifier, build_classifier
@@ -93,7 +100,7 @@ class TemplateMixture:
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        templates = tuple(self.templates)
+        templates = check_sequence(self.templates, "templates", "MixtureTemplate")
         if not templates:
             raise InvalidInputError("templates must hold at least one template; got none")
         for template in templates:
@@ -132,6 +139,7 @@ class TemplateMixture:
         """
         from vehicle_detection.mixture.search import MixtureSearch
 
+        check_choice(method, "method", ("shared", "windows"))
         if method != "shared":
             raise InvalidInputError(
                 f"method must be 'shared' for a mixture of templates, got {method!r}; use the model 'highway'"
@@ -194,6 +202,7 @@ class TemplateMixture:
 
     def with_metadata(self, metadata: Mapping[str, Any]) -> TemplateMixture:
         """Return the same model with other metadata."""
+        check_type(metadata, "metadata", Mapping, "pass a dictionary")
         return replace(self, metadata=dict(metadata))
 
     def save(self, path: str | os.PathLike[str]) -> None:

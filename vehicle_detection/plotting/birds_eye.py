@@ -6,7 +6,11 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from vehicle_detection._common import check_number, check_type
+from vehicle_detection._common import (
+    check_number,
+    check_sequence,
+    check_type,
+)
 from vehicle_detection.camera import Camera, check_shape
 from vehicle_detection.detector import FrameResult
 from vehicle_detection.drawing import (
@@ -74,7 +78,9 @@ def plot_birds_eye(
     >>> [text.get_text() for text in axes.texts]
     ['#1']
     """
-    listed = [results] if isinstance(results, FrameResult) else list(results)
+    if isinstance(results, FrameResult):
+        results = [results]
+    listed = list(check_sequence(results, "results", "FrameResult"))
     for result in listed:
         check_type(result, "results", FrameResult, "pass what detector.process returns")
     if not listed:

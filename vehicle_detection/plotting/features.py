@@ -218,7 +218,8 @@ def plot_hog(
     >>> len(plot_hog(patch, pix_per_cell=[8]).axes)
     6
     """
-    params = params or FeatureParams()
+    params = FeatureParams() if params is None else params
+    check_type(params, "params", FeatureParams, "omit it for the default")
     single = isinstance(images, np.ndarray) and images.ndim == 3
     listed, names = style.split_titles([images] if single else images)
     sizes = style.check_list(pix_per_cell, "pix_per_cell", "cell sizes")
@@ -296,7 +297,8 @@ def plot_features(
     shades = (COLORS[1], COLORS[3], "0.6", COLORS[2])
     for panel, values in ((above, raw), (below, (raw - mean) / scale)):
         for line, label, color in zip(values, labels, LINE_COLORS * len(chosen)):
-            panel.plot(line, linewidth=0.6, color=color, label=label)
+            text = None if label is None else str(label)
+            panel.plot(line, linewidth=0.6, color=color, label=text)
         for shade, (name, part) in zip(shades, part_slices(params).items()):
             label, middle = f"{name} ({part.stop - part.start:,})", (part.start + part.stop) / 2
             top = panel.get_xaxis_transform()

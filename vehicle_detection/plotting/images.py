@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_image, check_integer, check_type, describe
+from vehicle_detection._common import (
+    check_array,
+    check_image,
+    check_integer,
+    check_type,
+    describe,
+)
 from vehicle_detection.boxes import Detections
 from vehicle_detection.datasets import PatchSet, Split, make_thumbnails
 from vehicle_detection.errors import InvalidInputError
@@ -256,7 +262,7 @@ def plot_patches(
     if isinstance(patches, PatchSet):
         images = patches.patches
         labels = patches.labels if labels is None else labels
-        captions = captions or patches.sources.tolist()
+        captions = patches.sources.tolist() if captions is None else captions
     else:
         images = style.check_list(patches, "patches", "images")
     classes = style.check_numbers(labels, "labels", len(images), "patches")
@@ -382,7 +388,7 @@ def plot_near_duplicates(
     '2 of 4 patches have a near duplicate (50.0%)'
     """
     _check_patch_set(patch_set)
-    rows = np.asarray(pairs)
+    rows = check_array(pairs, "pairs")
     size = len(patch_set)
     valid = rows.ndim == 2 and rows.shape[1] == 2 and rows.dtype.kind in "iu"
     if not valid or rows.min(initial=0) < 0 or rows.max(initial=0) >= size:

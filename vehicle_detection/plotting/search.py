@@ -122,7 +122,7 @@ def plot_bands(
     (3, '64x64 px, step 8x8, 3,825 windows')
     """
     height, width = check_image(image).shape[:2]
-    search = search or SearchParams.preset()
+    search = SearchParams.preset() if search is None else search
     check_type(search, "search", SearchParams, "pass SearchParams.preset()")
     bands = search.place(image.shape)
     columns = 2 if len(bands) in (2, 4) else min(len(bands), 3)
@@ -232,8 +232,8 @@ def plot_speedups(
     if not isinstance(given, Mapping) or not given:
         raise InvalidInputError(f"seconds must map names to seconds, at least one; got {describe(given)}")
     times = {str(name): check_number(value, f"seconds[{name!r}]", above=0) for name, value in given.items()}
-    baseline = max(times, key=times.__getitem__) if reference is None else reference
-    if baseline not in times:
+    baseline: object = max(times, key=times.__getitem__) if reference is None else reference
+    if not isinstance(baseline, str) or baseline not in times:
         raise InvalidInputError(f"reference must be one of {', '.join(times)}; got {describe(reference)}")
     axes = style.new_axes(ax, 8, 0.8 + 0.45 * len(times))
     values = [1000 * value for value in times.values()]
@@ -297,7 +297,7 @@ def plot_heatmap(
     """
     height, width = check_image(image).shape[:2]
     check_type(windows, "windows", Detections, "pass what find_cars returns, or Detections(boxes, scores)")
-    params = params or HeatParams()
+    params = HeatParams() if params is None else params
     check_type(params, "params", HeatParams, "pass HeatParams()")
     given: object = frame_heat(image.shape, windows, params) if heat is None else heat
     if not isinstance(given, np.ndarray) or given.shape != (height, width):

@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Union
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_boxes, check_image, check_integer, check_type, describe
+from vehicle_detection._common import (
+    check_array,
+    check_boxes,
+    check_image,
+    check_integer,
+    check_sequence,
+    check_type,
+    describe,
+)
 from vehicle_detection.boxes import Detections
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.errors import InvalidInputError
@@ -136,18 +144,19 @@ def check_length(values: Sequence[object] | None, name: str, count: int, entries
     """Return `values` as a list of `count` entries; None stands for `count` times None."""
     if values is None:
         return [None] * count
-    if len(values) != count:
+    listed = list(check_sequence(values, name, "values"))
+    if len(listed) != count:
         raise InvalidInputError(
-            f"{name} must have one value for each of the {count} {entries}, got {len(values)}"
+            f"{name} must have one value for each of the {count} {entries}, got {len(listed)}"
         )
-    return list(values)
+    return listed
 
 
 def check_numbers(values: ArrayLike | None, name: str, count: int, entries: str) -> NDArray[Any] | None:
     """Return `values` as an array with one number for each of `count` entries; None stays None."""
     if values is None:
         return None
-    array = np.asarray(values)
+    array = check_array(values, name)
     if array.shape != (count,) or array.dtype.kind not in "biuf":
         raise InvalidInputError(
             f"{name} must be one number for each of {count} {entries}; got {describe(array)}"
@@ -157,7 +166,7 @@ def check_numbers(values: ArrayLike | None, name: str, count: int, entries: str)
 
 def check_scores(scores: ArrayLike, name: str) -> NDArray[np.float64]:
     """Return `scores` as ``(N,)`` finite float64, N >= 1."""
-    array = np.asarray(scores)
+    array = check_array(scores, name)
     if array.ndim != 1 or not array.size or array.dtype.kind not in "iuf" or not np.isfinite(array).all():
         raise InvalidInputError(
             f"{name} must be a list of finite numbers, at least one; got {describe(array)}"
@@ -170,7 +179,8 @@ def split_titles(images: object, titles: Sequence[str] | None = None) -> tuple[l
     if isinstance(images, Mapping):
         titles, images = list(images) if titles is None else titles, images.values()
     listed = check_list(images, "images", "images")
-    return listed, check_length(titles, "titles", len(listed), "images")
+    texts = check_length(titles, "titles", len(listed), "images")
+    return listed, [None if text is None else str(text) for text in texts]
 
 
 def box_array(boxes: Boxes, name: str = "boxes") -> NDArray[Any]:

@@ -151,7 +151,8 @@ def _rows_of_truth(truth: object, rate: float) -> Iterator[Row]:
     if isinstance(truth, FrameBoxes):
         yield from _rows_of_boxes(truth[~truth.ignore], rate, "truth")
         return
-    frames = truth if isinstance(truth, Sequence) else [[truth]]
+    given = isinstance(truth, Sequence) and all(isinstance(each, Sequence) for each in truth)
+    frames: Any = truth if given else [[truth]]
     for frame, rows in enumerate(frames):
         for row in rows:
             if not isinstance(row, VehicleTruth):

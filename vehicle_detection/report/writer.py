@@ -13,6 +13,7 @@ from vehicle_detection._common import (
     check_choice,
     check_integer,
     check_path,
+    check_sequence,
     check_target,
     check_type,
 )
@@ -119,7 +120,7 @@ class ReportWriter:
             speeds = None if own is None else self.log.own_speeds(own, fps)
             events = find_events(self.log, fps=fps, shape=report.shape, camera=camera, own_speed_mps=speeds)
         options = {
-            "events": list(events),
+            "events": list(check_sequence(events, "events", "Event")),
             "video": self._embed(),
             "source": self._source,
             "detector": self._detector,

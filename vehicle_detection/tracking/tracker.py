@@ -113,6 +113,7 @@ class Tracker:
 
     def set_camera(self, camera: Camera) -> None:
         """Use another camera from the next frame on, for example if the size of the frames changes."""
+        check_type(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
         if camera != self._given_camera:
             self._given_camera = camera
             self._horizon = self._open_horizon(self._shape or (720, 1280))

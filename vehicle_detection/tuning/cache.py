@@ -14,7 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import atomic_write, check_number, check_patches
+from vehicle_detection._common import (
+    atomic_write,
+    check_number,
+    check_patches,
+    check_path,
+)
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import extract_features
 from vehicle_detection.params import PATCH_SIZE, FeatureParams
@@ -59,7 +64,7 @@ class FeatureCache:
     ) -> None:
         self.patches = check_patches(patches, PATCH_SIZE)
         self.digest = digest_of(self.patches)
-        self._folder = None if folder is None else Path(folder)
+        self._folder = None if folder is None else check_path(folder, "cache", kind="a folder")
         self._max_bytes = check_number(memory_mb, "memory_mb", low=0) * 1e6
         self._n_jobs = n_jobs
         self._in_memory: OrderedDict[tuple[FeatureParams, bool], NDArray[np.float32]] = OrderedDict()

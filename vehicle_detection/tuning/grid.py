@@ -61,7 +61,8 @@ def read_configurations(
     if isinstance(given, Mapping):
         pairs: list[tuple[str | None, Any]] = list(given.items())
     else:
-        listed = isinstance(given, Iterable) and not isinstance(given, (str, bytes))
+        scalar = isinstance(given, (str, bytes)) or getattr(given, "ndim", 1) == 0
+        listed = isinstance(given, Iterable) and not scalar
         pairs = [(None, each) for each in configurations] if listed else []
     if not pairs:
         raise InvalidInputError(

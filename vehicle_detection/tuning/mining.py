@@ -9,9 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_integer, check_number
+from vehicle_detection._common import (
+    check_integer,
+    check_number,
+    check_type,
+)
 from vehicle_detection.boxes import intersection_matrix, non_max_suppression
-from vehicle_detection.classifier import VehicleClassifier
+from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.evaluation import FrameBoxes, Frames, LabelledFrames, keyed_frames
 from vehicle_detection.params import PATCH_SIZE, SearchParams
@@ -73,9 +77,10 @@ def mine_negatives(
     labelled = LabelledFrames(source, keyed_frames(frames), labels)
     overlap = check_number(max_overlap, "max_overlap", low=0, high=1)
     limit = None if max_per_frame is None else check_integer(max_per_frame, "max_per_frame", low=1)
-    params = dataclasses.replace(
-        search_params or SearchParams.preset(), min_score=check_number(min_score, "min_score")
-    )
+    check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
+    given = SearchParams.preset() if search_params is None else search_params
+    check_type(given, "search_params", SearchParams, "omit it for the default")
+    params = dataclasses.replace(given, min_score=check_number(min_score, "min_score"))
     patches: list[NDArray[np.uint8]] = []
     names: list[str] = []
     with contextlib.closing(classifier.open_search(n_jobs)) as search:

@@ -38,7 +38,7 @@ def make_table(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None 
     return table.astype(dict.fromkeys(empty, np.float64))
 
 
-def check_column(table: DataFrame, name: str) -> None:
+def check_column(table: DataFrame, name: object) -> None:
     """Raise unless `table` is a pandas table with the column."""
     import pandas as pd
 
@@ -47,7 +47,7 @@ def check_column(table: DataFrame, name: str) -> None:
             f"table must be a pandas DataFrame, got {describe(table)}; "
             "pass what compare_configurations, search_parameters or read_results returns"
         )
-    if name not in table.columns:
+    if not isinstance(name, str) or name not in table.columns:
         listed = ", ".join(map(str, table.columns))
         raise InvalidInputError(f"table has no column {name!r}; its columns are {listed or 'none'}")
 
@@ -190,7 +190,7 @@ class RowStore(dict[str, Mapping[str, Any]]):
 
 
 def _check_suffix(path: str | os.PathLike[str], allowed: tuple[str, ...], name: str) -> str:
-    suffix = Path(path).suffix.lower()
+    suffix = check_path(path, name).suffix.lower()
     if suffix not in allowed:
         raise InvalidInputError(f"{name} must end in {' or '.join(allowed)}; got {Path(path).name!r}")
     return suffix

@@ -15,7 +15,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_choice, check_integer, describe, progress_bar
+from vehicle_detection._common import (
+    check_choice,
+    check_flags,
+    check_integer,
+    check_number,
+    check_sequence,
+    check_type,
+    describe,
+    progress_bar,
+)
 from vehicle_detection.classifier import DEFAULT_C
 from vehicle_detection.datasets import SEEDED_SPLITS, SPLIT_NAMES, PatchSet, Split, make_split
 from vehicle_detection.errors import InvalidInputError
@@ -105,10 +114,16 @@ def compare_configurations(
     >>> compare_configurations(patch_set, grid, splits="random", options=untimed)["status"].tolist()
     ['ok', 'failed']
     """
-    values = [C] if isinstance(C, (int, float)) else list(C)
+    values = [C] if isinstance(C, (int, float)) else check_sequence(C, "C", "numbers")
     if not values:
         raise InvalidInputError("C must be a number or several; got none")
+    for value in values:
+        check_number(value, "C")
     checked_seeds = check_seeds(seeds)
+    check_flags(mirror=mirror)
+    check_number(positive_weight, "positive_weight", above=0, high=1e6)
+    if options is not None:
+        check_type(options, "options", TrialOptions, "omit it for the defaults")
     defaults = {"mirror": mirror, "positive_weight": positive_weight}
     # A configuration that sets C itself is tried with that value only.
     candidates = [
@@ -207,6 +222,8 @@ def search_parameters(
     check_integer(factor, "factor", low=2, high=100)
     check_integer(n_finalists, "n_finalists", low=0)
     seed = check_integer(random_state, "random_state", low=0, high=2**32 - 1)
+    if options is not None:
+        check_type(options, "options", TrialOptions, "omit it for the defaults")
     if n_candidates is not None:
         check_integer(n_candidates, "n_candidates", low=1)
     defaults = {"C": DEFAULT_C, "mirror": True, "positive_weight": 1.0}
@@ -347,7 +364,7 @@ def make_splits(
                 )
             yield str(name), seeds[0], split
         return
-    names = (splits,) if isinstance(splits, str) else tuple(splits)
+    names = (splits,) if isinstance(splits, str) else check_sequence(splits, "splits", "names of splits")
     if not names:
         raise InvalidInputError(f"splits must name at least one of {', '.join(SPLIT_NAMES)}")
     for name in names:
@@ -358,7 +375,8 @@ def make_splits(
 
 def check_seeds(seeds: object) -> tuple[int, ...]:
     """Return the seeds if they are different integers."""
-    listed = tuple(seeds) if isinstance(seeds, Iterable) and not isinstance(seeds, (str, bytes)) else ()
+    scalar = isinstance(seeds, (str, bytes)) or getattr(seeds, "ndim", 1) == 0
+    listed = tuple(seeds) if isinstance(seeds, Iterable) and not scalar else ()
     checked = tuple(check_integer(seed, "seeds", low=0, high=2**32 - 1) for seed in listed)
     if not checked or len(set(checked)) < len(checked):
         raise InvalidInputError(

@@ -15,7 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import describe
+from vehicle_detection._common import (
+    check_path,
+    check_sequence,
+    describe,
+)
 from vehicle_detection.classifier import VehicleClassifier, check_labels, fit_features
 from vehicle_detection.datasets import PatchSet, Split
 from vehicle_detection.detector import VehicleDetector
@@ -85,6 +89,8 @@ class TrialOptions:
     n_jobs: int | None = None
 
     def __post_init__(self) -> None:
+        if self.cache is not None and not isinstance(self.cache, FeatureCache):
+            check_path(self.cache, "cache", kind="a folder")
         for each in self.frame_sets:
             if not isinstance(each, LabelledFrames):
                 raise InvalidInputError(f"frames must be LabelledFrames, one or more; got {describe(each)}")
@@ -94,7 +100,9 @@ class TrialOptions:
     @property
     def frame_sets(self) -> tuple[LabelledFrames, ...]:
         """The sets of `frames` as a tuple."""
-        return (self.frames,) if isinstance(self.frames, LabelledFrames) else tuple(self.frames or ())
+        if self.frames is None or isinstance(self.frames, LabelledFrames):
+            return () if self.frames is None else (self.frames,)
+        return check_sequence(self.frames, "frames", "LabelledFrames")
 
 
 class TrialEvaluator:

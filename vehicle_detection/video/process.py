@@ -26,6 +26,7 @@ from vehicle_detection._common import (
     atomic_write,
     available_cores,
     check_choice,
+    check_flags,
     check_integer,
     check_path,
     check_target,
@@ -202,6 +203,7 @@ def process_video(
     >>> from vehicle_detection import VehicleDetector  # doctest: +SKIP
     >>> print(process_video("drive.mp4", "found.mp4", VehicleDetector()))  # doctest: +SKIP
     """
+    check_flags(audio=audio, strict=strict, progress=progress)
     if on_result is not None and not callable(on_result):
         raise InvalidInputError(f"on_result must be a function of a result, got {describe(on_result)}")
     with VideoRun(

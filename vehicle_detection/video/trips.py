@@ -17,6 +17,12 @@ from datetime import datetime
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
+from vehicle_detection._common import (
+    check_sequence,
+    describe,
+)
+from vehicle_detection.errors import InvalidInputError
+
 File = TypeVar("File", Path, str)
 
 VIDEO_SUFFIXES = {
@@ -121,7 +127,9 @@ def find_trips(
     rear 2026-01-31 08:15:00 1
     """
     groups: defaultdict[tuple[str, str, str, bool], list[tuple[_Segment, Path | str]]] = defaultdict(list)
-    for file in files:
+    for file in check_sequence(files, "files", "paths"):
+        if not isinstance(file, (str, Path)):
+            raise InvalidInputError(f"files must be paths or URLs, got {describe(file)}; pass strings")
         name = _posix(file)
         segment = _parse_name(name)
         if segment.start is None and isinstance(file, Path):

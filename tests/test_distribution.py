@@ -1,0 +1,84 @@
+"""The wheel and the source distribution: their files, and that two builds give the same bytes."""
+
+import os
+import shutil
+import subprocess
+import tarfile
+import zipfile
+
+import pytest
+
+from tests.helpers import ROOT
+from vehicle_detection import __version__
+
+NAME = f"vehicle_detection-{__version__}"
+SOURCES = {
+    "vehicle_detection",
+    "benchmarks",
+    "docs",
+    "notebooks",
+    "requirements",
+    "test_images",
+    "tests",
+    "tools",
+}
+TEXTS = {"README.md", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "SECURITY.md", "LICENSE"}
+
+
+@pytest.fixture(scope="module")
+def tracked():
+    """Files of the repository that git tracks."""
+    git = shutil.which("git")
+    if git is None or not (ROOT / ".git").exists():
+        pytest.skip("this is not a git repository")
+    listed = subprocess.run([git, "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True)
+    return {name for name in listed.stdout.split("\0") if name and (ROOT / name).exists()}
+
+
+@pytest.fixture(scope="module")
+def source(tracked, tmp_path_factory):
+    """A copy of the tracked files, with another date and other permissions than in the repository."""
+    folder = tmp_path_factory.mktemp("source")
+    for name in tracked:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(ROOT / name, folder / name)
+        os.chmod(folder / name, 0o600)
+        os.utime(folder / name, (1e9, 1e9))
+    return folder
+
+
+def build(kind, source, folder):
+    """Build a wheel or a source distribution in this process, without a network."""
+    module = pytest.importorskip(f"hatchling.builders.{kind}")
+    builder = {"wheel": "WheelBuilder", "sdist": "SdistBuilder"}[kind]
+    (path,) = getattr(module, builder)(str(source)).build(directory=str(folder), versions=["standard"])
+    return path
+
+
+def test_the_wheel_holds_the_package_and_nothing_else(source, tracked, tmp_path):
+    with zipfile.ZipFile(build("wheel", source, tmp_path)) as wheel:
+        names = set(wheel.namelist())
+    metadata = {f"{NAME}.dist-info/{name}" for name in ("METADATA", "WHEEL", "RECORD", "entry_points.txt")}
+    package = {name for name in tracked if name.startswith("vehicle_detection/")}
+    assert names == package | metadata | {f"{NAME}.dist-info/licenses/LICENSE"}
+    assert {"vehicle_detection/py.typed", "vehicle_detection/models/default.safetensors"} <= names
+
+
+def test_the_source_distribution_holds_the_sources_and_nothing_else(source, tracked, tmp_path):
+    with tarfile.open(build("sdist", source, tmp_path)) as archive:
+        members = archive.getmembers()
+    assert all(member.isfile() and not member.name.startswith(("/", "..")) for member in members)
+    names = {member.name.removeprefix(f"{NAME}/") for member in members}
+    expected = {name for name in tracked if name.split("/")[0] in SOURCES} | TEXTS
+    assert names == expected | {"pyproject.toml", ".gitignore", "PKG-INFO"}
+
+
+@pytest.mark.parametrize("kind", ["wheel", "sdist"])
+def test_two_builds_give_the_same_bytes(kind, source, tmp_path, monkeypatch):
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    first = build(kind, source, tmp_path / "first")
+    copy = shutil.copytree(
+        source, tmp_path / "copy", copy_function=shutil.copyfile
+    )  # other dates and permissions
+    with open(first, "rb") as one, open(build(kind, copy, tmp_path / "second"), "rb") as other:
+        assert one.read() == other.read()

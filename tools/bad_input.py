@@ -1,0 +1,633 @@
+"""Call every public function with bad values of every argument: only the library's errors may come back.
+
+The functions are found by introspection: those of `vehicle_detection`, `vehicle_detection.course` and
+`vehicle_detection.plotting`, with the constructors and methods of their classes. A new one is covered as
+soon as `_Valid` knows valid values for its arguments. ``python -m tools.bad_input`` tries one value of each
+kind for each argument, also of the commands' options; ``--every`` tries all values, and ``--write`` writes
+the tables of ``docs/bad_input.md``. The tests try a fixed quarter.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import inspect
+import itertools
+import signal
+import sys
+import tempfile
+import warnings
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import partial
+from pathlib import Path
+from types import FrameType, SimpleNamespace
+from typing import Any, Literal
+
+import numpy as np
+
+import vehicle_detection as vd
+from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "bad_input.md"
+MAX_SECONDS = 20
+"""Time limit of one call."""
+
+NOT_CALLED = {
+    "open_dask": "starts a cluster",
+    "fetch_patches": "downloads; its arguments are tested in tests/datasets/test_archives.py",
+    "train_mixture": "trains for minutes; tests/mixture_training/test_train.py",
+    "Detections.to_supervision": "needs the package supervision; tests/test_boxes.py",
+    "cross_validate_mixture": "trains for minutes; tests/mixture_training/test_cross_validation.py",
+}
+"""Public functions that are not called, and why."""
+
+RESULTS = {
+    "BatchReport", "BatchStatus", "DetectionScores", "Event", "Explanation", "FrameResult", "FrameSet",
+    "FrameSource", "HorizonEstimate", "SearchResult", "Track", "TrackScores", "TrackedFrame", "Trip",
+    "VehicleCounts", "VideoInfo", "VideoReport", "plotting.ImageDescription",
+}  # fmt: skip
+"""Classes whose instances the library makes, and whose constructors therefore check nothing."""
+
+
+def bad_values(folder: Path) -> dict[str, tuple[Any, ...]]:
+    """Return bad values of every kind. Some of them are valid for some arguments."""
+    # A link: a function that replaced the device itself would do harm.
+    zero = folder / "zero"
+    if not zero.is_symlink():
+        zero.symlink_to("/dev/zero")
+        for suffix in (".csv", ".png", ".mp4", ".json"):
+            zero.with_suffix(suffix).symlink_to("/dev/zero")
+    full, image = np.full((2, 4), np.nan), np.zeros((5, 5, 3), np.uint8)
+    return {
+        "`None`": (None,),
+        "negative number": (-1, 0, np.int8(-5), -0.5),
+        "huge integer": (10**400, -(10**400), 2**63),
+        "NaN, infinity": (float("nan"), float("inf"), 1e308, np.float32("nan")),
+        "empty": ("", (), {}, [], np.zeros((0, 4))),
+        "text": ("x", ["x", "y"], "frame,x1\n0,1"),
+        "wrong type": (object(), print, True, b"x", {"a": 1}, {1, 2}, 1j, 1.5, range(3),
+                       np.datetime64("now")),
+        "ragged list": ([1, [2, 3]], [[1, 2], [3]], [None], [(0, 0, 1, 1), "x"], [[10**400, 0, 1, 1]]),
+        "wrong number of items": ((1,), (1, 2, 3, 4, 5), (10**400, 10**400), np.array(3)),
+        "wrong shape": (np.zeros((2, 3)), np.zeros((2, 2, 3)), image[..., 0], image[None], np.zeros((2, 4))),
+        "wrong dtype": (np.array(["x"]), np.array([object()]), np.zeros((70, 70, 3), np.int64),
+                        np.zeros((5, 5, 3)), np.zeros((64, 64, 4), np.uint8)),
+        "invalid boxes": (full, np.array([[5, 5, 1, 1]]), [(1e308, 0, 1e308, 1)]),
+        "tiny image": (image, image[:0], np.zeros((1, 1, 3), np.uint8)),
+        "impossible name": ("\ud800", "a" * 5000, "a\0b", "b" * 300 + ".csv"),
+        "missing file": (Path("missing"), "missing/missing.mp4", folder / "missing.csv"),
+        "folder": (folder, str(folder)),
+        "device": (zero, *(zero.with_suffix(suffix) for suffix in (".csv", ".png", ".mp4", ".json"))),
+    }  # fmt: skip
+
+
+def public_callables() -> dict[str, Callable[..., Any]]:
+    """Return the public functions, the constructors of public classes and their methods, by name."""
+    found: dict[str, Callable[..., Any]] = {}
+    for module in (vd, vd.course, vd.plotting):
+        prefix = "" if module is vd else module.__name__.rpartition(".")[2] + "."
+        for name in module.__all__:
+            value = getattr(module, name)
+            if inspect.ismodule(value) or (inspect.isclass(value) and issubclass(value, Exception)):
+                continue
+            if prefix and value is getattr(vd, name, None):  # public in the package, too
+                continue
+            if prefix + name not in RESULTS:
+                found[prefix + name] = value
+            if inspect.isclass(value):
+                found.update((f"{prefix}{name}.{each}", method) for each, method in _methods(value))
+    called = {name: value for name, value in found.items() if name not in NOT_CALLED}
+    return {name: value for name, value in called.items() if _parameters(value)}
+
+
+def _methods(kind: type) -> Iterator[tuple[str, Callable[..., Any]]]:
+    """Yield the public methods that a class of this library defines, and that have arguments."""
+    for name, member in inspect.getmembers(kind):
+        if name.startswith("_") or not inspect.isroutine(member):
+            continue
+        public_bases = [base for base in kind.__mro__[1:] if base.__name__ in vd.__all__]
+        inherited = name not in vars(kind) and any(hasattr(base, name) for base in public_bases)
+        own = str(getattr(member, "__module__", "")).startswith("vehicle_detection")
+        if own and not inherited and _parameters(member):
+            yield name, member
+
+
+def _parameters(function: Callable[..., Any]) -> list[inspect.Parameter]:
+    """Return the arguments of a function, without ``self`` and those of any number."""
+    many = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    parameters = inspect.signature(function).parameters.values()
+    return [each for each in parameters if each.name != "self" and each.kind not in many]
+
+
+INTERNAL = {
+    "FeatureParams.spatial_planes", "FrameSource.audio", "FrameSource.read", "FunctionParams.heat_range",
+    "HeatParams.for_search",
+    "PyramidParams.heat_range", "PyramidParams.rows", "PyramidParams.sizes", "PyramidParams.smallest_width",
+    "SearchBand.place", "SearchParams.heat_range", "SearchParams.place", "TemplateMixture.detect_vehicles",
+    "TemplateMixture.margin_of", "TemplateMixture.propose_boxes", "TemplateMixture.scores",
+    "VehicleDetector.interpolate", "VehicleDetector.skip",
+}  # fmt: skip
+"""Methods that only the library calls, with its own results."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A public function, and valid values of its arguments."""
+
+    name: str
+    call: Callable[..., Any]
+    arguments: Mapping[str, Any]
+
+
+def targets(folder: Path) -> dict[str, Target]:
+    """Return the public functions with valid arguments.
+
+    Raises
+    ------
+    LookupError
+        If a valid value of an argument is not known.
+    """
+    valid = _Valid(folder)
+    found: dict[str, Target] = {}
+    missing: list[str] = []
+    for name, function in public_callables().items():
+        if name in INTERNAL:
+            continue
+        owner, _, method = name.removeprefix("course.").removeprefix("plotting.").rpartition(".")
+        call = (
+            function if not owner or inspect.ismethod(function) else getattr(valid.instances[owner], method)
+        )
+        known = valid.by_name | valid.by_function.get(name.partition(".")[0] + ".", {})
+        known |= valid.by_function.get(name, {})
+        arguments = dict(valid.by_function.get(name, {}))
+        for each in _parameters(call):
+            if each.default is not each.empty:
+                arguments.setdefault(each.name, each.default)
+            elif each.name in known:
+                arguments[each.name] = known[each.name]
+            else:
+                missing.append(f"{each.name} of {name}")
+        found[name] = Target(name, call, arguments)
+    if missing:
+        raise LookupError(f"add valid values to {__name__} for {', '.join(missing)}")
+    return found
+
+
+class _Valid:
+    """Valid values of arguments, by the argument's name or by the function's and the argument's."""
+
+    def __init__(self, folder: Path) -> None:
+        import moviepy
+
+        from vehicle_detection.cli.demo import draw_clip
+        from vehicle_detection.tuning import write_results
+
+        scene = vd.render_scene(shape=(180, 320), vehicles=1, random_state=0)
+        image = scene.image
+        boxes, scores = np.array([[1, 2, 30, 40], [5, 6, 50, 60]]), np.array([1.0, 0.5])
+        windows = vd.Detections(boxes, scores)
+        heat = np.zeros((180, 320), np.float32)
+        patches, labels = vd.render_patches(20)
+        names = tuple(f"{'ab'[number // 2 % 2]}/{number}.png" for number in range(20))
+        patch_set = vd.PatchSet(patches, labels, names)
+        params = vd.FeatureParams(hog_channel=0, spatial_feat=False, hist_feat=False, orient=4)
+        classifier = vd.train_classifier(patches, labels, params=params)
+        truth = vd.FrameBoxes([0, 1], np.array([1, 1]), boxes)
+        predicted = vd.FrameBoxes([0, 1], np.array([1, 1]), boxes, scores=scores)
+        frames = vd.LabelledFrames("a", {0: image, 1: image}, truth)
+        camera = vd.Camera(focal_px=500.0, horizon_px=40.0)
+        band = vd.SearchBand(window=(64, 64), y=(0.0, 256.0))
+        search = vd.SearchParams(bands=(band,))
+        detector = vd.VehicleDetector(classifier, n_jobs=1)
+        result = detector.process(image)
+        tracker, log = vd.Tracker(), vd.TrackLog()
+        report = vd.VideoReport(
+            frames=1, fps=Fraction(25), shape=image.shape, seconds=1.0, stages={"search": 1.0}, tracks=0
+        )
+        clip = folder / "valid.mp4"
+        draw_clip(vd.render_drive(frames=3, shape=(64, 96)), clip, folder / "valid.csv")
+        vd.write_image(folder / "valid.png", image)
+        vd.write_camera(camera, folder / "camera.json", (180, 320))
+        (folder / "patches").mkdir()
+        vd.write_image(folder / "patches" / "vehicle.png", patches[0])
+        scores_of = vd.evaluate_detections(predicted, truth)
+        _, scaler, svc = (step for _, step in classifier.to_pipeline().steps)
+        moving = moviepy.VideoClip(lambda time: image, duration=0.1)
+        theirs = SimpleNamespace(xyxy=boxes, confidence=scores, class_id=None)
+        quick = vd.TrialOptions(time_search=False, n_jobs=1)
+        table = _table()
+        write_results(table, folder / "results.csv")
+        lesson_only = {"spatial_feat": False, "hist_feat": False, "hog_channel": 0, "color_space": "YCrCb"}
+        lesson = {"img": image, "svc": svc, "X_scaler": scaler, "clf": svc, "scaler": scaler,
+                  "orient": 4, "pix_per_cell": 8, "cell_per_block": 2,
+                  "spatial_size": (16, 16), "hist_bins": 16, "windows": [((0, 0), (64, 64))], "ystart": 0,
+                  "ystop": 96, "scale": 1.0}  # fmt: skip
+        self.instances: dict[str, Any] = {
+            "Camera": camera, "Detections": windows, "Explorer": vd.Explorer([image], classifier),
+            "FrameBoxes": predicted, "FunctionParams": vd.FunctionParams(), "HeatHistory": vd.HeatHistory(),
+            "FrameSource": vd.open_source(clip), "HeatmapDetector": vd.HeatmapDetector(classifier),
+            "PatchFeatures": vd.PatchFeatures(n_jobs=1), "PatchSet": patch_set,
+            "PyramidParams": vd.PyramidParams(), "ReportWriter": vd.ReportWriter(folder / "writer.html"),
+            "SearchParams": search, "TemplateMixture": vd.load_model("default"), "TrackLog": log,
+            "Tracker": tracker, "VehicleClassifier": classifier, "VehicleDetector": detector,
+        }  # fmt: skip
+        self.by_name: dict[str, Any] = {
+            "image": image, "img": image, "frame": image, "patches": patches, "labels": labels,
+            "boxes": boxes, "scores": scores, "windows": windows, "detections": windows, "shape": (180, 320),
+            "camera": camera, "patch_set": patch_set, "classifier": classifier, "predictions": predicted,
+            "heatmap": heat, "heat": heat, "tracks": [], "fps": 25.0, "folder": folder / "patches",
+            "detector": detector, "threshold": 0.5, "box": boxes[0], "explanation": None, "table": table,
+            "source": patches, "params": params, "result": result, "results": [result], "n": 2,
+            "random_state": 0, "path": folder / "out.csv", "log": log, "events": [], "video": clip,
+            "focal_px": 500.0, "horizon_px": 40.0, "first": boxes, "second": boxes, "bboxes": boxes,
+            "X": patches, "y": labels, "metadata": {}, "horizon": 0.5, "images": [image], "index": 0,
+            "time": 0.0, "name": "a", "bbox_list": boxes, "files": [clip], "model": classifier,
+            "key": 0, "sets": [patch_set], "frames": [image], "clip": moving,
+            "before": result, "after": None, "times": [], "thumbnail": np.zeros((9, 16), np.float32),
+            "report": report, "on_result": None, "view": "heat", "rename": int,
+            "templates": classifier.templates, "fast": scores, "reference": scores,
+            "seconds": {"a": 1.0, "b": 2.0},
+            "pairs": np.array([[0, 1]]),
+            "parameter": "orient", "methods": {"a": [windows]}, "curves": (scores, scores, scores),
+            "runs": {"a": [result]}, "out": folder / "out", "target": folder / "out.mp4",
+            "pipeline": classifier.to_pipeline(), "lateral_px": 10.0, "frame_index": 0, "imgs": [image],
+            "split": vd.Split(np.arange(10), np.arange(10, 20)),
+        }  # fmt: skip
+        self.by_function: dict[str, dict[str, Any]] = {
+            "course.": lesson,
+            "LabelledFrames": {"frames": [image, image], "labels": truth},
+            "LabelledFrames.from_video": {"path": clip, "labels": truth},
+            "FrameBoxes": {"frames": [0, 1], "tracks": np.array([1, 1])},
+            "FrameBoxes.from_detections": {"detections": {0: windows}},
+            "FrameBoxes.from_pandas": {"table": predicted.to_pandas()},
+            "Detections.from_supervision": {"detections": theirs},
+            "FrameDataset": {"sets": (frames,)},
+            "PatchSet": {"names": names},
+            "SearchBand": {"window": (64, 64), "y": (0.0, 256.0)},
+            "SearchParams": {"bands": (band,)},
+            "Explorer": {"frames": [image], "model": classifier},
+            "Explorer.set_frame": {"frame": 0},
+            "Tracker": {"fps": 25.0},
+            "TemplateMixture": {"templates": vd.load_model("default").templates},
+            "Split": {"train": np.arange(3), "test": np.arange(3, 5)},
+            "HeatmapDetector": {"clf": classifier},
+            "ReportWriter": {"path": folder / "out.html"},
+            "VehicleDetector": {"model": classifier},
+            "FeatureParams.preset": {"name": "lab-8460"},
+            "SearchParams.preset": {"name": "default"},
+            "PatchFeatures.fit": {"y": labels},
+            "VehicleClassifier": {"params": params},
+            "VehicleClassifier.from_pipeline": {"params": params},
+            "VehicleClassifier.save": {"path": folder / "out.safetensors"},
+            "TemplateMixture.save": {"path": folder / "out.safetensors"},
+            "VehicleDetector.track": {"found": detector.search(image)},
+            "batch_status": {"out": folder},
+            "bin_spatial": {"size": 16},
+            "bounding_boxes": {"params": None},
+            "calibrate_scores": {"labels": [1, 0]},
+            "calibration_error": {"probabilities": [0.2, 0.5], "labels": [0, 1], "bins": 5},
+            "compare_classifiers": {"classifiers": {"a": _small_tree()}, "params": params, "n_jobs": 1},
+            "compare_configurations": {"configurations": {"a": params}, "options": quick},
+            "detector_from": {"function": lambda image: (boxes, scores)},
+            "draw_labeled_bboxes": {"labels": (heat.astype(np.int32), 0)},
+            "course.find_car_windows": lesson_only,
+            "course.find_cars": lesson_only,
+            "course.search_windows": {**lesson_only, "color_space": "RGB", "hog_channel": 0},
+            "course.draw_labeled_bboxes": {"labels": (heat.astype(np.int32), 0)},
+            "course.get_hog_features": {"img": image[..., 0]},
+            "estimate_horizon": {"boxes": [[40 * n, 60, 30 + 40 * n + n, 90 + n] for n in range(1, 7)]},
+            "evaluate_detections": {"labels": truth},
+            "evaluate_tracks": {"labels": truth},
+            "extract_features": {"n_jobs": 1},
+            "find_cars": {"params": search, "n_jobs": 1},
+            "find_vehicles": {"params": None},
+            "get_hog_features": {"img": image[..., 0]},
+            "hog_image": {"img": image[..., 0]},
+            "load_classifier": {"path": "highway"},
+            "load_patches": {"source": folder / "patches", "label": 1, "n_jobs": 1},
+            "load_training_patches": {"vehicles": folder / "patches", "non_vehicles": folder / "patches"},
+            "mine_negatives": {"labels": truth, "search_params": search, "n_jobs": 1},
+            "open_source": {"source": clip},
+            "precision_recall_curve": {"labels": truth},
+            "probe_video": {"path": clip},
+            "process_video": {"source": clip, "progress": False, "workers": 1},
+            "read_camera": {"path": folder / "camera.json"},
+            "read_frames": {"source": clip},
+            "read_image": {"path": folder / "valid.png"},
+            "read_labels": {"path": folder / "valid.csv"},
+            "read_results": {"path": folder / "results.csv"},
+            "render_drive": {"frames": 2, "shape": (64, 96)},
+            "render_scene": {"shape": (64, 64), "vehicles": 1},
+            "run_batch": {
+                "sources": [clip],
+                "executor": ThreadPoolExecutor(1),
+                "model": "highway",
+                "progress": False,
+                "tracks_only": True,
+                "options": {"n_jobs": 1},
+            },
+            "search_parameters": {"grid": {"orient": [4]}, "n_folds": 2, "options": quick},
+            "search_windows": {"windows": boxes, "n_jobs": 1},
+            "single_img_features": {"image": patches[0]},
+            "split_random": {"patches_or_labels": labels},
+            "split_sources": {"train": ("a",), "test": ("b",)},
+            "track": {"source": clip, "model": detector},
+            "train_and_evaluate": {"params": params, "seeds": 1, "n_jobs": 1},
+            "train_classifier": {"labels": labels, "params": params, "n_jobs": 1},
+            "write_boxes": {"boxes": [("a.png", windows)]},
+            "write_camera": {"path": folder / "out.json"},
+            "write_image": {"path": folder / "out.png"},
+            "write_labels": {"labels": truth},
+            "write_tracks": {"results": [(0, 1, 10, 20, 30, 40, 1.5)]},
+            "plotting.plot_errors": {"frames": frames},
+            "plotting.plot_explanation": {"explanation": vd.explain(detector, image, boxes[0])},
+            "plotting.plot_f1": {"scores": {"a": scores_of}},
+            "plotting.plot_features": {"model": classifier},
+            "plotting.plot_scores": {"labels": [0, 1]},
+            "plotting.plot_tracks": {"results": predicted},
+            "plotting.plot_weights": {"classifier": vd.load_classifier("highway")},
+        }
+
+
+def _table() -> Any:
+    """Return a small table of tuning results."""
+    import pandas as pd
+
+    return pd.DataFrame({"orient": [4, 9], "accuracy": [0.9, 0.95], "search_ms": [1.0, 2.0],
+                         "configuration": ["a", "b"]})  # fmt: skip
+
+
+def _small_tree() -> Any:
+    """Return a classifier of scikit-learn that trains quickly."""
+    from sklearn.tree import DecisionTreeClassifier
+
+    return DecisionTreeClassifier(max_depth=1)
+
+
+@dataclass
+class Outcome:
+    """What happened to the values of one kind in one function."""
+
+    refused: int = 0
+    accepted: int = 0
+    problems: list[str] = field(default_factory=list)
+
+    def add(self, text: str, error: BaseException | None, written: set[str]) -> None:
+        """Add a call, its error and the files that it wrote."""
+        if error is None:
+            self.accepted += 1
+        elif isinstance(error, VehicleDetectionError):
+            self.refused += 1
+            if written:
+                self.problems.append(f"{text}: failed, but left {sorted(written)}")
+        else:
+            self.problems.append(f"{text}: {' '.join(f'{type(error).__name__}: {error}'.split())[:150]}")
+
+
+Effort = Literal["quarter", "one", "every"]
+"""One value for a fixed quarter of the kinds and arguments (the tests), or for all; or every value."""
+
+
+def cases(
+    functions: Mapping[str, Target], values: Mapping[str, tuple[Any, ...]], effort: Effort
+) -> Iterator[Case]:
+    """Yield the functions with bad values of their arguments."""
+    for name, target in functions.items():
+        for argument, (kind, choices) in itertools.product(target.arguments, values.items()):
+            number = _number(name, argument, kind)
+            if effort == "quarter" and number % 4:
+                continue
+            one = choices[number // 4 % len(choices)]
+            for value in choices if effort == "every" else (one,):
+                text = f"{name}({argument}={' '.join(repr(value).split())[:60]})"
+                yield name, kind, text, partial(target.call, **{**target.arguments, argument: value})
+
+
+def _number(*words: str) -> int:
+    """Return a number that depends on the words, but not on the run, as that of `hash` does."""
+    return zlib.crc32(" ".join(words).encode())
+
+
+@contextlib.contextmanager
+def time_limit(seconds: float) -> Iterator[None]:
+    """Raise TimeoutError in the main thread after some seconds, where the system has alarms."""
+    if not hasattr(signal, "setitimer"):
+        yield
+        return
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise TimeoutError(f"no result after {seconds:g} s")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+Case = tuple[str, str, str, Callable[[], Any]]
+"""Function or command, kind of the value, description of the call, and the call."""
+
+
+def run(
+    effort: Effort, *, functions: Iterable[str] = (), commands: bool = True
+) -> tuple[dict[str, dict[str, Outcome]], list[str]]:
+    """Call the functions and commands; return the outcomes by name and kind, and all problems.
+
+    Problems are errors of other classes, calls without an end, files written although the call failed, and
+    files outside the folder of the valid files.
+    """
+    outcomes: dict[str, dict[str, Outcome]] = {}
+    with tempfile.TemporaryDirectory(prefix="bad_input.") as outer, contextlib.chdir(outer):
+        folder = Path(outer) / "in"
+        folder.mkdir()
+        values, found = bad_values(folder), targets(folder)
+        chosen = {name: found[name] for name in functions or found}
+        tried: Iterator[Case] = cases(chosen, values, effort)
+        if commands:
+            tried = itertools.chain(tried, command_cases(folder, effort))
+        before = _files(outer)
+        for name, kind, text, call in tried:
+            outcome = outcomes.setdefault(name, {}).setdefault(kind, Outcome())
+            error = call_quietly(call)
+            written = _files(outer) - before
+            outcome.add(text, error, written)
+            for path in sorted(written, reverse=True):
+                remove = Path(outer, path)
+                remove.rmdir() if remove.is_dir() else remove.unlink()
+    return outcomes, [text for row in outcomes.values() for each in row.values() for text in each.problems]
+
+
+def call_quietly(call: Callable[[], Any]) -> BaseException | None:
+    """Call without warnings and open figures, and return the error if there is one."""
+    try:
+        with np.errstate(all="ignore"), warnings.catch_warnings(), time_limit(MAX_SECONDS):
+            warnings.simplefilter("ignore")
+            result = call()
+            if inspect.isgenerator(result):
+                result.close()
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        return error
+    finally:
+        if "matplotlib.pyplot" in sys.modules:
+            sys.modules["matplotlib.pyplot"].close("all")
+    return None
+
+
+def _files(folder: str) -> set[str]:
+    return {str(path.relative_to(folder)) for path in Path(folder).rglob("*")}
+
+
+COMMANDS = {
+    "demo": ("-o", "demo", "--frames", "1"),
+    "detect": ("in/valid.png", "-o", "out", "--model", "highway"),
+    "video": ("in/valid.mp4", "-o", "out.mp4", "--model", "highway", "-q"),
+    "evaluate": ("in/valid.csv", "in/valid.csv"),
+    "batch": ("missing.mp4", "-o", "out", "--model", "highway", "-q"),
+    "train": ("--vehicles", "in/patches", "--non-vehicles", "in/patches", "-o", "out.safetensors"),
+    "train-frames": ("in/patches", "-o", "out.safetensors"),
+    "tune": (
+        "--vehicles",
+        "in/patches",
+        "--non-vehicles",
+        "in/patches",
+        "--grid",
+        "orient=4",
+        "-o",
+        "out.csv",
+    ),
+    "info": (),
+}
+"""Arguments of the commands. The slow ones fail after all options were checked."""
+
+COMMANDS_NOT_CALLED = {"fetch": "downloads"}
+"""Commands that are not called, and why."""
+
+
+def command_options() -> dict[str, list[str | None]]:
+    """Return the options of each command that take a value; None stands for its positional arguments."""
+    import typer
+
+    from vehicle_detection.cli.app import app
+
+    group: Any = typer.main.get_command(app)
+    return {
+        name: [
+            None if each.param_type_name == "argument" else each.opts[-1]
+            for each in command.params
+            if not getattr(each, "is_flag", False) and each.name != "help"
+        ]
+        for name, command in group.commands.items()
+        if name not in COMMANDS_NOT_CALLED
+    }
+
+
+def command_cases(folder: Path, effort: Effort) -> Iterator[Case]:
+    """Yield the commands with bad values of their options and arguments, one of each kind."""
+    values = {
+        "negative number": "-1", "huge integer": "9" * 400, "NaN, infinity": "nan", "empty": "", "text": "x",
+        "impossible name": "a" * 5000, "missing file": "missing/missing.mp4", "folder": str(folder),
+        "device": str(folder / "zero.csv"), "wrong type": "\udc80.csv",
+    }  # fmt: skip
+    for name, options in command_options().items():
+        for option, (kind, value) in itertools.product(options, values.items()):
+            if effort == "quarter" and _number(name, option or "", kind) % 4:
+                continue
+            words = [*COMMANDS[name], option, value] if option else [value, *COMMANDS[name][1:]]
+            yield (
+                f"`{name}`",
+                kind,
+                f"{name} {option or ''} {value[:60]!r}",
+                partial(_run_command, name, words),
+            )
+
+
+def _run_command(name: str, words: list[str]) -> None:
+    """Run a command in this process; an error that it reports in one line counts as one of the library's."""
+    from typer.testing import CliRunner
+
+    from vehicle_detection.cli.app import app
+
+    result = CliRunner().invoke(app, [name, *words])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    if "Traceback" in result.output:
+        raise AssertionError("the output holds a traceback")
+    if result.exit_code in (1, 2):
+        raise InvalidInputError(result.output[-200:])
+    if result.exit_code:
+        raise AssertionError(f"exit code {result.exit_code}")
+
+
+def table(outcomes: Mapping[str, Mapping[str, Outcome]]) -> str:
+    """Return a Markdown table: how many values were refused, of those that were tried."""
+    kinds = list(dict.fromkeys(kind for row in outcomes.values() for kind in row))
+    lines = [f"| function | {' | '.join(kinds)} |", f"|---{'|---' * len(kinds)}|"]
+    for name, row in outcomes.items():
+        cells = [
+            f"{row[kind].refused} of {row[kind].refused + row[kind].accepted}" if kind in row else ""
+            for kind in kinds
+        ]
+        lines.append(f"| {name if name.startswith('`') else f'`{name}`'} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def page(outcomes: Mapping[str, Mapping[str, Outcome]]) -> str:
+    """Return the text of ``docs/bad_input.md``."""
+    functions = {name: row for name, row in outcomes.items() if not name.startswith("`")}
+    commands = {name: row for name, row in outcomes.items() if name.startswith("`")}
+    cells = [each for row in outcomes.values() for each in row.values()]
+    refused, accepted = sum(each.refused for each in cells), sum(each.accepted for each in cells)
+    skipped = "".join(f"- `{name}`: {why}\n" for name, why in {**NOT_CALLED, **COMMANDS_NOT_CALLED}.items())
+    return f"""# Bad input, function by function
+
+Written by `python -m tools.bad_input --write`. Every argument of every public function, constructor and
+method, and every option of the commands, was given a value of each kind, all other arguments being valid.
+A cell states for how many arguments it was refused, of all; it is valid for the others, such as `None` for an
+optional one. Of {refused + accepted:,} calls, {refused:,} ended with an error of
+`vehicle_detection.errors` or exit code 2; {accepted:,} were valid. None raised another error, took longer
+than {MAX_SECONDS} s, or left a file after an error. `tests/tools/test_bad_input.py` tries a part of
+them, and fails if a new public function is not called.
+
+Not called:
+
+{skipped}
+## Functions
+
+{table(functions)}
+## Commands
+
+{table(commands)}"""
+
+
+def main() -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--functions", nargs="+", default=(), help="functions to call; default: all")
+    parser.add_argument("--every", action="store_true", help="try every value; default: one of a kind")
+    parser.add_argument("--write", action="store_true", help=f"write {PAGE.relative_to(ROOT)}")
+    options = parser.parse_args()
+    effort: Effort = "every" if options.every else "one"
+    outcomes, problems = run(effort, functions=options.functions, commands=not options.functions)
+    for problem in problems:
+        print(problem)
+    cells = [each for row in outcomes.values() for each in row.values()]
+    print(f"{sum(each.refused for each in cells)} refused, {sum(each.accepted for each in cells)} accepted")
+    if options.write and not problems:
+        PAGE.write_text(page(outcomes))
+    sys.exit(bool(problems))
+
+
+if __name__ == "__main__":
+    main()
