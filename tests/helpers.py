@@ -27,8 +27,8 @@ ROOT = Path(__file__).parents[1]
 
 
 def start_interruptible(*command, **options):
-    """Start a program that SIGINT interrupts, even if pytest is a background job, which ignores SIGINT."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Start a program that SIGINT and SIGHUP interrupt, even if pytest is a background job or under nohup."""
+    before = {each: signal.signal(each, signal.SIG_DFL) for each in (signal.SIGINT, signal.SIGHUP)}
     try:
         return subprocess.Popen(
             [str(word) for word in command],
@@ -40,7 +40,8 @@ def start_interruptible(*command, **options):
             **options,
         )
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def random_template(params, seed=0, *, bias=0.0):
