@@ -15,13 +15,14 @@ from typing import TypeVar
 
 import cv2
 
-from vehicle_detection._common.checks import check_integer
+from vehicle_detection._common.checks import check_integer, describe
 from vehicle_detection.errors import InvalidInputError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 JOBS_VARIABLE = "VEHICLE_DETECTION_JOBS"
+_MAX_JOBS = 1024
 
 
 def available_cores(root: Path = Path("/")) -> int:
@@ -64,12 +65,15 @@ def _read_cpu_quotas(root: Path) -> Iterator[float]:
 def resolve_jobs(n_jobs: int | None = None) -> int:
     """Return `n_jobs`, else the environment variable ``VEHICLE_DETECTION_JOBS``, else all cores."""
     if n_jobs is not None:
-        return check_integer(n_jobs, "n_jobs", low=1, high=1024)
+        return check_integer(n_jobs, "n_jobs", low=1, high=_MAX_JOBS)
     text = os.environ.get(JOBS_VARIABLE, "")
     if not text:
         return available_cores()
-    if not text.isdecimal() or int(text) < 1:
-        raise InvalidInputError(f"{JOBS_VARIABLE} must be a number of threads, at least 1; got {text!r}")
+    # The length first: Python refuses to convert thousands of digits.
+    if not text.isdecimal() or len(text) > 9 or not 1 <= int(text) <= _MAX_JOBS:
+        raise InvalidInputError(
+            f"{JOBS_VARIABLE} must be a number of threads from 1 to {_MAX_JOBS}; got {describe(text)}"
+        )
     return int(text)
 
 
