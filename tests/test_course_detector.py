@@ -133,7 +133,7 @@ def test_it_finds_all_vehicles_of_the_courses_images(real_data):
         ({"clf": None}, "clf must be a model of the library"),
         ({"ystart": -1}, "ystart must be an integer"),
         ({"ystop": 400}, "ystop must be an integer at least 401"),
-        ({"scales": 1.5}, "scales must be a list of numbers"),
+        ({"scales": 1.5}, "scales must be a sequence of numbers"),
         ({"scales": (0,)}, "scales must be a number"),
         ({"cells_per_step": 0}, "cells_per_step must be an integer"),
         ({"n_frames": 0}, "frames must be an integer"),

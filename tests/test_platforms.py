@@ -37,7 +37,7 @@ GUARDED = {
     ("_common.threads", "available_cores", "os.sched_getaffinity"): "hasattr; macOS does not have it, either",
     ("_common.threads", "", "os.register_at_fork"): "hasattr",
     ("tuning.trials", "_check_memory", "os.sysconf"): "AttributeError is caught",
-    ("batch.trip", "_lock", "fcntl"): "ImportError is caught",
+    ("batch.store", "_lock_file", "fcntl"): "ImportError is caught",
     ("video.ffmpeg", "", "os.register_at_fork"): "hasattr",
     ("video.ffmpeg", "_enlarge", "fcntl"): "on Linux only",
     ("video.ffmpeg", "wait", "os.WNOHANG"): "returns before on win32",
@@ -102,14 +102,14 @@ import vehicle_detection
 print(len([importlib.import_module(name) for name in names()]))
 
 from vehicle_detection._common import atomic_write, available_cores, temporary_folder
-from vehicle_detection.batch.trip import _lock
+from vehicle_detection.batch.store import LocalStore
 from vehicle_detection.cli.signals import raise_on_signals
 
 folder = Path(tempfile.mkdtemp())
 with atomic_write(folder / "a.csv") as part, temporary_folder(folder, "b") as inner:
     part.write_text("whole")
     (inner / "c").touch()
-with _lock(folder / "locks" / "a") as free, raise_on_signals():
+with LocalStore(folder).lock("a") as free, raise_on_signals():
     print(free, available_cores() > 0, sorted(path.name for path in folder.iterdir()))
 """
 

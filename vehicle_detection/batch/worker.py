@@ -31,6 +31,8 @@ def main() -> None:
             answers.flush()
             if calls.empty():
                 idle.set()
+        # An interrupt that is meant for the last call may come after it.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     except (KeyboardInterrupt, BrokenPipeError):
         os._exit(1)
 
@@ -46,7 +48,9 @@ def _receive(calls: queue.SimpleQueue[str | None], idle: threading.Event) -> Non
             signal.pthread_kill(int(threading.main_thread().ident or 0), signal.SIGINT)
         else:
             _thread.interrupt_main()
-        threading.Timer(_GRACE, os._exit, (1,)).start()
+        timer = threading.Timer(_GRACE, os._exit, (1,))
+        timer.daemon = True
+        timer.start()
 
 
 def _call(message: dict[str, Any]) -> dict[str, Any]:
