@@ -235,50 +235,25 @@ def _normalize_row(cells, factors, y, channels):
 
 
 @jit
-def fhog_channels(sums, first, squares, grids, eps, channels):
+def fhog_channels(sums, square, first, squares, grids, eps, channels):
     """FHOG channels at the cells of several grids, ``(grids, 20, rows, columns)`` float32.
 
     `grids` is ``(grids, 4)`` float64: left, top, width and height of each grid's first cell in squares.
-    `sums`, `first` and `squares` are as in `_resample`; `eps` is added to the energy of a block.
+    `sums`, `square`, `first` and `squares` are as in `_resample`; `eps` is added to the energy of a block.
     """
     count, _, rows, columns = channels.shape
     cells = np.empty((16, rows + 2, columns + 2), np.float32)
     factors = np.empty((rows + 1, columns + 1), np.float32)
+    line = np.empty((20, columns), np.float32)
     for number in range(count):
         left, top, step_x, step_y = grids[number]
-        _resample(sums, SQUARE, first, squares, (left - step_x, top - step_y, step_x, step_y), cells)
+        _resample(sums, square, first, squares, (left - step_x, top - step_y, step_x, step_y), cells)
         _block_factors(cells, eps, factors)
         for y in range(rows):
-            _normalize_row(cells, factors, y, channels[number, :, y])
-
-
-@jit
-def small_fhog_channels(planes, cotangents, grids, eps, channels):
-    """FHOG channels at the cells of several grids of small cells, from sums over small squares around each.
-
-    `planes` is ``(3, H, W)`` uint8, and `grids` as in `fhog_channels`, but in pixels.
-    """
-    count, _, rows, columns = channels.shape
-    height, width = planes.shape[1:]
-    cells = np.empty((16, rows + 2, columns + 2), np.float32)
-    factors = np.empty((rows + 1, columns + 1), np.float32)
-    for number in range(count):
-        left, top, step_x, step_y = grids[number]
-        # Two cells and two squares around the grid; the image's own border is replicated.
-        low_x, high_x = math.floor(left - 2 * step_x) - 4, math.ceil(left + (columns + 2) * step_x) + 4
-        low_y, high_y = math.floor(top - 2 * step_y) - 4, math.ceil(top + (rows + 2) * step_y) + 4
-        low_x, low_y = min(max(low_x, 0), width - 1), min(max(low_y, 0), height - 1)
-        high_x, high_y = min(max(high_x, low_x + 1), width), min(max(high_y, low_y + 1), height)
-        down, across = (high_y - low_y + 1) // SMALL_SQUARE, (high_x - low_x + 1) // SMALL_SQUARE
-        sums = np.empty((down + 2, across + 2, 16), np.float32)
-        region = planes[:, low_y:high_y, low_x:high_x]
-        orientation_sums(region, cotangents, SMALL_SQUARE, -1, sums)
-        left, top = (left - low_x - step_x) / SMALL_SQUARE, (top - low_y - step_y) / SMALL_SQUARE
-        grid = left, top, step_x / SMALL_SQUARE, step_y / SMALL_SQUARE
-        _resample(sums, SMALL_SQUARE, -1, down, grid, cells)
-        _block_factors(cells, eps, factors)
-        for y in range(rows):
-            _normalize_row(cells, factors, y, channels[number, :, y])
+            _normalize_row(cells, factors, y, line)
+            for k in range(20):
+                for x in range(columns):
+                    channels[number, k, y, x] = line[k, x]
 
 
 @jit
@@ -293,7 +268,9 @@ def packed_channels(sums, first, squares, grid, eps, scales, per_word, cells, pa
     factors = np.empty((rows + 1, columns + 1), np.float32)
     line = np.empty((20, columns), np.float32)
     left, top, step_x, step_y = grid[0], grid[1], grid[2], grid[3]
-    _resample(sums, SQUARE, first, squares, (left - step_x, top - step_y, step_x, step_y), cells)
+    # Not a constant, for which numba would compile `_resample` again.
+    square = np.int64(SQUARE)
+    _resample(sums, square, first, squares, (left - step_x, top - step_y, step_x, step_y), cells)
     _block_factors(cells, eps, factors)
     half, limit = np.float32(0.5), np.float32(255)
     for y in range(rows):

@@ -157,8 +157,7 @@ class EdgePyramid:
             chosen = numbers == number
             found = np.empty((int(chosen.sum()), *channels.shape[1:]), np.float32)
             if number < 0:
-                planes = self.octaves[0].planes
-                _fhog_kernels.small_fhog_channels(planes, _COTANGENTS, grids[chosen], _EPS, found)
+                self._compute_small(grids[chosen], found)
             else:
                 self._interpolate(number, grids[chosen], found)
             channels[chosen] = found
@@ -168,7 +167,24 @@ class EdgePyramid:
         octave = self.octaves[number]
         squares = -(-octave.planes.shape[1] // SQUARE)
         scaled = grids / (SQUARE * 2**number)
-        _fhog_kernels.fhog_channels(octave.sums, octave.first, squares, scaled, _EPS, channels)
+        _fhog_kernels.fhog_channels(octave.sums, SQUARE, octave.first, squares, scaled, _EPS, channels)
+
+    def _compute_small(self, grids: NDArray[np.float64], channels: NDArray[np.float32]) -> None:
+        """FHOG channels of grids of small cells, from small squares of the pixels around each."""
+        planes, square = self.octaves[0].planes, _fhog_kernels.SMALL_SQUARE
+        shape, steps = np.array(planes.shape[:0:-1]), grids[:, 2:]
+        # Two cells and two squares around the grid; the image's own border is replicated.
+        ends = grids[:, :2] + (np.array(channels.shape[:1:-1]) + 2) * steps
+        low = (np.floor(grids[:, :2] - 2 * steps) - 2 * square).clip(0, shape - 1).astype(np.intp)
+        high = (np.ceil(ends) + 2 * square).clip(low + 1, shape).astype(np.intp)
+        scaled = np.hstack([grids[:, :2] - low, steps]) / square
+        for number, ((left, top), (right, bottom)) in enumerate(zip(low.tolist(), high.tolist())):
+            region = np.ascontiguousarray(planes[:, top:bottom, left:right])
+            down, across = (bottom - top + 1) // square, (right - left + 1) // square
+            sums = np.empty((down + 2, across + 2, 16), np.float32)
+            _fhog_kernels.orientation_sums(region, _COTANGENTS, square, -1, sums)
+            one = slice(number, number + 1)
+            _fhog_kernels.fhog_channels(sums, square, -1, down, scaled[one], _EPS, channels[one])
 
     def feature_map(self, grid: CellGrid) -> FeatureMap:
         """FHOG channels of one grid."""
