@@ -129,14 +129,22 @@ def _tent_taps(start, step, squares, taps, index, weights):
 
 
 @jit
-def _resample(sums, square, first, squares, grid, cells):
-    """Interpolate the sums of squares at the cells of a grid.
+def resample(sums, square, first, squares, grids, cells):
+    """Interpolate the sums of squares at the cells of several grids, and at one cell more on each side.
 
     `sums` and `square` are as in `orientation_sums`, with one column of squares beyond each side; `first` is
-    the first row, and `squares` the number of rows that the image has. `grid` is left, top, width and height
-    of the first cell in squares, and `cells` the output ``(16, rows, columns)``, in gray levels of the mean
-    gradient.
+    the first row, and `squares` the number of rows that the image has. `grids` is ``(grids, 4)`` float64:
+    left, top, width and height of each grid's first cell in squares. `cells` is the output
+    ``(grids, 16, rows + 2, columns + 2)``, in gray levels of the mean gradient.
     """
+    for number in range(len(grids)):
+        left, top, step_x, step_y = grids[number]
+        _resample(sums, square, first, squares, (left - step_x, top - step_y, step_x, step_y), cells[number])
+
+
+@jit
+def _resample(sums, square, first, squares, grid, cells):
+    """Interpolate the sums of squares at the cells of one grid: left, top, width and height of its first."""
     _, rows, columns = cells.shape
     left, top, step_x, step_y = grid
     # Two taps at a time along a row, at first four; those beyond the tent have no weight.
@@ -235,42 +243,34 @@ def _normalize_row(cells, factors, y, channels):
 
 
 @jit
-def fhog_channels(sums, square, first, squares, grids, eps, channels):
-    """FHOG channels at the cells of several grids, ``(grids, 20, rows, columns)`` float32.
+def fhog_channels(cells, eps, channels):
+    """FHOG channels of several grids of cells, ``(grids, 20, rows, columns)`` float32.
 
-    `grids` is ``(grids, 4)`` float64: left, top, width and height of each grid's first cell in squares.
-    `sums`, `square`, `first` and `squares` are as in `_resample`; `eps` is added to the energy of a block.
+    `cells` is the output of `resample`; `eps` is added to the energy of a block.
     """
     count, _, rows, columns = channels.shape
-    cells = np.empty((16, rows + 2, columns + 2), np.float32)
     factors = np.empty((rows + 1, columns + 1), np.float32)
     line = np.empty((20, columns), np.float32)
     for number in range(count):
-        left, top, step_x, step_y = grids[number]
-        _resample(sums, square, first, squares, (left - step_x, top - step_y, step_x, step_y), cells)
-        _block_factors(cells, eps, factors)
+        _block_factors(cells[number], eps, factors)
         for y in range(rows):
-            _normalize_row(cells, factors, y, line)
+            _normalize_row(cells[number], factors, y, line)
             for k in range(20):
                 for x in range(columns):
                     channels[number, k, y, x] = line[k, x]
 
 
 @jit
-def packed_channels(sums, first, squares, grid, eps, scales, per_word, cells, packed):
-    """FHOG channels at the cells of a grid as small integers, several in each word of 32 bits.
+def packed_channels(cells, eps, scales, per_word, packed):
+    """FHOG channels of the cells of a grid as small integers, several in each word of 32 bits.
 
     The value of channel `k` is multiplied by ``scales[k]``, rounded, and limited to 255. `packed` is the
-    output ``(20 / per_word, rows, columns)`` int32; the first channel is in the lowest bits. `cells` is
-    memory, ``(16, rows + 2, columns + 2)``; the other arguments are as in `fhog_channels`.
+    output ``(20 / per_word, rows, columns)`` int32; the first channel is in the lowest bits. `cells` is one
+    of the grids of `resample`, and `eps` as in `fhog_channels`.
     """
     words, rows, columns = packed.shape
     factors = np.empty((rows + 1, columns + 1), np.float32)
     line = np.empty((20, columns), np.float32)
-    left, top, step_x, step_y = grid[0], grid[1], grid[2], grid[3]
-    # Not a constant, for which numba would compile `_resample` again.
-    square = np.int64(SQUARE)
-    _resample(sums, square, first, squares, (left - step_x, top - step_y, step_x, step_y), cells)
     _block_factors(cells, eps, factors)
     half, limit = np.float32(0.5), np.float32(255)
     for y in range(rows):

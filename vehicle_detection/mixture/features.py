@@ -167,7 +167,9 @@ class EdgePyramid:
         octave = self.octaves[number]
         squares = -(-octave.planes.shape[1] // SQUARE)
         scaled = grids / (SQUARE * 2**number)
-        _fhog_kernels.fhog_channels(octave.sums, SQUARE, octave.first, squares, scaled, _EPS, channels)
+        cells = _new_cells(channels)
+        _fhog_kernels.resample(octave.sums, SQUARE, octave.first, squares, scaled, cells)
+        _fhog_kernels.fhog_channels(cells, _EPS, channels)
 
     def _compute_small(self, grids: NDArray[np.float64], channels: NDArray[np.float32]) -> None:
         """FHOG channels of grids of small cells, from small squares of the pixels around each."""
@@ -178,13 +180,15 @@ class EdgePyramid:
         low = (np.floor(grids[:, :2] - 2 * steps) - 2 * square).clip(0, shape - 1).astype(np.intp)
         high = (np.ceil(ends) + 2 * square).clip(low + 1, shape).astype(np.intp)
         scaled = np.hstack([grids[:, :2] - low, steps]) / square
+        cells = _new_cells(channels)
         for number, ((left, top), (right, bottom)) in enumerate(zip(low.tolist(), high.tolist())):
             region = np.ascontiguousarray(planes[:, top:bottom, left:right])
             down, across = (bottom - top + 1) // square, (right - left + 1) // square
             sums = np.empty((down + 2, across + 2, 16), np.float32)
             _fhog_kernels.orientation_sums(region, _COTANGENTS, square, -1, sums)
             one = slice(number, number + 1)
-            _fhog_kernels.fhog_channels(sums, square, -1, down, scaled[one], _EPS, channels[one])
+            _fhog_kernels.resample(sums, square, -1, down, scaled[one], cells[one])
+        _fhog_kernels.fhog_channels(cells, _EPS, channels)
 
     def feature_map(self, grid: CellGrid) -> FeatureMap:
         """FHOG channels of one grid."""
@@ -202,21 +206,20 @@ class EdgePyramid:
         """
         number = self.octave_of(math.sqrt(grid.step_x * grid.step_y))
         octave, scale = self.octaves[number], SQUARE * 2**number
-        cells = workspace.take((16, grid.rows + 2, grid.columns + 2), np.float32, "cells")
+        cells = workspace.take((1, 16, grid.rows + 2, grid.columns + 2), np.float32, "cells")
         shape = N_CHANNELS // packing.per_word, grid.rows, grid.columns
         packed = workspace.take(shape, packing.dtype, "packed")
-        _fhog_kernels.packed_channels(
-            octave.sums,
-            octave.first,
-            -(-octave.planes.shape[1] // SQUARE),
-            np.array([grid.left, grid.top, grid.step_x, grid.step_y]) / scale,
-            _EPS,
-            CHANNEL_SCALES,
-            packing.per_word,
-            cells,
-            packed,
-        )
+        squares = -(-octave.planes.shape[1] // SQUARE)
+        corner = np.array([[grid.left, grid.top, grid.step_x, grid.step_y]]) / scale
+        _fhog_kernels.resample(octave.sums, SQUARE, octave.first, squares, corner, cells)
+        _fhog_kernels.packed_channels(cells[0], _EPS, CHANNEL_SCALES, packing.per_word, packed)
         return packed
+
+
+def _new_cells(channels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Memory for the cells of some grids with these channels, and one cell more on each side."""
+    count, _, rows, columns = channels.shape
+    return np.empty((count, 16, rows + 2, columns + 2), np.float32)
 
 
 def octave_count(shape: tuple[int, ...]) -> int:
