@@ -70,7 +70,7 @@ def test_a_killed_worker_is_replaced(many, model, tmp_path, start_batch):
     assert "warning: " in errors
     assert "drive e.mp4: " in errors
     check_whole(out, done=TRIPS - 1, failed=1)
-    assert not list((tmp_path / "scratch").glob("vehicle-batch*"))
+    assert not list((tmp_path / "scratch").glob("*vehicle-batch*"))
 
 
 def test_a_killed_batch_is_resumed_by_the_same_command(many, model, tmp_path, start_batch):
@@ -88,7 +88,7 @@ def test_a_killed_batch_is_resumed_by_the_same_command(many, model, tmp_path, st
     assert len(before) < TRIPS
     skipped = int(printed.split(" skipped")[0].rpartition(" ")[2])
     assert skipped >= len(before)
-    assert not list((tmp_path / "scratch").glob("vehicle-batch*"))
+    assert not list((tmp_path / "scratch").glob("*vehicle-batch*"))
 
 
 def test_a_disk_that_is_full_in_the_middle(many, model, tmp_path, start_batch):
@@ -110,7 +110,7 @@ def test_a_disk_that_is_full_in_the_middle(many, model, tmp_path, start_batch):
     assert code == 0, errors
     after = check_whole(out, done=TRIPS - 1, failed=1)
     assert before.items() <= after.items(), "a trip was done twice"
-    assert not list((tmp_path / "scratch").glob("vehicle-batch*"))
+    assert not list((tmp_path / "scratch").glob("*vehicle-batch*"))
 
 
 def test_two_batches_on_one_folder_share_the_work(many, model, tmp_path, start_batch):
@@ -133,7 +133,7 @@ def test_an_interrupt_ends_the_workers(many, model, tmp_path, start_batch):
     assert (code, errors) == (130, "interrupted\n")
     assert children
     assert not any(Path(f"/proc/{child}").exists() for child in children)
-    assert not list((tmp_path / "scratch").glob("vehicle-batch*"))
+    assert not list((tmp_path / "scratch").glob("*vehicle-batch*"))
 
 
 def test_a_worker_that_dies_in_every_attempt_is_an_error(card, model, tmp_path, monkeypatch):

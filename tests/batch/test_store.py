@@ -13,7 +13,7 @@ from tests.batch.object_store import PORT, SITE, ObjectStore
 from vehicle_detection import batch_status
 from vehicle_detection.batch.plan import list_videos
 from vehicle_detection.batch.store import open_store
-from vehicle_detection.errors import OutputError
+from vehicle_detection.errors import OutputError, TransientVideoError
 
 fsspec = pytest.importorskip("fsspec")
 
@@ -22,7 +22,7 @@ def test_remote_sources_are_listed():
     for name in ("a.mp4", "b.MP4", "c.txt"):
         with fsspec.open(f"memory://fleet/day/{name}", "wb") as file:
             file.write(b"x")
-    expected = ["memory:///fleet/day/a.mp4", "memory:///fleet/day/b.MP4"]
+    expected = ["memory://fleet/day/a.mp4", "memory://fleet/day/b.MP4"]
     for source in ("memory://fleet/day/*", "memory://fleet"):
         assert list(list_videos([source])) == expected
 
@@ -135,3 +135,29 @@ def test_a_store_is_the_same_for_a_folder_and_a_url(tmp_path, bucket):
         assert opened.list_files("tracks") == ["tracks/day/cd-2.txt"]
         with opened.lock("ab") as locked:
             assert locked
+
+
+def test_passwords_are_neither_stored_nor_printed(clip, model, tmp_path, bucket):
+    """The user and password of sources and of the output, in records, errors and the summary."""
+    bucket.fails = lambda: False
+    bucket.objects["cam/drive.mp4"] = clip.read_bytes()
+    sources = ["loopback://anna:pa@ss@cam/drive.mp4", "loopback://anna:pa@ss@cam/missing.mp4"]
+    out = "loopback://bob:word@results"
+    report = run(sources, out, model, tracks_only=True)
+    assert counts(report) == (1, 1, 0, 0)
+    assert dict(report.messages) == {
+        "loopback://***@cam/missing.mp4": (
+            "source loopback://***@cam/missing.mp4 does not exist; check the URL"
+        )
+    }
+    stored = b"".join(data for key, data in bucket.objects.items() if key.startswith("results/"))
+    for secret in (b"anna", b"ss@", b"bob", b"word"):
+        assert secret not in stored
+    # A new password changes nothing.
+    changed = [source.replace("pa@ss", "new") for source in sources]
+    assert counts(run(changed, out, model, tracks_only=True)) == (0, 0, 0, 2)
+    bucket.fails = lambda: True
+    with pytest.raises(OutputError, match=r"^loopback://\*\*\*@results/records cannot be listed"):
+        batch_status(out)
+    with pytest.raises(TransientVideoError, match=r"^loopback://\*\*\*@cam cannot be listed"):
+        list_videos(["loopback://anna:pa@ss@cam"])

@@ -51,7 +51,7 @@ class _LiveProcess:
     def __init__(
         self, name: str, options: Sequence[str], *, stdin: int | None, like: VideoInfo | None, timed: bool
     ) -> None:
-        self.name, self._input, self._timed = name, options[-1], timed
+        self.name, self._timed = name, timed
         self._stalled = False
         filters = "crop=trunc(iw/2)*2:trunc(ih/2)*2,scale=out_color_matrix=bt601:out_range=tv"
         rate: tuple[str, ...] = ()
@@ -81,8 +81,8 @@ class _LiveProcess:
         )
 
     def reason(self) -> str:
-        """Last message of ffmpeg, without the password that a URL may hold."""
-        return last_line(self.process.log().replace(self._input, self.name))
+        """Last message of ffmpeg."""
+        return last_line(self.process.log())
 
     def read_planes(self, planes: NDArray[np.uint8]) -> bool:
         """Read the next frame into `planes`; False at the end of the stream."""
