@@ -138,7 +138,7 @@ def test_an_interrupt_ends_the_workers(many, model, tmp_path, start_batch):
 
 def test_a_worker_that_dies_in_every_attempt_is_an_error(card, model, tmp_path, monkeypatch):
     before = child_processes()
-    monkeypatch.setattr("vehicle_detection.batch.run.run_trip", suicide)
+    monkeypatch.setattr("vehicle_detection.batch.run.run_trip", kill_this_process)
     report = run_batch(card / "20260131_093000_F.mp4", tmp_path / "out", model=model, jobs=1, progress=False)
     assert counts(report) == (0, 0, 1, 0)
     assert "the worker process ended (signal 9), 3 times" in next(iter(report.messages.values()))
@@ -146,7 +146,7 @@ def test_a_worker_that_dies_in_every_attempt_is_an_error(card, model, tmp_path, 
     assert child_processes() == before
 
 
-def suicide(task):
+def kill_this_process(task):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
