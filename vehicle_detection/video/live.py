@@ -70,7 +70,9 @@ class _LiveProcess:
         size = re.match(rb"YUV4MPEG2 W(\d+) H(\d+) F(\d+):(\d+)", header)
         if size is None:
             if self._stalled:
-                raise TransientVideoError(f"{self.name} sends no video within {_OPEN_TIMEOUT:g} s; check it")
+                raise TransientVideoError(
+                    f"{self.name} sends no video within {_OPEN_TIMEOUT:g} s; check the source"
+                )
             code = self.process.wait()
             check_frame_size(self.name, self.process.log())
             message = f"{self.name} is not a video that ffmpeg can read ({self.reason()}); check the source"

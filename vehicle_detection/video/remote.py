@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -32,7 +33,9 @@ def download(url: str, folder: Path) -> Path:
         raise InvalidInputError(f"source {name} is not readable ({reason}); check its permissions") from None
     except Exception as error:  # each storage has its own
         reason = hide_credentials(str(error))
-        raise TransientVideoError(f"{name} cannot be copied ({reason}); check the connection") from error
+        is_full = getattr(error, "errno", None) == errno.ENOSPC
+        remedy = "free some space" if is_full else "check the connection"
+        raise TransientVideoError(f"{name} cannot be copied ({reason}); {remedy}") from error
     return path
 
 
