@@ -5,12 +5,14 @@ import os
 import signal
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 
 from tests.batch.helpers import check_whole, counts, run
 from tests.batch.object_store import PORT, SITE, ObjectStore
 from vehicle_detection import batch_status
+from vehicle_detection.batch import plan
 from vehicle_detection.batch.plan import list_videos
 from vehicle_detection.batch.store import open_store
 from vehicle_detection.errors import OutputError, TransientVideoError
@@ -25,6 +27,15 @@ def test_remote_sources_are_listed():
     expected = ["memory://fleet/day/a.mp4", "memory://fleet/day/b.MP4"]
     for source in ("memory://fleet/day/*", "memory://fleet"):
         assert list(list_videos([source])) == expected
+
+
+def test_files_of_a_server_are_listed_with_its_name(monkeypatch):
+    files = {"/cards/a.mp4": {"type": "file", "size": 3}, "/cards/note.txt": {"type": "file", "size": 1}}
+    server = SimpleNamespace(
+        invalidate_cache=lambda: None, isdir=lambda path: True, find=lambda path, detail: files
+    )
+    monkeypatch.setattr(plan, "open_filesystem", lambda url: (server, "/cards"))  # as that of FTP
+    assert list(list_videos(["ftp://anna:word@nas/cards/"])) == ["ftp://anna:word@nas/cards/a.mp4"]
 
 
 @pytest.fixture
