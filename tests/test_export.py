@@ -441,6 +441,10 @@ def test_a_yolo_folder_has_a_file_for_each_frame(tmp_path):
     assert write_boxes(boxes, tmp_path / "boxes", format="yolo", shape=(100, 200)) == 1
     texts = {path.name: path.read_text() for path in (tmp_path / "boxes" / "labels").iterdir()}
     assert texts == {"a.txt": "0 0.150000 0.400000 0.200000 0.400000 0.500000\n", "b.txt": ""}
+    with pytest.raises(InvalidInputError, match=r"the frames 'x/a.jpg' and 'y/a.jpg', which are one file"):
+        write_boxes([("x/a.jpg", found), ("y/a.jpg", found)], tmp_path / "c", format="yolo", shape=(9, 9))
+    write_tracks([(0, 1, 0, 0, 5, 5, -1e4)], tmp_path / "low", format="yolo", shape=(10, 10))
+    assert (tmp_path / "low" / "labels" / "000000.txt").read_text().split()[5:] == ["0.000000", "1"]
 
 
 def test_memory_does_not_grow_with_the_number_of_parquet_rows(tmp_path, monkeypatch):

@@ -116,6 +116,8 @@ def test_a_source_that_is_opened_already(clip, detector):
 def test_bad_arguments(clip, detector, tmp_path):
     with pytest.raises(InvalidInputError, match=r"model is a detector, .* got every in addition"):
         track(clip, detector, every=2)
+    with pytest.raises(InvalidInputError, match="show must be True or False; got 'yes'"):
+        track(clip, detector, show="yes")
     with pytest.raises(InvalidInputError, match=r"source missing\.mp4 does not exist"):
         track("missing.mp4", random_mixture(), stream=True)
     (tmp_path / "text.mp4").write_text("no video")

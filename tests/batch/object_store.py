@@ -81,6 +81,10 @@ class LoopbackFileSystem(AbstractFileSystem):
     protocol = "loopback"
     cachable = False
 
+    @classmethod
+    def _strip_protocol(cls, path):
+        return super()._strip_protocol(path).rpartition("@")[2]
+
     def _ask(self, command, path, data=None):
         connection = http.client.HTTPConnection("127.0.0.1", int(os.environ[PORT]), timeout=10)
         with contextlib.closing(connection):

@@ -70,7 +70,7 @@ def test_a_killed_worker_is_replaced(many, model, tmp_path, start_batch):
     assert "warning: " in errors
     assert "drive e.mp4: " in errors
     check_whole(out, done=TRIPS - 1, failed=1)
-    assert not list((tmp_path / "scratch").glob("vehicle-batch*"))
+    assert not list((tmp_path / "scratch").glob("*vehicle-batch*"))
 
 
 def test_a_killed_batch_is_resumed_by_the_same_command(many, model, tmp_path, start_batch):
@@ -88,7 +88,7 @@ def test_a_killed_batch_is_resumed_by_the_same_command(many, model, tmp_path, st
     assert len(before) < TRIPS
     skipped = int(printed.split(" skipped")[0].rpartition(" ")[2])
     assert skipped >= len(before)
-    assert not list((tmp_path / "scratch").glob("vehicle-batch*"))
+    assert not list((tmp_path / "scratch").glob("*vehicle-batch*"))
 
 
 def test_a_disk_that_is_full_in_the_middle(many, model, tmp_path, start_batch):
@@ -110,7 +110,7 @@ def test_a_disk_that_is_full_in_the_middle(many, model, tmp_path, start_batch):
     assert code == 0, errors
     after = check_whole(out, done=TRIPS - 1, failed=1)
     assert before.items() <= after.items(), "a trip was done twice"
-    assert not list((tmp_path / "scratch").glob("vehicle-batch*"))
+    assert not list((tmp_path / "scratch").glob("*vehicle-batch*"))
 
 
 def test_two_batches_on_one_folder_share_the_work(many, model, tmp_path, start_batch):
@@ -133,12 +133,12 @@ def test_an_interrupt_ends_the_workers(many, model, tmp_path, start_batch):
     assert (code, errors) == (130, "interrupted\n")
     assert children
     assert not any(Path(f"/proc/{child}").exists() for child in children)
-    assert not list((tmp_path / "scratch").glob("vehicle-batch*"))
+    assert not list((tmp_path / "scratch").glob("*vehicle-batch*"))
 
 
 def test_a_worker_that_dies_in_every_attempt_is_an_error(card, model, tmp_path, monkeypatch):
     before = child_processes()
-    monkeypatch.setattr("vehicle_detection.batch.run.run_trip", suicide)
+    monkeypatch.setattr("vehicle_detection.batch.run.run_trip", kill_this_process)
     report = run_batch(card / "20260131_093000_F.mp4", tmp_path / "out", model=model, jobs=1, progress=False)
     assert counts(report) == (0, 0, 1, 0)
     assert "the worker process ended (signal 9), 3 times" in next(iter(report.messages.values()))
@@ -146,7 +146,7 @@ def test_a_worker_that_dies_in_every_attempt_is_an_error(card, model, tmp_path, 
     assert child_processes() == before
 
 
-def suicide(task):
+def kill_this_process(task):
     os.kill(os.getpid(), signal.SIGKILL)
 
 

@@ -5,15 +5,17 @@ import os
 import signal
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 
 from tests.batch.helpers import check_whole, counts, run
 from tests.batch.object_store import PORT, SITE, ObjectStore
 from vehicle_detection import batch_status
+from vehicle_detection.batch import plan
 from vehicle_detection.batch.plan import list_videos
 from vehicle_detection.batch.store import open_store
-from vehicle_detection.errors import OutputError
+from vehicle_detection.errors import OutputError, TransientVideoError
 
 fsspec = pytest.importorskip("fsspec")
 
@@ -22,9 +24,18 @@ def test_remote_sources_are_listed():
     for name in ("a.mp4", "b.MP4", "c.txt"):
         with fsspec.open(f"memory://fleet/day/{name}", "wb") as file:
             file.write(b"x")
-    expected = ["memory:///fleet/day/a.mp4", "memory:///fleet/day/b.MP4"]
+    expected = ["memory://fleet/day/a.mp4", "memory://fleet/day/b.MP4"]
     for source in ("memory://fleet/day/*", "memory://fleet"):
         assert list(list_videos([source])) == expected
+
+
+def test_files_of_a_server_are_listed_with_its_name(monkeypatch):
+    files = {"/cards/a.mp4": {"type": "file", "size": 3}, "/cards/note.txt": {"type": "file", "size": 1}}
+    server = SimpleNamespace(
+        invalidate_cache=lambda: None, isdir=lambda path: True, find=lambda path, detail: files
+    )
+    monkeypatch.setattr(plan, "open_filesystem", lambda url: (server, "/cards"))  # as that of FTP
+    assert list(list_videos(["ftp://anna:word@nas/cards/"])) == ["ftp://anna:word@nas/cards/a.mp4"]
 
 
 @pytest.fixture
@@ -135,3 +146,29 @@ def test_a_store_is_the_same_for_a_folder_and_a_url(tmp_path, bucket):
         assert opened.list_files("tracks") == ["tracks/day/cd-2.txt"]
         with opened.lock("ab") as locked:
             assert locked
+
+
+def test_passwords_are_neither_stored_nor_printed(clip, model, tmp_path, bucket):
+    """The user and password of sources and of the output, in records, errors and the summary."""
+    bucket.fails = lambda: False
+    bucket.objects["cam/drive.mp4"] = clip.read_bytes()
+    sources = ["loopback://anna:pa@ss@cam/drive.mp4", "loopback://anna:pa@ss@cam/missing.mp4"]
+    out = "loopback://bob:word@results"
+    report = run(sources, out, model, tracks_only=True)
+    assert counts(report) == (1, 1, 0, 0)
+    assert dict(report.messages) == {
+        "loopback://***@cam/missing.mp4": (
+            "source loopback://***@cam/missing.mp4 does not exist; check the URL"
+        )
+    }
+    stored = b"".join(data for key, data in bucket.objects.items() if key.startswith("results/"))
+    for secret in (b"anna", b"ss@", b"bob", b"word"):
+        assert secret not in stored
+    # A new password changes nothing.
+    changed = [source.replace("pa@ss", "new") for source in sources]
+    assert counts(run(changed, out, model, tracks_only=True)) == (0, 0, 0, 2)
+    bucket.fails = lambda: True
+    with pytest.raises(OutputError, match=r"^loopback://\*\*\*@results/records cannot be listed"):
+        batch_status(out)
+    with pytest.raises(TransientVideoError, match=r"^loopback://\*\*\*@cam cannot be listed"):
+        list_videos(["loopback://anna:pa@ss@cam"])

@@ -344,7 +344,7 @@ def test_results_take_the_ids_of_a_foreign_ground_truth(tmp_path):
             boxes_of(("a.jpg", 1, CAR), ("a.png", 1, CAR)),
             "t",
             {"format": "yolo", "shape": (9, 9)},
-            "frames 'a.jpg' and 'a.png', which are one file in YOLO",
+            "the frames 'a.jpg' and 'a.png', which are one file in YOLO; rename them",
         ),
         (boxes_of((0, 1, CAR)), "t.csv", {"truth": "x.json"}, "truth must be None for the format 'csv'"),
     ],

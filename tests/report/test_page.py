@@ -102,6 +102,11 @@ class TestPage:
         name = b"road \xff.mp4".decode("utf-8", "surrogateescape")
         assert "Vehicles in road ?.mp4" in write_report(tmp_path, FRAMES, source=name)
 
+    def test_a_url_is_shown_without_its_password(self, tmp_path):
+        text = write_report(tmp_path, FRAMES[:1], source="rtsp://anna:se@cret@camera")
+        assert "Vehicles in ***@camera" in text
+        assert "anna" not in text
+
     def test_a_run_without_a_video(self, tmp_path):
         text = write_report(tmp_path, FRAMES)
         parsed = StrictParser(text)

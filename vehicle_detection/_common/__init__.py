@@ -31,6 +31,7 @@ from vehicle_detection._common.threads import (
     resolve_jobs,
     single_threaded_opencv,
 )
+from vehicle_detection._common.urls import hide_credentials, is_url
 from vehicle_detection._common.workspace import NEW_ARRAYS, Workspace
 
 check_environment()
@@ -65,7 +66,9 @@ __all__ = [
     "degrade_patches",
     "describe",
     "finite_array",
+    "hide_credentials",
     "image_size",
+    "is_url",
     "mirror_patches",
     "progress_bar",
     "read_model",

@@ -11,9 +11,10 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 from vehicle_detection import __version__
-from vehicle_detection._common import check_path, describe
+from vehicle_detection._common import check_path, describe, hide_credentials, is_url
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection.video import (
     Trip,
@@ -24,7 +25,7 @@ from vehicle_detection.video import (
     with_retries,
 )
 
-_URL = re.compile(r"^[a-zA-Z][a-zA-Z0-9+.-]+://")
+_PASSWORD = re.compile(r"(?<=://)([^\s/?#:@]*):[^\s/?#]*@")
 _ID_DIGITS = _HASH_DIGITS = 12
 
 
@@ -41,11 +42,13 @@ def list_videos(sources: Iterable[str | os.PathLike[str]]) -> dict[str, Facts]:
                 f"sources must be files, folders, patterns or URLs, got {describe(source)}; pass strings"
             )
         text = os.fspath(source)
-        if not _URL.match(text):
+        if text.startswith("file://"):
+            text = unquote(text.removeprefix("file://"))
+        if not is_url(text):
             check_path(text, "sources", kind="a file, folder or pattern")
-        files = dict(_list_remote(text) if _URL.match(text) else _list_local(Path(text)))
+        files = dict(_list_remote(text) if is_url(text) else _list_local(Path(text)))
         if not files:
-            raise InvalidInputError(f"sources {text} holds no videos; check the path")
+            raise InvalidInputError(f"sources {hide_credentials(text)} holds no videos; check the path")
         found.update(files)
     if not found:
         raise InvalidInputError("sources must name at least one video, got none; pass files or folders")
@@ -71,24 +74,32 @@ def _list_remote(url: str) -> Iterator[tuple[str, Facts]]:
         return
     filesystem, path = open_filesystem(url)
     filesystem.invalidate_cache()
+    # `unstrip_protocol` omits the host of FTP and the like.
+    whole = url.rstrip("/")
+    start = whole.removesuffix(path.rstrip("/"))
+
+    def url_of(name: str) -> str:
+        return f"{start}{name}" if start != whole else str(filesystem.unstrip_protocol(name))
+
     try:
         if glob.has_magic(path):
             found = with_retries(lambda: filesystem.glob(path, detail=True))
         elif with_retries(lambda: filesystem.isdir(path)):
             found = with_retries(lambda: filesystem.find(path, detail=True))
         else:
-            yield str(filesystem.unstrip_protocol(path)), {}
+            yield url_of(path), {}
             return
     except Exception as error:  # each storage has its own
-        raise TransientVideoError(f"{url} cannot be listed ({error}); check the connection") from error
+        message = f"{url} cannot be listed ({error}); check the connection and permissions"
+        raise TransientVideoError(hide_credentials(message)) from error
     for name, facts in found.items():
         if is_video_file(name) and facts.get("type") != "directory":
-            yield str(filesystem.unstrip_protocol(name)), facts
+            yield url_of(name), facts
 
 
 def group_files(files: Sequence[str], group: str) -> list[Trip]:
     """Group files into trips, or make each file a trip."""
-    named = [file if _URL.match(file) else Path(file) for file in files]
+    named = [file if is_url(file) else Path(file) for file in files]
     if group == "file":
         return [trip for file in named for trip in find_trips([file])]
     return find_trips(named, duration=_duration)
@@ -97,7 +108,7 @@ def group_files(files: Sequence[str], group: str) -> list[Trip]:
 def _duration(file: Path | str) -> float:
     """Length of a local video in seconds; 0 if it is unknown, so that a new trip begins after it."""
     try:
-        return 0.0 if _URL.match(str(file)) else probe_video(file).duration
+        return 0.0 if is_url(str(file)) else probe_video(file).duration
     except (InvalidInputError, VideoError):  # reported when its trip is processed
         return 0.0
 
@@ -108,8 +119,9 @@ def trip_id(trip: Trip) -> str:
 
 
 def source_id(uri: str) -> str:
-    """Identity of a file: a hash of its path or URL."""
-    return hashlib.sha256(uri.encode("utf-8", "surrogateescape")).hexdigest()[:_ID_DIGITS]
+    """Identity of a file: a hash of its path or URL, which a new password does not change."""
+    named = _PASSWORD.sub(r"\1@", uri) if is_url(uri) else uri
+    return hashlib.sha256(named.encode("utf-8", "surrogateescape")).hexdigest()[:_ID_DIGITS]
 
 
 def plan_trip(
@@ -118,13 +130,18 @@ def plan_trip(
     """Describe the work on a trip as plain values, for a worker on any machine.
 
     Its ``key`` is the trip's identity and a hash of everything that the results depend on. `known` are the
-    facts of `list_videos`.
+    facts of `list_videos`. The worker opens ``files``; the record gets ``sources``, without passwords.
     """
-    sources = [_identify(str(file), known.get(str(file), {})) for file in trip.files]
+    files = [str(file) for file in trip.files]
+    sources = [
+        {"uri": hide_credentials(file) if is_url(file) else file, **_identify(file, known.get(file, {}))}
+        for file in files
+    ]
     facts = [sources, dict(settings), fingerprint, __version__]
     digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:_HASH_DIGITS]
     return {
         "key": f"{trip_id(trip)}-{digest}",
+        "files": files,
         "sources": sources,
         "camera": trip.camera,
         "date": _date(trip, sources[0]),
@@ -134,20 +151,20 @@ def plan_trip(
 
 
 def _identify(uri: str, facts: Facts) -> dict[str, Any]:
-    """Path or URL of a file, its size, and its modification time or entity tag."""
+    """Size of a file, and its modification time or entity tag."""
     try:
         if uri.startswith(("http://", "https://")):
-            return {"uri": uri, **with_retries(lambda: _identify_http(uri))}
-        if _URL.match(uri):
+            return with_retries(lambda: _identify_http(uri))
+        if is_url(uri):
             filesystem, path = open_filesystem(uri)
             info = facts or with_retries(lambda: filesystem.info(path))
             names = ("ETag", "etag", "md5Hash", "mtime", "LastModified", "last_modified", "created")
             tag = next((str(info[name]) for name in names if info.get(name)), "")
-            return {"uri": uri, "size": info.get("size"), "tag": tag}
+            return {"size": info.get("size"), "tag": tag}
         stat = os.stat(uri)
     except Exception:  # each storage has its own; reported when its trip is processed
-        return {"uri": uri, "size": None, "tag": ""}
-    return {"uri": uri, "size": stat.st_size, "tag": str(stat.st_mtime_ns)}
+        return {"size": None, "tag": ""}
+    return {"size": stat.st_size, "tag": str(stat.st_mtime_ns)}
 
 
 def _identify_http(url: str) -> dict[str, Any]:
@@ -170,6 +187,6 @@ def _date(trip: Trip, source: Mapping[str, Any]) -> str:
     if trip.start is not None:
         return trip.start.date().isoformat()
     tag = source["tag"]
-    if tag and not _URL.match(source["uri"]):
+    if tag and not is_url(source["uri"]):
         return datetime.datetime.fromtimestamp(int(tag) / 1e9, datetime.UTC).date().isoformat()
     return "unknown"

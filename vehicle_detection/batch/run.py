@@ -25,6 +25,7 @@ from vehicle_detection._common import (
     check_sequence,
     check_type,
     describe,
+    hide_credentials,
     progress_bar,
 )
 from vehicle_detection.batch.plan import group_files, list_videos, plan_trip, source_id, trip_id
@@ -383,7 +384,7 @@ def _outcome(
 
 def _lost_record(task: Mapping[str, Any], error: Exception, store: Store) -> dict[str, Any]:
     """Record a trip that has ended its worker in every attempt."""
-    record = _basic_record(task, f"{error}, {_ATTEMPTS} times")
+    record = _basic_record(task, hide_credentials(f"{error}, {_ATTEMPTS} times"))
     try:
         write_record(store, record)
     except OSError as full:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 from urllib.parse import unquote
 
-from vehicle_detection._common import atomic_write, check_path, describe
+from vehicle_detection._common import atomic_write, check_path, describe, hide_credentials, is_url
 from vehicle_detection.errors import InvalidInputError, OutputError, VehicleDetectionError
 from vehicle_detection.video import open_filesystem, with_retries
 
@@ -24,7 +24,7 @@ class Store(Protocol):
     """A folder or URL with the results of a batch."""
 
     name: str
-    """What errors and the settings of workers call it."""
+    """Path or URL, with which a worker opens it."""
 
     def exists(self, path: str) -> bool:
         """Whether there is a file."""
@@ -58,7 +58,7 @@ def open_store(out: str | os.PathLike[str], *, create: bool = False) -> Store:
     text = os.fsdecode(out)
     if text.startswith("file://"):
         text = unquote(text.removeprefix("file://"))
-    if "://" in text:
+    if is_url(text):
         return RemoteStore(text)
     folder = Path(os.path.abspath(check_path(text, "out", kind="a folder or a URL")))
     if create:
@@ -166,6 +166,7 @@ class RemoteStore:
 
     def __init__(self, url: str) -> None:
         self.name = url.rstrip("/")
+        self._shown = hide_credentials(self.name)
         self._files, root = open_filesystem(self.name, "out")
         self._root = root.rstrip("/")
 
@@ -175,9 +176,9 @@ class RemoteStore:
         except (FileNotFoundError, VehicleDetectionError):
             raise
         except Exception as error:  # each storage has its own
-            reason = " ".join(str(error).split()) or type(error).__name__
+            reason = hide_credentials(" ".join(str(error).split())) or type(error).__name__
             raise OutputError(
-                f"{self.name}{what} ({reason}); check the connection and permissions"
+                f"{self._shown}{what} ({reason}); check the connection and permissions"
             ) from error
 
     def _path(self, path: str) -> str:
@@ -247,7 +248,8 @@ class RemoteStore:
         try:
             self._request(what, lambda: request(target))
         except FileNotFoundError:
-            self._files.makedirs(target.rpartition("/")[0], exist_ok=True)
+            folder = target.rpartition("/")[0]
+            self._request(what, lambda: self._files.makedirs(folder, exist_ok=True))
             self._request(what, lambda: request(target))
 
     def remove(self, path: str) -> None:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import platform
-import shutil
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from vehicle_detection import __version__
-from vehicle_detection._common import ParquetRows
+from vehicle_detection._common import ParquetRows, hide_credentials, is_url, temporary_folder
 from vehicle_detection.batch.records import (
     DONE,
     ERROR,
@@ -92,7 +91,7 @@ def run_trip(task: Mapping[str, Any]) -> dict[str, Any]:
 
 def _failure(error: Exception) -> dict[str, Any]:
     """Status and message of an error: of the source, or of the machine, which may go away."""
-    message = " ".join(str(error).split())
+    message = hide_credentials(" ".join(str(error).split()))
     if not isinstance(error, VehicleDetectionError):
         return {"status": ERROR, "message": f"{type(error).__name__}: {message}"}
     passing = isinstance(error, (TransientVideoError, OSError))  # an OutputError is an OSError
@@ -136,16 +135,16 @@ def _process(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
 
 def _open(task: Mapping[str, Any], folder: Path) -> FrameSource:
     """Open the files of a trip; several remote ones are copied first, which one source does itself."""
-    uris = [source["uri"] for source in task["sources"]]
-    if len(uris) == 1:
-        return open_source(uris[0])
+    files = task["files"]
+    if len(files) == 1:
+        return open_source(files[0])
     paths = []
-    for number, uri in enumerate(uris):
-        if "://" in uri:
+    for number, file in enumerate(files):
+        if is_url(file):
             (folder / str(number)).mkdir()
-            paths.append(download(uri, folder / str(number)))
+            paths.append(download(file, folder / str(number)))
         else:
-            paths.append(Path(uri))
+            paths.append(Path(file))
     return open_source(paths)
 
 
@@ -174,17 +173,13 @@ class _TrackTable:
         self._table.__exit__(*error)
 
 
-@contextlib.contextmanager
-def _scratch(store: Store, key: str) -> Iterator[Path]:
-    """Empty folder on a local disk, where ffmpeg writes; what a killed process left there is removed."""
+def _scratch(store: Store, key: str) -> AbstractContextManager[Path]:
+    """Empty folder on a local disk, where ffmpeg writes; what a killed process left there is removed.
+
+    Another process may work on the same trip of a store without locks, and has its own folder.
+    """
     batch = hashlib.sha256(store.name.encode("utf-8", "surrogateescape")).hexdigest()[:8]
-    folder = Path(tempfile.gettempdir()) / f"vehicle-batch-{batch}-{key}"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(mode=0o700)
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    return temporary_folder(Path(tempfile.gettempdir()), f"vehicle-batch-{batch}-{key}")
 
 
 def _remove_earlier(store: Store, task: Mapping[str, Any]) -> None:

@@ -85,6 +85,7 @@ def batch(
         return
     if not sources:
         raise InvalidInputError("SOURCES... must name at least one video, folder, pattern or URL")
+    from vehicle_detection._common import hide_credentials
     from vehicle_detection.batch import open_dask, run_batch
 
     options: dict[str, Any] = {
@@ -122,7 +123,7 @@ def batch(
     _write_summary(output, summary)
     if not quiet:
         typer.echo(str(done))
-        typer.echo(f"wrote {output}" + (f", {summary}" if summary else ""))
+        typer.echo(f"wrote {hide_credentials(output)}" + (f", {summary}" if summary else ""))
     if done.errors:  # the machine's fault: a job that is started again does the rest
         raise typer.Exit(1)
 

@@ -20,10 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import (
-    check_flags,
-    check_number,
-)
+from vehicle_detection._common import check_flags, check_number
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.frame_boxes import FrameBoxes, FrameKey
 from vehicle_detection.evaluation.matching import DetectionMatches, match_detections, prepare_evaluation

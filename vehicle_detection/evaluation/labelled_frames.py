@@ -10,13 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    check_image,
-    check_integer,
-    check_number,
-    check_type,
-    describe,
-)
+from vehicle_detection._common import check_image, check_integer, check_number, check_type, describe
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.frame_boxes import FrameBoxes, FrameKey, count_noun

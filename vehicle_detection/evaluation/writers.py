@@ -156,8 +156,10 @@ def _check_holds(labels: FrameBoxes, kind: str) -> None:
         raise InvalidInputError(
             f"labels must have numbered frames for MOT, got {names[0]!r}; number them with labels.renamed"
         )
-    if kind == "yolo":
-        _check_yolo(labels)
+    if kind == "yolo" and labels.ignore.any():
+        raise InvalidInputError(
+            "labels hold boxes marked ignore, which YOLO cannot mark; drop them with labels[~labels.ignore]"
+        )
     if kind in ("mot", "coco_results") and labels.scores is not None and labels.ignore.any():
         raise InvalidInputError(
             f"labels hold predictions marked ignore, which the format {kind!r} cannot mark; drop them with "
@@ -165,20 +167,6 @@ def _check_holds(labels: FrameBoxes, kind: str) -> None:
         )
     if kind == "coco_results" and labels.scores is None and len(labels):
         raise InvalidInputError("labels need scores for COCO results; write labels as a data set ('coco')")
-
-
-def _check_yolo(labels: FrameBoxes) -> None:
-    if labels.ignore.any():
-        raise InvalidInputError(
-            "labels hold boxes marked ignore, which YOLO cannot mark; drop them with labels[~labels.ignore]"
-        )
-    stems: dict[str, str] = {}
-    for key in labels.frame_keys:
-        if isinstance(key, str) and stems.setdefault(Path(key).stem, key) != key:
-            raise InvalidInputError(
-                f"labels hold frames {stems[Path(key).stem]!r} and {key!r}, which are one file in YOLO; "
-                "rename them with labels.renamed"
-            )
 
 
 def _records(labels: FrameBoxes) -> Iterator[dict[str, Any]]:

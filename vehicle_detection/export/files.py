@@ -209,6 +209,7 @@ class _YoloFolder:
 
     def __init__(self, folder: Path, shape: tuple[int, ...]) -> None:
         self._folder, self._shape = folder, shape
+        self._frames: dict[str, str] = {}  # named frames, by the name of their file
 
     def add_frame(self, frame: int | str) -> None:
         """Create the file of a frame, which stays empty without boxes."""
@@ -220,13 +221,23 @@ class _YoloFolder:
         x, y = (row.x1 + row.x2) / 2 / width, (row.y1 + row.y2) / 2 / height
         words = ["0", *(f"{v:.6f}" for v in (x, y, (row.x2 - row.x1) / width, (row.y2 - row.y1) / height))]
         if row.score is not None:  # a label has five columns only
-            known = 1 / (1 + math.exp(-row.score)) if row.confidence is None else row.confidence
+            # math.exp overflows beyond 709.
+            known = 1 / (1 + math.exp(min(-row.score, 700))) if row.confidence is None else row.confidence
             words += [f"{known:.6f}"] + ([] if row.track_id is None else [str(row.track_id)])
         with self._file_of(row.frame).open("a", encoding="utf-8", newline="") as file:
             file.write(" ".join(words) + "\n")
 
     def _file_of(self, frame: int | str) -> Path:
-        name = f"{frame:06d}" if isinstance(frame, int) else Path(frame).stem
+        if isinstance(frame, str):
+            name = Path(frame).stem
+            other = self._frames.setdefault(name, frame)
+            if other != frame:
+                raise InvalidInputError(
+                    f"path cannot hold the frames {other!r} and {frame!r}, which are one file in YOLO; "
+                    "rename them"
+                )
+        else:
+            name = f"{frame:06d}"
         return self._folder / f"{name}.txt"
 
 

@@ -16,6 +16,8 @@ from vehicle_detection._common import (
     check_sequence,
     check_target,
     check_type,
+    hide_credentials,
+    is_url,
 )
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events import Event, TrackLog, find_events
@@ -74,8 +76,8 @@ class ReportWriter:
         given: dict[str, Any] = {"path": path, "video": video, "source": source}
         for name, value in given.items():
             # A URL may have longer parts than a path.
-            is_url = name == "source" and isinstance(value, str) and "://" in value
-            if (value is not None or name == "path") and not is_url:
+            from_url = name == "source" and isinstance(value, str) and is_url(value)
+            if (value is not None or name == "path") and not from_url:
                 check_path(value, name)
         self._path = Path(path)
         if self._path.suffix.lower() not in (".html", ".htm"):
@@ -87,7 +89,7 @@ class ReportWriter:
             if value is not None and os.path.realpath(value) == os.path.realpath(self._path):
                 raise InvalidInputError(f"path {self._path} is also the {name}; choose another name")
         self._video = None if video is None else Path(video)
-        self._source = None if source is None else Path(source).name
+        self._source = None if source is None else Path(hide_credentials(os.fspath(source))).name
         self._detector = detector
         self._embed_limit = check_integer(embed_limit, "embed_limit", low=0)
         self.log = TrackLog()

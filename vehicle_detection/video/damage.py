@@ -12,7 +12,7 @@ import sys
 from fractions import Fraction
 from pathlib import Path
 
-from vehicle_detection.video.ffmpeg import Process, VideoInfo, input_options, last_line
+from vehicle_detection.video.ffmpeg import Process, VideoInfo, input_options, last_line, source_name
 
 # Error of a frame rate that ffmpeg has derived from the file's times.
 _RATE_ERROR = Fraction(6, 1000)
@@ -33,7 +33,7 @@ def find_damage(path: Path | str, info: VideoInfo, end: int, log: str, *, stop: 
         parts.append(f"{expected - end} of {expected} frames cannot be decoded")
     if count:
         parts.append(f"ffmpeg reports {count} decoding error{'s' * (count > 1)} ({message})")
-    return f"{path} is damaged: {', and '.join(parts)}; copy or record it again" if parts else ""
+    return f"{source_name(path)} is damaged: {', and '.join(parts)}; copy or record it again" if parts else ""
 
 
 def _decode_errors(log: str) -> tuple[int, str]:

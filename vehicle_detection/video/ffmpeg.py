@@ -24,7 +24,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import IO, Any
 
-from vehicle_detection._common import Limit
+from vehicle_detection._common import Limit, hide_credentials
 from vehicle_detection.errors import TransientVideoError, VideoError
 from vehicle_detection.video.yuv import ColorEncoding
 
@@ -104,6 +104,11 @@ def input_options(path: Path | str) -> tuple[str, ...]:
     return (*limit, "-reconnect", "1", "-reconnect_delay_max", "4", "-i", path)
 
 
+def source_name(path: Path | str) -> str:
+    """Name of a file or URL in messages."""
+    return str(path) if isinstance(path, Path) else hide_credentials(path)
+
+
 def probe(path: Path | str) -> VideoInfo:
     """Read the properties of a video and decode its first frame; raise a VideoError if there is none."""
     # Python raises KeyboardInterrupt in the main thread only; another thread cannot lose the started process.
@@ -115,25 +120,26 @@ def _probe(path: Path | str) -> VideoInfo:
     # "V" excludes cover pictures. Only the showinfo filter prints the exact frame rate.
     options = ("-map", "0:V:0", "-frames:v", "1", "-vf", "showinfo", "-f", "null", "-")
     source = ("-nostdin", *pixel_limit(), *input_options(path))
+    name = source_name(path)
     with contextlib.closing(Process((*source, *options), level="info")) as process:
         code = process.wait()
         log = process.log()
     if code < 0:
-        raise video_error(f"{path} cannot be read: {exit_reason(code, log)}", path, code, log)
-    check_frame_size(str(path), log)
+        raise video_error(f"{name} cannot be read: {exit_reason(code, log)}", path, code, log)
+    check_frame_size(name, log)
     header, mapped, decoded = log.partition("Stream mapping:")
     if not re.search(r"^Input #0", header, re.MULTILINE):
         if _is_text(Path(path)):
-            raise VideoError(f"{path} is a text file, not a video; choose the video")
+            raise VideoError(f"{name} is a text file, not a video; choose the video")
         truncated = "moov atom not found" in log
         reason = "its index is missing: the recording or copy is incomplete" if truncated else last_line(log)
-        message = f"{path} is not a video that ffmpeg can read ({reason}); record or copy it again"
+        message = f"{name} is not a video that ffmpeg can read ({reason}); record or copy it again"
         raise video_error(message, path, code, log)
     if not mapped:
-        raise VideoError(f"{path} has no video track; choose a file with one")
+        raise VideoError(f"{name} has no video track; choose a file with one")
     frame = re.search(r"n: *0 .*?pts_time:(\S+).*? sar:(\d+)/(\d+) s:(\d+)x(\d+)", decoded)
     if frame is None:
-        message = f"{path} has no frame that can be decoded ({last_line(log)}); copy it again"
+        message = f"{name} has no frame that can be decoded ({last_line(log)}); copy it again"
         raise video_error(message, path, code, log)
     start_time, width, height = frame[1], int(frame[4]), int(frame[5])
     aspect = int(frame[2]), int(frame[3])
@@ -391,10 +397,10 @@ class Process:
                 stream.close()
 
     def log(self) -> str:
-        """Return the log, or its last 256 KiB."""
+        """Return the log, or its last 256 KiB, without the passwords of URLs."""
         size = self._log.seek(0, os.SEEK_END)
         self._log.seek(max(0, size - (1 << 18)))
-        return self._log.read().decode("utf-8", "replace")
+        return hide_credentials(self._log.read().decode("utf-8", "replace"))
 
 
 def _enlarge(pipe: IO[bytes] | None) -> None:

@@ -51,7 +51,7 @@ class _LiveProcess:
     def __init__(
         self, name: str, options: Sequence[str], *, stdin: int | None, like: VideoInfo | None, timed: bool
     ) -> None:
-        self.name, self._input, self._timed = name, options[-1], timed
+        self.name, self._timed = name, timed
         self._stalled = False
         filters = "crop=trunc(iw/2)*2:trunc(ih/2)*2,scale=out_color_matrix=bt601:out_range=tv"
         rate: tuple[str, ...] = ()
@@ -70,7 +70,9 @@ class _LiveProcess:
         size = re.match(rb"YUV4MPEG2 W(\d+) H(\d+) F(\d+):(\d+)", header)
         if size is None:
             if self._stalled:
-                raise TransientVideoError(f"{self.name} sends no video within {_OPEN_TIMEOUT:g} s; check it")
+                raise TransientVideoError(
+                    f"{self.name} sends no video within {_OPEN_TIMEOUT:g} s; check the source"
+                )
             code = self.process.wait()
             check_frame_size(self.name, self.process.log())
             message = f"{self.name} is not a video that ffmpeg can read ({self.reason()}); check the source"
@@ -81,8 +83,8 @@ class _LiveProcess:
         )
 
     def reason(self) -> str:
-        """Last message of ffmpeg, without the password that a URL may hold."""
-        return last_line(self.process.log().replace(self._input, self.name))
+        """Last message of ffmpeg."""
+        return last_line(self.process.log())
 
     def read_planes(self, planes: NDArray[np.uint8]) -> bool:
         """Read the next frame into `planes`; False at the end of the stream."""

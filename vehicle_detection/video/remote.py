@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
+from vehicle_detection._common import hide_credentials
 from vehicle_detection.errors import InvalidInputError, TransientVideoError
 
 Result = TypeVar("Result")
@@ -18,18 +20,22 @@ _FINAL_ERRORS = (FileNotFoundError, PermissionError, NotImplementedError, TypeEr
 
 def download(url: str, folder: Path) -> Path:
     """Copy a file from storage that fsspec knows to a folder."""
-    path = folder / (url.rstrip("/").rpartition("/")[2] or "video")
+    path, name = folder / (url.rstrip("/").rpartition("/")[2] or "video"), hide_credentials(url)
     try:
         filesystem, remote = open_filesystem(url)
         with_retries(lambda: filesystem.get_file(remote, str(path)))
     except InvalidInputError:
         raise
     except FileNotFoundError:
-        raise InvalidInputError(f"source {url} does not exist; check the URL") from None
+        raise InvalidInputError(f"source {name} does not exist; check the URL") from None
     except PermissionError as error:
-        raise InvalidInputError(f"source {url} is not readable ({error}); check its permissions") from None
+        reason = hide_credentials(str(error))
+        raise InvalidInputError(f"source {name} is not readable ({reason}); check its permissions") from None
     except Exception as error:  # each storage has its own
-        raise TransientVideoError(f"{url} cannot be copied ({error}); check the connection") from error
+        reason = hide_credentials(str(error))
+        is_full = getattr(error, "errno", None) == errno.ENOSPC
+        remedy = "free some space" if is_full else "check the connection"
+        raise TransientVideoError(f"{name} cannot be copied ({reason}); {remedy}") from error
     return path
 
 
@@ -50,14 +56,16 @@ def with_retries(request: Callable[[], Result]) -> Result:
 
 def open_filesystem(url: str, name: str = "source") -> tuple[Any, str]:
     """Return the fsspec file system of a URL, and the path in it; `name` is the argument in errors."""
+    shown = hide_credentials(url)
     try:
         import fsspec
     except ImportError:
         raise InvalidInputError(
-            f"{name} {url} needs fsspec; pip install 'vehicle-detection[batch]', or use a local path"
+            f"{name} {shown} needs fsspec; pip install 'vehicle-detection[batch]', or use a local path"
         ) from None
     try:
         filesystem, path = fsspec.core.url_to_fs(url)
     except (ImportError, ValueError) as error:  # an unknown scheme, or a missing package such as s3fs
-        raise InvalidInputError(f"{name} {url} cannot be opened ({error})") from None
+        reason = hide_credentials(str(error))
+        raise InvalidInputError(f"{name} {shown} cannot be opened ({reason}); check the URL") from None
     return filesystem, str(path)

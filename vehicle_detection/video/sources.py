@@ -13,7 +13,7 @@ from urllib.parse import unquote
 
 from vehicle_detection._common import check_number, check_path, describe
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.video.ffmpeg import NETWORK_TIMEOUT, VideoInfo, input_options, probe
+from vehicle_detection.video.ffmpeg import NETWORK_TIMEOUT, VideoInfo, input_options, probe, source_name
 from vehicle_detection.video.files import IMAGE_SUFFIXES, check_file, list_files
 from vehicle_detection.video.frame_source import FrameSource
 from vehicle_detection.video.image_sequence import ImageSequence
@@ -31,7 +31,7 @@ class _VideoFile(FrameSource):
     """A video file, or the URL of one."""
 
     def __init__(self, path: Path | str, info: VideoInfo) -> None:
-        super().__init__(str(path), info, () if isinstance(path, str) else (path,))
+        super().__init__(source_name(path), info, () if isinstance(path, str) else (path,))
         self._path = path
 
     def read(self, first: int = 0, count: int | None = None, *, strict: bool = False) -> FrameReader:
@@ -203,9 +203,8 @@ def _open_url(url: str, scheme: str, fps: float, live: bool | None, reconnect: b
 
 
 def _open_stream(url: str, options: Sequence[str], live: bool | None, reconnect: bool) -> FrameSource:
-    """Open a network stream; messages do not show a password in its URL."""
-    name = re.sub(r"(?<=://)[^/@]*@", "***@", url)
-    stream = LiveStream(name, options, network=True, reconnect=reconnect)
+    """Open a network stream."""
+    stream = LiveStream(source_name(url), options, network=True, reconnect=reconnect)
     return _Stream(stream, live=live is not False)
 
 
@@ -215,6 +214,6 @@ def _download(url: str) -> FrameSource:
         folder = on_error.enter_context(tempfile.TemporaryDirectory(prefix="vehicle-source-"))
         path = download(url, Path(folder))
         source = _VideoFile(path, probe(path))
-        source.name = url
+        source.name = source_name(url)
         source._on_close = on_error.pop_all()
     return source

@@ -25,6 +25,7 @@ from vehicle_detection.video.ffmpeg import (
     exit_reason,
     input_options,
     pixel_limit,
+    source_name,
     video_error,
 )
 from vehicle_detection.video.yuv import FORMATS, planes_from_rgb, rgb_from_planes
@@ -180,24 +181,24 @@ class FrameReader(_FfmpegStream):
         self.close()
         if self._killed:
             return
-        end = self._first + self.frames_read
+        end, name = self._first + self.frames_read, source_name(self._path)
         complete = self._count is not None and self.frames_read >= self._count
         if not complete and end < self.info.frames - 1 and _TRUNCATED.search(log):
             seconds = math.floor(end / self.info.fps * 100) / 100
             message = (
-                f"{self._path} is incomplete: {end} of about {self.info.frames} frames can be decoded; "
+                f"{name} is incomplete: {end} of about {self.info.frames} frames can be decoded; "
                 f"copy the file again, or end at {seconds:g} s to process the readable part"
             )
             raise video_error(message, self._path, code, log)
         if code and not complete:
             message = (
-                f"{self._path} cannot be decoded after frame {end}: {exit_reason(code, log)}; "
+                f"{name} cannot be decoded after frame {end}: {exit_reason(code, log)}; "
                 "if this happens again, copy the file again"
             )
             raise video_error(message, self._path, code, log)
         if not self.frames_read:
             start = float(self._first / self.info.fps)
-            raise VideoError(f"{self._path} has no frame after {start:g} s; choose an earlier start")
+            raise VideoError(f"{name} has no frame after {start:g} s; choose an earlier start")
         # After a jump into the file, the first frames may refer to frames before it, which is no damage.
         errors = "" if self._sought else log
         stop = None if self._count is None else self._first + self._count

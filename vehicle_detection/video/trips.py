@@ -17,10 +17,7 @@ from datetime import datetime
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
-from vehicle_detection._common import (
-    check_sequence,
-    describe,
-)
+from vehicle_detection._common import check_sequence, describe
 from vehicle_detection.errors import InvalidInputError
 
 File = TypeVar("File", Path, str)
