@@ -166,7 +166,7 @@ def track(
     0 0.0 (720, 1280, 3) 2
     1 0.04 (720, 1280, 3) 0
     """
-    check_flags(stream=stream, progress=progress)
+    check_flags(stream=stream, progress=progress, show=show)
     given = isinstance(model, VehicleDetector)
     if given and options:
         raise InvalidInputError(

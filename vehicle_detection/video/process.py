@@ -203,7 +203,7 @@ def process_video(
     >>> from vehicle_detection import VehicleDetector  # doctest: +SKIP
     >>> print(process_video("drive.mp4", "found.mp4", VehicleDetector()))  # doctest: +SKIP
     """
-    check_flags(audio=audio, strict=strict, progress=progress)
+    check_flags(audio=audio, strict=strict, progress=progress, show=show)
     if on_result is not None and not callable(on_result):
         raise InvalidInputError(f"on_result must be a function of a result, got {describe(on_result)}")
     with VideoRun(
