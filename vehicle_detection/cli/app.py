@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -63,6 +63,10 @@ if TYPE_CHECKING:
 
 BAD_INPUT, DAMAGED, INTERRUPTED = 2, 3, 130  # exit codes
 _CHECKED_IMAGES = 20  # images that are searched again if no vehicle was found
+_UNKNOWN_LENS = (
+    "warning: distances assume a lens of 58 degrees, and may be wrong by a factor of 2 or more; "
+    "pass --fov or --camera"
+)
 
 
 class _Commands(TyperGroup):
@@ -525,23 +529,9 @@ def video(
     }  # fmt: skip
     sources = {"SOURCE": Path(source)} | ({} if gpx is None else {"--gpx": gpx})
     check_distinct_paths(outputs, sources)
-    if output is None and (report or clips):
-        raise InvalidInputError(
-            f"--output must name a video for {'--report' if report else '--clips'}, which contains it; add it"
-        )
-    if not any((output, show, tracks, events, srt)):
-        raise InvalidInputError(
-            "--output must name the video to write; or use --show, --tracks, --events or --srt"
-        )
-    draw_params = _draw_params(
-        labels,
-        line_width=line_width,
-        color_by=color_by,
-        panel=panel,
-        units=units,
-    )
-    if why and (report is None or not Path(source).exists()):
-        raise InvalidInputError("--why needs --report and a source that can be read again, such as a file")
+    _check_outputs(outputs, clips, show=show, why=why)
+    region = _parse_blur(blur)
+    draw_params = _draw_params(labels, line_width=line_width, color_by=color_by, panel=panel, units=units)
     speed = read_speed(own_speed, gpx, gpx_offset)
     side_outputs = SideOutputs(events, clips, srt)
     if not quiet:
@@ -554,8 +544,8 @@ def video(
                 check_format(tracks, None, FORMATS.values())
         loaded = load_model(model)
         if horizon == "auto":
-            with _everywhere(loaded, conf) as detector:
-                fraction = _estimate_horizon(source, detector, start, end, quiet)
+            with _everywhere(loaded, conf) as everywhere:
+                fraction = _estimate_horizon(source, everywhere, start, end, quiet)
         else:
             fraction = None if horizon is None else _parse_horizon(horizon)
         detector = stack.enter_context(
@@ -570,7 +560,7 @@ def video(
                 own_speed=speed,
                 diagnostics=diagnostics,
                 draw_params=draw_params,
-                blur=_parse_blur(blur),
+                blur=region,
             )
         )
         page = None
@@ -584,6 +574,10 @@ def video(
         log = page.log if page else TrackLog()
         writers.append(page or log)
         opened = stack.enter_context(open_source(source, live=live or None, reconnect=not no_reconnect))
+        if why and not opened.rereadable:
+            raise InvalidInputError(
+                f"--why needs a source that can be read again, got {source}; use a file, or omit --why"
+            )
         if tracks is not None:
             with option_names(path="--tracks"):
                 writers.append(stack.enter_context(TrackWriter(tracks, shape=opened.info.shape)))
@@ -607,14 +601,11 @@ def video(
             # After the tracks, whose file is complete when its writer closes.
             stack.close()
             page.finish(done, events=found, pictures=explain_vehicles(detector, source, log) if why else ())
-    if not done.tracks and horizon not in (None, "auto") and not quiet and Path(source).exists():
-        with _everywhere(loaded, conf) as detector:
-            _warn_of_horizon(horizon, estimate_video_horizon(source, detector, start=start, end=end))
+    if not done.tracks and horizon not in (None, "auto") and not quiet and opened.rereadable:
+        with _everywhere(loaded, conf) as everywhere:
+            _warn_of_horizon(horizon, estimate_video_horizon(source, everywhere, start=start, end=end))
     if done.tracks and not detector.lens_is_known and not quiet:
-        print_error(
-            "warning: distances assume a lens of 58 degrees, and may be wrong by a factor of 2 or more; pass "
-            "--fov or --camera"
-        )
+        print_error(_UNKNOWN_LENS)
     if not quiet or profile:
         lines = str(done).splitlines()
         typer.echo("\n".join(lines if profile else lines[:1]))
@@ -625,6 +616,21 @@ def video(
             typer.echo(f"wrote {', '.join(map(str, written))}")
     if done.damage:
         raise typer.Exit(DAMAGED)
+
+
+def _check_outputs(outputs: Mapping[str, Path | None], clips: Path | None, *, show: bool, why: bool) -> None:
+    """Refuse outputs of ``video`` that need another one, and a run without any output."""
+    if outputs["--output"] is None:
+        if outputs["--report"] is not None:
+            raise InvalidInputError("--output must name a video for --report, which contains it; add it")
+        if clips is not None:
+            raise InvalidInputError("--output must name a video for --clips, which are cut out of it; add it")
+    if not show and all(path is None for path in outputs.values()):
+        raise InvalidInputError(
+            "--output must name the video to write; or use --show, --tracks, --events or --srt"
+        )
+    if why and outputs["--report"] is None:
+        raise InvalidInputError("--why needs --report, which shows the explanations; add it")
 
 
 def _draw_params(labels: str, **options: Any) -> DrawParams:
