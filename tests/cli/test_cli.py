@@ -644,6 +644,7 @@ def test_video_writes_subtitles_with_the_own_speed(clip, tmp_path):
     result = run(*words, "--units", "imperial")
     assert (result.exit_code, warning in result.stderr) == (0, True)
     assert "own speed" not in subtitles.read_text()
+    assert "warning" not in run(*words, "--quiet").stderr
 
 
 def test_existing_files_are_replaced_with_a_note(clip, picture, tmp_path):

@@ -312,7 +312,7 @@ def video(
             show=show,
             on_result=lambda result: [write(result) for write in writers],
         )
-        found = side_outputs.find_events(log, done, detector)
+        found = side_outputs.find_events(log, done, detector, quiet=quiet)
         side_outputs.write(log, found, output, done, detector)
         if page is not None:
             # After the tracks, whose file is complete when its writer closes.
