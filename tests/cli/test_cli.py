@@ -34,7 +34,7 @@ from vehicle_detection.images import read_image, write_image
 from vehicle_detection.mixture import load_model
 from vehicle_detection.params import DrawParams
 from vehicle_detection.synthetic import SceneVehicle, render_drive, render_patches, render_scene
-from vehicle_detection.video import probe_video, read_frames
+from vehicle_detection.video import FrameSource, probe_video, read_frames
 
 COMMANDS = ("demo", "detect", "video", "batch", "evaluate", "train", "train-frames", "tune", "fetch", "info")
 HEADER = "frame,track_id,x1,y1,x2,y2,score"
@@ -622,6 +622,18 @@ def test_video_explains_each_vehicle_in_the_report(tmp_path):
     assert "Why these boxes" not in page.read_text()
 
 
+def test_a_source_that_is_read_once_is_not_opened_again(clip, tmp_path, monkeypatch):
+    """Such as a camera or a named pipe, whose path exists."""
+    monkeypatch.setattr(FrameSource, "rereadable", False)
+    words = ["video", clip, "-o", tmp_path / "out.mp4", "--preset", "ultrafast"]
+    page = tmp_path / "page.html"
+    assert "--why needs a source that can be read again" in refuse(*words, "--report", page, "--why")
+    assert contents(tmp_path) == []
+    result = run(*words, "--horizon", 0.95, "--model", "highway")
+    assert result.exit_code == 0
+    assert "no vehicle was found" not in result.stderr
+
+
 def test_video_writes_subtitles_with_the_own_speed(clip, tmp_path):
     target, subtitles, speed = tmp_path / "out.mp4", tmp_path / "out.srt", tmp_path / "speed.csv"
     speed.write_text("time_s,speed_kmh\n100,90\n101,90\n")
@@ -632,6 +644,7 @@ def test_video_writes_subtitles_with_the_own_speed(clip, tmp_path):
     result = run(*words, "--units", "imperial")
     assert (result.exit_code, warning in result.stderr) == (0, True)
     assert "own speed" not in subtitles.read_text()
+    assert "warning" not in run(*words, "--quiet").stderr
 
 
 def test_existing_files_are_replaced_with_a_note(clip, picture, tmp_path):
@@ -752,7 +765,7 @@ def bad_videos(material, tmp):
         r"--gpx \S+none.gpx does not exist": [clip, "-o", target, "--gpx", tmp / "none.gpx"],
         r"--own-speed and --gpx both state": [clip, "-o", target, "--own-speed", 9, "--gpx", tmp / "a.gpx"],
         r"--gpx-offset needs --gpx": [clip, "-o", target, "--gpx-offset", 9],
-        r"--why needs --report and a source that can be read again": [clip, "-o", target, "--why"],
+        r"--why needs --report, which shows": [clip, "-o", target, "--why"],
         r"--clips must be a folder": [clip, "-o", target, "--clips", clip],
         r"--tracks \S+ is also SOURCE \S+;": [tmp / "a.csv", "-o", target, "--tracks", tmp / "a.csv"],
     }

@@ -41,7 +41,7 @@ def test_no_events_give_a_header(tmp_path):
     [
         (EVENTS, "events.txt", "path must end in .csv or .json, got 'events.txt'; write 'events.csv'"),
         (EVENTS, "none/events.csv", "path needs an existing folder"),
-        ([1], "events.csv", "events must be a Event, got 1; pass what find_events returned"),
+        ([1], "events.csv", "events must be an Event, got 1; pass what find_events returned"),
     ],
 )
 def test_bad_files_are_refused(events, name, message, tmp_path):

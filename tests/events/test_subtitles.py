@@ -120,8 +120,8 @@ def test_long_times(tmp_path):
         ({"path": "none/found.srt"}, "path needs an existing folder"),
         ({"log": []}, "log must be a TrackLog"),
         ({"fps": 0}, "fps must be a number, greater than 0"),
-        ({"own_speed": 25.0}, "own_speed must be a OwnSpeed, got 25.0; pass what read_own_speed returns"),
-        ({"events": [1]}, "events must be a Event"),
+        ({"own_speed": 25.0}, "own_speed must be an OwnSpeed, got 25.0; pass what read_own_speed returns"),
+        ({"events": [1]}, "events must be an Event"),
         ({"units": "nautical"}, "units must be one of 'metric', 'imperial'"),
     ],
 )

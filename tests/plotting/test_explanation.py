@@ -46,5 +46,5 @@ def test_a_given_figure_is_used_and_nothing_found_is_said():
 
 
 def test_bad_arguments_are_refused():
-    with pytest.raises(InvalidInputError, match="explanation must be a Explanation, got 1"):
+    with pytest.raises(InvalidInputError, match="explanation must be an Explanation, got 1"):
         plot_explanation(gray_image(), 1)

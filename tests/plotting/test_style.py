@@ -39,7 +39,7 @@ def test_a_single_panel_uses_the_given_axes_or_a_pyplot_figure():
     assert not plt.get_fignums()
     own = plotting.plot_windows(gray_image(), [[1, 2, 30, 40]])
     assert plt.get_fignums() == [own.figure.number]
-    with pytest.raises(InvalidInputError, match="ax must be a Axes, got 'here'"):
+    with pytest.raises(InvalidInputError, match="ax must be an Axes, got 'here'"):
         plotting.plot_windows(gray_image(), [], ax="here")
 
 

@@ -7,7 +7,7 @@ from tools import bad_input
 
 @pytest.fixture(scope="module")
 def outcomes():
-    return bad_input.run("quarter")
+    return bad_input.run("few")
 
 
 def test_only_errors_of_the_library_come_back_and_nothing_is_left(outcomes):

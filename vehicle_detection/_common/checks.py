@@ -35,7 +35,8 @@ def check_type(value: object, name: str, kind: type | tuple[type, ...], remedy: 
     """Raise unless `value` is an instance of `kind`, or of one of several."""
     if not isinstance(value, kind):
         names = " or ".join(each.__name__ for each in (kind if isinstance(kind, tuple) else (kind,)))
-        raise InvalidInputError(f"{name} must be a {names}, got {describe(value)}; {remedy}")
+        article = "an" if names[0] in "AEIOU" else "a"
+        raise InvalidInputError(f"{name} must be {article} {names}, got {describe(value)}; {remedy}")
 
 
 def check_path(path: object, name: str = "path", *, kind: str = "a file name") -> Path:

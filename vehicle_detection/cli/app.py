@@ -1,4 +1,4 @@
-"""The command line, ``vehicle-detection``: errors and exit codes, and the commands on images and video.
+"""The command line, ``vehicle-detection``: errors and exit codes, and the short commands.
 
 Commands import heavy libraries when they run, so that ``--help`` is fast.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,31 +17,22 @@ from typer.core import TyperArgument, TyperGroup
 
 from vehicle_detection import __version__
 from vehicle_detection.cli.batch import batch
+from vehicle_detection.cli.horizon import search_everywhere, warn_of_horizon
 from vehicle_detection.cli.options import (
-    CAMERA,
     DRAWING,
-    HORIZON_HELP,
-    INPUT,
     OUTPUT,
-    SEARCH,
     Blur,
-    CameraHeight,
-    CameraName,
     Confidence,
-    Every,
-    FieldOfView,
     Horizon,
     LineWidth,
     Model,
-    NoAudio,
-    Preset,
     flag,
+    parse_blur,
 )
 from vehicle_detection.cli.output import (
     announce_replaced,
     capture_stderr,
     check_distinct_paths,
-    name_kept_files,
     option_names,
     output_folder,
     print_error,
@@ -53,15 +44,14 @@ from vehicle_detection.cli.output import (
 from vehicle_detection.cli.signals import raise_on_signals
 from vehicle_detection.cli.train import fetch, info, train, train_frames
 from vehicle_detection.cli.tune import tune
+from vehicle_detection.cli.video import video
 from vehicle_detection.errors import DatasetError, InvalidInputError, VehicleDetectionError
 
 if TYPE_CHECKING:
     from vehicle_detection.boxes import Detections
-    from vehicle_detection.camera import HorizonEstimate
     from vehicle_detection.detector import VehicleDetector
-    from vehicle_detection.params import DrawParams
 
-BAD_INPUT, DAMAGED, INTERRUPTED = 2, 3, 130  # exit codes
+BAD_INPUT, INTERRUPTED = 2, 130  # exit codes
 _CHECKED_IMAGES = 20  # images that are searched again if no vehicle was found
 
 
@@ -205,7 +195,7 @@ def detect(
     _check_images(images, output, boxes)
     announce_replaced([boxes])
     with (
-        VehicleDetector(model, conf=conf, horizon=horizon, blur=_parse_blur(blur)) as detector,
+        VehicleDetector(model, conf=conf, horizon=horizon, blur=parse_blur(blur)) as detector,
         output_folder(output, "--output"),
         output_folder(why, "--why"),
     ):
@@ -264,7 +254,7 @@ def _warn_if_empty(
     if total or horizon is None:
         return
     boxes, shape = [np.empty((0, 4))], (1, 1)
-    with _everywhere(detector.model, None) as everywhere:
+    with search_everywhere(detector.model, None) as everywhere:
         for image in map(read_image, images[:_CHECKED_IMAGES]):
             if image.shape[:2] == shape or shape == (1, 1):
                 shape = image.shape[:2]
@@ -272,7 +262,7 @@ def _warn_if_empty(
     estimate = None
     with contextlib.suppress(InvalidInputError):  # too few boxes
         estimate = estimate_horizon(np.concatenate(boxes), shape)
-    _warn_of_horizon(horizon, estimate)
+    warn_of_horizon(horizon, estimate)
 
 
 def _detect_each(
@@ -329,367 +319,7 @@ def _write_explanations(
             picture.savefig(part)
 
 
-@app.command()
-@option_names(target="--output", workers="--jobs", field_of_view="--fov", camera_height_m="--camera-height")
-def video(
-    source: Annotated[
-        str,
-        Argument(
-            metavar="SOURCE",
-            help="Video file; folder or quoted pattern of a trip's segments, or images; URL; camera; or -.",
-        ),
-    ],
-    output: Annotated[
-        Path | None,
-        Option(
-            "-o",
-            "--output",
-            metavar="TARGET",
-            help="Video to write: .mp4, .m4v, .mov or .mkv.",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = None,
-    show: Annotated[
-        bool,
-        flag("--show", panel=OUTPUT, help="Show the annotated frames in a window; Escape ends the run."),
-    ] = False,
-    tracks: Annotated[
-        Path | None,
-        Option(
-            metavar="FILE",
-            help="Tracks: .csv, .jsonl, .parquet, .txt (MOT), .zip (CVAT) or .json (COCO).",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = None,
-    report: Annotated[
-        Path | None,
-        Option(metavar="FILE.html", help="Page with the video and its tracks.", rich_help_panel=OUTPUT),
-    ] = None,
-    why: Annotated[
-        bool,
-        flag(
-            "--why", panel=OUTPUT, help="Explain a box of each vehicle in --report: the share of each cell."
-        ),
-    ] = False,
-    events: Annotated[
-        Path | None,
-        Option(
-            metavar="FILE",
-            help="Events, such as cut-ins and overtaking: .csv or .json.",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = None,
-    clips: Annotated[
-        Path | None,
-        Option(
-            metavar="DIR", help="Folder for a short annotated clip of each event.", rich_help_panel=OUTPUT
-        ),
-    ] = None,
-    srt: Annotated[
-        Path | None,
-        Option(
-            metavar="FILE",
-            help="Subtitles with vehicles, nearest distance and events, second by second: .srt or .ass.",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = None,
-    preset: Preset = "veryfast",
-    no_audio: NoAudio = False,
-    quiet: Annotated[
-        bool, flag("-q", "--quiet", panel=OUTPUT, help="Print errors and warnings of damage only.")
-    ] = False,
-    profile: Annotated[bool, flag("--profile", panel=OUTPUT, help="Print the time of each stage.")] = False,
-    start: Annotated[
-        float | None,
-        Option(metavar="S", help="Start time in seconds, such as 12.5.", rich_help_panel=INPUT),
-    ] = None,
-    end: Annotated[
-        float | None, Option(metavar="S", help="End time in seconds, such as 30.", rich_help_panel=INPUT)
-    ] = None,
-    own_speed: Annotated[
-        float | None,
-        Option(
-            metavar="KM/H",
-            help="Speed of the own vehicle, such as 100, for headways and speeds over ground.",
-            rich_help_panel=INPUT,
-        ),
-    ] = None,
-    gpx: Annotated[
-        Path | None,
-        Option(
-            metavar="FILE",
-            help="Own speed over time: a GPX track, or a .csv table with the columns time_s and speed_kmh.",
-            rich_help_panel=INPUT,
-        ),
-    ] = None,
-    gpx_offset: Annotated[
-        float,
-        Option(
-            metavar="S",
-            help="Seconds from the first point of --gpx to the start of the video, such as 12.5 or -3.",
-            rich_help_panel=INPUT,
-        ),
-    ] = 0.0,
-    live: Annotated[
-        bool,
-        flag(
-            "--live",
-            panel=INPUT,
-            help="Drop frames of a pipe rather than lag; default for cameras and streams.",
-        ),
-    ] = False,
-    no_reconnect: Annotated[
-        bool, flag("--no-reconnect", panel=INPUT, help="End with a network stream that breaks off.")
-    ] = False,
-    strict: Annotated[
-        bool, flag("--strict", panel=INPUT, help="Fail, and write nothing, if the source is damaged.")
-    ] = False,
-    camera: CameraName = None,
-    fov: FieldOfView = None,
-    camera_height: CameraHeight = None,
-    horizon: Annotated[
-        str | None,
-        Option(
-            metavar="F|auto",
-            help=f'{HORIZON_HELP} "auto": estimated from vehicles in a sample of frames.',
-            rich_help_panel=CAMERA,
-        ),
-    ] = None,
-    model: Model = "default",
-    conf: Confidence = None,
-    every: Every = None,
-    jobs: Annotated[
-        int | None,
-        Option(
-            metavar="N",
-            help="Frames searched in parallel; default: one per core, at most 4.",
-            rich_help_panel=SEARCH,
-        ),
-    ] = None,
-    labels: Annotated[
-        str,
-        Option(
-            metavar="LIST",
-            help="Fields of the labels: some of id,distance,speed,score,std, such as id,distance; or none.",
-            rich_help_panel=DRAWING,
-        ),
-    ] = "id,distance,speed",
-    line_width: LineWidth = None,
-    color_by: Annotated[
-        str,
-        Option(
-            metavar="id|distance", help="What the colors of the boxes stand for.", rich_help_panel=DRAWING
-        ),
-    ] = "id",
-    panel: Annotated[
-        str,
-        Option(
-            metavar="corner|side|none",
-            help="Bird's-eye view in the frame's corner, or beside it.",
-            rich_help_panel=DRAWING,
-        ),
-    ] = "none",
-    units: Annotated[
-        str,
-        Option(
-            metavar="metric|imperial",
-            help="Labels, subtitles and report in m and km/h, or ft and mph.",
-            rich_help_panel=DRAWING,
-        ),
-    ] = "metric",
-    blur: Blur = None,
-    diagnostics: Annotated[
-        bool,
-        flag(
-            "--diagnostics",
-            panel=DRAWING,
-            help="Show frame, positive windows, heat map and tracks side by side.",
-        ),
-    ] = False,
-) -> None:
-    """Track the vehicles of a video, and write or show an annotated copy.
-
-    Speeds are relative to the camera, and over ground where its own speed is known (--gpx, --own-speed).
-
-    Exit code 3: the source is damaged, and the copy lacks what cannot be decoded.
-    """
-    from vehicle_detection.cli.events import SideOutputs, explain_vehicles, print_summary, read_speed
-    from vehicle_detection.detector import VehicleDetector
-    from vehicle_detection.events import TrackLog
-    from vehicle_detection.export import FORMATS, TrackWriter, check_format
-    from vehicle_detection.mixture import load_model
-    from vehicle_detection.video import estimate_video_horizon, open_source, process_video
-
-    outputs = {
-        "--output": output, "--tracks": tracks, "--report": report, "--events": events, "--srt": srt,
-    }  # fmt: skip
-    sources = {"SOURCE": Path(source)} | ({} if gpx is None else {"--gpx": gpx})
-    check_distinct_paths(outputs, sources)
-    if output is None and (report or clips):
-        raise InvalidInputError(
-            f"--output must name a video for {'--report' if report else '--clips'}, which contains it; add it"
-        )
-    if not any((output, show, tracks, events, srt)):
-        raise InvalidInputError(
-            "--output must name the video to write; or use --show, --tracks, --events or --srt"
-        )
-    draw_params = _draw_params(
-        labels,
-        line_width=line_width,
-        color_by=color_by,
-        panel=panel,
-        units=units,
-    )
-    if why and (report is None or not Path(source).exists()):
-        raise InvalidInputError("--why needs --report and a source that can be read again, such as a file")
-    speed = read_speed(own_speed, gpx, gpx_offset)
-    side_outputs = SideOutputs(events, clips, srt)
-    if not quiet:
-        announce_replaced(outputs.values())
-    with name_kept_files(outputs.values()), contextlib.ExitStack() as stack:
-        stack.enter_context(output_folder(clips, "--clips"))
-        writers: list[Callable[[Any], object]] = []
-        if tracks is not None:
-            with option_names(path="--tracks"):
-                check_format(tracks, None, FORMATS.values())
-        loaded = load_model(model)
-        if horizon == "auto":
-            with _everywhere(loaded, conf) as detector:
-                fraction = _estimate_horizon(source, detector, start, end, quiet)
-        else:
-            fraction = None if horizon is None else _parse_horizon(horizon)
-        detector = stack.enter_context(
-            VehicleDetector(
-                loaded,
-                conf=conf,
-                camera=camera,
-                field_of_view=fov,
-                camera_height_m=camera_height,
-                horizon=fraction,
-                every=every,
-                own_speed=speed,
-                diagnostics=diagnostics,
-                draw_params=draw_params,
-                blur=_parse_blur(blur),
-            )
-        )
-        page = None
-        if report is not None and output is not None:
-            from vehicle_detection.report import ReportWriter
-
-            with option_names(path="--report"):
-                page = ReportWriter(
-                    report, video=output, source=source, detector=detector, units=draw_params.units
-                )
-        log = page.log if page else TrackLog()
-        writers.append(page or log)
-        opened = stack.enter_context(open_source(source, live=live or None, reconnect=not no_reconnect))
-        if tracks is not None:
-            with option_names(path="--tracks"):
-                writers.append(stack.enter_context(TrackWriter(tracks, shape=opened.info.shape)))
-        done = process_video(
-            opened,
-            output,
-            detector,
-            start=start,
-            end=end,
-            audio=not no_audio,
-            preset=preset,
-            workers=jobs,
-            progress=not quiet,
-            strict=strict,
-            show=show,
-            on_result=lambda result: [write(result) for write in writers],
-        )
-        found = side_outputs.find_events(log, done, detector)
-        side_outputs.write(log, found, output, done, detector)
-        if page is not None:
-            # After the tracks, whose file is complete when its writer closes.
-            stack.close()
-            page.finish(done, events=found, pictures=explain_vehicles(detector, source, log) if why else ())
-    if not done.tracks and horizon not in (None, "auto") and not quiet and Path(source).exists():
-        with _everywhere(loaded, conf) as detector:
-            _warn_of_horizon(horizon, estimate_video_horizon(source, detector, start=start, end=end))
-    if done.tracks and not detector.lens_is_known and not quiet:
-        print_error(
-            "warning: distances assume a lens of 58 degrees, and may be wrong by a factor of 2 or more; pass "
-            "--fov or --camera"
-        )
-    if not quiet or profile:
-        lines = str(done).splitlines()
-        typer.echo("\n".join(lines if profile else lines[:1]))
-    if not quiet:
-        print_summary(log, found, done)
-        written = [path for path in (*outputs.values(), clips) if path is not None]
-        if written:
-            typer.echo(f"wrote {', '.join(map(str, written))}")
-    if done.damage:
-        raise typer.Exit(DAMAGED)
-
-
-def _draw_params(labels: str, **options: Any) -> DrawParams:
-    """Parameters of the annotations, with labels given as a comma-separated list or "none"."""
-    from vehicle_detection.params import DrawParams
-
-    fields = [field.strip() for field in labels.split(",")]
-    return DrawParams(labels=() if fields == ["none"] else fields, **options)
-
-
-def _everywhere(model: Any, conf: float | None) -> VehicleDetector:
-    """Open a detector that searches all rows, whatever the horizon."""
-    from vehicle_detection.detector import VehicleDetector
-
-    return VehicleDetector(model, conf=conf, search_params=model.search_params_type.default().everywhere())
-
-
-def _warn_of_horizon(horizon: str | float, found: HorizonEstimate | None) -> None:
-    """Print what a search of all rows found where none was found below a given horizon."""
-    message = f"warning: no vehicle was found with --horizon {horizon}, and too few with a search of all rows"
-    if found is not None:
-        message = (
-            f"warning: no vehicle was found with --horizon {horizon}, but a search of all rows found "
-            f"{found.n_boxes} boxes, whose horizon is {found.horizon:.2f}; use --horizon {found.horizon:.2f}"
-        )
-    print_error(message)
-
-
-def _parse_blur(text: str | None) -> Any:
-    """Check the region to blur before a model is loaded."""
-    from vehicle_detection._common import check_choice
-    from vehicle_detection.drawing import BLUR_REGIONS
-
-    if text is not None:
-        check_choice(text, "--blur", BLUR_REGIONS)
-    return text
-
-
-def _parse_horizon(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise InvalidInputError(
-            f"--horizon must be a fraction of the frame's height, such as 0.55, or auto; got {text!r}"
-        ) from None
-
-
-def _estimate_horizon(
-    source: str, detector: VehicleDetector, start: float | None, end: float | None, quiet: bool
-) -> float | None:
-    """Estimate the horizon of a video from its vehicles, and print the result."""
-    from vehicle_detection.video import estimate_video_horizon
-
-    found = estimate_video_horizon(source, detector, start=start, end=end)
-    if found is None:
-        if not quiet:
-            print_error(
-                "warning: --horizon auto: too few vehicles to estimate the horizon; searching near the middle"
-            )
-        return None
-    if not quiet:
-        typer.echo(
-            f"horizon {found.horizon:.3f} (standard error {found.horizon_std:.3f}, {found.n_boxes} boxes)"
-        )
-    return found.horizon
+app.command()(video)
 
 
 @app.command()

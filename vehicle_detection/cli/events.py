@@ -56,16 +56,20 @@ class SideOutputs:
         if self.subtitles is not None:
             check_suffix(self.subtitles, "--srt", SUBTITLE_SUFFIXES)
 
-    def find_events(self, log: TrackLog, report: VideoReport, detector: VehicleDetector) -> tuple[Event, ...]:
-        """Find the events of a processed video."""
+    def find_events(
+        self, log: TrackLog, report: VideoReport, detector: VehicleDetector, *, quiet: bool = False
+    ) -> tuple[Event, ...]:
+        """Find the events of a processed video, and warn if the own speed is unknown for a part of it."""
         import numpy as np
 
         from vehicle_detection.events import find_events
 
         speeds = None if detector.own_speed is None else log.own_speeds(detector.own_speed, float(report.fps))
-        if speeds is not None and len(speeds) and np.isnan(speeds).mean() > _MAX_UNKNOWN:
-            known = float(np.isfinite(speeds).mean())
-            print_error(f"warning: the own speed is known for {known:.0%} of the video; check --gpx-offset")
+        unknown = 0.0 if speeds is None or not len(speeds) else float(np.isnan(speeds).mean())
+        if unknown > _MAX_UNKNOWN and not quiet:
+            print_error(
+                f"warning: the own speed is known for {1 - unknown:.0%} of the video; check --gpx-offset"
+            )
         camera = detector.camera_of(report.shape)
         return find_events(
             log, fps=float(report.fps), shape=report.shape, camera=camera, own_speed_mps=speeds

@@ -94,3 +94,13 @@ Preset = Annotated[
     ),
 ]
 NoAudio = Annotated[bool, flag("--no-audio", panel=OUTPUT, help="Write no sound.")]
+
+
+def parse_blur(text: str | None) -> Any:
+    """Check the region to blur before a model is loaded."""
+    from vehicle_detection._common import check_choice
+    from vehicle_detection.drawing import BLUR_REGIONS
+
+    if text is not None:
+        check_choice(text, "--blur", BLUR_REGIONS)
+    return text

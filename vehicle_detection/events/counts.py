@@ -11,12 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_detection._common import (
-    check_number,
-    check_sequence,
-    check_type,
-)
-from vehicle_detection.events.find import Event, Kind
+from vehicle_detection._common import check_number, check_type
+from vehicle_detection.events.find import Event, Kind, check_events
 from vehicle_detection.events.history import TrackLog
 
 COUNTED: tuple[Kind, ...] = ("met", "overtaken", "overtaking", "passed")
@@ -99,9 +95,7 @@ def count_vehicles(events: Iterable[Event], log: TrackLog, *, fps: float) -> Veh
     """
     rate = check_number(fps, "fps", above=0, high=1e6)
     check_type(log, "log", TrackLog, "pass the TrackLog of the video")
-    listed = list(check_sequence(events, "events", "Event"))
-    for event in listed:
-        check_type(event, "events", Event, "pass what find_events returned")
+    listed = check_events(events)
     frames = np.array(log.counts, np.int64)
     minutes = range(math.ceil(len(frames) / rate / 60 - 1e-9))
     edges = [min(round(number * 60 * rate), len(frames)) for number in (*minutes, len(minutes))]

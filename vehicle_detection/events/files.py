@@ -9,8 +9,8 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from vehicle_detection._common import atomic_write, check_number, check_sequence, check_suffix, check_type
-from vehicle_detection.events.find import EVENT_COLUMNS, Event
+from vehicle_detection._common import atomic_write, check_number, check_suffix
+from vehicle_detection.events.find import EVENT_COLUMNS, Event, check_events
 from vehicle_detection.video import cut_video
 
 EVENT_SUFFIXES = (".csv", ".json")
@@ -52,10 +52,7 @@ def write_events(events: Iterable[Event], path: str | os.PathLike[str]) -> int:
     met,3,50,40,52,2.0,,,,,,,,,,
     """
     target = check_suffix(path, "path", EVENT_SUFFIXES)
-    rows = []
-    for event in check_sequence(events, "events", "Event"):
-        check_type(event, "events", Event, "pass what find_events returned")
-        rows.append(dataclasses.asdict(event))
+    rows = [dataclasses.asdict(event) for event in check_events(events)]
     with atomic_write(target, "path") as part, part.open("w", encoding="utf-8", newline="") as file:
         if target.suffix.lower() == ".json":
             json.dump(rows, file, indent=1)
@@ -108,8 +105,7 @@ def cut_clips(
     rate = check_number(fps, "fps", above=0, high=1e6)
     check_number(margin, "margin", low=0, high=3600)
     paths = []
-    for event in check_sequence(events, "events", "Event"):
-        check_type(event, "events", Event, "pass what find_events returned")
+    for event in check_events(events):
         start = max(event.start_frame / rate - margin, event.time_s - _MAX_EXTENT, 0.0)
         end = min((event.end_frame + 1) / rate + margin, event.time_s + _MAX_EXTENT)
         path = Path(folder) / f"{event.time_s:06.1f}s_{event.kind}_{event.track_id}.mp4"

@@ -149,6 +149,14 @@ EVENT_COLUMNS = tuple(field.name for field in fields(Event))
 """Columns of a table of events."""
 
 
+def check_events(events: object) -> list[Event]:
+    """Return `events` as a list, unless one is something else."""
+    listed = list(check_sequence(events, "events", "Event"))
+    for event in listed:
+        check_type(event, "events", Event, "pass what find_events returned")
+    return listed
+
+
 def find_events(
     log: TrackLog | Iterable[TrackHistory],
     *,

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_integer, check_number, describe
+from vehicle_detection._common import check_integer, check_number, check_type, describe
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video import OwnSpeed
@@ -137,6 +137,8 @@ class TrackLog:
 
     def own_speeds(self, speed: OwnSpeed, fps: float) -> Floats:
         """Speed of the own vehicle (m/s) in each frame; NaN where it is unknown."""
+        check_type(speed, "speed", OwnSpeed, "pass what read_own_speed returns")
+        check_number(fps, "fps", above=0, high=1e6)
         return speed.at((self.first_time or 0.0) + np.arange(len(self.counts)) / fps)
 
     def histories(self) -> list[TrackHistory]:

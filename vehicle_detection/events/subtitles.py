@@ -12,7 +12,7 @@ import numpy as np
 
 from vehicle_detection._common import atomic_write, check_choice, check_number, check_suffix, check_type
 from vehicle_detection.drawing import MAX_SPEED_STD
-from vehicle_detection.events.find import Event
+from vehicle_detection.events.find import Event, check_events
 from vehicle_detection.events.history import Floats, TrackHistory, TrackLog
 from vehicle_detection.units import UNITS, Units
 from vehicle_detection.video import OwnSpeed
@@ -111,9 +111,7 @@ def write_subtitles(
     if own_speed is not None:
         check_type(own_speed, "own_speed", OwnSpeed, "pass what read_own_speed returns")
     check_choice(units, "units", UNITS)
-    listed = list(events)
-    for event in listed:
-        check_type(event, "events", Event, "pass what find_events returned")
+    listed = check_events(events)
     cues = list(_merge(_second_texts(log, rate, listed, own_speed, UNITS[units])))
     end = len(log.counts) / rate
     with atomic_write(target, "path") as part, part.open("w", encoding="utf-8", newline="\n") as file:

@@ -17,7 +17,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_choice, check_image, check_integer, check_sequence, describe
+from vehicle_detection._common import (
+    check_choice,
+    check_image,
+    check_integer,
+    check_number,
+    check_sequence,
+    describe,
+)
 from vehicle_detection.boxes import Detections, box_areas
 from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import VehicleClassifier
@@ -270,6 +277,8 @@ class Explorer:
 
     def box_at(self, x: float, y: float) -> int:
         """Return the number of the smallest box that holds a point of the frame; 0 if none does."""
+        check_number(x, "x")
+        check_number(y, "y")
         boxes = self.boxes().boxes
         left, top, right, bottom = boxes.T
         inside = (left <= x) & (x < right) & (top <= y) & (y < bottom)

@@ -20,7 +20,7 @@ from vehicle_detection._common import (
     is_url,
 )
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.events import Event, TrackLog, find_events
+from vehicle_detection.events import Event, TrackLog, check_events, find_events
 from vehicle_detection.report.page import TrackPicture, VideoEmbed, render_page
 from vehicle_detection.units import UNITS
 from vehicle_detection.video import VideoReport
@@ -121,13 +121,16 @@ class ReportWriter:
             own = getattr(self._detector, "own_speed", None)
             speeds = None if own is None else self.log.own_speeds(own, fps)
             events = find_events(self.log, fps=fps, shape=report.shape, camera=camera, own_speed_mps=speeds)
+        listed = check_sequence(pictures, "pictures", "TrackPicture")
+        for picture in listed:
+            check_type(picture, "pictures", TrackPicture, "omit them, or pass TrackPicture objects")
         options = {
-            "events": list(check_sequence(events, "events", "Event")),
+            "events": check_events(events),
             "video": self._embed(),
             "source": self._source,
             "detector": self._detector,
             "units": self._units,
-            "pictures": pictures,
+            "pictures": listed,
         }
         pieces = render_page(self.log, report, **options)
         with (

@@ -17,7 +17,14 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import Limit, check_number, check_path, describe, read_regular_file
+from vehicle_detection._common import (
+    Limit,
+    check_array,
+    check_number,
+    check_path,
+    describe,
+    read_regular_file,
+)
 from vehicle_detection.errors import InvalidInputError
 
 Floats = NDArray[np.float64]
@@ -64,7 +71,7 @@ class OwnSpeed:
 
     def __post_init__(self) -> None:
         for name in ("seconds", "speeds_mps"):
-            values = np.asarray(getattr(self, name))
+            values = check_array(getattr(self, name), name)
             if values.ndim != 1 or not len(values) or values.dtype.kind not in "iuf":
                 raise InvalidInputError(
                     f"{name} must be a list of numbers, got {describe(getattr(self, name))}; "
@@ -98,7 +105,12 @@ class OwnSpeed:
 
     def at(self, seconds: ArrayLike) -> Floats:
         """Speed in m/s at each time: interpolated; NaN before, after and in long gaps of the record."""
-        times = np.asarray(seconds, np.float64)
+        given = check_array(seconds, "seconds")
+        if given.dtype.kind not in "iuf":
+            raise InvalidInputError(
+                f"seconds must be numbers, got {describe(seconds)}; pass times in seconds"
+            )
+        times: Floats = given.astype(np.float64)
         speeds = np.interp(times, self.seconds, self.speeds_mps, left=np.nan, right=np.nan)
         after = np.clip(np.searchsorted(self.seconds, times), 1, max(len(self.seconds) - 1, 1))
         if len(self.seconds) > 1:

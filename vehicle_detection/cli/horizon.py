@@ -1,0 +1,62 @@
+"""The horizon on the command line: its option, its estimate, and a warning if it hides all vehicles."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from vehicle_detection.cli.output import print_error
+from vehicle_detection.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from vehicle_detection.camera import HorizonEstimate
+    from vehicle_detection.detector import VehicleDetector
+
+
+def search_everywhere(model: Any, conf: float | None) -> VehicleDetector:
+    """Open a detector that searches all rows, whatever the horizon."""
+    from vehicle_detection.detector import VehicleDetector
+
+    return VehicleDetector(model, conf=conf, search_params=model.search_params_type.default().everywhere())
+
+
+def warn_of_horizon(horizon: str | float, found: HorizonEstimate | None) -> None:
+    """Print what a search of all rows found where none was found below a given horizon."""
+    message = f"warning: no vehicle was found with --horizon {horizon}, and too few with a search of all rows"
+    if found is not None:
+        message = (
+            f"warning: no vehicle was found with --horizon {horizon}, but a search of all rows found "
+            f"{found.n_boxes} boxes, whose horizon is {found.horizon:.2f}; use --horizon {found.horizon:.2f}"
+        )
+    print_error(message)
+
+
+def parse_horizon(text: str) -> float:
+    """Return the horizon that the option states as a fraction."""
+    try:
+        return float(text)
+    except ValueError:
+        raise InvalidInputError(
+            f"--horizon must be a fraction of the frame's height, such as 0.55, or auto; got {text!r}"
+        ) from None
+
+
+def find_horizon(
+    source: str, detector: VehicleDetector, start: float | None, end: float | None, quiet: bool
+) -> float | None:
+    """Estimate the horizon of a video from its vehicles, and print the result."""
+    from vehicle_detection.video import estimate_video_horizon
+
+    found = estimate_video_horizon(source, detector, start=start, end=end)
+    if found is None:
+        if not quiet:
+            print_error(
+                "warning: --horizon auto: too few vehicles to estimate the horizon; searching near the middle"
+            )
+        return None
+    if not quiet:
+        typer.echo(
+            f"horizon {found.horizon:.3f} (standard error {found.horizon_std:.3f}, {found.n_boxes} boxes)"
+        )
+    return found.horizon

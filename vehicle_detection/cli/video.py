@@ -1,0 +1,358 @@
+"""The command that tracks the vehicles of a video."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer import Argument, Option
+
+from vehicle_detection.cli.horizon import find_horizon, parse_horizon, search_everywhere, warn_of_horizon
+from vehicle_detection.cli.options import (
+    CAMERA,
+    DRAWING,
+    HORIZON_HELP,
+    INPUT,
+    OUTPUT,
+    SEARCH,
+    Blur,
+    CameraHeight,
+    CameraName,
+    Confidence,
+    Every,
+    FieldOfView,
+    LineWidth,
+    Model,
+    NoAudio,
+    Preset,
+    flag,
+    parse_blur,
+)
+from vehicle_detection.cli.output import (
+    announce_replaced,
+    check_distinct_paths,
+    name_kept_files,
+    option_names,
+    output_folder,
+    print_error,
+)
+from vehicle_detection.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from vehicle_detection.params import DrawParams
+
+DAMAGED = 3  # exit code
+_UNKNOWN_LENS = (
+    "warning: distances assume a lens of 58 degrees, and may be wrong by a factor of 2 or more; "
+    "pass --fov or --camera"
+)
+
+
+@option_names(target="--output", workers="--jobs", field_of_view="--fov", camera_height_m="--camera-height")
+def video(
+    source: Annotated[
+        str,
+        Argument(
+            metavar="SOURCE",
+            help="Video file; folder or quoted pattern of a trip's segments, or images; URL; camera; or -.",
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        Option(
+            "-o",
+            "--output",
+            metavar="TARGET",
+            help="Video to write: .mp4, .m4v, .mov or .mkv.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
+    show: Annotated[
+        bool,
+        flag("--show", panel=OUTPUT, help="Show the annotated frames in a window; Escape ends the run."),
+    ] = False,
+    tracks: Annotated[
+        Path | None,
+        Option(
+            metavar="FILE",
+            help="Tracks: .csv, .jsonl, .parquet, .txt (MOT), .zip (CVAT) or .json (COCO).",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
+    report: Annotated[
+        Path | None,
+        Option(metavar="FILE.html", help="Page with the video and its tracks.", rich_help_panel=OUTPUT),
+    ] = None,
+    why: Annotated[
+        bool,
+        flag(
+            "--why", panel=OUTPUT, help="Explain a box of each vehicle in --report: the share of each cell."
+        ),
+    ] = False,
+    events: Annotated[
+        Path | None,
+        Option(
+            metavar="FILE",
+            help="Events, such as cut-ins and overtaking: .csv or .json.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
+    clips: Annotated[
+        Path | None,
+        Option(
+            metavar="DIR", help="Folder for a short annotated clip of each event.", rich_help_panel=OUTPUT
+        ),
+    ] = None,
+    srt: Annotated[
+        Path | None,
+        Option(
+            metavar="FILE",
+            help="Subtitles with vehicles, nearest distance and events, second by second: .srt or .ass.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
+    preset: Preset = "veryfast",
+    no_audio: NoAudio = False,
+    quiet: Annotated[
+        bool, flag("-q", "--quiet", panel=OUTPUT, help="Print errors and warnings of damage only.")
+    ] = False,
+    profile: Annotated[bool, flag("--profile", panel=OUTPUT, help="Print the time of each stage.")] = False,
+    start: Annotated[
+        float | None,
+        Option(metavar="S", help="Start time in seconds, such as 12.5.", rich_help_panel=INPUT),
+    ] = None,
+    end: Annotated[
+        float | None, Option(metavar="S", help="End time in seconds, such as 30.", rich_help_panel=INPUT)
+    ] = None,
+    own_speed: Annotated[
+        float | None,
+        Option(
+            metavar="KM/H",
+            help="Speed of the own vehicle, such as 100, for headways and speeds over ground.",
+            rich_help_panel=INPUT,
+        ),
+    ] = None,
+    gpx: Annotated[
+        Path | None,
+        Option(
+            metavar="FILE",
+            help="Own speed over time: a GPX track, or a .csv table with the columns time_s and speed_kmh.",
+            rich_help_panel=INPUT,
+        ),
+    ] = None,
+    gpx_offset: Annotated[
+        float,
+        Option(
+            metavar="S",
+            help="Seconds from the first point of --gpx to the start of the video, such as 12.5 or -3.",
+            rich_help_panel=INPUT,
+        ),
+    ] = 0.0,
+    live: Annotated[
+        bool,
+        flag(
+            "--live",
+            panel=INPUT,
+            help="Drop frames of a pipe rather than lag; default for cameras and streams.",
+        ),
+    ] = False,
+    no_reconnect: Annotated[
+        bool, flag("--no-reconnect", panel=INPUT, help="End with a network stream that breaks off.")
+    ] = False,
+    strict: Annotated[
+        bool, flag("--strict", panel=INPUT, help="Fail, and write nothing, if the source is damaged.")
+    ] = False,
+    camera: CameraName = None,
+    fov: FieldOfView = None,
+    camera_height: CameraHeight = None,
+    horizon: Annotated[
+        str | None,
+        Option(
+            metavar="F|auto",
+            help=f'{HORIZON_HELP} "auto": estimated from vehicles in a sample of frames.',
+            rich_help_panel=CAMERA,
+        ),
+    ] = None,
+    model: Model = "default",
+    conf: Confidence = None,
+    every: Every = None,
+    jobs: Annotated[
+        int | None,
+        Option(
+            metavar="N",
+            help="Frames searched in parallel; default: one per core, at most 4.",
+            rich_help_panel=SEARCH,
+        ),
+    ] = None,
+    labels: Annotated[
+        str,
+        Option(
+            metavar="LIST",
+            help="Fields of the labels: some of id,distance,speed,score,std, such as id,distance; or none.",
+            rich_help_panel=DRAWING,
+        ),
+    ] = "id,distance,speed",
+    line_width: LineWidth = None,
+    color_by: Annotated[
+        str,
+        Option(
+            metavar="id|distance", help="What the colors of the boxes stand for.", rich_help_panel=DRAWING
+        ),
+    ] = "id",
+    panel: Annotated[
+        str,
+        Option(
+            metavar="corner|side|none",
+            help="Bird's-eye view in the frame's corner, or beside it.",
+            rich_help_panel=DRAWING,
+        ),
+    ] = "none",
+    units: Annotated[
+        str,
+        Option(
+            metavar="metric|imperial",
+            help="Labels, subtitles and report in m and km/h, or ft and mph.",
+            rich_help_panel=DRAWING,
+        ),
+    ] = "metric",
+    blur: Blur = None,
+    diagnostics: Annotated[
+        bool,
+        flag(
+            "--diagnostics",
+            panel=DRAWING,
+            help="Show frame, positive windows, heat map and tracks side by side.",
+        ),
+    ] = False,
+) -> None:
+    """Track the vehicles of a video, and write or show an annotated copy.
+
+    Speeds are relative to the camera, and over ground where its own speed is known (--gpx, --own-speed).
+
+    Exit code 3: the source is damaged, and the copy lacks what cannot be decoded.
+    """
+    from vehicle_detection.cli.events import SideOutputs, explain_vehicles, print_summary, read_speed
+    from vehicle_detection.detector import VehicleDetector
+    from vehicle_detection.events import TrackLog
+    from vehicle_detection.export import FORMATS, TrackWriter, check_format
+    from vehicle_detection.mixture import load_model
+    from vehicle_detection.video import estimate_video_horizon, open_source, process_video
+
+    outputs = {
+        "--output": output, "--tracks": tracks, "--report": report, "--events": events, "--srt": srt,
+    }  # fmt: skip
+    sources = {"SOURCE": Path(source)} | ({} if gpx is None else {"--gpx": gpx})
+    check_distinct_paths(outputs, sources)
+    _check_outputs(outputs, clips, show=show, why=why)
+    region = parse_blur(blur)
+    draw_params = _draw_params(labels, line_width=line_width, color_by=color_by, panel=panel, units=units)
+    speed = read_speed(own_speed, gpx, gpx_offset)
+    side_outputs = SideOutputs(events, clips, srt)
+    if not quiet:
+        announce_replaced(outputs.values())
+    with name_kept_files(outputs.values()), contextlib.ExitStack() as stack:
+        stack.enter_context(output_folder(clips, "--clips"))
+        writers: list[Callable[[Any], object]] = []
+        if tracks is not None:
+            with option_names(path="--tracks"):
+                check_format(tracks, None, FORMATS.values())
+        loaded = load_model(model)
+        if horizon == "auto":
+            with search_everywhere(loaded, conf) as everywhere:
+                fraction = find_horizon(source, everywhere, start, end, quiet)
+        else:
+            fraction = None if horizon is None else parse_horizon(horizon)
+        detector = stack.enter_context(
+            VehicleDetector(
+                loaded,
+                conf=conf,
+                camera=camera,
+                field_of_view=fov,
+                camera_height_m=camera_height,
+                horizon=fraction,
+                every=every,
+                own_speed=speed,
+                diagnostics=diagnostics,
+                draw_params=draw_params,
+                blur=region,
+            )
+        )
+        page = None
+        if report is not None and output is not None:
+            from vehicle_detection.report import ReportWriter
+
+            with option_names(path="--report"):
+                page = ReportWriter(
+                    report, video=output, source=source, detector=detector, units=draw_params.units
+                )
+        log = page.log if page else TrackLog()
+        writers.append(page or log)
+        opened = stack.enter_context(open_source(source, live=live or None, reconnect=not no_reconnect))
+        if why and not opened.rereadable:
+            raise InvalidInputError(
+                f"--why needs a source that can be read again, got {source}; use a file, or omit --why"
+            )
+        if tracks is not None:
+            with option_names(path="--tracks"):
+                writers.append(stack.enter_context(TrackWriter(tracks, shape=opened.info.shape)))
+        done = process_video(
+            opened,
+            output,
+            detector,
+            start=start,
+            end=end,
+            audio=not no_audio,
+            preset=preset,
+            workers=jobs,
+            progress=not quiet,
+            strict=strict,
+            show=show,
+            on_result=lambda result: [write(result) for write in writers],
+        )
+        found = side_outputs.find_events(log, done, detector, quiet=quiet)
+        side_outputs.write(log, found, output, done, detector)
+        if page is not None:
+            # After the tracks, whose file is complete when its writer closes.
+            stack.close()
+            page.finish(done, events=found, pictures=explain_vehicles(detector, source, log) if why else ())
+    if not done.tracks and horizon not in (None, "auto") and not quiet and opened.rereadable:
+        with search_everywhere(loaded, conf) as everywhere:
+            warn_of_horizon(horizon, estimate_video_horizon(source, everywhere, start=start, end=end))
+    if done.tracks and not detector.lens_is_known and not quiet:
+        print_error(_UNKNOWN_LENS)
+    if not quiet or profile:
+        lines = str(done).splitlines()
+        typer.echo("\n".join(lines if profile else lines[:1]))
+    if not quiet:
+        print_summary(log, found, done)
+        written = [path for path in (*outputs.values(), clips) if path is not None]
+        if written:
+            typer.echo(f"wrote {', '.join(map(str, written))}")
+    if done.damage:
+        raise typer.Exit(DAMAGED)
+
+
+def _check_outputs(outputs: Mapping[str, Path | None], clips: Path | None, *, show: bool, why: bool) -> None:
+    """Refuse outputs of ``video`` that need another one, and a run without any output."""
+    if outputs["--output"] is None:
+        if outputs["--report"] is not None:
+            raise InvalidInputError("--output must name a video for --report, which contains it; add it")
+        if clips is not None:
+            raise InvalidInputError("--output must name a video for --clips, which are cut out of it; add it")
+    if not show and all(path is None for path in outputs.values()):
+        raise InvalidInputError(
+            "--output must name the video to write; or use --show, --tracks, --events or --srt"
+        )
+    if why and outputs["--report"] is None:
+        raise InvalidInputError("--why needs --report, which shows the explanations; add it")
+
+
+def _draw_params(labels: str, **options: Any) -> DrawParams:
+    """Parameters of the annotations, with labels given as a comma-separated list or "none"."""
+    from vehicle_detection.params import DrawParams
+
+    fields = [field.strip() for field in labels.split(",")]
+    return DrawParams(labels=() if fields == ["none"] else fields, **options)
