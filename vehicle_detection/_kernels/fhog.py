@@ -129,24 +129,17 @@ def _tent_taps(start, step, squares, taps, index, weights):
 
 
 @jit
-def resample(sums, square, first, squares, grids, cells):
-    """Interpolate the sums of squares at the cells of several grids, and at one cell more on each side.
+def resample(sums, square, first, squares, grid, cells):
+    """Interpolate the sums of squares at the cells of a grid, and at one cell more on each side.
 
     `sums` and `square` are as in `orientation_sums`, with one column of squares beyond each side; `first` is
-    the first row, and `squares` the number of rows that the image has. `grids` is ``(grids, 4)`` float64:
-    left, top, width and height of each grid's first cell in squares. `cells` is the output
-    ``(grids, 16, rows + 2, columns + 2)``, in gray levels of the mean gradient.
+    the first row, and `squares` the number of rows that the image has. `grid` is ``(4,)`` float64: left, top,
+    width and height of its first cell in squares. `cells` is the output ``(16, rows + 2, columns + 2)``, in
+    gray levels of the mean gradient.
     """
-    for number in range(len(grids)):
-        left, top, step_x, step_y = grids[number]
-        _resample(sums, square, first, squares, (left - step_x, top - step_y, step_x, step_y), cells[number])
-
-
-@jit
-def _resample(sums, square, first, squares, grid, cells):
-    """Interpolate the sums of squares at the cells of one grid: left, top, width and height of its first."""
     _, rows, columns = cells.shape
-    left, top, step_x, step_y = grid
+    step_x, step_y = grid[2], grid[3]
+    left, top = grid[0] - step_x, grid[1] - step_y
     # Two taps at a time along a row, at first four; those beyond the tent have no weight.
     taps_x, taps_y = max(4, 2 * math.ceil((2 * step_x + 1) / 2)), math.ceil(2 * step_y) + 1
     index_x, weights_x = np.empty((columns, taps_x), np.int64), np.empty((columns, taps_x), np.float32)
@@ -246,7 +239,7 @@ def _normalize_row(cells, factors, y, channels):
 def fhog_channels(cells, eps, channels):
     """FHOG channels of several grids of cells, ``(grids, 20, rows, columns)`` float32.
 
-    `cells` is the output of `resample`; `eps` is added to the energy of a block.
+    `cells` are the outputs of `resample`; `eps` is added to the energy of a block.
     """
     count, _, rows, columns = channels.shape
     factors = np.empty((rows + 1, columns + 1), np.float32)
@@ -265,8 +258,8 @@ def packed_channels(cells, eps, scales, per_word, packed):
     """FHOG channels of the cells of a grid as small integers, several in each word of 32 bits.
 
     The value of channel `k` is multiplied by ``scales[k]``, rounded, and limited to 255. `packed` is the
-    output ``(20 / per_word, rows, columns)`` int32; the first channel is in the lowest bits. `cells` is one
-    of the grids of `resample`, and `eps` as in `fhog_channels`.
+    output ``(20 / per_word, rows, columns)`` int32; the first channel is in the lowest bits. `cells` is the
+    output of `resample`, and `eps` as in `fhog_channels`.
     """
     words, rows, columns = packed.shape
     factors = np.empty((rows + 1, columns + 1), np.float32)

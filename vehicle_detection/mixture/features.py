@@ -166,9 +166,9 @@ class EdgePyramid:
     def _interpolate(self, number: int, grids: NDArray[np.float64], channels: NDArray[np.float32]) -> None:
         octave = self.octaves[number]
         squares = -(-octave.planes.shape[1] // SQUARE)
-        scaled = grids / (SQUARE * 2**number)
         cells = _new_cells(channels)
-        _fhog_kernels.resample(octave.sums, SQUARE, octave.first, squares, scaled, cells)
+        for grid, each in zip(grids / (SQUARE * 2**number), cells):
+            _fhog_kernels.resample(octave.sums, SQUARE, octave.first, squares, grid, each)
         _fhog_kernels.fhog_channels(cells, _EPS, channels)
 
     def _compute_small(self, grids: NDArray[np.float64], channels: NDArray[np.float32]) -> None:
@@ -186,8 +186,7 @@ class EdgePyramid:
             down, across = (bottom - top + 1) // square, (right - left + 1) // square
             sums = np.empty((down + 2, across + 2, 16), np.float32)
             _fhog_kernels.orientation_sums(region, _COTANGENTS, square, -1, sums)
-            one = slice(number, number + 1)
-            _fhog_kernels.resample(sums, square, -1, down, scaled[one], cells[one])
+            _fhog_kernels.resample(sums, square, -1, down, scaled[number], cells[number])
         _fhog_kernels.fhog_channels(cells, _EPS, channels)
 
     def feature_map(self, grid: CellGrid) -> FeatureMap:
@@ -206,13 +205,13 @@ class EdgePyramid:
         """
         number = self.octave_of(math.sqrt(grid.step_x * grid.step_y))
         octave, scale = self.octaves[number], SQUARE * 2**number
-        cells = workspace.take((1, 16, grid.rows + 2, grid.columns + 2), np.float32, "cells")
+        cells = workspace.take((16, grid.rows + 2, grid.columns + 2), np.float32, "cells")
         shape = N_CHANNELS // packing.per_word, grid.rows, grid.columns
         packed = workspace.take(shape, packing.dtype, "packed")
         squares = -(-octave.planes.shape[1] // SQUARE)
-        corner = np.array([[grid.left, grid.top, grid.step_x, grid.step_y]]) / scale
+        corner = np.array([grid.left, grid.top, grid.step_x, grid.step_y]) / scale
         _fhog_kernels.resample(octave.sums, SQUARE, octave.first, squares, corner, cells)
-        _fhog_kernels.packed_channels(cells[0], _EPS, CHANNEL_SCALES, packing.per_word, packed)
+        _fhog_kernels.packed_channels(cells, _EPS, CHANNEL_SCALES, packing.per_word, packed)
         return packed
 
 
