@@ -6,10 +6,14 @@ The cache notices changes of a kernel's own file only, so kernels that call each
 from __future__ import annotations
 
 import functools
+import logging
 from collections.abc import Callable
 from typing import Any
 
 import numba
+from numba.core import event
+
+log = logging.getLogger(__name__)
 
 
 def jit(function: Callable[..., Any], *, reorder: bool = False) -> Callable[..., Any]:
@@ -29,3 +33,23 @@ def jit(function: Callable[..., Any], *, reorder: bool = False) -> Callable[...,
     except RuntimeError:
         # Neither the package's folder nor the user's cache is writable: compile in every process.
         return compiler()(function)  # type: ignore[no-any-return]
+
+
+class _Announcement(event.Listener):  # type: ignore[misc]
+    """Logs that kernels of this package are compiled, once in a process."""
+
+    def __init__(self) -> None:
+        self._announced = False
+
+    def on_start(self, event: Any) -> None:
+        """Log the first kernel that is not in the cache."""
+        module = event.data["dispatcher"].py_func.__module__
+        if not self._announced and module.startswith(__package__):
+            self._announced = True
+            log.info("compiling for this processor, which takes up to half a minute and is done once")
+
+    def on_end(self, event: Any) -> None:
+        """Do nothing; numba calls it."""
+
+
+event.register("numba:compile", _Announcement())

@@ -35,29 +35,36 @@ def print_error(message: str) -> None:
     typer.echo(" ".join(message.split()), err=True)
 
 
-class _WarningPrinter(logging.Handler):
-    """Prints the library's warnings, each text once."""
+class _LogPrinter(logging.Handler):
+    """Prints the library's warnings, and notes of less importance, each text once."""
 
     def __init__(self) -> None:
-        super().__init__(logging.WARNING)
+        super().__init__()
         self._printed: set[str] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
-        message = record.getMessage()
+        message, kind = record.getMessage(), "warning" if record.levelno >= logging.WARNING else "note"
         if message not in self._printed:
             self._printed.add(message)
-            print_error(f"warning: {message}")
+            print_error(f"{kind}: {message}")
 
 
 @contextlib.contextmanager
 def print_warnings() -> Iterator[None]:
-    """Print the warnings that the library logs in the block, one line each."""
-    logger, printer = logging.getLogger("vehicle_detection"), _WarningPrinter()
+    """Print the warnings that the library logs in the block, one line each.
+
+    A terminal also shows that kernels are compiled, because that takes long.
+    """
+    logger, kernels = logging.getLogger("vehicle_detection"), logging.getLogger("vehicle_detection._kernels")
+    printer, level = _LogPrinter(), kernels.level
     logger.addHandler(printer)
+    if sys.stderr.isatty():
+        kernels.setLevel(logging.INFO)
     try:
         yield
     finally:
         logger.removeHandler(printer)
+        kernels.setLevel(level)
 
 
 def rename_argument(message: str, options: Mapping[str, str]) -> str:

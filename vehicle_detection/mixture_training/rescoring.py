@@ -39,6 +39,7 @@ Singles = NDArray[np.float32]
 
 _OUTPUTS = (32, 48, 64, 64, 5)  # of the layers
 _EPOCHS, _BATCH, _DROPOUT = 8, 256, 0.3
+_PARTS = 4  # of a batch, which threads share
 _MIN_STEPS = 40  # of an epoch; with few samples batches are smaller
 # Largest step of the optimizer, the share of the steps in which it rises, and the decay of the weights.
 _RATE, _WARMUP, _DECAY = 2e-3, 0.2, 1e-3
@@ -90,7 +91,7 @@ def train_rescorer(
     samples = Samples.join([part for parts in pool.map(sample, frames, seeds) for part in parts])
     if samples.is_vehicle.all() or not samples.is_vehicle.any():
         return None
-    return Rescorer(fit_network(samples, rng), params.blend_weight)
+    return Rescorer(fit_network(samples, rng, pool), params.blend_weight)
 
 
 def _sample(
@@ -133,11 +134,11 @@ def sample_boxes(
     return np.concatenate([copies, proposals[right]]), np.concatenate([proposals[wrong], beside])
 
 
-def fit_network(samples: Samples, rng: np.random.Generator) -> tuple[Layer, ...]:
+def fit_network(samples: Samples, rng: np.random.Generator, pool: ThreadPoolExecutor) -> tuple[Layer, ...]:
     """Minimize the logistic loss and the error of the shifts: AdamW (Loshchilov and Hutter, ICLR 2019).
 
     Half of the crops of a batch are mirrored, and some values of the dense layers are dropped out (Srivastava
-    et al., "Dropout", JMLR 2014).
+    et al., "Dropout", JMLR 2014). The result does not depend on the number of threads.
     """
     values = _initial_values(rng)
     means, squares = ([np.zeros_like(value) for value in values] for _ in range(2))
@@ -145,7 +146,7 @@ def fit_network(samples: Samples, rng: np.random.Generator) -> tuple[Layer, ...]
     batch = min(_BATCH, max(count // _MIN_STEPS, 1))
     steps = _EPOCHS * (count // batch)
     for step, rows in enumerate(_batches(count, batch, rng), 1):
-        gradients = _gradients(values, _draw(samples, rows, rng), rng)
+        gradients = _batch_gradients(values, samples, rows, rng, pool)
         # The rate rises linearly, then falls like a cosine.
         progress = step / steps
         rising = progress / _WARMUP
@@ -179,6 +180,24 @@ def _batches(count: int, batch: int, rng: np.random.Generator) -> Iterator[NDArr
             yield order[start : start + batch]
 
 
+def _batch_gradients(
+    values: list[Singles],
+    samples: Samples,
+    rows: NDArray[np.intp],
+    rng: np.random.Generator,
+    pool: ThreadPoolExecutor,
+) -> list[Singles]:
+    """Gradients of the loss of a batch, whose parts are shared by the threads."""
+    totals = len(rows), max(int(samples.is_vehicle[rows].sum()), 1)
+
+    def part(rows: NDArray[np.intp], rng: np.random.Generator) -> list[Singles]:
+        return _gradients(values, _draw(samples, rows, rng), totals, rng)
+
+    count = min(_PARTS, len(rows))
+    parts = pool.map(part, np.array_split(rows, count), rng.spawn(count))
+    return [sum(gradients[1:], start=gradients[0]) for gradients in zip(*parts)]
+
+
 def _draw(samples: Samples, rows: NDArray[np.intp], rng: np.random.Generator) -> Samples:
     """Take some samples, half of them mirrored."""
     inputs, shifts = samples.inputs[:, rows], samples.shifts[rows].copy()
@@ -188,8 +207,13 @@ def _draw(samples: Samples, rows: NDArray[np.intp], rng: np.random.Generator) ->
     return Samples(inputs, samples.is_vehicle[rows], shifts)
 
 
-def _gradients(values: list[Singles], batch: Samples, rng: np.random.Generator | None) -> list[Singles]:
-    """Gradients of the loss by backpropagation; without a generator nothing is dropped out."""
+def _gradients(
+    values: list[Singles], batch: Samples, totals: tuple[int, int], rng: np.random.Generator | None
+) -> list[Singles]:
+    """Gradients of the loss by backpropagation; without a generator nothing is dropped out.
+
+    `totals` are the numbers of samples and of vehicles that the losses are divided by.
+    """
     weights, biases = values[::2], values[1::2]
     columns: list[Singles] = []
     kept: list[Singles] = []
@@ -215,7 +239,7 @@ def _gradients(values: list[Singles], batch: Samples, rng: np.random.Generator |
         if number + 1 == len(STRIDES):
             last_shape = current.shape
             current = flatten(current)
-    gradient = _loss_gradient(current, batch)
+    gradient = _loss_gradient(current, batch, totals)
     gradients: list[Singles] = []
     for number in range(len(weights) - 1, -1, -1):
         if number + 1 < len(weights):
@@ -231,13 +255,13 @@ def _gradients(values: list[Singles], batch: Samples, rng: np.random.Generator |
     return gradients[::-1]
 
 
-def _loss_gradient(outputs: Singles, batch: Samples) -> Singles:
+def _loss_gradient(outputs: Singles, batch: Samples, totals: tuple[int, int]) -> Singles:
     """Gradient of the mean loss by the outputs ``(5, N)``."""
-    count, positive = len(batch.is_vehicle), batch.is_vehicle
+    positive = batch.is_vehicle
     gradient = np.empty_like(outputs)
-    gradient[0] = (1 / (1 + np.exp(-outputs[0].clip(-80, 80))) - positive) / count
+    gradient[0] = (1 / (1 + np.exp(-outputs[0].clip(-80, 80))) - positive) / totals[0]
     error = (outputs[1:] - batch.shifts.T) / _SMOOTH
-    gradient[1:] = _BOX_WEIGHT * error.clip(-1, 1) * positive / max(int(positive.sum()), 1)
+    gradient[1:] = _BOX_WEIGHT * error.clip(-1, 1) * positive / totals[1]
     return gradient
 
 

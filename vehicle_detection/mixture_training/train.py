@@ -11,6 +11,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from vehicle_detection._common import check_image, check_integer, check_type, resolve_jobs
 from vehicle_detection._kernels import hinge_loss
@@ -96,7 +97,8 @@ def train_mixture(
     check_type(patches, "patches", (list, tuple, np.ndarray), "pass a list of images")
     for image in patches:
         check_image(image, "patches")
-    with ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
+    # Threads of the linear algebra library would compete with those of the pool.
+    with threadpool_limits(1, "blas"), ThreadPoolExecutor(resolve_jobs(n_jobs)) as pool:
         rng, frames = np.random.default_rng(random_state), load_training_frames(sources)
         return _Training(frames, params, rng, pool, on_step or log.info).run(patches)
 
