@@ -82,6 +82,7 @@ SMALL_MIXTURE = MixtureParams(
     size_prior_weight=0.0,
     vote_weight=0.0,
     count_weight=0.0,
+    perspective_weight=0.0,
     blend_weight=0.0,
     C=5e-3,
     border_C=5e-3,

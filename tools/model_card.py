@@ -90,8 +90,9 @@ def _facts(model: TemplateMixture) -> list[str]:
     if rescorer is not None:
         facts.insert(
             1,
-            f"Rescoring and box correction: a convolutional network of {rescorer.n_weights:,} weights on the "
-            f"edges and colors of cells, with a weight of {rescorer.blend_weight:g}",
+            f"Rescoring and box correction: the mean of {len(rescorer.networks)} convolutional networks, "
+            f"together {rescorer.n_weights:,} weights, on the edges and colors of cells, with a weight of "
+            f"{rescorer.blend_weight:g}",
         )
     return facts
 

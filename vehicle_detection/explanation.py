@@ -60,7 +60,7 @@ class Explanation:
     terms
         Named amounts whose sum is `margin`: ``"cells"``, the sum of `cells`; ``"bias"``; for classifiers of
         patches ``"color histogram"``, which has no position; for mixtures ``"votes and size"``,
-        ``"second stage"`` and ``"candidates"``, if there are.
+        ``"second stage"``, ``"candidates"`` and ``"perspective"``, if there are.
     template
         Number of the template with the best window, from 0.
     score
@@ -73,7 +73,7 @@ class Explanation:
     >>> scene = render_scene(shape=(360, 640), vehicles=[SceneVehicle(distance_m=15.0)], random_state=1)
     >>> found = explain(VehicleDetector(), scene.image, scene.boxes[0])
     >>> found.found, list(found.terms)
-    (True, ['cells', 'bias', 'votes and size', 'second stage', 'candidates'])
+    (True, ['cells', 'bias', 'votes and size', 'second stage', 'candidates', 'perspective'])
     """
 
     box: Floats
@@ -229,10 +229,8 @@ def _explain_mixture(
     row = _best_overlap(box, vehicles.boxes, _MIN_IOU)
     with model.open_search() as search:
         pyramid, windows = search.score_windows(prepare(image), params)
-        candidates = {}
-        if model.count_weight:
-            shift = model.detect_vehicles(pyramid, windows, min_margin=RESCORE_MIN)[2]
-            candidates = {"candidates": shift}
+        every = model.detect_vehicles(pyramid, windows, min_margin=-np.inf)
+        frame_terms = {"candidates": every.shift} if model.count_weight else {}
         proposals, margins = model.propose_boxes(pyramid, windows, min_margin=RESCORE_MIN)
         corrected, final = proposals, margins
         if model.rescorer is not None:
@@ -250,7 +248,10 @@ def _explain_mixture(
                 terms["votes and size"] = float(margins[proposal]) - sum(terms.values())
                 if model.rescorer is not None:
                     terms["second stage"] = float(final[proposal] - margins[proposal])
-                terms |= candidates
+                terms |= frame_terms
+                if model.perspective_weight:
+                    same = _best_overlap(vehicles.boxes[row], every.boxes, _MIN_IOU)
+                    terms["perspective"] = 0.0 if same is None else float(every.perspective[same])
                 score = float(vehicles.scores[row])
                 found = vehicles.boxes[row].astype(np.float64)
                 return Explanation(found, True, _window_of(grid), cells, terms, number, score)
@@ -269,7 +270,7 @@ def _explain_mixture(
     if model.rescorer is not None:
         margin = np.array([sum(terms.values())])
         terms["second stage"] = float((model.rescorer.apply(pyramid, box[None], margin)[1] - margin)[0])
-    terms |= candidates
+    terms |= frame_terms
     return Explanation(box, False, _window_of(grid), cells, terms, number, None)
 
 

@@ -574,7 +574,8 @@ def test_detect_explains_each_box(tmp_path):
     scene = render_scene(shape=(360, 640), vehicles=[SceneVehicle(distance_m=14.0)], lane=1, random_state=1)
     write_image(image, scene.image)
     out = succeed("detect", image, "--why", why)
-    assert re.search(r"^  1: score \S+, template \d: margin \S+ = .* cells .* candidates$", out, re.MULTILINE)
+    line = r"^  1: score \S+, template \d: margin \S+ = .* cells .* candidates .* perspective$"
+    assert re.search(line, out, re.MULTILINE)
     assert contents(why) == ["road.png_1.png"]
     assert "--why must be a folder" in refuse("detect", image, "--why", image)
 
@@ -1039,7 +1040,7 @@ def test_info_of_the_shipped_models():
     assert out.startswith(f"default: 6 templates, threshold {default.threshold:.2f} (log-odds)\n")
     assert re.search(r"box of 7x6 cells\s*\n", out)
     assert "box of 6x6 cells at the frame's border" in out
-    assert re.search(r"rescoring +network of [\d,]+ weights, blend weight 0\.\d+", out)
+    assert re.search(r"rescoring +2 networks, [\d,]+ weights, blend weight 0\.\d+", out)
     for name, scores in default.metadata["metrics"]["left_out"].items():
         assert re.search(rf"{name} .*{scores['f1']:.3f}", out)
 

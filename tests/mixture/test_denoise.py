@@ -68,10 +68,10 @@ def test_the_search_uses_the_smoothed_frame():
     found = search.find(image).vehicles
     smooth = denoise(image)
     min_margin = model.margin_of(0.0)
-    boxes, margins, _ = model.detect_vehicles(
+    boxes, margins, *_ = model.detect_vehicles(
         *search.score_windows(smooth, PyramidParams()), min_margin=min_margin
     )
     np.testing.assert_array_equal(found.boxes, boxes)
     np.testing.assert_array_equal(found.scores, model.scores(margins))
-    boxes, _, _ = model.detect_vehicles(*search.score_windows(image, PyramidParams()), min_margin=min_margin)
+    boxes, *_ = model.detect_vehicles(*search.score_windows(image, PyramidParams()), min_margin=min_margin)
     assert not np.array_equal(found.boxes, boxes)

@@ -39,9 +39,9 @@ def test_the_size_prior_raises_the_margins_of_near_vehicles():
     model = random_mixture()
     pyramid, found = MixtureSearch(model, n_jobs=1).score_windows(ROAD, PyramidParams())
     min_margin = float(np.quantile(found.margins, 0.2))
-    boxes, margins, _ = model.detect_vehicles(pyramid, found, min_margin=min_margin)
+    boxes, margins, *_ = model.detect_vehicles(pyramid, found, min_margin=min_margin)
     with_prior = dataclasses.replace(model, size_prior_weight=0.1)
-    others, raised, _ = with_prior.detect_vehicles(pyramid, found, min_margin=min_margin)
+    others, raised, *_ = with_prior.detect_vehicles(pyramid, found, min_margin=min_margin)
     before = {tuple(box): margin for box, margin in zip(boxes, margins)}
     common = [row for row, box in enumerate(others) if tuple(box) in before]
     assert len(common) > 3
@@ -59,7 +59,7 @@ def test_many_votes_raise_a_margin():
     windows = ScoredWindows(boxes, np.array([0.5, *[0.4] * copies]), np.zeros(copies + 1, np.intp))
     assert model.detect_vehicles(pyramid, windows, min_margin=0.0)[1].tolist() == [0.5, 0.4]
     with_votes = dataclasses.replace(model, vote_weight=0.1)
-    found, margins, _ = with_votes.detect_vehicles(pyramid, windows, min_margin=0.0)
+    found, margins, *_ = with_votes.detect_vehicles(pyramid, windows, min_margin=0.0)
     assert found.tolist() == [vehicle, boxes[0].tolist()]
     # The vote masses are 30 * 1.5 and 1.6.
     np.testing.assert_allclose(margins, [0.4 + 0.1 * (np.log(46) - 2), 0.5 + 0.1 * (np.log(2.6) - 2)])
@@ -76,7 +76,7 @@ def test_many_candidates_lower_the_margins(candidates):
     boxes, margins = np.hstack([corners, corners + 15]), np.linspace(-0.9, 0.5, candidates)[::-1]
     windows = ScoredWindows(boxes, margins, np.zeros(candidates, np.intp))
     counted = dataclasses.replace(model, count_weight=0.2)
-    found, lowered, shift = counted.detect_vehicles(pyramid, windows, min_margin=-2.0)
+    found, lowered, shift, _ = counted.detect_vehicles(pyramid, windows, min_margin=-2.0)
     np.testing.assert_allclose(found, boxes)
     np.testing.assert_allclose(lowered, margins - 0.2 * np.log((1 + candidates) / 8))
     assert shift == pytest.approx(-0.2 * np.log((1 + candidates) / 8))
@@ -88,7 +88,7 @@ def test_many_candidates_lower_the_margins(candidates):
 def test_a_saved_model_is_loaded_bit_by_bit(tmp_path):
     path = tmp_path / "model.safetensors"
     options = {"slope": 1.7, "offset": 0.1, "threshold": -0.3, "count_weight": 0.3}
-    options |= {"size_prior_weight": 0.02, "vote_weight": 0.04}
+    options |= {"perspective_weight": 0.1, "size_prior_weight": 0.02, "vote_weight": 0.04}
     model = random_mixture(**options, metadata={"a": [1, {"b": None}]})
     templates = *model.templates, mixture_template(5, 6, seed=4, border=True)
     model = dataclasses.replace(model, templates=templates)
@@ -140,6 +140,7 @@ def write_file(path, tensors=None, params=None, *, params_text=None, **changes):
         "size_prior_weight": 0.0,
         "vote_weight": 0.0,
         "count_weight": 0.0,
+        "perspective_weight": 0.0,
         **(params or {}),
     }
     header = {

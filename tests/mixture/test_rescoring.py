@@ -10,6 +10,7 @@ from vehicle_detection.mixture import (
     EdgePyramid,
     Layer,
     MixtureSearch,
+    Network,
     Rescorer,
     TemplateMixture,
     load_model,
@@ -24,10 +25,13 @@ BOXES = np.array([[20.0, 30.0, 80.0, 70.0], [-10.0, 5.0, 30.0, 60.0], [100.5, 40
 SHAPES = [(4, 9 * 23), (6, 9 * 4), (5, 9 * 6), (7, 4 * 5), (5, 7)]
 
 
-def random_rescorer(seed=0, blend_weight=0.4):
+def random_network(seed=0):
     rng = np.random.default_rng(seed)
-    layers = [Layer(rng.normal(0, 0.2, shape), rng.normal(0, 0.2, shape[0])) for shape in SHAPES]
-    return Rescorer(tuple(layers), blend_weight)
+    return Network(tuple(Layer(rng.normal(0, 0.2, shape), rng.normal(0, 0.2, shape[0])) for shape in SHAPES))
+
+
+def random_rescorer(seed=0, blend_weight=0.4):
+    return Rescorer((random_network(seed), random_network(seed + 1)), blend_weight)
 
 
 def one_template_mixture(**options):
@@ -38,10 +42,10 @@ def noise(seed, shape=(120, 160, 3)):
     return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
 
 
-def network_reference(rescorer, crop):
+def network_reference(network, crop):
     """Outputs for one crop ``(23, 12, 12)``, cell by cell in double precision."""
     values = crop.astype(np.float64)
-    for layer, stride in zip(rescorer.layers[:3], (1, 2, 1)):
+    for layer, stride in zip(network.layers[:3], (1, 2, 1)):
         side = (values.shape[1] - 3) // stride + 1
         found = np.zeros((len(layer.bias), side, side))
         weights = layer.weights.reshape(-1, 3, 3, len(values))
@@ -49,17 +53,20 @@ def network_reference(rescorer, crop):
             part = values[:, y * stride : y * stride + 3, x * stride : x * stride + 3]
             found[:, y, x] = np.einsum("oijc,cij->o", weights, part) + layer.bias
         values = np.maximum(found, 0)
-    hidden = np.maximum(rescorer.layers[3].weights @ values.ravel() + rescorer.layers[3].bias, 0)
-    return rescorer.layers[4].weights @ hidden + rescorer.layers[4].bias
+    hidden = np.maximum(network.layers[3].weights @ values.ravel() + network.layers[3].bias, 0)
+    return network.layers[4].weights @ hidden + network.layers[4].bias
 
 
 @given(seed=st.integers(0, 1000), count=st.integers(0, 5))
 @settings(max_examples=25)
-def test_the_network_equals_the_reference(seed, count):
+def test_the_networks_equal_the_reference(seed, count):
     rescorer = random_rescorer(seed)
     inputs = np.random.default_rng(seed).normal(0, 1, (23, count, 12, 12)).astype(np.float32)
     log_odds, shifts = rescorer.predict(inputs)
-    expected = np.array([network_reference(rescorer, inputs[:, row]) for row in range(count)]).reshape(-1, 5)
+    each = [
+        [network_reference(network, inputs[:, row]) for row in range(count)] for network in rescorer.networks
+    ]
+    expected = np.mean(each, axis=0).reshape(-1, 5)
     np.testing.assert_allclose(log_odds, expected[:, 0], atol=1e-4)
     np.testing.assert_allclose(shifts, expected[:, 1:].clip(-0.4, 0.4), atol=1e-4)
 
@@ -96,11 +103,11 @@ def test_nms_uses_the_rescored_margins():
     corrected, rescored = model.rescorer.apply(pyramid, proposals, margins)
     rows = nms(corrected, rescored)
     assert len(rows) < len(proposals)
-    boxes, found, _ = model.detect_vehicles(pyramid, windows, min_margin=-9.0)
+    boxes, found, *_ = model.detect_vehicles(pyramid, windows, min_margin=-9.0)
     np.testing.assert_array_equal(boxes, corrected[rows])
     np.testing.assert_array_equal(found, rescored[rows])
     middle = float(np.median(found))
-    boxes, fewer, _ = model.detect_vehicles(pyramid, windows, min_margin=middle)
+    boxes, fewer, *_ = model.detect_vehicles(pyramid, windows, min_margin=middle)
     np.testing.assert_array_equal(fewer, found[found >= middle])
 
 
@@ -116,15 +123,17 @@ def test_nms_uses_the_rescored_margins():
     ],
 )
 def test_invalid_layers_are_rejected(number, weights, bias, message):
-    layers = list(random_rescorer().layers)
+    layers = list(random_network().layers)
     layers[number] = Layer(weights, bias)
     with pytest.raises(InvalidInputError, match=message):
-        Rescorer(tuple(layers), 0.4)
+        Network(tuple(layers))
 
 
 def test_invalid_rescorers_are_rejected():
     with pytest.raises(InvalidInputError, match="layers must be 5, got 1; train again"):
-        Rescorer(random_rescorer().layers[:1], 0.4)
+        Network(random_network().layers[:1])
+    with pytest.raises(InvalidInputError, match="networks must hold at least one network, got none"):
+        Rescorer((), 0.4)
     with pytest.raises(InvalidInputError, match=r"rescorer\.blend_weight must be a number"):
         random_rescorer(blend_weight=1.5)
 
@@ -151,7 +160,7 @@ def test_a_model_file_preserves_the_rescorer(tmp_path):
 def test_a_file_with_an_incomplete_rescorer_is_rejected(tmp_path, monkeypatch):
     model = one_template_mixture(rescorer=random_rescorer())
     tensors = model.rescorer.tensors()
-    tensors.pop(f"rescorer.{LAYERS[3]}.bias")
+    tensors.pop(f"rescorer.2.{LAYERS[3]}.bias")
     monkeypatch.setattr(Rescorer, "tensors", lambda self: tensors)
     model.save(tmp_path / "model.safetensors")
     with pytest.raises(

@@ -13,7 +13,7 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ from vehicle_detection.classifier import VehicleClassifier, build_classifier
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.mixture.boxes import DUPLICATE_IOU, ScoredWindows, nms, vote_boxes
 from vehicle_detection.mixture.features import EdgePyramid
+from vehicle_detection.mixture.perspective import perspective_ratios
 from vehicle_detection.mixture.rescoring import RESCORE_MIN, Rescorer
 from vehicle_detection.mixture.template import MixtureTemplate
 from vehicle_detection.params import PyramidParams
@@ -44,8 +45,28 @@ Floats = NDArray[np.float64]
 # Height in pixels of a box, and number of candidates plus one, that leave a margin as it is.
 _USUAL_HEIGHT, _USUAL_COUNT = 64.0, 8
 
+# Numbers of a mixture in its model file.
+_NUMBERS = (
+    "slope",
+    "offset",
+    "threshold",
+    "size_prior_weight",
+    "vote_weight",
+    "count_weight",
+    "perspective_weight",
+)
+
 KIND = "mixture"
 """Kind of the model files that hold a mixture of templates."""
+
+
+class FoundVehicles(NamedTuple):
+    """Vehicles of a frame, best first."""
+
+    boxes: Floats  # (N, 4)
+    margins: Floats  # (N,)
+    shift: float  # what the number of candidates has added to each margin
+    perspective: Floats  # (N,) what perspective has added
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +90,8 @@ class TemplateMixture:
     vote_weight
         Margin added per unit of ``log(1 + vote mass) - 2``, at most 2 units: a vehicle is found by many
         windows of similar position and size, clutter by one or two.
+    perspective_weight
+        Factor of what the other boxes of the frame say about the height of a box, see `perspective_ratios`.
     count_weight
         Margin subtracted per unit of ``log((1 + n) / 8)``, where `n` counts the candidates in the frame: the
         more there are, the more of them are clutter.
@@ -96,6 +119,7 @@ class TemplateMixture:
     size_prior_weight: float = 0.0
     vote_weight: float = 0.0
     count_weight: float = 0.0
+    perspective_weight: float = 0.0
     rescorer: Rescorer | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
@@ -113,6 +137,7 @@ class TemplateMixture:
         check_number(self.size_prior_weight, "size_prior_weight", low=0)
         check_number(self.vote_weight, "vote_weight", low=0)
         check_number(self.count_weight, "count_weight", low=0)
+        check_number(self.perspective_weight, "perspective_weight", low=0)
         object.__setattr__(self, "templates", templates)
 
     @property
@@ -155,7 +180,8 @@ class TemplateMixture:
         }
         if self.rescorer is not None:
             facts["rescoring"] = (
-                f"network of {self.rescorer.n_weights:,} weights, blend weight {self.rescorer.blend_weight:g}"
+                f"{len(self.rescorer.networks)} networks, {self.rescorer.n_weights:,} weights, blend weight "
+                f"{self.rescorer.blend_weight:g}"
             )
         return f"{len(self.templates)} templates, threshold {self.threshold:.2f} (log-odds)", facts
 
@@ -169,20 +195,23 @@ class TemplateMixture:
 
     def detect_vehicles(
         self, pyramid: EdgePyramid, windows: ScoredWindows, *, min_margin: float
-    ) -> tuple[Floats, Floats, float]:
-        """Boxes and margins of the vehicles that the windows of a frame propose, best first.
-
-        Also returns what the number of candidates has added to each margin.
-        """
+    ) -> FoundVehicles:
+        """Find the vehicles that the windows of a frame propose, best first."""
         boxes, margins = self.propose_boxes(pyramid, windows, min_margin=RESCORE_MIN)
         if self.rescorer is not None:
             boxes, margins = self.rescorer.apply(pyramid, boxes, margins)
         rows = nms(boxes, margins)
-        count = np.count_nonzero(margins[rows] >= RESCORE_MIN)
+        boxes, margins = boxes[rows], margins[rows]
+        count = np.count_nonzero(margins >= RESCORE_MIN)
         shift = -self.count_weight * math.log((1 + count) / _USUAL_COUNT)
-        margins = margins + shift
-        rows = rows[(margins[rows] >= min_margin) & (box_areas(boxes[rows]) > 0)]
-        return boxes[rows], margins[rows], shift
+        perspective = np.zeros(len(boxes))
+        if self.perspective_weight:
+            ratios = perspective_ratios(boxes, margins + shift, pyramid.shape[0])
+            perspective = self.perspective_weight * ratios
+        margins = margins + shift + perspective
+        order = np.argsort(-margins, kind="stable")
+        rows = order[(margins[order] >= min_margin) & (box_areas(boxes[order]) > 0)]
+        return FoundVehicles(boxes[rows], margins[rows], shift, perspective[rows])
 
     def propose_boxes(
         self, pyramid: EdgePyramid, windows: ScoredWindows, *, min_margin: float
@@ -214,13 +243,7 @@ class TemplateMixture:
             "biases": [template.bias for template in self.templates],
             "paddings": [template.padding for template in self.templates],
             "borders": [template.border for template in self.templates],
-            "slope": self.slope,
-            "offset": self.offset,
-            "threshold": self.threshold,
-            "size_prior_weight": self.size_prior_weight,
-            "vote_weight": self.vote_weight,
-            "count_weight": self.count_weight,
-        }
+        } | {name: getattr(self, name) for name in _NUMBERS}
         if self.rescorer is not None:
             tensors |= self.rescorer.tensors()
             params["rescorer"] = self.rescorer.numbers()
@@ -265,8 +288,7 @@ def load_model(path: str | os.PathLike[str] = "default") -> TemplateMixture | Ve
             )
             for index, (bias, padding, border) in enumerate(rows)
         )
-        names = "slope", "offset", "threshold", "size_prior_weight", "vote_weight", "count_weight"
-        numbers = {name: float(params[name]) for name in names}
+        numbers = {name: float(params[name]) for name in _NUMBERS}
         rescorer = Rescorer.build(tensors, params["rescorer"]) if "rescorer" in params else None
         return TemplateMixture(templates, **numbers, rescorer=rescorer, metadata=data.metadata)
     except (InvalidInputError, KeyError, IndexError, TypeError, ValueError, OverflowError) as error:

@@ -50,7 +50,7 @@ class Layer:
 
 
 @dataclass(frozen=True, eq=False)
-class Rescorer:
+class Network:
     """A small convolutional network on the edges and colors of a box's cells.
 
     Three convolutions of 3x3 cells and a hidden layer, with rectified outputs, give the log-odds of a vehicle
@@ -61,12 +61,9 @@ class Rescorer:
     ----------
     layers
         The five `LAYERS`.
-    blend_weight
-        Factor of the log-odds in the final margin: margin of the templates plus weighted log-odds.
     """
 
     layers: tuple[Layer, ...]
-    blend_weight: float
     _products: tuple[DenseLayer, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -84,33 +81,61 @@ class Rescorer:
             raise InvalidInputError(
                 f"rescorer.{LAYERS[-1]} must have 5 outputs, got {len(layers[-1].bias)}; train again"
             )
-        check_number(self.blend_weight, "rescorer.blend_weight", above=0, high=1)
         object.__setattr__(self, "layers", tuple(layers))
         object.__setattr__(self, "_products", tuple(DenseLayer(layer.weights) for layer in layers))
+
+    def outputs(self, columns: Singles, shape: tuple[int, int, int]) -> Floats:
+        """Log-odds and shifts of the edges, ``(N, 5)``, of crops whose cells are unfolded."""
+        for number, (layer, product) in enumerate(zip(self.layers, self._products)):
+            values = product(columns) + layer.bias[:, None]
+            if number + 1 < len(LAYERS):
+                np.maximum(values, 0, out=values)
+            columns = values
+            if number < len(STRIDES):
+                values = values.reshape(len(layer.bias), *shape)
+                if number + 1 < len(STRIDES):
+                    columns, shape = unfold(values, STRIDES[number + 1])
+                else:
+                    columns = flatten(values)
+        return columns.T.astype(np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Rescorer:
+    """Networks that score and correct boxes together.
+
+    The mean of networks that differ in their random initial weights is better than each: Hansen and Salamon,
+    "Neural network ensembles" (PAMI 1990).
+
+    Attributes
+    ----------
+    networks
+        One or more `Network`.
+    blend_weight
+        Factor of the log-odds in the final margin: margin of the templates plus weighted log-odds.
+    """
+
+    networks: tuple[Network, ...]
+    blend_weight: float
+
+    def __post_init__(self) -> None:
+        if not self.networks:
+            raise InvalidInputError("networks must hold at least one network, got none; train again")
+        check_number(self.blend_weight, "rescorer.blend_weight", above=0, high=1)
 
     @property
     def n_weights(self) -> int:
         """Number of trained numbers."""
-        return sum(layer.weights.size + layer.bias.size for layer in self.layers)
+        layers = [layer for network in self.networks for layer in network.layers]
+        return sum(layer.weights.size + layer.bias.size for layer in layers)
 
     def predict(self, inputs: Singles) -> tuple[Floats, Floats]:
         """Log-odds ``(N,)`` and shifts of the edges ``(N, 4)``, as fractions of a box's sides, of crops.
 
         `inputs` are `network_inputs`.
         """
-        values = inputs
-        for number, (layer, product) in enumerate(zip(self.layers, self._products)):
-            columns = values
-            if number < len(STRIDES):
-                columns, shape = unfold(values, STRIDES[number])
-            values = product(columns) + layer.bias[:, None]
-            if number + 1 < len(LAYERS):
-                np.maximum(values, 0, out=values)
-            if number < len(STRIDES):
-                values = values.reshape(len(layer.bias), *shape)
-            if number + 1 == len(STRIDES):
-                values = flatten(values)
-        outputs = values.T.astype(np.float64)
+        columns, shape = unfold(inputs, STRIDES[0])
+        outputs = np.mean([network.outputs(columns, shape) for network in self.networks], axis=0)
         return outputs[:, 0], np.clip(outputs[:, 1:], -MAX_CORRECTION, MAX_CORRECTION)
 
     def apply(self, pyramid: EdgePyramid, boxes: Floats, margins: Floats) -> tuple[Floats, Floats]:
@@ -125,21 +150,25 @@ class Rescorer:
     def tensors(self) -> dict[str, NDArray[Any]]:
         """Arrays for the model file by name."""
         arrays = {}
-        for name, layer in zip(LAYERS, self.layers):
-            arrays[f"rescorer.{name}.weights"], arrays[f"rescorer.{name}.bias"] = layer.weights, layer.bias
+        for number, network in enumerate(self.networks, 1):
+            for name, layer in zip(LAYERS, network.layers):
+                arrays[f"rescorer.{number}.{name}.weights"] = layer.weights
+                arrays[f"rescorer.{number}.{name}.bias"] = layer.bias
         return arrays
 
     def numbers(self) -> dict[str, float]:
         """Numbers for the model file."""
-        return {"blend_weight": self.blend_weight}
+        return {"blend_weight": self.blend_weight, "networks": len(self.networks)}
 
     @classmethod
     def build(cls, tensors: Mapping[str, NDArray[Any]], numbers: Mapping[str, float]) -> Rescorer:
         """Rebuild a rescorer from its `tensors` and `numbers`."""
-        layers = [
-            Layer(tensors[f"rescorer.{name}.weights"], tensors[f"rescorer.{name}.bias"]) for name in LAYERS
-        ]
-        return cls(tuple(layers), float(numbers["blend_weight"]))
+        networks = []
+        for number in range(1, int(numbers["networks"]) + 1):
+            names = [f"rescorer.{number}.{name}" for name in LAYERS]
+            layers = [Layer(tensors[f"{name}.weights"], tensors[f"{name}.bias"]) for name in names]
+            networks.append(Network(tuple(layers)))
+        return cls(tuple(networks), float(numbers["blend_weight"]))
 
 
 def network_inputs(edges: Singles, colors: Singles) -> Singles:

@@ -33,17 +33,28 @@ _BEYOND, _CONTEXT = 4, 4
 _MAX_WINDOWS = 2000
 _MAX_PLANS = 8
 
+Floats = NDArray[np.float64]
 
 INNER, RIGHT, LEFT = range(3)
 """Where windows lie: anywhere, or at a border of the frame."""
 
 
 @dataclass(frozen=True, eq=False)
+class _LevelSearch:
+    """A search of the cells of one size: at one place, with some of the templates there."""
+
+    place: int
+    templates: NDArray[np.intp]  # indices
+    columns: NDArray[np.intp]  # of cells that become one, see `PackedSearch.find`
+    search: PackedSearch
+
+
+@dataclass(frozen=True, eq=False)
 class _Level:
-    """The cells of one size, and the templates that search them: inside, at the right and the left border."""
+    """The cells of one size, and their searches."""
 
     grid: CellGrid
-    searches: list[tuple[int, list[int], PackedSearch]]  # where, indices of templates, search
+    searches: list[_LevelSearch]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +63,29 @@ class _Plan:
 
     levels: list[_Level]
     row_ranges: list[Rows]
+    # For each search of all levels: place, corner and size of its cells, and indices of its templates.
+    places: NDArray[np.intp]
+    corners: Floats
+    steps: Floats
+    templates: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, levels: list[_Level], row_ranges: list[Rows]) -> _Plan:
+        """List the facts of the searches that turn their windows into boxes."""
+        pairs = [(level.grid, each) for level in levels for each in level.searches]
+        templates = np.zeros(
+            (len(pairs), max((len(each.templates) for _, each in pairs), default=0)), np.intp
+        )
+        for row, (_, each) in zip(templates, pairs):
+            row[: len(each.templates)] = each.templates
+        return cls(
+            levels,
+            row_ranges,
+            np.array([each.place for _, each in pairs], np.intp),
+            np.array([(grid.left, grid.top) for grid, _ in pairs]).reshape(-1, 2),
+            np.array([(grid.step_x, grid.step_y) for grid, _ in pairs]).reshape(-1, 2),
+            templates,
+        )
 
 
 class MixtureSearch(FrameSearch):
@@ -86,6 +120,9 @@ class MixtureSearch(FrameSearch):
                 [self._strip_weights(scaled[index][:, ::-1, MIRROR_ORDER]) for index in self._numbers[LEFT]]
             ),
         ]
+        self._box_cells = np.array([each.box_cells for each in templates])
+        self._paddings = np.array([each.padding for each in templates])
+        self._biases = np.array([each.bias for each in templates])
         # Of each place and template.
         self._units = np.zeros((len(self._filters), len(templates)))
         for units, numbers, filters in zip(self._units, self._numbers, self._filters):
@@ -102,12 +139,13 @@ class MixtureSearch(FrameSearch):
         model = self.model
         with single_threaded_opencv():
             pyramid, found = self.score_windows(prepare(frame), params)
-            boxes, margins, shift = model.detect_vehicles(
-                pyramid, found, min_margin=model.margin_of(min_vehicle_score)
-            )
-        scores = model.scores(found.margins + shift)
+            vehicles = model.detect_vehicles(pyramid, found, min_margin=model.margin_of(min_vehicle_score))
+        scores = model.scores(found.margins + vehicles.shift)
         shown = scores >= params.min_score
-        return Detections(found.boxes[shown], scores[shown]), Detections(boxes, model.scores(margins))
+        return (
+            Detections(found.boxes[shown], scores[shown]),
+            Detections(vehicles.boxes, model.scores(vehicles.margins)),
+        )
 
     def score_windows(
         self, image: NDArray[np.uint8], params: PyramidParams
@@ -126,45 +164,32 @@ class MixtureSearch(FrameSearch):
                 plan.levels,
                 cost=lambda level: level.grid.rows * level.grid.columns,
             )
-        windows = self._to_windows([level.grid for level in plan.levels], found, pyramid.shape)
+        windows = self._to_windows(plan, [each for level in found for each in level], pyramid.shape)
         return pyramid, windows.best(_MAX_WINDOWS)
 
-    def _search_level(self, pyramid: EdgePyramid, level: _Level) -> NDArray[np.int32]:
-        """Windows on the cells of one size: place, template, row, column and score; ``(N, 5)``."""
-        grid, workspace = level.grid, self.workspace
-        packed = pyramid.packed_channels(grid, self._filters[INNER].packing, workspace)
-        found = [np.empty((0, 5), np.int32)]
-        for place, templates, search in level.searches:
-            cells = np.minimum(_BEYOND + self._strip_cells, grid.columns - 1)
-            columns = {INNER: cells[:0], LEFT: cells, RIGHT: grid.columns - 1 - cells}[place]
-            windows = search.find(packed, columns, workspace)
-            if place != INNER:
-                windows[:, 1] = windows[:, 2]
-            table = np.empty((len(windows), 5), np.int32)
-            table[:, 0], table[:, 1] = place, np.array(templates)[windows[:, 0]]
-            table[:, 2:] = windows[:, 1:]
-            found.append(table)
-        return np.concatenate(found)
+    def _search_level(self, pyramid: EdgePyramid, level: _Level) -> list[NDArray[np.int32]]:
+        """Windows of each search on the cells of one size, see `PackedSearch.find`."""
+        packed = pyramid.packed_channels(level.grid, self._filters[INNER].packing, self.workspace)
+        return [each.search.find(packed, each.columns, self.workspace) for each in level.searches]
 
     def _to_windows(
-        self, grids: list[CellGrid], found: list[NDArray[np.int32]], shape: tuple[int, int]
+        self, plan: _Plan, found: list[NDArray[np.int32]], shape: tuple[int, int]
     ) -> ScoredWindows:
-        """Boxes and margins of the windows of all sizes, without those mostly outside the frame."""
-        place, index, row, column, score = np.concatenate([np.empty((0, 5), np.int32), *found]).T
-        level = np.repeat(np.arange(len(found)), [len(each) for each in found])
-        corners = np.array([(grid.left, grid.top) for grid in grids]).reshape(-1, 2)[level]
-        steps = np.array([(grid.step_x, grid.step_y) for grid in grids]).reshape(-1, 2)[level]
-        templates = self.model.templates
-        sizes = np.array([each.box_cells for each in templates])[index] * steps
-        padding = np.array([each.padding for each in templates])[index]
-        start = corners + (np.column_stack([column, row]) + padding) * steps
+        """Boxes and margins of the windows of all searches, without those mostly outside the frame."""
+        number, row, column, score = np.concatenate([np.empty((0, 4), np.int32), *found]).T
+        search = np.repeat(np.arange(len(found)), [len(each) for each in found])
+        place, index, steps = plan.places[search], plan.templates[search, number], plan.steps[search]
+        # The rows of a strip lie side by side.
+        row = np.where(place == INNER, row, column)
+        sizes = self._box_cells[index] * steps
+        start = plan.corners[search] + (np.column_stack([column, row]) + self._paddings[index]) * steps
         start[place == LEFT, 0] = 0
         at_right = place == RIGHT
         start[at_right, 0] = shape[1] - sizes[at_right, 0]
-        margins = score * self._units[place, index] + np.array([each.bias for each in templates])[index]
+        margins = score * self._units[place, index] + self._biases[index]
         boxes = np.hstack([start, start + sizes])
         inside = mostly_inside(boxes, shape)
-        return ScoredWindows(boxes, margins, index.astype(np.intp))[np.flatnonzero(inside)]
+        return ScoredWindows(boxes, margins, index)[np.flatnonzero(inside)]
 
     def _plan(self, shape: tuple[int, int], params: PyramidParams, min_margin: float) -> _Plan:
         plan = self._plans.get((shape, params))
@@ -208,7 +233,9 @@ class MixtureSearch(FrameSearch):
                 bounds = [min_margin - templates[index].bias for index in indices]
                 search = filters.on_map(columns, chosen, spans, bounds)
                 if search is not None:
-                    searches.append((place, indices, search))
+                    cells = np.minimum(_BEYOND + self._strip_cells, grid.columns - 1)
+                    merged = {INNER: cells[:0], LEFT: cells, RIGHT: grid.columns - 1 - cells}[place]
+                    searches.append(_LevelSearch(place, np.array(indices, np.intp), merged, search))
             levels.append(_Level(grid, searches))
             context = math.ceil(_CONTEXT * size)
             octaves[octave_of(size, len(octaves))].append((rows[0] - context, rows[1] + context))
@@ -218,7 +245,7 @@ class MixtureSearch(FrameSearch):
             else (0, shape[0])
             for each in octaves
         ]
-        return _Plan(levels, row_ranges)
+        return _Plan.of(levels, row_ranges)
 
 
 def frame_grid(size: float, shape: tuple[int, ...], rows: Rows | None = None) -> CellGrid:

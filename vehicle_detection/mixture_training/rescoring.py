@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from vehicle_detection.mixture import (
     EdgePyramid,
     Layer,
     MixtureSearch,
+    Network,
     Rescorer,
     flatten,
     last_cells,
@@ -37,9 +39,9 @@ from vehicle_detection.params import MixtureParams, PyramidParams
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
+_NETWORKS = 2  # that are trained, and averaged
 _OUTPUTS = (32, 48, 64, 64, 5)  # of the layers
 _EPOCHS, _BATCH, _DROPOUT = 8, 256, 0.3
-_PARTS = 4  # of a batch, which threads share
 _MIN_STEPS = 40  # of an epoch; with few samples batches are smaller
 # Largest step of the optimizer, the share of the steps in which it rises, and the decay of the weights.
 _RATE, _WARMUP, _DECAY = 2e-3, 0.2, 1e-3
@@ -91,7 +93,8 @@ def train_rescorer(
     samples = Samples.join([part for parts in pool.map(sample, frames, seeds) for part in parts])
     if samples.is_vehicle.all() or not samples.is_vehicle.any():
         return None
-    return Rescorer(fit_network(samples, rng, pool), params.blend_weight)
+    networks = pool.map(partial(fit_network, samples), rng.spawn(_NETWORKS))
+    return Rescorer(tuple(networks), params.blend_weight)
 
 
 def _sample(
@@ -134,11 +137,11 @@ def sample_boxes(
     return np.concatenate([copies, proposals[right]]), np.concatenate([proposals[wrong], beside])
 
 
-def fit_network(samples: Samples, rng: np.random.Generator, pool: ThreadPoolExecutor) -> tuple[Layer, ...]:
+def fit_network(samples: Samples, rng: np.random.Generator) -> Network:
     """Minimize the logistic loss and the error of the shifts: AdamW (Loshchilov and Hutter, ICLR 2019).
 
     Half of the crops of a batch are mirrored, and some values of the dense layers are dropped out (Srivastava
-    et al., "Dropout", JMLR 2014). The result does not depend on the number of threads.
+    et al., "Dropout", JMLR 2014).
     """
     values = _initial_values(rng)
     means, squares = ([np.zeros_like(value) for value in values] for _ in range(2))
@@ -146,7 +149,7 @@ def fit_network(samples: Samples, rng: np.random.Generator, pool: ThreadPoolExec
     batch = min(_BATCH, max(count // _MIN_STEPS, 1))
     steps = _EPOCHS * (count // batch)
     for step, rows in enumerate(_batches(count, batch, rng), 1):
-        gradients = _batch_gradients(values, samples, rows, rng, pool)
+        gradients = _gradients(values, _draw(samples, rows, rng), rng)
         # The rate rises linearly, then falls like a cosine.
         progress = step / steps
         rising = progress / _WARMUP
@@ -158,7 +161,7 @@ def fit_network(samples: Samples, rng: np.random.Generator, pool: ThreadPoolExec
             corrected = mean / (1 - 0.9**step)
             value *= np.float32(1 - rate * _DECAY * (value.ndim == 2))
             value -= np.float32(rate) * corrected / (np.sqrt(square / (1 - 0.999**step)) + np.float32(1e-8))
-    return tuple(Layer(weights, bias) for weights, bias in zip(values[::2], values[1::2]))
+    return Network(tuple(Layer(weights, bias) for weights, bias in zip(values[::2], values[1::2])))
 
 
 def _initial_values(rng: np.random.Generator) -> list[Singles]:
@@ -180,24 +183,6 @@ def _batches(count: int, batch: int, rng: np.random.Generator) -> Iterator[NDArr
             yield order[start : start + batch]
 
 
-def _batch_gradients(
-    values: list[Singles],
-    samples: Samples,
-    rows: NDArray[np.intp],
-    rng: np.random.Generator,
-    pool: ThreadPoolExecutor,
-) -> list[Singles]:
-    """Gradients of the loss of a batch, whose parts are shared by the threads."""
-    totals = len(rows), max(int(samples.is_vehicle[rows].sum()), 1)
-
-    def part(rows: NDArray[np.intp], rng: np.random.Generator) -> list[Singles]:
-        return _gradients(values, _draw(samples, rows, rng), totals, rng)
-
-    count = min(_PARTS, len(rows))
-    parts = pool.map(part, np.array_split(rows, count), rng.spawn(count))
-    return [sum(gradients[1:], start=gradients[0]) for gradients in zip(*parts)]
-
-
 def _draw(samples: Samples, rows: NDArray[np.intp], rng: np.random.Generator) -> Samples:
     """Take some samples, half of them mirrored."""
     inputs, shifts = samples.inputs[:, rows], samples.shifts[rows].copy()
@@ -207,13 +192,8 @@ def _draw(samples: Samples, rows: NDArray[np.intp], rng: np.random.Generator) ->
     return Samples(inputs, samples.is_vehicle[rows], shifts)
 
 
-def _gradients(
-    values: list[Singles], batch: Samples, totals: tuple[int, int], rng: np.random.Generator | None
-) -> list[Singles]:
-    """Gradients of the loss by backpropagation; without a generator nothing is dropped out.
-
-    `totals` are the numbers of samples and of vehicles that the losses are divided by.
-    """
+def _gradients(values: list[Singles], batch: Samples, rng: np.random.Generator | None) -> list[Singles]:
+    """Gradients of the loss by backpropagation; without a generator nothing is dropped out."""
     weights, biases = values[::2], values[1::2]
     columns: list[Singles] = []
     kept: list[Singles] = []
@@ -239,7 +219,7 @@ def _gradients(
         if number + 1 == len(STRIDES):
             last_shape = current.shape
             current = flatten(current)
-    gradient = _loss_gradient(current, batch, totals)
+    gradient = _loss_gradient(current, batch)
     gradients: list[Singles] = []
     for number in range(len(weights) - 1, -1, -1):
         if number + 1 < len(weights):
@@ -255,13 +235,13 @@ def _gradients(
     return gradients[::-1]
 
 
-def _loss_gradient(outputs: Singles, batch: Samples, totals: tuple[int, int]) -> Singles:
+def _loss_gradient(outputs: Singles, batch: Samples) -> Singles:
     """Gradient of the mean loss by the outputs ``(5, N)``."""
-    positive = batch.is_vehicle
+    count, positive = len(batch.is_vehicle), batch.is_vehicle
     gradient = np.empty_like(outputs)
-    gradient[0] = (1 / (1 + np.exp(-outputs[0].clip(-80, 80))) - positive) / totals[0]
+    gradient[0] = (1 / (1 + np.exp(-outputs[0].clip(-80, 80))) - positive) / count
     error = (outputs[1:] - batch.shifts.T) / _SMOOTH
-    gradient[1:] = _BOX_WEIGHT * error.clip(-1, 1) * positive / totals[1]
+    gradient[1:] = _BOX_WEIGHT * error.clip(-1, 1) * positive / max(int(positive.sum()), 1)
     return gradient
 
 

@@ -125,6 +125,7 @@ class _Training:
             size_prior_weight=params.size_prior_weight,
             vote_weight=params.vote_weight,
             count_weight=params.count_weight,
+            perspective_weight=params.perspective_weight,
         )
         if params.blend_weight:
             with mixture.open_search(n_jobs=1) as search:

@@ -36,7 +36,7 @@ class MixtureParams:
         Inverse regularization strength, as in ``LinearSVC``, of the templates and of the border templates.
     positive_weight
         Total weight of all positives of a template; each negative weighs 1.
-    size_prior_weight, vote_weight, count_weight, blend_weight
+    size_prior_weight, vote_weight, count_weight, perspective_weight, blend_weight
         As in `TemplateMixture` and `Rescorer`; with a `blend_weight` of 0 no rescorer is
         trained.
     min_width
@@ -80,6 +80,7 @@ class MixtureParams:
     size_prior_weight: float = 0.1
     vote_weight: float = 0.1
     count_weight: float = 0.22
+    perspective_weight: float = 0.2
     blend_weight: float = 0.1
     min_width: float = 28.0
     aspect_tolerance: float = 0.2
@@ -109,7 +110,7 @@ class MixtureParams:
         for name in "C", "border_C":
             check_number(getattr(self, name), name, above=0, high=1e6)
         check_number(self.positive_weight, "positive_weight", above=0, high=1e9)
-        for name in "size_prior_weight", "vote_weight", "count_weight":
+        for name in "size_prior_weight", "vote_weight", "count_weight", "perspective_weight":
             check_number(getattr(self, name), name, low=0)
         check_number(self.blend_weight, "blend_weight", low=0, high=1)
         check_number(self.min_width, "min_width", low=8, high=10_000)
