@@ -298,9 +298,9 @@ def test_hovering_over_a_chart_shows_the_values_there(browser, embedded):
     readout = browser.run("document.querySelector('.readout').textContent")
     assert readout == "0:01.2#1 23 m +9 km/h#2 \u22124 km/h"
     assert browser.run("document.querySelectorAll('.cursor.visible').length") == 4
+    assert browser.run("document.querySelector('.cursor').getAttribute('x1')") == "61%"
     browser.point("figure:nth-of-type(4) .plot", 0.97)
     assert browser.run("document.querySelector('.readout').textContent") == "0:01.9#1 ~25 m +9 km/h"
-    assert browser.run("document.querySelector('.cursor').getAttribute('x1')") == "61%"
     assert browser.run(f"{VIDEO}.currentTime") == 0
     browser.point("h1", 0.5)
     assert browser.run("document.querySelectorAll('.cursor.visible').length") == 0
