@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import typer
 from typer.testing import CliRunner
 
 import vehicle_detection
@@ -785,6 +786,24 @@ def test_video_refuses_bad_input_and_changes_no_file(material, tmp_path):
         assert re.search(message, refuse("video", *words, "--quiet")), message
     assert (contents(tmp_path), contents(material)) == before
     assert (material / "clip.mp4").read_bytes() == original
+
+
+def test_the_help_of_each_option_shows_what_to_write():
+    choices = re.compile(r"[a-z]+(\|[a-z]+)+")  # all values
+    example = re.compile(r'such as \S|"\w+"|\.[a-z]{3,}|\d')
+    types = {None, "TEXT", "INTEGER", "FLOAT", "BOOLEAN", "STR", "INT"}
+    command = typer.main.get_command(app)
+    assert set(command.commands) == set(COMMANDS)
+    for name, each in command.commands.items():
+        for option in each.params:
+            assert option.help.endswith((".", "'")), (name, option.opts)
+            if getattr(option, "is_flag", False):
+                continue
+            words = f"{name} {option.opts[0]} {option.metavar}: {option.help}"
+            assert option.metavar not in types, words
+            given = option.default is not None and not callable(option.default)  # printed by --help
+            shown = given or choices.fullmatch(option.metavar) or "." in option.metavar
+            assert shown or example.search(option.help), words
 
 
 def test_video_refuses_bad_input_before_it_estimates_the_horizon(material, tmp_path, monkeypatch):

@@ -57,7 +57,8 @@ def video(
         str,
         Argument(
             metavar="SOURCE",
-            help="Video file; folder or quoted pattern of a trip's segments, or images; URL; camera; or -.",
+            help="Video file, such as drive.mp4; folder or quoted pattern of a trip's segments, or images; "
+            "URL; camera, such as 0; or -.",
         ),
     ],
     output: Annotated[
@@ -103,7 +104,9 @@ def video(
     clips: Annotated[
         Path | None,
         Option(
-            metavar="DIR", help="Folder for a short annotated clip of each event.", rich_help_panel=OUTPUT
+            metavar="DIR",
+            help="Folder for a short annotated clip of each event, such as clips.",
+            rich_help_panel=OUTPUT,
         ),
     ] = None,
     srt: Annotated[
@@ -183,7 +186,7 @@ def video(
         int | None,
         Option(
             metavar="N",
-            help="Frames searched in parallel; default: one per core, at most 4.",
+            help="Frames searched in parallel, such as 2; default: one per core, at most 4.",
             rich_help_panel=SEARCH,
         ),
     ] = None,

@@ -160,7 +160,9 @@ def event_markers(events: Sequence[Event], axis: TimeAxis, *, label: str) -> str
         top = row * _KIND_HEIGHT
         if row:
             names.append(svg_element("line", class_="grid", x1=0, x2="100%", y1=top, y2=top))
-        names.append(svg_element("text", KINDS[kind].capitalize(), class_="track-name", x=0, dx=4, y=top + 13))
+        names.append(
+            svg_element("text", KINDS[kind].capitalize(), class_="track-name", x=0, dx=4, y=top + 13)
+        )
         for event in events:
             if event.kind != kind:
                 continue
