@@ -181,9 +181,8 @@ def tidy_commands(page: str) -> str:
         re.findall(r"^## `vehicle-detection (\S+)`\n\n(.+?)\n\n", page, re.MULTILINE | re.DOTALL)
     )
     for name, text in described.items():
-        page = re.sub(
-            rf"^\* `{name}`: .*$", lambda _, line=f"* `{name}`: {text}": line, page, flags=re.MULTILINE
-        )
+        full = " ".join(text.split()).replace("\\", r"\\")
+        page = re.sub(rf"^(\* `{name}`): .*$", rf"\1: {full}", page, flags=re.MULTILINE)
     page = re.sub(r"^(\* `[A-Z][\w.]*) <[^>`]+>`", r"\1`", page, flags=re.MULTILINE)
     usage = re.compile(r"^\$ vehicle-detection .*$", re.MULTILINE)
     return usage.sub(

@@ -98,7 +98,7 @@ $ vehicle-detection one [OPTIONS] {IMAGE...}... {LABELS.csv}
 * `LABELS.csv <path>`: Labels.
 """
         tidied = site_pages.tidy_commands(page)
-        assert "* `one`: Do one thing with a file, and\nanother.\n" in tidied
+        assert "* `one`: Do one thing with a file, and another.\n" in tidied
         assert "$ vehicle-detection one [OPTIONS] IMAGE... LABELS.csv\n" in tidied
         assert "* `IMAGE...`: Images.\n* `LABELS.csv`: Labels.\n" in tidied
 
