@@ -116,6 +116,7 @@ def _photograph(browser: Browser, page: Path) -> NDArray[np.uint8]:
     bottom = browser.run("document.querySelector('#explorer')?.getBoundingClientRect().bottom")
     if bottom is not None:
         return browser.screenshot(round(bottom) + 4)
+    browser.run("document.querySelector('h1 + p').remove()")  # the speed depends on the machine
     browser.run(f"seek({REPORT_FRAME})")
     browser.wait_until("!document.querySelector('video').seeking")
     time.sleep(1)  # until the controls no longer show that the video loads
