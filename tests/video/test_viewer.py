@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from tests.helpers import StubDetector, random_mixture
-from tests.video.clips import child_processes, frame_numbers, running_threads
+from tests.video.clips import (
+    child_processes,
+    frame_numbers,
+    gray_frames,
+    running_threads,
+    sound_seconds,
+    write_clip,
+)
 from vehicle_detection import VehicleDetector, stream, track
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video import process, process_video, viewer
@@ -49,6 +56,18 @@ def test_closing_the_window_ends_the_run_and_completes_the_video(clip, tmp_path,
     assert frame_numbers(tmp_path / "out.mp4") == list(range(report.frames))
     assert child_processes() == before
     assert not running_threads()
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_the_sound_ends_with_the_frames_when_the_window_is_closed(folder, tmp_path, monkeypatch, suffix):
+    source = write_clip(folder / f"long.{suffix}", [*gray_frames(20)] * 10, fps=20, sound=True)
+    monkeypatch.setattr(process, "open_viewer", lambda title: Recorder(last=3))
+    target = tmp_path / f"out.{suffix}"
+    report = process_video(source, target, StubDetector(pause=0.02), show=True, workers=1)
+    assert report.frames <= 100
+    assert len(frame_numbers(target)) == report.frames
+    assert sound_seconds(target) == pytest.approx(report.frames / 20, abs=0.06)
+    assert list(tmp_path.iterdir()) == [target]
 
 
 @pytest.mark.parametrize("as_stream", [True, False])

@@ -154,7 +154,13 @@ def detect(
     images: Annotated[list[Path], Argument(metavar="IMAGE...", help="Image files, such as frames/*.jpg.")],
     output: Annotated[
         Path | None,
-        Option("-o", "--output", metavar="DIR", help="Annotated images.", rich_help_panel=OUTPUT),
+        Option(
+            "-o",
+            "--output",
+            metavar="DIR",
+            help="Folder for annotated images, such as found.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = None,
     boxes: Annotated[
         Path | None,
@@ -168,7 +174,7 @@ def detect(
         Path | None,
         Option(
             metavar="DIR",
-            help="Pictures that explain each box: the share of each cell in its score.",
+            help="Folder, such as why, for pictures that explain each box: the share of each cell.",
             rich_help_panel=OUTPUT,
         ),
     ] = None,
@@ -338,7 +344,9 @@ def evaluate(
     ignored_as_regions: Annotated[
         bool, flag("--ignored-as-regions", help="Ignore boxes of which half lies in an ignored box.")
     ] = False,
-    json: Annotated[Path | None, Option(metavar="FILE", help="File for all scores.")] = None,
+    json: Annotated[
+        Path | None, Option(metavar="FILE", help="File for all scores, such as scores.json.")
+    ] = None,
 ) -> None:
     """Score boxes, and tracks if there are any, against labels."""
     from json import dumps

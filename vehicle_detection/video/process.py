@@ -39,7 +39,7 @@ from vehicle_detection.video.ffmpeg import VideoInfo
 from vehicle_detection.video.frame_source import FrameSource
 from vehicle_detection.video.pipeline import FramePipeline, Frames, VideoDetector
 from vehicle_detection.video.reading import check_span, frame_range
-from vehicle_detection.video.sources import Source, open_source
+from vehicle_detection.video.sources import Source, borrow_source, open_source
 from vehicle_detection.video.streams import CONTAINERS, AudioSource, FrameWriter
 from vehicle_detection.video.viewer import Viewer, open_viewer
 
@@ -389,7 +389,7 @@ def _sound(source: FrameSource, first: int, end: float | None) -> AudioSource | 
 
 
 def cut_video(
-    source: str | os.PathLike[str],
+    source: Source,
     target: str | os.PathLike[str],
     *,
     start: float | None = None,
@@ -403,7 +403,7 @@ def cut_video(
     check_span(start, end)
     check_choice(preset, "preset", PRESETS)
     output = _check_video_target(target)
-    with open_source(source) as opened:
+    with borrow_source(source) as opened:
         _check_not_a_source(output, opened.files)
         first, count = frame_range(opened.info, start, end)
         with (

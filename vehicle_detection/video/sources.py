@@ -7,7 +7,7 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -144,6 +144,16 @@ def open_source(
         return _Stream(LiveStream(text, input_options(path)), live=bool(live))
     files = list_files(path)
     return _open_files(files, fps)
+
+
+@contextlib.contextmanager
+def borrow_source(source: Source) -> Iterator[FrameSource]:
+    """Open a source for a block; one that the caller has opened stays open."""
+    if isinstance(source, FrameSource):
+        yield source
+        return
+    with open_source(source) as opened:
+        yield opened
 
 
 def _open_files(files: Sequence[Path], fps: float) -> FrameSource:
