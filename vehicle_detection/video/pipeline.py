@@ -169,7 +169,7 @@ class FramePipeline:
         self._reader: Reader | None = None
         self._streams: list[Reader | FrameWriter] = []
         self._lock = threading.Lock()
-        self._aborted = False
+        self._aborted = self._stopped = False
         self.damage = ""
         """What is damaged in the source; known after the last frame."""
 
@@ -196,6 +196,7 @@ class FramePipeline:
     def stop(self) -> None:
         """End the source, so that the run completes with the frames read so far."""
         with self._lock:
+            self._stopped = True
             if self._reader is not None:
                 self._reader.kill()
 
@@ -224,7 +225,10 @@ class FramePipeline:
                 for stream in (reader, writer):
                     if stream is not None:
                         self._register(stream)
-                self._reader = reader
+                with self._lock:
+                    self._reader = reader
+                    if self._stopped:  # before there was a reader
+                        reader.kill()
                 self._run_threads(reader, writer)
         except QueueClosed:
             return
