@@ -354,7 +354,7 @@ class FramePipeline:
                 for _ in range(missed):
                     writer.repeat()
                 writer.write(drawn)
-            writer.finish()
+            writer.finish(early=self._stopped)
         except QueueClosed:
             return
         except BaseException as error:  # raised in the tracking thread at its next frame

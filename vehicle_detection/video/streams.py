@@ -5,6 +5,7 @@ moviepy's reader and writer copy each frame twice and round the frame rate to tw
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import re
@@ -246,8 +247,8 @@ class FrameWriter(_FfmpegStream):
         video += ["-framerate", str(info.fps)]
         sound: list[str] = []
         mapped = ["-map", "0:v:0"]
+        whole = audio is not None and audio.start is None and audio.length is None
         if audio is not None:
-            whole = audio.start is None and audio.length is None
             if whole and info.start_time:  # keep the delay of the first frame after the sound
                 video += ["-itsoffset", f"{info.start_time:.6f}"]
             sound += [] if audio.start is None else ["-ss", f"{audio.start:.6f}"]
@@ -260,11 +261,13 @@ class FrameWriter(_FfmpegStream):
         if info.pixel_aspect != 1:
             filters += f",setsar={info.pixel_aspect}"
         encoder = ["-vf", filters, "-c:v", "libx264", "-preset", preset, "-fps_mode", "passthrough"]
-        encoder += ["-f", container]
+        muxer = ["-f", container]
         if container != "matroska":  # the index at the front lets a browser play while it downloads
-            encoder += ["-movflags", "+faststart"]
-        options = ["-y", *video, "-i", "pipe:0", *sound, *mapped, *encoder, f"file:{path}"]
+            muxer += ["-movflags", "+faststart"]
+        options = ["-y", *video, "-i", "pipe:0", *sound, *mapped, *encoder, *muxer, f"file:{path}"]
         self._process = Process(options, stdin=True)
+        self._path, self._muxer, self._fps, self._frames = path, muxer, info.fps, 0
+        self._sound_start = None if audio is None else info.start_time if whole else 0.0
 
     def write(self, frame: NDArray[np.uint8]) -> None:
         """Send one frame to ffmpeg."""
@@ -279,14 +282,29 @@ class FrameWriter(_FfmpegStream):
             while done < len(view):
                 done += self._process.stdin.write(view[done:])
         except OSError as error:
-            raise self._error() from error
+            raise self._error(self._process) from error
+        self._frames += 1
 
-    def finish(self) -> None:
-        """Wait until ffmpeg has written the last frame."""
+    def finish(self, *, early: bool = False) -> None:
+        """Wait until ffmpeg has written the last frame; with `early`, end the sound there as well."""
         self._process.stdin.close()
         if self._process.wait():
-            raise self._error()
+            raise self._error(self._process)
+        if early and self._sound_start is not None:
+            self._cut_sound(self._sound_start + float(self._frames / self._fps))
 
-    def _error(self) -> TransientVideoError:
-        reason = exit_reason(self._process.wait(), self._process.log())
+    def _cut_sound(self, seconds: float) -> None:
+        """Copy the file without the sound after a time."""
+        whole = self._path.with_name(f"{self._path.stem}.whole{self._path.suffix}")
+        self._path.replace(whole)
+        source = ("-nostdin", "-i", f"file:{whole}", "-map", "0", "-c", "copy", "-t", f"{seconds:.6f}")
+        try:
+            with contextlib.closing(Process((*source, *self._muxer, f"file:{self._path}"))) as process:
+                if process.wait():
+                    raise self._error(process)
+        finally:
+            whole.unlink()
+
+    def _error(self, process: Process) -> TransientVideoError:
+        reason = exit_reason(process.wait(), process.log())
         return TransientVideoError(f"the video cannot be written: {reason}; nothing of it was kept")
