@@ -393,8 +393,8 @@ def _lost_record(task: Mapping[str, Any], error: Exception, store: Store) -> dic
     record = _basic_record(task, hide_credentials(f"{error}, {_ATTEMPTS} times"))
     try:
         write_record(store, record)
-    except OSError as full:
-        record["message"] += f"; {full}"
+    except (OSError, InvalidInputError) as unwritten:
+        record["message"] += f"; {unwritten}"
     return record | {"new": True}
 
 

@@ -88,7 +88,7 @@ def run_trip(task: Mapping[str, Any]) -> dict[str, Any]:
         record["seconds"] = round(time.time() - started, 3)
         try:
             write_record(store, record)
-        except OSError as error:  # the disk is full: the trip is missing, and the next run repeats it
+        except (OSError, InvalidInputError) as error:  # a full disk, no access: the next run repeats the trip
             record |= {"status": ERROR, "message": str(error)}
     return record | {"new": True}
 
