@@ -1,7 +1,8 @@
 """Records of a batch: one small JSON file per trip, written after its outputs, and a summary of them.
 
 A record's ``status`` is ``"done"``; ``"failed"`` if the source cannot be processed, which is not tried again
-before it changes; or ``"error"`` if the machine failed (disk full, lost worker), which the next run repeats.
+before it changes; or ``"error"`` if the machine failed (disk full, lost worker) or there was no access to the
+source, which the next run repeats.
 """
 
 from __future__ import annotations

@@ -70,6 +70,12 @@ class VideoInfo:
         How luma and chroma encode colors.
     audio_track, audio_codec
         Index and codec (such as ``"aac"``) of the first audio track that can be decoded; None without one.
+
+    Examples
+    --------
+    >>> info = VideoInfo(width=1280, height=720, fps=Fraction(30000, 1001), frames=60, duration=2.002)
+    >>> info.shape, info.has_audio
+    ((720, 1280, 3), False)
     """
 
     width: int

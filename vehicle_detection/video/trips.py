@@ -73,6 +73,11 @@ class Trip:
         ``"front"``, ``"rear"``, ``"left"``, ``"right"``, ``"interior"`` or ``"unknown"``.
     start
         Time of the first frame by the camera's clock, if the name tells it.
+
+    Examples
+    --------
+    >>> print(Trip(("20260131_081500_F.MP4", "20260131_081600_F.MP4"), "front"))
+    front, 2 files
     """
 
     files: tuple[Path | str, ...]
