@@ -283,6 +283,7 @@ def _detect_each(
     """Detect the vehicles of each image, print them, and write the annotated image."""
     import cv2
 
+    from vehicle_detection._common import pluralize
     from vehicle_detection.drawing import blur_boxes, draw_detections, score_texts
     from vehicle_detection.images import read_image, write_image
 
@@ -296,7 +297,7 @@ def _detect_each(
             f"  [{' '.join(f'{side:.0f}' for side in box)}] {text}"
             for box, text in zip(found.boxes.tolist(), score_texts(found))
         )
-        typer.echo(f"{path}: {len(found)} vehicle{'s' * (len(found) != 1)}{listed}")
+        typer.echo(f"{path}: {pluralize(len(found), 'vehicle')}{listed}")
         shown = image
         if detector.blur is not None:
             shown = blur_boxes(image, found.boxes, region=detector.blur)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import vehicle_detection
+from vehicle_detection._common import pluralize
 from vehicle_detection.boxes import Floats
 from vehicle_detection.drawing import MAX_SPEED_STD
 from vehicle_detection.events import (
@@ -41,7 +42,7 @@ from vehicle_detection.report.charts import (
     fraction_bar,
     gantt,
 )
-from vehicle_detection.report.formatting import format_time, format_value, pluralize
+from vehicle_detection.report.formatting import format_time, format_value
 from vehicle_detection.training import SPLITS
 from vehicle_detection.units import ROUGH_DISTANCE, UNITS, Units
 from vehicle_detection.video import VideoReport

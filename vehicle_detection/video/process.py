@@ -31,6 +31,7 @@ from vehicle_detection._common import (
     check_path,
     check_target,
     describe,
+    pluralize,
     progress_bar,
     single_threaded_opencv,
 )
@@ -113,11 +114,10 @@ class VideoReport:
     def __str__(self) -> str:
         height, width = self.shape[:2]
         rate = self.frames_per_second
-        vehicles = "1 vehicle" if self.tracks == 1 else f"{self.tracks} vehicles"
         lines = [
-            f"{self.frames} frames of {width}x{height} in {self.seconds:.1f} s: {rate:.1f} frames/s, "
-            f"{rate / self.fps:.1f} times real time, {vehicles}"
-            + (f", {self.dropped} frames dropped" if self.dropped else ""),
+            f"{pluralize(self.frames, 'frame')} of {width}x{height} in {self.seconds:.1f} s: "
+            f"{rate:.1f} frames/s, {rate / self.fps:.1f} times real time, {pluralize(self.tracks, 'vehicle')}"
+            + (f", {pluralize(self.dropped, 'frame')} dropped" if self.dropped else ""),
             "stage    ms/frame  fraction",
         ]
         fractions = self.stage_fractions
