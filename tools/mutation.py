@@ -256,7 +256,9 @@ class Recorder:
 
     def __init__(self, files: Sequence[Path]) -> None:
         self.files = files
-        self.coverage = coverage.Coverage(data_file=None, include=[str(path) for path in files])
+        self.coverage = coverage.Coverage(
+            data_file=None, config_file=False, include=[str(path) for path in files]
+        )
         self.tests: dict[str, dict[str, Any]] = {}
 
     @pytest.hookimpl(wrapper=True)
