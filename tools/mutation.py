@@ -53,10 +53,7 @@ TARGETS = {
 }
 """Files and folders of the package that are changed, with the tests of each."""
 
-OTHER_TESTS = (
-    "tests/test_course.py", "tests/test_course_detector.py", "tests/test_detector.py",
-    "tests/test_confidence.py", "tests/test_stream.py",
-)  # fmt: skip
+OTHER_TESTS = ("tests/test_detector.py", "tests/test_confidence.py", "tests/test_stream.py")
 """Further tests, which run for a change of a line that they execute."""
 
 PRELOADED = ("cv2", "numba", "pandas", "scipy.ndimage", "scipy.optimize", "skimage.feature",
@@ -356,11 +353,13 @@ def target_files(names: Sequence[str]) -> dict[Path, tuple[str, ...]]:
     return found
 
 
-def sample(path: Path, count: int, seed: int) -> list[Mutant]:
-    """Return a part of the changes of a file, the same one for the same seed."""
-    found = mutants(path.read_text())
-    chosen = random.Random(f"{seed} {path.name}").sample(found, min(count, len(found)))
-    return sorted(chosen, key=lambda mutant: (mutant.line, mutant.site))
+def sample(files: Sequence[Path], count: int, seed: int) -> Iterator[tuple[Path, Mutant]]:
+    """Yield up to `count` changes of each file, the same ones for the same seed, in turns."""
+    found = {path: mutants(path.read_text()) for path in files}
+    for path, changes in found.items():
+        random.Random(f"{seed} {path.name}").shuffle(changes)
+    for turn in range(count):
+        yield from ((path, changes[turn]) for path, changes in found.items() if turn < len(changes))
 
 
 def main() -> None:
@@ -372,6 +371,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=20, help="changes of each file; default: 20")
     parser.add_argument("--seed", type=int, default=1, help="seed of the sample; default: 1")
     parser.add_argument("--budget", type=float, default=10.0, help="seconds of tests of each; default: 10")
+    parser.add_argument("--minutes", type=float, default=60.0, help="time limit; default: 60")
     parser.add_argument("--only", type=Path, help="an earlier output, whose survivors are tried again")
     options = parser.parse_args()
     files = target_files(options.files)
@@ -381,22 +381,23 @@ def main() -> None:
     modules = [str(path.relative_to(ROOT)) for path in files]
     baseline = record(list(files), [*tests, *OTHER_TESTS, *modules])
     before = options.only.read_text().splitlines() if options.only else None
-    killed = survived = 0
-    for path, own in files.items():
-        source, name, counts = path.read_text(), str(path.relative_to(ROOT)), [0, 0]
-        for mutant in sample(path, options.count, options.seed):
-            text = f"{name}:{mutant.line}: {mutant.before} -> {mutant.after}"
-            if before is not None and text not in before:
-                continue
-            chosen = baseline.tests_for(path, mutant.line, (*own, name), options.budget)
-            limit = 30 + 4 * sum(baseline.seconds[each] for each in chosen)
-            call = functools.partial(run_tests, chosen, mutated=(path, mutate(source, mutant)))
-            is_survivor = in_child(call, limit) == 0
-            counts[is_survivor] += 1
-            if is_survivor:
-                print(text, flush=True)
-        print(f"{name}: {counts[0]} killed, {counts[1]} survived", flush=True)
-        killed, survived = killed + counts[0], survived + counts[1]
+    counts = {path: [0, 0] for path in files}
+    end = time.monotonic() + 60 * options.minutes
+    for path, mutant in sample(list(files), options.count, options.seed):
+        source, name = path.read_text(), str(path.relative_to(ROOT))
+        text = f"{name}:{mutant.line}: {mutant.before} -> {mutant.after}"
+        if time.monotonic() > end or (before is not None and text not in before):
+            continue
+        chosen = baseline.tests_for(path, mutant.line, (*files[path], name), options.budget)
+        limit = 30 + 4 * sum(baseline.seconds[each] for each in chosen)
+        call = functools.partial(run_tests, chosen, mutated=(path, mutate(source, mutant)))
+        is_survivor = in_child(call, limit) == 0
+        counts[path][is_survivor] += 1
+        if is_survivor:
+            print(text, flush=True)
+    for path, (killed, survived) in counts.items():
+        print(f"{path.relative_to(ROOT)}: {killed} killed, {survived} survived")
+    killed, survived = (sum(column) for column in zip(*counts.values()))
     print(f"{killed} of {killed + survived} killed")
     sys.exit(bool(survived))
 
