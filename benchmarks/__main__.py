@@ -53,7 +53,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the named benchmarks, by default all but those on request."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHMARKS))
-    parser.add_argument("--long", action="store_true", help="memory: also a run of 3,000 frames")
+    parser.add_argument(
+        "--long", action="store_true", help="memory: also a run of 3,000 frames; batch: three rounds"
+    )
     parser.add_argument("--plots", type=Path, metavar="DIR", help="scaling: write scaling.png to this folder")
     parser.add_argument("--compare", metavar="REF", help="only compare the speed with another commit's")
     parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FILE", help="the JSON file to write")

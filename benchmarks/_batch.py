@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 from benchmarks._material import Context, clip, repeated_clip
@@ -17,33 +22,81 @@ MEMORY_TRIPS, MEMORY_FRAMES = 20, 50
 RECORDS = 10_000
 ROUNDS = 3
 MEGABYTE = 1e6
+_TOPOLOGY = "/sys/devices/system/cpu/cpu{}/topology/thread_siblings_list"
 
 
 def run(context: Context) -> list[Row]:
     """Process eight trips with one and two workers, in turns; then measure the rest."""
     source, material = clip(context.work)
+    first = _copies(repeated_clip(source, 1, context.work), 1, context.work / "first")
+    _batch(first, context.work / "out", 1)  # compiles the kernels
     trips = _copies(repeated_clip(source, FRAMES // TRIPS, context.work), TRIPS, context.work / "trips")
-    single: list[float] = []
-    seconds: dict[int, list[float]] = {1: [], 2: []}
-    for number in range(ROUNDS):
-        single.append(_process_all(trips, context.work / f"single{number}"))
-        for jobs, times in seconds.items():
-            times.append(_batch(trips, context.work / f"out{number}_{jobs}", jobs))
-    one, two, direct = median_of(seconds[1]), median_of(seconds[2]), median_of(single)
+    rounds = ROUNDS if context.long else 1
     return [
         Row(
-            f"{TRIPS} trips, one worker with one thread",
-            one,
-            unit="s",
-            material=f"{material}, {FRAMES:,} frames as {TRIPS} trips, with videos",
+            "rounds of the comparisons of workers",
+            rounds,
+            material=f"{material}, {FRAMES:,} frames as {TRIPS} trips; workers of one thread",
         ),
-        Row("two workers with one thread each", two, unit="s"),
-        Row("two workers to one", one / two, unit="x", target=at_least(1.8)),
-        Row("process_video for each trip in one process, one thread", direct, unit="s"),
-        Row("one worker to process_video", one / direct, unit="x", target=at_most(1.1)),
+        *_compare_workers(trips, context.work, rounds, tracks_only=False),
+        *_compare_workers(trips, context.work, rounds, tracks_only=True),
         *_memory(context, source),
         Row(f"status of {RECORDS:,} trips", _status_seconds(context.work), unit="s", target=at_most(2)),
     ]
+
+
+def _compare_workers(trips: Path, work: Path, rounds: int, *, tracks_only: bool) -> list[Row]:
+    """Compare two workers with one, free to use all CPUs and each bound to one, and with `process_video`."""
+    out, cpus = work / "out", two_cpus()
+    runs: dict[str, Callable[[], float]] = {
+        "process_video": partial(_process_all, trips, out, tracks_only=tracks_only),
+        "one worker": partial(_batch, trips, out, 1, tracks_only=tracks_only),
+        "two workers": partial(_batch, trips, out, 2, tracks_only=tracks_only),
+    }
+    if cpus:
+        for name, used in (("one worker on one CPU", cpus[:1]), ("two workers on a CPU each", cpus)):
+            runs[name] = partial(_bound_batch, trips, out, used, tracks_only=tracks_only)
+    times: defaultdict[str, list[float]] = defaultdict(list)
+    for _ in range(rounds):
+        for name, measure in runs.items():
+            times[name].append(measure())
+    seconds = {name: median_of(each) for name, each in times.items()}
+    kind = "tracks only" if tracks_only else "with videos"
+    rows = [Row(f"{kind}: {name}", each, unit="s") for name, each in seconds.items()]
+    overhead = seconds["one worker"] / seconds["process_video"]
+    rows.append(Row(f"{kind}: one worker to process_video", overhead, unit="x", target=at_most(1.1)))
+    gain = seconds["one worker"] / seconds["two workers"]
+    rows.append(Row(f"{kind}: two workers to one", gain, unit="x", target=None if cpus else at_least(1.8)))
+    if cpus:
+        bound = seconds["one worker on one CPU"] / seconds["two workers on a CPU each"]
+        rows.append(
+            Row(
+                f"{kind}: two workers to one, bound to a CPU each",
+                bound,
+                unit="x",
+                target=at_least(1.8),
+                details={"CPUs": cpus, "of one core": _siblings(cpus[0]) == _siblings(cpus[1])},
+            )
+        )
+    return rows
+
+
+def two_cpus() -> list[int]:
+    """Two CPUs that this process may use, of different cores if possible; none where CPUs cannot be bound."""
+    if not hasattr(os, "sched_getaffinity"):  # only Linux
+        return []
+    allowed = sorted(os.sched_getaffinity(0))
+    if len(allowed) < 2:
+        return []
+    first = allowed[0]
+    other = next((cpu for cpu in allowed[1:] if _siblings(cpu) != _siblings(first)), allowed[1])
+    return [first, other]
+
+
+def _siblings(cpu: int) -> str:
+    """Logical CPUs of the core to which a CPU belongs."""
+    path = Path(_TOPOLOGY.format(cpu))
+    return path.read_text(encoding="ascii").strip() if path.exists() else str(cpu)
 
 
 def _copies(video: Path, count: int, folder: Path) -> Path:
@@ -54,21 +107,47 @@ def _copies(video: Path, count: int, folder: Path) -> Path:
     return folder
 
 
-def _batch(trips: Path, out: Path, jobs: int) -> float:
+def _batch(trips: Path, out: Path, jobs: int, *, tracks_only: bool = False) -> float:
     """Seconds of a whole batch, with the start of its workers."""
     reports = []
-    seconds = seconds_of(lambda: reports.append(run_batch(trips, out, jobs=jobs, progress=False)))
-    done = reports[-1].done
-    shutil.rmtree(out)
-    if done != len(list(trips.iterdir())):
-        raise AssertionError(f"the batch has processed {done} trips: {dict(reports[-1].messages)}")
+    options = {"jobs": jobs, "tracks_only": tracks_only, "progress": False}
+    seconds = seconds_of(lambda: reports.append(run_batch(trips, out, **options)))
+    _check_done(reports[0].done, trips, out)
     return seconds
 
 
-def _process_all(trips: Path, out: Path) -> float:
+def _bound_batch(trips: Path, out: Path, cpus: Sequence[int], *, tracks_only: bool) -> float:
+    """Seconds of batches at the same time, one for each CPU, as the tasks of a job array.
+
+    Each has an equal part of the trips. Its worker and ffmpeg run on its CPU only.
+    """
+    files = [str(path) for path in sorted(trips.iterdir())]
+    kind = "tracks" if tracks_only else "videos"
+
+    def process(place: int) -> int:
+        part = files[place :: len(cpus)]
+        done: int = run_probe("bound", str(cpus[place]), kind, str(out), *part)["done"]
+        return done
+
+    with ThreadPoolExecutor(len(cpus)) as pool:
+        counts: list[int] = []
+        seconds = seconds_of(lambda: counts.extend(pool.map(process, range(len(cpus)))))
+    _check_done(sum(counts), trips, out)
+    return seconds
+
+
+def _check_done(done: int, trips: Path, out: Path) -> None:
+    """Check that a batch has processed all trips, and remove its results."""
+    if done != len(list(trips.iterdir())):
+        raise AssertionError(f"the batch has processed {done} trips: {batch_status(out)}")
+    shutil.rmtree(out)
+
+
+def _process_all(trips: Path, out: Path, *, tracks_only: bool) -> float:
     """Seconds of `process_video` for each trip in a new process with one thread, with the start of Python."""
     out.mkdir()
-    seconds = seconds_of(lambda: run_probe("videos", str(trips), str(out), VEHICLE_DETECTION_JOBS="1"))
+    kind = "tracks" if tracks_only else "videos"
+    seconds = seconds_of(lambda: run_probe("each", kind, str(trips), str(out), VEHICLE_DETECTION_JOBS="1"))
     shutil.rmtree(out)
     return seconds
 

@@ -44,7 +44,7 @@ _STRIDE = 6
 
 @dataclass(frozen=True)
 class Context:
-    """Options of a run: a temporary folder, a folder for plots, and whether to do the long memory run."""
+    """Options of a run: a temporary folder, a folder for plots, and whether to measure longer."""
 
     work: Path
     plots: Path | None = None

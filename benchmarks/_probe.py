@@ -1,7 +1,8 @@
 """Measurements in a process of their own, which print one line of JSON.
 
-``python -m benchmarks._probe startup FRAME.npy [--kernels]``, ``... memory VIDEO TARGET`` and
-``... videos|trips FOLDER OUTPUT``. Only the standard library is imported before the measurement starts.
+``python -m benchmarks._probe startup FRAME.npy [--kernels]``, ``... memory VIDEO TARGET``,
+``... each videos|tracks FOLDER OUTPUT``, ``... bound CPU videos|tracks OUTPUT VIDEO...`` and
+``... trips FOLDER OUTPUT``. Only the standard library is imported before the measurement starts.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ def memory(source: str, target: str) -> dict[str, Any]:
     return {"frames": len(times), "peak": peak_memory(), "memory": sampled, "times": times}
 
 
-def videos(folder: str, out: str) -> dict[str, Any]:
+def each(kind: str, folder: str, out: str) -> dict[str, Any]:
     """Process each video of a folder with one thread, as a worker of a batch does."""
     import vehicle_detection
 
@@ -94,10 +95,24 @@ def videos(folder: str, out: str) -> dict[str, Any]:
             target = Path(out) / path.name
             with vehicle_detection.TrackWriter(target.with_suffix(".parquet")) as write:
                 done = vehicle_detection.process_video(
-                    path, target, detector, workers=1, progress=False, on_result=write
+                    path,
+                    target if kind == "videos" else None,
+                    detector,
+                    workers=1,
+                    progress=False,
+                    on_result=write,
                 )
                 frames += done.frames
     return {"frames": frames}
+
+
+def bound(cpu: str, kind: str, out: str, *files: str) -> dict[str, Any]:
+    """Process videos as a batch with one worker; all processes of it may use one CPU only."""
+    os.sched_setaffinity(0, {int(cpu)})
+    import vehicle_detection
+
+    report = vehicle_detection.run_batch(files, out, jobs=1, tracks_only=kind == "tracks", progress=False)
+    return {"done": report.done}
 
 
 def trips(folder: str, out: str) -> dict[str, Any]:
@@ -145,7 +160,7 @@ def main(arguments: list[str]) -> None:
     if kind == "startup":
         found = startup(rest[0], kernels="--kernels" in rest)
     else:
-        found = {"memory": memory, "videos": videos, "trips": trips}[kind](*rest)
+        found = {"memory": memory, "each": each, "bound": bound, "trips": trips}[kind](*rest)
     print(json.dumps(found))
 
 

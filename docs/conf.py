@@ -38,6 +38,7 @@ python_maximum_signature_line_length = 88
 autodoc_member_order = "bysource"
 numpydoc_show_class_members = False
 
+smartquotes_action = "qe"  # not dashes: --fov is an option
 html_theme = "pydata_sphinx_theme"
 html_title = project
 html_static_path = ["_static"]

@@ -1,17 +1,26 @@
 """The fast parts of the benchmarks, on small rendered images."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-from benchmarks import _report
+from benchmarks import _batch, _report
 from benchmarks._course import search_course
+from benchmarks._probe import run_probe
 from benchmarks._report import Row, Target, at_least, at_most
 from benchmarks._scaling import stage_seconds
 from benchmarks._search import check_agreement, compare_searches
-from vehicle_detection import FeatureParams, SearchBand, SearchParams, VehicleClassifier, render_scene
+from vehicle_detection import (
+    FeatureParams,
+    SearchBand,
+    SearchParams,
+    VehicleClassifier,
+    batch_status,
+    render_scene,
+)
 from vehicle_detection.classifier import Template
 from vehicle_detection.search import BandSearch
 
@@ -158,3 +167,32 @@ def test_table_shows_measured_target_and_verdict():
     assert "windows 11,580" in lines
     assert "F1 0.9877 ≥ 1 missed" in lines
     assert "things (drawn)" in lines
+
+
+@pytest.mark.parametrize("cpus", [[0, 1], []])
+def test_workers_are_compared(tmp_path, monkeypatch, cpus):
+    seconds = {1: 8.0, 2: 5.0}
+    monkeypatch.setattr(_batch, "two_cpus", lambda: cpus)
+    monkeypatch.setattr(_batch, "_process_all", lambda *_, **__: 7.9)
+    monkeypatch.setattr(_batch, "_batch", lambda trips, out, jobs, **_: seconds[jobs])
+    monkeypatch.setattr(_batch, "_bound_batch", lambda trips, out, used, **_: 2 * seconds[len(used)])
+    rows = _batch._compare_workers(tmp_path, tmp_path, 2, tracks_only=True)
+    found = {row.what.removeprefix("tracks only: "): (row.value, row.target) for row in rows}
+    assert found["one worker to process_video"] == (8 / 7.9, at_most(1.1))
+    assert found["two workers to one"] == (1.6, None if cpus else at_least(1.8))
+    assert found.get("two workers to one, bound to a CPU each") == ((1.6, at_least(1.8)) if cpus else None)
+
+
+def test_a_bound_batch_uses_one_cpu(tmp_path):
+    if not _batch.two_cpus():
+        pytest.skip("CPUs cannot be bound here, or there is one only")
+    cpu = _batch.two_cpus()[1]
+    program = "import os, sys; print('bound to', *os.sched_getaffinity(0), file=sys.stderr); sys.exit(1)"
+    # A stand-in for ffmpeg, started by the worker.
+    stand_in = tmp_path / "ffmpeg"
+    stand_in.write_text(f"#!{sys.executable}\n{program}\n")
+    stand_in.chmod(0o755)
+    (tmp_path / "drive.mp4").write_bytes(b"\0")
+    words = ("bound", str(cpu), "tracks", str(tmp_path / "out"), str(tmp_path / "drive.mp4"))
+    assert run_probe(*words, FFMPEG_BINARY=str(stand_in)) == {"done": 0}
+    assert f"(bound to {cpu})" in next(iter(batch_status(tmp_path / "out").messages.values()))

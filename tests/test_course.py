@@ -700,6 +700,7 @@ def test_every_call_form_binds(call_data, form, is_right):
             "find_cars(d.image, 90, 200, 1, d.svc, d.scaler, 9, 8, 2, 16, 16, cells_per_step=0)",
             "cells_per_step",
         ),
+        ("extract_features(np.array(3))", "imgs must be a list of file names or images"),
         ("add_heat(d.patch, d.boxes)", "heatmap must be an"),
         ("add_heat(d.read_only, d.boxes)", "heatmap must be writable"),
         ("add_heat(d.heat, [((9, 9), (5, 5))])", "x1 <= x2"),

@@ -3,8 +3,8 @@
 The functions are found by introspection: those of `vehicle_detection`, `vehicle_detection.course` and
 `vehicle_detection.plotting`, with the constructors and methods of their classes. A new one is covered as
 soon as `_Valid` knows valid values for its arguments. ``python -m tools.bad_input`` tries one value of each
-kind for each argument, also of the commands' options; ``--every`` tries all values, and ``--write`` writes
-the tables of ``docs/bad_input.md``. The tests try a few kinds for each argument.
+kind for each argument, also of the commands' options; ``--every`` tries all values. The tests try a few
+kinds for each argument. `tools.bad_input_page` writes the outcomes as a page of the documentation.
 """
 
 from __future__ import annotations
@@ -32,8 +32,6 @@ import numpy as np
 import vehicle_detection as vd
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
 
-ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "bad_input.md"
 MAX_SECONDS = 60
 """Time limit of one call, which may have to compile kernels."""
 
@@ -587,47 +585,6 @@ def _run_command(name: str, words: list[str]) -> None:
         raise AssertionError(f"exit code {result.exit_code}")
 
 
-def table(outcomes: Mapping[str, Mapping[str, Outcome]]) -> str:
-    """Return a Markdown table: how many values were refused, of those that were tried."""
-    kinds = list(dict.fromkeys(kind for row in outcomes.values() for kind in row))
-    lines = [f"| function | {' | '.join(kinds)} |", f"|---{'|---' * len(kinds)}|"]
-    for name, row in outcomes.items():
-        cells = [
-            f"{row[kind].refused} of {row[kind].refused + row[kind].accepted}" if kind in row else ""
-            for kind in kinds
-        ]
-        lines.append(f"| {name if name.startswith('`') else f'`{name}`'} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
-
-
-def page(outcomes: Mapping[str, Mapping[str, Outcome]]) -> str:
-    """Return the text of ``docs/bad_input.md``."""
-    functions = {name: row for name, row in outcomes.items() if not name.startswith("`")}
-    commands = {name: row for name, row in outcomes.items() if name.startswith("`")}
-    cells = [each for row in outcomes.values() for each in row.values()]
-    refused, accepted = sum(each.refused for each in cells), sum(each.accepted for each in cells)
-    skipped = "".join(f"- `{name}`: {why}\n" for name, why in {**NOT_CALLED, **COMMANDS_NOT_CALLED}.items())
-    return f"""# Bad input, function by function
-
-Written by `python -m tools.bad_input --write`. Every argument of every public function, constructor and
-method, and every option of the commands, was given a value of each kind, all other arguments being valid.
-A cell states for how many arguments it was refused, of all; it is valid for the others, such as `None` for an
-optional one. Of {refused + accepted:,} calls, {refused:,} ended with an error of
-`vehicle_detection.errors` or exit code 2; {accepted:,} were valid. None raised another error, took longer
-than {MAX_SECONDS} s, or left a file after an error. `tests/tools/test_bad_input.py` tries a part of
-them, and fails if a new public function is not called.
-
-Not called:
-
-{skipped}
-## Functions
-
-{table(functions)}
-## Commands
-
-{table(commands)}"""
-
-
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(
@@ -635,7 +592,6 @@ def main() -> None:
     )
     parser.add_argument("--functions", nargs="+", default=(), help="functions to call; default: all")
     parser.add_argument("--every", action="store_true", help="try every value; default: one of a kind")
-    parser.add_argument("--write", action="store_true", help=f"write {PAGE.relative_to(ROOT)}")
     options = parser.parse_args()
     effort: Effort = "every" if options.every else "one"
     outcomes, problems = run(effort, functions=options.functions, commands=not options.functions)
@@ -643,8 +599,6 @@ def main() -> None:
         print(problem)
     cells = [each for row in outcomes.values() for each in row.values()]
     print(f"{sum(each.refused for each in cells)} refused, {sum(each.accepted for each in cells)} accepted")
-    if options.write and not problems:
-        PAGE.write_text(page(outcomes))
     sys.exit(bool(problems))
 
 

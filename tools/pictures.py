@@ -42,6 +42,8 @@ MODEL = Path(vehicle_detection.__file__).parent / "models" / "default.safetensor
 _HERO_FRAME = 0.5  # position in the drive
 # Width of the frames in the animations, step of the frames in the GIF, and its number of colors.
 _WEBP_WIDTH, _GIF_WIDTH, _GIF_STEP, _GIF_COLORS = 640, 480, 3, 128
+# Changes of a pixel up to this many gray levels per channel are left out of the GIF.
+_GIF_TOLERANCE = 12
 _MIN_IOU = 0.5
 
 
@@ -63,7 +65,7 @@ def make_pictures(folder: Path, detector: VehicleDetector, scene: Mapping[str, A
     _write_hero(folder / HERO, images, results)
     frames = _annotate_small(images, results, _WEBP_WIDTH)
     _write_animation(folder / ANIMATION, frames, 1 / drive.fps, quality=50, method=5)
-    frames = _annotate_small(images, results, _GIF_WIDTH)[::_GIF_STEP]
+    frames = _hold_pixels(_annotate_small(images, results, _GIF_WIDTH)[::_GIF_STEP])
     _write_animation(folder / GIF, _reduce_colors(frames), _GIF_STEP / drive.fps)
     record = {
         "scene": dict(scene),
@@ -126,9 +128,22 @@ def _annotate_small(
     return drawn
 
 
+def _hold_pixels(frames: Sequence[PillowImage.Image]) -> list[PillowImage.Image]:
+    """Keep a pixel until it changes clearly, because unchanged pixels take no space in a GIF."""
+    shown = np.asarray(frames[0], np.int16)
+    held = []
+    for frame in frames:
+        new = np.asarray(frame, np.int16)
+        changed = np.abs(new - shown).max(axis=2, keepdims=True) > _GIF_TOLERANCE
+        shown = np.where(changed, new, shown)
+        held.append(PillowImage.fromarray(shown.astype(np.uint8)))
+    return held
+
+
 def _reduce_colors(frames: Sequence[PillowImage.Image]) -> list[PillowImage.Image]:
     """Give all frames the palette of one in the middle, without dithering, which makes files large."""
-    palette = frames[len(frames) // 2].quantize(_GIF_COLORS)
+    # The octree keeps the rare colors of labels and lights, unlike the median cut.
+    palette = frames[len(frames) // 2].quantize(_GIF_COLORS, PillowImage.Quantize.FASTOCTREE)
     return [frame.quantize(palette=palette, dither=PillowImage.Dither.NONE) for frame in frames]
 
 

@@ -1,7 +1,8 @@
 """Run the detector for very many frames: memory, speed and identities must stay as they are.
 
 ``python -m tools.soak --frames 100000`` renders a short drive once and repeats it. The last tenth of the
-frames is compared with the first.
+frames is compared with the first. ``--hours 20`` searches each frame of the drive once and tracks the results
+for so many hours of video, which takes minutes.
 """
 
 from __future__ import annotations
@@ -28,19 +29,35 @@ class Sample:
     mean_distance_m: float
 
 
+FPS = 25.0
+
+
 def soak(
-    model: str, *, frames: int, length: int = 100, shape: tuple[int, int] = (270, 480), seed: int = 0
+    model: str,
+    *,
+    frames: int,
+    length: int = 100,
+    shape: tuple[int, int] = (270, 480),
+    seed: int = 0,
+    replay: bool = False,
 ) -> list[Sample]:
-    """Track the vehicles of `frames` frames, and measure after each tenth of them."""
+    """Track the vehicles of `frames` frames, and measure after each tenth of them.
+
+    With `replay`, each frame of the drive is searched once only.
+    """
     scenes = [scene.image for scene in vd.render_drive(frames=length, shape=shape, random_state=seed)]
     samples: list[Sample] = []
-    distances: list[float] = []
-    start, before = time.perf_counter(), 0
+    total, count = 0.0, 0  # of the distances
     with vd.VehicleDetector(model) as detector:
-        detector.reset(fps=25.0)
+        detector.reset(fps=FPS)
+        found = [detector.search(scene) for scene in scenes] if replay else []
+        start, before = time.perf_counter(), 0
         for number in range(frames):
-            result = detector.track(detector.search(scenes[number % length]), time=number / 25.0)
-            distances += [track.distance_m for track in result.tracks if track.distance_m is not None]
+            place = number % length
+            search = found[place] if replay else detector.search(scenes[place])
+            result = detector.track(search, time=number / FPS)
+            distances = [track.distance_m for track in result.tracks if track.distance_m is not None]
+            total, count = total + sum(distances), count + len(distances)
             if (number + 1) % max(frames // 10, 1) == 0:
                 elapsed = time.perf_counter() - start
                 samples.append(
@@ -49,10 +66,10 @@ def soak(
                         memory_mb=_memory_mb(),
                         frames_per_second=(number + 1 - before) / elapsed,
                         tracks=len(result.tracks),
-                        mean_distance_m=float(np.mean(distances)) if distances else 0.0,
+                        mean_distance_m=total / count if count else 0.0,
                     )
                 )
-                distances.clear()
+                total, count = 0.0, 0
                 start, before = time.perf_counter(), number + 1
     return samples
 
@@ -87,11 +104,13 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--frames", type=int, default=100_000)
+    parser.add_argument("--hours", type=float, help="hours of video whose searched frames are tracked")
     parser.add_argument("--models", nargs="+", default=["default", "highway"])
     options = parser.parse_args()
     failed = False
+    frames = round(options.hours * 3600 * FPS) if options.hours else options.frames
     for model in options.models:
-        samples = soak(model, frames=options.frames)
+        samples = soak(model, frames=frames, replay=options.hours is not None)
         for sample in samples:
             print(
                 f"{model}: {sample.frames} frames, {sample.memory_mb:.0f} MB, "

@@ -34,5 +34,6 @@ class VideoError(VehicleDetectionError):
 class TransientVideoError(VideoError):
     """A video cannot be read or written for a reason outside the file; the next attempt may succeed.
 
-    Such reasons are an ffmpeg that was killed, a full disk, and a network or storage that does not answer.
+    Such reasons are an ffmpeg that was killed, a full disk, a network or storage that does not answer, and
+    permissions or signatures that have expired.
     """

@@ -33,7 +33,7 @@ from vehicle_detection.mixture import (
     window_grid,
 )
 from vehicle_detection.params import PATCH_SIZE, FeatureParams
-from vehicle_detection.video import Source, open_source
+from vehicle_detection.video import Source, borrow_source
 
 # IoU from which a found vehicle or a window belongs to a box.
 _MIN_IOU = 0.5
@@ -176,7 +176,7 @@ def explain_tracks(
     """
     tracks = sorted(log.histories(), key=lambda track: -len(track.frames))[:limit]
     explained = {}
-    with open_source(source) as opened:
+    with borrow_source(source) as opened:
         shape = opened.info.shape[:2]
         offset = round((log.first_time or 0.0) * float(opened.info.fps))
         for track in tracks:

@@ -34,6 +34,12 @@ class TrackedFrame:
         ``(H, W, 3)`` uint8 RGB.
     result
         Windows, detections and tracks of the frame.
+
+    Examples
+    --------
+    >>> (first,) = track("test_images/*.jpg", "highway", stream=True, end=0.04)
+    >>> first.index, first.time, first.searched, first.frame.shape
+    (0, 0.0, True, (720, 1280, 3))
     """
 
     frame: NDArray[np.uint8]

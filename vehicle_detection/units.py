@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-# Relative standard error above which a distance is marked as rough.
-_ROUGH = 0.2
+ROUGH_DISTANCE = 0.2
+"""Relative standard error above which a distance is marked as rough, by a tilde."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +30,7 @@ class Units:
         value, symbol = self.distance * meters, self.distance_symbol
         if with_std and std_m is not None:
             return f"{value:.0f} ± {self.distance * std_m:.0f} {symbol}"
-        rough = std_m is not None and std_m > _ROUGH * meters
+        rough = std_m is not None and std_m > ROUGH_DISTANCE * meters
         return f"{'~' * rough}{value:.0f} {symbol}"
 
     def speed_text(

@@ -19,7 +19,6 @@ from tests.batch.helpers import check_whole, counts, files, records
 from tests.helpers import ROOT
 from tests.video.clips import child_processes
 from vehicle_detection import batch_status, open_dask, run_batch
-from vehicle_detection.batch import workers
 from vehicle_detection.errors import InvalidInputError
 
 
@@ -200,10 +199,3 @@ def test_a_scheduler_that_does_not_answer(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InvalidInputError, match=r"dask needs dask\[distributed\]"), open_dask("local"):
         pass
-
-
-def test_workers_keep_kernels_on_a_local_disk(monkeypatch, tmp_path):
-    monkeypatch.delenv("NUMBA_CACHE_DIR")
-    assert Path(workers.worker_environment()["NUMBA_CACHE_DIR"]).parent == tmp_path / "scratch"
-    monkeypatch.setenv("NUMBA_CACHE_DIR", "/elsewhere")
-    assert workers.worker_environment()["NUMBA_CACHE_DIR"] == "/elsewhere"

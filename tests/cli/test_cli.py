@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import typer
 from typer.testing import CliRunner
 
 import vehicle_detection
@@ -756,7 +757,13 @@ def bad_videos(material, tmp):
             tmp / "tracks.doc",
         ],
         r"--tracks needs an existing folder": [clip, "-o", target, "--tracks", tmp / "none" / "tracks.csv"],
-        r"--report must end in .html, .*got 'page.pdf'": [clip, "-o", target, "--report", tmp / "page.pdf"],
+        r"--report must end in .html or .htm, got 'page.pdf'": [
+            clip,
+            "-o",
+            target,
+            "--report",
+            tmp / "page.pdf",
+        ],
         r"--report \S+ is also --output \S+;": [clip, "-o", target, "--report", target],
         r"--blur must be one of 'vehicles', 'plates'; got 'faces'": [clip, "-o", target, "--blur", "faces"],
         r"--events must end in .csv or .json, got 'e.txt'": [clip, "-o", target, "--events", tmp / "e.txt"],
@@ -780,6 +787,46 @@ def test_video_refuses_bad_input_and_changes_no_file(material, tmp_path):
         assert re.search(message, refuse("video", *words, "--quiet")), message
     assert (contents(tmp_path), contents(material)) == before
     assert (material / "clip.mp4").read_bytes() == original
+
+
+def test_the_help_of_each_option_shows_what_to_write():
+    choices = re.compile(r"[a-z]+(\|[a-z]+)+")  # all values
+    example = re.compile(r'such as \S|"\w+"|\.[a-z]{3,}|\d')
+    types = {None, "TEXT", "INTEGER", "FLOAT", "BOOLEAN", "STR", "INT"}
+    command = typer.main.get_command(app)
+    assert set(command.commands) == set(COMMANDS)
+    for name, each in command.commands.items():
+        for option in each.params:
+            assert option.help.endswith((".", "'")), (name, option.opts)
+            if getattr(option, "is_flag", False):
+                continue
+            words = f"{name} {option.opts[0]} {option.metavar}: {option.help}"
+            assert option.metavar not in types, words
+            given = option.default is not None and not callable(option.default)  # printed by --help
+            shown = given or choices.fullmatch(option.metavar) or "." in option.metavar
+            assert shown or example.search(option.help), words
+
+
+def test_video_refuses_bad_input_before_it_estimates_the_horizon(material, tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise AssertionError("estimated")
+
+    monkeypatch.setattr(video, "estimate_video_horizon", fail)
+    clip, target = material / "clip.mp4", tmp_path / "out.mp4"
+    lens = tmp_path / "lens.json"
+    lens.write_text('{"image_size": [640, 480], "focal_px": 600}')
+    cases = bad_videos(material, tmp_path) | {
+        r"--fov must be None with a camera": [clip, "-o", target, "--camera", "wide-90", "--fov", 90],
+        r"--fov must be a number": [clip, "-o", target, "--fov", 500],
+        r"lens.json: image_size must have the aspect ratio": [clip, "-o", target, "--camera", lens],
+        r"--conf must be a number": [clip, "-o", target, "--conf", 2],
+        r"--every must be an integer": [clip, "-o", target, "--every", 0],
+        r"--jobs must be an integer": [clip, "-o", target, "--jobs", 0],
+    }
+    for message, words in cases.items():
+        if "--horizon" not in words and "no search window" not in message:
+            assert re.search(message, refuse("video", *words, "--quiet", "--horizon", "auto")), message
+    assert not target.exists()
 
 
 def test_read_only_folders_are_refused(monkeypatch, material, clip, picture, tmp_path):

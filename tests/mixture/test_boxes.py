@@ -4,7 +4,7 @@ from hypothesis import strategies as st
 
 from vehicle_detection.boxes import greedy_nms, iou_matrix, overlap_matrices
 from vehicle_detection.mixture import vote_boxes
-from vehicle_detection.mixture.boxes import ScoredWindows, nms
+from vehicle_detection.mixture.boxes import ScoredWindows, mostly_inside, nms
 
 
 def random_windows(count, seed):
@@ -68,3 +68,27 @@ def test_nms_removes_the_weaker_of_two_overlapping_boxes(count, seed):
     expected = greedy_nms(boxes, scores, max_iou=0.35, max_coverage=0.75)
     np.testing.assert_array_equal(rows, expected)
     np.testing.assert_array_equal(nms(boxes, scores, max_boxes=3), expected[:3])
+
+
+def test_windows_of_several_searches_are_joined_without_those_outside():
+    first, second = random_windows(3, 1), random_windows(2, 2)
+    outside = ScoredWindows(np.array([[-90.0, 0, -10, 40]]), np.array([1.0]), np.array([4]))
+    joined = ScoredWindows.join([first, ScoredWindows.empty(), outside, second], (300, 300, 3))
+    assert len(joined) == 5
+    np.testing.assert_array_equal(joined.boxes, np.vstack([first.boxes, second.boxes]))
+    np.testing.assert_array_equal(joined.margins, np.concatenate([first.margins, second.margins]))
+    np.testing.assert_array_equal(joined.templates, np.concatenate([first.templates, second.templates]))
+    assert len(ScoredWindows.join([], (300, 300))) == len(ScoredWindows.join([outside], (300, 300))) == 0
+
+
+def test_more_than_a_third_of_a_box_must_be_visible():
+    boxes = np.array(
+        [[-65.0, 0, 35, 40], [-64, 0, 36, 40], [0, 280, 40, 380], [0, 264, 40, 364], [9, 9, 9, 9]]
+    )
+    assert mostly_inside(boxes, (300, 300)).tolist() == [False, True, False, True, False]
+
+
+def test_the_best_windows_keep_their_order():
+    windows = ScoredWindows(np.arange(16.0).reshape(4, 4), np.array([1.0, 3.0, 2.0, 3.0]), np.arange(4))
+    assert windows.best(3).templates.tolist() == [1, 3, 2]
+    assert windows.best(9).templates.tolist() == [1, 3, 2, 0]

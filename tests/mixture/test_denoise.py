@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -75,3 +76,28 @@ def test_the_search_uses_the_smoothed_frame():
     np.testing.assert_array_equal(found.scores, model.scores(margins))
     boxes, *_ = model.detect_vehicles(*search.score_windows(image, PyramidParams()), min_margin=min_margin)
     assert not np.array_equal(found.boxes, boxes)
+
+
+def test_the_estimate_is_the_median_of_a_difference_of_laplacians():
+    image = np.random.default_rng(5).integers(0, 256, (60, 40, 3), dtype=np.uint8)
+    roots = np.sqrt(255.0 * image[..., 1])
+    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]])
+    differences = [
+        (roots[row - 1 : row + 2, column - 1 : column + 2] * kernel).sum()
+        for row in (1, 25, 49)
+        for column in range(1, 39, 2)
+    ]
+    assert estimate_noise(image) == pytest.approx(np.median(np.abs(differences)) / (6 * 0.6745), rel=1e-5)
+
+
+@pytest.mark.parametrize(("noise", "weight"), [(3.0, 0.0), (4.5, 0.5), (6.0, 1.0), (9.0, 1.0)])
+def test_the_weight_of_the_smoothing_depends_on_the_noise(monkeypatch, noise, weight):
+    image = noisy(90, 9)
+    monkeypatch.setitem(denoise.__globals__, "estimate_noise", lambda image: noise)
+    smooth = cv2.GaussianBlur(image, (5, 5), 0.9).astype(float)
+    np.testing.assert_allclose(denoise(image), weight * smooth + (1 - weight) * image, atol=0.51)
+
+
+@pytest.mark.parametrize("shape", [(2, 40, 3), (40, 2, 3)])
+def test_images_of_two_rows_or_columns_have_no_estimate(shape):
+    assert estimate_noise(np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)) == 0

@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -48,3 +49,33 @@ def test_images_of_any_size(height, width, seed):
     assert (result.shape, result.dtype) == (image.shape, np.uint8)
     np.testing.assert_array_equal(image, before)
     np.testing.assert_array_equal(result, reduce_haze(image))
+
+
+@pytest.mark.parametrize("width", [160, 480, 500])
+def test_the_contrast_is_that_of_blocks_in_every_sixteenth_row(width):
+    image = np.random.default_rng(2).integers(0, 256, (50, width, 3), dtype=np.uint8)
+    size = width // 160
+    means = [
+        [float(image[row, start : start + size, 1].mean()) for start in range(0, width - size + 1, size)]
+        for row in (8, 24, 40)
+    ]
+    expected = np.abs(np.diff(means, axis=1)).mean() / (np.mean(means) + 1)
+    assert relative_contrast(image) == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(8, 200, 3), (40, 1, 3)])
+def test_an_image_too_small_to_tell_is_clear(shape):
+    image = np.full(shape, 200, np.uint8)
+    assert relative_contrast(image) == 1
+    assert reduce_haze(image) is image
+
+
+@pytest.mark.parametrize(("contrast", "weight"), [(0.03, 0.0), (0.025, 0.5), (0.02, 1.0), (0.01, 1.0)])
+def test_the_weight_of_the_equalization_depends_on_the_contrast(monkeypatch, contrast, weight):
+    hazy = np.round(0.15 * SCENE + 0.85 * 180).astype(np.uint8)
+    monkeypatch.setattr("vehicle_detection.mixture.haze.relative_contrast", lambda image: contrast)
+    lab = cv2.cvtColor(hazy, cv2.COLOR_RGB2LAB)
+    lab[..., 0] = cv2.createCLAHE(2.0, (8, 8)).apply(lab[..., 0])
+    equalized = cv2.cvtColor(lab, cv2.COLOR_LAB2RGB).astype(float)
+    expected = weight * equalized + (1 - weight) * hazy
+    np.testing.assert_allclose(reduce_haze(hazy), expected, atol=0.51)

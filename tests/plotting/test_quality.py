@@ -266,6 +266,7 @@ def test_every_score_is_in_a_bin_and_the_threshold_is_an_edge(scores, threshold,
         ([np.nan], [1], "scores must be a list of finite numbers"),
         ([1.0], [1, 0], "labels must be 0 or 1 for each of the 1 scores"),
         ([1.0, 2.0], [1, -1], "labels must be 0 or 1"),
+        ([1.0, 2.0], [(0, 1), 1], "labels must be an array or a sequence of numbers of equal lengths"),
     ],
 )
 def test_malformed_scores_are_rejected(scores, labels, message):

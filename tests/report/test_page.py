@@ -182,8 +182,14 @@ class TestPage:
                 "first": 0,
                 "distance": [10.0, 11.0, 12.0, 13.0, None, None, 16.0, 17.0, 18.0],
                 "speed": [-4.5, -4.5, -4.5, -4.5, None, None, -4.5, -4.5, -4.5],
+                "rough": [0] * 9,
             }
         ]
+
+    def test_distances_with_large_standard_errors_are_marked(self, tmp_path):
+        frames = [[track(1, distance=20.0, distance_std=std)] for std in (3.0, 4.5, 9.0)]
+        data = json.loads(script_data(write_report(tmp_path, frames)))
+        assert data["tracks"][0]["rough"] == [0, 1, 1]
 
     def test_speeds_with_large_standard_errors_are_hidden(self, tmp_path):
         frames = [[track(1, speed=9.0, speed_std=3.5 - index)] for index in range(3)]
@@ -254,7 +260,7 @@ class TestSettingsAndModel:
         assert all(html.escape(fact) in text for fact in facts.values() if "'" not in fact)
         for name, scores in load_model().metadata["metrics"]["left_out"].items():
             assert name in text
-            assert f"{scores['f1']:.6g}" in text
+            assert f"{scores['f1']:.3f}" in text
         assert "inherits the terms of the data" in text
 
     @pytest.mark.parametrize(

@@ -69,7 +69,7 @@ def test_rejects_paths_that_cannot_be_written(tmp_path):
     with pytest.raises(InvalidInputError, match=r"source must be a file name, got \['a'\]"):
         ReportWriter(tmp_path / "report.html", source=["a"])
     with pytest.raises(
-        InvalidInputError, match=r"path must end in .html, got 'report.pdf'; write 'report.html'"
+        InvalidInputError, match=r"path must end in .html or .htm, got 'report.pdf'; write 'report.html'"
     ):
         ReportWriter(tmp_path / "report.pdf")
     with pytest.raises(InvalidInputError, match="path needs an existing folder"):

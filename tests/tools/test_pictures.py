@@ -42,7 +42,7 @@ class TestShipped:
                 assert pictures.find_errors([detector.detect(scene.image).boxes], [scene.truth]) == [], HINT
 
     def test_they_are_small(self):
-        assert sum((DOCS / name).stat().st_size for name in pictures.FILES) < 4e6
+        assert sum((DOCS / name).stat().st_size for name in pictures.FILES) < 2e6
         with Image.open(DOCS / pictures.ANIMATION) as animation:
             assert animation.n_frames == pictures.SCENE["frames"]
 
@@ -90,6 +90,14 @@ def test_pictures_with_an_error_are_not_written(tmp_path, true_boxes, change, me
     with pytest.raises(DetectorError, match=rf"{message}.*choose another random_state"):
         pictures.make_pictures(tmp_path, detector, SMALL)
     assert not list(tmp_path.iterdir())
+
+
+def test_small_changes_of_pixels_are_left_out_of_the_gif():
+    levels = [0, 8, 16, 100, 95, 5]
+    frames = [Image.fromarray(np.full((4, 6, 3), level, np.uint8)) for level in levels]
+    assert [np.unique(frame).tolist() for frame in pictures._hold_pixels(frames)] == [
+        [0], [0], [16], [100], [100], [5]
+    ]  # fmt: skip
 
 
 def test_a_vehicle_with_two_boxes_is_an_error(true_boxes):

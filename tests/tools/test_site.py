@@ -82,6 +82,26 @@ class TestPages:
         with pytest.raises(ValueError, match="no section 'B': change README_SECTIONS"):
             site_pages.read_section("## A\n", "B")
 
+    def test_commands_are_described_in_full_and_arguments_without_types(self):
+        page = """* `one`: Do one...
+
+## `vehicle-detection one`
+
+Do one thing with a file, and
+another.
+
+```console
+$ vehicle-detection one [OPTIONS] {IMAGE...}... {LABELS.csv}
+```
+
+* `IMAGE... <list[Path]>`: Images.
+* `LABELS.csv <path>`: Labels.
+"""
+        tidied = site_pages.tidy_commands(page)
+        assert "* `one`: Do one thing with a file, and another.\n" in tidied
+        assert "$ vehicle-detection one [OPTIONS] IMAGE... LABELS.csv\n" in tidied
+        assert "* `IMAGE...`: Images.\n* `LABELS.csv`: Labels.\n" in tidied
+
     def test_writing_twice_changes_no_file(self, tmp_path, monkeypatch):
         monkeypatch.setattr(site_pages, "command_page", lambda: "# Command line\n")
         times = []

@@ -1,15 +1,23 @@
+import math
+
 import numpy as np
 import pytest
 
 from vehicle_detection.camera import Camera
+from vehicle_detection.params import TrackParams
 from vehicle_detection.tracking.kalman_filter import (
     UNKNOWN,
+    KalmanSmoother,
+    KalmanStates,
     Measurements,
     boxes_from_states,
     centers_and_sizes,
+    coasted_distance,
+    estimate_distances,
     initiate,
     initiate_states,
     predict,
+    predict_distances,
     update,
     update_distances,
 )
@@ -135,3 +143,239 @@ def test_inputs_are_not_modified():
     np.testing.assert_array_equal(cov, copies[1])
     for column, copy in zip(states, before, strict=True):
         np.testing.assert_array_equal(column, copy)
+
+
+# --- against the equations of a Kalman filter, one track at a time ---
+
+# Edges from [cx, cy, w, h] and velocities.
+EDGES = np.hstack([[[1, 0, -0.5, 0], [0, 1, 0, -0.5], [1, 0, 0.5, 0], [0, 1, 0, 0.5]], np.zeros((4, 4))])
+
+
+def textbook(mean, cov, edges, variance):
+    """Corrected state of one track."""
+    gain = cov @ EDGES.T @ np.linalg.inv(EDGES @ cov @ EDGES.T + np.diag(variance))
+    return mean + gain @ (edges - EDGES @ mean), (np.eye(8) - gain @ EDGES) @ cov
+
+
+def predicted_states():
+    mean, cov, density = moving_states()
+    return predict(mean, cov, 0.2, density)
+
+
+def normalized(mean, cov, edges, variance):
+    return (edges - EDGES @ mean) / np.sqrt(np.diag(EDGES @ cov @ EDGES.T) + variance)
+
+
+def test_a_new_state_has_the_errors_of_its_edges():
+    edge_std = np.array([[1.0, 2.0, 3.0, 4.0]])
+    mean, cov = initiate(BOXES[:1], edge_std)
+    np.testing.assert_allclose(EDGES @ cov[0] @ EDGES.T, np.diag([1, 4, 9, 16.0]), atol=1e-9)
+    # Speeds in widths and heights per second.
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(cov[0])[4:]), np.array([100, 90, 100, 90]) * [1, 0.6, 0.35, 0.35]
+    )
+    assert not cov[0, :4, 4:].any()
+    assert not mean[0, 4:].any()
+
+
+def test_velocities_move_boxes_and_their_noise_is_that_of_constant_velocity():
+    mean, cov, density = moving_states()
+    moved, grown = predict(mean, cov, 0.2, density)
+    np.testing.assert_allclose(moved[:, :4], mean[:, :4] + 0.2 * mean[:, 4:])
+    np.testing.assert_allclose(moved[:, 4:], mean[:, 4:])
+    variance, speed = cov[0, 0, 0], cov[0, 4, 4]
+    assert grown[0, 0, 0] == pytest.approx(variance + 0.2**2 * speed + 7 * 0.2**3 / 3)
+    assert grown[0, 0, 4] == pytest.approx(0.2 * speed + 7 * 0.2**2 / 2)
+    assert grown[0, 4, 4] == pytest.approx(speed + 7 * 0.2)
+    tiny = predict(mean - 99 * np.eye(8)[2], cov, 0.2, density)[0]
+    assert tiny[0, 2] == 4.0
+
+
+def test_a_correction_is_that_of_the_textbook():
+    mean, cov = predicted_states()
+    edges = boxes_from_states(mean) + np.array([[3.0, -2, 5, 1], [-4, 2, 0, 6]])
+    variance = np.array([[25.0, 16, 25, 9], [30, 20, 10, 40]])
+    before = np.array([[0.5, 0, 0, 0], [0, -1, 0, 0.2]])
+    after, after_cov, innovation = corrected(mean, cov, edges, variance, innovation_mean=before)
+    for row in range(2):
+        expected = textbook(mean[row], cov[row], edges[row], variance[row])
+        np.testing.assert_allclose(after[row], expected[0])
+        np.testing.assert_allclose(after_cov[row], expected[1], atol=1e-9)
+        errors = normalized(mean[row], cov[row], edges[row], variance[row])
+        assert np.abs(errors).max() < 2.5
+        np.testing.assert_allclose(innovation[row], 0.75 * before[row] + 0.25 * errors)
+
+
+def test_the_variance_of_an_outlier_grows_with_its_square():
+    mean, cov = predicted_states()
+    edges = boxes_from_states(mean) + np.array([[0, 0, 120.0, 0], [0, 0, 0, -90.0]])
+    variance = np.full((2, 4), 25.0)
+    after, _, innovation = corrected(mean, cov, edges, variance)
+    for row in range(2):
+        errors = normalized(mean[row], cov[row], edges[row], variance[row])
+        assert np.abs(errors).max() > 2.5
+        expected, _ = textbook(mean[row], cov[row], edges[row], 25 * np.maximum((errors / 2.5) ** 2, 1))
+        np.testing.assert_allclose(after[row], expected)
+        np.testing.assert_allclose(innovation[row], 0.25 * np.clip(errors, -6, 6))
+
+
+def test_an_edge_that_deviates_to_one_side_for_long_is_believed():
+    mean, cov = predicted_states()
+    edges = boxes_from_states(mean) + np.array([[0, 0, 120.0, 0], [0, 0, 0, -90.0]])
+    variance, before = np.full((2, 4), 25.0), np.array([[0, 0, 9.0, 0], [0, 0, 0, 9.0]])
+    after, after_cov, _ = corrected(mean, cov, edges, variance, innovation_mean=before)
+    plain, _, _ = corrected(mean, cov, edges, variance)
+    # The first one deviates to the side of its past, and its edge gains a quarter of the innovation as error.
+    wide = cov[0].copy()
+    back = np.linalg.inv(EDGES[:, :4])
+    wide[:4, :4] += back @ np.diag([0, 0, (0.25 * 120.0) ** 2, 0]) @ back.T
+    expected, expected_cov = textbook(mean[0], wide, edges[0], variance[0])
+    np.testing.assert_allclose(after[0], expected)
+    np.testing.assert_allclose(after_cov[0], expected_cov, atol=1e-9)
+    # The second one deviates to the other side.
+    np.testing.assert_allclose(after[1], plain[1])
+
+
+def test_only_the_outliers_of_merged_boxes_are_rejected():
+    mean, cov = predicted_states()
+    shift = np.array([[0, 0, 120.0, 0], [0, 0, 0, 2.0]])
+    edges, variance = boxes_from_states(mean) + shift, np.full((2, 4), 25.0)
+    after, _, innovation = corrected(mean, cov, edges, variance, reject_outliers=True)
+    expected, _ = textbook(mean[0], cov[0], edges[0], np.array([25, 25, UNKNOWN, 25]))
+    np.testing.assert_allclose(after[0], expected)
+    np.testing.assert_allclose(after[1], textbook(mean[1], cov[1], edges[1], variance[1])[0])
+    assert not innovation.any()
+
+
+def states_of(mean, cov, camera=CAMERA):
+    return initiate_states(mean, cov, camera)
+
+
+def test_a_growing_box_accelerates_and_a_coasting_one_slows_down():
+    mean, cov, _ = moving_states()
+    smoother = KalmanSmoother(TrackParams())
+    states = states_of(mean, cov)
+    detected, coasting = (
+        smoother.predict(states, np.full(2, state, np.bool_), 0.1).mean for state in (False, True)
+    )
+    growth = (mean[:, 6:] / mean[:, 2:4]).mean(axis=1, keepdims=True)
+    speed = mean[:, 4:] * np.exp(0.1 * 2 * growth)
+    np.testing.assert_allclose(detected, np.hstack([mean[:, :4] + 0.1 * speed, speed]))
+    speed = mean[:, 4:] * np.exp(-0.1 / np.array([1.5, 1.5, 0.5, 0.5]))
+    np.testing.assert_allclose(coasting, np.hstack([mean[:, :4] + 0.1 * speed, speed]))
+
+
+def test_the_growth_that_counts_as_approach_is_limited():
+    mean, cov, _ = moving_states()
+    mean[:, 6:] = mean[:, 2:4] * [[5.0], [-5.0]]
+    moved = KalmanSmoother(TrackParams()).predict(states_of(mean, cov), np.zeros(2, np.bool_), 0.1).mean
+    np.testing.assert_allclose(moved[:, 4:], mean[:, 4:] * np.exp([[0.3], [-0.3]]))
+
+
+def test_errors_of_coasting_tracks_are_limited():
+    mean, cov, _ = moving_states()
+    states = states_of(mean, 1e6 * cov)
+    found = KalmanSmoother(TrackParams()).predict(states, np.ones(2, np.bool_), 0.04)
+    std = np.sqrt(found.cov[:, np.arange(8), np.arange(8)])
+    sizes = found.mean[:, [2, 3, 2, 3]]
+    np.testing.assert_allclose(std, np.hstack([0.5 * sizes, 2 * sizes]))
+    np.testing.assert_allclose(found.cov, found.cov.transpose(0, 2, 1))
+
+
+def test_a_truncated_box_is_extended_beyond_the_border():
+    boxes = np.array([[0.0, 300, 60, 400], [1220, 300, 1280, 400], [0, 300, 1280, 400], [600, 300, 650, 400]])
+    mean, cov = KalmanSmoother(TrackParams()).initiate(Measurements.from_boxes(boxes, SHAPE))
+    expected = boxes.copy()
+    expected[0, 0], expected[1, 2] = 60 - 150, 1220 + 150
+    np.testing.assert_allclose(boxes_from_states(mean), expected)
+    std = np.sqrt(np.einsum("ij,njk,ik->ni", EDGES, cov, EDGES))
+    noise = TrackParams().measurement_noise
+    np.testing.assert_allclose(std[0], [0.3 * 150, 100 * noise, 60 * noise, 100 * noise])
+    np.testing.assert_allclose(std[1], [60 * noise, 100 * noise, 0.3 * 150, 100 * noise])
+    np.testing.assert_allclose(std[3], np.array([50, 100, 50, 100]) * noise)
+
+
+def test_a_box_that_reaches_the_border_as_predicted_is_not_corrected_there():
+    smoother, boxes = KalmanSmoother(TrackParams()), np.array([[1200.0, 300, 1300, 400]])
+    states = states_of(*initiate(boxes, np.full((1, 4), 5.0)))
+    inside = Measurements.from_boxes(np.array([[1200.0, 300, 1280, 400]]), SHAPE)
+    after = smoother.correct(states, [], inside, 0.04)
+    np.testing.assert_allclose(after.boxes(), boxes, atol=1e-3)
+    # A prediction that ends before the border is corrected.
+    states = states_of(*initiate(np.array([[1200.0, 300, 1260, 400]]), np.full((1, 4), 5.0)))
+    assert smoother.correct(states, [], inside, 0.04).boxes()[0, 2] > 1262
+
+
+def test_correlated_errors_correct_less_at_high_frame_rates():
+    params, boxes = TrackParams(measurement_correlation_time=0.2), BOXES[:1]
+    states = states_of(*initiate(boxes, np.full((1, 4), 5.0)))
+    measured = Measurements.from_boxes(boxes + 2, SHAPE)
+    for dt, frames in ((0.04, 5.0), (0.4, 1.0)):
+        after = KalmanSmoother(params).correct(states, [], measured, dt)
+        noise = np.square(np.array([100, 90, 100, 90]) * params.measurement_noise) * frames
+        expected, _ = textbook(states.mean[0], states.cov[0], measured.boxes[0], noise)
+        np.testing.assert_allclose(after.mean[0], expected)
+        decay = max(math.exp(-dt / 0.15), 0.75)
+        errors = normalized(states.mean[0], states.cov[0], measured.boxes[0], noise)
+        np.testing.assert_allclose(after.innovation_mean[0], (1 - decay) * errors)
+
+
+def test_the_way_of_a_coasting_track_is_the_integral_of_its_speed():
+    mean = np.array([[0.0, 0, 100, 50, -30, 20, 0, 0]])
+    # Its speed of 0.4 heights per second was greater before, by a factor e in 1.5 s.
+    times = np.linspace(0, 0.6, 10_001)
+    expected = np.trapezoid(0.4 * np.exp(times / 1.5), times)
+    np.testing.assert_allclose(coasted_distance(mean, np.array([0.6])), [expected], rtol=1e-6)
+    assert coasted_distance(mean, np.zeros(1)) == 0
+
+
+def ranges(mean, cov):
+    """States of a track with this distance, speed and width."""
+    boxes = states_of(*initiate(BOXES[:1], np.ones((1, 4))))
+    return boxes._replace(range_mean=np.array([mean], float), range_cov=np.array([cov], float))
+
+
+def test_distances_are_predicted_at_constant_speed():
+    cov = np.array([[4.0, 0.5, 0.1], [0.5, 9.0, 0.2], [0.1, 0.2, 0.04]])
+    found = predict_distances(ranges([30.0, -5.0, 0.1], cov), 0.2, CAMERA)
+    np.testing.assert_allclose(found.range_mean, [[29.0, -5.0, 0.1]])
+    transition = np.array([[1, 0.2, 0], [0, 1, 0], [0, 0, 1]])
+    expected = transition @ cov @ transition.T
+    expected[:2, :2] += 1.5**2 * np.array([[0.2**3 / 3, 0.2**2 / 2], [0.2**2 / 2, 0.2]])
+    expected[2, 2] += (CAMERA.vehicle_width_std_m / CAMERA.vehicle_width_m) ** 2 * 0.2 / 20
+    np.testing.assert_allclose(found.range_cov[0], expected)
+    for start, speed, end in ((2.0, -50.0, 1.0), (499.0, 50.0, 500.0)):
+        assert predict_distances(ranges([start, speed, 0], cov), 0.2, CAMERA).range_mean[0, 0] == end
+
+
+@pytest.mark.parametrize(
+    ("distance_std", "speed_std", "age", "known"),
+    [
+        (8.0, 6.0, 0.5, (True, True)),
+        (8.1, 6.0, 0.5, (False, False)),
+        (8.0, 6.1, 0.5, (True, False)),
+        (8.0, 6.0, 0.51, (False, False)),
+    ],
+)
+def test_distances_and_speeds_are_stated_where_they_are_known(distance_std, speed_std, age, known):
+    camera = Camera.for_frame(SHAPE, focal_std=0.1)
+    states = ranges([20.0, -3.0, 0.0], np.diag([distance_std**2, speed_std**2, 0.1]))
+    (found,) = estimate_distances(states, np.array([age]), camera)
+    distance = (20.0, math.hypot(distance_std, 2.0)) if known[0] else (None, None)
+    speed = (-3.0, math.hypot(speed_std, 0.3)) if known[1] else (None, None)
+    names = ["distance_m", "distance_std_m", "speed_mps", "speed_std_mps"]
+    assert list(found) == names
+    for name, value in zip(names, (*distance, *speed)):
+        assert found[name] == (value if value is None else pytest.approx(value))
+
+
+def test_rows_of_states_are_taken_put_and_joined():
+    states = states_of(*moving_states()[:2])
+    assert states.take([0, 1]) is states
+    np.testing.assert_array_equal(states.take([1]).mean, states.mean[1:])
+    np.testing.assert_array_equal(states.take([1, 0]).cov, states.cov[::-1])
+    changed = states.put([1], states.take([0]))
+    np.testing.assert_array_equal(changed.mean, states.mean[[0, 0]])
+    assert not np.array_equal(states.mean[0], states.mean[1])
+    joined = KalmanStates.empty().join(states)
+    np.testing.assert_array_equal(joined.range_cov, states.range_cov)

@@ -7,7 +7,7 @@ from tests.helpers import boxes_on_a_road
 from vehicle_detection.boxes import Detections
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.video import estimate_video_horizon
+from vehicle_detection.video import estimate_video_horizon, open_source
 
 
 class StubImageDetector:
@@ -38,6 +38,16 @@ def test_the_horizon_from_fifteen_frames_of_a_short_video(clip):
     assert detector.frames == 12
     assert found.horizon == pytest.approx(0.55, abs=0.01)
     assert estimate_video_horizon(clip, detector, start=1, end=2).n_boxes == 64
+
+
+def test_a_source_of_the_caller_stays_open(clip):
+    closed = []
+    with open_source(clip) as source:
+        source._on_close.callback(closed.append, True)
+        for _ in range(2):
+            estimate_video_horizon(source, StubImageDetector(np.empty((0, 4))), end=0.4)
+        assert not closed
+    assert closed
 
 
 def test_no_more_frames_than_necessary(clip):

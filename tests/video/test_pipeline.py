@@ -255,3 +255,10 @@ def test_the_first_frame_of_a_scene_is_searched(tmp_path):
     # Frames 0 and 3; the cuts at 4 and 7; and 10.
     assert [round(level, -1) for level in detector.searched] == [20, 20, 200, 20, 20]
     assert [result.index for result in results] == list(range(11))
+
+
+def test_a_stop_before_the_first_frame_ends_the_run(clip):
+    with process.VideoRun(clip, StubDetector()) as run:
+        run.stop()
+        assert list(run.results()) == []
+    assert not running_threads()

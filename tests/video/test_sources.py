@@ -398,3 +398,50 @@ def test_messages_do_not_show_passwords(live):
 def test_a_server_that_is_away_is_a_transient_error():
     with pytest.raises(TransientVideoError, match="Connection refused"):
         open_source("http://127.0.0.1:9/x.mp4")
+
+
+def test_an_unexpected_error_of_a_live_stream_reaches_its_reader(tmp_path, monkeypatch):
+    with endless_pipe(tmp_path / "pipe"), open_source(tmp_path / "pipe", live=True) as source:
+        original = live.LiveStream.read
+
+        def read(stream, planes):
+            if stream._number > 1:
+                raise MemoryError("no memory for a frame")
+            return original(stream, planes)
+
+        monkeypatch.setattr(live.LiveStream, "read", read)
+        with pytest.raises(MemoryError, match="no memory for a frame"):
+            process_video(source, tmp_path / "out.mp4", StubDetector())
+    assert not (tmp_path / "out.mp4").exists()
+    assert not running_threads()
+
+
+def test_copies_of_killed_processes_are_removed(clip, tmp_path, monkeypatch):
+    fsspec = pytest.importorskip("fsspec")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    left = tmp_path / ".vehicle-source.abc.part"
+    left.mkdir()
+    (left / "clip.mp4").write_bytes(b"x")
+    with fsspec.open("memory://bucket/clip.mp4", "wb") as file:
+        file.write(clip.read_bytes())
+    with open_source("memory://bucket/clip.mp4") as source:
+        assert source.files[0].is_relative_to(tmp_path)
+        if sys.platform != "win32":
+            assert not left.exists()
+        with open_source("memory://bucket/clip.mp4") as other:
+            assert source.files[0].exists()
+            assert other.files[0] != source.files[0]
+
+
+@pytest.mark.parametrize(
+    ("url", "name"),
+    [
+        ("s3://bucket/day/a.mp4", "a.mp4"),
+        ("http://nas/a%20b.mp4?X-Amz-Credential=AK/2026/us&sig=" + "a" * 900, "a b.mp4"),
+        ("http://nas/" + "é" * 300 + ".mp4", "é" * 56 + ".mp4"),
+        ("http://nas/..%2F..%2Fx.mp4", ".._.._x.mp4"),
+        ("http://nas/", "nas"),
+    ],
+)
+def test_names_of_local_copies(url, name):
+    assert remote.file_name(url) == name

@@ -132,3 +132,9 @@ def test_paths_and_urls_keep_their_type():
 
 def test_hidden_files_are_no_videos():
     assert [is_video_file(Path(name)) for name in ("a.MP4", "._a.mp4", "a.thm")] == [True, False, False]
+
+
+def test_the_query_of_a_url_tells_no_time():
+    names = [f"https://nas/card/20260131_08150{n}_F.mp4?X-Amz-Date=20300101T120000Z&sig=a/b" for n in (0, 1)]
+    (trip,) = find_trips(names, duration=lambda _: 1.0)
+    assert (trip.camera, len(trip.files), trip.start.year) == ("front", 2, 2026)

@@ -1,5 +1,6 @@
 """Frames that are shown while they are processed."""
 
+import os
 import sys
 import types
 
@@ -7,7 +8,14 @@ import numpy as np
 import pytest
 
 from tests.helpers import StubDetector, random_mixture
-from tests.video.clips import child_processes, frame_numbers, running_threads
+from tests.video.clips import (
+    child_processes,
+    frame_numbers,
+    gray_frames,
+    running_threads,
+    sound_seconds,
+    write_clip,
+)
 from vehicle_detection import VehicleDetector, stream, track
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video import process, process_video, viewer
@@ -40,15 +48,31 @@ def test_the_shown_frames_are_those_that_are_written(clip, tmp_path, monkeypatch
     assert not written or frame_numbers(target) == list(range(20))
 
 
-def test_closing_the_window_ends_the_run_and_completes_the_video(clip, tmp_path, monkeypatch):
+def test_closing_the_window_ends_the_run_and_completes_the_video(folder, tmp_path, monkeypatch):
+    # A pipe holds about 60 of these small frames, which are read after its ffmpeg has ended.
+    clip = write_clip(folder / "long.mp4", gray_frames(20) * 8, sound=True)
     before = child_processes()
     window = Recorder(last=3)
     monkeypatch.setattr(process, "open_viewer", lambda title: window)
-    report = process_video(clip, tmp_path / "out.mp4", StubDetector(pause=0.02), show=True, workers=1)
-    assert 3 <= report.frames <= 20
-    assert frame_numbers(tmp_path / "out.mp4") == list(range(report.frames))
+    report = process_video(clip, tmp_path / "out.mp4", StubDetector(pause=0.01), show=True, workers=1)
+    assert 3 <= report.frames < 160
+    assert frame_numbers(tmp_path / "out.mp4") == [number % 20 for number in range(report.frames)]
+    assert sound_seconds(tmp_path / "out.mp4") == pytest.approx(float(report.frames / report.fps), abs=0.07)
+    assert os.listdir(tmp_path) == ["out.mp4"]
     assert child_processes() == before
     assert not running_threads()
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_the_sound_ends_with_the_frames_when_the_window_is_closed(folder, tmp_path, monkeypatch, suffix):
+    source = write_clip(folder / f"long.{suffix}", [*gray_frames(20)] * 10, fps=20, sound=True)
+    monkeypatch.setattr(process, "open_viewer", lambda title: Recorder(last=3))
+    target = tmp_path / f"out.{suffix}"
+    report = process_video(source, target, StubDetector(pause=0.02), show=True, workers=1)
+    assert report.frames <= 100
+    assert len(frame_numbers(target)) == report.frames
+    assert sound_seconds(target) == pytest.approx(report.frames / 20, abs=0.06)
+    assert list(tmp_path.iterdir()) == [target]
 
 
 @pytest.mark.parametrize("as_stream", [True, False])

@@ -24,6 +24,7 @@ from vehicle_detection._common.limits import Limit, check_regular_file, read_reg
 from vehicle_detection._common.model_file import FORMAT_VERSION, ModelData, read_model, write_model
 from vehicle_detection._common.parquet import ParquetRows, write_parquet
 from vehicle_detection._common.progress import progress_bar
+from vehicle_detection._common.text import pluralize
 from vehicle_detection._common.threads import (
     JOBS_VARIABLE,
     ThreadTeam,
@@ -31,7 +32,7 @@ from vehicle_detection._common.threads import (
     resolve_jobs,
     single_threaded_opencv,
 )
-from vehicle_detection._common.urls import hide_credentials, is_url
+from vehicle_detection._common.urls import hide_credentials, is_url, stable_url
 from vehicle_detection._common.workspace import NEW_ARRAYS, Workspace
 
 check_environment()
@@ -70,12 +71,14 @@ __all__ = [
     "image_size",
     "is_url",
     "mirror_patches",
+    "pluralize",
     "progress_bar",
     "read_model",
     "read_regular_file",
     "relight",
     "resolve_jobs",
     "single_threaded_opencv",
+    "stable_url",
     "temporary_folder",
     "write_model",
     "write_parquet",

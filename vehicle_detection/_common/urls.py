@@ -1,12 +1,25 @@
-"""URLs among paths, and messages without their passwords."""
+"""URLs among paths, and messages without their passwords and signatures."""
 
 from __future__ import annotations
 
 import re
+from urllib.parse import unquote_plus
 
 _URL = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+://")
 # A password may hold an "@": the host begins after the last one.
 _CREDENTIALS = re.compile(r"(?<=://)[^\s/?#]*@")
+_PASSWORD = re.compile(r"(?<=://)([^\s/?#:@]*):[^\s/?#]*@")
+# Parameters of queries that are secret; punctuation after a value belongs to the sentence.
+_SECRET = re.compile(
+    r"(?<=[?&])([\w.-]*(?:signature|token|credential|secret|passw|api[_-]?key|access[_-]?key)[\w.-]*"
+    r"|sig|key|key-pair-id|policy|pass|pwd|jwt|auth(?:orization|key)?)=[^\s&#'\"<>]*[^\s&#'\"<>).,:;]",
+    re.IGNORECASE,
+)
+# Parameters of URLs signed by S3, Google, CloudFront or Azure; a token may instead be what names a file.
+_SIGNATURE = re.compile(
+    r"x-(amz|goog)-.*|awsaccesskeyid|googleaccessid|expires|signature|key-pair-id|policy", re.IGNORECASE
+)
+_AZURE = re.compile(r"sig|s[eprstv]|srt|spr|sip|sdd|sk(oid|tid|[estv])|saoid|suoid|scid", re.IGNORECASE)
 
 
 def is_url(text: str) -> bool:
@@ -15,5 +28,19 @@ def is_url(text: str) -> bool:
 
 
 def hide_credentials(text: str) -> str:
-    """Replace the user and password of each URL in a text by ``***``."""
-    return _CREDENTIALS.sub("***@", text)
+    """Replace the user, the password, and signatures and tokens in the query of each URL by ``***``."""
+    return _SECRET.sub(r"\1=***", _CREDENTIALS.sub("***@", text))
+
+
+def stable_url(url: str) -> str:
+    """Return a URL without its password and without the parameters of a signature, which are renewed."""
+    url = _PASSWORD.sub(r"\1@", url)
+    head, mark, rest = url.partition("?")
+    if not mark:
+        return url
+    query, mark, fragment = rest.partition("#")
+    named = [(unquote_plus(pair.partition("=")[0]), pair) for pair in query.split("&")]
+    if any(name.lower() == "sig" for name, _ in named):
+        named = [(name, pair) for name, pair in named if not _AZURE.fullmatch(name)]
+    kept = "&".join(pair for name, pair in named if not _SIGNATURE.fullmatch(name))
+    return head + (f"?{kept}" if kept else "") + mark + fragment

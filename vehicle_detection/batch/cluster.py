@@ -25,6 +25,11 @@ def open_dask(address: str, jobs: int | None = None) -> Iterator[tuple[Executor,
     ------
     InvalidInputError
         If distributed is missing, or the scheduler does not answer.
+
+    Examples
+    --------
+    >>> with open_dask("local", jobs=4) as (executor, dashboard):  # doctest: +SKIP
+    ...     report = run_batch("card", "results", executor)
     """
     try:
         import dask

@@ -7,14 +7,13 @@ import glob
 import hashlib
 import json
 import os
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
 from vehicle_detection import __version__
-from vehicle_detection._common import check_path, describe, hide_credentials, is_url
+from vehicle_detection._common import check_path, describe, hide_credentials, is_url, stable_url
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection.video import (
     Trip,
@@ -25,8 +24,10 @@ from vehicle_detection.video import (
     with_retries,
 )
 
-_PASSWORD = re.compile(r"(?<=://)([^\s/?#:@]*):[^\s/?#]*@")
 _ID_DIGITS = _HASH_DIGITS = 12
+_HTTP_TIMEOUT = 10
+# Answers to a HEAD request after which a GET may succeed, such as that of a URL signed for GET only.
+_NO_HEAD = (400, 401, 403, 405, 501)
 
 
 Facts = Mapping[str, Any]
@@ -57,7 +58,7 @@ def list_videos(sources: Iterable[str | os.PathLike[str]]) -> dict[str, Facts]:
 
 def _list_local(path: Path) -> Iterator[tuple[str, Facts]]:
     if path.is_dir():
-        files: Iterable[Path] = (each for each in path.rglob("*") if is_video_file(each))
+        files: Iterable[Path] = (each for each in _walk(path) if is_video_file(each))
     elif path.exists():
         files = [path]
     elif glob.has_magic(str(path)):
@@ -66,6 +67,18 @@ def _list_local(path: Path) -> Iterator[tuple[str, Facts]]:
     else:
         raise InvalidInputError(f"sources {path} does not exist; check the path")
     return ((os.path.abspath(each), {}) for each in files if each.is_file())
+
+
+def _walk(folder: Path) -> Iterator[Path]:
+    """Yield the files of a folder and below; a folder that cannot be read is an error, not an empty one."""
+
+    def refuse(error: OSError) -> None:
+        raise InvalidInputError(
+            f"sources {error.filename} cannot be listed ({error.strerror}); change its permissions"
+        ) from error
+
+    for parent, _, names in os.walk(folder, onerror=refuse):
+        yield from (Path(parent, name) for name in names)
 
 
 def _list_remote(url: str) -> Iterator[tuple[str, Facts]]:
@@ -119,8 +132,8 @@ def trip_id(trip: Trip) -> str:
 
 
 def source_id(uri: str) -> str:
-    """Identity of a file: a hash of its path or URL, which a new password does not change."""
-    named = _PASSWORD.sub(r"\1@", uri) if is_url(uri) else uri
+    """Identity of a file: a hash of its path or URL, which a new password or signature does not change."""
+    named = stable_url(uri) if is_url(uri) else uri
     return hashlib.sha256(named.encode("utf-8", "surrogateescape")).hexdigest()[:_ID_DIGITS]
 
 
@@ -130,13 +143,11 @@ def plan_trip(
     """Describe the work on a trip as plain values, for a worker on any machine.
 
     Its ``key`` is the trip's identity and a hash of everything that the results depend on. `known` are the
-    facts of `list_videos`. The worker opens ``files``; the record gets ``sources``, without passwords.
+    facts of `list_videos`. The worker opens ``files``; the record gets ``sources``, without passwords and
+    signatures.
     """
     files = [str(file) for file in trip.files]
-    sources = [
-        {"uri": hide_credentials(file) if is_url(file) else file, **_identify(file, known.get(file, {}))}
-        for file in files
-    ]
+    sources = [{"uri": _shown(file), **_identify(file, known.get(file, {}))} for file in files]
     facts = [sources, dict(settings), fingerprint, __version__]
     digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:_HASH_DIGITS]
     return {
@@ -150,8 +161,13 @@ def plan_trip(
     }
 
 
+def _shown(uri: str) -> str:
+    """Path or URL of a file in its record: without what is secret, or is renewed with a signature."""
+    return hide_credentials(stable_url(uri)) if is_url(uri) else uri
+
+
 def _identify(uri: str, facts: Facts) -> dict[str, Any]:
-    """Size of a file, and its modification time or entity tag."""
+    """Size of a file, and its modification time or entity tag; None and empty where it cannot be found."""
     try:
         if uri.startswith(("http://", "https://")):
             return with_retries(lambda: _identify_http(uri))
@@ -170,14 +186,19 @@ def _identify(uri: str, facts: Facts) -> dict[str, Any]:
 def _identify_http(url: str) -> dict[str, Any]:
     import requests
 
-    answer = requests.head(url, timeout=10, allow_redirects=True)
+    answer = requests.head(url, timeout=_HTTP_TIMEOUT, allow_redirects=True)
+    if answer.status_code in _NO_HEAD:
+        first_byte = {"Range": "bytes=0-0"}
+        with requests.get(url, timeout=_HTTP_TIMEOUT, headers=first_byte, stream=True) as answer:
+            pass
     if answer.status_code >= 500:
         answer.raise_for_status()
     if not answer.ok:
         return {"size": None, "tag": ""}
     headers = answer.headers
+    length = headers.get("Content-Range", "").rpartition("/")[2] or headers.get("Content-Length", "")
     return {
-        "size": headers.get("Content-Length"),
+        "size": int(length) if length.isdecimal() else None,
         "tag": headers.get("ETag") or headers.get("Last-Modified") or "",
     }
 

@@ -1,7 +1,8 @@
 """Records of a batch: one small JSON file per trip, written after its outputs, and a summary of them.
 
 A record's ``status`` is ``"done"``; ``"failed"`` if the source cannot be processed, which is not tried again
-before it changes; or ``"error"`` if the machine failed (disk full, lost worker), which the next run repeats.
+before it changes; or ``"error"`` if the machine failed (disk full, lost worker) or there was no access to the
+source, which the next run repeats.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from vehicle_detection._common import pluralize
 from vehicle_detection.batch.store import Store, open_store
 
 if TYPE_CHECKING:
@@ -49,7 +51,7 @@ class BatchStatus:
     ... )
     >>> print(status)
     2 trips done, 1 failed, 0 errors
-    0.0 hours of video, 3000 frames, 9 vehicles, 50.0 frames/s per worker
+    0.0 hours of video, 3,000 frames, 9 vehicles, 50.0 frames/s per worker
     cut.mp4: cut.mp4 is incomplete
     """
 
@@ -65,9 +67,9 @@ class BatchStatus:
     def __str__(self) -> str:
         rate = self.frames / self.work_seconds if self.work_seconds else 0.0
         lines = [
-            f"{self.done} trips done, {self.failed} failed, {self.errors} errors",
-            f"{self.video_seconds / 3600:.1f} hours of video, {self.frames} frames, {self.tracks} vehicles, "
-            f"{rate:.1f} frames/s per worker",
+            f"{pluralize(self.done, 'trip')} done, {self.failed:,} failed, {pluralize(self.errors, 'error')}",
+            f"{self.video_seconds / 3600:,.1f} hours of video, {pluralize(self.frames, 'frame')}, "
+            f"{pluralize(self.tracks, 'vehicle')}, {rate:.1f} frames/s per worker",
         ]
         return "\n".join([*lines, *(f"{source}: {text}" for source, text in self.messages.items())])
 

@@ -10,7 +10,7 @@ import re
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import BrokenExecutor, Executor, Future
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -26,6 +26,7 @@ from vehicle_detection._common import (
     check_type,
     describe,
     hide_credentials,
+    pluralize,
     progress_bar,
 )
 from vehicle_detection.batch.plan import group_files, list_videos, plan_trip, source_id, trip_id
@@ -39,7 +40,7 @@ from vehicle_detection.batch.records import (
     write_record,
 )
 from vehicle_detection.batch.store import Store, open_store
-from vehicle_detection.batch.trip import BUSY, run_trip, warm_up
+from vehicle_detection.batch.trip import BUSY, remove_replaced, run_trip, warm_up
 from vehicle_detection.batch.workers import WorkerPool
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
@@ -47,6 +48,8 @@ from vehicle_detection.video import PRESETS
 
 # Attempts at a trip whose worker is lost.
 _ATTEMPTS = 3
+# Files that are looked up at the same time: a server takes a while to answer for each.
+_LOOKUPS = 16
 # Seconds between looks at a trip that another run is working on.
 _BUSY_INTERVAL = 0.5
 
@@ -91,9 +94,9 @@ class BatchReport:
     def __str__(self) -> str:
         rate = self.frames / self.seconds if self.seconds else 0.0
         return (
-            f"{self.trips} trip{'s' * (self.trips != 1)}: {self.done} done, {self.failed} failed, "
-            f"{self.errors} errors, {self.skipped} skipped; {self.frames} frames in {self.seconds:.1f} s, "
-            f"{rate:.1f} frames/s"
+            f"{pluralize(self.trips, 'trip')}: {self.done:,} done, {self.failed:,} failed, "
+            f"{pluralize(self.errors, 'error')}, {self.skipped:,} skipped; "
+            f"{pluralize(self.frames, 'frame')} in {self.seconds:.1f} s, {rate:.1f} frames/s"
         )
 
 
@@ -299,10 +302,11 @@ def _plan(
         earlier.setdefault(key.partition("-")[0], []).append(key)
     number, count = part
     tasks = []
-    for trip in trips:
-        if int(trip_id(trip), 16) % count != number - 1:
-            continue
-        task = plan_trip(trip, listed, settings, fingerprint) | {"out": store.name}
+    mine = [trip for trip in trips if int(trip_id(trip), 16) % count == number - 1]
+    with ThreadPoolExecutor(_LOOKUPS, thread_name_prefix="vehicle-plan") as pool:
+        plans = list(pool.map(lambda trip: plan_trip(trip, listed, settings, fingerprint), mine))
+    for trip, plan in zip(mine, plans, strict=True):
+        task = plan | {"out": store.name}
         # A trip replaces the earlier ones that began with one of its files.
         ids = (source_id(str(file)) for file in trip.files)
         keys = [key for each in ids for key in earlier.get(each, ())]
@@ -322,6 +326,8 @@ def _pending(tasks: Iterable[dict[str, Any]], store: Store, retry_failed: bool) 
         again = retry_failed and record is not None and record["status"] == FAILED
         if again or not is_complete(record, outputs.__contains__):
             pending.append({**task, "again": again})
+        elif record is not None and task["replaces"]:  # such as an error while the source was away
+            remove_replaced(store, task, record)
     return pending
 
 
@@ -387,8 +393,8 @@ def _lost_record(task: Mapping[str, Any], error: Exception, store: Store) -> dic
     record = _basic_record(task, hide_credentials(f"{error}, {_ATTEMPTS} times"))
     try:
         write_record(store, record)
-    except OSError as full:
-        record["message"] += f"; {full}"
+    except (OSError, InvalidInputError) as unwritten:
+        record["message"] += f"; {unwritten}"
     return record | {"new": True}
 
 

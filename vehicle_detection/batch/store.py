@@ -92,6 +92,8 @@ class LocalStore:
                 return file.read()
         except FileNotFoundError:
             return None
+        except OSError as error:
+            raise _unreadable(error) from error
 
     def read_many(self, paths: Iterable[str]) -> Iterator[tuple[str, bytes]]:
         """Yield paths and contents of files; files that have gone are left out."""
@@ -103,7 +105,7 @@ class LocalStore:
     def list_files(self, folder: str, prefix: str = "") -> list[str]:
         """Paths of the files in a folder and below, whose names start with `prefix`."""
         found = []
-        for parent, _, names in os.walk(self.folder / folder):
+        for parent, _, names in os.walk(self.folder / folder, onerror=_check_listing):
             place = Path(parent).relative_to(self.folder).as_posix()
             found += [f"{place}/{name}" for name in names if name.startswith(prefix) and name[0] != "."]
         return found
@@ -132,6 +134,16 @@ class LocalStore:
         path = self.folder / "locks" / f"{name}.lock"
         with contextlib.ExitStack() as stack:
             yield _lock_file(path, stack)
+
+
+def _check_listing(error: OSError) -> None:
+    """Raise an error of `os.walk`, except that of a folder that is not there."""
+    if not isinstance(error, FileNotFoundError):
+        raise _unreadable(error) from error
+
+
+def _unreadable(error: OSError) -> OutputError:
+    return OutputError(f"{error.filename} cannot be read ({error.strerror}); check its permissions")
 
 
 def _lock_file(path: Path, stack: contextlib.ExitStack) -> bool:

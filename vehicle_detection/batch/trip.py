@@ -26,7 +26,12 @@ from vehicle_detection.batch.records import (
 )
 from vehicle_detection.batch.store import Store, open_store
 from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.errors import InvalidInputError, TransientVideoError, VehicleDetectionError
+from vehicle_detection.errors import (
+    InvalidInputError,
+    TransientVideoError,
+    VehicleDetectionError,
+    VideoError,
+)
 from vehicle_detection.export import DIGITS, TRACK_COLUMNS, track_rows
 from vehicle_detection.video import FrameSource, download, open_source, process_video
 
@@ -77,14 +82,13 @@ def run_trip(task: Mapping[str, Any]) -> dict[str, Any]:
             "started": started,
         }
         try:
-            _remove_earlier(store, task)
-            record |= _process(store, task)
+            record |= _replace(store, task)
         except Exception as error:
             record |= _failure(error)
         record["seconds"] = round(time.time() - started, 3)
         try:
             write_record(store, record)
-        except OSError as error:  # the disk is full: the trip is missing, and the next run repeats it
+        except (OSError, InvalidInputError) as error:  # a full disk, no access: the next run repeats the trip
             record |= {"status": ERROR, "message": str(error)}
     return record | {"new": True}
 
@@ -98,6 +102,25 @@ def _failure(error: Exception) -> dict[str, Any]:
     return {"status": ERROR if passing else FAILED, "message": message}
 
 
+def remove_replaced(store: Store, task: Mapping[str, Any], record: Mapping[str, Any]) -> None:
+    """Remove what a complete trip has replaced, which another run may have written in the meantime."""
+    with store.lock(task["key"].partition("-")[0]) as locked:
+        if locked:
+            _remove_earlier(store, task, record.get("outputs", {}))
+
+
+def _replace(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
+    """Process a trip, then remove the results that it replaces; an error of the machine removes nothing."""
+    try:
+        facts = _process(store, task)
+    except Exception as error:
+        facts = _failure(error)
+        if facts["status"] == ERROR:
+            return facts
+    _remove_earlier(store, task, facts.get("outputs", {}))
+    return facts
+
+
 def _process(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
     """Write the outputs of a trip; return the facts for its record."""
     settings, key = task["settings"], task["key"]
@@ -105,17 +128,21 @@ def _process(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
     place = f"date={task['date']}/camera={task['camera']}/{key}"
     with _scratch(store, key) as folder:
         video = None if settings["tracks_only"] else folder / "video.mp4"
-        with _open(task, folder) as source, _TrackTable(folder / "tracks.parquet", key) as write:
-            report = process_video(
-                source,
-                video,
-                detector,
-                audio=settings["audio"],
-                preset=settings["preset"],
-                workers=1,
-                progress=False,
-                on_result=write,
-            )
+        try:
+            with _open(task, folder) as source, _TrackTable(folder / "tracks.parquet", key) as write:
+                report = process_video(
+                    source,
+                    video,
+                    detector,
+                    audio=settings["audio"],
+                    preset=settings["preset"],
+                    workers=1,
+                    progress=False,
+                    on_result=write,
+                )
+        except VideoError as error:
+            raise type(error)(_with_urls(str(error), task, folder)) from error
+        damage = _with_urls(report.damage, task, folder)
         outputs = {"tracks": f"tracks/{place}.parquet"}
         store.publish(folder / "tracks.parquet", outputs["tracks"])
         if video is not None:
@@ -129,23 +156,58 @@ def _process(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
         "tracks": report.tracks,
         "rows": write.rows,
         "outputs": outputs,
-        **({"damage": report.damage} if report.damage else {}),
+        **({"damage": damage} if damage else {}),
     }
 
 
+def _with_urls(message: str, task: Mapping[str, Any], folder: Path) -> str:
+    """Replace the paths of local copies in a message by the URLs of the sources."""
+    for number, source in enumerate(task["sources"]):
+        for path in (folder / str(number)).glob("*"):
+            message = message.replace(str(path), source["uri"])
+    return message
+
+
 def _open(task: Mapping[str, Any], folder: Path) -> FrameSource:
-    """Open the files of a trip; several remote ones are copied first, which one source does itself."""
+    """Open the files of a trip; remote ones are copied first, unless a single one can be read in place."""
     files = task["files"]
-    if len(files) == 1:
+    if len(files) == 1 and files[0].startswith(("http://", "https://")):
         return open_source(files[0])
     paths = []
     for number, file in enumerate(files):
         if is_url(file):
             (folder / str(number)).mkdir()
-            paths.append(download(file, folder / str(number)))
+            paths.append(_copy(file, folder / str(number), task["sources"][number]))
         else:
+            _check_access(file)
             paths.append(Path(file))
     return open_source(paths)
+
+
+def _copy(url: str, folder: Path, source: Mapping[str, Any]) -> Path:
+    """Copy a remote file of a trip.
+
+    Where the file was found when the batch started, any error is transient: a missing package, permissions
+    that have been revoked, a file that has gone. Where it was not, the trip gets another key once it is.
+    """
+    try:
+        return download(url, folder)
+    except InvalidInputError as error:
+        if source["size"] is None:
+            raise
+        raise TransientVideoError(str(error)) from error
+
+
+def _check_access(file: str) -> None:
+    """Raise a TransientVideoError if a local file cannot be opened: a change of its permissions helps."""
+    try:
+        with open(file, "rb") as opened:
+            opened.read(1)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise TransientVideoError(
+            f"{file} cannot be read ({reason}); check its permissions and its disk"
+        ) from error
 
 
 class _TrackTable:
@@ -182,8 +244,8 @@ def _scratch(store: Store, key: str) -> AbstractContextManager[Path]:
     return temporary_folder(Path(tempfile.gettempdir()), f"vehicle-batch-{batch}-{key}")
 
 
-def _remove_earlier(store: Store, task: Mapping[str, Any]) -> None:
-    """Remove the results of this trip's files for other contents, parameters or trips."""
+def _remove_earlier(store: Store, task: Mapping[str, Any], outputs: Mapping[str, str]) -> None:
+    """Remove results of this trip's files for other contents, parameters or trips; keep its `outputs`."""
     for key, record in read_records(store, task.get("replaces", ())).items():
         for path in record.get("outputs", {}).values():
             store.remove(path)
@@ -192,4 +254,5 @@ def _remove_earlier(store: Store, task: Mapping[str, Any]) -> None:
     identity, place = task["key"].partition("-")[0], f"date={task['date']}/camera={task['camera']}"
     for kind in ("tracks", "videos"):
         for path in store.list_files(f"{kind}/{place}", f"{identity}-"):
-            store.remove(path)
+            if path not in outputs.values():
+                store.remove(path)

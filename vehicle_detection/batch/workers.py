@@ -6,10 +6,11 @@ With ``ProcessPoolExecutor``, one killed process breaks the pool.
 from __future__ import annotations
 
 import contextlib
-import getpass
 import json
+import logging
 import os
 import queue
+import stat
 import subprocess
 import sys
 import tempfile
@@ -20,6 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from vehicle_detection._common import JOBS_VARIABLE
+
+_LOGGER = logging.getLogger(__name__)
 
 
 class WorkerLost(Exception):  # noqa: N818 - named after what happened, as BrokenExecutor is
@@ -32,11 +35,29 @@ def worker_environment() -> dict[str, str]:
     A cache on shared storage is corrupted by processes of several machines.
     """
     threads = dict.fromkeys((JOBS_VARIABLE, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    with contextlib.suppress(OSError, KeyError):
-        user = getpass.getuser()
-        cache = Path(tempfile.gettempdir()) / f"vehicle-detection-kernels-{user}"
-        threads["NUMBA_CACHE_DIR"] = os.environ.get("NUMBA_CACHE_DIR", str(cache))
-    return threads
+    cache = os.environ.get("NUMBA_CACHE_DIR") or _private_folder("vehicle-detection-kernels")
+    return threads | ({"NUMBA_CACHE_DIR": cache} if cache else {})
+
+
+def _private_folder(name: str) -> str | None:
+    """Create a folder for temporary files that only this user can write; None if that is impossible.
+
+    numba's cache holds pickled objects, so another user must not have created it.
+    """
+    if not hasattr(os, "getuid"):  # Windows, where the folder of temporary files is private
+        return str(Path(tempfile.gettempdir()) / name)
+    user = os.getuid()  # containers may have users without a name
+    folder = Path(tempfile.gettempdir()) / f"{name}-{user}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError as error:
+        _LOGGER.warning("%s cannot be created (%s); kernels are kept elsewhere", folder, error.strerror)
+        return None
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != user or found.st_mode & 0o022:
+        _LOGGER.warning("%s can be written by other users; remove it, kernels are kept elsewhere", folder)
+        return None
+    return str(folder)
 
 
 class WorkerPool(Executor):
@@ -128,10 +149,13 @@ class WorkerPool(Executor):
                     **group,
                 )
                 self._processes.add(process)
-            answer = _ask(process, self._initializer)
-        if "error" in answer:
-            self._end(process)
-            raise RuntimeError(answer["error"])
+            try:
+                answer = _ask(process, self._initializer)
+                if "error" in answer:
+                    raise RuntimeError(answer["error"])
+            except BaseException:
+                self._end(process)
+                raise
         return process
 
     def _end(self, process: subprocess.Popen[str] | None) -> None:

@@ -154,7 +154,13 @@ def detect(
     images: Annotated[list[Path], Argument(metavar="IMAGE...", help="Image files, such as frames/*.jpg.")],
     output: Annotated[
         Path | None,
-        Option("-o", "--output", metavar="DIR", help="Annotated images.", rich_help_panel=OUTPUT),
+        Option(
+            "-o",
+            "--output",
+            metavar="DIR",
+            help="Folder for annotated images, such as found.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = None,
     boxes: Annotated[
         Path | None,
@@ -168,7 +174,7 @@ def detect(
         Path | None,
         Option(
             metavar="DIR",
-            help="Pictures that explain each box: the share of each cell in its score.",
+            help="Folder, such as why, for pictures that explain each box: the share of each cell.",
             rich_help_panel=OUTPUT,
         ),
     ] = None,
@@ -277,6 +283,7 @@ def _detect_each(
     """Detect the vehicles of each image, print them, and write the annotated image."""
     import cv2
 
+    from vehicle_detection._common import pluralize
     from vehicle_detection.drawing import blur_boxes, draw_detections, score_texts
     from vehicle_detection.images import read_image, write_image
 
@@ -290,7 +297,7 @@ def _detect_each(
             f"  [{' '.join(f'{side:.0f}' for side in box)}] {text}"
             for box, text in zip(found.boxes.tolist(), score_texts(found))
         )
-        typer.echo(f"{path}: {len(found)} vehicle{'s' * (len(found) != 1)}{listed}")
+        typer.echo(f"{path}: {pluralize(len(found), 'vehicle')}{listed}")
         shown = image
         if detector.blur is not None:
             shown = blur_boxes(image, found.boxes, region=detector.blur)
@@ -338,7 +345,9 @@ def evaluate(
     ignored_as_regions: Annotated[
         bool, flag("--ignored-as-regions", help="Ignore boxes of which half lies in an ignored box.")
     ] = False,
-    json: Annotated[Path | None, Option(metavar="FILE", help="File for all scores.")] = None,
+    json: Annotated[
+        Path | None, Option(metavar="FILE", help="File for all scores, such as scores.json.")
+    ] = None,
 ) -> None:
     """Score boxes, and tracks if there are any, against labels."""
     from json import dumps

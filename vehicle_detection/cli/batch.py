@@ -34,22 +34,36 @@ from vehicle_detection.errors import InvalidInputError
 )
 def batch(
     output: Annotated[
-        str, Option("-o", "--output", metavar="DIR|URL", help="Folder or URL (s3://...) of the results.")
+        str,
+        Option(
+            "-o",
+            "--output",
+            metavar="DIR|URL",
+            help="Folder or URL of the results, such as results or s3://fleet/results.",
+        ),
     ],
     sources: Annotated[
         list[str] | None,
-        Argument(metavar="SOURCES...", help="Video files, folders, quoted patterns and URLs (s3://...)."),
+        Argument(
+            metavar="SOURCES...",
+            help="Video files, folders, quoted patterns and URLs, such as CARD/ or s3://cam/*.mp4.",
+        ),
     ] = None,
     model: Model = "default",
     conf: Confidence = None,
     jobs: Annotated[
-        int | None, Option(metavar="N", help="Worker processes of one thread; default: one per core.")
+        int | None,
+        Option(metavar="N", help="Worker processes of one thread, such as 4; default: one per core."),
     ] = None,
     shard: Annotated[
-        str | None, Option(metavar="I/N", help="Process the I-th of N parts, for job arrays; I from 1.")
+        str | None, Option(metavar="I/N", help="Process the I-th of N parts, such as 2/8, for job arrays.")
     ] = None,
     dask: Annotated[
-        str | None, Option(metavar="ADDRESS|local", help="Use a Dask cluster, or start one here.")
+        str | None,
+        Option(
+            metavar="ADDRESS|local",
+            help="Use a Dask cluster, such as tcp://10.0.0.5:8786, or start one here.",
+        ),
     ] = None,
     group: Annotated[
         str, Option(metavar="trip|file", help="Make consecutive segments one trip, or each file.")

@@ -12,6 +12,7 @@ from vehicle_detection.errors import InvalidInputError
 if TYPE_CHECKING:
     from vehicle_detection.camera import HorizonEstimate
     from vehicle_detection.detector import VehicleDetector
+    from vehicle_detection.video import FrameSource
 
 
 def search_everywhere(model: Any, conf: float | None) -> VehicleDetector:
@@ -43,7 +44,7 @@ def parse_horizon(text: str) -> float:
 
 
 def find_horizon(
-    source: str, detector: VehicleDetector, start: float | None, end: float | None, quiet: bool
+    source: FrameSource, detector: VehicleDetector, start: float | None, end: float | None, quiet: bool
 ) -> float | None:
     """Estimate the horizon of a video from its vehicles, and print the result."""
     from vehicle_detection.video import estimate_video_horizon

@@ -33,9 +33,15 @@ _HIDDEN_FOLD_COLUMNS = "best_f1", "strict_average_precision", "calibration_error
 
 @option_names(random_state="--seed", patches_or_labels="--vehicles and --non-vehicles")
 def train(
-    vehicles: Annotated[Path, Option(metavar="PATH", help="Folder or zip of patches of vehicles.")],
-    non_vehicles: Annotated[Path, Option(metavar="PATH", help="Folder or zip of other patches.")],
-    output: Annotated[Path, Option("-o", "--output", metavar="FILE", help="Model file to write.")],
+    vehicles: Annotated[
+        Path, Option(metavar="PATH", help="Folder or zip of patches of vehicles, such as vehicles.zip.")
+    ],
+    non_vehicles: Annotated[
+        Path, Option(metavar="PATH", help="Folder or zip of other patches, such as non-vehicles.zip.")
+    ],
+    output: Annotated[
+        Path, Option("-o", "--output", metavar="FILE", help="Model file to write, such as own.safetensors.")
+    ],
     features: Annotated[
         str, Option(metavar="PRESET", help="lab-9432, lab-8460, ycrcb-8460, ycrcb-6156 or luv-2384.")
     ] = "lab-9432",
@@ -47,7 +53,10 @@ def train(
     no_mirror: Annotated[bool, flag("--no-mirror", help="Train without mirrored copies.")] = False,
     gamma: Annotated[
         float | None,
-        Option(metavar="F", help="Brightness range of mirrored copies; default: 0.4, without mirroring 0."),
+        Option(
+            metavar="F",
+            help="Brightness range of mirrored copies, such as 0.3; default: 0.4, without mirroring 0.",
+        ),
     ] = None,
     degraded: Annotated[
         float, Option(metavar="W", help="Weight of blurred, pale and compressed copies of each patch, 0-1.")
@@ -61,7 +70,8 @@ def train(
     ] = None,
     card: Annotated[Path | None, Option(metavar="FILE.md", help="Model card to write.")] = None,
     compare: Annotated[
-        list[str] | None, Option(metavar="PRESET", help="Other features to evaluate; repeatable.")
+        list[str] | None,
+        Option(metavar="PRESET", help="Other features to evaluate, such as luv-2384; repeatable."),
     ] = None,
 ) -> None:
     """Train a model on patches, and evaluate it on held-out patches; by default like the model "highway"."""
@@ -132,7 +142,8 @@ def _print_report(report: TrainingReport) -> None:
 
 def fetch(
     output: Annotated[
-        Path | None, Option("-o", "--output", metavar="DIR", help="Folder; default: user's cache.")
+        Path | None,
+        Option("-o", "--output", metavar="DIR", help="Folder, such as data; default: the user's cache."),
     ] = None,
 ) -> None:
     """Download the course's training patches (110 MB) once."""
@@ -146,7 +157,7 @@ def fetch(
 
 def info(
     model: Annotated[
-        str, Argument(metavar="MODEL", help='"default", "highway" or a model file.')
+        str, Argument(metavar="MODEL", help='"default", "highway" or a model file, such as own.safetensors.')
     ] = "default",
 ) -> None:
     """Show a model's parameters, accuracy, training data and versions."""
@@ -202,9 +213,12 @@ def train_frames(
         Path,
         Argument(metavar="DATA", help="Folder with labels/NAME.csv and frames/NAME/ or videos/NAME.mp4."),
     ],
-    output: Annotated[Path, Option("-o", "--output", metavar="FILE", help="Model file to write.")],
+    output: Annotated[
+        Path, Option("-o", "--output", metavar="FILE", help="Model file to write, such as own.safetensors.")
+    ],
     patches: Annotated[
-        Path | None, Option(metavar="PATH", help="Folder or zip of patches with more vehicles.")
+        Path | None,
+        Option(metavar="PATH", help="Folder or zip of patches with more vehicles, such as vehicles.zip."),
     ] = None,
     curves: Annotated[
         Path | None,

@@ -25,8 +25,12 @@ _MAX_ROWS = 15
 
 @option_names(random_state="--seed", seeds="--seed", n_finalists="--finalists", store="--output")
 def tune(
-    vehicles: Annotated[Path, Option(metavar="PATH", help="Folder or zip of patches of vehicles.")],
-    non_vehicles: Annotated[Path, Option(metavar="PATH", help="Folder or zip of other patches.")],
+    vehicles: Annotated[
+        Path, Option(metavar="PATH", help="Folder or zip of patches of vehicles, such as vehicles.zip.")
+    ],
+    non_vehicles: Annotated[
+        Path, Option(metavar="PATH", help="Folder or zip of other patches, such as non-vehicles.zip.")
+    ],
     grid: Annotated[
         str, Option(metavar="GRID", help="Values to try: 'orient=8,9 color_space=YCrCb,LAB C=1e-4,1'.")
     ],
@@ -48,11 +52,17 @@ def tune(
     finalists: Annotated[
         int, Option(metavar="N", help="Configurations to measure fully after --halving.")
     ] = 3,
-    frames: Annotated[Path | None, Option(metavar="DIR", help="Labelled frames to score models on.")] = None,
+    frames: Annotated[
+        Path | None, Option(metavar="DIR", help="Labelled frames to score models on, such as test_images.")
+    ] = None,
     labels: Annotated[Path | None, Option(metavar="FILE.csv", help="True boxes of --frames.")] = None,
-    horizon: Annotated[float | None, Option(metavar="F", help="Horizon of --frames, 0 (top) to 1.")] = None,
+    horizon: Annotated[
+        float | None, Option(metavar="F", help="Horizon of --frames, 0 (top) to 1, such as 0.55.")
+    ] = None,
     seed: Annotated[int, Option(metavar="N", help="Random seed of splits and training.")] = 0,
-    cache: Annotated[Path | None, Option(metavar="DIR", help="Folder to keep features in.")] = None,
+    cache: Annotated[
+        Path | None, Option(metavar="DIR", help="Folder to keep features in, such as cache.")
+    ] = None,
 ) -> None:
     """Train and measure every combination of a grid of parameters, and show the best."""
     from vehicle_detection._common import check_choice, check_target

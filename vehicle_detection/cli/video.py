@@ -57,7 +57,8 @@ def video(
         str,
         Argument(
             metavar="SOURCE",
-            help="Video file; folder or quoted pattern of a trip's segments, or images; URL; camera; or -.",
+            help="Video file, such as drive.mp4; folder or quoted pattern of a trip's segments, or images; "
+            "URL; camera, such as 0; or -.",
         ),
     ],
     output: Annotated[
@@ -103,7 +104,9 @@ def video(
     clips: Annotated[
         Path | None,
         Option(
-            metavar="DIR", help="Folder for a short annotated clip of each event.", rich_help_panel=OUTPUT
+            metavar="DIR",
+            help="Folder for a short annotated clip of each event, such as clips.",
+            rich_help_panel=OUTPUT,
         ),
     ] = None,
     srt: Annotated[
@@ -183,7 +186,7 @@ def video(
         int | None,
         Option(
             metavar="N",
-            help="Frames searched in parallel; default: one per core, at most 4.",
+            help="Frames searched in parallel, such as 2; default: one per core, at most 4.",
             rich_help_panel=SEARCH,
         ),
     ] = None,
@@ -239,7 +242,7 @@ def video(
     from vehicle_detection.events import TrackLog
     from vehicle_detection.export import FORMATS, TrackWriter, check_format
     from vehicle_detection.mixture import load_model
-    from vehicle_detection.video import estimate_video_horizon, open_source, process_video
+    from vehicle_detection.video import VideoRun, estimate_video_horizon, open_source, process_video
 
     outputs = {
         "--output": output, "--tracks": tracks, "--report": report, "--events": events, "--srt": srt,
@@ -259,27 +262,33 @@ def video(
         if tracks is not None:
             with option_names(path="--tracks"):
                 check_format(tracks, None, FORMATS.values())
+        fraction = None if horizon in (None, "auto") else parse_horizon(str(horizon))
         loaded = load_model(model)
-        if horizon == "auto":
-            with search_everywhere(loaded, conf) as everywhere:
-                fraction = find_horizon(source, everywhere, start, end, quiet)
-        else:
-            fraction = None if horizon is None else parse_horizon(horizon)
-        detector = stack.enter_context(
-            VehicleDetector(
-                loaded,
-                conf=conf,
-                camera=camera,
-                field_of_view=fov,
-                camera_height_m=camera_height,
-                horizon=fraction,
-                every=every,
-                own_speed=speed,
-                diagnostics=diagnostics,
-                draw_params=draw_params,
-                blur=region,
+        opened = stack.enter_context(open_source(source, live=live or None, reconnect=not no_reconnect))
+        if why and not opened.rereadable:
+            raise InvalidInputError(
+                f"--why needs a source that can be read again, got {source}; use a file, or omit --why"
             )
-        )
+        options: dict[str, Any] = {
+            "conf": conf,
+            "camera": camera,
+            "field_of_view": fov,
+            "camera_height_m": camera_height,
+            "every": every,
+            "own_speed": speed,
+            "diagnostics": diagnostics,
+            "draw_params": draw_params,
+            "blur": region,
+        }
+        settings: dict[str, Any] = {"start": start, "end": end, "preset": preset, "workers": jobs}
+        if horizon == "auto":
+            # The estimate takes seconds: refuse invalid options before it.
+            with VehicleDetector(loaded, **options) as unsure:
+                unsure.camera_of(opened.info.shape)
+                VideoRun(opened, unsure, target=output, audio=False, **settings)
+            with search_everywhere(loaded, conf) as everywhere:
+                fraction = find_horizon(opened, everywhere, start, end, quiet)
+        detector = stack.enter_context(VehicleDetector(loaded, horizon=fraction, **options))
         page = None
         if report is not None and output is not None:
             from vehicle_detection.report import ReportWriter
@@ -290,11 +299,6 @@ def video(
                 )
         log = page.log if page else TrackLog()
         writers.append(page or log)
-        opened = stack.enter_context(open_source(source, live=live or None, reconnect=not no_reconnect))
-        if why and not opened.rereadable:
-            raise InvalidInputError(
-                f"--why needs a source that can be read again, got {source}; use a file, or omit --why"
-            )
         if tracks is not None:
             with option_names(path="--tracks"):
                 writers.append(stack.enter_context(TrackWriter(tracks, shape=opened.info.shape)))
@@ -302,15 +306,12 @@ def video(
             opened,
             output,
             detector,
-            start=start,
-            end=end,
             audio=not no_audio,
-            preset=preset,
-            workers=jobs,
             progress=not quiet,
             strict=strict,
             show=show,
             on_result=lambda result: [write(result) for write in writers],
+            **settings,
         )
         found = side_outputs.find_events(log, done, detector, quiet=quiet)
         side_outputs.write(log, found, output, done, detector)
@@ -337,6 +338,10 @@ def video(
 
 def _check_outputs(outputs: Mapping[str, Path | None], clips: Path | None, *, show: bool, why: bool) -> None:
     """Refuse outputs of ``video`` that need another one, and a run without any output."""
+    from vehicle_detection._common import check_suffix
+
+    if outputs["--report"] is not None:
+        check_suffix(outputs["--report"], "--report", (".html", ".htm"))
     if outputs["--output"] is None:
         if outputs["--report"] is not None:
             raise InvalidInputError("--output must name a video for --report, which contains it; add it")

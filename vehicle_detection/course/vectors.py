@@ -161,7 +161,8 @@ def extract_features(
     [1764, 1764]
     """
     options = FeatureOptions.of(locals())
-    if isinstance(imgs, (str, os.PathLike)) or not isinstance(imgs, Iterable):
+    scalar = isinstance(imgs, (str, os.PathLike)) or getattr(imgs, "ndim", 1) == 0
+    if scalar or not isinstance(imgs, Iterable):
         raise InvalidInputError(f"imgs must be a list of file names or images; got {describe(imgs)}")
     if imread is not None and not callable(imread):
         raise InvalidInputError(f"imread must be a function of a file name; got {describe(imread)}")

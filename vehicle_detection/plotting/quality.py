@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_choice, check_integer, check_number, check_type, describe
+from vehicle_detection._common import (
+    check_array,
+    check_choice,
+    check_integer,
+    check_number,
+    check_type,
+    describe,
+)
 from vehicle_detection.boxes import box_areas, clip_boxes, iou_matrix
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
@@ -67,7 +74,7 @@ def plot_scores(
     """
     from matplotlib.ticker import LogFormatter
 
-    values, known = style.check_scores(scores, "scores"), np.asarray(labels)
+    values, known = style.check_scores(scores, "scores"), check_array(labels, "labels")
     if known.shape != values.shape or not np.isin(known, (0, 1)).all():
         raise InvalidInputError(
             f"labels must be 0 or 1 for each of the {len(values)} scores; got {describe(known)}"

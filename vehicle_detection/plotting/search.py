@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from vehicle_detection._common import check_image, check_number, check_type, describe
+from vehicle_detection._common import check_image, check_number, check_type, describe, pluralize
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import frame_heat, heat_threshold, label_heat
@@ -77,7 +77,7 @@ def plot_windows(
         style.add_boxes(axes, true, TRUTH, linestyles="--", linewidths=2.0)
     _expand_limits(axes, boxes, width, height)
     axes.set(xlabel="x (px)", ylabel="y (px)")
-    axes.set_title(_count(len(boxes), "window") if title is None else title, fontsize=10)
+    axes.set_title(pluralize(len(boxes), "window") if title is None else title, fontsize=10)
     return axes
 
 
@@ -86,10 +86,6 @@ def _expand_limits(axes: Axes, boxes: NDArray[Any], width: int, height: int) -> 
     left, top = boxes[:, :2].min(axis=0, initial=0)
     right, bottom = np.maximum((width, height), boxes[:, 2:].max(axis=0, initial=0))
     axes.set(xlim=(left, right), ylim=(bottom, top))
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number:,} {noun}{'s' * (number != 1)}"
 
 
 def plot_bands(
@@ -145,7 +141,7 @@ def plot_bands(
         style.add_boxes(panel, windows[:1], VERMILION, linewidths=1.4)
         _expand_limits(panel, bounds, width, height)
         side, step = (f"{x}x{y}" for x, y in (band.window, band.step))
-        panel.set_title(f"{side} px, step {step}, {_count(len(windows), 'window')}", fontsize=9)
+        panel.set_title(f"{side} px, step {step}, {pluralize(len(windows), 'window')}", fontsize=9)
     handles = style.legend_lines(
         ("band", YELLOW, "-"),
         ("first window", VERMILION, "-"),
@@ -189,7 +185,7 @@ def plot_comparison(fast: ArrayLike, reference: ArrayLike, *, figure: FigureLike
     figure, ((left, right),) = style.new_panels(figure, (10, 4.2), 1, 2)
     ends = [min(x.min(), y.min()), max(x.max(), y.max())]
     left.plot(ends, ends, color="0.3", linewidth=0.8, label="equal")
-    left.scatter(x, y, s=5, color=BLUE, alpha=0.5, linewidths=0, label=_count(len(x), "window"))
+    left.scatter(x, y, s=5, color=BLUE, alpha=0.5, linewidths=0, label=pluralize(len(x), "window"))
     left.set(xlabel="score of the reference search", ylabel="score of the fast search")
     left.legend(fontsize=9)
     difference = float(np.abs(y - x).max())
@@ -310,7 +306,7 @@ def plot_heatmap(
     figure, ((first, second, third),) = style.new_panels(figure, size, 1, 3, layout="compressed")
     style.add_image(first, image)
     style.add_boxes(first, windows.boxes, SKY, halo=False, linewidths=0.8)
-    first.set_title(_count(len(windows), "window"), fontsize=10)
+    first.set_title(pluralize(len(windows), "window"), fontsize=10)
     peak = float(given.max())
     style.add_image(second, given, cmap="inferno", vmin=0, vmax=max(peak, 1e-6))
     bar = second.figure.colorbar(second.images[0], ax=second, shrink=0.8, pad=0.02)
@@ -320,7 +316,7 @@ def plot_heatmap(
     second.set_title(f"heat, peak {peak:.1f}", fontsize=10)
     style.add_image(third, _color_regions(image, given, threshold))
     style.add_boxes(third, found.boxes, YELLOW, linewidths=2.0)
-    third.set_title(f"{_count(len(found), 'region')} above {threshold:g}", fontsize=10)
+    third.set_title(f"{pluralize(len(found), 'region')} above {threshold:g}", fontsize=10)
     return figure
 
 

@@ -24,6 +24,7 @@ MAX_ROWS = 14
 
 _CURVE_WIDTH = 1000  # units across the nested SVG of the curves
 _ROW_HEIGHT, _BAR_HEIGHT = 22, 14  # pixels
+_KIND_HEIGHT = 34  # pixels of a kind of event: its name, and its markers below
 _LABEL_WIDTH, _LABEL_HEIGHT = 5.0, 13.0  # percent of the chart's width, pixels
 _MIN_LABELED = 0.08  # fraction of the video that a track must last to be labeled inside a chart
 _TICK_STEPS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200)  # seconds
@@ -152,13 +153,15 @@ def gantt(tracks: Sequence[TrackHistory], axis: TimeAxis, *, label: str) -> str:
 
 
 def event_markers(events: Sequence[Event], axis: TimeAxis, *, label: str) -> str:
-    """Draw a marker for each event, in a row for each kind."""
+    """Draw a marker for each event, below the name of its kind."""
     kinds = [kind for kind in KINDS if any(event.kind == kind for event in events)]
     names, markers = [], []
     for row, kind in enumerate(kinds):
-        y = (row + 0.5) * _ROW_HEIGHT
+        top = row * _KIND_HEIGHT
+        if row:
+            names.append(svg_element("line", class_="grid", x1=0, x2="100%", y1=top, y2=top))
         names.append(
-            svg_element("text", KINDS[kind].capitalize(), class_="track-name", x=0, dx=4, y=_decimal(y - 2))
+            svg_element("text", KINDS[kind].capitalize(), class_="track-name", x=0, dx=4, y=top + 13)
         )
         for event in events:
             if event.kind != kind:
@@ -166,12 +169,12 @@ def event_markers(events: Sequence[Event], axis: TimeAxis, *, label: str) -> str
             x, color = axis.percent(event.frame), f"c{(event.track_id - 1) % len(TRACK_COLORS)}"
             parts = [
                 svg_element("title", str(event)),
-                svg_element("circle", cx=x, cy=_decimal(y + 6), r=5),
+                svg_element("circle", cx=x, cy=top + 24, r=5),
             ]
             button = {"role": "button", "tabindex": 0, "aria_label": f"{event}: show in the video"}
             seek = {"data_frame": event.frame, "data_track": event.track_id}
             markers.append(svg_element("g", *parts, class_=f"bar {color}", **button, **seek))
-    return _graph([], [*names, *markers], axis, _ROW_HEIGHT * len(kinds), role="group", label=label)
+    return _graph([], [*names, *markers], axis, _KIND_HEIGHT * len(kinds), role="group", label=label)
 
 
 def _assign_rows(tracks: Sequence[TrackHistory], axis: TimeAxis) -> list[int]:

@@ -15,11 +15,6 @@ def format_time(seconds: float, *, tenths: bool = True) -> str:
     return f"{hours}:{minutes:02d}:{end}" if hours else f"{minutes}:{end}"
 
 
-def pluralize(count: int, noun: str) -> str:
-    """Format a count with its noun: "1 vehicle", "1,200 frames"."""
-    return f"{count:,} {noun}{'s' * (count != 1)}"
-
-
 def format_value(value: object) -> str:
     """Format a parameter or a value of a model's metadata."""
     if isinstance(value, bool):

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import vehicle_detection
+from vehicle_detection._common import pluralize
 from vehicle_detection.boxes import Floats
 from vehicle_detection.drawing import MAX_SPEED_STD
 from vehicle_detection.events import (
@@ -41,9 +42,9 @@ from vehicle_detection.report.charts import (
     fraction_bar,
     gantt,
 )
-from vehicle_detection.report.formatting import format_time, format_value, pluralize
+from vehicle_detection.report.formatting import format_time, format_value
 from vehicle_detection.training import SPLITS
-from vehicle_detection.units import UNITS, Units
+from vehicle_detection.units import ROUGH_DISTANCE, UNITS, Units
 from vehicle_detection.video import VideoReport
 
 _COUNT_SECONDS = (1, 2, 5, 10, 15, 30, 60, 120, 300)  # durations of a bar in the chart of counts
@@ -277,6 +278,9 @@ def _script_data(tracks: Sequence[TrackHistory], axis: TimeAxis) -> dict[str, An
         for key, name in (("distance", "distance_m"), ("speed", "speed_mps")):
             means = dict(zip(*bin_means(track.frames, track.columns[name], axis.bin_width)))
             points[key] = [round(float(means[n]), 1) if n in means else None for n in range(first, last + 1)]
+        rough = track.columns["distance_std_m"] > ROUGH_DISTANCE * track.columns["distance_m"]
+        shares = dict(zip(*bin_means(track.frames, rough.astype(np.float64), axis.bin_width)))
+        points["rough"] = [int(shares.get(n, 0.0) > 0.5) for n in range(first, last + 1)]
         values = {"id": track.id, "color": track.color, "spans": track.spans(), "first": first}
         listed.append(values | points)
     return {"fps": axis.fps, "frames": axis.frames, "step": axis.bin_width, "tracks": listed}
@@ -370,9 +374,11 @@ def _split_table(scores: Mapping[str, Mapping[str, Any]]) -> Table:
 def _left_out_table(scores: Mapping[str, Mapping[str, Any]]) -> Table:
     """Scores on frames of sources that were left out of training."""
     columns = ("f1", "average_precision", "precision", "recall", "mean_iou")
-    rows = [
-        [name, *(format_value(values.get(key, "")) for key in columns)] for name, values in scores.items()
-    ]
+
+    def cell(value: object) -> str:
+        return f"{value:.3f}" if isinstance(value, (int, float)) else str(value)
+
+    rows = [[name, *(cell(values.get(key, "")) for key in columns)] for name, values in scores.items()]
     note = "Single frames of sources that were left out of training, IoU 0.5."
     return Table("Quality of the model", note, ("Frames", *map(_heading, columns)), rows)
 

@@ -45,7 +45,7 @@ function showReadout(frame) {
     const distance = track.distance[index], speed = track.speed[index];
     name.className = "c" + track.color;
     name.textContent = "#" + track.id;
-    if (distance != null) name.textContent += " " + distance.toFixed(0) + " " + data.units[0];
+    if (distance != null) name.textContent += (track.rough[index] ? " ~" : " ") + distance.toFixed(0) + " " + data.units[0];
     if (speed != null) {
       const sign = speed > 0 ? "+" : speed < 0 ? "\u2212" : "";
       name.textContent += " " + sign + Math.abs(speed).toFixed(0) + " " + data.units[1];

@@ -14,7 +14,7 @@ from vehicle_detection._common import (
     check_integer,
     check_path,
     check_sequence,
-    check_target,
+    check_suffix,
     check_type,
     hide_credentials,
     is_url,
@@ -80,11 +80,7 @@ class ReportWriter:
             if (value is not None or name == "path") and not from_url:
                 check_path(value, name)
         self._path = Path(path)
-        if self._path.suffix.lower() not in (".html", ".htm"):
-            raise InvalidInputError(
-                f"path must end in .html, got {self._path.name!r}; write {self._path.stem + '.html'!r}"
-            )
-        check_target(self._path, "path")
+        check_suffix(self._path, "path", (".html", ".htm"))
         for name, value in (("video", video), ("source", source)):
             if value is not None and os.path.realpath(value) == os.path.realpath(self._path):
                 raise InvalidInputError(f"path {self._path} is also the {name}; choose another name")

@@ -8,7 +8,7 @@ from vehicle_detection.video.pipeline import VideoDetector
 from vehicle_detection.video.process import PRESETS, VideoReport, VideoRun, cut_video, process_video
 from vehicle_detection.video.reading import probe_video, read_frames
 from vehicle_detection.video.remote import download, open_filesystem, with_retries
-from vehicle_detection.video.sources import Source, open_source
+from vehicle_detection.video.sources import Source, borrow_source, open_source
 from vehicle_detection.video.trips import UNKNOWN_CAMERA, Trip, find_trips, is_video_file
 from vehicle_detection.video.viewer import Viewer, open_viewer
 
@@ -24,6 +24,7 @@ __all__ = [
     "VideoReport",
     "VideoRun",
     "Viewer",
+    "borrow_source",
     "cut_video",
     "download",
     "estimate_video_horizon",

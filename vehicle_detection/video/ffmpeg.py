@@ -31,10 +31,11 @@ from vehicle_detection.video.yuv import ColorEncoding
 _PIPE_BYTES = 1 << 18
 # Signals by which ffmpeg ends itself, because of the file.
 _CRASHES = {signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGILL}
-# Messages of ffmpeg about a server or connection, rather than about the video.
+# Messages of ffmpeg about a server, a connection or an expired signature, rather than about the video.
 _NETWORK_FAULT = re.compile(
-    r"Connection (refused|reset|timed out)|Operation timed out|Server returned 5|Failed to resolve"
-    r"|Network is unreachable|No route to host|Input/output error|ends prematurely|Broken pipe"
+    r"Connection (refused|reset|timed out)|Operation timed out|Server returned (5|40[013]|429)"
+    r"|Failed to resolve|Network is unreachable|No route to host|Input/output error|ends prematurely"
+    r"|Broken pipe"
 )
 NETWORK_TIMEOUT = 10.0
 """Seconds without data after which a server has failed."""
@@ -69,6 +70,12 @@ class VideoInfo:
         How luma and chroma encode colors.
     audio_track, audio_codec
         Index and codec (such as ``"aac"``) of the first audio track that can be decoded; None without one.
+
+    Examples
+    --------
+    >>> info = VideoInfo(width=1280, height=720, fps=Fraction(30000, 1001), frames=60, duration=2.002)
+    >>> info.shape, info.has_audio
+    ((720, 1280, 3), False)
     """
 
     width: int

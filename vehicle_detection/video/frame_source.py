@@ -30,6 +30,13 @@ class FrameSource:
         Whether frames that are not read in time are dropped; whether it can be read more than once.
     files
         Files that are read, in order; empty for streams.
+
+    Examples
+    --------
+    >>> from vehicle_detection import open_source
+    >>> with open_source("test_images/*.jpg", fps=10) as source:
+    ...     print(source.info.frames, source.live, source.rereadable)
+    6 False True
     """
 
     live = False

@@ -13,7 +13,7 @@ from vehicle_detection.camera import HorizonEstimate, estimate_horizon
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video.ffmpeg import VideoInfo
 from vehicle_detection.video.reading import check_span, frame_range
-from vehicle_detection.video.sources import Source, open_source
+from vehicle_detection.video.sources import Source, borrow_source
 
 _MAX_STD = 0.05  # as a fraction of the frame's height
 # Seconds between searched frames, their number at least (in a short video) and at most, and the number of
@@ -38,7 +38,7 @@ def estimate_video_horizon(
     """
     boxes: list[NDArray[np.floating]] = []
     check_span(start, end)
-    with open_source(source) as opened, opened.read(*frame_range(opened.info, start, end)) as frames:
+    with borrow_source(source) as opened, opened.read(*frame_range(opened.info, start, end)) as frames:
         if not opened.rereadable:
             raise InvalidInputError(
                 f"horizon cannot be estimated from {opened.name}, which is read only once; pass a fraction"

@@ -259,6 +259,7 @@ class LiveReader:
         self._changed = threading.Condition()
         self._newest: tuple[int, NDArray[np.uint8]] | None = None
         self._finished = self._killed = False
+        self._error: BaseException | None = None  # of the thread
         self._thread = None
         if drop:
             self._thread = threading.Thread(target=self._read_all, name="vehicle-live", daemon=True)
@@ -286,6 +287,8 @@ class LiveReader:
                     self._changed.wait()
                 planes, self._newest = self._newest, None
         if planes is None:
+            if self._error is not None and not self._killed:
+                raise self._error
             self._finish()
             raise StopIteration
         return planes
@@ -309,6 +312,8 @@ class LiveReader:
                 with self._changed:
                     self._newest = item
                     self._changed.notify_all()
+        except BaseException as error:  # raised in the thread of the consumer
+            self._error = error
         finally:
             with self._changed:
                 self._finished = True

@@ -169,7 +169,7 @@ class FramePipeline:
         self._reader: Reader | None = None
         self._streams: list[Reader | FrameWriter] = []
         self._lock = threading.Lock()
-        self._aborted = False
+        self._aborted = self._stopped = False
         self.damage = ""
         """What is damaged in the source; known after the last frame."""
 
@@ -196,6 +196,7 @@ class FramePipeline:
     def stop(self) -> None:
         """End the source, so that the run completes with the frames read so far."""
         with self._lock:
+            self._stopped = True
             if self._reader is not None:
                 self._reader.kill()
 
@@ -350,7 +351,7 @@ class FramePipeline:
                 for _ in range(missed):
                     writer.repeat()
                 writer.write(drawn)
-            writer.finish()
+            writer.finish(trim_sound=self._stopped)
         except QueueClosed:
             return
         except BaseException as error:  # raised in the tracking thread at its next frame

@@ -31,6 +31,7 @@ from vehicle_detection._common import (
     check_path,
     check_target,
     describe,
+    pluralize,
     progress_bar,
     single_threaded_opencv,
 )
@@ -39,7 +40,7 @@ from vehicle_detection.video.ffmpeg import VideoInfo
 from vehicle_detection.video.frame_source import FrameSource
 from vehicle_detection.video.pipeline import FramePipeline, Frames, VideoDetector
 from vehicle_detection.video.reading import check_span, frame_range
-from vehicle_detection.video.sources import Source, open_source
+from vehicle_detection.video.sources import Source, borrow_source, open_source
 from vehicle_detection.video.streams import CONTAINERS, AudioSource, FrameWriter
 from vehicle_detection.video.viewer import Viewer, open_viewer
 
@@ -113,11 +114,10 @@ class VideoReport:
     def __str__(self) -> str:
         height, width = self.shape[:2]
         rate = self.frames_per_second
-        vehicles = "1 vehicle" if self.tracks == 1 else f"{self.tracks} vehicles"
         lines = [
-            f"{self.frames} frames of {width}x{height} in {self.seconds:.1f} s: {rate:.1f} frames/s, "
-            f"{rate / self.fps:.1f} times real time, {vehicles}"
-            + (f", {self.dropped} frames dropped" if self.dropped else ""),
+            f"{pluralize(self.frames, 'frame')} of {width}x{height} in {self.seconds:.1f} s: "
+            f"{rate:.1f} frames/s, {rate / self.fps:.1f} times real time, {pluralize(self.tracks, 'vehicle')}"
+            + (f", {pluralize(self.dropped, 'frame')} dropped" if self.dropped else ""),
             "stage    ms/frame  fraction",
         ]
         fractions = self.stage_fractions
@@ -389,7 +389,7 @@ def _sound(source: FrameSource, first: int, end: float | None) -> AudioSource | 
 
 
 def cut_video(
-    source: str | os.PathLike[str],
+    source: Source,
     target: str | os.PathLike[str],
     *,
     start: float | None = None,
@@ -403,7 +403,7 @@ def cut_video(
     check_span(start, end)
     check_choice(preset, "preset", PRESETS)
     output = _check_video_target(target)
-    with open_source(source) as opened:
+    with borrow_source(source) as opened:
         _check_not_a_source(output, opened.files)
         first, count = frame_range(opened.info, start, end)
         with (

@@ -3,27 +3,37 @@
 from __future__ import annotations
 
 import errno
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
+from urllib.parse import unquote
 
 from vehicle_detection._common import hide_credentials
 from vehicle_detection.errors import InvalidInputError, TransientVideoError
+from vehicle_detection.video.ffmpeg import NETWORK_TIMEOUT
 
 Result = TypeVar("Result")
 
 # Seconds before the second and the third attempt of a request.
 _RETRY_DELAYS = (0.2, 1.0)
+_CHUNK_BYTES = 1 << 20
+# Maximum length of a file name, in characters that may take four bytes each.
+_MAX_NAME = 60
 _FINAL_ERRORS = (FileNotFoundError, PermissionError, NotImplementedError, TypeError, AttributeError)
 
 
 def download(url: str, folder: Path) -> Path:
-    """Copy a file from storage that fsspec knows to a folder."""
-    path, name = folder / (url.rstrip("/").rpartition("/")[2] or "video"), hide_credentials(url)
+    """Copy a file from a web server, or from storage that fsspec knows, to a folder."""
+    name = hide_credentials(url)
+    path = folder / file_name(url)
     try:
-        filesystem, remote = open_filesystem(url)
-        with_retries(lambda: filesystem.get_file(remote, str(path)))
+        if url.startswith(("http://", "https://")):
+            with_retries(lambda: _download_http(url, path))
+        else:
+            filesystem, remote = open_filesystem(url)
+            with_retries(lambda: filesystem.get_file(remote, str(path)))
     except InvalidInputError:
         raise
     except FileNotFoundError:
@@ -34,9 +44,27 @@ def download(url: str, folder: Path) -> Path:
     except Exception as error:  # each storage has its own
         reason = hide_credentials(str(error))
         is_full = getattr(error, "errno", None) == errno.ENOSPC
-        remedy = "free some space" if is_full else "check the connection"
+        remedy = "free some space" if is_full else "check the connection and permissions"
         raise TransientVideoError(f"{name} cannot be copied ({reason}); {remedy}") from error
     return path
+
+
+def file_name(url: str) -> str:
+    """Name of a local copy: the end of the URL's path."""
+    path = re.split("[?#]", url)[0] if url.startswith(("http://", "https://")) else url
+    name = unquote(path.rstrip("/").rpartition("/")[2])
+    return re.sub(r"[\x00-\x1f/\\]", "_", name)[-_MAX_NAME:] or "video"
+
+
+def _download_http(url: str, path: Path) -> None:
+    import requests
+
+    with requests.get(url, stream=True, timeout=NETWORK_TIMEOUT) as answer:
+        if answer.status_code in (404, 410):
+            raise FileNotFoundError(url)
+        answer.raise_for_status()
+        with path.open("wb") as file:
+            file.writelines(answer.iter_content(_CHUNK_BYTES))
 
 
 def with_retries(request: Callable[[], Result]) -> Result:

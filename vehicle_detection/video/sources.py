@@ -7,11 +7,11 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from urllib.parse import unquote
 
-from vehicle_detection._common import check_number, check_path, describe
+from vehicle_detection._common import check_number, check_path, describe, temporary_folder
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video.ffmpeg import NETWORK_TIMEOUT, VideoInfo, input_options, probe, source_name
 from vehicle_detection.video.files import IMAGE_SUFFIXES, check_file, list_files
@@ -146,6 +146,16 @@ def open_source(
     return _open_files(files, fps)
 
 
+@contextlib.contextmanager
+def borrow_source(source: Source) -> Iterator[FrameSource]:
+    """Open a source for a block; one that the caller has opened stays open."""
+    if isinstance(source, FrameSource):
+        yield source
+        return
+    with open_source(source) as opened:
+        yield opened
+
+
 def _open_files(files: Sequence[Path], fps: float) -> FrameSource:
     """Open one file, the segments of a trip or images."""
     if not files:
@@ -211,8 +221,8 @@ def _open_stream(url: str, options: Sequence[str], live: bool | None, reconnect:
 def _download(url: str) -> FrameSource:
     """Copy a file of other storage to a temporary one, because a video is read at several places."""
     with contextlib.ExitStack() as on_error:
-        folder = on_error.enter_context(tempfile.TemporaryDirectory(prefix="vehicle-source-"))
-        path = download(url, Path(folder))
+        folder = on_error.enter_context(temporary_folder(Path(tempfile.gettempdir()), "vehicle-source"))
+        path = download(url, folder)
         source = _VideoFile(path, probe(path))
         source.name = source_name(url)
         source._on_close = on_error.pop_all()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import math
 import re
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -17,6 +18,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection._common import temporary_folder
 from vehicle_detection.errors import TransientVideoError, VideoError
 from vehicle_detection.video.damage import find_damage
 from vehicle_detection.video.ffmpeg import (
@@ -239,6 +241,10 @@ class FrameWriter(_FfmpegStream):
 
     def __init__(self, path: Path, info: VideoInfo, *, preset: str, audio: AudioSource | None = None) -> None:
         container = CONTAINERS[path.suffix.lower()]
+        self.frames_written = 0
+        self._path, self._has_sound = path, audio is not None
+        # Seconds of sound for n written frames: those before the first frame, and n / fps.
+        self._delay, self._fps = 0.0, info.fps
         width, height = info.width + info.width % 2, info.height + info.height % 2
         self._planes = np.empty((height * 3 // 2, width), np.uint8)
         self._channels = np.empty((3, height, width), np.uint8)
@@ -249,7 +255,8 @@ class FrameWriter(_FfmpegStream):
         if audio is not None:
             whole = audio.start is None and audio.length is None
             if whole and info.start_time:  # keep the delay of the first frame after the sound
-                video += ["-itsoffset", f"{info.start_time:.6f}"]
+                self._delay = info.start_time
+                video += ["-itsoffset", f"{self._delay:.6f}"]
             sound += [] if audio.start is None else ["-ss", f"{audio.start:.6f}"]
             sound += [] if audio.length is None else ["-t", f"{audio.length:.6f}"]
             sound += ["-vn", *audio.input]
@@ -260,10 +267,10 @@ class FrameWriter(_FfmpegStream):
         if info.pixel_aspect != 1:
             filters += f",setsar={info.pixel_aspect}"
         encoder = ["-vf", filters, "-c:v", "libx264", "-preset", preset, "-fps_mode", "passthrough"]
-        encoder += ["-f", container]
+        self._muxer = ["-f", container]
         if container != "matroska":  # the index at the front lets a browser play while it downloads
-            encoder += ["-movflags", "+faststart"]
-        options = ["-y", *video, "-i", "pipe:0", *sound, *mapped, *encoder, f"file:{path}"]
+            self._muxer += ["-movflags", "+faststart"]
+        options = ["-y", *video, "-i", "pipe:0", *sound, *mapped, *encoder, *self._muxer, f"file:{path}"]
         self._process = Process(options, stdin=True)
 
     def write(self, frame: NDArray[np.uint8]) -> None:
@@ -280,12 +287,32 @@ class FrameWriter(_FfmpegStream):
                 done += self._process.stdin.write(view[done:])
         except OSError as error:
             raise self._error() from error
+        self.frames_written += 1
 
-    def finish(self) -> None:
-        """Wait until ffmpeg has written the last frame."""
+    def finish(self, *, trim_sound: bool = False) -> None:
+        """Wait until ffmpeg has written the last frame, and all of the sound.
+
+        With `trim_sound`, for frames that end before the source does, the sound ends with them.
+        """
         self._process.stdin.close()
         if self._process.wait():
             raise self._error()
+        if trim_sound and self._has_sound:
+            self._trim_sound()
+
+    def _trim_sound(self) -> None:
+        """Copy the file with the sound up to the end of the last frame."""
+        seconds = self._delay + float(self.frames_written / self._fps)
+        whole = ("-i", f"file:{self._path}")
+        with temporary_folder(self._path.parent, self._path.stem) as folder:
+            trimmed = folder / self._path.name
+            options = ["-nostdin", *whole, "-t", f"{seconds:.6f}", *whole, "-map", "0:v:0", "-map", "1:a:0"]
+            self.close()
+            self._process = Process([*options, "-c", "copy", *self._muxer, f"file:{trimmed}"])
+            if self._process.wait():
+                raise self._error()
+            # Not renamed: other processes recognize a file in use by its lock.
+            shutil.copyfile(trimmed, self._path)
 
     def _error(self) -> TransientVideoError:
         reason = exit_reason(self._process.wait(), self._process.log())

@@ -17,7 +17,7 @@ from datetime import datetime
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
-from vehicle_detection._common import check_sequence, describe
+from vehicle_detection._common import check_sequence, describe, pluralize
 from vehicle_detection.errors import InvalidInputError
 
 File = TypeVar("File", Path, str)
@@ -73,6 +73,11 @@ class Trip:
         ``"front"``, ``"rear"``, ``"left"``, ``"right"``, ``"interior"`` or ``"unknown"``.
     start
         Time of the first frame by the camera's clock, if the name tells it.
+
+    Examples
+    --------
+    >>> print(Trip(("20260131_081500_F.MP4", "20260131_081600_F.MP4"), "front"))
+    front, 2 files
     """
 
     files: tuple[Path | str, ...]
@@ -81,8 +86,7 @@ class Trip:
 
     def __str__(self) -> str:
         camera = "" if self.camera == UNKNOWN_CAMERA else f"{self.camera}, "
-        count = len(self.files)
-        return f"{camera}{count} file{'s' * (count != 1)}"
+        return f"{camera}{pluralize(len(self.files), 'file')}"
 
 
 def is_video_file(file: Path | str) -> bool:
@@ -145,7 +149,9 @@ def find_trips(
 
 
 def _posix(file: Path | str) -> PurePosixPath:
-    return PurePosixPath(os.fspath(file))
+    """Path of a file, or of a URL without its query, which may hold another time."""
+    text = os.fspath(file)
+    return PurePosixPath(re.split("[?#]", text)[0] if text.startswith(("http://", "https://")) else text)
 
 
 def _parse_name(name: PurePosixPath) -> _Segment:

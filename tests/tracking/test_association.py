@@ -1,0 +1,142 @@
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vehicle_detection.boxes import iou_matrix
+from vehicle_detection.params import TrackParams
+from vehicle_detection.tracking.association import (
+    center_distances,
+    covered_fractions,
+    distinct_vehicles,
+    match_boxes,
+    merged_detections,
+)
+
+NONE = np.empty((0, 4))
+
+
+def boxes_at(*centers, side=40.0):
+    """Squares around centers."""
+    middle = np.array(centers, float)
+    return np.hstack([middle - side / 2, middle + side / 2])
+
+
+def random_boxes(rng, count):
+    corners, sides = rng.uniform(0, 150, (count, 2)), rng.uniform(20, 60, (count, 2))
+    return np.hstack([corners, corners + sides])
+
+
+def test_distances_are_in_mean_widths_and_heights():
+    first, second = np.array([[0.0, 0, 40, 20]]), np.array([[30.0, 20, 50, 60], [0.0, 0, 40, 20]])
+    # Centers (20, 10) and (40, 40); mean width 30, mean height 30.
+    np.testing.assert_allclose(center_distances(first, second), [[math.hypot(20 / 30, 30 / 30), 0]])
+
+
+def test_distances_of_boxes_without_area_are_in_pixels():
+    empty = np.array([[5.0, 5, 5, 5]])
+    np.testing.assert_allclose(center_distances(empty, empty + np.array([3, 4, 3, 4])), [[5]])
+
+
+def test_covered_fractions_are_of_the_first_boxes():
+    first, second = np.array([[0.0, 0, 10, 10], [5, 5, 5, 5]]), np.array([[5.0, 0, 25, 10]])
+    np.testing.assert_allclose(covered_fractions(first, second), [[0.5], [0.0]])
+    np.testing.assert_allclose(covered_fractions(second, first), [[0.25, 0.0]])
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(0, 0), (0, 2), (2, 0)])
+def test_nothing_is_matched_with_nothing(rows, columns):
+    assert (
+        match_boxes(random_boxes(np.random.default_rng(0), rows), np.ones((columns, 4)), np.ones(rows)) == []
+    )
+
+
+@pytest.mark.parametrize(("shift", "pairs"), [(40.0, [(0, 0)]), (40.1, [])])
+def test_the_largest_distance_is_inclusive(shift, pairs):
+    assert match_boxes(boxes_at((50, 50)), boxes_at((50 + shift, 50)), np.array([1.0])) == pairs
+
+
+@pytest.mark.parametrize(("side", "pairs"), [(80.0, [(0, 0)]), (80.5, []), (20.1, [(0, 0)]), (19.8, [])])
+def test_areas_differ_by_a_factor_of_four_at_most(side, pairs):
+    assert match_boxes(boxes_at((50, 50)), boxes_at((50, 50), side=side), np.array([1.0])) == pairs
+
+
+def test_each_track_has_its_own_largest_distance():
+    predicted, measured = boxes_at((50, 50), (300, 50)), boxes_at((75, 50), (325, 50))
+    assert match_boxes(predicted, measured, np.array([0.7, 0.6])) == [(0, 0)]
+
+
+def test_the_total_cost_is_least_although_a_single_pair_is_not():
+    # The nearest pair is (1, 0); it would leave the first track without a detection.
+    predicted, measured = boxes_at((50, 50), (80, 50)), boxes_at((75, 50), (105, 50))
+    assert match_boxes(predicted, measured, np.array([1.0, 1.0])) == [(0, 0), (1, 1)]
+
+
+def test_the_size_decides_between_boxes_at_one_place():
+    predicted = np.vstack([boxes_at((50, 50), side=40), boxes_at((50, 50), side=60)])
+    measured = np.vstack([boxes_at((50, 50), side=58), boxes_at((50, 50), side=42)])
+    assert match_boxes(predicted, measured, np.ones(2)) == [(0, 1), (1, 0)]
+
+
+def cost(predicted, measured, limit):
+    """Cost of a pair, and whether it is allowed."""
+    distance = center_distances(predicted[None], measured[None])[0, 0] / limit
+    areas = [np.prod(box[2:] - box[:2]) for box in (predicted, measured)]
+    ratio = abs(math.log(areas[0] / areas[1]))
+    iou = iou_matrix(predicted[None], measured[None])[0, 0]
+    return 1 - iou + distance + 0.3 * ratio, bool(distance <= 1 and ratio <= math.log(4))
+
+
+@given(st.integers(0, 10_000), st.integers(1, 4), st.integers(1, 4))
+def test_pairs_have_the_least_cost_of_all_assignments(seed, rows, columns):
+    rng = np.random.default_rng(seed)
+    predicted, measured = random_boxes(rng, rows), random_boxes(rng, columns)
+    limit = rng.uniform(0.3, 1.5, rows)
+    pairs = match_boxes(predicted, measured, limit)
+    assert len({row for row, _ in pairs}) == len({column for _, column in pairs}) == len(pairs)
+
+    def total(assignment):
+        costs = [cost(predicted[row], measured[column], limit[row]) for row, column in assignment]
+        return sum(value if allowed else 1e3 for value, allowed in costs)
+
+    count = min(rows, columns)
+    best = min(
+        total(zip(chosen, order))
+        for chosen in itertools.combinations(range(rows), count)
+        for order in itertools.permutations(range(columns), count)
+    )
+    assert total(pairs) + 1e3 * (count - len(pairs)) == pytest.approx(best)
+
+
+def test_a_better_or_known_box_hides_a_weaker_one():
+    params = TrackParams()
+    boxes = np.array([[0.0, 0, 40, 40], [2, 0, 42, 40], [100, 0, 140, 40], [200, 0, 240, 40]])
+    assert distinct_vehicles(boxes, [1, 0, 2, 3], NONE, params) == [1, 2, 3]
+    assert distinct_vehicles(boxes, [1, 0, 2, 3], boxes[2:3] + 1, params) == [1, 3]
+    assert distinct_vehicles(boxes, [], boxes, params) == []
+    assert distinct_vehicles(NONE, [], NONE, params) == []
+
+
+def test_a_box_inside_a_known_one_is_no_vehicle():
+    known, inside = np.array([[0.0, 0, 100, 100]]), np.array([[10.0, 10, 40, 40]])
+    assert iou_matrix(known, inside)[0, 0] < 0.1
+    assert distinct_vehicles(inside, [0], known, TrackParams()) == []
+
+
+def test_a_box_over_two_predictions_is_merged():
+    predicted = np.array([[0.0, 0, 40, 40], [35, 0, 75, 40], [200, 0, 240, 40]])
+    both = np.array([[0.0, 0, 75, 40], [200, 0, 240, 40]])
+    assert merged_detections(predicted, both, {0: 0, 2: 1}) == ({0}, {1: 0})
+    assert merged_detections(predicted, both, {0: 0, 1: 1, 2: 1}) == (set(), {})
+    assert merged_detections(predicted, both, {}) == (set(), {})
+
+
+def test_a_box_that_fits_a_prediction_is_not_merged():
+    predicted = np.array([[0.0, 0, 40, 40], [20, 0, 40, 40]])
+    assert merged_detections(predicted, np.array([[0.0, 0, 44, 40]]), {0: 0}) == (set(), {})
+    # Nor is one that covers the other prediction in part only.
+    predicted = np.array([[0.0, 0, 40, 40], [50, 0, 90, 40]])
+    assert merged_detections(predicted, np.array([[0.0, 0, 70, 40]]), {0: 0}) == (set(), {})
