@@ -30,6 +30,11 @@ def test_exceptions_to_the_rule_exist():
     assert public >= bad_input.RESULTS
 
 
+def test_the_page_says_what_happens(outcomes):
+    text = bad_input_page.PAGE.read_text()
+    assert bad_input_page.differences(outcomes[0], text) == []
+
+
 def test_the_page_says_of_each_kind_what_happens():
     refused, valid = bad_input.Outcome(refused=2), bad_input.Outcome(accepted=2)
     mixed = bad_input.Outcome(refused=1, accepted=1)
