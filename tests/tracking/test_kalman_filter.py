@@ -207,7 +207,7 @@ def test_a_correction_is_that_of_the_textbook():
 
 def test_the_variance_of_an_outlier_grows_with_its_square():
     mean, cov = predicted_states()
-    edges = boxes_from_states(mean) + np.array([[0, 0, 120.0, 0], [0, 0, 0, -90.0]])
+    edges = boxes_from_states(mean) + np.array([[0, 0, 250.0, 0], [0, 0, 0, -150.0]])
     variance = np.full((2, 4), 25.0)
     after, _, innovation = corrected(mean, cov, edges, variance)
     for row in range(2):
@@ -237,7 +237,7 @@ def test_an_edge_that_deviates_to_one_side_for_long_is_believed():
 
 def test_only_the_outliers_of_merged_boxes_are_rejected():
     mean, cov = predicted_states()
-    shift = np.array([[0, 0, 120.0, 0], [0, 0, 0, 2.0]])
+    shift = np.array([[0, 0, 250.0, 0], [0, 0, 0, 2.0]])
     edges, variance = boxes_from_states(mean) + shift, np.full((2, 4), 25.0)
     after, _, innovation = corrected(mean, cov, edges, variance, reject_outliers=True)
     expected, _ = textbook(mean[0], cov[0], edges[0], np.array([25, 25, UNKNOWN, 25]))
@@ -335,16 +335,16 @@ def ranges(mean, cov):
 
 
 def test_distances_are_predicted_at_constant_speed():
-    cov = np.array([[4.0, 0.5, 0.1], [0.5, 9.0, 0.2], [0.1, 0.2, 0.04]])
-    found = predict_distances(ranges([30.0, -5.0, 0.1], cov), 0.2, CAMERA)
-    np.testing.assert_allclose(found.range_mean, [[29.0, -5.0, 0.1]])
-    transition = np.array([[1, 0.2, 0], [0, 1, 0], [0, 0, 1]])
+    cov = np.array([[4.0, 0.5, 0.1, 0], [0.5, 9.0, 0.2, 0], [0.1, 0.2, 0.04, 0], [0, 0, 0, 0.5]])
+    found = predict_distances(ranges([30.0, -5.0, 0.1, 0.3], cov), 0.2, CAMERA)
+    np.testing.assert_allclose(found.range_mean, [[29.0, -5.0, 0.1, 0.3]])
+    transition = np.array([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     expected = transition @ cov @ transition.T
     expected[:2, :2] += 1.5**2 * np.array([[0.2**3 / 3, 0.2**2 / 2], [0.2**2 / 2, 0.2]])
     expected[2, 2] += (CAMERA.vehicle_width_std_m / CAMERA.vehicle_width_m) ** 2 * 0.2 / 20
     np.testing.assert_allclose(found.range_cov[0], expected)
     for start, speed, end in ((2.0, -50.0, 1.0), (499.0, 50.0, 500.0)):
-        assert predict_distances(ranges([start, speed, 0], cov), 0.2, CAMERA).range_mean[0, 0] == end
+        assert predict_distances(ranges([start, speed, 0, 0], cov), 0.2, CAMERA).range_mean[0, 0] == end
 
 
 @pytest.mark.parametrize(
