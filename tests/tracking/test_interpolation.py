@@ -1,7 +1,9 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from vehicle_detection.tracking import Track, interpolate_tracks
+from vehicle_detection.tracking import Track, backfill_tracks, interpolate_tracks
 
 SHAPE = (720, 1280, 3)
 
@@ -53,3 +55,25 @@ def test_a_track_is_shown_from_its_first_detection_on():
     # One that was detected for the first time after this frame is not shown, and neither are tentative ones.
     new = track(5, [104, 200, 154, 260], age=0.0)
     assert interpolate_tracks([tentative], [new, track(0, [0, 0, 9, 9])], 0.04, 0.04, SHAPE) == ()
+
+
+def test_a_track_is_backfilled_with_what_is_known_later():
+    options = {"confidence": 0.5}
+    tentative = replace(track(0, [100, 200, 150, 260], key=4, **options), state="tentative", shown=False)
+    missed = replace(tentative, key=6, misses=1)
+    other = replace(tentative, key=5)
+    known = track(2, [500, 200, 550, 260], key=1)
+    confirmed = track(3, [104, 200, 154, 260], key=4, confidence=0.9)
+    later = [known, confirmed, track(1, [0, 0, 50, 50], key=6), replace(other, key=7)]
+    found = backfill_tracks([known, tentative, missed, other], later)
+    assert [each.id for each in found] == [1, 2, 3, 0]
+    assert [each.state for each in found] == ["coasting", "confirmed", "confirmed", "tentative"]
+    assert [each.shown for each in found] == [True, True, True, False]
+    assert found[1] is known
+    assert found[2].confidence == 0.9
+    np.testing.assert_array_equal(found[2].box, tentative.box)
+
+
+def test_tracks_without_a_key_are_not_backfilled():
+    tentative = replace(track(0, [100, 200, 150, 260]), state="tentative", shown=False)
+    assert backfill_tracks([tentative], [track(3, [104, 200, 154, 260])]) == (tentative,)

@@ -14,6 +14,7 @@ from vehicle_detection.tracking.kalman_filter import (
     centers_and_sizes,
     coasted_distance,
     estimate_distances,
+    exit_times,
     initiate,
     initiate_states,
     predict,
@@ -171,9 +172,7 @@ def test_a_new_state_has_the_errors_of_its_edges():
     mean, cov = initiate(BOXES[:1], edge_std)
     np.testing.assert_allclose(EDGES @ cov[0] @ EDGES.T, np.diag([1, 4, 9, 16.0]), atol=1e-9)
     # Speeds in widths and heights per second.
-    np.testing.assert_allclose(
-        np.sqrt(np.diag(cov[0])[4:]), np.array([100, 90, 100, 90]) * [1, 0.6, 0.35, 0.35]
-    )
+    np.testing.assert_allclose(np.sqrt(np.diag(cov[0])[4:]), np.array([100, 90, 100, 90]) * [3, 1, 0.7, 0.7])
     assert not cov[0, :4, 4:].any()
     assert not mean[0, 4:].any()
 
@@ -208,7 +207,7 @@ def test_a_correction_is_that_of_the_textbook():
 
 def test_the_variance_of_an_outlier_grows_with_its_square():
     mean, cov = predicted_states()
-    edges = boxes_from_states(mean) + np.array([[0, 0, 120.0, 0], [0, 0, 0, -90.0]])
+    edges = boxes_from_states(mean) + np.array([[0, 0, 250.0, 0], [0, 0, 0, -150.0]])
     variance = np.full((2, 4), 25.0)
     after, _, innovation = corrected(mean, cov, edges, variance)
     for row in range(2):
@@ -238,7 +237,7 @@ def test_an_edge_that_deviates_to_one_side_for_long_is_believed():
 
 def test_only_the_outliers_of_merged_boxes_are_rejected():
     mean, cov = predicted_states()
-    shift = np.array([[0, 0, 120.0, 0], [0, 0, 0, 2.0]])
+    shift = np.array([[0, 0, 250.0, 0], [0, 0, 0, 2.0]])
     edges, variance = boxes_from_states(mean) + shift, np.full((2, 4), 25.0)
     after, _, innovation = corrected(mean, cov, edges, variance, reject_outliers=True)
     expected, _ = textbook(mean[0], cov[0], edges[0], np.array([25, 25, UNKNOWN, 25]))
@@ -336,16 +335,16 @@ def ranges(mean, cov):
 
 
 def test_distances_are_predicted_at_constant_speed():
-    cov = np.array([[4.0, 0.5, 0.1], [0.5, 9.0, 0.2], [0.1, 0.2, 0.04]])
-    found = predict_distances(ranges([30.0, -5.0, 0.1], cov), 0.2, CAMERA)
-    np.testing.assert_allclose(found.range_mean, [[29.0, -5.0, 0.1]])
-    transition = np.array([[1, 0.2, 0], [0, 1, 0], [0, 0, 1]])
+    cov = np.array([[4.0, 0.5, 0.1, 0], [0.5, 9.0, 0.2, 0], [0.1, 0.2, 0.04, 0], [0, 0, 0, 0.5]])
+    found = predict_distances(ranges([30.0, -5.0, 0.1, 0.3], cov), 0.2, CAMERA)
+    np.testing.assert_allclose(found.range_mean, [[29.0, -5.0, 0.1, 0.3]])
+    transition = np.array([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     expected = transition @ cov @ transition.T
     expected[:2, :2] += 1.5**2 * np.array([[0.2**3 / 3, 0.2**2 / 2], [0.2**2 / 2, 0.2]])
     expected[2, 2] += (CAMERA.vehicle_width_std_m / CAMERA.vehicle_width_m) ** 2 * 0.2 / 20
     np.testing.assert_allclose(found.range_cov[0], expected)
     for start, speed, end in ((2.0, -50.0, 1.0), (499.0, 50.0, 500.0)):
-        assert predict_distances(ranges([start, speed, 0], cov), 0.2, CAMERA).range_mean[0, 0] == end
+        assert predict_distances(ranges([start, speed, 0, 0], cov), 0.2, CAMERA).range_mean[0, 0] == end
 
 
 @pytest.mark.parametrize(
@@ -379,3 +378,27 @@ def test_rows_of_states_are_taken_put_and_joined():
     assert not np.array_equal(states.mean[0], states.mean[1])
     joined = KalmanStates.empty().join(states)
     np.testing.assert_array_equal(joined.range_cov, states.range_cov)
+
+
+def test_a_box_that_a_nearer_vehicle_covers_is_a_weaker_measurement():
+    width = np.array([[600.0, 380.0, 660.0, 430.0]])  # narrower than before: part of it is hidden
+
+    def distance(covered):
+        boxes = np.array([[600.0, 380.0, 680.0, 446.0]])
+        states = initiate_states(*initiate(boxes, np.ones((1, 4))), CAMERA)
+        for box, fraction in ((boxes, 0.0), (boxes, 0.0), (width, covered)):
+            measured = Measurements.from_boxes(box, SHAPE, covered=fraction)
+            states = update_distances(states, measured, CAMERA, 0.08, 0.04)
+        return states.range_mean[0, 0], states.range_cov[0, 0, 0]
+
+    visible, partial, hidden = distance(0.0), distance(0.1), distance(0.5)
+    # The narrower a box, the farther the vehicle seems.
+    assert hidden[0] < partial[0] < visible[0]
+    assert visible[1] < partial[1] < hidden[1]
+
+
+def test_exit_times():
+    boxes = np.array([[0, 400, 100, 480], [0, 400, 100, 480], [1180, 400, 1280, 480], [600, 400, 700, 480.0]])
+    mean, _ = initiate(boxes, np.ones((4, 4)))
+    mean[:, 4] = [-200.0, 200.0, 400.0, -400.0]
+    np.testing.assert_allclose(exit_times(mean, SHAPE[:2]), [0.5, np.inf, 0.25, np.inf])

@@ -874,6 +874,29 @@ class TestArguments:
         assert tracks[0].box.dtype == np.float64
 
 
+def test_a_track_that_moves_out_of_the_frame_ends_at_once():
+    tracker = Tracker(fps=25)
+    for frame in range(12):
+        left = 330.0 - 30 * frame
+        tracks = tracker.update(found([left, 380, left + 160, 480]), SHAPE)
+    assert tracks[0].shown
+    assert tracks[0].box[0] < 5
+    assert not any(track.shown for track in tracker.update(found(), SHAPE))
+
+
+def test_a_track_keeps_its_key_when_it_is_confirmed():
+    tracker = Tracker(fps=25)
+    keys = []
+    for frame in range(6):
+        boxes = [[600, 400, 700, 490]] + ([[100, 400, 200, 490]] if frame == 1 else [])
+        keys += [(track.key, track.id) for track in tracker.update(found(*boxes), SHAPE)]
+    assert {key for key, number in keys if number} == {1}
+    assert (1, 0) in keys
+    assert (2, 0) in keys
+    tracker.reset()
+    assert tracker.update(found([600, 400, 700, 490]), SHAPE)[0].key == 1
+
+
 def simulated_detections(truth, shape, *, seed, misses=0.1, clutter=0.3):
     """Simulate the detections of a good detector on a drive that is not rendered.
 

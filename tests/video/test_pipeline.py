@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 import weakref
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ from tests.video.clips import (
 )
 from vehicle_detection.errors import InvalidInputError, VideoError
 from vehicle_detection.video import probe_video, process, process_video
+from vehicle_detection.video.frame_source import FrameSource
 
 
 def test_the_result_does_not_depend_on_the_number_of_workers(clip, tmp_path):
@@ -262,3 +264,47 @@ def test_a_stop_before_the_first_frame_ends_the_run(clip):
         run.stop()
         assert list(run.results()) == []
     assert not running_threads()
+
+
+class DelayedDetector(StubDetector):
+    """Holds three searched frames back, and marks the results that it saw again."""
+
+    def search_interval(self, fps):
+        return 2
+
+    def search_delay(self, fps):
+        return 3
+
+    def skip(self, thumbnail):
+        self.index += 1
+
+    def interpolate(self, before, after, times):
+        self.between.append((self.seen[before.index], after and self.seen[after.index]))
+        return [Result(before.index + 1, before.brightness, time, before.tracks) for time in times]
+
+    def reset(self, *, fps):
+        super().reset(fps=fps)
+        self.between, self.seen = [], Counter()
+
+    def backfill(self, results):
+        self.seen.update(result.index for result in results)
+        return results
+
+
+def test_searched_frames_are_held_back(clip, tmp_path):
+    detector, results = DelayedDetector(), []
+    process_video(clip, tmp_path / "out.mp4", detector, on_result=results.append)
+    assert [result.index for result in results] == list(range(len(frame_numbers(clip))))
+    seen = [detector.seen[result.index] for result in results[::2]]
+    # Each one is seen once when it is tracked, and with each of the three after it.
+    assert seen == [4] * (len(seen) - 3) + [3, 2, 1]
+    assert detector.between[0] == (4, 4)
+
+
+def test_live_sources_are_not_delayed(tmp_path, monkeypatch):
+    detector, results = DelayedDetector(), []
+    source = write_clip(tmp_path / "clip.mp4", gray_frames(8))
+    monkeypatch.setattr(FrameSource, "live", True)
+    process_video(source, None, detector, on_result=results.append)
+    assert len(results) == 8
+    assert not detector.seen

@@ -43,6 +43,9 @@ class TrackParams:
         since its confirmation. While another vehicle hides it, it is shown up to `max_coast`, no longer than
         it was detected, and for `show_covered` if nothing of it is visible. It is not shown once it must have
         moved by half of its size.
+    backfill
+        A track is also shown for this time before its confirmation, where frames can wait: in
+        `process_video` and `track`, unless the source is live.
     max_gap
         A longer gap between two frames ends all tracks.
     max_distance
@@ -79,6 +82,7 @@ class TrackParams:
     show_covered: float = 0.4
     max_coast: float = 1.0
     max_hidden: float = 4.0
+    backfill: float = 0.32
     max_gap: float = 1.0
     max_distance: float = 0.7
     max_iou: float = 0.3
@@ -101,6 +105,7 @@ class TrackParams:
             "show_covered",
             "max_coast",
             "max_hidden",
+            "backfill",
         )
         for name in (*times, "measurement_correlation_time"):
             check_number(getattr(self, name), name, low=0, high=3600)

@@ -1,7 +1,7 @@
 """Tracking: detections of single frames in, vehicles with constant identities out."""
 
-from vehicle_detection.tracking.interpolation import interpolate_tracks
+from vehicle_detection.tracking.interpolation import backfill_tracks, interpolate_tracks
 from vehicle_detection.tracking.track import Track
 from vehicle_detection.tracking.tracker import Tracker
 
-__all__ = ["Track", "Tracker", "interpolate_tracks"]
+__all__ = ["Track", "Tracker", "backfill_tracks", "interpolate_tracks"]

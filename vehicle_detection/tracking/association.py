@@ -6,12 +6,18 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vehicle_detection.boxes import Floats, box_areas, intersection_matrix, iter_nms, overlap_matrices
 from vehicle_detection.params import TrackParams
 
 # A detection shows two vehicles if it covers more than this fraction of both, and has a lower IoU with both.
 _MIN_MERGED_COVERAGE, _MAX_MERGED_IOU = 0.7, 0.7
+# Fraction of its size by which the box of a nearer vehicle is enlarged, and fraction of a vehicle's height by
+# which the bottom edge of a nearer one is lower.
+_COVER_MARGIN, _MIN_NEARER = 0.03, 0.1
+
+Bools = NDArray[np.bool_]
 
 
 def match_boxes(predicted: Floats, measured: Floats, max_distance: Floats) -> list[tuple[int, int]]:
@@ -50,6 +56,19 @@ def center_distances(first: Floats, second: Floats) -> Floats:
 def covered_fractions(boxes: Floats, others: Floats) -> Floats:
     """``(N, M)`` fraction of each of `boxes` that each of `others` covers."""
     return intersection_matrix(boxes, others) / np.maximum(box_areas(boxes), 1e-9)[:, None]
+
+
+def nearer_cover(boxes: Floats, is_opaque: Bools) -> Floats:
+    """``(N,)`` fraction of each of `boxes` that the one of them covers most that is nearer and opaque.
+
+    A vehicle is nearer if its bottom edge is lower. Its box is enlarged by a few percent, because a vehicle
+    that only touches another one hides its edge.
+    """
+    sides = boxes[:, 2:] - boxes[:, :2]
+    margin = _COVER_MARGIN * np.tile(sides, 2) * np.array([-1.0, -1.0, 1.0, 1.0])
+    nearer = boxes[None, :, 3] > boxes[:, None, 3] + _MIN_NEARER * sides[:, 1][:, None]
+    fractions = covered_fractions(boxes, boxes + margin)
+    return np.asarray(np.where(nearer & is_opaque[None], fractions, 0.0).max(axis=1, initial=0.0))
 
 
 def distinct_vehicles(boxes: Floats, order: Sequence[int], known: Floats, params: TrackParams) -> list[int]:

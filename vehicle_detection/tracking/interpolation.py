@@ -1,7 +1,8 @@
-"""Tracks of the frames between two searched frames."""
+"""Tracks of the frames between two searched frames, and of those before a track was confirmed."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -42,6 +43,29 @@ def interpolate_tracks(
     started = [track for track in following.values() if track.id and track.age >= dt_after - TIME_TOLERANCE]
     found += [_move(track, -dt_after, shape) for track in started]
     return tuple(track for track in found if (track.box[2:] - track.box[:2]).min() >= 1)
+
+
+def backfill_tracks(earlier: Sequence[Track], later: Sequence[Track]) -> tuple[Track, ...]:
+    """Confirm the tentative tracks of an earlier frame that are confirmed in a later one.
+
+    They get the id, the score and the confidence that they have there, and are shown.
+    """
+    confirmed = {track.key: track for track in later if track.id and track.key}
+    found = []
+    for track in earlier:
+        other = None if track.id else confirmed.get(track.key)
+        if other is not None:
+            track = replace(
+                track,
+                id=other.id,
+                score=other.score,
+                confidence=other.confidence,
+                state="coasting" if track.misses else "confirmed",
+                shown=True,
+            )
+        found.append(track)
+    # Confirmed tracks by id, then tentative ones.
+    return tuple(sorted(found, key=lambda track: track.id or math.inf))
 
 
 def _mean(first: Track, second: Track, dt: float, dt_after: float) -> Track:

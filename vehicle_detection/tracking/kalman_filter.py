@@ -4,9 +4,10 @@ The state of a box is ``[cx, cy, w, h]`` and its velocity in pixels per second. 
 velocity and corrected by the measured edges (Bar-Shalom, Li and Kirubarajan, *Estimation with Applications
 to Tracking and Navigation*, chapter 6), because the frame's border may truncate one edge alone.
 
-The state of a distance is ``[distance in m, speed in m/s, log(width / camera.vehicle_width_m)]``. The width
-is part of the state: a truck seems near by its width until its bottom edge has corrected it, and from then
-on its growth in the image gives the speed.
+The state of a distance is ``[distance in m, speed in m/s, log(width / camera.vehicle_width_m), length error
+in m]``. Width and length are part of the state: a truck seems near by its width until its bottom edge has
+corrected it, and from then on its growth in the image gives the speed. The length matters where the side of
+a vehicle is visible, and its error is relative to ``camera.vehicle_length_m``.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ _FROM_EDGES = np.linalg.inv(_TO_EDGES)
 _DIAGONAL = np.arange(4)
 _MIN_SIZE = 4.0
 # Standard deviation of a new box's velocity ``[cx, cy, w, h]``, in box sizes per second.
-_INITIAL_SPEED_STD = np.array([1.0, 0.6, 0.35, 0.35])
+_INITIAL_SPEED_STD = np.array([3.0, 1.0, 0.7, 0.7])
 # Innovations in standard errors: above the first an edge is an outlier; the second is the clipping limit.
 _OUTLIER, _MAX_INNOVATION = 2.5, 6.0
 # Standard error that a persistent innovation adds to an edge of the track, as a fraction of the innovation.
@@ -61,13 +62,13 @@ class KalmanStates(NamedTuple):
     mean: Floats  # (N, 8) box and its velocity
     cov: Floats  # (N, 8, 8)
     innovation_mean: Floats  # (N, 4) moving average of each edge's innovation in standard errors
-    range_mean: Floats  # (N, 3) distance, speed and logarithm of the relative width
-    range_cov: Floats  # (N, 3, 3)
+    range_mean: Floats  # (N, 4) distance, speed, logarithm of the relative width, error of the length
+    range_cov: Floats  # (N, 4, 4)
 
     @classmethod
     def empty(cls) -> KalmanStates:
         """States of no tracks."""
-        return cls(*(np.empty((0, *shape)) for shape in ((8,), (8, 8), (4,), (3,), (3, 3))))
+        return cls(*(np.empty((0, *shape)) for shape in ((8,), (8, 8), (4,), (4,), (4, 4))))
 
     def boxes(self) -> Floats:
         """``(N, 4)`` boxes, including parts outside the frame."""
@@ -100,15 +101,22 @@ class Measurements(NamedTuple):
     truncated: Bools  # (N, 4) edges at the frame's border
     lateral_px: Floats  # (N,) distance of the inner edge from the frame's middle column
     merged: Bools  # (N,) whether the box shows another vehicle too
+    covered: Floats  # (N,) fraction of the box that nearer vehicles cover
 
     @classmethod
     def from_boxes(
-        cls, boxes: Floats, frame: FrameShape, merged: ArrayLike = False, camera: Camera | None = None
+        cls,
+        boxes: Floats,
+        frame: FrameShape,
+        merged: ArrayLike = False,
+        camera: Camera | None = None,
+        covered: ArrayLike = 0.0,
     ) -> Measurements:
         """Measure boxes in a frame of this shape, seen by `camera` or, by default, a pinhole camera."""
         merged = np.broadcast_to(np.asarray(merged, np.bool_), len(boxes))
+        covered = np.broadcast_to(np.asarray(covered, np.float64), len(boxes))
         road = boxes if camera is None else camera.rectify_boxes(boxes, frame)
-        return cls(boxes, road, truncated_edges(boxes, frame), lateral_offsets(road, frame), merged)
+        return cls(boxes, road, truncated_edges(boxes, frame), lateral_offsets(road, frame), merged, covered)
 
 
 class KalmanSmoother:
@@ -242,9 +250,21 @@ def coasted_distance(mean: Floats, seconds: Floats) -> Floats:
     return np.asarray(speed * _VELOCITY_DECAY[0] * np.expm1(seconds / _VELOCITY_DECAY[0]))
 
 
-_INITIAL_DISTANCE, _INITIAL_DISTANCE_STD, _INITIAL_RANGE_SPEED_STD = 30.0, 1e3, 20.0
+def exit_times(mean: Floats, frame: FrameShape) -> Floats:
+    """``(N,)`` seconds until boxes at the left or right border have moved out; infinite for others."""
+    boxes, speeds = boxes_from_states(mean), mean[:, 4:] @ _TO_EDGES.T
+    at_border = truncated_edges(boxes, frame)
+    inside = np.stack([boxes[:, 2], frame[1] - boxes[:, 0]], axis=1)
+    outward = np.stack([-speeds[:, 2], speeds[:, 0]], axis=1)
+    moves_out = at_border[:, [0, 2]] & (outward > 0)
+    seconds = np.where(moves_out, inside / np.where(moves_out, outward, 1.0), np.inf)
+    return np.asarray(seconds.min(axis=1))
+
+
+_INITIAL_DISTANCE, _INITIAL_DISTANCE_STD, _INITIAL_RANGE_SPEED_STD = 30.0, 1e3, 40.0
 _MIN_DISTANCE, _MAX_DISTANCE = 1.0, 500.0
 _MIN_LOG_WIDTH, _MAX_LOG_WIDTH = -0.7, 0.9
+_MIN_LENGTH_ERROR, _MAX_LENGTH_ERROR = -3.0, 8.0
 # Process noise of the speed (m/s per square root of a second).
 _ACCELERATION = 1.5
 # Times (s) in which the width's prior variance is added to its process noise, and over which the pitch of the
@@ -254,6 +274,9 @@ _WIDTH_TIME, _PITCH_TIME = 20.0, 2.0
 _UNSETTLED, _UNSETTLED_STD = 1.5, 0.5
 # Maximum relative error of a reported distance, age of its last measurement (s), and error of a speed (m/s).
 _MAX_RANGE_STD, _MAX_RANGE_AGE, _MAX_RANGE_SPEED_STD = 0.4, 0.5, 6.0
+# Fraction of a box that nearer vehicles cover, from which on it is no measurement, and relative error of the
+# width of a box that they cover less.
+_MAX_COVERED, _COVERED_STD = 0.3, 0.15
 # Aspect ratio above which a detector's boxes are narrower than the vehicle with its side.
 _MAX_ASPECT = 1.5
 
@@ -261,19 +284,21 @@ _MAX_ASPECT = 1.5
 def initiate_states(mean: Floats, cov: Floats, camera: Camera) -> KalmanStates:
     """Return the states of new tracks, whose distance is unknown, from those of their boxes."""
     count, width_std = len(mean), camera.vehicle_width_std_m / camera.vehicle_width_m
-    range_std = np.array([_INITIAL_DISTANCE_STD, _INITIAL_RANGE_SPEED_STD, width_std])
-    range_mean = np.tile([_INITIAL_DISTANCE, 0.0, 0.0], (count, 1))
+    length_std = camera.vehicle_length_std_m
+    range_std = np.array([_INITIAL_DISTANCE_STD, _INITIAL_RANGE_SPEED_STD, width_std, length_std])
+    range_mean = np.tile([_INITIAL_DISTANCE, 0.0, 0.0, 0.0], (count, 1))
     range_cov = np.tile(np.diag(np.square(range_std)), (count, 1, 1))
     return KalmanStates(mean, cov, np.zeros((count, 4)), range_mean, range_cov)
 
 
 def predict_distances(states: KalmanStates, dt: float, camera: Camera) -> KalmanStates:
     """Predict distances by `dt` seconds."""
-    transition = np.eye(3)
+    transition = np.eye(4)
     transition[0, 1] = dt
     mean = states.range_mean @ transition.T
     mean[:, 0] = np.clip(mean[:, 0], _MIN_DISTANCE, _MAX_DISTANCE)
-    noise = np.array([[dt**3 / 3, dt**2 / 2, 0], [dt**2 / 2, dt, 0], [0, 0, 0]]) * _ACCELERATION**2
+    noise = np.zeros((4, 4))
+    noise[:2, :2] = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]) * _ACCELERATION**2
     noise[2, 2] = (camera.vehicle_width_std_m / camera.vehicle_width_m) ** 2 * dt / _WIDTH_TIME
     return states._replace(range_mean=mean, range_cov=transition @ states.range_cov @ transition.T + noise)
 
@@ -286,11 +311,13 @@ def update_distances(
     The errors of a vehicle's boxes are correlated over `correlation_time` seconds.
     """
     mean, cov = states.range_mean.copy(), states.range_cov.copy()
-    # While the edges of a box have not settled, its distance is uncertain.
+    # While the edges of a box have not settled, or are partly covered, its distance is uncertain.
     unsettled = (np.abs(states.innovation_mean) > _UNSETTLED).any(axis=1)
+    unsettled |= measured.covered > 0
     cov[:, 0, 0] += unsettled * np.square(_UNSETTLED_STD * mean[:, 0]) * dt
     # A merged box shows neither the bottom nor the width of its vehicles.
     visible = ~(measured.truncated | measured.merged[:, None])
+    visible &= (measured.covered < _MAX_COVERED)[:, None]
     bottom_visible, width_visible = visible[:, 3], visible[:, 0] & visible[:, 2]
     boxes, lateral_px = measured.road_boxes, measured.lateral_px
     sides = np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0)
@@ -305,10 +332,15 @@ def update_distances(
     if unknown.any():
         # Linearize at the first measurement itself.
         below = bottom_visible & (below_horizon > 2 * np.hypot(edge_std[:, 1], horizon_std))
-        first = np.where(below, bottom_scale / np.where(below, below_horizon, 1.0), width_scale / sides[:, 0])
+        by_bottom = bottom_scale / np.where(below, below_horizon, 1.0)
+        # The measurement with the smaller relative error.
+        bottom_error = np.hypot(edge_std[:, 1], horizon_std) / np.where(below, below_horizon, 1.0)
+        width_error = np.sqrt(cov[:, 2, 2] + np.square(lateral_px / width_scale) * cov[:, 3, 3])
+        is_better = below & ((bottom_error < width_error) | ~width_visible)
+        first = np.where(is_better, by_bottom, width_scale / sides[:, 0])
         known = unknown & (below | width_visible)
         mean[known, 0] = np.clip(first[known], _MIN_DISTANCE, _MAX_DISTANCE)
-        bottom_visible &= below | ~unknown
+        bottom_visible &= is_better | ~unknown
 
     # Pixels below the horizon: bottom_scale / distance.
     expected = bottom_scale / mean[:, 0]
@@ -320,18 +352,23 @@ def update_distances(
     mean, cov = _scalar_update(mean, cov, jacobian, below_horizon - expected, variance)
     np.clip(mean[:, 0], _MIN_DISTANCE, _MAX_DISTANCE, out=mean[:, 0])
 
-    # Logarithm of the width in pixels: log(width_scale) + log(relative width) - log(distance).
-    innovation = np.log(sides[:, 0] / width_scale) - mean[:, 2] + np.log(mean[:, 0])
+    # Logarithm of the width in pixels: log(width_scale) + log(relative width) - log(distance), with the error
+    # of the length to first order.
+    side = lateral_px / width_scale
+    innovation = np.log(sides[:, 0] / width_scale) - mean[:, 2] - side * mean[:, 3] + np.log(mean[:, 0])
     # Detectors cut the long sides of vehicles short, where the whole box would be wider than usual.
     aspect = width_scale / (camera.focal_px * camera.vehicle_height_m)
     cut_short = np.log(np.maximum(aspect / _MAX_ASPECT, 1.0))
-    systematic = np.square(lateral_px * camera.vehicle_length_std_m / width_scale) + np.square(cut_short)
+    covered_std = np.where(measured.covered > 0, _COVERED_STD, 0.0)
+    side_std = side * camera.vehicle_length_std_m
+    systematic = np.square(cut_short) + np.square(covered_std) + np.square(side_std)
     variance = np.square(edge_std[:, 0] / sides[:, 0]) * 2 * box_frames + systematic * pitch_frames
-    jacobian[:, 0], jacobian[:, 2] = -1 / mean[:, 0], 1.0
+    jacobian[:, 0], jacobian[:, 2], jacobian[:, 3] = -1 / mean[:, 0], 1.0, side
     variance = np.where(width_visible, variance, np.inf)
     mean, cov = _scalar_update(mean, cov, jacobian, innovation, variance)
     np.clip(mean[:, 0], _MIN_DISTANCE, _MAX_DISTANCE, out=mean[:, 0])
     mean[:, 2] = np.clip(mean[:, 2], _MIN_LOG_WIDTH, _MAX_LOG_WIDTH)
+    mean[:, 3] = np.clip(mean[:, 3], _MIN_LENGTH_ERROR, _MAX_LENGTH_ERROR)
     return states._replace(range_mean=mean, range_cov=cov)
 
 

@@ -32,6 +32,9 @@ class Track:
         (confirmed, but not detected in this frame: the box is a prediction); whether to draw the track.
     age, misses, time_since_update
         Seconds since the first detection, and frames and seconds since the last.
+    key
+        Number of the track from its first detection on, from 1; unlike `id` it is set while the track is
+        tentative, and tracks that are never confirmed have one.
     distance_m, distance_std_m, speed_mps, speed_std_mps
         Distance along the road in meters, and speed relative to the camera in meters per second, positive
         when moving away, with their standard errors; None where they are unknown.
@@ -46,6 +49,7 @@ class Track:
     misses: int
     time_since_update: float
     velocity: tuple[float, float]
+    key: int = 0
     confidence: float | None = None
     distance_m: float | None = None
     distance_std_m: float | None = None
@@ -59,6 +63,7 @@ class TrackState:
 
     score: float
     confirm_at_birth: bool = False  # whether its first detection suffices to confirm it
+    key: int = 0
     id: int = 0
     hits: int = 1
     misses: int = 0  # since the last detection
@@ -70,6 +75,7 @@ class TrackState:
     coast_budget: float = 0.0  # time for which it is still shown without a detection
     covered_budget: float = 0.0  # time for which it is still shown while nothing of it is visible
     hidden: bool = False  # whether another vehicle explains the missing detection
+    covered: float = 0.0  # fraction of its box that nearer vehicles cover
     lost: bool = False  # whether its predicted position is only a guess
     past_boxes: list[tuple[float, Floats]] = field(default_factory=list)  # for the smoother "history"
 

@@ -26,7 +26,12 @@ from vehicle_detection.camera import (
     truncated_edges,
 )
 from vehicle_detection.params import TrackParams
-from vehicle_detection.tracking.association import covered_fractions, distinct_vehicles, merged_detections
+from vehicle_detection.tracking.association import (
+    covered_fractions,
+    distinct_vehicles,
+    merged_detections,
+    nearer_cover,
+)
 from vehicle_detection.tracking.horizon_filter import HorizonFilter
 from vehicle_detection.tracking.kalman_filter import (
     OUTWARD,
@@ -34,6 +39,7 @@ from vehicle_detection.tracking.kalman_filter import (
     Measurements,
     coasted_distance,
     estimate_distances,
+    exit_times,
     initiate_states,
     predict_distances,
     update_distances,
@@ -44,6 +50,8 @@ from vehicle_detection.tracking.track import TIME_TOLERANCE, Track, TrackState
 # Visible fraction of a box below which its vehicle leaves the frame if it moves outwards, and below which it
 # has left; covered fractions above which a vehicle is hidden, and above which nothing of it is visible.
 _LEAVING, _LEFT, _HIDDEN, _COVERED = 0.5, 0.15, 0.5, 0.9
+# Seconds until a track that reaches the border has moved out, below which it has left if it is not detected.
+_EXIT_TIME = 0.5
 # Distance in box sizes that a track may coast before its position is only a guess.
 _MAX_COAST_DISTANCE = 0.5
 # Factors of `max_distance` for tentative tracks, and for low-score detections.
@@ -108,7 +116,7 @@ class Tracker:
         self._shape: FrameShape | None = None
         self._horizon = self._open_horizon((720, 1280))
         self._time: float | None = None
-        self._next_id = 1
+        self._next_id = self._next_key = 1
         self.end_tracks()
 
     def set_camera(self, camera: Camera) -> None:
@@ -275,9 +283,12 @@ class Tracker:
         unassigned[list(own.values())] = False
         rows = sorted(source)
         tracks, boxes = [self._live[row] for row in rows], boxes[[source[row] for row in rows]]
-        measured = Measurements.from_boxes(
-            boxes, frame, [row in shared or row in merged for row in rows], self._lens
-        )
+        in_front = np.array([track.id > 0 and track.misses == 0 for track in self._live])
+        covered = nearer_cover(_clip(self._states.boxes(), frame), in_front)
+        for track, fraction in zip(self._live, covered.tolist()):
+            track.covered = fraction
+        is_merged = [row in shared or row in merged for row in rows]
+        measured = Measurements.from_boxes(boxes, frame, is_merged, self._lens, covered[rows])
         states = self._smoother.correct(self._states.take(rows), tracks, measured, dt)
         self._states = self._states.put(rows, self._update_distances(states, measured, dt))
         return unassigned
@@ -330,6 +341,7 @@ class Tracker:
             beyond = (whole - inside) * OUTWARD > 0
             outwards = self._states.mean[:, [4, 5, 4, 5]] * OUTWARD > 0
             leaving = (visible < _LEAVING) & (beyond & outwards).any(axis=1)
+            leaving |= exit_times(self._states.mean, frame) < _EXIT_TIME
             expired = np.array([track.is_expired(self.params) for track in self._live])
             ended |= missed & ((visible < _LEFT) | leaving | expired)
         self._keep(np.flatnonzero(~ended).tolist())
@@ -366,7 +378,8 @@ class Tracker:
         weight = 1 - math.exp(-dt / self.params.score_time_constant)
         for score in scores[rows].tolist():
             confirm_at_birth = self._at_start and score >= self.params.instant_confirm_score
-            self._live.append(TrackState(score * weight, confirm_at_birth))
+            self._live.append(TrackState(score * weight, confirm_at_birth, key=self._next_key))
+            self._next_key += 1
 
     def _confirm(self, frame: FrameShape) -> None:
         """Confirm tentative tracks that meet the conditions, best score first, and assign their ids."""
@@ -384,7 +397,9 @@ class Tracker:
     def _update_horizon(self, frame: FrameShape, dt: float) -> None:
         """Update the horizon from confirmed tracks that are fully visible in this frame."""
         boxes, ids = self._states.boxes(), np.array([track.id for track in self._live], np.int64)
-        visible = np.array([track.id > 0 and track.misses == 0 for track in self._live], np.bool_)
+        visible = np.array(
+            [track.id > 0 and track.misses == 0 and track.covered == 0 for track in self._live], np.bool_
+        )
         visible &= ~truncated_edges(boxes, frame).any(axis=1)
         road_boxes = boxes[visible]
         if self._lens is not None:
@@ -402,7 +417,7 @@ class Tracker:
         confidences = [None] * len(scores)
         if self._calibration is not None:
             confidences = self._calibration.probability(scores).tolist()
-        fields = ("id", "score", "state", "shown", "age", "misses", "time_since_update")
+        fields = ("id", "key", "score", "state", "shown", "age", "misses", "time_since_update")
         return tuple(
             Track(
                 box=box,

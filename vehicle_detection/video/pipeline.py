@@ -60,6 +60,21 @@ class IntervalDetector(VideoDetector, Protocol):
     def interpolate(self, before: Any, after: Any, times: Sequence[float], /) -> list[Any]:
         """Results of the frames at `times` between two searched frames; `after` may be None."""
 
+    def search_delay(self, fps: float, /) -> int:
+        """Return how many searched frames to hold back, so that `backfill` can change their results."""
+
+    def backfill(self, results: Sequence[Any], /) -> list[Any]:
+        """Results of consecutive searched frames, changed by what is known since the last one."""
+
+
+@dataclass
+class _TrackedFrame:
+    """A searched frame, and those before it that were not searched."""
+
+    between: list[_QueuedFrame]
+    item: _QueuedFrame
+    result: Any
+
 
 @dataclass
 class _QueuedFrame:
@@ -138,7 +153,8 @@ class FramePipeline:
     `open_writer` returns a context that, on exit, completes the target or removes it after an error.
 
     With an `interval` above 1, only every n-th frame and the first one of each scene are searched. The frames
-    between wait for the next searched frame, and get interpolated tracks.
+    between wait for the next searched frame, and get interpolated tracks. With a `delay` above 0, that many
+    searched frames are held back, so that the detector can still change their results.
 
     `drawn_shape` is the shape of drawn frames, by default that of the frames themselves. Where a live source
     drops frames, the next frame is searched, and the written video repeats the last frame as often, so that
@@ -154,13 +170,14 @@ class FramePipeline:
         interval: int = 1,
         drawn_shape: tuple[int, ...] | None = None,
         *,
+        delay: int = 0,
         frames: Frames = "none",
     ) -> None:
         self._seconds: defaultdict[str, float] = defaultdict(float)
         self._open_reader, self._open_writer = open_reader, open_writer
         self._detector: Any = detector
         self._workers, self._interval, self._drawn_shape = workers, interval, drawn_shape
-        self._frames = frames
+        self._frames, self._delay = frames, delay
         self.missed_frames = 0
         """Number of frames that a live source dropped."""
         self._searched: ClosableQueue[_QueuedFrame] = ClosableQueue(workers * interval + 1)
@@ -243,18 +260,7 @@ class FramePipeline:
         try:
             for thread in threads:
                 thread.start()
-            waiting: list[_QueuedFrame] = []
-            before = None
-            for item in self._searched:
-                if item.search is None:
-                    waiting.append(item)
-                    continue
-                result = self._track(item, waiting)
-                self._emit_between(before, result, waiting, draw=writer is not None)
-                self._emit(item, result, draw=writer is not None)
-                waiting, before = [], result
-                del item  # free the frame before waiting for the next one
-            self._emit_between(before, None, waiting, draw=writer is not None)
+            self._track_frames(draw=writer is not None)
             self._drawn.finish()
             for thread in threads:
                 thread.join()
@@ -273,6 +279,34 @@ class FramePipeline:
         self._seconds["decode"] += reader.cpu_seconds
         if writer is not None:
             self._seconds["encode"] += writer.cpu_seconds
+
+    def _track_frames(self, *, draw: bool) -> None:
+        """Track the searched frames, and queue all frames in their order."""
+        waiting: list[_QueuedFrame] = []
+        held: deque[_TrackedFrame] = deque()
+        before = None
+        for item in self._searched:
+            if item.search is None:
+                waiting.append(item)
+                continue
+            held.append(_TrackedFrame(waiting, item, self._track(item, waiting)))
+            waiting = []
+            if self._delay:
+                results = self._detector.backfill([tracked.result for tracked in held])
+                for tracked, result in zip(held, results, strict=True):
+                    tracked.result = result
+            if len(held) > self._delay:
+                before = self._emit_tracked(before, held.popleft(), draw=draw)
+            del item  # free the frame before waiting for the next one
+        while held:
+            before = self._emit_tracked(before, held.popleft(), draw=draw)
+        self._emit_between(before, None, waiting, draw=draw)
+
+    def _emit_tracked(self, before: Any, tracked: _TrackedFrame, *, draw: bool) -> Any:
+        """Queue a searched frame after those before it that were not searched; returns its result."""
+        self._emit_between(before, tracked.result, tracked.between, draw=draw)
+        self._emit(tracked.item, tracked.result, draw=draw)
+        return tracked.result
 
     def _track(self, item: _QueuedFrame, waiting: list[_QueuedFrame]) -> Any:
         """Track a searched frame after the `waiting` ones, which are not searched."""

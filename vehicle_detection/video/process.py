@@ -303,13 +303,16 @@ class VideoRun:
         self._total = count or max(info.frames - first, 0) or None
         self._frames, self._seconds, self._track_ids = 0, 0.0, set[int]()
         self._detector = detector
+        fps = float(info.fps)
+        delay = 0 if self.source.live else getattr(detector, "search_delay", lambda fps: 0)(fps)
         self._pipeline = FramePipeline(
             functools.partial(self.source.read, first, count, strict=strict),
             None if output is None else functools.partial(_open_writer, output, drawn, preset, sound),
             detector,
             workers,
             drawn_shape=drawn_shape,
-            interval=getattr(detector, "search_interval", lambda fps: 1)(float(info.fps)),
+            interval=getattr(detector, "search_interval", lambda fps: 1)(fps),
+            delay=delay,
             frames=frames,
         )
 
