@@ -344,6 +344,8 @@ class FramePipeline:
         try:
             last, skipped, expected = None, 0, None
             for index, moment, frame in reader:
+                if self._stopped:
+                    break
                 thumbnail = make_thumbnail(frame)
                 skipped += 1
                 missed = index - expected if expected is not None else 0
