@@ -91,7 +91,7 @@ def _train(options: argparse.Namespace) -> None:
     model = model.with_metadata(training_metadata(scores, sources, options.seed, len(patches)))
     model.save(options.output)
     if options.card is not None:
-        write_card(options.card, model, scores, sources, seed=options.seed, patches=len(patches))
+        write_card(options.card, model, scores, sources, seed=options.seed, patches=len(patches), folds=folds)
     if options.curves is not None:
         write_curves(options.curves, folds)
     if options.pictures is not None:
