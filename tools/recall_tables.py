@@ -74,7 +74,8 @@ def _usable(fold: FoldDetections, threshold: float) -> tuple[NDArray[np.intp], N
 def _hidden_fractions(labels: FrameBoxes) -> NDArray[np.float64]:
     """Largest fraction of each labelled box that one other vehicle with a lower bottom edge covers."""
     hidden = np.zeros(len(labels))
-    vehicles = np.flatnonzero(labels.tracks != -1)
+    # The others are regions.
+    vehicles = np.flatnonzero(~labels.ignore | (labels.tracks != -1))
     for key in labels.frame_keys:
         rows = np.intersect1d(labels.rows(key), vehicles)
         boxes = labels.boxes[rows]
