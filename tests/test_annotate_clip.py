@@ -241,7 +241,8 @@ def test_speeds_are_right_for_every_frame_rate():
         pictures(detector.annotate_clip(clip, on_result=results.append))
         medians[fps] = np.median(speeds_of(results[-fps // 2 :])), np.median([row.speed_mps for row in truth])
     for estimate, true in medians.values():
-        assert estimate == pytest.approx(true, rel=0.15)
+        # A wrong frame rate would double or halve it.
+        assert estimate == pytest.approx(true, rel=0.15, abs=0.1)
 
 
 def test_an_image_transform_counts_the_first_frame_once_and_warns_of_speeds():

@@ -44,10 +44,6 @@ UNSAFE = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marsh
 # Public names without an example in their docstring, and why.
 WITHOUT_EXAMPLE = {
     "Event": "a result of find_events",
-    "open_dask": "starts or needs a cluster",
-    "FrameSource": "see open_source",
-    "TrackedFrame": "a result of track",
-    "Trip": "a result of find_trips",
     "FrameResult": "a result of VehicleDetector",
     "HeatParams": "see bounding_boxes",
     "HorizonEstimate": "a result of estimate_horizon",
@@ -62,7 +58,6 @@ WITHOUT_EXAMPLE = {
     "FrameSet": "a result of load_frames",
     "TrackScores": "a result of evaluate_tracks",
     "VehicleCounts": "a result of count_vehicles",
-    "VideoInfo": "a result of probe_video",
     "cross_validate_mixture": "trains several models",
     "hog_image": "a picture",
     "search_windows": "its scores are the shipped model's",

@@ -19,6 +19,7 @@ from vehicle_detection._common import (
     check_image,
     check_integer,
     check_number,
+    check_sequence,
     check_type,
     describe,
 )
@@ -414,6 +415,9 @@ class VehicleDetector:
         results
             Results of consecutive searched frames, in their order.
         """
+        results = check_sequence(results, "results", "FrameResult")
+        for result in results:
+            check_type(result, "results", FrameResult, "pass what track returns")
         if not results:
             return []
         *earlier, last = results
