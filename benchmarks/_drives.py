@@ -121,17 +121,21 @@ def track_drive(drive: Drive, detector: VehicleDetector) -> tuple[list[FrameResu
     """Results of all frames, and the frames that were searched; only these are rendered."""
     step, fps = detector.search_interval(drive.fps), drive.fps
     detector.reset(fps=fps)
-    results: list[FrameResult] = []
+    tracked: list[FrameResult] = []
     searched = list(range(0, len(drive), step))
+    held = detector.search_delay(fps) + 1
     for index in searched:
         found = detector.search(drive[index].image)
-        result = detector.track(found, time=index / fps)
-        if results:
-            between = range(results[-1].index + 1, index)
-            results += detector.interpolate(results[-1], result, [frame / fps for frame in between])
-        results.append(result)
+        tracked.append(detector.track(found, time=index / fps))
+        tracked[-held:] = detector.backfill(tracked[-held:])
         for _ in range(step - 1):
             detector.skip(found.thumbnail)
+    results: list[FrameResult] = []
+    for result in tracked:
+        if results:
+            between = range(results[-1].index + 1, result.index)
+            results += detector.interpolate(results[-1], result, [frame / fps for frame in between])
+        results.append(result)
     rest = range(results[-1].index + 1, len(drive))
     return results + detector.interpolate(results[-1], None, [frame / fps for frame in rest]), searched
 
