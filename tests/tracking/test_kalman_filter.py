@@ -22,6 +22,7 @@ from vehicle_detection.tracking.kalman_filter import (
     update,
     update_distances,
 )
+from vehicle_detection.tracking.track import TrackState
 
 SHAPE = (720, 1280)
 CAMERA = Camera.for_frame(SHAPE, horizon_std_px=0.0)
@@ -38,7 +39,7 @@ def moving_states():
 def corrected(mean, cov, edges, variance, *, innovation_mean=None, reject_outliers=False):
     if innovation_mean is None:
         innovation_mean = np.zeros((2, 4))
-    return update(mean, cov, innovation_mean, edges, variance, np.full(2, reject_outliers), 0.75)
+    return update(mean, cov, innovation_mean, edges, variance, np.full(2, reject_outliers), 0.1)
 
 
 def test_boxes_and_states_are_inverse():
@@ -172,7 +173,7 @@ def test_a_new_state_has_the_errors_of_its_edges():
     mean, cov = initiate(BOXES[:1], edge_std)
     np.testing.assert_allclose(EDGES @ cov[0] @ EDGES.T, np.diag([1, 4, 9, 16.0]), atol=1e-9)
     # Speeds in widths and heights per second.
-    np.testing.assert_allclose(np.sqrt(np.diag(cov[0])[4:]), np.array([100, 90, 100, 90]) * [3, 1, 0.7, 0.7])
+    np.testing.assert_allclose(np.sqrt(np.diag(cov[0])[4:]), np.array([100, 90, 100, 90]) * [2, 1, 0.7, 0.7])
     assert not cov[0, :4, 4:].any()
     assert not mean[0, 4:].any()
 
@@ -224,10 +225,13 @@ def test_an_edge_that_deviates_to_one_side_for_long_is_believed():
     variance, before = np.full((2, 4), 25.0), np.array([[0, 0, 9.0, 0], [0, 0, 0, 9.0]])
     after, after_cov, _ = corrected(mean, cov, edges, variance, innovation_mean=before)
     plain, _, _ = corrected(mean, cov, edges, variance)
-    # The first one deviates to the side of its past, and its edge gains a quarter of the innovation as error.
-    wide = cov[0].copy()
+    # The first one deviates to the side of its past. Its edge gains a quarter of the innovation as error of
+    # the position, and five times the innovation per second as error of the velocity.
     back = np.linalg.inv(EDGES[:, :4])
-    wide[:4, :4] += back @ np.diag([0, 0, (0.25 * 120.0) ** 2, 0]) @ back.T
+    added = back @ np.diag([0, 0, 120.0**2, 0]) @ back.T
+    moved = np.vstack([0.1 * np.eye(4), np.eye(4)])
+    wide = cov[0] + 5**2 * moved @ added @ moved.T
+    wide[:4, :4] += 0.25**2 * added
     expected, expected_cov = textbook(mean[0], wide, edges[0], variance[0])
     np.testing.assert_allclose(after[0], expected)
     np.testing.assert_allclose(after_cov[0], expected_cov, atol=1e-9)
@@ -268,7 +272,7 @@ def test_the_growth_that_counts_as_approach_is_limited():
     mean, cov, _ = moving_states()
     mean[:, 6:] = mean[:, 2:4] * [[5.0], [-5.0]]
     moved = KalmanSmoother(TrackParams()).predict(states_of(mean, cov), np.zeros(2, np.bool_), 0.1).mean
-    np.testing.assert_allclose(moved[:, 4:], mean[:, 4:] * np.exp([[0.3], [-0.3]]))
+    np.testing.assert_allclose(moved[:, 4:], mean[:, 4:] * np.exp([[0.6], [-0.6]]))
 
 
 def test_errors_of_coasting_tracks_are_limited():
@@ -298,11 +302,11 @@ def test_a_box_that_reaches_the_border_as_predicted_is_not_corrected_there():
     smoother, boxes = KalmanSmoother(TrackParams()), np.array([[1200.0, 300, 1300, 400]])
     states = states_of(*initiate(boxes, np.full((1, 4), 5.0)))
     inside = Measurements.from_boxes(np.array([[1200.0, 300, 1280, 400]]), SHAPE)
-    after = smoother.correct(states, [], inside, 0.04)
+    after = smoother.correct(states, [TrackState(1.0)], inside, 0.04)
     np.testing.assert_allclose(after.boxes(), boxes, atol=1e-3)
     # A prediction that ends before the border is corrected.
     states = states_of(*initiate(np.array([[1200.0, 300, 1260, 400]]), np.full((1, 4), 5.0)))
-    assert smoother.correct(states, [], inside, 0.04).boxes()[0, 2] > 1262
+    assert smoother.correct(states, [TrackState(1.0)], inside, 0.04).boxes()[0, 2] > 1262
 
 
 def test_correlated_errors_correct_less_at_high_frame_rates():
@@ -310,13 +314,29 @@ def test_correlated_errors_correct_less_at_high_frame_rates():
     states = states_of(*initiate(boxes, np.full((1, 4), 5.0)))
     measured = Measurements.from_boxes(boxes + 2, SHAPE)
     for dt, frames in ((0.04, 5.0), (0.4, 1.0)):
-        after = KalmanSmoother(params).correct(states, [], measured, dt)
+        after = KalmanSmoother(params).correct(states, [TrackState(1.0)], measured, dt)
         noise = np.square(np.array([100, 90, 100, 90]) * params.measurement_noise) * frames
         expected, _ = textbook(states.mean[0], states.cov[0], measured.boxes[0], noise)
         np.testing.assert_allclose(after.mean[0], expected)
         decay = max(math.exp(-dt / 0.15), 0.75)
         errors = normalized(states.mean[0], states.cov[0], measured.boxes[0], noise)
         np.testing.assert_allclose(after.innovation_mean[0], (1 - decay) * errors)
+
+
+def test_the_motion_of_a_vehicle_that_was_not_detected_for_long_is_unknown():
+    smoother = KalmanSmoother(TrackParams())
+    mean, cov, _ = moving_states()
+    states = states_of(mean, cov)._replace(innovation_mean=np.ones((2, 4)))
+    tracks = [TrackState(1.0, last_gap=gap) for gap in (0.4, 0.6)]
+    measured = Measurements.from_boxes(BOXES + 9.0, SHAPE)
+    after = smoother.correct(states, tracks, measured, 0.08)
+    for column, new in zip(after, smoother.initiate(measured)):
+        np.testing.assert_allclose(column[1], new[1])
+    assert not after.innovation_mean[1].any()
+    # After a shorter time, and where it is merged with another vehicle, the state is only corrected.
+    np.testing.assert_allclose(after.mean[0, 4], 30, atol=5)
+    merged = Measurements.from_boxes(BOXES + 9.0, SHAPE, merged=True)
+    np.testing.assert_allclose(smoother.correct(states, tracks, merged, 0.08).mean[1, 4], -80, atol=5)
 
 
 def test_the_way_of_a_coasting_track_is_the_integral_of_its_speed():

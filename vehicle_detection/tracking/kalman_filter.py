@@ -39,17 +39,20 @@ _FROM_EDGES = np.linalg.inv(_TO_EDGES)
 _DIAGONAL = np.arange(4)
 _MIN_SIZE = 4.0
 # Standard deviation of a new box's velocity ``[cx, cy, w, h]``, in box sizes per second.
-_INITIAL_SPEED_STD = np.array([3.0, 1.0, 0.7, 0.7])
+_INITIAL_SPEED_STD = np.array([2.0, 1.0, 0.7, 0.7])
 # Innovations in standard errors: above the first an edge is an outlier; the second is the clipping limit.
 _OUTLIER, _MAX_INNOVATION = 2.5, 6.0
-# Standard error that a persistent innovation adds to an edge of the track, as a fraction of the innovation.
-_PERSISTENT_STD = 0.25
+# Mean innovation (standard errors) of an edge above which it is persistent, and the standard errors that it
+# adds to the edge's position, as a fraction of the innovation, and to its velocity, per second.
+_PERSISTENT, _PERSISTENT_STD, _PERSISTENT_SPEED_STD = 2.0, 0.25, 5.0
 # Time constant (s) of the innovation's mean, and minimum weight of its past from frame to frame.
 _INNOVATION_TIME, _MIN_INNOVATION_DECAY = 0.15, 0.75
 # Time constants (s) with which the velocity ``[cx, cy, w, h]`` of a coasting track decays.
 _VELOCITY_DECAY = np.array([1.5, 1.5, 0.5, 0.5])
 # Maximum relative change of size per second that is interpreted as an approach.
-_MAX_GROWTH = 1.5
+_MAX_GROWTH = 3.0
+# Seconds without a detection after which the velocity of a vehicle that is detected again is unknown.
+_MAX_VELOCITY_AGE = 0.5
 # Prior aspect ratio (width to height) of a box that the frame's border truncates, and its relative error.
 _TRUNCATED_ASPECT, _TRUNCATED_STD = 1.5, 0.3
 # Limits of standard errors: positions and velocities in box sizes.
@@ -169,9 +172,13 @@ class KalmanSmoother:
         correlated_frames = max(1.0, params.measurement_correlation_time / dt)
         noise = np.square(mean[:, [2, 3, 2, 3]] * params.measurement_noise) * correlated_frames
         variance = np.where(beyond, UNKNOWN, noise)
-        decay = max(math.exp(-dt / _INNOVATION_TIME), _MIN_INNOVATION_DECAY)
-        corrected = update(*states[:3], boxes, variance, measured.merged, decay)
-        return KalmanStates(*corrected, *states[3:])
+        corrected = KalmanStates(*update(*states[:3], boxes, variance, measured.merged, dt), *states[3:])
+        again = np.array([track.last_gap > _MAX_VELOCITY_AGE for track in tracks]) & ~measured.merged
+        if again.any():
+            new = (*self.initiate(measured), np.zeros((len(boxes), 4)))
+            for column, values in zip(corrected, new):
+                column[again] = values[again]
+        return corrected
 
 
 def boxes_from_states(mean: Floats) -> Floats:
@@ -212,25 +219,29 @@ def update(
     edges: Floats,
     variance: Floats,
     reject_outliers: Bools,
-    decay: float,
+    dt: float,
 ) -> tuple[Floats, Floats, Floats]:
     """Correct states by measured edges; returns means, covariances and innovation means.
 
     The weight of an outlier is reduced (Huber, *Robust Statistics*, chapter 7), or set to 0 with
     `reject_outliers`, so that one wrong box does not distort the track. If an edge deviates persistently to
-    one side, the track is wrong: the variance of that edge's position is increased instead.
+    one side, the track is wrong: the variances of that edge's position and of its velocity during the last
+    `dt` seconds are increased instead.
     """
     cross = cov[:, :, :4] @ _TO_EDGES.T  # cov @ H.T, because H is zero for the velocities
     innovation_cov = _TO_EDGES @ cross[:, :4]
     innovation = edges - boxes_from_states(mean)
     normalized = innovation / np.sqrt(innovation_cov[:, _DIAGONAL, _DIAGONAL] + variance)
     clipped = np.where(reject_outliers[:, None], 0.0, np.clip(normalized, -_MAX_INNOVATION, _MAX_INNOVATION))
+    decay = max(math.exp(-dt / _INNOVATION_TIME), _MIN_INNOVATION_DECAY)
     innovation_mean = decay * innovation_mean + (1 - decay) * clipped
-    persistent = (np.abs(innovation_mean) > _OUTLIER) & (innovation_mean * normalized > 0)
+    persistent = (np.abs(innovation_mean) > _PERSISTENT) & (innovation_mean * normalized > 0)
     if persistent.any():
-        added = np.where(persistent, np.square(_PERSISTENT_STD * innovation), 0.0)
-        cov = cov.copy()
-        cov[:, :4, :4] += (_FROM_EDGES * added[:, None, :]) @ _FROM_EDGES.T
+        squared = np.where(persistent, np.square(innovation), 0.0)
+        added = (_FROM_EDGES * squared[:, None, :]) @ _FROM_EDGES.T
+        speed = _PERSISTENT_SPEED_STD**2
+        factors = [[_PERSISTENT_STD**2 + speed * dt**2, speed * dt], [speed * dt, speed]]
+        cov = cov + np.kron(factors, added)
         cross = cov[:, :, :4] @ _TO_EDGES.T
         innovation_cov = _TO_EDGES @ cross[:, :4]
     penalty = np.where(persistent, 1.0, np.maximum(np.square(normalized / _OUTLIER), 1.0))

@@ -70,6 +70,7 @@ class TrackState:
     all_misses: int = 0
     age: float = 0.0
     time_since_update: float = 0.0
+    last_gap: float = 0.0  # time without a detection before the last one
     unexplained_gap: float = 0.0  # time without a detection while no other vehicle hides it
     hidden_gap: float = 0.0  # time without a detection while another vehicle hides it
     coast_budget: float = 0.0  # time for which it is still shown without a detection
@@ -110,6 +111,7 @@ class TrackState:
             self.time_since_update += dt
         else:
             self.hits += 1
+            self.last_gap = self.time_since_update
             self.misses, self.time_since_update = 0, 0.0
             self.unexplained_gap, self.hidden_gap, self.covered_budget = 0.0, 0.0, params.show_covered
             self.coast_budget = min(self.coast_budget + dt, params.show_coast) if self.id else 0.0
