@@ -242,7 +242,9 @@ def run_tests(tests: Sequence[str], *, mutated: tuple[Path, ast.Module] | None =
     if mutated is not None:
         path, tree = mutated
         sys.meta_path.insert(0, _Finder(path, compile(tree, str(path), "exec")))
-    return int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *tests]))
+    # Plain assertions, because pytest would import modules with doctests by an import hook of its own.
+    options = ["-x", "-q", "--assert=plain", "-p", "no:cacheprovider", "-p", "no:xdist"]
+    return int(pytest.main([*options, *tests]))
 
 
 class Recorder:

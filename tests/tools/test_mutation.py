@@ -89,7 +89,10 @@ def test_the_files_and_their_tests_exist():
 def test_survivors_are_printed_and_can_be_tried_again(tmp_path):
     (tmp_path / "package").mkdir()
     (tmp_path / "package/__init__.py").touch()
-    (tmp_path / "package/clip.py").write_text("def clip(x, high=10):\n    return min(x, high)\n")
+    (tmp_path / "pytest.ini").write_text("[pytest]\naddopts = --doctest-modules\n")
+    (tmp_path / "package/clip.py").write_text(
+        'def clip(x, high=10):\n    """\n    >>> clip(3)\n    3\n    """\n    return min(x, high)\n'
+    )
     (tmp_path / "test_clip.py").write_text(
         "from package.clip import clip\n\ndef test_clip():\n    assert clip(3) == 3\n"
     )
