@@ -215,7 +215,7 @@ def test_a_processor_without_the_instruction_uses_half_words(caplog):
     broken.compile.side_effect = RuntimeError("no such intrinsic")
     correlation._packed_format.cache_clear()
     try:
-        with mock.patch.object(correlation, "_find_windows", broken):
+        with mock.patch.object(correlation, "_correlate_blocks", broken):
             assert correlation._packed_format() == HALF_WORDS
     finally:
         correlation._packed_format.cache_clear()

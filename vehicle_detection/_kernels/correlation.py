@@ -200,24 +200,21 @@ class PackedSearch:
         Templates are counted in the chosen order. With `columns`, these columns of the map become one cell
         in each row, with the channels of one column after those of the other; the rows lie side by side.
         """
-        words, rows, _ = packed.shape
-        strip = workspace.take((len(columns) * words, 1, rows), packed.dtype, "strip")
+        cells = packed
+        if len(columns):
+            cells = packed.transpose(2, 0, 1)[columns].reshape(-1, 1, packed.shape[1])
         sums = workspace.take((self.length,), np.int32, "window sums")
         found = workspace.take((self.windows, 4), np.int32, "windows")
-        arrays = self.weights, self.offsets, self.spans, sums, self.stride, self.planes, found
-        return found[: _find_windows(packed, columns, strip, *arrays)].copy()
+        _correlate_blocks(cells, self.weights, self.offsets, self.spans, sums, self.stride)
+        return found[: _find_windows(sums, self.stride, self.planes, found)].copy()
 
 
 @functools.cache
 def _packed_format() -> PackedFormat:
     """Return the host's format, or half-words if its instruction does not compile."""
     packing = host_packing()
-    words, sums, kernel = numba.from_dtype(np.dtype(packing.dtype)), numba.int32, cast("Any", _find_windows)
-    cells = words[:, :, ::1]
-    table = numba.int64[:, ::1]
-    arrays = cells, numba.intp[::1], cells, cells, numba.intp[:, ::1], table, sums[::1]
     try:
-        kernel.compile((*arrays, numba.intp, table, sums[:, ::1]))
+        _compile_blocks(numba.from_dtype(np.dtype(packing.dtype)), numba.int32)
     except (numba.core.errors.NumbaError, RuntimeError) as error:  # LLVM's are RuntimeErrors
         logging.getLogger(__name__).warning("correlation uses slower instructions: %s", error)
         return HALF_WORDS
@@ -227,22 +224,18 @@ def _packed_format() -> PackedFormat:
 @functools.cache
 def _kernel() -> Callable[..., None]:
     """Return the block kernel, or plain loops if the block kernel does not compile."""
-    floats, kernel = numba.float32, cast("Any", _correlate_blocks)
     try:
-        kernel.compile(
-            (
-                floats[:, :, ::1],
-                floats[:, :, ::1],
-                numba.intp[:, ::1],
-                numba.int64[:, ::1],
-                floats[::1],
-                numba.intp,
-            )
-        )
+        _compile_blocks(numba.float32, numba.float32)
     except numba.core.errors.NumbaError as error:
         logging.getLogger(__name__).warning("correlation uses plain, slower loops: %s", error)
         return _correlate_plain
     return _correlate_blocks
+
+
+def _compile_blocks(number: Any, total: Any) -> None:
+    """Compile the block kernel for numbers and sums of these types."""
+    maps, table = number[:, :, ::1], numba.int64[:, ::1]
+    cast("Any", _correlate_blocks).compile((maps, maps, numba.intp[:, ::1], table, total[::1], numba.intp))
 
 
 @jit
@@ -260,40 +253,29 @@ def _correlate_blocks(channels, weights, offsets, spans, sums, stride):
     for position in range(len(sums)):
         sums[position] = 0
     # A block may read beyond the last cell of a row; those products are added where no window is.
-    tail = np.zeros((depth, _COLUMNS), channels.dtype)
+    tail = np.empty((depth, _COLUMNS), channels.dtype)
     for y in range(rows):
         for x in range(0, columns, _COLUMNS):
-            first = y * columns + x
-            if first + _COLUMNS <= total:
-                for block_start, block_stop, row_start, row_stop in spans:
-                    if row_start <= y < row_stop:
-                        for block in range(block_start, block_stop):
-                            _add_products(weights, block, flat, first, sums, offsets, y * stride + x)
-            else:
+            cells, first = flat, y * columns + x
+            if first + _COLUMNS > total:
                 for channel in range(depth):
-                    for position in range(first, total):
-                        tail[channel, position - first] = flat[channel, position]
-                for block_start, block_stop, row_start, row_stop in spans:
-                    if row_start <= y < row_stop:
-                        for block in range(block_start, block_stop):
-                            _add_products(weights, block, tail, 0, sums, offsets, y * stride + x)
+                    for column in range(_COLUMNS):
+                        position = min(first + column, total - 1)
+                        tail[channel, column] = flat[channel, position]
+                cells, first = tail, 0
+            for block_start, block_stop, row_start, row_stop in spans:
+                if row_start <= y < row_stop:
+                    for block in range(block_start, block_stop):
+                        _add_products(weights, block, cells, first, sums, offsets, y * stride + x)
 
 
 @jit
-def _find_windows(packed, columns, strip, weights, offsets, spans, sums, stride, planes, found):
-    """Correlate packed channels, and list the windows with a score above the limit of their template.
+def _find_windows(sums, stride, planes, found):
+    """List the windows with a score above the limit of their template; returns their number.
 
-    `strip` is memory for the `columns` of the map, and `found` the output ``(windows, 4)``, see
-    `PackedSearch.find`; returns the number of windows.
+    `sums` and `stride` are those of `_correlate_blocks`, and `found` is the output ``(windows, 4)``, see
+    `PackedSearch.find`.
     """
-    if len(columns):
-        words, rows = packed.shape[:2]
-        for number in range(len(columns)):
-            for word in range(words):
-                for row in range(rows):
-                    strip[number * words + word, 0, row] = packed[word, row, columns[number]]
-        packed = strip
-    _correlate_blocks(packed, weights, offsets, spans, sums, stride)
     count = 0
     for template in range(len(planes)):
         corner, first, last, width, limit = planes[template]

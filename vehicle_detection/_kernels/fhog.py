@@ -175,7 +175,7 @@ def resample(sums, square, first, squares, grid, cells):
                 wa, wb = weights_x[x, tap], weights_x[x, tap + 1]
                 for k in range(16):
                     row[x, k] += wa * inner[a, k] + wb * inner[b, k]
-        for k in range(16):
+        for k in range(len(cells)):
             out = cells[k, y]
             for x in range(columns):
                 out[x] = row[x, k]
@@ -191,7 +191,7 @@ def _block_factors(cells, eps, factors):
         line, above = energy[y % 2], energy[(y + 1) % 2]
         for x in range(columns):
             line[x] = np.float32(0)
-        for k in range(8):
+        for k in range(len(cells) // 2):
             positive, negative = cells[k, y], cells[k + 8, y]
             for x in range(columns):
                 both = positive[x] + negative[x]
@@ -218,7 +218,7 @@ def _normalize_row(cells, factors, y, channels):
     t0, t1, t2, t3 = channels[16], channels[17], channels[18], channels[19]
     for x in range(columns):
         t0[x] = t1[x] = t2[x] = t3[x] = np.float32(0)
-    for k in range(16):
+    for k in range(len(cells)):
         line, out = cells[k, y + 1, 1:], channels[k]
         for x in range(columns):
             value = line[x]
@@ -229,70 +229,57 @@ def _normalize_row(cells, factors, y, channels):
             t2[x] += q2
             t3[x] += q3
             out[x] = half * ((q0 + q1) + (q2 + q3))
-    for k in range(16, 20):
+    for k in range(len(cells), len(channels)):
         out = channels[k]
         for x in range(columns):
             out[x] *= texture_scale
 
 
 @jit
-def fhog_channels(cells, eps, channels):
-    """FHOG channels of several grids of cells, ``(grids, 20, rows, columns)`` float32.
+def fhog_channels(cells, eps, channels, scales, per_word, packed):
+    """FHOG channels of several grids of cells, as numbers or as small integers in words of 32 bits.
 
-    `cells` are the outputs of `resample`; `eps` is added to the energy of a block.
+    `cells` are the outputs of `resample`; `eps` is added to the energy of a block. If `per_word` is 0, the
+    output is `channels`, ``(grids, 20, rows, columns)`` float32. Else it is `packed`,
+    ``(grids, 20 / per_word, rows, columns)`` int32: the value of channel `k` is multiplied by ``scales[k]``,
+    rounded, and limited to 255; the first of a word's 4 or 2 channels is in the lowest bits. Both are one
+    kernel because most of the time of compiling it goes into what they share.
     """
-    count, _, rows, columns = channels.shape
+    grids, _, rows, columns = cells.shape
+    rows, columns = rows - 2, columns - 2
     factors = np.empty((rows + 1, columns + 1), np.float32)
     line = np.empty((20, columns), np.float32)
-    for number in range(count):
+    half, limit = np.float32(0.5), np.float32(255)
+    for number in range(grids):
         _block_factors(cells[number], eps, factors)
         for y in range(rows):
             _normalize_row(cells[number], factors, y, line)
-            for k in range(20):
-                for x in range(columns):
-                    channels[number, k, y, x] = line[k, x]
-
-
-@jit
-def packed_channels(cells, eps, scales, per_word, packed):
-    """FHOG channels of the cells of a grid as small integers, several in each word of 32 bits.
-
-    The value of channel `k` is multiplied by ``scales[k]``, rounded, and limited to 255. `packed` is the
-    output ``(20 / per_word, rows, columns)`` int32; the first channel is in the lowest bits. `cells` is the
-    output of `resample`, and `eps` as in `fhog_channels`.
-    """
-    words, rows, columns = packed.shape
-    factors = np.empty((rows + 1, columns + 1), np.float32)
-    line = np.empty((20, columns), np.float32)
-    _block_factors(cells, eps, factors)
-    half, limit = np.float32(0.5), np.float32(255)
-    for y in range(rows):
-        _normalize_row(cells, factors, y, line)
-        for word in range(words):
-            out = packed[word, y]
             if per_word == 4:
-                a, b, c, d = line[4 * word], line[4 * word + 1], line[4 * word + 2], line[4 * word + 3]
-                sa, sb, sc, sd = (
-                    scales[4 * word],
-                    scales[4 * word + 1],
-                    scales[4 * word + 2],
-                    scales[4 * word + 3],
-                )
-                for x in range(columns):
-                    low = numba.int32(min(a[x] * sa + half, limit)) | (
-                        numba.int32(min(b[x] * sb + half, limit)) << 8
-                    )
-                    high = numba.int32(min(c[x] * sc + half, limit)) | (
-                        numba.int32(min(d[x] * sd + half, limit)) << 8
-                    )
-                    out[x] = low | (high << 16)
+                for word in range(packed.shape[1]):
+                    out, k = packed[number, word, y], 4 * word
+                    a, b, c, d = line[k], line[k + 1], line[k + 2], line[k + 3]
+                    sa, sb, sc, sd = scales[k], scales[k + 1], scales[k + 2], scales[k + 3]
+                    for x in range(columns):
+                        low = numba.int32(min(a[x] * sa + half, limit)) | (
+                            numba.int32(min(b[x] * sb + half, limit)) << 8
+                        )
+                        high = numba.int32(min(c[x] * sc + half, limit)) | (
+                            numba.int32(min(d[x] * sd + half, limit)) << 8
+                        )
+                        out[x] = low | (high << 16)
+            elif per_word == 2:
+                for word in range(packed.shape[1]):
+                    out, k = packed[number, word, y], 2 * word
+                    a, b, sa, sb = line[k], line[k + 1], scales[k], scales[k + 1]
+                    for x in range(columns):
+                        out[x] = numba.int32(min(a[x] * sa + half, limit)) | (
+                            numba.int32(min(b[x] * sb + half, limit)) << 16
+                        )
             else:
-                a, b = line[2 * word], line[2 * word + 1]
-                sa, sb = scales[2 * word], scales[2 * word + 1]
-                for x in range(columns):
-                    out[x] = numba.int32(min(a[x] * sa + half, limit)) | (
-                        numba.int32(min(b[x] * sb + half, limit)) << 16
-                    )
+                for k in range(channels.shape[1]):
+                    source, target = line[k], channels[number, k, y]
+                    for x in range(columns):
+                        target[x] = source[x]
 
 
 @jit

@@ -46,7 +46,7 @@ class _Announcement(event.Listener):  # type: ignore[misc]
         module = event.data["dispatcher"].py_func.__module__
         if not self._announced and module.startswith(__package__):
             self._announced = True
-            log.info("compiling for this processor at the first use, which takes up to half a minute")
+            log.info("compiling for this processor at the first use, which takes up to 15 seconds")
 
     def on_end(self, event: Any) -> None:
         """Do nothing; numba calls it."""

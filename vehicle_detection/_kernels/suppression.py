@@ -31,7 +31,8 @@ def suppress(boxes, order, max_iou, max_coverage, max_boxes):
     `max_coverage` of the smaller one.
     """
     iou, coverage = np.empty(len(boxes)), np.empty(len(boxes))
-    dropped = np.zeros(len(boxes), np.bool_)
+    dropped = np.empty(len(boxes), np.bool_)
+    dropped[:] = False
     kept = np.empty(len(order), np.int64)
     count = 0
     for row in order:

@@ -169,7 +169,7 @@ class EdgePyramid:
         cells = _new_cells(channels)
         for grid, each in zip(grids / (SQUARE * 2**number), cells):
             _fhog_kernels.resample(octave.sums, SQUARE, octave.first, squares, grid, each)
-        _fhog_kernels.fhog_channels(cells, _EPS, channels)
+        _fhog_kernels.fhog_channels(cells, _EPS, channels, CHANNEL_SCALES, 0, _NO_WORDS)
 
     def _compute_small(self, grids: NDArray[np.float64], channels: NDArray[np.float32]) -> None:
         """FHOG channels of grids of small cells, from small squares of the pixels around each."""
@@ -187,7 +187,7 @@ class EdgePyramid:
             sums = np.empty((down + 2, across + 2, 16), np.float32)
             _fhog_kernels.orientation_sums(region, _COTANGENTS, square, -1, sums)
             _fhog_kernels.resample(sums, square, -1, down, scaled[number], cells[number])
-        _fhog_kernels.fhog_channels(cells, _EPS, channels)
+        _fhog_kernels.fhog_channels(cells, _EPS, channels, CHANNEL_SCALES, 0, _NO_WORDS)
 
     def feature_map(self, grid: CellGrid) -> FeatureMap:
         """FHOG channels of one grid."""
@@ -205,14 +205,18 @@ class EdgePyramid:
         """
         number = self.octave_of(math.sqrt(grid.step_x * grid.step_y))
         octave, scale = self.octaves[number], SQUARE * 2**number
-        cells = workspace.take((16, grid.rows + 2, grid.columns + 2), np.float32, "cells")
+        cells = workspace.take((1, 16, grid.rows + 2, grid.columns + 2), np.float32, "cells")
         shape = N_CHANNELS // packing.per_word, grid.rows, grid.columns
         packed = workspace.take(shape, packing.dtype, "packed")
         squares = -(-octave.planes.shape[1] // SQUARE)
         corner = np.array([grid.left, grid.top, grid.step_x, grid.step_y]) / scale
-        _fhog_kernels.resample(octave.sums, SQUARE, octave.first, squares, corner, cells)
-        _fhog_kernels.packed_channels(cells, _EPS, CHANNEL_SCALES, packing.per_word, packed)
+        _fhog_kernels.resample(octave.sums, SQUARE, octave.first, squares, corner, cells[0])
+        words = packed.view(np.int32)[None]
+        _fhog_kernels.fhog_channels(cells, _EPS, _NO_CHANNELS, CHANNEL_SCALES, packing.per_word, words)
         return packed
+
+
+_NO_CHANNELS, _NO_WORDS = np.empty((0, 0, 0, 0), np.float32), np.empty((0, 0, 0, 0), np.int32)
 
 
 def _new_cells(channels: NDArray[np.float32]) -> NDArray[np.float32]:
