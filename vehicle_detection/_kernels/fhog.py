@@ -8,6 +8,7 @@ import numba
 import numpy as np
 
 from vehicle_detection._kernels.jit import jit
+from vehicle_detection._kernels.vector import weighted_sum
 
 SQUARE, SMALL_SQUARE = 4, 2
 """Sides in pixels of the squares over which gradients are summed, and of those for crops of small cells."""
@@ -140,41 +141,37 @@ def resample(sums, square, first, squares, grid, cells):
     _, rows, columns = cells.shape
     step_x, step_y = grid[2], grid[3]
     left, top = grid[0] - step_x, grid[1] - step_y
-    # Two taps at a time along a row, at first four; those beyond the tent have no weight.
-    taps_x, taps_y = max(4, 2 * math.ceil((2 * step_x + 1) / 2)), math.ceil(2 * step_y) + 1
+    # Two taps at a time along a row, at first three along a column; those beyond the tent have no weight.
+    taps_x, taps_y = 2 * math.ceil((2 * step_x + 1) / 2), max(3, math.ceil(2 * step_y) + 1)
     index_x, weights_x = np.empty((columns, taps_x), np.int64), np.empty((columns, taps_x), np.float32)
     index_y, weights_y = np.empty((rows, taps_y), np.int64), np.empty((rows, taps_y), np.float32)
     _tent_taps(left, step_x, sums.shape[1] - 2, taps_x, index_x, weights_x)
     _tent_taps(top, step_y, squares, taps_y, index_y, weights_y)
     low, high = index_x[0, 0], index_x[columns - 1, taps_x - 1] + 1
+    for x in range(columns):
+        for tap in range(taps_x):
+            index_x[x, tap] = 16 * (index_x[x, tap] - low)
     count = 16 * (high - low)
     flat = sums.reshape(len(sums), -1)
     line, row = np.empty(count, np.float32), np.empty((columns, 16), np.float32)
-    inner = line.reshape(-1, 16)
     scale = np.float32(1 / (square * square))
     for y in range(rows):
         for tap in range(taps_y):
             # Rows that were not computed are replaced by the closest one.
-            place = min(max(index_y[y, tap] - 1 - first, 0), len(sums) - 1)
-            source, weight = flat[place, 16 * low : 16 * high], weights_y[y, tap] * scale
-            if tap == 0:
-                for i in range(count):
-                    line[i] = weight * source[i]
-            elif weight != 0:
+            index_y[y, tap] = min(max(index_y[y, tap] - 1 - first, 0), len(sums) - 1)
+        above = flat[index_y[y, 0], 16 * low : 16 * high]
+        middle = flat[index_y[y, 1], 16 * low : 16 * high]
+        below = flat[index_y[y, 2], 16 * low : 16 * high]
+        wa, wb, wc = weights_y[y, 0] * scale, weights_y[y, 1] * scale, weights_y[y, 2] * scale
+        for i in range(count):
+            line[i] = wa * above[i] + wb * middle[i] + wc * below[i]
+        for tap in range(3, taps_y):
+            source, weight = flat[index_y[y, tap], 16 * low : 16 * high], weights_y[y, tap] * scale
+            if weight != 0:
                 for i in range(count):
                     line[i] += weight * source[i]
         for x in range(columns):
-            a, b = index_x[x, 0] - low, index_x[x, 1] - low
-            c, d = index_x[x, 2] - low, index_x[x, 3] - low
-            wa, wb, wc, wd = weights_x[x, 0], weights_x[x, 1], weights_x[x, 2], weights_x[x, 3]
-            for k in range(16):
-                pair = wa * inner[a, k] + wb * inner[b, k]
-                row[x, k] = pair + (wc * inner[c, k] + wd * inner[d, k])
-            for tap in range(4, taps_x, 2):
-                a, b = index_x[x, tap] - low, index_x[x, tap + 1] - low
-                wa, wb = weights_x[x, tap], weights_x[x, tap + 1]
-                for k in range(16):
-                    row[x, k] += wa * inner[a, k] + wb * inner[b, k]
+            weighted_sum(line, index_x[x], weights_x[x], taps_x, row[x])
         for k in range(len(cells)):
             out = cells[k, y]
             for x in range(columns):

@@ -134,12 +134,6 @@ def block_adder(block: Block) -> Callable[..., None]:
                 value.align = 8 if kind is index_type else 4
                 return value
 
-            def broadcast(value: Any) -> Any:
-                undefined = ir.Constant(vector, ir.Undefined)
-                single = builder.insert_element(undefined, value, ir.Constant(int_type, 0))
-                zeros = ir.Constant(ir.VectorType(int_type, lanes), [0] * lanes)
-                return builder.shuffle_vector(single, undefined, zeros)
-
             def vector_offsets(offset: Any) -> list[Any]:
                 return [builder.add(offset, constant(4 * lanes * part)) for part in range(vectors)]
 
@@ -159,7 +153,8 @@ def block_adder(block: Block) -> Callable[..., None]:
             values = [load(right, offset, vector) for offset in vector_offsets(channel)]
             updated = []
             for row, line in enumerate(totals):
-                factor = broadcast(load(left, builder.add(weight, constant(4 * row)), element))
+                number = load(left, builder.add(weight, constant(4 * row)), element)
+                factor = _broadcast(builder, number, vector)
                 updated.append(
                     [products(builder, total, value, factor) for value, total in zip(values, line)]
                 )
@@ -192,6 +187,54 @@ def block_adder(block: Block) -> Callable[..., None]:
         return signature, generate
 
     return add_products  # type: ignore[no-any-return]
+
+
+LANES = 16
+"""Numbers that `weighted_sum` adds side by side."""
+
+
+@intrinsic
+def weighted_sum(_context: Any, values: Any, starts: Any, weights: Any, terms: Any, out: Any) -> Any:
+    """Write ``sum(weights[i] * values[starts[i] : starts[i] + LANES] for i in range(terms))`` to `out`.
+
+    For use in kernels, where plain loops stay scalar, because `out` might overlap `values`. Two products are
+    added at a time; `terms` is even and at least 2. `starts` is int64, the others are float32; all are 1-D
+    and contiguous. Nothing is checked.
+    """
+    signature = types.void(values, starts, weights, types.intp, out)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        source, places, factors, target = (
+            context.make_array(signature.args[number])(context, builder, arguments[number]).data
+            for number in (0, 1, 2, 4)
+        )
+        vector = ir.VectorType(ir.FloatType(), LANES)
+        zero, one, two = (context.get_constant(types.intp, number) for number in range(3))
+
+        def product(term: Any) -> Any:
+            start = builder.load(builder.gep(places, [term]))
+            chosen = builder.load(builder.bitcast(builder.gep(source, [start]), vector.as_pointer()))
+            chosen.align = 4
+            factor = _broadcast(builder, builder.load(builder.gep(factors, [term])), vector)
+            return builder.fmul(factor, chosen)
+
+        total = cgutils.alloca_once_value(builder, ir.Constant(vector, [0.0] * LANES))
+        with cgutils.for_range_slice(builder, zero, arguments[3], two, zero.type) as (term, _):
+            pair = builder.fadd(product(term), product(builder.add(term, one)))
+            builder.store(builder.fadd(builder.load(total), pair), total)
+        stored = builder.store(builder.load(total), builder.bitcast(target, vector.as_pointer()))
+        stored.align = 4
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+def _broadcast(builder: Any, value: Any, vector: Any) -> Any:
+    """Vector whose elements are all `value`."""
+    undefined, index = ir.Constant(vector, ir.Undefined), ir.IntType(32)
+    single = builder.insert_element(undefined, value, ir.Constant(index, 0))
+    zeros = ir.Constant(ir.VectorType(index, vector.count), [0] * vector.count)
+    return builder.shuffle_vector(single, undefined, zeros)
 
 
 def _add_floats(builder: Any, total: Any, value: Any, factor: Any) -> Any:
