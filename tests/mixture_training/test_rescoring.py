@@ -98,7 +98,7 @@ def test_folding_is_the_transpose_of_unfolding():
     rng = np.random.default_rng(2)
     for stride in (1, 2):
         values = rng.normal(size=(3, 2, 9, 9)).astype(np.float32)
-        unfolded, _ = training.unfold(values, stride)
+        unfolded, _ = training._unfold(values, stride)
         other = rng.normal(size=unfolded.shape).astype(np.float32)
         folded = training._fold(other, values.shape, stride)
         np.testing.assert_allclose((unfolded * other).sum(), (values * folded).sum(), rtol=1e-3)

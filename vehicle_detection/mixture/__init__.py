@@ -28,10 +28,8 @@ from vehicle_detection.mixture.rescoring import (
     Layer,
     Network,
     Rescorer,
-    flatten,
     last_cells,
     network_inputs,
-    unfold,
 )
 from vehicle_detection.mixture.search import MixtureSearch, frame_grid
 from vehicle_detection.mixture.template import MixtureTemplate, smallest_box
@@ -57,7 +55,6 @@ __all__ = [
     "TemplateMixture",
     "denoise",
     "edge_features",
-    "flatten",
     "frame_grid",
     "last_cells",
     "load_model",
@@ -69,7 +66,6 @@ __all__ = [
     "reduce_haze",
     "rescoring_features",
     "smallest_box",
-    "unfold",
     "vote_boxes",
     "window_grid",
 ]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_number, finite_array
@@ -84,7 +86,7 @@ class Network:
         object.__setattr__(self, "layers", tuple(layers))
         object.__setattr__(self, "_products", tuple(DenseLayer(layer.weights) for layer in layers))
 
-    def outputs(self, columns: Singles, shape: tuple[int, int, int]) -> Floats:
+    def outputs(self, columns: Singles, shape: tuple[int, ...]) -> Floats:
         """Log-odds and shifts of the edges, ``(N, 5)``, of crops whose cells are unfolded."""
         for number, (layer, product) in enumerate(zip(self.layers, self._products)):
             values = product(columns) + layer.bias[:, None]
@@ -94,9 +96,9 @@ class Network:
             if number < len(STRIDES):
                 values = values.reshape(len(layer.bias), *shape)
                 if number + 1 < len(STRIDES):
-                    columns, shape = unfold(values, STRIDES[number + 1])
+                    columns, shape = _unfold(values, STRIDES[number + 1])
                 else:
-                    columns = flatten(values)
+                    columns = values.reshape(math.prod(values.shape[:3]), shape[-1])
         return columns.T.astype(np.float64)
 
 
@@ -134,7 +136,8 @@ class Rescorer:
 
         `inputs` are `network_inputs`.
         """
-        columns, shape = unfold(inputs, STRIDES[0])
+        # Neighbors in memory are the same cell of each crop: whole rows of them are copied.
+        columns, shape = _unfold(np.ascontiguousarray(inputs.transpose(0, 2, 3, 1)), STRIDES[0])
         outputs = np.mean([network.outputs(columns, shape) for network in self.networks], axis=0)
         return outputs[:, 0], np.clip(outputs[:, 1:], -MAX_CORRECTION, MAX_CORRECTION)
 
@@ -178,25 +181,15 @@ def network_inputs(edges: Singles, colors: Singles) -> Singles:
     return np.ascontiguousarray(inputs.swapaxes(0, 1))
 
 
-def unfold(values: Singles, stride: int) -> tuple[Singles, tuple[int, int, int]]:
+def _unfold(values: Singles, stride: int) -> tuple[Singles, tuple[int, ...]]:
     """List the 3x3 cells around each output of a convolution, ``(9 * channels, outputs)``.
 
-    `values` is ``(channels, N, rows, columns)``; also returns the outputs' shape, ``(N, rows, columns)``.
+    `values` is ``(channels, rows, columns, N)``; also returns the outputs' shape, ``(rows, columns, N)``.
     """
-    channels, count, rows, columns = values.shape
-    high, wide = ((side - KERNEL) // stride + 1 for side in (rows, columns))
-    unfolded = np.empty((KERNEL, KERNEL, channels, count, high, wide), np.float32)
-    for i in range(KERNEL):
-        for j in range(KERNEL):
-            stop_y, stop_x = i + stride * (high - 1) + 1, j + stride * (wide - 1) + 1
-            unfolded[i, j] = values[:, :, i:stop_y:stride, j:stop_x:stride]
-    return unfolded.reshape(KERNEL**2 * channels, -1), (count, high, wide)
-
-
-def flatten(values: Singles) -> Singles:
-    """List the values of each crop, ``(channels * rows * columns, N)``."""
-    channels, count, rows, columns = values.shape
-    return np.ascontiguousarray(values.transpose(0, 2, 3, 1)).reshape(channels * rows * columns, count)
+    windows = sliding_window_view(values, (KERNEL, KERNEL), axis=(1, 2))[:, ::stride, ::stride]
+    shape = windows.shape[1:4]
+    columns = windows.transpose(4, 5, 0, 1, 2, 3).reshape(KERNEL**2 * len(values), math.prod(shape))
+    return columns, shape
 
 
 def last_cells() -> int:

@@ -25,11 +25,9 @@ from vehicle_detection.mixture import (
     MixtureSearch,
     Network,
     Rescorer,
-    flatten,
     last_cells,
     network_inputs,
     rescoring_features,
-    unfold,
 )
 from vehicle_detection.mixture_training.negatives import is_negative
 from vehicle_detection.mixture_training.positives import jitter_boxes
@@ -202,7 +200,7 @@ def _gradients(values: list[Singles], batch: Samples, rng: np.random.Generator |
     for number, (weight, bias) in enumerate(zip(weights, biases)):
         shapes.append(current.shape)
         if number < len(STRIDES):
-            unfolded, shape = unfold(current, STRIDES[number])
+            unfolded, shape = _unfold(current, STRIDES[number])
         else:
             unfolded = current
         columns.append(unfolded)
@@ -218,7 +216,8 @@ def _gradients(values: list[Singles], batch: Samples, rng: np.random.Generator |
             current = current.reshape(-1, *shape)
         if number + 1 == len(STRIDES):
             last_shape = current.shape
-            current = flatten(current)
+            channels, count, rows, wide = current.shape
+            current = current.transpose(0, 2, 3, 1).reshape(channels * rows * wide, count)
     gradient = _loss_gradient(current, batch)
     gradients: list[Singles] = []
     for number in range(len(weights) - 1, -1, -1):
@@ -245,8 +244,23 @@ def _loss_gradient(outputs: Singles, batch: Samples) -> Singles:
     return gradient
 
 
+def _unfold(values: Singles, stride: int) -> tuple[Singles, tuple[int, int, int]]:
+    """List the 3x3 cells around each output of a convolution, ``(9 * channels, outputs)``.
+
+    `values` is ``(channels, N, rows, columns)``; also returns the outputs' shape, ``(N, rows, columns)``.
+    """
+    channels, count, rows, columns = values.shape
+    high, wide = ((side - KERNEL) // stride + 1 for side in (rows, columns))
+    unfolded = np.empty((KERNEL, KERNEL, channels, count, high, wide), np.float32)
+    for i in range(KERNEL):
+        for j in range(KERNEL):
+            stop_y, stop_x = i + stride * (high - 1) + 1, j + stride * (wide - 1) + 1
+            unfolded[i, j] = values[:, :, i:stop_y:stride, j:stop_x:stride]
+    return unfolded.reshape(KERNEL**2 * channels, -1), (count, high, wide)
+
+
 def _fold(columns: Singles, shape: tuple[int, ...], stride: int) -> Singles:
-    """Add unfolded cells up: the transpose of `unfold`."""
+    """Add unfolded cells up: the transpose of `_unfold`."""
     channels, count, rows, wide = shape
     high, across = ((side - KERNEL) // stride + 1 for side in (rows, wide))
     parts = columns.reshape(KERNEL, KERNEL, channels, count, high, across)
