@@ -23,3 +23,15 @@ def test_new_arrays_share_nothing():
     assert first.shape == second.shape == (4, 6)
     assert first.dtype == np.float32
     assert not np.shares_memory(first, second)
+
+
+def test_views_are_of_the_largest_array():
+    workspace = Workspace()
+    small = workspace.take((2, 3), np.float32, "a")
+    assert workspace.take((2, 3), np.float32, "a") is small
+    large = workspace.take((4, 3), np.float32, "a")
+    assert np.shares_memory(workspace.take((2, 3), np.float32, "a"), large)
+    assert not np.shares_memory(workspace.take((2, 3), np.int32, "a"), large)
+    for number in range(5000):
+        workspace.take((number % 12, 1), np.float32, str(number))
+    assert np.shares_memory(workspace.take((2, 3), np.float32, "a"), large)

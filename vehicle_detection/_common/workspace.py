@@ -8,23 +8,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+# Shapes of arrays that a workspace remembers: those of a frame are the same from frame to frame.
+_MAX_VIEWS = 4096
+
 
 class Workspace:
     """The scratch arrays of one thread, by name; with ``reuse=False`` each array is newly allocated."""
 
     def __init__(self, *, reuse: bool = True) -> None:
         self._reuse = reuse
-        self._arrays: dict[tuple[Any, ...], NDArray[Any]] = {}
+        self._arrays: dict[tuple[Any, str], NDArray[Any]] = {}
+        self._views: dict[tuple[Any, str, tuple[int, ...]], NDArray[Any]] = {}
 
     def take(self, shape: tuple[int, ...], dtype: Any, name: str) -> NDArray[Any]:
         """Return an uninitialized array of `shape`; arrays of the same name and dtype share their memory."""
         if not self._reuse:
             return np.empty(shape, dtype)
-        size = math.prod(shape)
-        array = self._arrays.get((name, dtype))
-        if array is None or array.size < size:
-            array = self._arrays[name, dtype] = np.empty(size, dtype)
-        return array[:size].reshape(shape)
+        view = self._views.get((dtype, name, shape))
+        if view is None:
+            size = math.prod(shape)
+            array = self._arrays.get((dtype, name))
+            if array is None or array.size < size or len(self._views) == _MAX_VIEWS:
+                self._views.clear()  # also those of the smaller array
+            if array is None or array.size < size:
+                array = self._arrays[dtype, name] = np.empty(size, dtype)
+            view = self._views[dtype, name, shape] = array[:size].reshape(shape)
+        return view
 
 
 NEW_ARRAYS = Workspace(reuse=False)
