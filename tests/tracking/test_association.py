@@ -14,6 +14,7 @@ from vehicle_detection.tracking.association import (
     distinct_vehicles,
     match_boxes,
     merged_detections,
+    nearer_cover,
 )
 
 NONE = np.empty((0, 4))
@@ -140,3 +141,26 @@ def test_a_box_that_fits_a_prediction_is_not_merged():
     # Nor is one that covers the other prediction in part only.
     predicted = np.array([[0.0, 0, 40, 40], [50, 0, 90, 40]])
     assert merged_detections(predicted, np.array([[0.0, 0, 70, 40]]), {0: 0}) == (set(), {})
+
+
+@pytest.mark.parametrize(
+    ("lower", "expected"), [(0.05, [0, 0]), (0.15, [0, 0.5]), (-0.05, [0, 0]), (-0.15, [0.5, 0])]
+)
+def test_a_vehicle_is_covered_by_one_whose_bottom_edge_is_clearly_lower(lower, expected):
+    # Two boxes of 100 by 80 pixels, the first of which is farther right by half of its width.
+    boxes = np.array([[550.0, 400, 650, 480], [500.0, 400, 600, 480]])
+    boxes[0, [1, 3]] += 80 * lower
+    both = np.array([True, True])
+    # The box of the nearer one is enlarged by 3 percent of its size on each side.
+    margin = 0.03 * (expected != [0, 0])
+    height = 1 - max(abs(lower) - 0.03, 0)
+    found = nearer_cover(boxes, both)
+    np.testing.assert_allclose(found, np.array(expected) * (1 + 2 * margin) * height, atol=1e-9)
+    assert nearer_cover(boxes, ~both).tolist() == [0, 0]
+
+
+def test_the_nearer_vehicle_that_covers_most_counts():
+    far, left, right = [500.0, 400, 600, 480], [450.0, 400, 530, 500], [540.0, 400, 640, 520]
+    found = nearer_cover(np.array([far, left, right]), np.ones(3, np.bool_))
+    np.testing.assert_allclose(found, [0.63, 0, 0], atol=1e-9)
+    assert nearer_cover(NONE, np.empty(0, np.bool_)).shape == (0,)

@@ -122,3 +122,59 @@ def test_the_error_never_grows_and_the_order_of_boxes_does_not_matter(cars, fram
         assert one.camera.horizon_std_px <= std * (1 + 1e-9) or len(boxes)
         std = one.camera.horizon_std_px
     assert other.camera.horizon_px == pytest.approx(one.camera.horizon_px, abs=1e-6)
+
+
+def least_squares(camera, boxes, seconds):
+    """Horizon and its standard error after one frame with vehicles straight ahead, without outliers.
+
+    The unknowns are the horizon, the mean slope, and the deviation of each vehicle's slope from it.
+    """
+    count, slope = len(boxes), camera.height_m / camera.vehicle_width_m
+    width, height = (boxes[:, 2:] - boxes[:, :2]).T
+    rows = np.hstack([np.ones((count, 1)), width[:, None], np.diag(width)])
+    bottom_std, pitch_std = (
+        each * camera.pixel_scale for each in (camera.bottom_std_px, camera.pitch_std_px)
+    )
+    variance = (
+        bottom_std**2
+        + (camera.box_std * height) ** 2
+        + 2 * slope**2 * (bottom_std**2 + (camera.box_std * width) ** 2)
+        + pitch_std**2
+    )
+    # The errors are correlated over half a second.
+    weights = seconds / 0.5 / variance
+    prior_std = [camera.horizon_std_px, slope * camera.height_std_m / camera.height_m]
+    prior_std += [slope * camera.vehicle_width_std_m / camera.vehicle_width_m] * count
+    prior = np.diag(np.array(prior_std) ** -2.0)
+    cov = np.linalg.inv(prior + (rows.T * weights) @ rows)
+    mean = cov @ (prior @ [camera.horizon_px, slope, *[0] * count] + (rows.T * weights) @ boxes[:, 3])
+    return mean[0], np.sqrt(cov[0, 0])
+
+
+@pytest.mark.parametrize("distances", [[20], [12, 30, 60]])
+def test_one_frame_gives_the_least_squares_estimate(distances):
+    boxes = np.array([on_road(distance) for distance in distances])
+    found = estimated([boxes], fps=5.0)
+    assert (found.horizon_px, found.horizon_std_px) == pytest.approx(least_squares(GUESS, boxes, 0.2))
+    assert found.horizon_px > GUESS.horizon_px + 5
+
+
+def test_a_wide_vehicle_nearby_is_no_outlier():
+    """Its bottom edge is far from that of a car of its width, but widths differ between vehicles."""
+    camera = Camera.for_frame(FRAME, horizon=0.56, horizon_std_px=15.0)
+    assert estimated([[on_road(10, width=2.4)]] * 10, camera=camera).horizon_std_px < 14
+    # A narrow box at the same place is too far below the horizon.
+    left, top, right, bottom = on_road(10, width=2.4)
+    narrow = estimated([[[left + 130, top, right - 130, bottom]]] * 10, camera=camera)
+    assert (narrow.horizon_px, narrow.horizon_std_px) == pytest.approx((camera.horizon_px, 15))
+
+
+def test_vehicles_of_long_ago_are_forgotten():
+    horizon, box = HorizonFilter(GUESS), np.array([on_road(20)])
+    known = []
+    for frame in range(30):
+        horizon.update(np.array([1 if frame == 0 else 2]), box, FRAME, 10.0)
+        known.append(len(horizon._ids))
+    # The first weight decays by exp(-t / 30 s); the others sum to 3.5 of its initial value.
+    assert known[1:20] == [2] * 19
+    assert known[25:] == [1] * 5

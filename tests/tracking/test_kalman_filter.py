@@ -124,6 +124,18 @@ def test_truncated_edges_do_not_contribute_to_the_distance():
     assert first_range([1100.0, 420, 1280, 720])[1] > 500
 
 
+def test_the_first_distance_is_that_of_the_better_measurement():
+    # 8 m away by its bottom edge, 10 m by its width.
+    near, far = box_at(8.0), box_at(10.0)
+    box = [far[0], near[1], far[2], near[3]]
+    camera = Camera.for_frame(SHAPE, horizon_std_px=40.0)
+    assert first_range(box, camera=camera)[0] == pytest.approx(10.0)
+    assert first_range(box)[0] < 9.8  # the horizon is known, and the width corrects the distance
+    # Without a visible width, the bottom edge must do.
+    box = [0.0, near[1], near[2] - near[0], near[3]]
+    assert first_range(box, camera=camera)[0] == pytest.approx(8.0)
+
+
 def test_an_uncertain_horizon_gives_more_weight_to_the_width():
     box = box_at(30.0)
     fixed, uncertain = (
@@ -275,6 +287,27 @@ def test_the_growth_that_counts_as_approach_is_limited():
     np.testing.assert_allclose(moved[:, 4:], mean[:, 4:] * np.exp([[0.6], [-0.6]]))
 
 
+@pytest.mark.parametrize("coasting", [False, True])
+def test_the_errors_of_a_prediction_grow_with_the_velocities(coasting):
+    mean, cov, _ = moving_states()
+    cov = cov * 1e-2  # below the limit of the standard errors
+    mean[1, 6:] *= -1
+    params, dt = TrackParams(), 0.1
+    found = KalmanSmoother(params).predict(states_of(mean, cov), np.full(2, coasting), dt)
+    for row in range(2):
+        growth = (mean[row, 6:] / mean[row, 2:4]).mean()
+        rates = -1 / np.array([1.5, 1.5, 0.5, 0.5]) if coasting else np.full(4, 2 * growth)
+        factors = np.hstack([np.ones(4), np.exp(dt * rates)])
+        # A growing box grows faster by the error of its growth, too.
+        factors[6:] *= 1 if coasting else 1 + dt * max(2 * growth, 0)
+        scaled = cov[row] * factors[:, None] * factors
+        sizes = mean[row, [2, 3, 2, 3]]
+        position, size = params.process_noise_position, params.process_noise_size
+        density = (sizes * [position, position, size, size]) ** 2
+        _, expected = predict(mean[row : row + 1], scaled[None], dt, density[None])
+        np.testing.assert_allclose(found.cov[row], expected[0], rtol=1e-9, atol=1e-9)
+
+
 def test_errors_of_coasting_tracks_are_limited():
     mean, cov, _ = moving_states()
     states = states_of(mean, 1e6 * cov)
@@ -365,6 +398,25 @@ def test_distances_are_predicted_at_constant_speed():
     np.testing.assert_allclose(found.range_cov[0], expected)
     for start, speed, end in ((2.0, -50.0, 1.0), (499.0, 50.0, 500.0)):
         assert predict_distances(ranges([start, speed, 0, 0], cov), 0.2, CAMERA).range_mean[0, 0] == end
+
+
+@pytest.mark.parametrize("right", [700.0, 560.0])
+def test_the_width_corrects_distance_width_and_length(right):
+    cov = np.array([[9.0, 1.0, 0.2, 0.1], [1.0, 4.0, 0, 0], [0.2, 0, 0.02, 0], [0.1, 0, 0, 0.6]])
+    states = ranges([20.0, -2.0, 0.05, 0.3], cov)
+    box = np.array([[right - 100.0, 640, right, 720]])  # its bottom edge is truncated
+    found = update_distances(states, Measurements.from_boxes(box, SHAPE), CAMERA, 0.04, 0.04)
+    lateral = max(640 - right, 0)
+    scale = CAMERA.focal_px * CAMERA.vehicle_width_m + CAMERA.vehicle_length_m * lateral
+    side = lateral / scale
+    # The logarithm of the width in pixels, whose error is that of two edges and of the hidden length.
+    innovation = np.log(100 / scale) - 0.05 - side * 0.3 + np.log(20)
+    jacobian = np.array([-1 / 20, 0, 1, side])
+    edge_std = math.hypot(CAMERA.bottom_std_px * CAMERA.pixel_scale, CAMERA.box_std * 100)
+    variance = 2 * (edge_std / 100) ** 2 + 50 * (side * CAMERA.vehicle_length_std_m) ** 2
+    gain = cov @ jacobian / (jacobian @ cov @ jacobian + variance)
+    np.testing.assert_allclose(found.range_mean[0], [20.0, -2.0, 0.05, 0.3] + gain * innovation)
+    np.testing.assert_allclose(found.range_cov[0], cov - np.outer(gain, jacobian @ cov), atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -377,6 +377,32 @@ class TestLifeCycle:
         assert seen == list(range(1, len(seen) + 1))
         assert len(seen) <= 3
 
+    def test_several_tentative_tracks_are_continued_beside_a_confirmed_one(self):
+        tracker, others = Tracker(), [[100.0, 400, 180, 470], [900.0, 400, 980, 470]]
+        for _ in range(10):
+            tracker.update(found(CAR), SHAPE)
+        tracker.update(found(CAR, *others), SHAPE)
+        car, *tentative = tracker.update(found(CAR, *others), SHAPE)
+        assert (car.id, car.misses, car.key) == (1, 0, 1)
+        np.testing.assert_allclose(car.box, CAR, atol=1)
+        assert [(track.state, track.misses) for track in tentative] == [("tentative", 0)] * 2
+        assert [track.age for track in tentative] == pytest.approx([0.04] * 2)
+        np.testing.assert_allclose([track.box for track in tentative], others, atol=1)
+
+    def test_the_score_is_an_average_that_begins_at_zero(self):
+        tracker, weight = Tracker(fps=10), 1 - math.exp(-0.1 / TrackParams().score_time_constant)
+        (track,) = tracker.update(found(CAR, score=0.8), SHAPE)
+        assert track.score == pytest.approx(0.8 * weight)
+        (track,) = tracker.update(found(CAR, score=0.4), SHAPE)
+        assert track.score == pytest.approx(0.8 * weight * (1 - weight) + 0.4 * weight)
+
+    def test_the_confidence_is_the_probability_of_the_score_as_log_odds(self):
+        (track,) = Tracker().update(found(CAR, score=9.0), SHAPE)
+        assert track.score > 0.5
+        assert track.confidence == pytest.approx(1 / (1 + math.exp(-track.score)))
+        (track,) = Tracker(calibration=None).update(found(CAR), SHAPE)
+        assert track.confidence is None
+
 
 class TestOcclusion:
     @pytest.mark.parametrize("seed", range(4))
@@ -396,12 +422,13 @@ class TestOcclusion:
         ("left", "seconds"), [(745.0, 1.0), (690.0, 0.4)], ids=["partly visible", "not visible"]
     )
     def test_a_hidden_vehicle_is_shown_for_a_while_and_kept_for_four_seconds(self, left, seconds):
-        tracker, near, far = Tracker(), [300.0, 380, 800, 600], [left, 420, left + 90, 465]
-        for _ in range(60):
-            tracker.update(found(near, far), SHAPE)
-        steps = [tracker.update(found(near), SHAPE) for _ in range(130)]
-        assert sum(sum(t.shown for t in tracks) == 2 for tracks in steps) == 25 * seconds
-        assert sum(len(tracks) == 2 for tracks in steps) == pytest.approx(100, abs=5)
+        tracker, near = Tracker(fps=10), [300.0, 380, 800, 600]
+        for x in [*np.linspace(850, left, 20), *[left] * 10]:
+            tracks = tracker.update(found(near, [x, 420, x + 90, 465]), SHAPE)
+        assert [(track.id, track.misses) for track in tracks] == [(1, 0), (2, 0)]
+        steps = [tracker.update(found(near), SHAPE) for _ in range(52)]
+        assert sum(sum(t.shown for t in tracks) == 2 for tracks in steps) == 10 * seconds
+        assert sum(len(tracks) == 2 for tracks in steps) == 40
 
     def test_a_vehicle_keeps_its_identity_after_a_long_occlusion(self):
         near, tracker = [300.0, 380, 800, 600], Tracker()
@@ -674,6 +701,18 @@ class TestDistance:
             _, _, track = matched(steps, name)[-1]
             assert track.distance_m == pytest.approx(distance, rel=0.15)
             assert abs(track.distance_m - distance) < 2.5 * track.distance_std_m
+
+    def test_only_confirmed_tracks_change_the_horizon(self):
+        tracker = Tracker()
+        tracker.update(Detections.empty(), SHAPE)
+        before = tracker.camera
+        for _ in range(3):
+            assert tracker.camera is before
+            (track,) = tracker.update(found(CAR), SHAPE)
+        while not track.id:
+            assert tracker.camera is before
+            (track,) = tracker.update(found(CAR), SHAPE)
+        assert tracker.camera.horizon_std_px < before.horizon_std_px
 
     def test_another_camera_resets_the_horizon(self):
         tracker = Tracker()
