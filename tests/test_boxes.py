@@ -233,6 +233,14 @@ def test_empty_detections():
         assert list(found) == []
 
 
+def test_confidences_are_probabilities():
+    found = Detections(TWO, [1.0, 2.0], [0.0, 1.0])
+    assert found.confidences.tolist() == [0, 1]
+    for confidences in ([-0.01, 0.5], [0.5, 1.01], [0.5]):
+        with pytest.raises(InvalidInputError, match="confidences must be a probability, 0 to 1, for each of"):
+            Detections(TWO, [1.0, 2.0], confidences)
+
+
 @pytest.mark.parametrize(
     ("boxes", "scores", "message"),
     [

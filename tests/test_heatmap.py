@@ -82,6 +82,13 @@ def test_integers_that_cannot_hold_the_heat_are_rejected(start, scores, message)
     assert (heat == start).all()
 
 
+def test_integers_hold_heat_up_to_their_limits():
+    heat = np.array([[254, 1]], np.uint8)
+    add_heat(heat, [[0, 0, 1, 1]])
+    add_heat(heat, [[1, 0, 2, 1]], scores=[-1.0])
+    assert heat.tolist() == [[255, 0]]
+
+
 def test_read_only_maps_are_rejected():
     heat = np.zeros(SHAPE)
     heat.setflags(write=False)

@@ -115,6 +115,7 @@ def test_low_scores_and_single_windows_form_no_group():
     assert len(group_windows(Detections([window(300), window(302)], [0.9, 0.9]), strict)) == 0
     assert len(group_windows(Detections([window(300)], [1.5]), strict)) == 0
     assert len(group_windows(Detections([window(300), window(302)], [1.5, 0.9]), strict)) == 1
+    assert len(group_windows(Detections([window(300), window(302)], [1.0, 1.0]), strict)) == 1
 
 
 def test_windows_at_or_below_zero_are_ignored():
@@ -184,6 +185,11 @@ def test_the_box_of_a_vehicle_straight_ahead_is_its_face():
     found = fit_boxes(groups_of([window(640, 100, 450)]), CAMERA, SHAPE, PLAIN)
     np.testing.assert_allclose(found.boxes, [[600, 417.5, 680, 492.5]])
     assert found.scores.tolist() == [2.0]
+
+
+def test_width_and_height_of_a_window_scale_those_of_the_face():
+    found = fit_boxes(groups_of([[590, 420, 690, 480]]), CAMERA, SHAPE, PLAIN)
+    np.testing.assert_allclose(found.boxes, [[600, 430.5, 680, 475.5]])
 
 
 def test_the_box_of_a_vehicle_in_another_lane_includes_its_side():

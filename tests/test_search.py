@@ -271,6 +271,13 @@ def test_a_search_can_be_reused():
         assert len(bands.find_windows(images[0], search)) == len(fresh[0])
 
 
+def test_the_time_of_a_search():
+    with BandSearch(random_classifier(SMALL), n_jobs=1) as search:
+        start = time.perf_counter()
+        result = search.find(IMAGE, small_params())
+        assert 0 < result.seconds <= time.perf_counter() - start
+
+
 def test_a_score_map_is_not_overwritten_by_the_next_search():
     band = band_of((64, 64))
     with BandSearch(random_classifier(SMALL), n_jobs=1) as search:

@@ -210,7 +210,10 @@ def test_without_hog_both_borders_give_the_same_scores():
         ([[-1, 0, 63, 64]], "in row 0; use slide_window, or clip_boxes"),
         ([[0, 80, 64, 144]], "inside the 200x120 image"),
         ([[10, 10, 10, 20]], "windows must be non-empty boxes"),
-        ([[0, 0, 64.5, 64]], "windows must be whole pixels; got .* in row 0; round them first"),
+        (
+            [[0, 0, 64, 64], [0, 0, 64.5, 64]],
+            r"windows must be whole pixels; got \[0.0, 0.0, 64.5, 64.0\] in row 1; round them first",
+        ),
         ([0, 0, 64, 64], "windows must be an"),
         ([[0, 0, np.nan, 64]], "windows must be finite"),
     ],
@@ -281,6 +284,8 @@ def test_windows_are_an_array_otherwise():
     np.testing.assert_array_equal(np.add(windows, windows), 2 * plain)
     assert type(2 * windows) is type(windows.sum(axis=0)) is type(windows == windows) is np.ndarray
     np.testing.assert_array_equal(windows[:, :2] + windows[:, 2:], plain[:, :2] + plain[:, 2:])
+    np.testing.assert_array_equal(windows[0] + windows[1], plain[0] + plain[1])
+    np.testing.assert_array_equal(windows[0] + [1, 2, 3, 4], plain[0] + [1, 2, 3, 4])
     moved = windows.copy()
     moved += 3
     moved *= 2

@@ -108,6 +108,18 @@ def test_the_transformer_passes_the_estimator_checks_that_apply():
     assert len(passed) >= 20
 
 
+def test_the_transformer_states_that_it_needs_no_tables_and_no_fit():
+    pytest.importorskip("sklearn", minversion="1.6")
+    from sklearn.utils import get_tags
+
+    tags = get_tags(PatchFeatures())
+    assert not tags.input_tags.two_d_array
+    assert not tags.input_tags.three_d_array  # images in color have four dimensions
+    assert tags.no_validation
+    assert not tags.requires_fit
+    assert tags.transformer_tags.preserves_dtype == []
+
+
 def test_the_transformer_depends_on_each_patch_alone():
     transformer = PatchFeatures(n_jobs=1)
     expected = transformer.fit_transform(PATCHES)

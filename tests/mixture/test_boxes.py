@@ -70,6 +70,31 @@ def test_nms_removes_the_weaker_of_two_overlapping_boxes(count, seed):
     np.testing.assert_array_equal(nms(boxes, scores, max_boxes=3), expected[:3])
 
 
+def test_the_minimum_margin_is_inclusive():
+    windows = ScoredWindows(np.array([[0.0, 0, 9, 9], [20, 0, 29, 9]]), np.array([0.5, 0.25]), np.arange(2))
+    for min_margin, templates in ((0.25, [0, 1]), (0.26, [0]), (0.6, [])):
+        assert vote_boxes(windows, min_margin=min_margin)[0].templates.tolist() == templates
+
+
+def test_two_boxes_on_one_vehicle_are_reduced_to_the_better_one():
+    # IoU 0.43 with the first; 80 percent inside the first; IoU 0.33; 70 percent inside the first.
+    boxes = np.array([[0.0, 0, 100, 100], [40, 0, 140, 100], [90, 0, 140, 10], [50, 0, 150, 100]])
+    boxes[2] = [60, 10, 110, 30]
+    for row, kept in ((1, [0]), (2, [0]), (3, [0, 1])):
+        assert nms(boxes[[0, row]], np.array([2.0, 1.0])).tolist() == kept
+    assert nms(np.array([[0.0, 0, 100, 100], [65, 10, 115, 30]]), np.array([2.0, 1.0])).tolist() == [0, 1]
+
+
+def test_no_windows():
+    empty = ScoredWindows.empty()
+    assert (len(empty), empty.boxes.shape, empty.margins.shape, empty.templates.shape) == (
+        0,
+        (0, 4),
+        (0,),
+        (0,),
+    )
+
+
 def test_windows_of_several_searches_are_joined_without_those_outside():
     first, second = random_windows(3, 1), random_windows(2, 2)
     outside = ScoredWindows(np.array([[-90.0, 0, -10, 40]]), np.array([1.0]), np.array([4]))

@@ -10,6 +10,7 @@ from vehicle_detection.mixture import (
     edge_features,
     rescoring_features,
 )
+from vehicle_detection.mixture.crops import window_grid
 from vehicle_detection.synthetic import render_scene
 
 BOXES = np.array([[20.0, 30.0, 80.0, 70.0], [-10.0, 5.0, 30.0, 60.0], [100.5, 40.2, 180.0, 130.0]])
@@ -73,7 +74,25 @@ def test_colors_are_standardized_lightness_and_scaled_a_and_b():
     for column, lab in ((2, expected[0]), (9, expected[1])):
         np.testing.assert_allclose(a[:, column] * 20, lab[1], atol=0.1)
         np.testing.assert_allclose(b[:, column] * 20, lab[2], atol=0.1)
-    assert (lightness[:, 2] > lightness[:, 9]).all()
+    # Half of the cells are darker by `step`; the divisor is the standard deviation and 5 more.
+    step = expected[0, 0] - expected[1, 0]
+    np.testing.assert_allclose(lightness[:, 2] - lightness[:, 9], step / (step / 2 + 5), rtol=0.01)
+
+
+def test_a_box_fills_the_cells_in_the_middle_of_its_crop():
+    image = np.zeros((160, 160, 3), np.uint8)
+    image[40:120, 32:128] = (200, 0, 0)
+    _, (colors,) = rescoring_features(EdgePyramid(image), np.array([[32.0, 40.0, 128.0, 120.0]]))
+    expected = np.zeros((12, 12), bool)
+    expected[2:10, 2:10] = True
+    np.testing.assert_array_equal(colors.reshape(3, 12, 12)[1] > 1, expected)
+
+
+def test_the_grid_of_a_window_has_the_box_in_its_middle():
+    # 4 by 2 cells of the box, of 10 by 15 pixels, in a window of 8 by 6 cells.
+    grid = window_grid((100.0, 200.0, 140.0, 230.0), (4, 2), (8, 6))
+    assert (grid.left, grid.top, grid.step_x, grid.step_y) == (80, 170, 10, 15)
+    assert (grid.rows, grid.columns) == (6, 8)
 
 
 def test_lightness_features_hardly_depend_on_exposure():

@@ -101,3 +101,8 @@ def test_the_weight_of_the_smoothing_depends_on_the_noise(monkeypatch, noise, we
 @pytest.mark.parametrize("shape", [(2, 40, 3), (40, 2, 3)])
 def test_images_of_two_rows_or_columns_have_no_estimate(shape):
     assert estimate_noise(np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)) == 0
+
+
+@pytest.mark.parametrize("shape", [(3, 40, 3), (40, 3, 3)])
+def test_three_rows_and_columns_suffice_for_an_estimate(shape):
+    assert estimate_noise(np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)) > 0

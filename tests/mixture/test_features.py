@@ -229,6 +229,23 @@ def test_channels_are_between_zero_and_their_clipping_limit():
     assert 200 < scaled.max() <= 255.001
 
 
+def test_the_scales_map_the_largest_channels_to_255():
+    # Orientations are half of four terms of at most 0.2, texture sums are 0.2357 times sixteen terms.
+    largest = np.repeat([0.4, 0.2357 * 16 * 0.2], [16, 4])
+    np.testing.assert_allclose(CHANNEL_SCALES * largest, 255, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("width", "height"), [(7.0, 7.0), (20.0, 12.0), (5.0, 30.0)])
+def test_crops_of_large_cells_are_interpolated_like_a_map(width, height):
+    pyramid = EdgePyramid(road())
+    grids = np.array([[30.5, 20.0, width, height], [3.0, -9.5, width, height]])
+    crops = pyramid.crops(grids, 4, 5)
+    assert crops.shape == (2, N_CHANNELS, 4, 5)
+    for grid, crop in zip(grids.tolist(), crops):
+        expected = pyramid.feature_map(CellGrid(*grid, 4, 5)).channels
+        np.testing.assert_array_equal(crop, expected)
+
+
 @pytest.mark.parametrize("packing", [BYTES, HALF_WORDS])
 @pytest.mark.parametrize("size", SIZES)
 def test_packed_channels_are_rounded_channels(size, packing):

@@ -70,6 +70,12 @@ def test_an_image_too_small_to_tell_is_clear(shape):
     assert reduce_haze(image) is image
 
 
+def test_two_columns_suffice_to_tell():
+    image = np.zeros((40, 2, 3), np.uint8)
+    image[:, 0], image[:, 1] = 100, 200
+    assert relative_contrast(image) == pytest.approx(100 / 151)
+
+
 @pytest.mark.parametrize(("contrast", "weight"), [(0.03, 0.0), (0.025, 0.5), (0.02, 1.0), (0.01, 1.0)])
 def test_the_weight_of_the_equalization_depends_on_the_contrast(monkeypatch, contrast, weight):
     hazy = np.round(0.15 * SCENE + 0.85 * 180).astype(np.uint8)
@@ -79,3 +85,4 @@ def test_the_weight_of_the_equalization_depends_on_the_contrast(monkeypatch, con
     equalized = cv2.cvtColor(lab, cv2.COLOR_LAB2RGB).astype(float)
     expected = weight * equalized + (1 - weight) * hazy
     np.testing.assert_allclose(reduce_haze(hazy), expected, atol=0.51)
+    assert (reduce_haze(hazy) is hazy) == (weight == 0)

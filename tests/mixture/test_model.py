@@ -69,6 +69,25 @@ def test_many_votes_raise_a_margin():
     np.testing.assert_allclose(with_votes.detect_vehicles(pyramid, more, min_margin=0.0)[1], [0.6])
 
 
+def test_windows_that_show_the_same_part_of_the_frame_are_one_proposal():
+    boxes = np.array([[-90.0, 100, 40, 140], [-20, 100, 40, 140], [300, 100, 360, 140]])
+    windows = ScoredWindows(boxes, np.array([0.5, 0.4, 0.3]), np.zeros(3, np.intp))
+    found, margins = random_mixture().propose_boxes(EdgePyramid(ROAD), windows, min_margin=0.0)
+    assert found.tolist() == [[0, 100, 40, 140], [300, 100, 360, 140]]
+    assert margins.tolist() == [0.5, 0.3]
+
+
+def test_the_summary_lists_the_templates():
+    border = mixture_template(5, 6, border=True)
+    model = dataclasses.replace(random_mixture(threshold=0.25), templates=(mixture_template(), border))
+    title, facts = model.summary()
+    assert title == "2 templates, threshold 0.25 (log-odds)"
+    assert facts == {
+        "template 1": "box of 7x6 cells",
+        "template 2": "box of 4x4 cells at the frame's border",
+    }
+
+
 @pytest.mark.parametrize("candidates", [1, 7, 20])
 def test_many_candidates_lower_the_margins(candidates):
     model, pyramid = random_mixture(), EdgePyramid(ROAD)

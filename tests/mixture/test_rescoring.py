@@ -81,6 +81,21 @@ def test_the_outputs_of_a_crop_do_not_depend_on_the_others():
         np.testing.assert_array_equal(part[1], shifts[rows])
 
 
+def test_the_inputs_are_scaled_edges_and_colors():
+    edges, colors = np.zeros((2, 20 * 144), np.float32), np.full((2, 3 * 144), 3, np.float32)
+    edges[1, 144:288] = 0.4
+    inputs = network_inputs(edges, colors)
+    assert inputs.shape == (23, 2, 12, 12)
+    np.testing.assert_allclose(inputs[:20, 0], -0.5)
+    np.testing.assert_allclose(inputs[1, 1], 1.5)
+    np.testing.assert_allclose(inputs[20:], 1.5)
+
+
+def test_the_number_of_weights():
+    per_network = sum(outputs * (inputs + 1) for outputs, inputs in SHAPES)
+    assert random_rescorer().n_weights == 2 * per_network
+
+
 def test_rescoring_adds_log_odds_and_corrects_boxes():
     rescorer, pyramid = random_rescorer(), EdgePyramid(noise(1))
     margins = np.array([0.5, -0.2, 1.0])

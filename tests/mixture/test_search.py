@@ -8,8 +8,15 @@ from vehicle_detection import VehicleDetector
 from vehicle_detection.boxes import box_areas, clip_boxes
 from vehicle_detection.classifier import load_classifier
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture import MixtureSearch, TemplateMixture, load_model
-from vehicle_detection.mixture.search import _MAX_WINDOWS
+from vehicle_detection.mixture import (
+    CellGrid,
+    EdgePyramid,
+    MixtureSearch,
+    TemplateMixture,
+    frame_grid,
+    load_model,
+)
+from vehicle_detection.mixture.search import _MAX_WINDOWS, _cell_rows, _row_range
 from vehicle_detection.params import HeatParams, PyramidParams, SearchParams
 from vehicle_detection.search import find_cars
 from vehicle_detection.synthetic import render_scene
@@ -109,6 +116,49 @@ def test_windows_of_a_border_template_end_at_the_border():
     _, expected = MixtureSearch(alone, n_jobs=1).score_windows(ROAD, PyramidParams())
     others = found.boxes[found.templates == 0]
     np.testing.assert_array_equal(others, expected.boxes[: len(others)])
+
+
+def test_margins_of_windows_at_a_border_are_those_of_the_strip():
+    template = mixture_template(5, 6, seed=4, bias=1.0, border=True)
+    model = dataclasses.replace(random_mixture(), templates=(mixture_template(bias=-0.5), template))
+    _, found = MixtureSearch(model, n_jobs=1).score_windows(ROAD, PyramidParams())
+    pyramid = EdgePyramid(ROAD)
+    at_border = found[found.templates == 1]
+    for border_x, column in ((0, 0), (640, 2)):
+        windows = at_border[at_border.boxes[:, column] == border_x]
+        assert len(windows) > 5
+        for box, margin in zip(windows.boxes[:5], windows.margins):
+            size = (box[3] - box[1]) / 4  # the box has 4 rows, and one more on each side
+            grid = frame_grid(size, ROAD.shape)
+            grid = CellGrid(grid.left, box[1] - size, grid.step_x, size, 6, grid.columns)
+            strip = template.border_strip(pyramid.feature_map(grid), border_x, left=column == 0)
+            assert template.margins(strip) == pytest.approx(margin, abs=0.01)
+
+
+def test_weak_windows_are_found_because_they_vote():
+    model = TemplateMixture((mixture_template(bias=-1.3),))
+    _, found = MixtureSearch(model, n_jobs=1).score_windows(ROAD, PyramidParams(min_score=0.5))
+    assert len(found) < _MAX_WINDOWS
+    assert -1.01 < found.margins.min() < -0.9
+
+
+def test_rows_of_cells_cover_rows_of_the_frame():
+    shape = (80, 160)
+    whole, part = frame_grid(8.0, shape), frame_grid(8.0, shape, (16, 64))
+    # Four rows of cells lie beyond each border of the frame.
+    assert (whole.top, whole.rows, part.top, part.rows) == (-32, 18, 16, 6)
+    assert _cell_rows(whole, (0, 80), shape) == (0, 18)
+    assert _cell_rows(whole, (20, 44), shape) == (6, 10)
+    assert _cell_rows(part, (20, 44), shape) == (0, 4)
+
+
+def test_a_template_needs_the_rows_of_its_padding():
+    params, shape = PyramidParams(horizon=0.5), (360, 640)
+    plain, padded = mixture_template(4, 4, padding=(0.0, 0.0)), mixture_template(6, 8, padding=(1.0, 2.0))
+    top, bottom = _row_range(plain, 10.0, params, shape)
+    assert 0 < top < bottom < 360
+    assert _row_range(padded, 10.0, params, shape) == (top - 20, bottom + 20)
+    assert _row_range(padded, 10.0, PyramidParams(horizon=None), shape) == (0, 360)
 
 
 def test_only_the_best_windows_are_returned():

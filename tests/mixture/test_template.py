@@ -86,6 +86,27 @@ def test_both_borders_give_the_same_windows(seed, columns, rows):
     np.testing.assert_array_equal(others[:, [0, 2]], width - boxes[:, [2, 0]])
 
 
+def test_windows_of_a_grid_that_begins_outside_the_frame_end_at_the_border():
+    channels = np.random.default_rng(3).uniform(0, 0.3, (N_CHANNELS, 9, 14)).astype(np.float32)
+    feature_map = FeatureMap(channels, CellGrid(-16.0, 4.0, 8.0, 10.0, 9, 14))
+    right = BORDER_TEMPLATE.border_strip(feature_map, 80.0, left=False)
+    np.testing.assert_array_equal(right, channels[:, :, 7:12])
+    left = BORDER_TEMPLATE.border_strip(feature_map, 0.0, left=True)
+    np.testing.assert_array_equal(left, mirror_channels(channels[:, :, 2:7]))
+    # The box is 4 by 4 cells, and one row of padding is above it.
+    rows, grid = np.array([0, 3]), feature_map.grid
+    assert BORDER_TEMPLATE.border_boxes(grid, rows, 80.0, left=False).tolist() == [
+        [48, 14, 80, 54],
+        [48, 44, 80, 84],
+    ]
+    assert BORDER_TEMPLATE.border_boxes(grid, rows, 0.0, left=True)[1].tolist() == [0, 44, 32, 84]
+
+
+def test_nearly_half_of_a_window_may_be_padding():
+    template = MixtureTemplate(np.zeros((3, 4, N_CHANNELS)), 0.0, (1.9, 1.4))
+    assert template.box_cells == pytest.approx((0.2, 0.2))
+
+
 def test_weights_are_copied_and_read_only():
     weights = np.zeros((3, 4, N_CHANNELS), np.float32)
     template = MixtureTemplate(weights, 0.0, (0.0, 0.0))

@@ -82,6 +82,11 @@ def test_the_size_decides_between_boxes_at_one_place():
     assert match_boxes(predicted, measured, np.ones(2)) == [(0, 1), (1, 0)]
 
 
+def test_a_box_of_the_same_size_nearby_is_preferred_to_a_smaller_one_at_the_same_place():
+    predicted, measured = boxes_at((50, 50)), np.vstack([boxes_at((50, 50), side=28), boxes_at((60, 50))])
+    assert match_boxes(predicted, measured, np.ones(1)) == [(0, 1)]
+
+
 def cost(predicted, measured, limit):
     """Cost of a pair, and whether it is allowed."""
     distance = center_distances(predicted[None], measured[None])[0, 0] / limit

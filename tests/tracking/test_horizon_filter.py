@@ -161,12 +161,12 @@ def test_one_frame_gives_the_least_squares_estimate(distances):
 
 def test_a_wide_vehicle_nearby_is_no_outlier():
     """Its bottom edge is far from that of a car of its width, but widths differ between vehicles."""
-    camera = Camera.for_frame(FRAME, horizon=0.56, horizon_std_px=15.0)
-    assert estimated([[on_road(10, width=2.4)]] * 10, camera=camera).horizon_std_px < 14
+    camera = Camera.for_frame(FRAME, horizon=0.56, horizon_std_px=5.0)
+    assert estimated([[on_road(10, width=2.5)]] * 10, camera=camera).horizon_std_px < 4.99
     # A narrow box at the same place is too far below the horizon.
-    left, top, right, bottom = on_road(10, width=2.4)
+    left, top, right, bottom = on_road(10, width=2.5)
     narrow = estimated([[[left + 130, top, right - 130, bottom]]] * 10, camera=camera)
-    assert (narrow.horizon_px, narrow.horizon_std_px) == pytest.approx((camera.horizon_px, 15))
+    assert (narrow.horizon_px, narrow.horizon_std_px) == pytest.approx((camera.horizon_px, 5))
 
 
 def test_vehicles_of_long_ago_are_forgotten():
