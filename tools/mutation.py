@@ -3,8 +3,8 @@
 ``python -m tools.mutation`` draws a fixed sample of the changes of each file in `TARGETS`. Each one is tried
 in a process of its own, which imports the changed module instead of the file: nothing is written, and numpy,
 numba and pytest are imported only once. The tests that execute the changed line run first, the fastest ones
-first, then the other tests of that file. The survivors are printed; ``--only`` tries those of an earlier
-output again.
+first, then those of the test file with the module's name, then the other tests of its folder. The survivors
+are printed; ``--only`` tries those of an earlier output again.
 
 Kernels that numba compiles are not changed: their tests compare them with references. Text, type annotations
 and what is raised are not changed either. It needs the extra ``dev`` and a system that can fork.
@@ -306,10 +306,15 @@ class Baseline:
     lines: Mapping[str, Mapping[str, list[str]]]
 
     def tests_for(self, path: Path, line: int, own: Sequence[str], budget: float) -> list[str]:
-        """Return tests of about `budget` seconds: those that execute a line, then others of its file."""
+        """Return tests of about `budget` seconds: those that execute a line, then others of its file.
+
+        A line that only runs while its module is imported, such as a constant, is executed by no test.
+        """
         covering = self.lines[str(path)].get(str(line), [])
         others = [name for name in self.seconds if name.startswith(tuple(own)) and name not in covering]
-        names = [name for group in (covering, others) for name in sorted(group, key=self.seconds.__getitem__)]
+        named = [name for name in others if f"/test_{path.stem}.py::" in name]
+        groups = covering, named, [name for name in others if name not in named]
+        names = [name for group in groups for name in sorted(group, key=self.seconds.__getitem__)]
         ends = itertools.accumulate(self.seconds[name] for name in names)
         return [name for index, (name, end) in enumerate(zip(names, ends)) if end <= budget or index == 0]
 

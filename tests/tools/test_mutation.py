@@ -78,6 +78,14 @@ def test_tests_that_execute_the_line_come_first():
     assert baseline.tests_for(path, 4, ["tests/a.py"], 0.1) == ["tests/a.py::other"]
 
 
+def test_tests_of_the_module_precede_others_where_no_test_executes_the_line():
+    path = ROOT / "a.py"
+    seconds = {"tests/test_b.py::b": 0.1, "tests/test_a.py::slow": 2.0, "tests/test_a.py::fast": 1.0}
+    baseline = Baseline(seconds, {str(path): {}})
+    names = ["tests/test_a.py::fast", "tests/test_a.py::slow", "tests/test_b.py::b"]
+    assert baseline.tests_for(path, 1, ["tests"], 10) == names
+
+
 def test_the_files_and_their_tests_exist():
     for path, tests in target_files([]).items():
         assert all((ROOT / test).exists() for test in tests)
