@@ -43,6 +43,14 @@ def test_confident_boxes_decide_on_the_horizon():
     assert trusted <= doubted
 
 
+def test_a_horizon_near_the_middle_is_likely_before_other_vehicles_are_seen():
+    usual, low = (
+        perspective_ratios(np.array([standing(300, horizon)]), np.zeros(1), HEIGHT)[0]
+        for horizon in (180, 275)
+    )
+    assert low < 0 < usual
+
+
 def test_a_box_at_the_lower_border_is_not_too_high():
     box = [100.0, 60.0, 390.0, 399.0]
     others = [standing(bottom, 330) for bottom in (345, 360, 390)]
