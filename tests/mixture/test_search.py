@@ -161,6 +161,14 @@ def test_a_template_needs_the_rows_of_its_padding():
     assert _row_range(padded, 10.0, PyramidParams(horizon=None), shape) == (0, 360)
 
 
+@pytest.mark.parametrize("shape", [(200, 320), (320, 200)])
+def test_a_search_of_all_rows_has_the_gradients_of_all_rows(shape):
+    image = np.random.default_rng(0).integers(0, 256, (*shape, 3), dtype=np.uint8)
+    pyramid, _ = MixtureSearch(random_mixture(), n_jobs=1).score_windows(image, PyramidParams(horizon=None))
+    for found, expected in zip(pyramid.octaves, EdgePyramid(image).octaves, strict=True):
+        np.testing.assert_array_equal(found.sums, expected.sums)
+
+
 def test_only_the_best_windows_are_returned():
     every = search_once(random_mixture(), ROAD, PyramidParams(min_score=-30.0))
     assert len(every.windows) == _MAX_WINDOWS
