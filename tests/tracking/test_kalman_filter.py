@@ -420,6 +420,16 @@ def test_the_width_corrects_distance_width_and_length(right):
 
 
 @pytest.mark.parametrize(
+    ("mean", "limited"),
+    [([0.5, 1, -2, -9], [1, 1, -0.7, -3]), ([900, 1, 2, 20], [500, 1, 0.9, 8]), ([9, 1, 0, 0], [9, 1, 0, 0])],
+)
+def test_distance_width_and_length_are_limited(mean, limited):
+    measured = Measurements.from_boxes(BOXES[:1], SHAPE, merged=True)  # it shows neither edge
+    found = update_distances(ranges(mean, np.eye(4)), measured, CAMERA, 0.04, 0.04)
+    np.testing.assert_allclose(found.range_mean, [limited])
+
+
+@pytest.mark.parametrize(
     ("distance_std", "speed_std", "age", "known"),
     [
         (8.0, 6.0, 0.5, (True, True)),
