@@ -38,7 +38,7 @@ def install(kind: str, venv: Path, python: str) -> Path:
 def run_tests(executable: Path, venv: Path, tests: list[str]) -> bool:
     """Run tests of the source tree in an environment; return whether they pass."""
     # Old libraries warn about new ones, so warnings are no errors here.
-    options = ["-q", "-W", "default", "-p", "no:cacheprovider"]
+    options = ["-q", "-n", "2", "--dist", "worksteal", "-W", "default", "-p", "no:cacheprovider"]
     # Without real data, and without a test that trains for minutes.
     options += ["-m", "not realdata", "-k", "not train_frames"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(venv / "numba")}

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from vehicle_detection.boxes import greedy_nms, iou_matrix, overlap_matrices
 from vehicle_detection.mixture import vote_boxes
-from vehicle_detection.mixture.boxes import ScoredWindows, mostly_inside, nms
+from vehicle_detection.mixture.boxes import ScoredWindows, mostly_inside, nms, whole_vehicles
 
 
 def random_windows(count, seed):
@@ -91,6 +91,24 @@ def test_of_two_boxes_on_one_vehicle_the_better_one_is_kept(other, kept):
     assert nms(boxes, np.array([2.0, 1.0])).tolist() == kept
 
 
+@pytest.mark.parametrize(
+    ("other", "margin", "kept"),
+    [
+        ([150, 105, 250, 200], 0.9, [0]),  # half of it is on the vehicle, at the same distance
+        ([150, 105, 250, 200], 1.1, [0, 1]),  # hardly worse
+        ([150, 105, 250, 200], 3.1, [1]),
+        ([165, 105, 265, 200], 0.9, [0, 1]),  # a third is
+        ([150, 125, 250, 200], 0.9, [0, 1]),  # too low
+        ([150, 84, 250, 184], 0.9, [0, 1]),  # its lower edge is farther away
+    ],
+)
+def test_boxes_on_a_part_of_a_vehicle_are_removed(other, margin, kept):
+    boxes = np.array([[0, 100, 200, 200], other], float)
+    assert whole_vehicles(boxes, np.array([2.0, margin])).tolist() == kept
+    rows = whole_vehicles(boxes[::-1], np.array([margin, 2.0]))
+    assert sorted((1 - rows).tolist()) == kept
+
+
 def test_no_windows():
     empty = ScoredWindows.empty()
     assert (len(empty), empty.boxes.shape, empty.margins.shape, empty.templates.shape) == (
@@ -99,6 +117,7 @@ def test_no_windows():
         (0,),
         (0,),
     )
+    assert whole_vehicles(empty.boxes, empty.margins).tolist() == []
 
 
 def test_windows_of_several_searches_are_joined_without_those_outside():

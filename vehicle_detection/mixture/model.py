@@ -30,7 +30,13 @@ from vehicle_detection.boxes import Platt, box_areas, clip_boxes
 from vehicle_detection.classifier import KIND as PATCH_KIND
 from vehicle_detection.classifier import VehicleClassifier, build_classifier
 from vehicle_detection.errors import InvalidInputError, ModelFileError
-from vehicle_detection.mixture.boxes import DUPLICATE_IOU, ScoredWindows, nms, vote_boxes
+from vehicle_detection.mixture.boxes import (
+    DUPLICATE_IOU,
+    ScoredWindows,
+    nms,
+    vote_boxes,
+    whole_vehicles,
+)
 from vehicle_detection.mixture.features import EdgePyramid
 from vehicle_detection.mixture.perspective import perspective_ratios
 from vehicle_detection.mixture.rescoring import RESCORE_MIN, Rescorer
@@ -209,7 +215,8 @@ class TemplateMixture:
             ratios = perspective_ratios(boxes, margins + shift, pyramid.shape[0])
             perspective = self.perspective_weight * ratios
         margins = margins + shift + perspective
-        order = np.argsort(-margins, kind="stable")
+        whole = whole_vehicles(boxes, margins)
+        order = whole[np.argsort(-margins[whole], kind="stable")]
         rows = order[(margins[order] >= min_margin) & (box_areas(boxes[order]) > 0)]
         return FoundVehicles(boxes[rows], margins[rows], shift, perspective[rows])
 
