@@ -12,6 +12,7 @@ from vehicle_detection.tracking.association import (
     center_distances,
     covered_fractions,
     distinct_vehicles,
+    match_approaching,
     match_boxes,
     merged_detections,
     nearer_cover,
@@ -169,3 +170,43 @@ def test_the_nearer_vehicle_that_covers_most_counts():
     found = nearer_cover(np.array([far, left, right]), np.ones(3, np.bool_))
     np.testing.assert_allclose(found, [0.63, 0, 0], atol=1e-9)
     assert nearer_cover(NONE, np.empty(0, np.bool_)).shape == (0,)
+
+
+FOCUS, FRAME = (640.0, 400.0), (720, 1280)
+
+
+def approaching(box, growth):
+    """A box after a vehicle has come nearer, around `FOCUS`."""
+    center = np.tile(FOCUS, 2)
+    return np.asarray(center + (np.asarray(box) - center) * growth)
+
+
+def test_a_vehicle_that_comes_nearer_is_found_far_from_its_last_box():
+    boxes = np.array([[235.0, 398, 317, 442], [700, 410, 760, 450]])
+    measured = np.array([approaching(boxes[0], 1.2), boxes[1]])
+    assert iou_matrix(boxes[:1], measured[:1])[0, 0] < 0.1
+    assert match_approaching(boxes, measured, FOCUS, FRAME) == [(0, 0), (1, 1)]
+    assert match_approaching(boxes, measured[::-1], FOCUS, FRAME) == [(0, 1), (1, 0)]
+
+
+@pytest.mark.parametrize(
+    "measured",
+    [
+        [100.0, 398, 182, 442],  # moves sideways and does not grow
+        [270, 398, 348, 439],  # moves away
+        [90, 340, 190, 390],  # leaves the road
+        [-560, 397, -396, 485],  # is twice as near
+    ],
+)
+def test_other_boxes_are_no_approaching_vehicle(measured):
+    box = np.array([[235.0, 398, 317, 442]])
+    assert match_approaching(box, np.array([measured]), FOCUS, FRAME) == []
+    assert match_approaching(box[:0], np.array([measured]), FOCUS, FRAME) == []
+    assert match_approaching(box, np.empty((0, 4)), FOCUS, FRAME) == []
+
+
+def test_an_approaching_vehicle_may_leave_the_frame():
+    box = np.array([[30.0, 395, 170, 462]])
+    measured = approaching(box[0], 1.2).clip(0)
+    assert measured[0] == 0
+    assert match_approaching(box, measured[None], FOCUS, FRAME) == [(0, 0)]

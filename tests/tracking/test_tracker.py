@@ -1071,3 +1071,16 @@ def assert_valid(track: Track) -> None:
     for error in (track.distance_std_m, track.speed_std_mps):
         assert error is None or (math.isfinite(error) and error >= 0)
     assert track.distance_m is None or track.distance_m > 0
+
+
+def test_a_vehicle_that_comes_fast_is_tracked():
+    # Both cars drive at 100 km/h; the box moves by most of its width between two searched frames.
+    tracker, ids = Tracker(fps=12.5), []
+    tracker.update(Detections.empty(), SHAPE)
+    for frame in range(7):
+        distance = 46.0 - 56 * frame / 12.5
+        left, right = 640 - 1150 * 9.4 / distance, 640 - 1150 * 7.6 / distance
+        box = [left, 400 - 1150 * 0.3 / distance, right, 400 + 1150 * 1.2 / distance]
+        tracks = tracker.update(Detections([np.clip(box, 0, 1280)], [3.0]), SHAPE)
+        ids.append([track.id for track in tracks])
+    assert ids[3:] == [[1]] * 4

@@ -8,7 +8,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection.boxes import Floats, box_areas, intersection_matrix, iter_nms, overlap_matrices
+from vehicle_detection.boxes import (
+    Floats,
+    box_areas,
+    clip_boxes,
+    intersection_matrix,
+    iter_nms,
+    overlap_matrices,
+)
+from vehicle_detection.camera import FrameShape
 from vehicle_detection.params import TrackParams
 
 # A detection shows two vehicles if it covers more than this fraction of both, and has a lower IoU with both.
@@ -16,6 +24,8 @@ _MIN_MERGED_COVERAGE, _MAX_MERGED_IOU = 0.7, 0.7
 # Fraction of its size by which the box of a nearer vehicle is enlarged, and fraction of a vehicle's height by
 # which the bottom edge of a nearer one is lower.
 _COVER_MARGIN, _MIN_NEARER = 0.03, 0.1
+# Growth of an approaching vehicle between two searched frames, and IoU of its grown box with the new one.
+_MAX_GROWTH, _MIN_GROWN_IOU = 1.6, 0.6
 
 Bools = NDArray[np.bool_]
 
@@ -33,7 +43,36 @@ def match_boxes(predicted: Floats, measured: Floats, max_distance: Floats) -> li
     areas, others = (np.log(np.maximum(box_areas(boxes), 1.0)) for boxes in (predicted, measured))
     area_ratio = np.abs(areas[:, None] - others[None])
     cost = (1 - iou) + distance + 0.3 * area_ratio
-    allowed = (distance <= 1) & (area_ratio <= math.log(4))
+    return _cheapest_pairs(cost, (distance <= 1) & (area_ratio <= math.log(4)))
+
+
+def match_approaching(
+    boxes: Floats, measured: Floats, focus: tuple[float, float], frame: FrameShape
+) -> list[tuple[int, int]]:
+    """Pairs ``(box, measured)`` of indices of vehicles that may have come nearer between two frames.
+
+    On a straight course, the box of a vehicle grows around the focus of expansion, where the course meets the
+    horizon (Gibson, *The Perception of the Visual World*, 1950). The growth is that which takes the edges of
+    the box closest to the measured ones; the grown box, clipped to the frame, must then fit the measured one.
+    """
+    if not len(boxes) or not len(measured):
+        return []
+    center = np.tile(focus, 2)
+    offsets, others = boxes - center, measured - center
+    growth = offsets @ others.T / np.maximum(np.square(offsets).sum(axis=1), 1.0)[:, None]
+    grown = center + offsets[:, None] * growth.clip(1, _MAX_GROWTH)[:, :, None]
+    iou = np.stack(
+        [
+            overlap_matrices(clip_boxes(grown[:, column], frame), measured[[column]])[0][:, 0]
+            for column in range(len(measured))
+        ],
+        axis=1,
+    )
+    return _cheapest_pairs(1 - iou, (growth >= 1) & (growth <= _MAX_GROWTH) & (iou >= _MIN_GROWN_IOU))
+
+
+def _cheapest_pairs(cost: Floats, allowed: Bools) -> list[tuple[int, int]]:
+    """Choose allowed pairs of rows and columns, each in one pair at most, with minimum total cost."""
     if (allowed.sum(axis=0) <= 1).all() and (allowed.sum(axis=1) <= 1).all():
         rows, columns = np.nonzero(allowed)
     else:

@@ -29,6 +29,7 @@ from vehicle_detection.params import TrackParams
 from vehicle_detection.tracking.association import (
     covered_fractions,
     distinct_vehicles,
+    match_approaching,
     merged_detections,
     nearer_cover,
 )
@@ -300,7 +301,7 @@ class Tracker:
     def _assign(
         self, boxes: Floats, scores: Floats, frame: FrameShape
     ) -> tuple[dict[int, int], dict[int, int], set[int]]:
-        """Assign detections (best first) to tracks in three rounds.
+        """Assign detections (best first) to tracks in four rounds.
 
         Returns the detection of each track, the merged detection of each track without one, and the tracks
         whose own detection is merged.
@@ -326,6 +327,13 @@ class Tracker:
         columns = [column for column in range(len(boxes)) if column not in taken]
         for row, column in match(predicted[confirmed:], boxes[columns], max_distance[confirmed:]):
             own[confirmed + row] = columns[column]
+        # 4. Tentative tracks, whose speed is not known, with high-score detections of approaching vehicles.
+        taken = set(own.values())
+        columns = [column for column in range(high) if column not in taken]
+        rows = [row for row in range(confirmed, len(self._live)) if row not in own]
+        focus = frame[1] / 2, self.camera.horizon_px
+        for row, column in match_approaching(predicted[rows], boxes[columns], focus, frame):
+            own[rows[row]] = columns[column]
         return own, shared, merged
 
     def _end_lost_tracks(self, frame: FrameShape, dt: float) -> None:
