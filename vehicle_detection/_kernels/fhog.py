@@ -1,4 +1,8 @@
-"""Numba kernels of FHOG: signed and unsigned orientations of cells, with four normalizations."""
+"""Numba kernels of FHOG: signed and unsigned orientations of cells, with four normalizations.
+
+Loops over channels take their number from an array: with a number in the code, the compiler unrolls them,
+which takes seconds.
+"""
 
 from __future__ import annotations
 

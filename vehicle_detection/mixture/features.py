@@ -37,6 +37,8 @@ _COTANGENTS = (np.cos(_BIN_BOUNDS) / np.sin(_BIN_BOUNDS)).astype(np.float32)
 # Added to the energy of a block, in squared gray levels of the mean gradient. Noise of one gray level on a
 # medium gray surface has about this energy, and must not be normalized to full contrast.
 _EPS = np.float32(2)
+# In place of an output of the kernel that is not wanted.
+_NO_CHANNELS, _NO_WORDS = np.empty((0, 0, 0, 0), np.float32), np.empty((0, 0, 0, 0), np.int32)
 # Smallest cell of every octave but the first, in pixels of the resized frame: cells have 1.5 to 3 squares a
 # side. And the shortest side of a resized frame.
 _MIN_CELL, _MIN_SIDE = 6.0, 16
@@ -214,9 +216,6 @@ class EdgePyramid:
         words = packed.view(np.int32)[None]
         _fhog_kernels.fhog_channels(cells, _EPS, _NO_CHANNELS, CHANNEL_SCALES, packing.per_word, words)
         return packed
-
-
-_NO_CHANNELS, _NO_WORDS = np.empty((0, 0, 0, 0), np.float32), np.empty((0, 0, 0, 0), np.int32)
 
 
 def _new_cells(channels: NDArray[np.float32]) -> NDArray[np.float32]:
