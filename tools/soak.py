@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,13 +41,12 @@ def soak(
     shape: tuple[int, int] = (270, 480),
     seed: int = 0,
     replay: bool = False,
-) -> list[Sample]:
+) -> Iterator[Sample]:
     """Track the vehicles of `frames` frames, and measure after each tenth of them.
 
     With `replay`, each frame of the drive is searched once only.
     """
     scenes = [scene.image for scene in vd.render_drive(frames=length, shape=shape, random_state=seed)]
-    samples: list[Sample] = []
     total, count = 0.0, 0  # of the distances
     with vd.VehicleDetector(model) as detector:
         detector.reset(fps=FPS)
@@ -60,18 +60,15 @@ def soak(
             total, count = total + sum(distances), count + len(distances)
             if (number + 1) % max(frames // 10, 1) == 0:
                 elapsed = time.perf_counter() - start
-                samples.append(
-                    Sample(
-                        frames=number + 1,
-                        memory_mb=_memory_mb(),
-                        frames_per_second=(number + 1 - before) / elapsed,
-                        tracks=len(result.tracks),
-                        mean_distance_m=total / count if count else 0.0,
-                    )
+                yield Sample(
+                    frames=number + 1,
+                    memory_mb=_memory_mb(),
+                    frames_per_second=(number + 1 - before) / elapsed,
+                    tracks=len(result.tracks),
+                    mean_distance_m=total / count if count else 0.0,
                 )
                 total, count = 0.0, 0
                 start, before = time.perf_counter(), number + 1
-    return samples
 
 
 def _memory_mb() -> float:
@@ -110,8 +107,9 @@ def main() -> None:
     failed = False
     frames = round(options.hours * 3600 * FPS) if options.hours else options.frames
     for model in options.models:
-        samples = soak(model, frames=frames, replay=options.hours is not None)
-        for sample in samples:
+        samples = []
+        for sample in soak(model, frames=frames, replay=options.hours is not None):
+            samples.append(sample)
             print(
                 f"{model}: {sample.frames} frames, {sample.memory_mb:.0f} MB, "
                 f"{sample.frames_per_second:.1f} frames/s, {sample.tracks} tracks, "

@@ -6,14 +6,14 @@ STEADY = Sample(frames=10, memory_mb=500.0, frames_per_second=50.0, tracks=3, me
 
 
 def test_a_short_run_has_a_sample_for_each_tenth():
-    samples = soak("highway", frames=20, length=10, shape=(180, 320))
+    samples = list(soak("highway", frames=20, length=10, shape=(180, 320)))
     assert [sample.frames for sample in samples] == list(range(2, 21, 2))
     assert min(sample.frames_per_second for sample in samples) > 0
     assert samples[-1].memory_mb < samples[0].memory_mb + 20
 
 
 def test_searched_frames_are_tracked_again():
-    samples = soak("highway", frames=200, length=10, shape=(180, 320), replay=True)
+    samples = list(soak("highway", frames=200, length=10, shape=(180, 320), replay=True))
     assert [sample.frames for sample in samples] == list(range(20, 201, 20))
     assert samples[-1].memory_mb < samples[0].memory_mb + 20
 
