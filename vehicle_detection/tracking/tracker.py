@@ -327,9 +327,11 @@ class Tracker:
         columns = [column for column in range(len(boxes)) if column not in taken]
         for row, column in match(predicted[confirmed:], boxes[columns], max_distance[confirmed:]):
             own[confirmed + row] = columns[column]
-        # 4. Tentative tracks, whose speed is not known, with high-score detections of approaching vehicles.
+        # 4. Tentative tracks, whose speed is not known, with sure detections of approaching vehicles: what stands
+        # beside the road comes nearer, too.
         taken = set(own.values())
-        columns = [column for column in range(high) if column not in taken]
+        sure = int((scores >= params.instant_confirm_score).sum())
+        columns = [column for column in range(sure) if column not in taken]
         rows = [row for row in range(confirmed, len(self._live)) if row not in own]
         focus = frame[1] / 2, self.camera.horizon_px
         for row, column in match_approaching(predicted[rows], boxes[columns], focus, frame):
