@@ -327,8 +327,8 @@ class Tracker:
         columns = [column for column in range(len(boxes)) if column not in taken]
         for row, column in match(predicted[confirmed:], boxes[columns], max_distance[confirmed:]):
             own[confirmed + row] = columns[column]
-        # 4. Tentative tracks, whose speed is not known, with detections of approaching vehicles: only with sure
-        # ones, because what stands beside the road comes nearer, too.
+        # 4. Tentative tracks, whose speed is not known, with sure detections of approaching vehicles. Unsure
+        # ones may be of what stands beside the road, which comes nearer, too.
         taken = set(own.values())
         sure = int((scores >= params.instant_confirm_score).sum())
         columns = [column for column in range(sure) if column not in taken]
