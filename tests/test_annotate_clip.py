@@ -236,7 +236,7 @@ def test_speeds_are_right_for_every_frame_rate():
         boxes = [np.array([row.box for row in rows if not row.ignore]).reshape(-1, 4) for rows in drive.truth]
         found = iter(boxes)
         detector = detector_from(lambda image, found=found: ((box := next(found)), [0.95] * len(box)))
-        clip = ImageSequenceClip([scene.image for scene in drive], fps=fps)
+        clip = ImageSequenceClip([np.zeros((360, 640, 3), np.uint8)] * len(drive), fps=fps)
         results = []
         pictures(detector.annotate_clip(clip, on_result=results.append))
         medians[fps] = np.median(speeds_of(results[-fps // 2 :])), np.median([row.speed_mps for row in truth])
