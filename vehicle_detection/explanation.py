@@ -120,9 +120,9 @@ def explain(detector: VehicleDetector, image: NDArray[np.uint8], box: ArrayLike)
     Notes
     -----
     The terms of a mixture are sums and differences of what its search computes; its search rounds features
-    and weights to 8 bits, so that ``"cells"`` differs from it by about 0.002. The window of a classifier of
-    patches is cropped and scored like a patch; the shared search, which scales the frame once, gives similar
-    scores. Shares of a classifier are relative to the mean patch of its training set.
+    to 7 bits and weights to 8, so that ``"cells"`` differs from it by about 0.004. The window of a classifier
+    of patches is cropped and scored like a patch; the shared search, which scales the frame once, gives
+    similar scores. Shares of a classifier are relative to the mean patch of its training set.
 
     Examples
     --------

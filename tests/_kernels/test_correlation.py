@@ -5,17 +5,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from llvmlite import binding
 
 from vehicle_detection._common import Workspace
-from vehicle_detection._kernels import Filter, PackedFilters, correlation
+from vehicle_detection._kernels import BYTE_LIMIT, DenseLayer, Filter, PackedFilters, correlation
 from vehicle_detection._kernels.vector import (
-    BYTES,
-    HALF_WORDS,
+    GROUP,
     Block,
-    PackedFormat,
     block_adder,
-    host_block,
-    host_packing,
+    byte_block,
+    float_block,
+    pack_bytes,
+    unpack_bytes,
 )
 
 KERNELS = {"blocks": correlation._correlate_blocks, "plain": correlation._correlate_plain}
@@ -116,45 +117,82 @@ def test_values_beyond_the_last_cell_are_not_used():
     assert np.isfinite(scores).all()
 
 
-@pytest.mark.parametrize("block", [Block(16, 8, 3), Block(8, 4, 2), Block(4, 8, 3), Block(4, 4, 3)])
-def test_blocks_of_every_processor_add_the_same_products(block):
-    add_products = block_adder(block)
+@settings(max_examples=40)
+@given(
+    outputs=st.integers(1, 40), inputs=st.integers(1, 60), count=st.integers(0, 120), seed=st.integers(0, 99)
+)
+def test_a_dense_layer_is_a_matrix_product(outputs, inputs, count, seed):
+    rng = np.random.default_rng(seed)
+    weights, matrix = rng.normal(size=(outputs, inputs)), rng.normal(size=(inputs, count)).astype(np.float32)
+    product = DenseLayer(weights)(matrix)
+    assert product.shape == (outputs, count)
+    np.testing.assert_allclose(product, weights @ matrix, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("depth", [1, 7])
+@pytest.mark.parametrize("block", [Block(16, 3, 8), Block(8, 2, 6), Block(4, 3, 8), Block(4, 3, 4)])
+def test_blocks_of_every_processor_add_the_same_products(block, depth):
+    add_products = block_adder(block, block)
 
     @numba.njit
-    def run(weights, channels, sums, offsets):
-        add_products(weights, 1, channels, 2, sums, offsets, 5)
+    def run(weights, cells, sums):
+        add_products(weights, 1, 4, cells, 2, 100, 3, sums, 5 + 60 * block.rows, 60)
 
     rng = np.random.default_rng(4)
-    weights = rng.normal(size=(2, 7, block.rows)).astype(np.float32)
-    channels = rng.normal(size=(7, block.columns + 6)).astype(np.float32)
-    offsets = np.arange(2 * block.rows).reshape(2, -1) * (block.columns + 1)
-    sums = rng.normal(size=5 + 2 * block.rows * (block.columns + 1)).astype(np.float32)
+    weights = rng.normal(size=(5, depth, block.rows)).astype(np.float32)
+    cells = rng.normal(size=2 + 100 * depth).astype(np.float32)
+    sums = rng.normal(size=5 + 60 * (block.rows + 1)).astype(np.float32)
     expected = sums.astype(np.float64)
     for row in range(block.rows):
-        start = 5 + offsets[1, row]
-        expected[start : start + block.columns] += weights[1, :, row] @ channels[:, 2 : 2 + block.columns]
-    run(weights, channels, sums, offsets)
+        start = 5 + 60 * (block.rows - row)
+        for number, channel in np.ndindex(3, depth):
+            first = 2 + 3 * number + 100 * channel
+            values = cells[first : first + block.columns].astype(np.float64)
+            expected[start : start + block.columns] += weights[1 + number, channel, row] * values
+    run(weights, cells, sums)
     np.testing.assert_allclose(sums, expected, rtol=1e-5, atol=1e-5)
 
 
-def test_this_processor_has_a_block():
-    assert host_block().rows % 4 == 0
-    assert host_block().columns == host_block().vectors * host_block().lanes
+@pytest.mark.parametrize(
+    ("lanes", "features"), [(16, {}), (8, {}), (4, {}), (4, {"ssse3": True}), (8, {"avx2": True})]
+)
+@pytest.mark.parametrize("extreme", [False, True])
+def test_bytes_are_multiplied_exactly_on_every_processor(lanes, features, extreme):
+    if not all(binding.get_host_cpu_features().get(feature) for feature in features):
+        pytest.skip("this processor lacks the instructions")
+    block = Block(lanes, 2, 3)
+    add_products = block_adder(block, block)
+
+    @numba.njit
+    def run(weights, cells, sums):
+        add_products(weights, 0, 2, cells, 0, 80, 2, sums, 200, 100)
+
+    rng = np.random.default_rng(2)
+    cells = rng.integers(BYTE_LIMIT if extreme else 0, BYTE_LIMIT + 1, (80 * GROUP, 4))
+    weights = rng.integers(-25, 26, (2, GROUP, 3, 4))
+    if extreme:
+        # Two of the largest products, and sums of 16 bits that are nearly the largest.
+        weights[...] = -25
+        weights[:, 0, :, :2], weights[:, 1:, :, :2] = BYTE_LIMIT, 0
+    sums = np.zeros(200 + 100, np.int32)
+    with mock.patch("llvmlite.binding.get_host_cpu_features", return_value=features):
+        run(pack_bytes(weights).reshape(2, GROUP, 3), pack_bytes(cells).ravel(), sums)
+    for row in range(3):
+        expected = np.zeros(block.columns, np.int64)
+        for number, word in np.ndindex(2, GROUP):
+            first = 2 * number + 80 * word
+            expected += cells[first : first + block.columns] @ weights[number, word, row]
+        start = 200 - 100 * row
+        np.testing.assert_array_equal(sums[start : start + block.columns], expected)
 
 
-# The bytes are tested where the processor multiplies them; everywhere the result is that of integers.
-PACKINGS = sorted({HALF_WORDS, host_packing()})
-
-
-@pytest.mark.parametrize("packing", [BYTES, HALF_WORDS])
-def test_packed_values_are_in_the_bits_of_a_word(packing):
-    values = np.array([[1, 255, 0, 127], [-1, -128, 5, 0]])
-    words = packing.pack(values)
-    assert words.dtype == packing.dtype
-    assert words.shape == (2, 4 // packing.per_word)
-    bits = 32 // packing.per_word
-    parts = [(words.astype(np.int64) >> (bits * part)) % 2**bits for part in range(packing.per_word)]
-    np.testing.assert_array_equal(np.stack(parts, axis=-1).reshape(2, 4), values % 2**bits)
+def test_bytes_are_in_the_bits_of_a_word():
+    values = np.array([[1, 127, 0, 64], [-1, -127, 5, 0]])
+    words = pack_bytes(values)
+    assert words.dtype == np.int32
+    assert words.shape == (2, 1)
+    assert words[0, 0] == 1 + 127 * 256 + 64 * 256**3
+    np.testing.assert_array_equal(unpack_bytes(words), values)
 
 
 def packed_reference(weights, cells, limit):
@@ -164,7 +202,10 @@ def packed_reference(weights, cells, limit):
     return np.column_stack([rows, columns, scores[rows, columns]])
 
 
-@pytest.mark.parametrize("packing", PACKINGS)
+PACKED_KERNELS = {"blocks": correlation._correlate_blocks, "plain": correlation._correlate_unpacked}
+
+
+@pytest.mark.parametrize("kernel", PACKED_KERNELS)
 @settings(max_examples=60, deadline=None)
 @given(
     sizes=st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9)), min_size=1, max_size=3),
@@ -173,34 +214,48 @@ def packed_reference(weights, cells, limit):
     extreme=st.booleans(),
     seed=st.integers(0, 99),
 )
-def test_windows_are_those_with_the_highest_sums_of_integers(packing, sizes, more, groups, extreme, seed):
+def test_windows_are_those_with_the_highest_sums_of_integers(kernel, sizes, more, groups, extreme, seed):
     rng = np.random.default_rng(seed)
     rows, columns = (max(size[axis] for size in sizes) + more[axis] for axis in range(2))
-    cells = rng.integers(255 if extreme else 0, 256, (4 * groups, rows, columns))
+    cells = rng.integers(BYTE_LIMIT if extreme else 0, BYTE_LIMIT + 1, (4 * groups, rows, columns))
     weights = [rng.normal(size=(*size, 4 * groups)) for size in sizes]
     if extreme:
-        # The largest products of bytes, which overflow 16 bits.
+        # The largest products of bytes, which would overflow 16 bits.
         weights = [np.where(each > -1.5, 1.0, -1.0) for each in weights]
-    filters = PackedFilters(weights, packing=packing)
-    packed = np.ascontiguousarray(packing.pack(cells.transpose(1, 2, 0)).transpose(2, 0, 1))
+    filters = PackedFilters(weights)
+    packed = np.ascontiguousarray(pack_bytes(cells.transpose(1, 2, 0)).transpose(2, 0, 1))
     row_ranges = [(0, rows), *[(min(1, rows - size[0]), rows) for size in sizes[1:]]]
     rounded = [np.rint(each / unit) for each, unit in zip(weights, filters.units)]
-    assert max(np.abs(each).max() for each in rounded) == 127
     for bound in (-1e12, 0.0, 1e12):
         search = filters.on_map(columns, range(len(sizes)), row_ranges, [bound] * len(sizes))
-        found = search.find(packed)
+        with mock.patch.object(correlation, "_packed_kernel", return_value=PACKED_KERNELS[kernel]):
+            found = search.find(packed)
         for number, (each, (first, _)) in enumerate(zip(rounded, row_ranges)):
             expected = packed_reference(each, cells, np.floor(bound / filters.units[number]))
             expected = expected[expected[:, 0] >= first]
             np.testing.assert_array_equal(found[found[:, 0] == number][:, 1:], expected)
 
 
+@given(words=st.integers(1, 12), scale=st.sampled_from([1e-6, 1.0, 1e6]), seed=st.integers(0, 99))
+def test_weights_are_bytes_whose_sums_do_not_overflow(words, scale, seed):
+    weights = scale * np.random.default_rng(seed).normal(0.2, 1, (3, 2, 4 * words))
+    unit = PackedFilters([weights]).units[0]
+    rounded = np.rint(weights / unit)
+    assert np.abs(rounded).max() <= BYTE_LIMIT
+    group = correlation._group(words)
+    halves = rounded.reshape(3, 2, -1, group, 2, 2)
+    for sign in (1, -1):
+        sums = np.maximum(sign * halves, 0).sum(axis=(3, 5))
+        assert sums.max() * BYTE_LIMIT <= 2**15 - 1
+
+
 def test_columns_of_a_map_become_channels():
     rng = np.random.default_rng(1)
-    cells, weights = rng.integers(0, 256, (8, 30, 9)), rng.normal(size=(4, 3, 8))
-    packed = np.ascontiguousarray(HALF_WORDS.pack(cells.transpose(1, 2, 0)).transpose(2, 0, 1))
-    whole = PackedFilters([weights], packing=HALF_WORDS).on_map(3, [0], [(0, 30)], [-1e12])
-    strip = PackedFilters([weights.reshape(1, 4, -1)], packing=HALF_WORDS).on_map(30, [0], [(0, 1)], [-1e12])
+    cells, weights = rng.integers(0, BYTE_LIMIT + 1, (8, 30, 9)), rng.integers(-12, 13, (4, 3, 8))
+    weights[0, 0] = [BYTE_LIMIT, 0, 0, 0, 0, 0, 0, 0]  # the same unit for both
+    packed = np.ascontiguousarray(pack_bytes(cells.transpose(1, 2, 0)).transpose(2, 0, 1))
+    whole = PackedFilters([weights]).on_map(3, [0], [(0, 30)], [-1e12])
+    strip = PackedFilters([weights.reshape(1, 4, -1)]).on_map(30, [0], [(0, 1)], [-1e12])
     expected = whole.find(np.ascontiguousarray(packed[:, :, 5:8]))
     found = strip.find(packed, np.arange(5, 8))
     np.testing.assert_array_equal(found[:, [0, 2, 3]], expected[:, [0, 1, 3]])
@@ -210,40 +265,39 @@ def test_no_template_is_no_search():
     assert PackedFilters([]).on_map(9, [], [], []) is None
 
 
-def test_a_processor_without_the_instruction_uses_half_words(caplog):
+def test_an_instruction_that_does_not_compile_is_replaced(caplog):
     broken = mock.Mock()
     broken.compile.side_effect = RuntimeError("no such intrinsic")
-    correlation._packed_format.cache_clear()
+    correlation._packed_kernel.cache_clear()
     try:
         with mock.patch.object(correlation, "_correlate_blocks", broken):
-            assert correlation._packed_format() == HALF_WORDS
+            assert correlation._packed_kernel() is correlation._correlate_unpacked
     finally:
-        correlation._packed_format.cache_clear()
+        correlation._packed_kernel.cache_clear()
     assert [record.getMessage() for record in caplog.records] == [
-        "correlation uses slower instructions: no such intrinsic"
+        "correlation uses plain, slower loops: no such intrinsic"
     ]
-    assert correlation._packed_format() == host_packing()
+    assert correlation._packed_kernel() is correlation._correlate_blocks
 
 
 @pytest.mark.parametrize(
-    ("features", "packing", "block"),
+    ("features", "floats", "packed"),
     [
-        ({"avx512f": True, "avx512bw": True, "avx512vnni": True, "avx": True}, BYTES, Block(16, 8, 3)),
-        ({"avx512f": True, "avx": True, "avx2": True}, HALF_WORDS, Block(16, 8, 3)),
-        ({"avxvnni": True, "avx": True, "avx2": True}, BYTES, Block(8, 4, 2)),
-        ({"avx": True, "avx2": True}, HALF_WORDS, Block(8, 4, 2)),
-        ({"neon": True}, HALF_WORDS, Block(4, 8, 3)),
-        ({}, HALF_WORDS, Block(4, 4, 3)),
+        ({"avx512f": True, "avx512vnni": True, "avx": True}, Block(16, 3, 8), Block(16, 3, 8)),
+        ({"avx512f": True, "avx": True, "avx2": True}, Block(16, 3, 8), Block(16, 3, 4)),
+        ({"avxvnni": True, "avx": True, "avx2": True}, Block(8, 2, 6), Block(8, 2, 6)),
+        ({"avx": True, "avx2": True}, Block(8, 2, 6), Block(8, 3, 2)),
+        ({"neon": True}, Block(4, 3, 8), Block(4, 3, 4)),
+        ({}, Block(4, 3, 4), Block(4, 3, 2)),
     ],
 )
-def test_the_processor_decides_the_format_and_the_block(features, packing, block):
+def test_the_processor_decides_the_blocks(features, floats, packed):
     with mock.patch("llvmlite.binding.get_host_cpu_features", return_value=features):
-        assert host_packing() == packing
-        assert host_block() == block
-    assert isinstance(packing, PackedFormat)
+        assert float_block() == floats
+        assert byte_block() == packed
 
 
 def test_code_for_another_processor_uses_no_special_instructions():
     with mock.patch.object(numba.config, "CPU_NAME", "generic"):
-        assert host_packing() == HALF_WORDS
-        assert host_block() == Block(4, 4, 3)
+        assert float_block() == Block(4, 3, 4)
+        assert byte_block() == Block(4, 3, 2)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from vehicle_detection._common import ThreadTeam, Workspace
 from vehicle_detection._kernels import fhog as _fhog_kernels
-from vehicle_detection._kernels.vector import BYTES, HALF_WORDS
+from vehicle_detection._kernels.vector import unpack_bytes
 from vehicle_detection.mixture import N_CHANNELS, CellGrid, EdgePyramid, mirror_channels
 from vehicle_detection.mixture.features import (
     _EPS,
@@ -226,13 +226,13 @@ def test_channels_are_between_zero_and_their_clipping_limit():
     channels = EdgePyramid(noise((64, 96))).feature_map(inner_grid(8.0, (64, 96))).channels
     scaled = channels * CHANNEL_SCALES[:, None, None]
     assert scaled.min() >= 0
-    assert 200 < scaled.max() <= 255.001
+    assert 100 < scaled.max() <= 127.001
 
 
-def test_the_scales_map_the_largest_channels_to_255():
+def test_the_scales_map_the_largest_channels_to_127():
     # Orientations are half of four terms of at most 0.2, texture sums are 0.2357 times sixteen terms.
     largest = np.repeat([0.4, 0.2357 * 16 * 0.2], [16, 4])
-    np.testing.assert_allclose(CHANNEL_SCALES * largest, 255, rtol=1e-6)
+    np.testing.assert_allclose(CHANNEL_SCALES * largest, 127, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("width", "height"), [(7.0, 7.0), (20.0, 12.0), (5.0, 30.0)])
@@ -246,17 +246,14 @@ def test_crops_of_large_cells_are_interpolated_like_a_map(width, height):
         np.testing.assert_array_equal(crop, expected)
 
 
-@pytest.mark.parametrize("packing", [BYTES, HALF_WORDS])
 @pytest.mark.parametrize("size", SIZES)
-def test_packed_channels_are_rounded_channels(size, packing):
+def test_packed_channels_are_rounded_channels(size):
     pyramid, grid = EdgePyramid(road()), inner_grid(size)
-    packed = pyramid.packed_channels(grid, packing)
-    assert packed.shape == (N_CHANNELS // packing.per_word, grid.rows, grid.columns)
-    bits = 32 // packing.per_word
-    parts = [(packed.view(np.uint32) >> (bits * part)) & (2**bits - 1) for part in range(packing.per_word)]
-    found = np.stack(parts, axis=1).reshape(N_CHANNELS, grid.rows, grid.columns)
+    packed = pyramid.packed_channels(grid)
+    assert packed.shape == (N_CHANNELS // 4, grid.rows, grid.columns)
+    found = unpack_bytes(packed.transpose(1, 2, 0)).transpose(2, 0, 1)
     scaled = pyramid.feature_map(grid).channels * CHANNEL_SCALES[:, None, None]
-    np.testing.assert_array_equal(found, np.floor(np.minimum(scaled + np.float32(0.5), 255)))
+    np.testing.assert_array_equal(found, np.floor(np.minimum(scaled + np.float32(0.5), 127)))
 
 
 @pytest.mark.parametrize("rows", [(40, 100), (0, 90), (100, 180), (170, 180)])
@@ -296,8 +293,8 @@ def test_neither_memory_nor_threads_change_the_result():
         for one, two in zip(fresh.octaves, reused.octaves):
             np.testing.assert_array_equal(one.sums, two.sums)
         grid = inner_grid(5.0, shape)
-        packed = fresh.packed_channels(grid, BYTES)
-        np.testing.assert_array_equal(reused.packed_channels(grid, BYTES, workspace), packed)
+        packed = fresh.packed_channels(grid)
+        np.testing.assert_array_equal(reused.packed_channels(grid, workspace), packed)
     team.close()
 
 

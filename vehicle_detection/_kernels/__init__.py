@@ -11,14 +11,14 @@ from vehicle_detection._kernels.hog import (
 )
 from vehicle_detection._kernels.linear_svm import fit_svm, hinge_loss
 from vehicle_detection._kernels.suppression import suppress, vote
-from vehicle_detection._kernels.vector import PackedFormat
+from vehicle_detection._kernels.vector import BYTE_LIMIT
 from vehicle_detection._kernels.yuv import channels_from_planes, planes_from_channels
 
 __all__ = [
+    "BYTE_LIMIT",
     "DenseLayer",
     "Filter",
     "PackedFilters",
-    "PackedFormat",
     "PackedSearch",
     "bin_of_value",
     "cell_means",

@@ -15,39 +15,67 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import NEW_ARRAYS, Workspace
 from vehicle_detection._kernels.jit import jit
-from vehicle_detection._kernels.vector import HALF_WORDS, PackedFormat, block_adder, host_block, host_packing
+from vehicle_detection._kernels.vector import (
+    BYTE_LIMIT,
+    GROUP,
+    MAX_FACTORS,
+    block_adder,
+    byte_block,
+    float_block,
+    pack_bytes,
+    unpack_bytes,
+)
 
-_BLOCK = host_block()
-_ROWS, _COLUMNS = _BLOCK.rows, _BLOCK.columns
-_add_products = block_adder(_BLOCK)
+_FLOATS, _BYTES = float_block(), byte_block()
+_add_products = block_adder(_FLOATS, _BYTES)
+
+Blocks = NDArray[np.int64]
+"""What to multiply, one block of rows of a template in each row: first and last of its entries of `weights`,
+first channel, first and last row of the map, number of windows in a row, and position in the sums."""
 
 
 class _FilterBlocks:
-    """The cells of a template in blocks of as many as the registers hold.
+    """The rows of a template in blocks of as many as the registers hold.
 
-    `weights` is ``(rows, columns, depth)``; neighboring cells of a window are `dilation` cells apart.
+    `weights` is ``(rows, columns, depth)``; neighboring cells of a window are `dilation` cells apart. The
+    channels are in groups of `group`, which divides the depth.
     """
 
-    def __init__(self, weights: NDArray[Any], dilation: int = 1) -> None:
+    def __init__(self, weights: NDArray[Any], group: int, dilation: int = 1) -> None:
         rows, columns, depth = weights.shape
-        # Column-major order: consecutive cells update different rows of sums, which avoids store-load stalls.
-        cells = weights.swapaxes(0, 1).reshape(rows * columns, depth)
-        blocks = -(-len(cells) // _ROWS)
-        padded = np.zeros((blocks * _ROWS, depth), weights.dtype)
-        padded[: len(cells)] = cells
-        self.weights = np.ascontiguousarray(padded.reshape(blocks, _ROWS, depth).swapaxes(1, 2))
+        size, groups = (_FLOATS if weights.dtype == np.float32 else _BYTES).rows, depth // group
+        count = -(-rows // size)
+        padded = np.zeros((count * size, columns, depth), weights.dtype)
+        padded[:rows] = weights
+        split = padded.reshape(count, size, columns, groups, group).transpose(0, 3, 2, 4, 1)
+        self.weights = np.ascontiguousarray(split).reshape(-1, group, size)
+        self.dilation = dilation
         self.last_row, self.last_column = (rows - 1) * dilation, (columns - 1) * dilation
-        self._rows, self._columns = np.zeros((2, blocks * _ROWS), np.intp)
-        positions = np.indices((columns, rows)).reshape(2, -1) * dilation
-        self._columns[: len(cells)], self._rows[: len(cells)] = positions
+        # Rows of sums before and after those of the windows, because blocks have rows of weights 0.
+        self.margin = (size - 1) * dilation
+        number, part = np.divmod(np.arange(count * groups), groups)
+        self._first_weights, self._columns = np.arange(count * groups) * columns, columns
+        self._first_rows, self._first_channels = number * size * dilation, part * group
 
-    def offsets(self, stride: int) -> NDArray[np.intp]:
-        """Position of each weight's window relative to the cell's, in sums with rows of `stride`.
+    def blocks(self, rows: tuple[int, int], width: int, place: int, stride: int) -> Blocks:
+        """List the products for the windows of some rows, the first of which is at `place` in the sums.
 
-        The sums include windows that extend beyond the map, so that no product needs a bounds check.
+        The sums have rows of `stride` entries. There are `margin` rows more before and after.
         """
-        offsets = (self.last_row - self._rows) * stride + self.last_column - self._columns
-        return np.asarray(offsets.reshape(-1, _ROWS), np.intp)
+        first, last = rows
+        tops = self._first_rows
+        stops = last + tops + self.margin if last > first else first + tops
+        stops = np.minimum(stops, last + self.last_row)
+        columns = (
+            self._first_weights,
+            self._first_weights + self._columns,
+            self._first_channels,
+            first + tops,
+            stops,
+            np.full(len(tops), width),
+            place - (first + tops) * stride,
+        )
+        return np.column_stack(columns).astype(np.int64)
 
 
 class Filter:
@@ -63,7 +91,7 @@ class Filter:
     """
 
     def __init__(self, weights: NDArray[np.floating], *, dilation: int = 1) -> None:
-        self._blocks = _FilterBlocks(weights.astype(np.float32), dilation)
+        self._blocks = _FilterBlocks(weights.astype(np.float32), weights.shape[-1], dilation)
 
     def add_to(
         self, channels: NDArray[np.float32], scores: NDArray[np.float32], workspace: Workspace = NEW_ARRAYS
@@ -73,15 +101,12 @@ class Filter:
         `channels` is ``(channels, rows, columns)`` and C-contiguous, `scores`
         ``(window rows, window columns)`` with at most as many windows as fit.
         """
-        _, rows, columns = channels.shape
-        blocks = self._blocks
-        stride = columns + blocks.last_column + _COLUMNS
-        sums = workspace.take(((rows + blocks.last_row) * stride,), np.float32, "window sums")
-        spans = np.array([(0, len(blocks.weights), 0, rows)])
-        _kernel()(channels, blocks.weights, blocks.offsets(stride), spans, sums, stride)
-        height, width = scores.shape
-        top, left = blocks.last_row, blocks.last_column
-        scores += sums.reshape(-1, stride)[top : top + height, left : left + width]
+        filters, (height, width) = self._blocks, scores.shape
+        stride, margin = width + _FLOATS.columns, filters.margin
+        sums = workspace.take(((height + 2 * margin) * stride,), np.float32, "window sums")
+        blocks = filters.blocks((0, height), width, margin * stride, stride)
+        _kernel()(channels, filters.weights, blocks, sums, stride, filters.dilation, _FLOATS.columns)
+        scores += sums.reshape(-1, stride)[margin : margin + height, :width]
 
 
 class DenseLayer:
@@ -97,45 +122,38 @@ class DenseLayer:
 
     def __init__(self, weights: NDArray[np.floating]) -> None:
         self._outputs, depth = weights.shape
-        blocks = -(-self._outputs // _ROWS)
-        padded = np.zeros((blocks * _ROWS, depth), np.float32)
-        padded[: self._outputs] = weights
-        self._weights = np.ascontiguousarray(padded.reshape(blocks, _ROWS, depth).swapaxes(1, 2))
+        self._weights = _FilterBlocks(weights[:, None].astype(np.float32), depth).weights
 
     def __call__(self, matrix: NDArray[np.float32]) -> NDArray[np.float32]:
         """Multiply by ``(inputs, N)``, C-contiguous; returns ``(outputs, N)``."""
         depth, count = matrix.shape
-        stride = count + _COLUMNS
-        sums = np.empty(self._weights.shape[0] * _ROWS * stride, np.float32)
-        offsets = np.arange(self._weights.shape[0] * _ROWS).reshape(-1, _ROWS) * stride
-        spans = np.array([(0, len(self._weights), 0, 1)])
-        _kernel()(matrix.reshape(depth, 1, count), self._weights, offsets, spans, sums, stride)
-        return sums.reshape(-1, stride)[: self._outputs, :count]
+        number, _, size = self._weights.shape
+        index, stride = np.arange(number), count + _FLOATS.columns
+        sums = np.empty(number * size * stride, np.float32)
+        # The outputs are rows of a template, whose windows lie in the opposite order.
+        places = ((number - index) * size - 1) * stride
+        blocks = np.column_stack([index, index + 1, *np.tile([[0], [0], [1], [count]], number), places])
+        _kernel()(matrix.reshape(depth, 1, count), self._weights, blocks, sums, stride, 1, _FLOATS.columns)
+        return sums.reshape(-1, stride)[::-1][: self._outputs, :count]
 
 
 class PackedFilters:
     """Templates over maps of packed channels: the windows with a high score, as integers.
 
     The weights of a template are rounded to one signed byte each. A window's score is its integer times the
-    template's entry of `units`. The integers do not depend on the format.
+    template's entry of `units`. The integers are the same on every processor: none is rounded or saturated.
 
-    Parameters
-    ----------
-    weights
-        ``(rows, columns, channels)`` for each template, in units of the packed channels.
-    packing
-        Format of the channels; None chooses the fastest of this processor.
+    `weights` are ``(rows, columns, channels)`` for each template, in units of the packed channels, which have
+    values up to `BYTE_LIMIT`.
     """
 
-    def __init__(
-        self, weights: Sequence[NDArray[np.floating]], *, packing: PackedFormat | None = None
-    ) -> None:
-        self.packing = _packed_format() if packing is None else packing
-        self.units = np.array([max(float(np.abs(each).max()), 1e-12) / 127 for each in weights])
-        self._templates = [
-            _FilterBlocks(self.packing.pack(np.rint(each / unit).astype(np.int8)))
+    def __init__(self, weights: Sequence[NDArray[np.floating]]) -> None:
+        self.units = np.array([_unit(each) for each in weights])
+        words = [
+            pack_bytes(np.rint(each / unit).astype(np.int8))
             for each, unit in zip(weights, self.units.tolist())
         ]
+        self._templates = [_FilterBlocks(each, _group(each.shape[-1])) for each in words]
 
     def on_map(
         self,
@@ -152,26 +170,42 @@ class PackedFilters:
         templates = [self._templates[index] for index in chosen]
         if not templates:
             return None
-        rows = max(last for _, last in row_ranges)
-        stride = columns + max(each.last_column for each in templates) + _COLUMNS
-        starts = np.cumsum([0] + [(rows + each.last_row) * stride for each in templates]).tolist()
-        counts = np.cumsum([0] + [len(each.weights) for each in templates]).tolist()
-        planes, spans = [], []
+        widths = [max(columns - each.last_column, 0) for each in templates]
+        stride = max(widths) + _BYTES.columns
+        blocks, planes, start, weights = [], [], 0, 0
         for number, (template, (first, last)) in enumerate(zip(templates, row_ranges, strict=True)):
-            corner = starts[number] + template.last_row * stride + template.last_column
+            last = max(last - template.last_row, first)
+            place = start + template.margin * stride
+            table = template.blocks((first, last), widths[number], place, stride)
+            table[:, :2] += weights
+            blocks.append(table)
             limit = math.floor(bounds[number] / self.units[chosen[number]])
             limit = min(max(limit, -(2**31)), 2**31 - 1)
-            planes.append((corner, first, last - template.last_row, columns - template.last_column, limit))
-            spans.append((counts[number], counts[number + 1], first, last))
+            planes.append((place - first * stride, first, last, widths[number], limit))
+            start += (last - first + 2 * template.margin) * stride
+            weights += len(template.weights)
         return PackedSearch(
             np.concatenate([each.weights for each in templates]),
-            np.concatenate([each.offsets(stride) + start for each, start in zip(templates, starts)]),
-            np.array(spans, np.int64),
+            np.concatenate(blocks),
             stride,
-            starts[-1],
+            start,
             np.array(planes, np.int64),
-            sum(max(stop - first, 0) * max(width, 0) for _, first, stop, width, _ in planes),
+            sum((last - first) * width for _, first, last, width, _ in planes),
         )
+
+
+def _group(words: int) -> int:
+    """Divide a depth into groups: the largest number of words up to `GROUP` that divides it."""
+    return max(each for each in range(1, GROUP + 1) if words % each == 0)
+
+
+def _unit(weights: NDArray[np.floating]) -> float:
+    """Smallest unit in which the weights are bytes, and no sum of their products in 16 bits overflows."""
+    words = weights.reshape(*weights.shape[:2], -1, _group(weights.shape[-1] // 4), 2, 2)
+    # The first and the second halves of the words of a group.
+    sums = [np.maximum(each, 0).sum(axis=(3, 5)).max() for each in (words, -words)]
+    # Each of the ten weights is rounded by at most a half.
+    return max(float(np.abs(weights).max()) / BYTE_LIMIT, float(max(sums)) / (MAX_FACTORS - GROUP), 1e-12)
 
 
 _ALL_COLUMNS = np.empty(0, np.intp)
@@ -181,9 +215,8 @@ _ALL_COLUMNS = np.empty(0, np.intp)
 class PackedSearch:
     """A search of maps of one size with several templates."""
 
-    weights: NDArray[Any]
-    offsets: NDArray[np.intp]
-    spans: NDArray[np.int64]  # for each template: range of its blocks, range of the map's rows
+    weights: NDArray[np.int32]
+    blocks: Blocks
     stride: int
     length: int  # of the sums of all windows
     planes: NDArray[np.int64]  # for each template: place of its first window, rows, columns, score limit
@@ -191,7 +224,7 @@ class PackedSearch:
 
     def find(
         self,
-        packed: NDArray[Any],
+        packed: NDArray[np.int32],
         columns: NDArray[np.intp] = _ALL_COLUMNS,
         workspace: Workspace = NEW_ARRAYS,
     ) -> NDArray[np.int32]:
@@ -205,20 +238,19 @@ class PackedSearch:
             cells = packed.transpose(2, 0, 1)[columns].reshape(-1, 1, packed.shape[1])
         sums = workspace.take((self.length,), np.int32, "window sums")
         found = workspace.take((self.windows, 4), np.int32, "windows")
-        _correlate_blocks(cells, self.weights, self.offsets, self.spans, sums, self.stride)
+        _packed_kernel()(cells, self.weights, self.blocks, sums, self.stride, 1, _BYTES.columns)
         return found[: _find_windows(sums, self.stride, self.planes, found)].copy()
 
 
 @functools.cache
-def _packed_format() -> PackedFormat:
-    """Return the host's format, or half-words if its instruction does not compile."""
-    packing = host_packing()
+def _packed_kernel() -> Callable[..., None]:
+    """Return the block kernel for packed numbers, or plain loops if it does not compile."""
     try:
-        _compile_blocks(numba.from_dtype(np.dtype(packing.dtype)), numba.int32)
+        _compile_blocks(numba.int32, numba.int32)
     except (numba.core.errors.NumbaError, RuntimeError) as error:  # LLVM's are RuntimeErrors
-        logging.getLogger(__name__).warning("correlation uses slower instructions: %s", error)
-        return HALF_WORDS
-    return packing
+        logging.getLogger(__name__).warning("correlation uses plain, slower loops: %s", error)
+        return _correlate_unpacked
+    return _correlate_blocks
 
 
 @functools.cache
@@ -235,38 +267,55 @@ def _kernel() -> Callable[..., None]:
 def _compile_blocks(number: Any, total: Any) -> None:
     """Compile the block kernel for numbers and sums of these types."""
     maps, table = number[:, :, ::1], numba.int64[:, ::1]
-    cast("Any", _correlate_blocks).compile((maps, maps, numba.intp[:, ::1], table, total[::1], numba.intp))
+    cast("Any", _correlate_blocks).compile((maps, maps, table, total[::1], *[numba.intp] * 3))
 
 
 @jit
-def _correlate_blocks(channels, weights, offsets, spans, sums, stride):
-    """Add the products of every cell to the sums of the windows that contain it.
+def _correlate_blocks(channels, weights, blocks, sums, stride, dilation, tile):
+    """Compute the sums of products of all windows.
 
-    `channels` is ``(depth, rows, columns)``, `weights` ``(blocks, depth, rows of a block)``. `offsets`
-    ``(blocks, rows of a block)`` is the position of each weight's window relative to the cell's in `sums`,
-    whose rows have `stride` entries. `spans` ``(templates, 4)`` is the range of the blocks of each template,
-    and that of the rows of the map on which they are used. Numbers are float32, or packed, see `block_adder`.
+    `channels` is ``(depth, rows, columns)``, `weights` ``(N, channels of a group, rows of a block)``, and
+    `blocks` as in `Blocks`. `sums` is the output, with rows of `stride` entries. Numbers are float32, or
+    packed, and `tile` is the columns of their block, see `block_adder`.
     """
     depth, rows, columns = channels.shape
+    group = weights.shape[1]
     total = rows * columns
-    flat = channels.reshape(depth, total)
+    flat = channels.reshape(depth * total)
+    end, end_start, end_extent = flat, -1, -1
     for position in range(len(sums)):
         sums[position] = 0
-    # A block may read beyond the last cell of a row; those products are added where no window is.
-    tail = np.empty((depth, _COLUMNS), channels.dtype)
+    widest = 0
+    for block in range(len(blocks)):
+        widest = max(widest, blocks[block, 5])
     for y in range(rows):
-        for x in range(0, columns, _COLUMNS):
-            cells, first = flat, y * columns + x
-            if first + _COLUMNS > total:
-                for channel in range(depth):
-                    for column in range(_COLUMNS):
-                        position = min(first + column, total - 1)
-                        tail[channel, column] = flat[channel, position]
-                cells, first = tail, 0
-            for block_start, block_stop, row_start, row_stop in spans:
-                if row_start <= y < row_stop:
-                    for block in range(block_start, block_stop):
-                        _add_products(weights, block, cells, first, sums, offsets, y * stride + x)
+        for x in range(0, widest, tile):
+            for block in range(len(blocks)):
+                first, last, channel, row_start, row_stop, width, place = blocks[block]
+                if x < width and row_start <= y < row_stop:
+                    # Values beyond the last cell of a row are added where no window is.
+                    cells, start, step = flat, channel * total + y * columns + x, total
+                    extent = (last - first - 1) * dilation + tile
+                    if start + (group - 1) * total + extent > depth * total:
+                        if start != end_start or extent != end_extent:
+                            end = _end_of_cells(flat, start, total, group, extent)
+                            end_start, end_extent = start, extent
+                        cells, start, step = end, 0, extent
+                    position, row_step = place + y * stride + x, dilation * stride
+                    _add_products(
+                        weights, first, last, cells, start, step, dilation, sums, position, row_step
+                    )
+
+
+@jit
+def _end_of_cells(flat, start, step, count, length):
+    """Copy parts of the channels, of `length` cells, that go beyond the end; the last cell is repeated."""
+    copy = np.empty(count * length, flat.dtype)
+    for channel in range(count):
+        for cell in range(length):
+            position = min(start + channel * step + cell, len(flat) - 1)
+            copy[channel * length + cell] = flat[position]
+    return copy
 
 
 @jit
@@ -294,17 +343,39 @@ def _find_windows(sums, stride, planes, found):
 
 
 @jit
-def _correlate_plain(channels, weights, offsets, spans, sums, stride):
-    """`_correlate_blocks` without vector intrinsics."""
-    depth, rows, columns = channels.shape
+def _correlate_plain(channels, weights, blocks, sums, stride, dilation, tile):
+    """`_correlate_blocks` without vector intrinsics, for numbers that are not packed."""
+    rows = channels.shape[1]
     for position in range(len(sums)):
         sums[position] = 0
-    for y in range(rows):
-        for block in range(len(weights)):
+    for block in range(len(blocks)):
+        first, last, channel, row_start, row_stop, width, place = blocks[block]
+        for y in range(row_start, min(row_stop, rows)):
             for row in range(weights.shape[2]):
-                first = y * stride + offsets[block, row]
-                line = sums[first : first + columns]
-                for channel in range(depth):
-                    weight, values = weights[block, channel, row], channels[channel, y]
-                    for x in range(columns):
-                        line[x] += weight * values[x]
+                position = place + y * stride - row * dilation * stride
+                line = sums[position : position + width]
+                for k in range(weights.shape[1]):
+                    for number in range(first, last):
+                        weight = weights[number, k, row]
+                        values = channels[channel + k, y, (number - first) * dilation :]
+                        for x in range(width):
+                            line[x] += weight * values[x]
+
+
+def _correlate_unpacked(
+    channels: NDArray[np.int32],
+    weights: NDArray[np.int32],
+    blocks: Blocks,
+    sums: NDArray[np.int32],
+    stride: int,
+    dilation: int,
+    tile: int,
+) -> None:
+    """`_correlate_plain` for packed numbers."""
+    numbers = [
+        np.ascontiguousarray(np.moveaxis(unpack_bytes(np.moveaxis(each, axis, -1)), -1, axis))
+        for each, axis in ((channels, 0), (weights, 1))
+    ]
+    blocks = blocks.copy()
+    blocks[:, 2] *= 4
+    _correlate_plain(*numbers, blocks, sums, stride, dilation, tile)

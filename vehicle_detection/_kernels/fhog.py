@@ -237,25 +237,25 @@ def _normalize_row(cells, factors, y, channels):
 
 
 @jit
-def fhog_channels(cells, eps, channels, scales, per_word, packed):
-    """FHOG channels of several grids of cells, as numbers or as small integers in words of 32 bits.
+def fhog_channels(cells, eps, channels, scales, packed):
+    """FHOG channels of several grids of cells, as numbers or as bytes in words of 32 bits.
 
-    `cells` are the outputs of `resample`; `eps` is added to the energy of a block. If `per_word` is 0, the
-    output is `channels`, ``(grids, 20, rows, columns)`` float32. Else it is `packed`,
-    ``(grids, 20 / per_word, rows, columns)`` int32: the value of channel `k` is multiplied by ``scales[k]``,
-    rounded, and limited to 255; the first of a word's 4 or 2 channels is in the lowest bits. Both are one
-    kernel because most of the time of compiling it goes into what they share.
+    `cells` are the outputs of `resample`; `eps` is added to the energy of a block. One of the outputs may be
+    empty: `channels` is ``(grids, 20, rows, columns)`` float32, and `packed` ``(grids, 5, rows, columns)``
+    int32: the value of channel `k` is multiplied by ``scales[k]`` and rounded; the first of a word's 4
+    channels is in the lowest bits. Both are one kernel because most of the time of compiling it goes into
+    what they share.
     """
     grids, _, rows, columns = cells.shape
     rows, columns = rows - 2, columns - 2
     factors = np.empty((rows + 1, columns + 1), np.float32)
     line = np.empty((20, columns), np.float32)
-    half, limit = np.float32(0.5), np.float32(255)
+    half, limit = np.float32(0.5), np.float32(127)
     for number in range(grids):
         _block_factors(cells[number], eps, factors)
         for y in range(rows):
             _normalize_row(cells[number], factors, y, line)
-            if per_word == 4:
+            if len(packed):
                 for word in range(packed.shape[1]):
                     out, k = packed[number, word, y], 4 * word
                     a, b, c, d = line[k], line[k + 1], line[k + 2], line[k + 3]
@@ -268,14 +268,6 @@ def fhog_channels(cells, eps, channels, scales, per_word, packed):
                             numba.int32(min(d[x] * sd + half, limit)) << 8
                         )
                         out[x] = low | (high << 16)
-            elif per_word == 2:
-                for word in range(packed.shape[1]):
-                    out, k = packed[number, word, y], 2 * word
-                    a, b, sa, sb = line[k], line[k + 1], scales[k], scales[k + 1]
-                    for x in range(columns):
-                        out[x] = numba.int32(min(a[x] * sa + half, limit)) | (
-                            numba.int32(min(b[x] * sb + half, limit)) << 16
-                        )
             else:
                 for k in range(channels.shape[1]):
                     source, target = line[k], channels[number, k, y]

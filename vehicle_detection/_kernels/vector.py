@@ -22,8 +22,8 @@ class Block(NamedTuple):
     """Sums that a processor keeps in its registers: rows of vectors of lanes."""
 
     lanes: int
-    rows: int
     vectors: int
+    rows: int
 
     @property
     def columns(self) -> int:
@@ -31,47 +31,58 @@ class Block(NamedTuple):
         return self.lanes * self.vectors
 
 
-def host_block() -> Block:
-    """Choose the block for this processor's vector registers.
+def float_block() -> Block:
+    """Choose the block for sums of float32 in this processor's vector registers.
 
-    AVX-512 has 32 registers of 16 floats, NEON 32 of 4, AVX 16 of 8 and SSE 16 of 4. A few of them hold the
+    AVX-512 has 32 registers of 16 numbers, NEON 32 of 4, AVX 16 of 8 and SSE 16 of 4. A few of them hold the
     factors.
     """
     features = _host_features()
     if features.get("avx512f"):
-        return Block(16, 8, 3)
+        return Block(16, 3, 8)
     if features.get("avx"):
-        return Block(8, 4, 2)
-    return Block(4, 8 if features.get("neon") else 4, 3)
+        return Block(8, 2, 6)
+    return Block(4, 3, 8 if features.get("neon") else 4)
 
 
-class PackedFormat(NamedTuple):
-    """Small integers in words of 32 bits: unsigned ones of up to 8 bits, and signed factors of 8 bits.
+def byte_block() -> Block:
+    """Choose the block for sums of products of bytes.
 
-    The type of the words tells the kernels the format: int32 holds four bytes, uint32 two half-words.
+    A sum takes two registers where the processor has no instruction that adds four products to it (VNNI), and
+    adds them in 16 bits first.
     """
-
-    per_word: int
-
-    @property
-    def dtype(self) -> type[np.int32] | type[np.uint32]:
-        """Type of the words."""
-        return np.int32 if self.per_word == 4 else np.uint32
-
-    def pack(self, values: NDArray[np.integer]) -> NDArray[Any]:
-        """Pack the last axis, of a multiple of `per_word` values; the first one is in the lowest bits."""
-        bits = 32 // self.per_word
-        groups = values.astype(np.int64).reshape(*values.shape[:-1], -1, self.per_word) & (2**bits - 1)
-        words = (groups << (bits * np.arange(self.per_word))).sum(axis=-1)
-        return np.asarray(words.astype(np.uint32).view(self.dtype))
+    block = float_block()
+    if _adds_bytes(block.lanes, _host_features()):
+        return block
+    return Block(block.lanes, 3, 4 if block.rows == 8 else 2)
 
 
-BYTES, HALF_WORDS = PackedFormat(4), PackedFormat(2)
+def _adds_bytes(lanes: int, features: Mapping[str, bool]) -> bool:
+    """Whether the processor multiplies the four bytes of so many words, and adds the products."""
+    return bool(features.get({16: "avx512vnni", 8: "avxvnni"}.get(lanes, "")))
 
 
-def host_packing() -> PackedFormat:
-    """Choose the format for this processor: bytes where it multiplies them (VNNI), else half-words."""
-    return BYTES if _vnni_lanes() else HALF_WORDS
+BYTE_LIMIT = 127
+"""Largest packed value, and largest absolute factor."""
+
+GROUP = 5
+"""Words whose products are added at a time: those of a cell. Their sums may have 16 bits."""
+
+MAX_FACTORS = (2**15 - 1) // BYTE_LIMIT
+"""Limit for the positive, and for the negative factors whose products are added in 16 bits.
+
+These are the first or the second halves of the words of a group.
+"""
+
+
+def pack_bytes(values: NDArray[np.integer]) -> NDArray[np.int32]:
+    """Pack the last axis, of a multiple of four values, into words; the first byte is in the lowest bits."""
+    return np.ascontiguousarray(values.astype("<i1")).view("<i4").astype(np.int32)
+
+
+def unpack_bytes(words: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Invert `pack_bytes`."""
+    return np.ascontiguousarray(words.astype("<i4")).view("<i1").astype(np.int32)
 
 
 def _host_features() -> Mapping[str, bool]:
@@ -81,107 +92,122 @@ def _host_features() -> Mapping[str, bool]:
     return binding.get_host_cpu_features()  # type: ignore[no-any-return]
 
 
-def _vnni_lanes() -> int:
-    """Words of a vector of which the processor multiplies four bytes each and adds the products; 0: none."""
-    features = _host_features()
-    if features.get("avx512vnni") and features.get("avx512f"):
-        return 16
-    return 8 if features.get("avxvnni") else 0
+def block_adder(floats: Block, packed: Block) -> Callable[..., None]:
+    """Build ``add_products(weights, first, last, cells, start, stride, step, sums, position, row_step)``.
 
+    For use in kernels. With the `columns` of the block, for each of its rows `r` it adds ::
 
-def block_adder(block: Block) -> Callable[..., None]:
-    """Build ``add_products(weights, index, channels, first, sums, offsets, position)`` for use in kernels.
+        weights[first + k, c, r] * cells[start + k * step + c * stride + x]   for x in range(columns)
 
-    For each row `r` of the block it adds ``weights[index, :, r] @ channels[:, first : first + columns]`` to
-    ``sums[position + offsets[index, r] :]``. `weights` is ``(blocks, depth, rows)``, `channels`
-    ``(depth, N)``, `sums` 1-D, and `offsets` ``(blocks, rows)`` intp; all are C-contiguous. Numbers are
-    float32, or words of a `PackedFormat` with sums of int32. Nothing is checked.
+    to ``sums[position - r * row_step + x]``, for all `k` with ``first + k < last`` and all `c`, at least one
+    of each. `weights` is ``(N, depth, rows)``, `cells` and `sums` are 1-D, and all are C-contiguous. Numbers
+    are float32, or words of `pack_bytes` with sums of int32; then the depth is at most `GROUP`. Nothing is
+    checked.
     """
-    lanes, rows, vectors = block
-    int_type = ir.IntType(32)
 
     @intrinsic
     def add_products(
         _context: Any,
         weights: Any,
-        index: Any,
-        channels: Any,
         first: Any,
+        last: Any,
+        cells: Any,
+        start: Any,
+        stride: Any,
+        step: Any,
         sums: Any,
-        offsets: Any,
         position: Any,
+        row_step: Any,
     ) -> Any:
-        signature = types.void(weights, types.intp, channels, types.intp, sums, offsets, types.intp)
-        products = _PRODUCTS[channels.dtype]
+        size = types.intp
+        signature = types.void(weights, size, size, cells, size, size, size, sums, size, size)
+        is_float = cells.dtype == types.float32
+        lanes, vectors, rows = floats if is_float else packed
+        products = _float_products(lanes) if is_float else _byte_products(lanes)
+        vector = ir.VectorType(ir.FloatType() if is_float else ir.IntType(32), lanes)
+        zero_vector = ir.Constant(products.total, [0] * products.total.count)
 
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            left, right, out, shifts = (
+            left, right, out = (
                 context.make_array(signature.args[number])(context, builder, arguments[number])
-                for number in (0, 2, 4, 5)
+                for number in (0, 3, 7)
             )
-            element = ir.FloatType() if channels.dtype == types.float32 else int_type
-            vector = ir.VectorType(element, lanes)
+            _, first, last, _, start, stride, step, _, position, row_step = arguments
+            depth = cgutils.unpack_tuple(builder, left.shape)[1]
 
             def constant(value: int) -> Any:
                 return context.get_constant(types.intp, value)
 
-            def address(array: Any, offset: Any, kind: Any) -> Any:
-                data = builder.bitcast(array.data, ir.IntType(8).as_pointer())
-                return builder.bitcast(builder.gep(data, [offset]), kind.as_pointer())
+            def address(array: Any, place: Any, kind: Any) -> Any:
+                return builder.bitcast(builder.gep(array.data, [place]), kind.as_pointer())
 
-            def load(array: Any, offset: Any, kind: Any) -> Any:
-                value = builder.load(address(array, offset, kind))
-                value.align = 8 if kind is index_type else 4
+            def load(array: Any, place: Any, kind: Any) -> Any:
+                value = builder.load(address(array, place, kind))
+                value.align = 4
                 return value
 
-            def vector_offsets(offset: Any) -> list[Any]:
-                return [builder.add(offset, constant(4 * lanes * part)) for part in range(vectors)]
+            def places(place: Any) -> list[Any]:
+                return [builder.add(place, constant(lanes * part)) for part in range(vectors)]
 
-            index_type = context.get_value_type(types.intp)
-            depth = cgutils.unpack_tuple(builder, left.shape)[1]
-            block_bytes = cgutils.unpack_tuple(builder, left.strides)[0]
-            channel_bytes = cgutils.unpack_tuple(builder, right.strides)[0]
-            start = builder.block
-            weight_start = builder.mul(arguments[1], block_bytes)
-            channel_start = builder.mul(arguments[3], constant(4))
-            loop, done = builder.append_basic_block("depth"), builder.append_basic_block("sums")
-            builder.branch(loop)
-            # The loop over the depth: its counters and sums are phi nodes, which stay in registers.
-            builder.position_at_end(loop)
-            count, weight, channel = (builder.phi(depth.type) for _ in range(3))
-            totals = [[builder.phi(vector) for _ in range(vectors)] for _ in range(rows)]
-            values = [load(right, offset, vector) for offset in vector_offsets(channel)]
-            updated = []
-            for row, line in enumerate(totals):
-                number = load(left, builder.add(weight, constant(4 * row)), element)
-                factor = _broadcast(builder, number, vector)
-                updated.append(
-                    [products(builder, total, value, factor) for value, total in zip(values, line)]
+            def grid_of(function: Callable[[int, int], Any]) -> list[list[Any]]:
+                return [[function(row, part) for part in range(vectors)] for row in range(rows)]
+
+            def connect(phis: Any, block: Any, values: Any) -> None:
+                for phi, value in zip(phis, values, strict=True):
+                    phi.add_incoming(value, block)
+
+            entry = builder.block
+            outer, inner, latch, done = (
+                builder.append_basic_block(name) for name in ("cells", "depth", "next", "sums")
+            )
+            factor_step = builder.mul(depth, constant(rows))
+            origin = first, builder.mul(first, factor_step), start
+            builder.branch(outer)
+            # The counters and sums of both loops are phi nodes, which stay in registers.
+            builder.position_at_end(outer)
+            counters = [builder.phi(depth.type) for _ in range(3)]
+            totals = grid_of(lambda row, part: builder.phi(vector))
+            builder.branch(inner)
+            builder.position_at_end(inner)
+            channel, factor_place, place = inner_counters = [builder.phi(depth.type) for _ in range(3)]
+            parts = grid_of(lambda row, part: builder.phi(products.total))
+            values = [load(right, each, vector) for each in places(place)]
+            numbers = [
+                load(left, builder.add(factor_place, constant(row)), vector.element) for row in range(rows)
+            ]
+            factors = [_broadcast(builder, number, vector) for number in numbers]
+            added = grid_of(
+                lambda row, part: products.add(builder, parts[row][part], values[part], factors[row])
+            )
+            following = builder.add(channel, constant(1))
+            connect(inner_counters, outer, [constant(0), *counters[1:]])
+            moved = builder.add(factor_place, constant(rows)), builder.add(place, stride)
+            connect(inner_counters, inner, [following, *moved])
+            for line, known, new in zip(parts, totals, added):
+                connect(line, outer, known if products.finish is None else [zero_vector] * vectors)
+                connect(line, inner, new)
+            builder.cbranch(builder.icmp_signed("<", following, depth), inner, latch)
+            builder.position_at_end(latch)
+            finish = products.finish
+            if finish is not None:
+                added = grid_of(
+                    lambda row, part: builder.add(totals[row][part], finish(builder, added[row][part]))
                 )
-            for counter, origin, step in (
-                (count, constant(0), constant(1)),
-                (weight, weight_start, constant(4 * rows)),
-                (channel, channel_start, channel_bytes),
-            ):
-                counter.add_incoming(origin, start)
-                counter.add_incoming(builder.add(counter, step), loop)
-            for line, updated_line in zip(totals, updated):
-                for total, new_total in zip(line, updated_line):
-                    total.add_incoming(ir.Constant(vector, [0] * lanes), start)
-                    total.add_incoming(new_total, loop)
-            unfinished = builder.icmp_signed("<", builder.add(count, constant(1)), depth)
-            builder.cbranch(unfinished, loop, done)
+            following = builder.add(counters[0], constant(1))
+            moved = builder.add(counters[1], factor_step), builder.add(counters[2], step)
+            connect(counters, entry, origin)
+            connect(counters, latch, [following, *moved])
+            for line, new in zip(totals, added):
+                connect(line, entry, [ir.Constant(vector, [0] * lanes)] * vectors)
+                connect(line, latch, new)
+            builder.cbranch(builder.icmp_signed("<", following, last), outer, done)
             builder.position_at_end(done)
-            index_bytes = context.get_abi_sizeof(index_type)
-            block_offset = builder.mul(arguments[1], constant(rows * index_bytes))
-            add = builder.fadd if channels.dtype == types.float32 else builder.add
-            for row, line in enumerate(updated):
-                shift = load(shifts, builder.add(block_offset, constant(row * index_bytes)), index_type)
-                origin = builder.mul(builder.add(arguments[6], shift), constant(4))
-                for offset, total in zip(vector_offsets(origin), line):
-                    known = load(out, offset, vector)
-                    stored = builder.store(add(known, total), address(out, offset, vector))
+            add = builder.fadd if is_float else builder.add
+            for line in added:
+                for each, total in zip(places(position), line):
+                    stored = builder.store(add(load(out, each, vector), total), address(out, each, vector))
                     stored.align = 4
+                position = builder.sub(position, row_step)
             return context.get_dummy_value()
 
         return signature, generate
@@ -237,52 +263,78 @@ def _broadcast(builder: Any, value: Any, vector: Any) -> Any:
     return builder.shuffle_vector(single, undefined, zeros)
 
 
-def _add_floats(builder: Any, total: Any, value: Any, factor: Any) -> Any:
-    """``total + value * factor``."""
-    lanes = total.type.count
-    kind = ir.FunctionType(total.type, [total.type] * 3)
-    function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.fmuladd.v{lanes}f32")
-    return builder.call(function, [factor, value, total])
+class _Products(NamedTuple):
+    """How a block adds products: the type of its sums, one more product, and the sums as they are stored."""
+
+    total: Any
+    add: Callable[..., Any]  # builder, total, value, factor
+    finish: Callable[..., Any] | None = None  # builder, total
 
 
-def _add_bytes(builder: Any, total: Any, value: Any, factor: Any) -> Any:
-    """Add four products of an unsigned and a signed byte to each lane: the instruction ``vpdpbusd``."""
-    lanes = total.type.count
-    operand = ir.VectorType(ir.IntType(8), 4 * lanes) if binding.llvm_version_info[0] >= 22 else total.type
-    kind = ir.FunctionType(total.type, [total.type, operand, operand])
-    name = f"llvm.x86.avx512.vpdpbusd.{32 * lanes}"
-    function = cgutils.get_or_insert_function(builder.module, kind, name)
-    return builder.call(function, [total, builder.bitcast(value, operand), builder.bitcast(factor, operand)])
+def _float_products(lanes: int) -> _Products:
+    total = ir.VectorType(ir.FloatType(), lanes)
+
+    def add(builder: Any, total: Any, value: Any, factor: Any) -> Any:
+        return _call(builder, f"llvm.fmuladd.v{lanes}f32", total.type, factor, value, total)
+
+    return _Products(total, add)
 
 
-def _add_half_words(builder: Any, total: Any, value: Any, factor: Any) -> Any:
-    """Add two products of half-words to each lane: the instruction ``pmaddwd`` where there is one."""
-    lanes = total.type.count
-    halves = ir.VectorType(ir.IntType(16), 2 * lanes)
-    value, factor = builder.bitcast(value, halves), builder.bitcast(factor, halves)
-    name = _multiply_add_name(lanes)
-    if name is not None:
-        kind = ir.FunctionType(total.type, [halves, halves])
-        function = cgutils.get_or_insert_function(builder.module, kind, name)
-        return builder.add(total, builder.call(function, [value, factor]))
-    for half in range(2):
-        chosen = ir.Constant(ir.VectorType(ir.IntType(32), lanes), list(range(half, 2 * lanes, 2)))
-        parts = (
-            builder.shuffle_vector(each, ir.Constant(halves, ir.Undefined), chosen)
-            for each in (value, factor)
-        )
-        total = builder.add(total, builder.mul(*(builder.sext(part, total.type) for part in parts)))
-    return total
-
-
-def _multiply_add_name(lanes: int) -> str | None:
-    """LLVM's name of ``pmaddwd`` for vectors of so many sums; None without it."""
+def _byte_products(lanes: int) -> _Products:
+    """Products of the four bytes of each word; where the processor has no instruction, sums of 16 bits."""
     features = _host_features()
-    if lanes == 16 and features.get("avx512bw"):
-        return "llvm.x86.avx512.pmaddw.d.512"
-    if lanes == 8 and features.get("avx2"):
-        return "llvm.x86.avx2.pmadd.wd"
-    return "llvm.x86.sse2.pmadd.wd" if lanes == 4 and features.get("sse2") else None
+    bytes_type, halves = ir.VectorType(ir.IntType(8), 4 * lanes), ir.VectorType(ir.IntType(16), 2 * lanes)
+    words = ir.VectorType(ir.IntType(32), lanes)
+    if _adds_bytes(lanes, features):
+        operand = bytes_type if binding.llvm_version_info[0] >= 22 else words
+
+        def add_word(builder: Any, total: Any, value: Any, factor: Any) -> Any:
+            value, factor = builder.bitcast(value, operand), builder.bitcast(factor, operand)
+            return _call(builder, f"llvm.x86.avx512.vpdpbusd.{32 * lanes}", words, total, value, factor)
+
+        return _Products(words, add_word)
+    feature, multiply, add_pairs = _BYTE_INSTRUCTIONS.get(lanes, ("", "", ""))
+    if features.get(feature):
+
+        def add(builder: Any, total: Any, value: Any, factor: Any) -> Any:
+            value, factor = builder.bitcast(value, bytes_type), builder.bitcast(factor, bytes_type)
+            return builder.add(total, _call(builder, multiply, halves, value, factor))
+
+        def finish(builder: Any, total: Any) -> Any:
+            return _call(builder, add_pairs, words, total, ir.Constant(halves, [1] * halves.count))
+
+    else:
+
+        def add(builder: Any, total: Any, value: Any, factor: Any) -> Any:
+            value, factor = builder.bitcast(value, bytes_type), builder.bitcast(factor, bytes_type)
+            for part in range(2):
+                numbers = (_every_second(builder, each, part, halves) for each in (value, factor))
+                total = builder.add(total, builder.mul(*numbers))
+            return total
+
+        def finish(builder: Any, total: Any) -> Any:
+            return builder.add(*(_every_second(builder, total, part, words) for part in range(2)))
+
+    return _Products(halves, add, finish)
 
 
-_PRODUCTS = {types.float32: _add_floats, types.int32: _add_bytes, types.uint32: _add_half_words}
+# For vectors of so many words: the feature of processors with instructions that multiply bytes and add pairs
+# of products, and that add pairs of half-words; and their names.
+_BYTE_INSTRUCTIONS = {
+    16: ("avx512bw", "llvm.x86.avx512.pmaddubs.w.512", "llvm.x86.avx512.pmaddw.d.512"),
+    8: ("avx2", "llvm.x86.avx2.pmadd.ub.sw", "llvm.x86.avx2.pmadd.wd"),
+    4: ("ssse3", "llvm.x86.ssse3.pmadd.ub.sw.128", "llvm.x86.sse2.pmadd.wd"),
+}
+
+
+def _every_second(builder: Any, vector: Any, first: int, wide: Any) -> Any:
+    """Every second element of a vector as the elements of a type with twice the bits."""
+    numbers = ir.Constant(ir.VectorType(ir.IntType(32), wide.count), list(range(first, 2 * wide.count, 2)))
+    chosen = builder.shuffle_vector(vector, ir.Constant(vector.type, ir.Undefined), numbers)
+    return builder.sext(chosen, wide)
+
+
+def _call(builder: Any, name: str, result: Any, *arguments: Any) -> Any:
+    """Call an intrinsic function of LLVM."""
+    kind = ir.FunctionType(result, [each.type for each in arguments])
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), arguments)

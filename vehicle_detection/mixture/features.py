@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import NEW_ARRAYS, ThreadTeam, Workspace
-from vehicle_detection._kernels import PackedFormat
+from vehicle_detection._kernels import BYTE_LIMIT
 from vehicle_detection._kernels import fhog as _fhog_kernels
 
 SQUARE = _fhog_kernels.SQUARE
@@ -47,8 +47,8 @@ _PART_ROWS = 24
 # Largest values of an orientation and of a texture sum: four and sixteen terms of 0.2, weighted.
 _LARGEST = np.where(np.arange(N_CHANNELS) < 16, 0.4, 0.2357 * 16 * 0.2)
 
-CHANNEL_SCALES = (255 / _LARGEST).astype(np.float32)
-"""Factor of each channel that maps its range to 0 to 255."""
+CHANNEL_SCALES = (BYTE_LIMIT / _LARGEST).astype(np.float32)
+"""Factor of each channel that maps its range to 0 to 127."""
 
 Rows = tuple[int, int]
 """Half-open range of rows of a frame."""
@@ -171,7 +171,7 @@ class EdgePyramid:
         cells = _new_cells(channels)
         for grid, each in zip(grids / (SQUARE * 2**number), cells):
             _fhog_kernels.resample(octave.sums, SQUARE, octave.first, squares, grid, each)
-        _fhog_kernels.fhog_channels(cells, _EPS, channels, CHANNEL_SCALES, 0, _NO_WORDS)
+        _fhog_kernels.fhog_channels(cells, _EPS, channels, CHANNEL_SCALES, _NO_WORDS)
 
     def _compute_small(self, grids: NDArray[np.float64], channels: NDArray[np.float32]) -> None:
         """FHOG channels of grids of small cells, from small squares of the pixels around each."""
@@ -189,7 +189,7 @@ class EdgePyramid:
             sums = np.empty((down + 2, across + 2, 16), np.float32)
             _fhog_kernels.orientation_sums(region, _COTANGENTS, square, -1, sums)
             _fhog_kernels.resample(sums, square, -1, down, scaled[number], cells[number])
-        _fhog_kernels.fhog_channels(cells, _EPS, channels, CHANNEL_SCALES, 0, _NO_WORDS)
+        _fhog_kernels.fhog_channels(cells, _EPS, channels, CHANNEL_SCALES, _NO_WORDS)
 
     def feature_map(self, grid: CellGrid) -> FeatureMap:
         """FHOG channels of one grid."""
@@ -198,24 +198,20 @@ class EdgePyramid:
         self._interpolate(self.octave_of(math.sqrt(grid.step_x * grid.step_y)), corner, channels)
         return FeatureMap(channels[0], grid)
 
-    def packed_channels(
-        self, grid: CellGrid, packing: PackedFormat, workspace: Workspace = NEW_ARRAYS
-    ) -> NDArray[np.int32] | NDArray[np.uint32]:
-        """FHOG channels of a grid, times `CHANNEL_SCALES` and rounded, as words of several channels.
+    def packed_channels(self, grid: CellGrid, workspace: Workspace = NEW_ARRAYS) -> NDArray[np.int32]:
+        """FHOG channels of a grid, times `CHANNEL_SCALES` and rounded, as words of four channels.
 
         ``(words, rows, columns)``; the value of a word's first channel is in its lowest bits.
         """
         number = self.octave_of(math.sqrt(grid.step_x * grid.step_y))
         octave, scale = self.octaves[number], SQUARE * 2**number
         cells = workspace.take((1, 16, grid.rows + 2, grid.columns + 2), np.float32, "cells")
-        shape = N_CHANNELS // packing.per_word, grid.rows, grid.columns
-        packed = workspace.take(shape, packing.dtype, "packed")
+        packed = workspace.take((1, N_CHANNELS // 4, grid.rows, grid.columns), np.int32, "packed")
         squares = -(-octave.planes.shape[1] // SQUARE)
         corner = np.array([grid.left, grid.top, grid.step_x, grid.step_y]) / scale
         _fhog_kernels.resample(octave.sums, SQUARE, octave.first, squares, corner, cells[0])
-        words = packed.view(np.int32)[None]
-        _fhog_kernels.fhog_channels(cells, _EPS, _NO_CHANNELS, CHANNEL_SCALES, packing.per_word, words)
-        return packed
+        _fhog_kernels.fhog_channels(cells, _EPS, _NO_CHANNELS, CHANNEL_SCALES, packed)
+        return np.asarray(packed[0])
 
 
 def _new_cells(channels: NDArray[np.float32]) -> NDArray[np.float32]:

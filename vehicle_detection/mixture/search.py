@@ -92,8 +92,8 @@ class MixtureSearch(FrameSearch):
     """The search of frames with a mixture of templates.
 
     Vehicles lie inside the frame; windows may extend beyond it. Sensor noise and haze are removed
-    first. The weights are rounded to 8 bits, and so are the channels: a margin differs by about 0.002 from
-    the exact one.
+    first. The weights are rounded to 8 bits and the channels to 7: a margin differs by about 0.004 from the
+    exact one.
     """
 
     params_type = PyramidParams
@@ -169,7 +169,7 @@ class MixtureSearch(FrameSearch):
 
     def _search_level(self, pyramid: EdgePyramid, level: _Level) -> list[NDArray[np.int32]]:
         """Windows of each search on the cells of one size, see `PackedSearch.find`."""
-        packed = pyramid.packed_channels(level.grid, self._filters[INNER].packing, self.workspace)
+        packed = pyramid.packed_channels(level.grid, self.workspace)
         return [each.search.find(packed, each.columns, self.workspace) for each in level.searches]
 
     def _to_windows(
