@@ -43,7 +43,8 @@ class _Announcement(event.Listener):  # type: ignore[misc]
 
     def on_start(self, event: Any) -> None:
         """Log the first kernel that is not in the cache."""
-        module = event.data["dispatcher"].py_func.__module__
+        # Functions that `exec` defines may have no module.
+        module = event.data["dispatcher"].py_func.__module__ or ""
         if not self._announced and module.startswith(__package__):
             self._announced = True
             log.info("compiling for this processor at the first use, which takes up to 15 seconds")
