@@ -41,7 +41,7 @@ def float_block() -> Block:
     if features.get("avx512f"):
         return Block(16, 3, 8)
     if features.get("avx"):
-        return Block(8, 2, 6)
+        return Block(8, 2, 4)
     return Block(4, 3, 8 if features.get("neon") else 4)
 
 
