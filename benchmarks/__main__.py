@@ -17,6 +17,7 @@ from benchmarks import (
     _drives,
     _features,
     _frames,
+    _lenses,
     _memory,
     _peers,
     _scaling,
@@ -37,6 +38,7 @@ BENCHMARKS: dict[str, Callable[[Context], list[Row]]] = {
     "accuracy": _accuracy.run,
     "frames": _frames.run,
     "drives": _drives.run,
+    "lenses": _lenses.run,
     "batch": _batch.run,
     "scaling": _scaling.run,
     "wrappers": _wrappers.run,
@@ -57,8 +59,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--long", action="store_true", help="memory: also a run of 3,000 frames; batch: three rounds"
     )
     parser.add_argument("--plots", type=Path, metavar="DIR", help="scaling: write scaling.png to this folder")
-    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="drives: drives of each kind")
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="drives: number of processes")
+    parser.add_argument(
+        "--seeds", type=int, default=1, metavar="N", help="drives, lenses: drives of each kind"
+    )
+    parser.add_argument(
+        "--jobs", type=int, default=1, metavar="N", help="drives, lenses: number of processes"
+    )
     parser.add_argument("--compare", metavar="REF", help="only compare the speed with another commit's")
     parser.add_argument("--output", type=Path, default=OUTPUT, metavar="FILE", help="the JSON file to write")
     options = parser.parse_args(arguments)

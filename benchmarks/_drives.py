@@ -113,7 +113,7 @@ def score_drive(drive: Drive, detector: VehicleDetector) -> DriveScores:
     scores = None
     if len(labels.frames):
         scores = evaluate_tracks(shown, labels, iou=_IOU, frames=range(len(results)))
-    ranges = np.array(list(_ranges(truth, results))).reshape(-1, len(_COLUMNS))
+    ranges = match_ranges(truth, results)
     return DriveScores(scores, ranges, tuple(_delays(truth, results, detected)), len(shown.frames))
 
 
@@ -147,6 +147,13 @@ def _label_boxes(truth: Sequence[Sequence[VehicleTruth]]) -> FrameBoxes:
     ignored = np.array([bool(row.ignore) for _, row in rows], np.bool_)
     tracks = np.array([row.track for _, row in rows], np.int64)
     return FrameBoxes([frame for frame, _ in rows], tracks, boxes, ignore=ignored)
+
+
+def match_ranges(
+    truth: Sequence[Sequence[VehicleTruth]], results: Sequence[FrameResult]
+) -> NDArray[np.float64]:
+    """Return the rows of `DriveScores.ranges`."""
+    return np.array(list(_ranges(truth, results))).reshape(-1, len(_COLUMNS))
 
 
 def _ranges(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from benchmarks import _batch, _drives, _report
+from benchmarks import _batch, _drives, _lenses, _report
 from benchmarks._course import search_course
 from benchmarks._material import Context
 from benchmarks._probe import run_probe
@@ -211,6 +211,16 @@ def test_drives_are_scored_over_seeds(tmp_path, monkeypatch):
     assert rows["closing: minimum MOTA"].value <= rows["closing: MOTA"].value <= 1
     assert rows["closing: median error of the distance"].value <= rows["closing: 90th percentile of it"].value
     assert rows["drives without vehicles: boxes shown"].value == 0
+
+
+def test_distances_through_lenses_are_scored(tmp_path, monkeypatch):
+    monkeypatch.setattr(_drives, "FRAMES", 9)
+    for name, value in {"ANGLES": (90,), "HEIGHTS": (1.4,), "SHAPE": (540, 960)}.items():
+        monkeypatch.setattr(_lenses, name, value)
+    rows = {row.what: row for row in _lenses.run(Context(tmp_path))}
+    assert rows["90 degrees, the right camera: median error of the distance"].value < 20
+    assert rows["90 degrees, no camera: median error of the distance"].value > 30
+    assert rows["90 degrees, no camera: distances marked with ~"].value == 100
 
 
 def test_frames_between_searched_ones_are_scored():
