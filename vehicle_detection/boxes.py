@@ -27,6 +27,9 @@ Floats = NDArray[np.float64]
 
 # Lower bound of a divisor. An empty box shares no area with any other, so its ratios become 0.
 _TINY = np.finfo(np.float64).tiny
+# Boxes at one distance: least ratio of their heights, largest difference of their lower edges in heights. And
+# the fraction of the narrower one's width that boxes on one vehicle share.
+_ALIKE_HEIGHT, _ALIKE_BOTTOM, _PART_OVERLAP = 0.8, 0.15, 0.4
 
 
 def box_areas(boxes: NDArray[Any]) -> Floats:
@@ -54,6 +57,22 @@ def overlap_matrices(first: Floats, second: Floats) -> tuple[Floats, Floats]:
     shared = intersection_matrix(first, second)
     areas, others = box_areas(first)[:, None], box_areas(second)[None]
     return _iou(shared, areas, others), _coverage(shared, areas, others)
+
+
+def on_one_vehicle(boxes: Floats) -> NDArray[np.bool_]:
+    """``(N, N)``: whether two boxes are at one distance and share much of the narrower one's width.
+
+    Two vehicles at one distance from the camera do not overlap in the image. The side of a near vehicle in
+    the next lane, however, looks like a vehicle of the same height.
+    """
+    left, _, right, bottom = boxes.T
+    widths, heights = right - left, bottom - boxes[:, 1]
+    higher, lower = np.maximum(heights[:, None], heights), np.minimum(heights[:, None], heights)
+    apart = np.abs(bottom[:, None] - bottom)
+    at_one_distance = (lower > _ALIKE_HEIGHT * higher) & (apart < _ALIKE_BOTTOM * higher)
+    shared = np.minimum(right[:, None], right) - np.maximum(left[:, None], left)
+    overlapping = shared > _PART_OVERLAP * np.minimum(widths[:, None], widths)
+    return np.asarray(at_one_distance & overlapping)
 
 
 def iou_matrix(first: ArrayLike, second: ArrayLike) -> Floats:

@@ -468,6 +468,26 @@ class TestOcclusion:
             assert all(overlap > 0.6 for time, overlap, _ in matched(steps, name) if time > 0.3)
         assert shown_ids(steps) == {1, 2}
 
+    def test_a_track_of_the_side_of_a_vehicle_ends(self):
+        """A detector that shows a near vehicle's side as a second vehicle does so in few frames."""
+        tracker, rear, side = Tracker(), [500.0, 400, 680, 520], [620.0, 405, 720, 515]
+        seen = []
+        for index in range(40):
+            boxes, scores = [rear], [5.0]
+            if index % 4 < 2 and index < 30:
+                boxes, scores = [rear, side], [5.0, 1.5]
+            tracks = tracker.update(Detections(np.array(boxes), np.array(scores)), SHAPE)
+            seen.append([track.id for track in tracks if track.shown])
+        assert seen[-1] == [1]
+        assert sum(len(ids) > 1 for ids in seen) < 8
+
+    def test_vehicles_of_one_distance_that_touch_stay_two(self):
+        tracker = Tracker()
+        for _ in range(40):
+            boxes = np.array([[500.0, 400, 620, 520], [590.0, 405, 700, 515]])
+            tracks = tracker.update(Detections(boxes, np.array([6.0, 1.0])), SHAPE)
+        assert [track.id for track in tracks if track.shown] == [1, 2]
+
     def test_a_hidden_vehicle_that_must_have_moved_far_is_not_shown(self):
         """Its position is only a guess."""
         tracker, near = Tracker(), [300.0, 380, 800, 600]

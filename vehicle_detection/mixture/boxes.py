@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._kernels import suppress, vote
-from vehicle_detection.boxes import box_areas, clip_boxes
+from vehicle_detection.boxes import box_areas, clip_boxes, on_one_vehicle
 
 MIN_MARGIN = -1.0
 """Minimum margin of a window that takes part in the voting."""
@@ -23,10 +23,8 @@ DUPLICATE_IOU = 0.7
 # A window's vote is its margin above this one.
 _VOTE_MARGIN = -1.1
 _MAX_VEHICLES = 60
-# Boxes at one distance: least ratio of their heights, largest difference of their lower edges in heights.
-_ALIKE_HEIGHT, _ALIKE_BOTTOM = 0.8, 0.15
-# Of two such boxes, one is a part if its margin is so much lower and so much of the narrower one is shared.
-_PART_GAP, _PART_OVERLAP = 1.0, 0.4
+# Of two boxes on one vehicle, one is a part if its margin is so much lower.
+_PART_GAP = 1.0
 _MIN_VISIBLE_FRACTION = 0.35
 
 Floats = NDArray[np.float64]
@@ -115,13 +113,5 @@ def whole_vehicles(boxes: Floats, margins: Floats) -> NDArray[np.intp]:
     >>> whole_vehicles(np.array([[50.0, 395, 226, 494], [180, 399, 260, 487]]), np.array([1.2, -0.1]))
     array([0])
     """
-    left, _, right, bottom = boxes.T
-    widths, heights = right - left, bottom - boxes[:, 1]
-    higher, lower = np.maximum(heights[:, None], heights), np.minimum(heights[:, None], heights)
-    at_one_distance = (lower > _ALIKE_HEIGHT * higher) & (
-        np.abs(bottom[:, None] - bottom) < _ALIKE_BOTTOM * higher
-    )
-    shared = np.minimum(right[:, None], right) - np.maximum(left[:, None], left)
-    overlapping = shared > _PART_OVERLAP * np.minimum(widths[:, None], widths)
     better = margins[:, None] > margins + _PART_GAP
-    return np.flatnonzero(~(at_one_distance & overlapping & better).any(axis=0))
+    return np.flatnonzero(~(on_one_vehicle(boxes) & better).any(axis=0))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer, check_number, check_type
-from vehicle_detection.boxes import Detections, Floats, Platt, box_areas
+from vehicle_detection.boxes import Detections, Floats, Platt, box_areas, on_one_vehicle
 from vehicle_detection.camera import (
     UNKNOWN_LENS_STD,
     Camera,
@@ -58,6 +58,8 @@ _MAX_COAST_DISTANCE = 0.5
 # Factors of `max_distance` for tentative tracks, and for low-score detections.
 _TENTATIVE_DISTANCE, _LOW_SCORE_DISTANCE = 0.6, 0.5
 _LOG_ODDS = Platt(-1.0, 0.0)
+# Difference of the scores of two tracks on one vehicle from which on the lower one shows a part of it.
+_PART_GAP = 2.0
 # Seconds without a detection up to which that distance grows.
 _MAX_GAP = 2.0
 
@@ -192,6 +194,7 @@ class Tracker:
             self._states = predict_distances(states, dt, self.camera)
             unassigned = self._correct(boxes, scores, frame, dt)
             self._end_lost_tracks(frame, dt)
+            self._end_parts(frame)
         self._start(boxes[unassigned], scores[unassigned], frame, dt)
         self._confirm(frame)
         self._update_horizon(frame, dt)
@@ -355,6 +358,18 @@ class Tracker:
             expired = np.array([track.is_expired(self.params) for track in self._live])
             ended |= missed & ((visible < _LEFT) | leaving | expired)
         self._keep(np.flatnonzero(~ended).tolist())
+
+    def _end_parts(self, frame: FrameShape) -> None:
+        """End tracks that show a part of the vehicle of a much better one, such as its side."""
+        if len(self._live) < 2:
+            return
+        scores = np.array([track.score for track in self._live])
+        detected = np.array([track.misses == 0 for track in self._live])
+        is_whole = np.array([track.id > 0 for track in self._live]) & detected
+        better = is_whole[:, None] & (scores[:, None] > scores + _PART_GAP)
+        ended = detected & (better & on_one_vehicle(_clip(self._states.boxes(), frame))).any(axis=0)
+        if ended.any():
+            self._keep(np.flatnonzero(~ended).tolist())
 
     def _mark_missed(self, whole: Floats, inside: Floats, dt: float) -> None:
         """Account for missing detections, given the boxes of all tracks and their parts inside the frame."""
