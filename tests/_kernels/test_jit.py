@@ -1,6 +1,12 @@
 import logging
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
+import vehicle_detection
 from vehicle_detection._kernels import suppress
 from vehicle_detection._kernels.jit import _Announcement
 
@@ -13,3 +19,28 @@ def test_compiling_kernels_is_logged_once_and_other_functions_are_not(caplog):
             dispatcher = SimpleNamespace(py_func=getattr(function, "py_func", function))
             announcement.on_start(SimpleNamespace(data={"dispatcher": dispatcher}))
     assert [record.getMessage()[:9] for record in caplog.records] == ["compiling"]
+
+
+def test_a_change_of_another_kernel_file_is_noticed(tmp_path):
+    package = Path(vehicle_detection.__file__).parent
+    copy = tmp_path / "vehicle_detection"
+    shutil.copytree(package, copy, ignore=shutil.ignore_patterns("__pycache__", "*.safetensors"))
+    code = (
+        "import numpy as np; from vehicle_detection._kernels import suppress;"
+        "suppress(np.zeros((1, 4)), np.zeros(1, int), 0.5, 0.5, 1);"
+        "print(sum(suppress.stats.cache_hits.values()))"
+    )
+
+    def hits():
+        environment = {**os.environ, "PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+        )
+        return int(done.stdout)
+
+    assert hits() == 0
+    assert hits() == 1
+    with (copy / "_kernels" / "vector.py").open("a") as file:
+        file.write("# changed\n")
+    assert hits() == 0

@@ -1,13 +1,12 @@
-"""Compilation of the numba kernels: without the GIL, once, into a cache on disk.
-
-The cache notices changes of a kernel's own file only, so kernels that call each other are in one file.
-"""
+"""Compilation of the numba kernels: without the GIL, once, into a cache on disk."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -29,10 +28,22 @@ def jit(function: Callable[..., Any], *, reorder: bool = False) -> Callable[...,
         fastmath={"reassoc", "contract", "nsz"} if reorder else False,
     )
     try:
-        return compiler(cache=True)(function)  # type: ignore[no-any-return]
+        kernel = compiler(cache=True)(function)
     except RuntimeError:
         # Neither the package's folder nor the user's cache is writable: compile in every process.
         return compiler()(function)  # type: ignore[no-any-return]
+    # numba would notice changes of the kernel's own file only, not of those that it calls. Without this
+    # attribute, which is not public, it does that.
+    with contextlib.suppress(AttributeError):
+        kernel._cache._cache_file._source_stamp = source_stamp()
+    return kernel  # type: ignore[no-any-return]
+
+
+@functools.cache
+def source_stamp() -> tuple[float, int]:
+    """Return the newest time of a change of the kernels' files, and their total size."""
+    files = [file.stat() for file in Path(__file__).parent.glob("*.py")]
+    return max((file.st_mtime for file in files), default=0.0), sum(file.st_size for file in files)
 
 
 class _Announcement(event.Listener):  # type: ignore[misc]

@@ -156,18 +156,21 @@ def block_adder(floats: Block, packed: Block) -> Callable[..., None]:
                 for phi, value in zip(phis, values, strict=True):
                     phi.add_incoming(value, block)
 
+            # Two loops, over `k` and over the channels `c`. Their counters and sums are phi nodes: these stay
+            # in registers.
             entry = builder.block
             outer, inner, latch, done = (
-                builder.append_basic_block(name) for name in ("cells", "depth", "next", "sums")
+                builder.append_basic_block(name) for name in ("cells", "channels", "next", "sums")
             )
             factor_step = builder.mul(depth, constant(rows))
             origin = first, builder.mul(first, factor_step), start
             builder.branch(outer)
-            # The counters and sums of both loops are phi nodes, which stay in registers.
+
             builder.position_at_end(outer)
             counters = [builder.phi(depth.type) for _ in range(3)]
             totals = grid_of(lambda row, part: builder.phi(vector))
             builder.branch(inner)
+
             builder.position_at_end(inner)
             channel, factor_place, place = inner_counters = [builder.phi(depth.type) for _ in range(3)]
             parts = grid_of(lambda row, part: builder.phi(products.total))
@@ -187,6 +190,8 @@ def block_adder(floats: Block, packed: Block) -> Callable[..., None]:
                 connect(line, outer, known if products.finish is None else [zero_vector] * vectors)
                 connect(line, inner, new)
             builder.cbranch(builder.icmp_signed("<", following, depth), inner, latch)
+
+            # The end of the outer loop: short sums of one `k` are added to those of all.
             builder.position_at_end(latch)
             finish = products.finish
             if finish is not None:
@@ -201,6 +206,7 @@ def block_adder(floats: Block, packed: Block) -> Callable[..., None]:
                 connect(line, entry, [ir.Constant(vector, [0] * lanes)] * vectors)
                 connect(line, latch, new)
             builder.cbranch(builder.icmp_signed("<", following, last), outer, done)
+
             builder.position_at_end(done)
             add = builder.fadd if is_float else builder.add
             for line in added:
@@ -264,11 +270,15 @@ def _broadcast(builder: Any, value: Any, vector: Any) -> Any:
 
 
 class _Products(NamedTuple):
-    """How a block adds products: the type of its sums, one more product, and the sums as they are stored."""
+    """How a block adds products: the type of its sums, `add` for one more product, and how to widen the sums.
+
+    `add` takes builder, total, value and factor; `finish` takes builder and total, and is None where the sums
+    need not be widened.
+    """
 
     total: Any
-    add: Callable[..., Any]  # builder, total, value, factor
-    finish: Callable[..., Any] | None = None  # builder, total
+    add: Callable[..., Any]
+    finish: Callable[..., Any] | None = None
 
 
 def _float_products(lanes: int) -> _Products:
