@@ -53,7 +53,10 @@ def run(context: Context) -> list[Row]:
 
 
 def _start(frame: Path, cache: Path, *options: str) -> dict[str, Any]:
-    return run_probe("startup", str(frame), *options, NUMBA_CACHE_DIR=str(cache))
+    """Start an interpreter that finds compiled Python modules, as after an installation."""
+    variables = {"NUMBA_CACHE_DIR": cache, "PYTHONPYCACHEPREFIX": cache.with_name("bytecode")}
+    environment = {name: str(value) for name, value in variables.items()}
+    return run_probe("startup", str(frame), *options, PYTHONDONTWRITEBYTECODE="", **environment)
 
 
 def _kernel_seconds(frame: Path, cache: Path) -> dict[str, float]:

@@ -1,6 +1,8 @@
 import numpy as np
+import pytest
 
-from vehicle_detection._common import NEW_ARRAYS, Workspace
+from vehicle_detection._common import NEW_ARRAYS, SPARE, Workspace, with_spare
+from vehicle_detection._kernels.vector import byte_block, float_block
 
 
 def test_arrays_of_one_name_share_the_memory_of_the_largest():
@@ -35,3 +37,27 @@ def test_views_are_of_the_largest_array():
     for number in range(5000):
         workspace.take((number % 12, 1), np.float32, str(number))
     assert np.shares_memory(workspace.take((2, 3), np.float32, "a"), large)
+
+
+def test_memory_goes_on_beyond_the_end():
+    workspace = Workspace()
+    arrays = [workspace.take((3, 5), np.int32, "a"), NEW_ARRAYS.take((3, 5), np.int32, "a")]
+    arrays += [arrays[0][:2], with_spare(np.ones((3, 5), np.int32))]
+    for array in arrays:
+        assert with_spare(array) is array
+
+
+@pytest.mark.parametrize("missing", [0, 1, SPARE])
+def test_an_array_at_the_end_of_its_memory_is_copied(missing):
+    memory = np.arange(15 + SPARE, dtype=np.float32)
+    array = memory[SPARE - missing : SPARE - missing + 15].reshape(3, 5)
+    copied = with_spare(array)
+    assert (copied is array) == (missing == SPARE)
+    np.testing.assert_array_equal(copied, array)
+    # The memory of other objects has no known end.
+    foreign = np.frombuffer(array.tobytes(), np.float32)
+    assert with_spare(foreign) is not foreign
+
+
+def test_the_spare_memory_is_enough_for_every_processor():
+    assert max(float_block().columns, byte_block().columns) <= SPARE

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from llvmlite import binding
 
 from vehicle_detection._common import Workspace
-from vehicle_detection._kernels import BYTE_LIMIT, DenseLayer, Filter, PackedFilters, correlation
+from vehicle_detection._kernels import BYTE_LIMIT, Filter, PackedFilters, PackedSearch, correlation
 from vehicle_detection._kernels.vector import (
     GROUP,
     Block,
@@ -76,7 +76,7 @@ def test_a_block_kernel_that_does_not_compile_is_replaced(caplog):
     np.testing.assert_allclose(scores, 2 * reference(weights, channels), rtol=1e-4, atol=1e-4)
     broken.assert_not_called()
     assert [record.getMessage() for record in caplog.records] == [
-        "correlation uses plain, slower loops: no such intrinsic"
+        "products use plain, slower loops: no such intrinsic"
     ]
 
 
@@ -115,18 +115,6 @@ def test_values_beyond_the_last_cell_are_not_used():
     scores = np.zeros((3, 4), np.float32)
     Filter(weights).add_to(memory[: channels.size].reshape(channels.shape), scores)
     assert np.isfinite(scores).all()
-
-
-@settings(max_examples=40)
-@given(
-    outputs=st.integers(1, 40), inputs=st.integers(1, 60), count=st.integers(0, 120), seed=st.integers(0, 99)
-)
-def test_a_dense_layer_is_a_matrix_product(outputs, inputs, count, seed):
-    rng = np.random.default_rng(seed)
-    weights, matrix = rng.normal(size=(outputs, inputs)), rng.normal(size=(inputs, count)).astype(np.float32)
-    product = DenseLayer(weights)(matrix)
-    assert product.shape == (outputs, count)
-    np.testing.assert_allclose(product, weights @ matrix, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("depth", [1, 7])
@@ -202,7 +190,7 @@ def packed_reference(weights, cells, limit):
     return np.column_stack([rows, columns, scores[rows, columns]])
 
 
-PACKED_KERNELS = {"blocks": correlation._correlate_blocks, "plain": correlation._correlate_unpacked}
+PACKED_KERNELS = {"blocks": correlation._find_windows, "plain": correlation._find_windows_plain}
 
 
 @pytest.mark.parametrize("kernel", PACKED_KERNELS)
@@ -233,7 +221,7 @@ def test_windows_are_those_with_the_highest_sums_of_integers(kernel, sizes, more
         for number, (each, (first, _)) in enumerate(zip(rounded, row_ranges)):
             expected = packed_reference(each, cells, np.floor(bound / filters.units[number]))
             expected = expected[expected[:, 0] >= first]
-            np.testing.assert_array_equal(found[found[:, 0] == number][:, 1:], expected)
+            np.testing.assert_array_equal(found[found[:, 1] == number][:, 2:], expected)
 
 
 @given(words=st.integers(1, 12), scale=st.sampled_from([1e-6, 1.0, 1e6]), seed=st.integers(0, 99))
@@ -249,16 +237,38 @@ def test_weights_are_bytes_whose_sums_do_not_overflow(words, scale, seed):
         assert sums.max() * BYTE_LIMIT <= 2**15 - 1
 
 
-def test_columns_of_a_map_become_channels():
+@pytest.mark.parametrize("kernel", PACKED_KERNELS)
+def test_columns_of_a_map_become_channels(kernel):
     rng = np.random.default_rng(1)
     cells, weights = rng.integers(0, BYTE_LIMIT + 1, (8, 30, 9)), rng.integers(-12, 13, (4, 3, 8))
     weights[0, 0] = [BYTE_LIMIT, 0, 0, 0, 0, 0, 0, 0]  # the same unit for both
     packed = np.ascontiguousarray(pack_bytes(cells.transpose(1, 2, 0)).transpose(2, 0, 1))
     whole = PackedFilters([weights]).on_map(3, [0], [(0, 30)], [-1e12])
-    strip = PackedFilters([weights.reshape(1, 4, -1)]).on_map(30, [0], [(0, 1)], [-1e12])
+    strip = PackedFilters([weights.reshape(1, 4, -1)]).on_map(30, [0], [(0, 1)], [-1e12], np.arange(5, 8))
     expected = whole.find(np.ascontiguousarray(packed[:, :, 5:8]))
-    found = strip.find(packed, np.arange(5, 8))
-    np.testing.assert_array_equal(found[:, [0, 2, 3]], expected[:, [0, 1, 3]])
+    with mock.patch.object(correlation, "_packed_kernel", return_value=PACKED_KERNELS[kernel]):
+        found = strip.find(packed)
+    np.testing.assert_array_equal(found[:, [1, 3, 4]], expected[:, [1, 2, 4]])
+
+
+@pytest.mark.parametrize("kernel", PACKED_KERNELS)
+def test_joined_searches_find_the_windows_of_each(kernel):
+    rng = np.random.default_rng(3)
+    packed = pack_bytes(rng.integers(0, BYTE_LIMIT + 1, (5, 20, 40, 4)))[..., 0]
+    filters = PackedFilters([rng.normal(0.1, size=(rows, 4, 20)) for rows in (5, 3, 2)])
+    strips = PackedFilters([rng.normal(0.1, size=(1, 6, 3 * 20))])
+    searches = [
+        filters.on_map(40, [0, 2], [(0, 20), (5, 20)], [0.0, 50.0]),
+        strips.on_map(20, [0], [(0, 1)], [0.0], np.array([39, 38, 37])),
+        filters.on_map(40, [1], [(3, 12)], [0.0]),
+        strips.on_map(20, [0], [(0, 1)], [10.0], np.array([0, 1, 2])),
+    ]
+    with mock.patch.object(correlation, "_packed_kernel", return_value=PACKED_KERNELS[kernel]):
+        found = PackedSearch.join(searches).find(packed)
+    for number, search in enumerate(searches):
+        alone = search.find(packed)
+        assert len(alone)
+        np.testing.assert_array_equal(found[found[:, 0] == number][:, 1:], alone[:, 1:])
 
 
 def test_no_template_is_no_search():
@@ -270,14 +280,14 @@ def test_an_instruction_that_does_not_compile_is_replaced(caplog):
     broken.compile.side_effect = RuntimeError("no such intrinsic")
     correlation._packed_kernel.cache_clear()
     try:
-        with mock.patch.object(correlation, "_correlate_blocks", broken):
-            assert correlation._packed_kernel() is correlation._correlate_unpacked
+        with mock.patch.object(correlation, "_find_windows", broken):
+            assert correlation._packed_kernel() is correlation._find_windows_plain
     finally:
         correlation._packed_kernel.cache_clear()
     assert [record.getMessage() for record in caplog.records] == [
-        "correlation uses plain, slower loops: no such intrinsic"
+        "products use plain, slower loops: no such intrinsic"
     ]
-    assert correlation._packed_kernel() is correlation._correlate_blocks
+    assert correlation._packed_kernel() is correlation._find_windows
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ from vehicle_detection._common.threads import (
     single_threaded_opencv,
 )
 from vehicle_detection._common.urls import hide_credentials, is_url, stable_url
-from vehicle_detection._common.workspace import NEW_ARRAYS, Workspace
+from vehicle_detection._common.workspace import NEW_ARRAYS, SPARE, Workspace, with_spare
 
 check_environment()
 
@@ -41,6 +41,7 @@ __all__ = [
     "FORMAT_VERSION",
     "JOBS_VARIABLE",
     "NEW_ARRAYS",
+    "SPARE",
     "Limit",
     "ModelData",
     "ParquetRows",
@@ -80,6 +81,7 @@ __all__ = [
     "single_threaded_opencv",
     "stable_url",
     "temporary_folder",
+    "with_spare",
     "write_model",
     "write_parquet",
 ]

@@ -1,7 +1,7 @@
 """Compiled numba kernels: HOG, FHOG, color, correlation, matrix products and the SVM solver."""
 
 import vehicle_detection._common  # noqa: F401 - checks the environment variables of numba first
-from vehicle_detection._kernels.correlation import DenseLayer, Filter, PackedFilters, PackedSearch
+from vehicle_detection._kernels.correlation import Filter, PackedFilters, PackedSearch
 from vehicle_detection._kernels.fhog import cell_means
 from vehicle_detection._kernels.hog import (
     bin_of_value,
@@ -10,13 +10,15 @@ from vehicle_detection._kernels.hog import (
     sqrt_gradients,
 )
 from vehicle_detection._kernels.linear_svm import fit_svm, hinge_loss
+from vehicle_detection._kernels.network import Convolution, ConvolutionalNetwork
 from vehicle_detection._kernels.suppression import suppress, vote
 from vehicle_detection._kernels.vector import BYTE_LIMIT
 from vehicle_detection._kernels.yuv import channels_from_planes, planes_from_channels
 
 __all__ = [
     "BYTE_LIMIT",
-    "DenseLayer",
+    "Convolution",
+    "ConvolutionalNetwork",
     "Filter",
     "PackedFilters",
     "PackedSearch",

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import functools
-import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, cast
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import NEW_ARRAYS, Workspace
-from vehicle_detection._kernels.jit import jit
+from vehicle_detection._common import NEW_ARRAYS, SPARE, Workspace, with_spare
+from vehicle_detection._kernels.jit import compiles, inlined, jit
 from vehicle_detection._kernels.vector import (
     BYTE_LIMIT,
     GROUP,
@@ -105,36 +104,13 @@ class Filter:
         stride, margin = width + _FLOATS.columns, filters.margin
         sums = workspace.take(((height + 2 * margin) * stride,), np.float32, "window sums")
         blocks = filters.blocks((0, height), width, margin * stride, stride)
-        _kernel()(channels, filters.weights, blocks, sums, stride, filters.dilation, _FLOATS.columns)
+        _kernel()(
+            with_spare(channels), filters.weights, blocks, sums, stride, filters.dilation, _FLOATS.columns
+        )
         scores += sums.reshape(-1, stride)[margin : margin + height, :width]
 
 
-class DenseLayer:
-    """A matrix that multiplies others, arranged for the processor's vector registers.
-
-    Unlike BLAS it uses one thread, and the result does not depend on the number of columns.
-
-    >>> DenseLayer(np.float32([[1, 2], [0, 1], [1, 0]]))(np.float32([[1, 0], [2, 3]]))
-    array([[5., 6.],
-           [2., 3.],
-           [1., 0.]], dtype=float32)
-    """
-
-    def __init__(self, weights: NDArray[np.floating]) -> None:
-        self._outputs, depth = weights.shape
-        self._weights = _FilterBlocks(weights[:, None].astype(np.float32), depth).weights
-
-    def __call__(self, matrix: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Multiply by ``(inputs, N)``, C-contiguous; returns ``(outputs, N)``."""
-        depth, count = matrix.shape
-        number, _, size = self._weights.shape
-        index, stride = np.arange(number), count + _FLOATS.columns
-        sums = np.empty(number * size * stride, np.float32)
-        # The outputs are rows of a template, whose windows lie in the opposite order.
-        places = ((number - index) * size - 1) * stride
-        blocks = np.column_stack([index, index + 1, *np.tile([[0], [0], [1], [count]], number), places])
-        _kernel()(matrix.reshape(depth, 1, count), self._weights, blocks, sums, stride, 1, _FLOATS.columns)
-        return sums.reshape(-1, stride)[::-1][: self._outputs, :count]
+_NO_COLUMNS = np.empty(0, np.intp)
 
 
 class PackedFilters:
@@ -161,11 +137,14 @@ class PackedFilters:
         chosen: Sequence[int],
         row_ranges: Sequence[tuple[int, int]],
         bounds: Sequence[float],
+        merged: NDArray[np.intp] = _NO_COLUMNS,
     ) -> PackedSearch | None:
         """Prepare the search of maps of `columns` cells in a row with the `chosen` templates.
 
         It finds the windows inside the half-open `row_ranges` with scores above `bounds`, one of each for
-        each chosen template. None without templates.
+        each chosen template. With `merged`, these columns of a map become one cell in each row, with the
+        channels of one column after those of the other, and the rows lie side by side: `columns` is then the
+        number of rows of the map. None without templates.
         """
         templates = [self._templates[index] for index in chosen]
         if not templates:
@@ -184,13 +163,13 @@ class PackedFilters:
             planes.append((place - first * stride, first, last, widths[number], limit))
             start += (last - first + 2 * template.margin) * stride
             weights += len(template.weights)
+        sizes = [sum(len(each) for each in blocks), len(planes), len(merged), start, stride]
         return PackedSearch(
             np.concatenate([each.weights for each in templates]),
             np.concatenate(blocks),
-            stride,
-            start,
             np.array(planes, np.int64),
-            sum((last - first) * width for _, first, last, width, _ in planes),
+            merged.astype(np.int64),
+            np.array([sizes], np.int64),
         )
 
 
@@ -208,81 +187,73 @@ def _unit(weights: NDArray[np.floating]) -> float:
     return max(float(np.abs(weights).max()) / BYTE_LIMIT, float(max(sums)) / (MAX_FACTORS - GROUP), 1e-12)
 
 
-_ALL_COLUMNS = np.empty(0, np.intp)
-
-
 @dataclass(frozen=True, eq=False)
 class PackedSearch:
-    """A search of maps of one size with several templates."""
+    """Searches of maps of one size, each with several templates."""
 
     weights: NDArray[np.int32]
     blocks: Blocks
-    stride: int
-    length: int  # of the sums of all windows
     planes: NDArray[np.int64]  # for each template: place of its first window, rows, columns, score limit
-    windows: int
+    merged: NDArray[np.int64]  # columns
+    sizes: NDArray[np.int64]  # for each search: blocks, planes, merged columns, length and stride of the sums
 
-    def find(
-        self,
-        packed: NDArray[np.int32],
-        columns: NDArray[np.intp] = _ALL_COLUMNS,
-        workspace: Workspace = NEW_ARRAYS,
-    ) -> NDArray[np.int32]:
-        """Windows of a map ``(words, rows, columns)``: template, row, column and score; ``(N, 4)``.
+    @classmethod
+    def join(cls, searches: Sequence[PackedSearch]) -> PackedSearch:
+        """Join at least one search into one call; their depths are divided into the same groups."""
+        weights, blocks, planes, merged, sizes = (
+            [getattr(each, name.name) for each in searches] for name in fields(cls)
+        )
+        first = 0
+        for number, each in enumerate(weights):
+            blocks[number] = blocks[number] + first * np.array([1, 1, 0, 0, 0, 0, 0])
+            first += len(each)
+        return cls(*map(np.concatenate, (weights, blocks, planes, merged, sizes)))
 
-        Templates are counted in the chosen order. With `columns`, these columns of the map become one cell
-        in each row, with the channels of one column after those of the other; the rows lie side by side.
+    @functools.cached_property
+    def _memory(self) -> tuple[int, int]:
+        """Length of the longest sums, and largest number of windows."""
+        windows = (self.planes[:, 2] - self.planes[:, 1]) * self.planes[:, 3]
+        return int(self.sizes[:, 3].max()), int(windows.sum())
+
+    def find(self, packed: NDArray[np.int32], workspace: Workspace = NEW_ARRAYS) -> NDArray[np.int32]:
+        """Windows of a map ``(words, rows, columns)``: search, template, row, column and score; ``(N, 5)``.
+
+        Templates are counted in the chosen order.
         """
-        cells = packed
-        if len(columns):
-            cells = packed.transpose(2, 0, 1)[columns].reshape(-1, 1, packed.shape[1])
-        sums = workspace.take((self.length,), np.int32, "window sums")
-        found = workspace.take((self.windows, 4), np.int32, "windows")
-        _packed_kernel()(cells, self.weights, self.blocks, sums, self.stride, 1, _BYTES.columns)
-        return found[: _find_windows(sums, self.stride, self.planes, found)].copy()
+        length, windows = self._memory
+        sums = workspace.take((length,), np.int32, "window sums")
+        found = workspace.take((windows, 5), np.int32, "windows")
+        tables = self.weights, self.blocks, self.planes, self.merged, self.sizes
+        return found[: _packed_kernel()(with_spare(packed), *tables, sums, _BYTES.columns, found)].copy()
 
 
 @functools.cache
-def _packed_kernel() -> Callable[..., None]:
-    """Return the block kernel for packed numbers, or plain loops if it does not compile."""
-    try:
-        _compile_blocks(numba.int32, numba.int32)
-    except (numba.core.errors.NumbaError, RuntimeError) as error:  # LLVM's are RuntimeErrors
-        logging.getLogger(__name__).warning("correlation uses plain, slower loops: %s", error)
-        return _correlate_unpacked
-    return _correlate_blocks
+def _packed_kernel() -> Callable[..., int]:
+    """Return the kernel of `PackedSearch.find`, or plain loops if it does not compile."""
+    words, table = numba.int32[:, :, ::1], numba.int64[:, ::1]
+    types = words, words, table, table, numba.int64[::1], table, numba.int32[::1], numba.intp
+    return _find_windows if compiles(_find_windows, *types, numba.int32[:, ::1]) else _find_windows_plain
 
 
 @functools.cache
 def _kernel() -> Callable[..., None]:
-    """Return the block kernel, or plain loops if the block kernel does not compile."""
-    try:
-        _compile_blocks(numba.float32, numba.float32)
-    except numba.core.errors.NumbaError as error:
-        logging.getLogger(__name__).warning("correlation uses plain, slower loops: %s", error)
-        return _correlate_plain
-    return _correlate_blocks
+    """Return the block kernel for float32, or plain loops if it does not compile."""
+    values, table = numba.float32[:, :, ::1], numba.int64[:, ::1]
+    types = values, values, table, numba.float32[::1], *[numba.intp] * 3
+    return _correlate_blocks if compiles(_correlate_blocks, *types) else _correlate_plain
 
 
-def _compile_blocks(number: Any, total: Any) -> None:
-    """Compile the block kernel for numbers and sums of these types."""
-    maps, table = number[:, :, ::1], numba.int64[:, ::1]
-    cast("Any", _correlate_blocks).compile((maps, maps, table, total[::1], *[numba.intp] * 3))
-
-
-@jit
-def _correlate_blocks(channels, weights, blocks, sums, stride, dilation, tile):
+def _sum_blocks(channels, weights, blocks, sums, stride, dilation, tile):
     """Compute the sums of products of all windows.
 
     `channels` is ``(depth, rows, columns)``, `weights` ``(N, channels of a group, rows of a block)``, and
     `blocks` as in `Blocks`. `sums` is the output, with rows of `stride` entries. Numbers are float32, or
-    packed, and `tile` is the columns of their block, see `block_adder`.
+    packed, and `tile` is the columns of their block, see `block_adder`. Values are read up to a tile beyond
+    the end of a row, also of the last one (`with_spare`), and added where no window is.
     """
     depth, rows, columns = channels.shape
-    group = weights.shape[1]
     total = rows * columns
-    flat = channels.reshape(depth * total)
-    end, end_start, end_extent = flat, -1, -1
+    cells = channels.reshape(depth * total)
     for position in range(len(sums)):
         sums[position] = 0
     widest = 0
@@ -293,39 +264,57 @@ def _correlate_blocks(channels, weights, blocks, sums, stride, dilation, tile):
             for block in range(len(blocks)):
                 first, last, channel, row_start, row_stop, width, place = blocks[block]
                 if x < width and row_start <= y < row_stop:
-                    # Values beyond the last cell of a row are added where no window is.
-                    cells, start, step = flat, channel * total + y * columns + x, total
-                    extent = (last - first - 1) * dilation + tile
-                    if start + (group - 1) * total + extent > depth * total:
-                        if start != end_start or extent != end_extent:
-                            end = _end_of_cells(flat, start, total, group, extent)
-                            end_start, end_extent = start, extent
-                        cells, start, step = end, 0, extent
+                    start = channel * total + y * columns + x
                     position, row_step = place + y * stride + x, dilation * stride
                     _add_products(
-                        weights, first, last, cells, start, step, dilation, sums, position, row_step
+                        weights, first, last, cells, start, total, dilation, sums, position, row_step
                     )
 
 
-@jit
-def _end_of_cells(flat, start, step, count, length):
-    """Copy parts of the channels, of `length` cells, that go beyond the end; the last cell is repeated."""
-    copy = np.empty(count * length, flat.dtype)
-    for channel in range(count):
-        for cell in range(length):
-            position = min(start + channel * step + cell, len(flat) - 1)
-            copy[channel * length + cell] = flat[position]
-    return copy
+_correlate_blocks = jit(_sum_blocks)
+_sum_blocks_within = inlined(_sum_blocks)
 
 
 @jit
-def _find_windows(sums, stride, planes, found):
-    """List the windows with a score above the limit of their template; returns their number.
+def _find_windows(packed, weights, blocks, planes, merged, sizes, sums, tile, found):
+    """List the windows of all searches in `found`, and return their number; see `PackedSearch`."""
+    count = first_block = first_plane = first_column = 0
+    for search in range(len(sizes)):
+        n_blocks, n_planes, n_columns, length, stride = sizes[search]
+        cells = packed
+        if n_columns:
+            cells = _merge_columns(packed, merged[first_column : first_column + n_columns])
+        part = blocks[first_block : first_block + n_blocks]
+        _sum_blocks_within(cells, weights, part, sums[:length], stride, 1, tile)
+        count = _list_windows(
+            sums, stride, planes[first_plane : first_plane + n_planes], search, found, count
+        )
+        first_block, first_plane, first_column = (
+            first_block + n_blocks,
+            first_plane + n_planes,
+            first_column + n_columns,
+        )
+    return count
 
-    `sums` and `stride` are those of `_correlate_blocks`, and `found` is the output ``(windows, 4)``, see
-    `PackedSearch.find`.
-    """
-    count = 0
+
+@inlined
+def _merge_columns(packed, merged):
+    """Make the columns of a map one cell in each row; the rows lie side by side."""
+    words, rows, columns = packed.shape
+    flat = packed.reshape(packed.size)
+    size = len(merged) * words * rows
+    cells = np.empty(size + SPARE, packed.dtype)
+    place = 0
+    for column in merged:
+        for start in range(column, column + words * rows * columns, columns):
+            cells[place] = flat[start]
+            place += 1
+    return cells[:size].reshape(len(merged) * words, 1, rows)
+
+
+@inlined
+def _list_windows(sums, stride, planes, search, found, count):
+    """List the windows with a score above the limit of their template, after `count` others."""
     for template in range(len(planes)):
         corner, first, last, width, limit = planes[template]
         for row in range(first, last):
@@ -336,8 +325,8 @@ def _find_windows(sums, stride, planes, found):
             if best > limit:
                 for column in range(width):
                     if line[column] > limit:
-                        found[count, 0], found[count, 1] = template, row
-                        found[count, 2], found[count, 3] = column, line[column]
+                        found[count, 0], found[count, 1] = search, template
+                        found[count, 2], found[count, 3], found[count, 4] = row, column, line[column]
                         count += 1
     return count
 
@@ -362,20 +351,32 @@ def _correlate_plain(channels, weights, blocks, sums, stride, dilation, tile):
                             line[x] += weight * values[x]
 
 
-def _correlate_unpacked(
-    channels: NDArray[np.int32],
+def _find_windows_plain(
+    packed: NDArray[np.int32],
     weights: NDArray[np.int32],
     blocks: Blocks,
+    planes: NDArray[np.int64],
+    merged: NDArray[np.int64],
+    sizes: NDArray[np.int64],
     sums: NDArray[np.int32],
-    stride: int,
-    dilation: int,
-    tile: int,
-) -> None:
-    """`_correlate_plain` for packed numbers."""
-    numbers = [
-        np.ascontiguousarray(np.moveaxis(unpack_bytes(np.moveaxis(each, axis, -1)), -1, axis))
-        for each, axis in ((channels, 0), (weights, 1))
-    ]
-    blocks = blocks.copy()
-    blocks[:, 2] *= 4
-    _correlate_plain(*numbers, blocks, sums, stride, dilation, tile)
+    _tile: int,
+    found: NDArray[np.int32],
+) -> int:
+    """`_find_windows` without vector intrinsics."""
+    factors = _unpack_axis(weights, 1)
+    count = first_block = first_plane = first_column = 0
+    for search, (n_blocks, n_planes, n_columns, length, stride) in enumerate(sizes.tolist()):
+        columns = merged[first_column : first_column + n_columns]
+        cells = _unpack_axis(_merge_columns(packed, columns) if n_columns else packed, 0)
+        part = blocks[first_block : first_block + n_blocks] * np.array([1, 1, 4, 1, 1, 1, 1])
+        _correlate_plain(cells, factors, part, sums[:length], stride, 1, 1)
+        part = planes[first_plane : first_plane + n_planes]
+        count = _list_windows(sums, stride, part, search, found, count)
+        first_block, first_plane = first_block + n_blocks, first_plane + n_planes
+        first_column += n_columns
+    return count
+
+
+def _unpack_axis(words: NDArray[np.int32], axis: int) -> NDArray[np.int32]:
+    """Replace each word by its four bytes along an axis."""
+    return np.ascontiguousarray(np.moveaxis(unpack_bytes(np.moveaxis(words, axis, -1)), -1, axis))

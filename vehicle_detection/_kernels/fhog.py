@@ -11,7 +11,7 @@ import math
 import numba
 import numpy as np
 
-from vehicle_detection._kernels.jit import jit
+from vehicle_detection._kernels.jit import inlined, jit
 from vehicle_detection._kernels.vector import weighted_sum
 
 SQUARE, SMALL_SQUARE = 4, 2
@@ -111,7 +111,7 @@ def orientation_sums(channels, cotangents, square, first, sums):
                     out[place + np.uint64(bins[2 * x + 1])] += magnitudes[2 * x + 1]
 
 
-@jit
+@inlined
 def _tent_taps(start, step, squares, taps, index, weights):
     """Weights of the squares around each cell, along one axis, by bilinear interpolation.
 
@@ -134,7 +134,7 @@ def _tent_taps(start, step, squares, taps, index, weights):
 
 
 @jit
-def resample(sums, square, first, squares, grid, cells):
+def _resample(sums, square, first, squares, grid, cells):
     """Interpolate the sums of squares at the cells of a grid, and at one cell more on each side.
 
     `sums` and `square` are as in `orientation_sums`, with one column of squares beyond each side; `first` is
@@ -182,7 +182,7 @@ def resample(sums, square, first, squares, grid, cells):
                 out[x] = row[x, k]
 
 
-@jit
+@inlined
 def _block_factors(cells, eps, factors):
     """Write the normalization of each block of 2x2 cells, ``1 / sqrt(energy + eps)``."""
     rows, columns = cells.shape[1:]
@@ -203,7 +203,7 @@ def _block_factors(cells, eps, factors):
                 out[x] = one / np.sqrt(above[x] + above[x + 1] + line[x] + line[x + 1] + eps)
 
 
-@jit
+@inlined
 def _normalize_row(cells, factors, y, channels):
     """Normalize the cells of row `y` by the four blocks of 2x2 cells that contain each, and clip at 0.2.
 
@@ -237,24 +237,27 @@ def _normalize_row(cells, factors, y, channels):
 
 
 @jit
-def fhog_channels(cells, eps, channels, scales, packed):
+def cell_channels(sums, square, first, squares, grids, eps, scales, cells, channels, packed):
     """FHOG channels of several grids of cells, as numbers or as bytes in words of 32 bits.
 
-    `cells` are the outputs of `resample`; `eps` is added to the energy of a block. One of the outputs may be
-    empty: `channels` is ``(grids, 20, rows, columns)`` float32, and `packed` ``(grids, 5, rows, columns)``
-    int32: the value of channel `k` is multiplied by ``scales[k]`` and rounded; the first of a word's 4
-    channels is in the lowest bits. Both are one kernel because most of the time of compiling it goes into
-    what they share.
+    `sums`, `square`, `first` and `squares` are as in `_resample`, and `grids` is ``(N, 4)``. `eps` is added
+    to the energy of a block. `cells` is memory for one grid, ``(16, rows + 2, columns + 2)`` float32.
+
+    One of the outputs may be empty: `channels` is ``(N, 20, rows, columns)`` float32, and `packed`
+    ``(N, 5, rows, columns)`` int32: the value of channel `k` is multiplied by ``scales[k]`` and rounded; the
+    first of a word's 4 channels is in the lowest bits. Both are one kernel because most of the time of
+    compiling it goes into what they share.
     """
-    grids, _, rows, columns = cells.shape
+    _, rows, columns = cells.shape
     rows, columns = rows - 2, columns - 2
     factors = np.empty((rows + 1, columns + 1), np.float32)
     line = np.empty((20, columns), np.float32)
     half, limit = np.float32(0.5), np.float32(127)
-    for number in range(grids):
-        _block_factors(cells[number], eps, factors)
+    for number in range(len(grids)):
+        _resample(sums, square, first, squares, grids[number], cells)
+        _block_factors(cells, eps, factors)
         for y in range(rows):
-            _normalize_row(cells[number], factors, y, line)
+            _normalize_row(cells, factors, y, line)
             if len(packed):
                 for word in range(packed.shape[1]):
                     out, k = packed[number, word, y], 4 * word
@@ -276,25 +279,26 @@ def fhog_channels(cells, eps, channels, scales, packed):
 
 
 @jit
-def cell_means(planes, grid, means):
-    """Mean values of an image in the cells of a grid, with replicated borders.
+def cell_means(planes, grids, means):
+    """Mean values of an image in the cells of several grids, with replicated borders.
 
-    `planes` is ``(3, H, W)`` uint8, `grid` the left, top, width and height of the first cell in pixels, and
-    `means` the output ``(rows, columns, 3)`` float32. Cells are rounded to whole pixels.
+    `planes` is ``(3, H, W)`` uint8, `grids` ``(N, 4)`` the left, top, width and height of their first cells
+    in pixels, and `means` the output ``(N, rows, columns, 3)`` float32. Cells are rounded to whole pixels.
     """
     height, width = planes.shape[1:]
-    rows, columns = means.shape[:2]
-    left, top, step_x, step_y = grid[0], grid[1], grid[2], grid[3]
-    for row in range(rows):
-        start_y = math.floor(top + row * step_y + 0.5)
-        stop_y = max(math.floor(top + (row + 1) * step_y + 0.5), start_y + 1)
-        for column in range(columns):
-            start_x = math.floor(left + column * step_x + 0.5)
-            stop_x = max(math.floor(left + (column + 1) * step_x + 0.5), start_x + 1)
-            for c in range(3):
-                total = 0
-                for y in range(start_y, stop_y):
-                    line = planes[c, min(max(y, 0), height - 1)]
-                    for x in range(start_x, stop_x):
-                        total += line[min(max(x, 0), width - 1)]
-                means[row, column, c] = total / ((stop_y - start_y) * (stop_x - start_x))
+    rows, columns = means.shape[1:3]
+    for number in range(len(grids)):
+        left, top, step_x, step_y = grids[number]
+        for row in range(rows):
+            start_y = math.floor(top + row * step_y + 0.5)
+            stop_y = max(math.floor(top + (row + 1) * step_y + 0.5), start_y + 1)
+            for column in range(columns):
+                start_x = math.floor(left + column * step_x + 0.5)
+                stop_x = max(math.floor(left + (column + 1) * step_x + 0.5), start_x + 1)
+                for c in range(3):
+                    total = 0
+                    for y in range(start_y, stop_y):
+                        line = planes[c, min(max(y, 0), height - 1)]
+                        for x in range(start_x, stop_x):
+                            total += line[min(max(x, 0), width - 1)]
+                    means[number, row, column, c] = total / ((stop_y - start_y) * (stop_x - start_x))

@@ -7,7 +7,7 @@ import functools
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numba
 from numba.core import event
@@ -37,6 +37,20 @@ def jit(function: Callable[..., Any], *, reorder: bool = False) -> Callable[...,
     with contextlib.suppress(AttributeError):
         kernel._cache._cache_file._source_stamp = source_stamp()
     return kernel  # type: ignore[no-any-return]
+
+
+inlined = functools.partial(numba.njit, inline="always")
+"""Compile a function only as a part of each kernel that calls it."""
+
+
+def compiles(kernel: Callable[..., Any], *types: Any) -> bool:
+    """Compile a kernel for arguments of these types; log a warning and return False if that fails."""
+    try:
+        cast("Any", kernel).compile(types)
+    except (numba.core.errors.NumbaError, RuntimeError) as error:  # LLVM's are RuntimeErrors
+        log.warning("products use plain, slower loops: %s", error)
+        return False
+    return True
 
 
 @functools.cache

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from vehicle_detection._kernels.jit import jit
+from vehicle_detection._kernels.jit import inlined, jit
 
 _TINY = float(np.finfo(np.float64).tiny)
 
 
-@jit
+@inlined
 def _overlaps(boxes, best, iou, coverage):
     """IoU of one box with all boxes, and the shared fraction of the smaller box of each pair."""
     x1, y1, x2, y2 = boxes[best]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import cv2
@@ -43,10 +42,14 @@ def rescoring_features(
     if not count:
         return edges, np.empty((0, N_COLOR_FEATURES), np.float32)
     means = np.empty((count, CROP_CELLS, CROP_CELLS, 3), np.float32)
-    for mean, grid in zip(means, _grids(boxes, _BOX_CELLS, (CROP_CELLS, CROP_CELLS)).tolist()):
-        # Means need less detail than edges do: cells of two to six pixels a side.
-        number = pyramid.octave_of(2 * math.sqrt(grid[2] * grid[3]))
-        cell_means(pyramid.octaves[number].planes, np.array(grid) / 2**number, mean)
+    grids = _grids(boxes, _BOX_CELLS, (CROP_CELLS, CROP_CELLS))
+    # Means need less detail than edges do: cells of two to six pixels a side.
+    numbers = np.array([pyramid.octave_of(size) for size in 2 * np.sqrt(grids[:, 2] * grids[:, 3])], np.intp)
+    for number in np.unique(numbers).tolist():
+        chosen = np.flatnonzero(numbers == number)
+        found = np.empty((len(chosen), *means.shape[1:]), np.float32)
+        cell_means(pyramid.octaves[number].planes, grids[chosen] / 2**number, found)
+        means[chosen] = found
     # One conversion for all crops, one below the other.
     values = means.reshape(-1, CROP_CELLS, 3) / 255
     lab = cv2.cvtColor(values, cv2.COLOR_RGB2LAB).reshape(count, -1, 3).transpose(2, 0, 1)

@@ -96,6 +96,19 @@ class Octave:
         """Compute the sums, in place."""
         _fhog_kernels.orientation_sums(self.planes, _COTANGENTS, SQUARE, self.first, self.sums)
 
+    def channels_of(
+        self,
+        grids: NDArray[np.float64],
+        cells: NDArray[np.float32],
+        channels: NDArray[np.float32],
+        packed: NDArray[np.int32],
+    ) -> None:
+        """Compute the channels of grids, in squares; see `cell_channels` for the memory."""
+        squares = -(-self.planes.shape[1] // SQUARE)
+        _fhog_kernels.cell_channels(
+            self.sums, SQUARE, self.first, squares, grids, _EPS, CHANNEL_SCALES, cells, channels, packed
+        )
+
 
 class EdgePyramid:
     """Gradient sums of a frame in octaves, from which the channels of any cell follow.
@@ -166,12 +179,9 @@ class EdgePyramid:
         return channels
 
     def _interpolate(self, number: int, grids: NDArray[np.float64], channels: NDArray[np.float32]) -> None:
-        octave = self.octaves[number]
-        squares = -(-octave.planes.shape[1] // SQUARE)
-        cells = _new_cells(channels)
-        for grid, each in zip(grids / (SQUARE * 2**number), cells):
-            _fhog_kernels.resample(octave.sums, SQUARE, octave.first, squares, grid, each)
-        _fhog_kernels.fhog_channels(cells, _EPS, channels, CHANNEL_SCALES, _NO_WORDS)
+        octave, scaled = self.octaves[number], grids / (SQUARE * 2**number)
+        cells = np.empty(_cells_shape(channels.shape), np.float32)
+        octave.channels_of(scaled, cells, channels, _NO_WORDS)
 
     def _compute_small(self, grids: NDArray[np.float64], channels: NDArray[np.float32]) -> None:
         """FHOG channels of grids of small cells, from small squares of the pixels around each."""
@@ -182,14 +192,15 @@ class EdgePyramid:
         low = (np.floor(grids[:, :2] - 2 * steps) - 2 * square).clip(0, shape - 1).astype(np.intp)
         high = (np.ceil(ends) + 2 * square).clip(low + 1, shape).astype(np.intp)
         scaled = np.hstack([grids[:, :2] - low, steps]) / square
-        cells = _new_cells(channels)
+        cells = np.empty(_cells_shape(channels.shape), np.float32)
         for number, ((left, top), (right, bottom)) in enumerate(zip(low.tolist(), high.tolist())):
             region = np.ascontiguousarray(planes[:, top:bottom, left:right])
             down, across = (bottom - top + 1) // square, (right - left + 1) // square
             sums = np.empty((down + 2, across + 2, 16), np.float32)
             _fhog_kernels.orientation_sums(region, _COTANGENTS, square, -1, sums)
-            _fhog_kernels.resample(sums, square, -1, down, scaled[number], cells[number])
-        _fhog_kernels.fhog_channels(cells, _EPS, channels, CHANNEL_SCALES, _NO_WORDS)
+            outputs = channels[number : number + 1], _NO_WORDS
+            grid = scaled[number : number + 1]
+            _fhog_kernels.cell_channels(sums, square, -1, down, grid, _EPS, CHANNEL_SCALES, cells, *outputs)
 
     def feature_map(self, grid: CellGrid) -> FeatureMap:
         """FHOG channels of one grid."""
@@ -204,20 +215,16 @@ class EdgePyramid:
         ``(words, rows, columns)``; the value of a word's first channel is in its lowest bits.
         """
         number = self.octave_of(math.sqrt(grid.step_x * grid.step_y))
-        octave, scale = self.octaves[number], SQUARE * 2**number
-        cells = workspace.take((1, 16, grid.rows + 2, grid.columns + 2), np.float32, "cells")
+        cells = workspace.take((16, grid.rows + 2, grid.columns + 2), np.float32, "cells")
         packed = workspace.take((1, N_CHANNELS // 4, grid.rows, grid.columns), np.int32, "packed")
-        squares = -(-octave.planes.shape[1] // SQUARE)
-        corner = np.array([grid.left, grid.top, grid.step_x, grid.step_y]) / scale
-        _fhog_kernels.resample(octave.sums, SQUARE, octave.first, squares, corner, cells[0])
-        _fhog_kernels.fhog_channels(cells, _EPS, _NO_CHANNELS, CHANNEL_SCALES, packed)
+        corner = np.array([[grid.left, grid.top, grid.step_x, grid.step_y]]) / (SQUARE * 2**number)
+        self.octaves[number].channels_of(corner, cells, _NO_CHANNELS, packed)
         return np.asarray(packed[0])
 
 
-def _new_cells(channels: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Memory for the cells of some grids with these channels, and one cell more on each side."""
-    count, _, rows, columns = channels.shape
-    return np.empty((count, 16, rows + 2, columns + 2), np.float32)
+def _cells_shape(channels: tuple[int, ...]) -> tuple[int, ...]:
+    """Shape of the cells of a grid with channels of shape ``(N, 20, rows, columns)``, and those around it."""
+    return 16, channels[2] + 2, channels[3] + 2
 
 
 def octave_count(shape: tuple[int, ...]) -> int:

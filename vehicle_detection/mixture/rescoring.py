@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_number, finite_array
-from vehicle_detection._kernels import DenseLayer
+from vehicle_detection._kernels import Convolution, ConvolutionalNetwork
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture.crops import CROP_CELLS, rescoring_features
@@ -66,7 +65,7 @@ class Network:
     """
 
     layers: tuple[Layer, ...]
-    _products: tuple[DenseLayer, ...] = field(init=False, repr=False)
+    _kernel: ConvolutionalNetwork = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if len(self.layers) != len(LAYERS):
@@ -84,22 +83,11 @@ class Network:
                 f"rescorer.{LAYERS[-1]} must have 5 outputs, got {len(layers[-1].bias)}; train again"
             )
         object.__setattr__(self, "layers", tuple(layers))
-        object.__setattr__(self, "_products", tuple(DenseLayer(layer.weights) for layer in layers))
+        object.__setattr__(self, "_kernel", ConvolutionalNetwork(_convolutions(layers)))
 
-    def outputs(self, columns: Singles, shape: tuple[int, ...]) -> Floats:
-        """Log-odds and shifts of the edges, ``(N, 5)``, of crops whose cells are unfolded."""
-        for number, (layer, product) in enumerate(zip(self.layers, self._products)):
-            values = product(columns) + layer.bias[:, None]
-            if number + 1 < len(LAYERS):
-                np.maximum(values, 0, out=values)
-            columns = values
-            if number < len(STRIDES):
-                values = values.reshape(len(layer.bias), *shape)
-                if number + 1 < len(STRIDES):
-                    columns, shape = _unfold(values, STRIDES[number + 1])
-                else:
-                    columns = values.reshape(math.prod(values.shape[:3]), shape[-1])
-        return columns.T.astype(np.float64)
+    def outputs(self, inputs: Singles) -> Floats:
+        """Log-odds and shifts of the edges, ``(N, 5)``, of `network_inputs`."""
+        return self._kernel(inputs).T.astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,9 +124,7 @@ class Rescorer:
 
         `inputs` are `network_inputs`.
         """
-        # Neighbors in memory are the same cell of each crop: whole rows of them are copied.
-        columns, shape = _unfold(np.ascontiguousarray(inputs.transpose(0, 2, 3, 1)), STRIDES[0])
-        outputs = np.mean([network.outputs(columns, shape) for network in self.networks], axis=0)
+        outputs = np.mean([network.outputs(inputs) for network in self.networks], axis=0)
         return outputs[:, 0], np.clip(outputs[:, 1:], -MAX_CORRECTION, MAX_CORRECTION)
 
     def apply(self, pyramid: EdgePyramid, boxes: Floats, margins: Floats) -> tuple[Floats, Floats]:
@@ -181,15 +167,18 @@ def network_inputs(edges: Singles, colors: Singles) -> Singles:
     return np.ascontiguousarray(inputs.swapaxes(0, 1))
 
 
-def _unfold(values: Singles, stride: int) -> tuple[Singles, tuple[int, ...]]:
-    """List the 3x3 cells around each output of a convolution, ``(9 * channels, outputs)``.
-
-    `values` is ``(channels, rows, columns, N)``; also returns the outputs' shape, ``(rows, columns, N)``.
-    """
-    windows = sliding_window_view(values, (KERNEL, KERNEL), axis=(1, 2))[:, ::stride, ::stride]
-    shape = windows.shape[1:4]
-    columns = windows.transpose(4, 5, 0, 1, 2, 3).reshape(KERNEL**2 * len(values), math.prod(shape))
-    return columns, shape
+def _convolutions(layers: Sequence[Layer]) -> list[Convolution]:
+    """All layers as convolutions; the hidden one covers all cells that the last convolution leaves."""
+    convolutions = []
+    for layer, stride in zip(layers[: len(STRIDES)], STRIDES):
+        weights = layer.weights.reshape(len(layer.bias), KERNEL, KERNEL, -1)
+        convolutions.append(Convolution(weights, layer.bias, stride))
+    hidden, output = layers[len(STRIDES) :]
+    side = math.isqrt(last_cells())
+    weights = hidden.weights.reshape(len(hidden.bias), -1, side, side).transpose(0, 2, 3, 1)
+    convolutions.append(Convolution(weights, hidden.bias, 1))
+    convolutions.append(Convolution(output.weights[:, None, None], output.bias, 1))
+    return convolutions
 
 
 def last_cells() -> int:

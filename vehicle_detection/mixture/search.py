@@ -40,21 +40,13 @@ INNER, RIGHT, LEFT = range(3)
 
 
 @dataclass(frozen=True, eq=False)
-class _LevelSearch:
-    """A search of the cells of one size: at one place, with some of the templates there."""
-
-    place: int
-    templates: NDArray[np.intp]  # indices
-    columns: NDArray[np.intp]  # of cells that become one, see `PackedSearch.find`
-    search: PackedSearch
-
-
-@dataclass(frozen=True, eq=False)
 class _Level:
-    """The cells of one size, and their searches."""
+    """The cells of one size, and their searches: at one place each, with some of the templates there."""
 
     grid: CellGrid
-    searches: list[_LevelSearch]
+    places: list[int]
+    templates: list[list[int]]  # indices, for each search
+    search: PackedSearch
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,23 +60,24 @@ class _Plan:
     corners: Floats
     steps: Floats
     templates: NDArray[np.intp]
+    first_searches: NDArray[np.intp]  # of each level
 
     @classmethod
     def of(cls, levels: list[_Level], row_ranges: list[Rows]) -> _Plan:
         """List the facts of the searches that turn their windows into boxes."""
-        pairs = [(level.grid, each) for level in levels for each in level.searches]
-        templates = np.zeros(
-            (len(pairs), max((len(each.templates) for _, each in pairs), default=0)), np.intp
-        )
-        for row, (_, each) in zip(templates, pairs):
-            row[: len(each.templates)] = each.templates
+        grids = [level.grid for level in levels for _ in level.places]
+        indices = [each for level in levels for each in level.templates]
+        templates = np.zeros((len(indices), max(map(len, indices), default=0)), np.intp)
+        for row, each in zip(templates, indices):
+            row[: len(each)] = each
         return cls(
             levels,
             row_ranges,
-            np.array([each.place for _, each in pairs], np.intp),
-            np.array([(grid.left, grid.top) for grid, _ in pairs]).reshape(-1, 2),
-            np.array([(grid.step_x, grid.step_y) for grid, _ in pairs]).reshape(-1, 2),
+            np.array([place for level in levels for place in level.places], np.intp),
+            np.array([(grid.left, grid.top) for grid in grids]).reshape(-1, 2),
+            np.array([(grid.step_x, grid.step_y) for grid in grids]).reshape(-1, 2),
             templates,
+            np.cumsum([0, *(len(level.places) for level in levels)]),
         )
 
 
@@ -164,20 +157,19 @@ class MixtureSearch(FrameSearch):
                 plan.levels,
                 cost=lambda level: level.grid.rows * level.grid.columns,
             )
-        windows = self._to_windows(plan, [each for level in found for each in level], pyramid.shape)
+        windows = self._to_windows(plan, found, pyramid.shape)
         return pyramid, windows.best(_MAX_WINDOWS)
 
-    def _search_level(self, pyramid: EdgePyramid, level: _Level) -> list[NDArray[np.int32]]:
-        """Windows of each search on the cells of one size, see `PackedSearch.find`."""
-        packed = pyramid.packed_channels(level.grid, self.workspace)
-        return [each.search.find(packed, each.columns, self.workspace) for each in level.searches]
+    def _search_level(self, pyramid: EdgePyramid, level: _Level) -> NDArray[np.int32]:
+        """Windows of all searches on the cells of one size, see `PackedSearch.find`."""
+        return level.search.find(pyramid.packed_channels(level.grid, self.workspace), self.workspace)
 
     def _to_windows(
         self, plan: _Plan, found: list[NDArray[np.int32]], shape: tuple[int, int]
     ) -> ScoredWindows:
         """Boxes and margins of the windows of all searches, without those mostly outside the frame."""
-        number, row, column, score = np.concatenate([np.empty((0, 4), np.int32), *found]).T
-        search = np.repeat(np.arange(len(found)), [len(each) for each in found])
+        search, number, row, column, score = np.concatenate([np.empty((0, 5), np.int32), *found]).T
+        search = search + np.repeat(plan.first_searches[:-1], [len(each) for each in found])
         place, index, steps = plan.places[search], plan.templates[search, number], plan.steps[search]
         # The rows of a strip lie side by side.
         row = np.where(place == INNER, row, column)
@@ -222,7 +214,7 @@ class MixtureSearch(FrameSearch):
             if rows[1] - rows[0] < size:
                 continue
             grid = frame_grid(size, shape, rows)
-            searches = []
+            places, chosen_templates, searches = [], [], []
             for place, (numbers, filters) in enumerate(zip(self._numbers, self._filters)):
                 chosen = [number for number, index in enumerate(numbers) if index in ranges]
                 indices = [numbers[number] for number in chosen]
@@ -231,12 +223,15 @@ class MixtureSearch(FrameSearch):
                     spans = [(0, 1)] * len(indices)
                 columns = grid.columns if place == INNER else grid.rows
                 bounds = [min_margin - templates[index].bias for index in indices]
-                search = filters.on_map(columns, chosen, spans, bounds)
+                cells = np.minimum(_BEYOND + self._strip_cells, grid.columns - 1)
+                merged = {INNER: cells[:0], LEFT: cells, RIGHT: grid.columns - 1 - cells}[place]
+                search = filters.on_map(columns, chosen, spans, bounds, merged)
                 if search is not None:
-                    cells = np.minimum(_BEYOND + self._strip_cells, grid.columns - 1)
-                    merged = {INNER: cells[:0], LEFT: cells, RIGHT: grid.columns - 1 - cells}[place]
-                    searches.append(_LevelSearch(place, np.array(indices, np.intp), merged, search))
-            levels.append(_Level(grid, searches))
+                    places.append(place)
+                    chosen_templates.append(indices)
+                    searches.append(search)
+            if searches:
+                levels.append(_Level(grid, places, chosen_templates, PackedSearch.join(searches)))
             context = math.ceil(_CONTEXT * size)
             octaves[octave_of(size, len(octaves))].append((rows[0] - context, rows[1] + context))
         row_ranges = [
