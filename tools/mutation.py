@@ -138,7 +138,8 @@ def _is_fixed(node: ast.AST) -> bool:
     if isinstance(node, ast.If):
         return ast.unparse(node.test).endswith("TYPE_CHECKING")
     if isinstance(node, ast.FunctionDef):
-        return any("jit" in ast.unparse(each) for each in node.decorator_list)
+        decorators = [ast.unparse(each) for each in node.decorator_list]
+        return any("jit" in each or each == "inlined" for each in decorators)
     if isinstance(node, ast.Assign):  # __all__, and aliases such as Floats = NDArray[np.float64] | None
         targets = [ast.unparse(each) for each in node.targets]
         return targets == ["__all__"] or (targets[0][:1].isupper() and not targets[0].isupper())

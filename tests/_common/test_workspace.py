@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.lib.stride_tricks import sliding_window_view
 
 from vehicle_detection._common import NEW_ARRAYS, SPARE, Workspace, with_spare
 from vehicle_detection._kernels.vector import byte_block, float_block
@@ -54,9 +55,15 @@ def test_an_array_at_the_end_of_its_memory_is_copied(missing):
     copied = with_spare(array)
     assert (copied is array) == (missing == SPARE)
     np.testing.assert_array_equal(copied, array)
-    # The memory of other objects has no known end.
-    foreign = np.frombuffer(array.tobytes(), np.float32)
-    assert with_spare(foreign) is not foreign
+
+
+def test_memory_with_an_unknown_end_is_copied():
+    values = np.arange(100, dtype=np.float32)
+    # The memory of another object, and views that overlap.
+    for array in (np.frombuffer(values.tobytes(), np.float32), sliding_window_view(values, 90)[10:11]):
+        copied = with_spare(array)
+        assert not np.shares_memory(copied, array)
+        np.testing.assert_array_equal(copied, array)
 
 
 def test_the_spare_memory_is_enough_for_every_processor():

@@ -76,7 +76,7 @@ def test_a_block_kernel_that_does_not_compile_is_replaced(caplog):
     np.testing.assert_allclose(scores, 2 * reference(weights, channels), rtol=1e-4, atol=1e-4)
     broken.assert_not_called()
     assert [record.getMessage() for record in caplog.records] == [
-        "products use plain, slower loops: no such intrinsic"
+        "products are computed without vector instructions, which is slower: no such intrinsic"
     ]
 
 
@@ -285,7 +285,7 @@ def test_an_instruction_that_does_not_compile_is_replaced(caplog):
     finally:
         correlation._packed_kernel.cache_clear()
     assert [record.getMessage() for record in caplog.records] == [
-        "products use plain, slower loops: no such intrinsic"
+        "products are computed without vector instructions, which is slower: no such intrinsic"
     ]
     assert correlation._packed_kernel() is correlation._find_windows
 

@@ -42,7 +42,7 @@ class Workspace:
 
 def with_spare(array: NDArray[Any]) -> NDArray[Any]:
     """Return an array itself if its memory goes on for `SPARE` entries, as in a workspace, else a copy."""
-    if isinstance(array.base, np.ndarray):
+    if isinstance(array.base, np.ndarray) and array.base.flags.c_contiguous:
         start, base_start = (each.__array_interface__["data"][0] for each in (array, array.base))
         if base_start + array.base.nbytes - start - array.nbytes >= SPARE * array.itemsize:
             return array

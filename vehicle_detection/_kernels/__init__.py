@@ -1,4 +1,4 @@
-"""Compiled numba kernels: HOG, FHOG, color, correlation, matrix products and the SVM solver."""
+"""Compiled numba kernels: HOG, FHOG, color, correlation, convolutional networks and the SVM solver."""
 
 import vehicle_detection._common  # noqa: F401 - checks the environment variables of numba first
 from vehicle_detection._kernels.correlation import Filter, PackedFilters, PackedSearch

@@ -243,6 +243,7 @@ def _kernel() -> Callable[..., None]:
     return _correlate_blocks if compiles(_correlate_blocks, *types) else _correlate_plain
 
 
+@inlined
 def _sum_blocks(channels, weights, blocks, sums, stride, dilation, tile):
     """Compute the sums of products of all windows.
 
@@ -271,8 +272,10 @@ def _sum_blocks(channels, weights, blocks, sums, stride, dilation, tile):
                     )
 
 
-_correlate_blocks = jit(_sum_blocks)
-_sum_blocks_within = inlined(_sum_blocks)
+@jit
+def _correlate_blocks(channels, weights, blocks, sums, stride, dilation, tile):
+    """`_sum_blocks` as a kernel of its own."""
+    _sum_blocks(channels, weights, blocks, sums, stride, dilation, tile)
 
 
 @jit
@@ -285,7 +288,7 @@ def _find_windows(packed, weights, blocks, planes, merged, sizes, sums, tile, fo
         if n_columns:
             cells = _merge_columns(packed, merged[first_column : first_column + n_columns])
         part = blocks[first_block : first_block + n_blocks]
-        _sum_blocks_within(cells, weights, part, sums[:length], stride, 1, tile)
+        _sum_blocks(cells, weights, part, sums[:length], stride, 1, tile)
         count = _list_windows(
             sums, stride, planes[first_plane : first_plane + n_planes], search, found, count
         )

@@ -40,7 +40,7 @@ def jit(function: Callable[..., Any], *, reorder: bool = False) -> Callable[...,
 
 
 inlined = functools.partial(numba.njit, inline="always")
-"""Compile a function only as a part of each kernel that calls it."""
+"""Compile a function as a part of each kernel that calls it, instead of by itself."""
 
 
 def compiles(kernel: Callable[..., Any], *types: Any) -> bool:
@@ -48,7 +48,7 @@ def compiles(kernel: Callable[..., Any], *types: Any) -> bool:
     try:
         cast("Any", kernel).compile(types)
     except (numba.core.errors.NumbaError, RuntimeError) as error:  # LLVM's are RuntimeErrors
-        log.warning("products use plain, slower loops: %s", error)
+        log.warning("products are computed without vector instructions, which is slower: %s", error)
         return False
     return True
 

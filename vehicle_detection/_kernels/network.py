@@ -26,13 +26,14 @@ class Convolution(NamedTuple):
 
     weights: Singles  # (outputs, rows, columns, channels), as many rows as columns
     bias: Singles  # (outputs,)
-    stride: int  # at most the number of rows
+    stride: int
 
 
 class ConvolutionalNetwork:
     """Layers of convolutions with rectified outputs, except for the last, which has one output per image.
 
-    The outputs for an image do not depend on the others, and one thread computes them.
+    The outputs for an image do not depend on the others, and one thread computes them; except where the
+    kernel does not compile, so that numpy computes them.
 
     >>> layer = Convolution(np.ones((1, 2, 2, 1), np.float32), np.float32([1]), 1)
     >>> ConvolutionalNetwork([layer])(np.ones((1, 3, 2, 2), np.float32))
@@ -59,7 +60,7 @@ class ConvolutionalNetwork:
         self._weights, self._biases = (np.concatenate(each).astype(np.float32) for each in (weights, biases))
 
     def __call__(self, images: Singles) -> Singles:
-        """Return ``(outputs, N)`` of square images ``(channels, N, rows, columns)``, C-contiguous."""
+        """Return ``(outputs, N)`` of square images ``(channels, N, rows, columns)``."""
         if not _compiles():
             return self._run_plain(images)
         channels, count, side, _ = images.shape
@@ -128,9 +129,19 @@ def _run_layers(values, side, count, table, weights, biases, block, tile):
                         for phase in range(stride):
                             stop = tap + (kernel - phase + stride - 1) // stride
                             place = start + _place(phase, side, stride) * count
-                            _add_products(
-                                factors, tap, stop, values, place, side * count, count, sums, position, length
-                            )
+                            if tap < stop:
+                                _add_products(
+                                    factors,
+                                    tap,
+                                    stop,
+                                    values,
+                                    place,
+                                    side * count,
+                                    count,
+                                    sums,
+                                    position,
+                                    length,
+                                )
                             tap = stop
             for output in range(outputs):
                 bias = biases[first_bias + output]
@@ -140,7 +151,7 @@ def _run_layers(values, side, count, table, weights, biases, block, tile):
                     target = found[place * count : (place + 1) * count]
                     for n in range(count):
                         value = source[n] + bias
-                        target[n] = value if value > lowest else lowest
+                        target[n] = lowest if value < lowest else value
         values, side = found, across
     return values[: outputs * count].reshape(outputs, count)
 
@@ -148,4 +159,5 @@ def _run_layers(values, side, count, table, weights, biases, block, tile):
 @inlined
 def _place(column, columns, stride):
     """Place of a column in the order of `_phases`."""
-    return column % stride * ((columns + stride - 1) // stride) + column // stride
+    phase = column % stride
+    return phase * (columns // stride) + min(phase, columns % stride) + column // stride

@@ -1,4 +1,4 @@
-"""Sums of products in vector registers: the innermost step of the correlation, as an LLVM intrinsic.
+"""Sums of products in vector registers: the innermost step of correlation and networks, as LLVM intrinsics.
 
 A compiler keeps at most a vector or two of a sum in registers, and loads and stores them for every few
 products. Here a block of sums stays in registers over the whole depth of the product (Goto and van de Geijn,

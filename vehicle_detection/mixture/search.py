@@ -230,8 +230,7 @@ class MixtureSearch(FrameSearch):
                     places.append(place)
                     chosen_templates.append(indices)
                     searches.append(search)
-            if searches:
-                levels.append(_Level(grid, places, chosen_templates, PackedSearch.join(searches)))
+            levels.append(_Level(grid, places, chosen_templates, PackedSearch.join(searches)))
             context = math.ceil(_CONTEXT * size)
             octaves[octave_of(size, len(octaves))].append((rows[0] - context, rows[1] + context))
         row_ranges = [
