@@ -330,8 +330,30 @@ def test_a_stream_of_a_web_server_ends_with_it(clip, tmp_path):
     ):
         assert source.live
         report = process_video(source, tmp_path / "out.mp4", StubDetector())
-    assert report.frames + report.dropped > 30
-    assert probe_video(tmp_path / "out.mp4").frames == report.frames + report.dropped
+    assert report.frames + report.dropped == 60
+    assert probe_video(tmp_path / "out.mp4").frames == 60
+
+
+def test_the_first_frame_of_a_live_source_waits_for_its_reader(clip):
+    data = ffmpeg("-i", clip, "-c", "copy", "-an", "-f", "mpegts", "-")
+    with (
+        server(stream_of(data)) as address,
+        open_source(f"{address}/live.ts", reconnect=False) as source,
+        source.read() as reader,
+    ):
+        time.sleep(0.5)  # the other frames arrive
+        indices = [index for index, _, _ in reader]
+    assert indices[0] == 0
+    assert indices[-1] == 19
+
+
+def test_a_live_source_of_which_nothing_is_read_is_closed(clip):
+    data = ffmpeg("-i", clip, "-c", "copy", "-an", "-f", "mpegts", "-")
+    with server(stream_of(data)) as address, open_source(f"{address}/live.ts", reconnect=False) as source:
+        reader = source.read()
+        time.sleep(0.1)
+        reader.close()
+    assert not [thread for thread in threading.enumerate() if thread.name == "vehicle-live"]
 
 
 @pytest.fixture

@@ -242,8 +242,8 @@ class LiveStream:
 class LiveReader:
     """Frames of a `LiveStream`, in order: an iterator of ``(index, time, frame)`` and a context manager.
 
-    With `drop`, a thread reads all frames, and the iterator returns the newest one: a slow consumer sees
-    gaps in the indices. Without, ffmpeg and the sender wait for the consumer.
+    With `drop`, a thread reads all frames, and the iterator returns the first one, then the newest ones: a
+    slow consumer sees gaps in the indices. Without, ffmpeg and the sender wait for the consumer.
     """
 
     damage = ""
@@ -286,6 +286,7 @@ class LiveReader:
                 while self._newest is None and not self._finished:
                     self._changed.wait()
                 planes, self._newest = self._newest, None
+                self._changed.notify_all()
         if planes is None:
             if self._error is not None and not self._killed:
                 raise self._error
@@ -306,12 +307,16 @@ class LiveReader:
         return None
 
     def _read_all(self) -> None:
-        """Read until the end of the stream, and keep the newest frame."""
+        """Read until the end of the stream, and keep the newest frame; the first one until it is taken."""
         try:
-            while (item := self._read()) is not None:
+            first = item = self._read()
+            while item is not None:
                 with self._changed:
                     self._newest = item
                     self._changed.notify_all()
+                    while self._newest is first and not self._killed:
+                        self._changed.wait()
+                item = self._read()
         except BaseException as error:  # raised in the thread of the consumer
             self._error = error
         finally:
@@ -329,6 +334,8 @@ class LiveReader:
         """End ffmpeg at once, from any thread; a thread that reads sees the end."""
         self._killed = True
         self._stream.kill()
+        with self._changed:
+            self._changed.notify_all()
 
     def close(self) -> None:
         """End ffmpeg and the thread."""
