@@ -22,19 +22,28 @@ PORT = "VEHICLE_TEST_OBJECT_STORE"
 
 
 class ObjectStore(http.server.ThreadingHTTPServer):
-    """Objects by key; `requests` counts all requests, of which every third is answered with 503."""
+    """Objects by key; `requests` counts all requests, of which every third is answered with 503.
+
+    A thread's repetition of a failed request is answered: otherwise a request of one of several threads could
+    fail by chance as often as it is tried.
+    """
 
     daemon_threads = True
 
     def __init__(self):
         super().__init__(("127.0.0.1", 0), _Handler)
         self.objects, self.requests, self.written = {}, 0, []
+        self.failed = {}
         self.lock = threading.Lock()
 
-    def fails(self):
+    def fails(self, client, request):
         with self.lock:
             self.requests += 1
-            return self.requests % 3 == 0
+            repeated = self.failed.pop(client, None) == request
+            fails = self.requests % 3 == 0 and not repeated
+            if fails:
+                self.failed[client] = request
+            return fails
 
 
 class _Handler(http.server.BaseHTTPRequestHandler):
@@ -43,7 +52,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def handle_request(self):
         body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
         key, objects = unquote(self.path[1:]), self.server.objects
-        if self.server.fails():
+        if self.server.fails(self.headers["From"], (self.command, self.path)):
             return self.answer(503)
         if self.command == "PUT":
             objects[key] = body
@@ -88,7 +97,8 @@ class LoopbackFileSystem(AbstractFileSystem):
     def _ask(self, command, path, data=None):
         connection = http.client.HTTPConnection("127.0.0.1", int(os.environ[PORT]), timeout=10)
         with contextlib.closing(connection):
-            connection.request(command, "/" + quote(path), data)
+            client = {"From": f"{os.getpid()} {threading.get_ident()}"}
+            connection.request(command, "/" + quote(path), data, client)
             answer = connection.getresponse()
             body = answer.read()
         if answer.status == 404:

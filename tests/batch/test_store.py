@@ -91,11 +91,11 @@ def test_results_in_an_object_store_that_fails_every_third_request(clip, model, 
 
 
 def test_an_object_store_that_does_not_answer(clip, model, tmp_path, bucket, monkeypatch):
-    bucket.fails = lambda: True
+    bucket.fails = lambda *_: True
     with pytest.raises(OutputError, match=r"loopback://results/records cannot be listed \(.* 503\); check"):
         run(clip, "loopback://results", model)
     # Only the records answer: the next run repeats the trip.
-    bucket.fails = lambda: False
+    bucket.fails = lambda *_: False
     monkeypatch.setattr("tests.batch.object_store.LoopbackFileSystem.put_file", refuse)
     report = run(clip, "loopback://results", model)
     assert counts(report) == (0, 0, 1, 0)
@@ -150,7 +150,7 @@ def test_a_store_is_the_same_for_a_folder_and_a_url(tmp_path, bucket):
 
 def test_passwords_are_neither_stored_nor_printed(clip, model, tmp_path, bucket):
     """The user and password of sources and of the output, in records, errors and the summary."""
-    bucket.fails = lambda: False
+    bucket.fails = lambda *_: False
     bucket.objects["cam/drive.mp4"] = clip.read_bytes()
     sources = ["loopback://anna:pa@ss@cam/drive.mp4", "loopback://anna:pa@ss@cam/missing.mp4"]
     out = "loopback://bob:word@results"
@@ -167,7 +167,7 @@ def test_passwords_are_neither_stored_nor_printed(clip, model, tmp_path, bucket)
     # A new password changes nothing.
     changed = [source.replace("pa@ss", "new") for source in sources]
     assert counts(run(changed, out, model, tracks_only=True)) == (0, 0, 0, 2)
-    bucket.fails = lambda: True
+    bucket.fails = lambda *_: True
     with pytest.raises(OutputError, match=r"^loopback://\*\*\*@results/records cannot be listed"):
         batch_status(out)
     with pytest.raises(TransientVideoError, match=r"^loopback://\*\*\*@cam cannot be listed"):
