@@ -80,7 +80,7 @@ def write_card(
             "vehicles on any road. Created by"
         ),
         f"```bash\n{_COMMAND.format(name=name, seed=seed)}\n```",
-        "With the same versions, the command creates the same file again.",
+        "From the same commit, with the same versions, the command creates the same file again.",
         "\n".join(markdown_text(fact, "- ") for fact in _facts(model)),
         "## Accuracy on roads that it was not trained on",
         markdown_text(_METHOD),
