@@ -1,5 +1,7 @@
 import os
+import signal
 import threading
+import time
 
 import cv2
 import numpy as np
@@ -9,6 +11,7 @@ from vehicle_detection._common import (
     JOBS_VARIABLE,
     ThreadTeam,
     available_cores,
+    call_in_thread,
     resolve_jobs,
     single_threaded_opencv,
 )
@@ -216,3 +219,31 @@ def test_the_cpu_quota_of_a_container_limits_the_cores(tmp_path, monkeypatch, fi
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text)
     assert available_cores(tmp_path) == cores
+
+
+def test_a_call_in_another_thread_returns_or_raises():
+    assert call_in_thread(threading.get_ident) != threading.get_ident()
+    with pytest.raises(ZeroDivisionError, match="division by zero"):
+        call_in_thread(lambda: 1 / 0)
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="Windows has no timers")
+def test_an_interrupted_call_in_another_thread_ends_first():
+    def interrupt(number, frame):
+        raise KeyboardInterrupt
+
+    ended = []
+
+    def wait():
+        time.sleep(0.2)
+        ended.append(True)
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.05)
+        with pytest.raises(KeyboardInterrupt):
+            call_in_thread(wait)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    assert ended

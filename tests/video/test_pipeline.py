@@ -181,8 +181,7 @@ def test_ctrl_c_leaves_no_file_and_no_process(folder, tmp_path):
 
 
 def test_an_interrupt_at_any_time_leaves_no_file_and_no_process(clip, tmp_path):
-    # An alarm raises what Ctrl-C does: Python's own code, such as Thread.start, expects that no Exception comes from
-    # outside, and fails with another one.
+    # An alarm that raises the same as Ctrl-C: at another Exception, Thread.start would fail with a KeyError.
     def interrupt(number, frame):
         raise KeyboardInterrupt
 
@@ -201,6 +200,7 @@ def test_an_interrupt_at_any_time_leaves_no_file_and_no_process(clip, tmp_path):
                 time.sleep(0.01)
             assert not left
             assert child_processes() == before
+            assert not running_threads()
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, earlier)

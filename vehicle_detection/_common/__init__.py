@@ -29,6 +29,7 @@ from vehicle_detection._common.threads import (
     JOBS_VARIABLE,
     ThreadTeam,
     available_cores,
+    call_in_thread,
     resolve_jobs,
     single_threaded_opencv,
 )
@@ -50,6 +51,7 @@ __all__ = [
     "atomic_write",
     "available_cores",
     "blur_patches",
+    "call_in_thread",
     "check_array",
     "check_boxes",
     "check_channel",

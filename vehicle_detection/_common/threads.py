@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import functools
 import math
@@ -23,6 +24,37 @@ Result = TypeVar("Result")
 
 JOBS_VARIABLE = "VEHICLE_DETECTION_JOBS"
 _MAX_JOBS = 1024
+
+
+def call_in_thread(function: Callable[[], Result]) -> Result:
+    """Call a function in another thread, where no KeyboardInterrupt is raised, and wait for it.
+
+    Only C code waits for the thread. An interrupt of ``Thread.start`` or ``Future.result`` can leave a lock
+    closed, and the thread then waits for it for ever (https://bugs.python.org/issue29988).
+    """
+    results: list[Result] = []
+    errors: list[BaseException] = []
+    done = _thread.allocate_lock()
+    done.acquire()
+
+    def call() -> None:
+        try:
+            results.append(function())
+        except BaseException as error:
+            errors.append(error)
+        finally:
+            done.release()
+
+    _thread.start_new_thread(call, ())
+    try:
+        done.acquire()
+    except BaseException:
+        if not results and not errors:  # otherwise the lock may be acquired already
+            done.acquire()
+        raise
+    if errors:
+        raise errors.pop()
+    return results[0]
 
 
 def available_cores(root: Path = Path("/")) -> int:

@@ -24,7 +24,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import IO, Any
 
-from vehicle_detection._common import Limit, hide_credentials
+from vehicle_detection._common import Limit, call_in_thread, hide_credentials
 from vehicle_detection.errors import TransientVideoError, VideoError
 from vehicle_detection.video.yuv import ColorEncoding
 
@@ -119,8 +119,7 @@ def source_name(path: Path | str) -> str:
 def probe(path: Path | str) -> VideoInfo:
     """Read the properties of a video and decode its first frame; raise a VideoError if there is none."""
     # Python raises KeyboardInterrupt in the main thread only; another thread cannot lose the started process.
-    with ThreadPoolExecutor(1, thread_name_prefix="vehicle-probe") as thread:
-        return thread.submit(_probe, path).result()
+    return call_in_thread(lambda: _probe(path))
 
 
 def _probe(path: Path | str) -> VideoInfo:

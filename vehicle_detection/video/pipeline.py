@@ -15,7 +15,7 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import describe
+from vehicle_detection._common import call_in_thread, describe
 from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.images import is_cut, make_thumbnail
 from vehicle_detection.video.streams import FrameWriter, Reader
@@ -99,13 +99,15 @@ class ClosableQueue(Generic[Item]):
     def __init__(self, size: int) -> None:
         self._items: deque[Item] = deque()
         self._size = size
-        self._changed = threading.Condition()
+        # Entered directly: an interrupt of the condition's own __enter__ could leave the lock closed.
+        self._lock = threading.RLock()
+        self._changed = threading.Condition(self._lock)
         self._finished = self._aborted = False
         self._error: BaseException | None = None
 
     def put(self, item: Item) -> None:
         """Append an item when there is space; raise the error of `abort`, or `QueueClosed`."""
-        with self._changed:
+        with self._lock:
             while len(self._items) >= self._size and not self._aborted:
                 self._changed.wait()
             if self._aborted:
@@ -115,14 +117,14 @@ class ClosableQueue(Generic[Item]):
 
     def finish(self, error: BaseException | None = None) -> None:
         """Close the queue after the last item; the consumer gets the remaining items, then the error."""
-        with self._changed:
+        with self._lock:
             self._finished = True
             self._error = self._error or error
             self._changed.notify_all()
 
     def abort(self, error: BaseException | None = None) -> None:
         """Close the queue for both sides at once; waiting items are dropped."""
-        with self._changed:
+        with self._lock:
             self._aborted = True
             self._error = self._error or error
             self._items.clear()
@@ -130,7 +132,7 @@ class ClosableQueue(Generic[Item]):
 
     def __iter__(self) -> Iterator[Item]:
         while True:
-            with self._changed:
+            with self._lock:
                 while not self._items and not self._finished and not self._aborted:
                     self._changed.wait()
                 if not self._items:
@@ -203,7 +205,7 @@ class FramePipeline:
         """
         thread = threading.Thread(target=self._track_in_thread, name="vehicle-track")
         try:
-            thread.start()
+            call_in_thread(thread.start)
             yield from self._results
         finally:
             self._abort()  # no effect after a complete run
