@@ -180,6 +180,8 @@ def test_ctrl_c_leaves_no_file_and_no_process(folder, tmp_path):
     assert not [pid for pid in processes if Path(f"/proc/{pid}").exists()]
 
 
+# Python ignores an interrupt inside a weak reference's callback.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_an_interrupt_at_any_time_leaves_no_file_and_no_process(clip, tmp_path):
     # An alarm that raises the same as Ctrl-C: at another Exception, Thread.start would fail with a KeyError.
     def interrupt(number, frame):
