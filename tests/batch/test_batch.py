@@ -128,7 +128,7 @@ def test_a_bad_file_is_recorded_once(many, model, tmp_path):
     assert counts(run(source, out, model, tracks_only=True, retry_failed=True)) == (0, 1, 0, 1)
     status = batch_status(out)
     assert (status.done, status.failed, status.frames) == (1, 1, 12)
-    assert "drive e.mp4: " in str(status)
+    assert "drive e.mp4 " in str(status)
 
 
 def test_the_summary_has_a_row_for_each_trip(many, card, model, tmp_path):

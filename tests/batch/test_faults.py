@@ -67,7 +67,7 @@ def test_a_killed_worker_is_replaced(many, model, tmp_path, start_batch):
     assert code == 0, errors
     check_numbers(printed)
     assert "warning: " in errors
-    assert "drive e.mp4: " in errors
+    assert "drive e.mp4 " in errors
     check_whole(out, done=TRIPS - 1, failed=1)
     assert not list((tmp_path / "scratch").glob("*vehicle-batch*"))
 

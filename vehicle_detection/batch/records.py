@@ -52,7 +52,7 @@ class BatchStatus:
     >>> print(status)
     2 trips done, 1 failed, 0 errors
     0.0 hours of video, 3,000 frames, 9 vehicles, 50.0 frames/s per worker
-    cut.mp4: cut.mp4 is incomplete
+    cut.mp4 is incomplete
     """
 
     done: int
@@ -71,7 +71,16 @@ class BatchStatus:
             f"{self.video_seconds / 3600:,.1f} hours of video, {pluralize(self.frames, 'frame')}, "
             f"{pluralize(self.tracks, 'vehicle')}, {rate:.1f} frames/s per worker",
         ]
-        return "\n".join([*lines, *(f"{source}: {text}" for source, text in self.messages.items())])
+        return "\n".join([*lines, *(with_source(*each) for each in self.messages.items())])
+
+
+def with_source(source: str, message: str) -> str:
+    """Put the name of a source before a message that lacks it.
+
+    >>> with_source("a.mp4", "a.mp4 is incomplete"), with_source("a.mp4", "its worker was killed")
+    ('a.mp4 is incomplete', 'a.mp4: its worker was killed')
+    """
+    return message if source in message else f"{source}: {message}"
 
 
 def record_path(key: str) -> str:

@@ -101,6 +101,7 @@ def batch(
         raise InvalidInputError("SOURCES... must name at least one video, folder, pattern or URL")
     from vehicle_detection._common import hide_credentials
     from vehicle_detection.batch import open_dask, run_batch
+    from vehicle_detection.batch.records import with_source
 
     options: dict[str, Any] = {
         "conf": conf,
@@ -133,7 +134,7 @@ def batch(
             progress=not quiet,
         )
     for source, message in done.messages.items():
-        print_error(f"warning: {source}: {message}")
+        print_error(f"warning: {with_source(source, message)}")
     _write_summary(output, summary)
     if not quiet:
         typer.echo(str(done))
