@@ -232,11 +232,10 @@ def _explain_mixture(
         every = model.detect_vehicles(pyramid, windows, min_margin=-np.inf)
         frame_terms = {"candidates": every.shift} if model.count_weight else {}
         proposals, margins = model.propose_boxes(pyramid, windows, min_margin=RESCORE_MIN)
-        corrected, final = proposals, margins
-        if model.rescorer is not None:
-            corrected, final = model.rescorer.apply(pyramid, proposals, margins)
-        proposal = None if row is None else _best_overlap(vehicles.boxes[row], corrected, _MIN_IOU)
-        if row is not None and proposal is not None:
+        corrected, final, proposal_rows = model.rescore_boxes(pyramid, proposals, margins)
+        place = None if row is None else _best_overlap(vehicles.boxes[row], corrected, _MIN_IOU)
+        if row is not None and place is not None:
+            proposal = int(proposal_rows[place])
             # The windows are sorted, so that the first one that overlaps is the best.
             near = np.flatnonzero(iou_matrix(proposals[proposal][None], windows.boxes)[0] >= _MIN_IOU)
             if len(near):
@@ -247,7 +246,7 @@ def _explain_mixture(
                 terms = {"cells": float(cells.sum()), "bias": model.templates[number].bias}
                 terms["votes and size"] = float(margins[proposal]) - sum(terms.values())
                 if model.rescorer is not None:
-                    terms["second stage"] = float(final[proposal] - margins[proposal])
+                    terms["second stage"] = float(final[place] - margins[proposal])
                 terms |= frame_terms
                 if model.perspective_weight:
                     same = _best_overlap(vehicles.boxes[row], every.boxes, _MIN_IOU)

@@ -109,21 +109,42 @@ def test_rescoring_adds_log_odds_and_corrects_boxes():
     assert found.shape == (0,)
 
 
-def test_nms_uses_the_rescored_margins():
+def test_the_second_stage_rescores_twice_with_suppression_after_each():
     image = noise(2, (200, 300, 3))
     model = one_template_mixture(rescorer=random_rescorer(4))
     search = MixtureSearch(model, n_jobs=1)
     pyramid, windows = search.score_windows(image, PyramidParams(min_width=24, horizon=None))
     proposals, margins = model.propose_boxes(pyramid, windows, min_margin=RESCORE_MIN)
-    corrected, rescored = model.rescorer.apply(pyramid, proposals, margins)
-    rows = nms(corrected, rescored)
-    assert len(rows) < len(proposals)
-    boxes, found, *_ = model.detect_vehicles(pyramid, windows, min_margin=-9.0)
-    np.testing.assert_array_equal(boxes, corrected[rows])
-    np.testing.assert_array_equal(found, rescored[rows])
-    middle = float(np.median(found))
-    boxes, fewer, *_ = model.detect_vehicles(pyramid, windows, min_margin=middle)
-    np.testing.assert_array_equal(fewer, found[found >= middle])
+    found = model.rescore_boxes(pyramid, proposals, margins)
+    vehicles = model.detect_vehicles(pyramid, windows, min_margin=-9.0)
+    np.testing.assert_array_equal(vehicles[0], found[0])
+    np.testing.assert_array_equal(vehicles[1], found[1])
+    middle = float(np.median(found[1]))
+    fewer = model.detect_vehicles(pyramid, windows, min_margin=middle)[1]
+    np.testing.assert_array_equal(fewer, found[1][found[1] >= middle])
+    # With lower margins, some boxes are not rescored again.
+    margins = margins + RESCORE_MIN - np.median(margins)
+    boxes, final = model.rescorer.apply(pyramid, proposals, margins)
+    left = nms(boxes, final)
+    boxes, final = boxes[left], final[left]
+    again = np.flatnonzero(final >= RESCORE_MIN)
+    assert 0 < len(again) < len(left) < len(proposals)
+    for row in again:
+        box, margin = model.rescorer.apply(pyramid, boxes[[row]], margins[left[[row]]])
+        boxes[row], final[row] = box[0], (final[row] + margin[0]) / 2
+    kept = nms(boxes, final)
+    found = model.rescore_boxes(pyramid, proposals, margins)
+    np.testing.assert_allclose(found[0], boxes[kept])
+    np.testing.assert_allclose(found[1], final[kept])
+    np.testing.assert_array_equal(found[2], left[kept])
+
+
+def test_without_a_rescorer_boxes_are_only_suppressed():
+    boxes = np.array([[10.0, 10, 50, 50], [12, 10, 52, 50], [100, 10, 140, 50]])
+    found = one_template_mixture().rescore_boxes(EdgePyramid(noise(1)), boxes, np.array([0.1, 0.3, 0.2]))
+    np.testing.assert_array_equal(found[2], [1, 2])
+    np.testing.assert_array_equal(found[0], boxes[[1, 2]])
+    np.testing.assert_array_equal(found[1], [0.3, 0.2])
 
 
 @pytest.mark.parametrize(
