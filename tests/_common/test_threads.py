@@ -1,7 +1,9 @@
+import contextlib
 import os
 import signal
 import threading
 import time
+from collections import defaultdict
 
 import cv2
 import numpy as np
@@ -126,9 +128,13 @@ def test_a_team_returns_results_in_the_order_of_the_items(jobs, count):
 
 
 def test_a_team_processes_expensive_items_first():
-    taken = []
-    ThreadTeam(1, name="team").map(taken.append, [3, 9, 1, 5], cost=float)
-    assert taken == [9, 5, 3, 1]
+    taken = defaultdict(list)  # by thread
+    items = [(7 * number) % 50 for number in range(50)]
+    with contextlib.closing(ThreadTeam(2, name="team")) as team:
+        team.map(lambda item: taken[threading.get_ident()].append(item), items, cost=float)
+    assert sum(map(len, taken.values())) == 50
+    for each in taken.values():
+        assert each == sorted(each, reverse=True)
 
 
 def test_a_team_uses_all_threads():

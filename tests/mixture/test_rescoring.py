@@ -1,9 +1,12 @@
+import contextlib
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.helpers import mixture_template
+from vehicle_detection._common import ThreadTeam
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.mixture import (
@@ -71,10 +74,13 @@ def test_the_networks_equal_the_reference(seed, count):
     np.testing.assert_allclose(shifts, expected[:, 1:].clip(-0.4, 0.4), atol=1e-4)
 
 
-def test_the_outputs_of_a_crop_do_not_depend_on_the_others():
+def test_the_outputs_of_a_crop_depend_neither_on_the_others_nor_on_the_threads():
     rescorer = random_rescorer()
     inputs = np.random.default_rng(3).normal(0, 1, (23, 40, 12, 12)).astype(np.float32)
     log_odds, shifts = rescorer.predict(inputs)
+    with contextlib.closing(ThreadTeam(2, name="networks")) as team:
+        for found, alone in zip(rescorer.predict(inputs, team), (log_odds, shifts)):
+            np.testing.assert_array_equal(found, alone)
     for rows in (slice(7, 8), slice(3, 30)):
         part = rescorer.predict(np.ascontiguousarray(inputs[:, rows]))
         np.testing.assert_array_equal(part[0], log_odds[rows])

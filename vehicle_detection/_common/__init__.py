@@ -26,6 +26,7 @@ from vehicle_detection._common.parquet import ParquetRows, write_parquet
 from vehicle_detection._common.progress import progress_bar
 from vehicle_detection._common.text import pluralize
 from vehicle_detection._common.threads import (
+    CALLING_THREAD,
     JOBS_VARIABLE,
     ThreadTeam,
     available_cores,
@@ -39,6 +40,7 @@ from vehicle_detection._common.workspace import NEW_ARRAYS, SPARE, Workspace, wi
 check_environment()
 
 __all__ = [
+    "CALLING_THREAD",
     "FORMAT_VERSION",
     "JOBS_VARIABLE",
     "NEW_ARRAYS",

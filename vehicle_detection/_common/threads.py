@@ -156,6 +156,8 @@ class ThreadTeam:
 
         While several threads call this method, the later callers use no helpers: the cores are busy already.
         """
+        if not self._helpers:
+            return [function(item) for item in items]
         pending = deque(sorted(range(len(items)), key=lambda index: -cost(items[index])))
         results: dict[int, Result] = {}
 
@@ -190,3 +192,7 @@ class ThreadTeam:
             pool, self._pool = self._pool, None
         if pool is not None:
             pool.shutdown()
+
+
+CALLING_THREAD = ThreadTeam(1, name="")
+"""A team of the calling thread alone."""

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import NEW_ARRAYS, ThreadTeam, Workspace
+from vehicle_detection._common import CALLING_THREAD, NEW_ARRAYS, ThreadTeam, Workspace
 from vehicle_detection._kernels import BYTE_LIMIT
 from vehicle_detection._kernels import fhog as _fhog_kernels
 
@@ -121,7 +121,8 @@ class EdgePyramid:
         For each octave, the rows of the frame whose sums are needed; None or beyond the end: all rows. Cells
         elsewhere take the nearest known rows.
     workspace, team
-        Memory and threads of a search; with that memory, a pyramid is valid until the next one.
+        Memory and threads of a search; with that memory, a pyramid is valid until the next one. The threads
+        also compute what follows from the pyramid.
     """
 
     def __init__(
@@ -129,9 +130,10 @@ class EdgePyramid:
         image: NDArray[np.uint8],
         row_ranges: Sequence[Rows] = (),
         workspace: Workspace = NEW_ARRAYS,
-        team: ThreadTeam | None = None,
+        team: ThreadTeam = CALLING_THREAD,
     ) -> None:
         self.shape = image.shape[0], image.shape[1]
+        self.team = team
         planes = workspace.take((3, *self.shape), np.uint8, "planes 0")
         cv2.split(image, list(planes))
         self.octaves: list[Octave] = []
@@ -148,11 +150,7 @@ class EdgePyramid:
             octave = Octave(planes, workspace.take(size, np.float32, f"sums {number}"), first)
             self.octaves.append(octave)
             parts += octave.split(_PART_ROWS)
-        if team is None:
-            for part in parts:
-                part.compute()
-        else:
-            team.map(Octave.compute, parts, cost=lambda part: part.sums.size)
+        team.map(Octave.compute, parts, cost=lambda part: part.sums.size)
 
     def octave_of(self, cell_size: float) -> int:
         """Octave from which cells of a size in pixels of the frame are interpolated."""

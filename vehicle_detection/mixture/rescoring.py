@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_number, finite_array
+from vehicle_detection._common import CALLING_THREAD, ThreadTeam, check_number, finite_array
 from vehicle_detection._kernels import Convolution, ConvolutionalNetwork
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import InvalidInputError
@@ -119,19 +119,21 @@ class Rescorer:
         layers = [layer for network in self.networks for layer in network.layers]
         return sum(layer.weights.size + layer.bias.size for layer in layers)
 
-    def predict(self, inputs: Singles) -> tuple[Floats, Floats]:
+    def predict(self, inputs: Singles, team: ThreadTeam = CALLING_THREAD) -> tuple[Floats, Floats]:
         """Log-odds ``(N,)`` and shifts of the edges ``(N, 4)``, as fractions of a box's sides, of crops.
 
-        `inputs` are `network_inputs`.
+        `inputs` are `network_inputs`. The threads of a team compute a network each.
         """
-        outputs = np.mean([network.outputs(inputs) for network in self.networks], axis=0)
+        outputs = np.mean(
+            team.map(lambda network: network.outputs(inputs), self.networks, cost=lambda _: 1), axis=0
+        )
         return outputs[:, 0], np.clip(outputs[:, 1:], -MAX_CORRECTION, MAX_CORRECTION)
 
     def apply(self, pyramid: EdgePyramid, boxes: Floats, margins: Floats) -> tuple[Floats, Floats]:
         """Corrected boxes, clipped to the frame, and their margins."""
         if not len(boxes):
             return boxes, margins
-        log_odds, shifts = self.predict(network_inputs(*rescoring_features(pyramid, boxes)))
+        log_odds, shifts = self.predict(network_inputs(*rescoring_features(pyramid, boxes)), pyramid.team)
         limited = np.clip(log_odds, -_MAX_LOG_ODDS, _MAX_LOG_ODDS)
         corrected = boxes + shifts * np.tile(boxes[:, 2:] - boxes[:, :2], 2)
         return clip_boxes(corrected, pyramid.shape), np.asarray(margins + self.blend_weight * limited)
