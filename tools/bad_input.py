@@ -127,7 +127,8 @@ INTERNAL = {
     "FunctionParams.heat_range", "HeatParams.for_search",
     "PyramidParams.heat_range", "PyramidParams.rows", "PyramidParams.sizes", "PyramidParams.smallest_width",
     "SearchBand.place", "SearchParams.heat_range", "SearchParams.place", "TemplateMixture.detect_vehicles",
-    "TemplateMixture.margin_of", "TemplateMixture.propose_boxes", "TemplateMixture.scores",
+    "TemplateMixture.margin_of", "TemplateMixture.propose_boxes", "TemplateMixture.rescore_boxes",
+    "TemplateMixture.scores",
     "VehicleDetector.interpolate", "VehicleDetector.skip",
 }  # fmt: skip
 """Methods that only the library calls, with its own results."""

@@ -100,8 +100,7 @@ def batch(
     if not sources:
         raise InvalidInputError("SOURCES... must name at least one video, folder, pattern or URL")
     from vehicle_detection._common import hide_credentials
-    from vehicle_detection.batch import open_dask, run_batch
-    from vehicle_detection.batch.records import with_source
+    from vehicle_detection.batch import open_dask, run_batch, with_source
 
     options: dict[str, Any] = {
         "conf": conf,
