@@ -30,7 +30,7 @@ def call_in_thread(function: Callable[[], Result]) -> Result:
     """Call a function in another thread, where no KeyboardInterrupt is raised, and wait for it.
 
     Only C code waits for the thread. An interrupt of ``Thread.start`` or ``Future.result`` can leave a lock
-    closed, and the thread then waits for it for ever (https://bugs.python.org/issue29988).
+    acquired, and the thread then waits for it for ever (https://bugs.python.org/issue29988).
     """
     results: list[Result] = []
     errors: list[BaseException] = []

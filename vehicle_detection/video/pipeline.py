@@ -99,7 +99,7 @@ class ClosableQueue(Generic[Item]):
     def __init__(self, size: int) -> None:
         self._items: deque[Item] = deque()
         self._size = size
-        # Entered directly: an interrupt of the condition's own __enter__ could leave the lock closed.
+        # Used instead of the condition's own __enter__, whose interrupt could leave the lock acquired.
         self._lock = threading.RLock()
         self._changed = threading.Condition(self._lock)
         self._finished = self._aborted = False
