@@ -12,6 +12,7 @@ from vehicle_detection.tracking.association import (
     center_distances,
     covered_fractions,
     distinct_vehicles,
+    hidden_edges,
     match_approaching,
     match_boxes,
     merged_detections,
@@ -179,6 +180,28 @@ def approaching(box, growth):
     """A box after a vehicle has come nearer, around `FOCUS`."""
     center = np.tile(FOCUS, 2)
     return np.asarray(center + (np.asarray(box) - center) * growth)
+
+
+def test_a_nearer_vehicle_hides_the_edge_that_it_stands_beside():
+    car = [100.0, 100, 160, 150]
+    beside = {
+        "left": [40.0, 90, 98, 180],
+        "right": [158.0, 90, 240, 180],
+        "apart": [40.0, 90, 90, 180],
+        "farther": [40.0, 90, 98, 140],
+        "below": [40.0, 140, 98, 200],
+    }
+    expected = {"left": [0], "right": [2]}
+    for name, other in beside.items():
+        tracked = np.array([car, other])
+        found = hidden_edges(tracked[:1], tracked, [0], np.ones(2, np.bool_))
+        assert np.flatnonzero(found[0]).tolist() == expected.get(name, []), name
+        assert not hidden_edges(tracked[:1], tracked, [0], np.array([True, False])).any()
+    # A vehicle does not hide itself, and boxes are of the tracks in `rows`.
+    assert not hidden_edges(
+        np.array([beside["left"]]), np.array([car, beside["left"]]), [1], np.ones(2, np.bool_)
+    ).any()
+    assert hidden_edges(NONE, NONE, [], np.empty(0, np.bool_)).shape == (0, 4)
 
 
 def test_a_vehicle_that_comes_nearer_is_found_far_from_its_last_box():

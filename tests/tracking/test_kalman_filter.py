@@ -342,6 +342,21 @@ def test_a_box_that_reaches_the_border_as_predicted_is_not_corrected_there():
     assert smoother.correct(states, [TrackState(1.0)], inside, 0.04).boxes()[0, 2] > 1262
 
 
+def test_an_edge_where_a_nearer_vehicle_begins_corrects_little():
+    smoother, boxes = KalmanSmoother(TrackParams()), np.array([[600.0, 300, 700, 400]])
+    states = states_of(*initiate(boxes, np.full((1, 4), 5.0)))
+    step = np.array([[0.0, 0, 10, 0]])
+    hidden = np.array([[False, False, True, False]])
+
+    def right_edge(measured, hidden):
+        measurements = Measurements.from_boxes(measured, SHAPE, hidden=hidden)
+        return smoother.correct(states, [TrackState(1.0)], measurements, 0.04).boxes()[0, 2]
+
+    assert 700 - right_edge(boxes - step, hidden) < 0.1 * (700 - right_edge(boxes - step, False))
+    # A vehicle that is visible beyond its predicted edge reaches at least as far.
+    assert right_edge(boxes + step, hidden) == right_edge(boxes + step, False) > 702
+
+
 def test_correlated_errors_correct_less_at_high_frame_rates():
     params, boxes = TrackParams(measurement_correlation_time=0.2), BOXES[:1]
     states = states_of(*initiate(boxes, np.full((1, 4), 5.0)))

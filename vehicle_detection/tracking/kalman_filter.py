@@ -55,6 +55,8 @@ _MAX_GROWTH = 3.0
 _MAX_VELOCITY_AGE = 0.5
 # Prior aspect ratio (width to height) of a box that the frame's border truncates, and its relative error.
 _TRUNCATED_ASPECT, _TRUNCATED_STD = 1.5, 0.3
+# Factor of the standard error of an edge where a nearer vehicle begins.
+_HIDDEN_NOISE = 5.0
 # Limits of standard errors: positions and velocities in box sizes.
 _MAX_STD = np.array([0.5] * 4 + [2.0] * 4)
 
@@ -105,6 +107,7 @@ class Measurements(NamedTuple):
     lateral_px: Floats  # (N,) distance of the inner edge from the frame's middle column
     merged: Bools  # (N,) whether the box shows another vehicle too
     covered: Floats  # (N,) fraction of the box that nearer vehicles cover
+    hidden: Bools  # (N, 4) edges beyond which a nearer vehicle hides what follows
 
     @classmethod
     def from_boxes(
@@ -114,12 +117,15 @@ class Measurements(NamedTuple):
         merged: ArrayLike = False,
         camera: Camera | None = None,
         covered: ArrayLike = 0.0,
+        hidden: ArrayLike = False,
     ) -> Measurements:
         """Measure boxes in a frame of this shape, seen by `camera` or, by default, a pinhole camera."""
         merged = np.broadcast_to(np.asarray(merged, np.bool_), len(boxes))
         covered = np.broadcast_to(np.asarray(covered, np.float64), len(boxes))
+        hidden = np.broadcast_to(np.asarray(hidden, np.bool_), boxes.shape)
         road = boxes if camera is None else camera.rectify_boxes(boxes, frame)
-        return cls(boxes, road, truncated_edges(boxes, frame), lateral_offsets(road, frame), merged, covered)
+        truncated, lateral_px = truncated_edges(boxes, frame), lateral_offsets(road, frame)
+        return cls(boxes, road, truncated, lateral_px, merged, covered, hidden)
 
 
 class KalmanSmoother:
@@ -168,9 +174,12 @@ class KalmanSmoother:
         """Correct the boxes of tracks by a measurement each."""
         params, mean, boxes = self._params, states.mean, measured.boxes
         # A truncated edge says only that the vehicle reaches the border: no correction if it is predicted to.
-        beyond = measured.truncated & ((boxes_from_states(mean) - boxes) * OUTWARD >= 0)
+        is_outside = (boxes_from_states(mean) - boxes) * OUTWARD >= 0
+        beyond = measured.truncated & is_outside
         correlated_frames = max(1.0, params.measurement_correlation_time / dt)
         noise = np.square(mean[:, [2, 3, 2, 3]] * params.measurement_noise) * correlated_frames
+        # A vehicle may reach behind a nearer one: a hidden edge is corrected little, but for outwards.
+        noise = np.where(measured.hidden & is_outside, _HIDDEN_NOISE**2 * noise, noise)
         variance = np.where(beyond, UNKNOWN, noise)
         corrected = KalmanStates(*update(*states[:3], boxes, variance, measured.merged, dt), *states[3:])
         again = np.array([track.last_gap > _MAX_VELOCITY_AGE for track in tracks]) & ~measured.merged

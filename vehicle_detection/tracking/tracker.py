@@ -29,6 +29,7 @@ from vehicle_detection.params import TrackParams
 from vehicle_detection.tracking.association import (
     covered_fractions,
     distinct_vehicles,
+    hidden_edges,
     match_approaching,
     merged_detections,
     nearer_cover,
@@ -288,11 +289,13 @@ class Tracker:
         rows = sorted(source)
         tracks, boxes = [self._live[row] for row in rows], boxes[[source[row] for row in rows]]
         in_front = np.array([track.id > 0 and track.misses == 0 for track in self._live])
-        covered = nearer_cover(_clip(self._states.boxes(), frame), in_front)
+        predicted = _clip(self._states.boxes(), frame)
+        covered = nearer_cover(predicted, in_front)
         for track, fraction in zip(self._live, covered.tolist()):
             track.covered = fraction
         is_merged = [row in shared or row in merged for row in rows]
-        measured = Measurements.from_boxes(boxes, frame, is_merged, self._lens, covered[rows])
+        hidden = hidden_edges(boxes, predicted, rows, in_front)
+        measured = Measurements.from_boxes(boxes, frame, is_merged, self._lens, covered[rows], hidden)
         states = self._smoother.correct(self._states.take(rows), tracks, measured, dt)
         self._states = self._states.put(rows, self._update_distances(states, measured, dt))
         return unassigned
