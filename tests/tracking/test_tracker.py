@@ -1104,3 +1104,21 @@ def test_a_vehicle_that_comes_fast_is_tracked():
         tracks = tracker.update(Detections([np.clip(box, 0, 1280)], [3.0]), SHAPE)
         ids.append([track.id for track in tracks])
     assert ids[3:] == [[1]] * 4
+
+
+def test_a_vehicle_hidden_in_steps_keeps_its_size_place_and_id():
+    tracker, far = Tracker(fps=12.5, camera=CAMERA), on_road(33)
+    for step in range(75):
+        near = on_road(20, x=-4 + 8 * step / 75)
+        # The detection of the far car is what remains visible of it, beside the near one.
+        visible = far.copy()
+        if near[0] <= visible[0] < near[2]:
+            visible[0] = near[2]
+        elif near[0] < visible[2] <= near[2]:
+            visible[2] = near[0]
+        is_detected = visible[2] - visible[0] > 0.3 * (far[2] - far[0])
+        tracks = tracker.update(found(near, *([visible] if is_detected else [])), SHAPE)
+        if 20 < step < 44:  # until it is detected again
+            (box,) = (track.box for track in tracks if track.id and track.box[3] < near[3] - 10)
+            assert iou_matrix([box], [far])[0, 0] > 0.7
+    assert [track.id for track in tracks] == [1, 2]

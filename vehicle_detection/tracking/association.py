@@ -24,9 +24,9 @@ _MIN_MERGED_COVERAGE, _MAX_MERGED_IOU = 0.7, 0.7
 # Fraction of its size by which the box of a nearer vehicle is enlarged, and fraction of a vehicle's height by
 # which the bottom edge of a nearer one is lower.
 _COVER_MARGIN, _MIN_NEARER = 0.03, 0.1
-# Fraction of a vehicle's height in which a nearer one stands beside it, and distance beyond its edge, as a
-# fraction of its height, at which the nearer one hides it.
-_MIN_BESIDE, _HIDING_DISTANCE = 0.5, 0.06
+# A nearer vehicle hides a left or right edge if it shares this fraction of the height, and covers the point
+# at this distance beyond the edge, as a fraction of the height.
+_MIN_SHARED_HEIGHT, _HIDING_DISTANCE = 0.5, 0.06
 # Growth of an approaching vehicle between two searched frames, and IoU of its grown box with the new one.
 _MAX_GROWTH, _MIN_GROWN_IOU = 1.6, 0.6
 
@@ -108,9 +108,15 @@ def nearer_cover(boxes: Floats, is_opaque: Bools) -> Floats:
     """
     sides = boxes[:, 2:] - boxes[:, :2]
     margin = _COVER_MARGIN * np.tile(sides, 2) * np.array([-1.0, -1.0, 1.0, 1.0])
-    nearer = boxes[None, :, 3] > boxes[:, None, 3] + _MIN_NEARER * sides[:, 1][:, None]
     fractions = covered_fractions(boxes, boxes + margin)
-    return np.asarray(np.where(nearer & is_opaque[None], fractions, 0.0).max(axis=1, initial=0.0))
+    nearer = _are_nearer(boxes, boxes) & is_opaque
+    return np.asarray(np.where(nearer, fractions, 0.0).max(axis=1, initial=0.0))
+
+
+def _are_nearer(boxes: Floats, others: Floats) -> Bools:
+    """``(N, M)``: whether each of `others` is nearer than each of `boxes`: its bottom edge is lower."""
+    heights = boxes[:, 3] - boxes[:, 1]
+    return np.asarray(others[:, 3] > (boxes[:, 3] + _MIN_NEARER * heights)[:, None])
 
 
 def hidden_edges(boxes: Floats, tracked: Floats, rows: Sequence[int], is_opaque: Bools) -> Bools:
@@ -118,17 +124,14 @@ def hidden_edges(boxes: Floats, tracked: Floats, rows: Sequence[int], is_opaque:
 
     `boxes` are of the tracks `rows`. Only left and right edges are marked: vehicles pass each other sideways.
     """
-    sides = boxes[:, None, 2:] - boxes[:, None, :2]
-    others = tracked[None]
-    top, bottom = (pick(boxes[:, None, i], others[..., i]) for pick, i in ((np.maximum, 1), (np.minimum, 3)))
-    is_beside = bottom - top > _MIN_BESIDE * sides[..., 1]
-    nearer = others[..., 3] > boxes[:, None, 3] + _MIN_NEARER * sides[..., 1]
-    hiding = nearer & is_beside & is_opaque & (np.arange(len(tracked)) != np.array(rows)[:, None])
-    margin = _HIDING_DISTANCE * sides[..., 1]
+    heights = (boxes[:, 3] - boxes[:, 1])[:, None]
+    shared = np.minimum(boxes[:, None, 3], tracked[:, 3]) - np.maximum(boxes[:, None, 1], tracked[:, 1])
+    others = np.arange(len(tracked)) != np.array(rows)[:, None]
+    hiding = others & is_opaque & _are_nearer(boxes, tracked) & (shared > _MIN_SHARED_HEIGHT * heights)
     hidden = np.zeros(boxes.shape, np.bool_)
-    for edge, outside in (0, -margin), (2, margin):
-        x = boxes[:, None, edge] + outside
-        hidden[:, edge] = (hiding & (others[..., 0] < x) & (x < others[..., 2])).any(axis=1)
+    for edge, outward in (0, -1), (2, 1):
+        x = boxes[:, edge, None] + outward * _HIDING_DISTANCE * heights
+        hidden[:, edge] = (hiding & (tracked[:, 0] < x) & (x < tracked[:, 2])).any(axis=1)
     return hidden
 
 

@@ -178,7 +178,7 @@ class KalmanSmoother:
         beyond = measured.truncated & is_outside
         correlated_frames = max(1.0, params.measurement_correlation_time / dt)
         noise = np.square(mean[:, [2, 3, 2, 3]] * params.measurement_noise) * correlated_frames
-        # A vehicle may reach behind a nearer one: a hidden edge is corrected little, but for outwards.
+        # A vehicle may reach behind a nearer one, so a hidden edge moves its box inwards only a little.
         noise = np.where(measured.hidden & is_outside, _HIDDEN_NOISE**2 * noise, noise)
         variance = np.where(beyond, UNKNOWN, noise)
         corrected = KalmanStates(*update(*states[:3], boxes, variance, measured.merged, dt), *states[3:])
