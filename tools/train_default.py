@@ -38,7 +38,7 @@ COURSE_SETS = ("project_clip", "test_images", "test_video")
 # Indonesia's labels leave out small vehicles in the background.
 _MIN_LABELLED_WIDTHS = {"indonesia": 60.0}
 # Frames per second of the clips, and every n-th patch: neighbors show nearly the same.
-_CLIP_RATE, _PATCH_STEP = 3.0, 6
+_CLIP_RATE, _PATCH_STEP = 6.0, 6
 
 
 def load_sources(folder: str | os.PathLike[str]) -> list[FrameDataset]:

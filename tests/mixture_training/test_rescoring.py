@@ -94,6 +94,28 @@ def test_a_mirrored_sample_is_that_of_the_mirrored_image():
     np.testing.assert_array_equal(sample.inputs, seen)
 
 
+def test_varied_samples_show_the_same_edges_in_other_contrast_and_colors():
+    batch = random_samples(200)
+    known = batch.inputs.copy()
+    varied = training._vary(batch, np.random.default_rng(4))
+    np.testing.assert_array_equal(batch.inputs, known)
+    assert varied.inputs.dtype == np.float32
+    # The edges of a crop have one factor, where no edge stays no edge; the lightness is as it was.
+    factors = (varied.inputs[:20] + 0.5) / (known[:20] + 0.5)
+    contrast = np.median(factors, axis=(0, 2, 3))
+    np.testing.assert_allclose(
+        varied.inputs[:20] + 0.5, (known[:20] + 0.5) * contrast[:, None, None], atol=1e-4
+    )
+    assert 0.2 < np.log(contrast).std() < 0.3
+    np.testing.assert_array_equal(varied.inputs[20], known[20])
+    for channel in (21, 22):
+        for seen, before in zip(varied.inputs[channel], known[channel]):
+            factor, tint = np.polyfit(before.ravel(), seen.ravel(), 1)
+            np.testing.assert_allclose(seen, factor * before + tint, atol=1e-4)
+            assert factor > 0
+    np.testing.assert_array_equal(varied.shifts, batch.shifts)
+
+
 def test_folding_is_the_transpose_of_unfolding():
     rng = np.random.default_rng(2)
     for stride in (1, 2):

@@ -21,6 +21,7 @@ from vehicle_detection.mixture.features import (
 from vehicle_detection.mixture.haze import prepare, reduce_haze
 from vehicle_detection.mixture.model import TemplateMixture, load_model
 from vehicle_detection.mixture.rescoring import (
+    EDGE_OFFSET,
     KERNEL,
     N_INPUTS,
     RESCORE_MIN,
@@ -36,6 +37,7 @@ from vehicle_detection.mixture.template import MixtureTemplate, smallest_box
 
 __all__ = [
     "CROP_CELLS",
+    "EDGE_OFFSET",
     "KERNEL",
     "MIRROR_ORDER",
     "N_CHANNELS",

@@ -35,8 +35,11 @@ MAX_CORRECTION = 0.4
 LAYERS = ("convolution 1", "convolution 2", "convolution 3", "hidden", "output")
 """Layers of the network."""
 
+EDGE_OFFSET = -0.5
+"""Input of the network where there is no edge."""
+
 # Range of edge channels to about -0.5 to 1.5, and of colors to about -1 to 1; log-odds are limited.
-_EDGE_SCALE, _EDGE_OFFSET, _COLOR_SCALE, _MAX_LOG_ODDS = 5, -0.5, 0.5, 6
+_EDGE_SCALE, _COLOR_SCALE, _MAX_LOG_ODDS = 5, 0.5, 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +167,7 @@ class Rescorer:
 
 def network_inputs(edges: Singles, colors: Singles) -> Singles:
     """Arrange `rescoring_features` as the network's inputs, ``(23, N, 12, 12)``."""
-    scaled = edges * np.float32(_EDGE_SCALE) + np.float32(_EDGE_OFFSET), colors * np.float32(_COLOR_SCALE)
+    scaled = edges * np.float32(_EDGE_SCALE) + np.float32(EDGE_OFFSET), colors * np.float32(_COLOR_SCALE)
     inputs = np.hstack(scaled).reshape(len(edges), N_INPUTS, CROP_CELLS, CROP_CELLS)
     return np.ascontiguousarray(inputs.swapaxes(0, 1))
 

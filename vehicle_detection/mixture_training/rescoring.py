@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from vehicle_detection._common import relight
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.mixture import (
+    EDGE_OFFSET,
     KERNEL,
     MIRROR_ORDER,
+    N_CHANNELS,
     N_INPUTS,
     STRIDES,
     EdgePyramid,
@@ -39,7 +41,7 @@ Singles = NDArray[np.float32]
 
 _NETWORKS = 2  # that are trained, and averaged
 _OUTPUTS = (32, 48, 64, 64, 5)  # of the layers
-_EPOCHS, _BATCH, _DROPOUT = 8, 256, 0.3
+_EPOCHS, _BATCH, _DROPOUT = 16, 256, 0.3
 _MIN_STEPS = 40  # of an epoch; with few samples batches are smaller
 # Largest step of the optimizer, the share of the steps in which it rises, and the decay of the weights.
 _RATE, _WARMUP, _DECAY = 2e-3, 0.2, 1e-3
@@ -51,6 +53,8 @@ _MIN_POSITIVE_IOU, _NEGATIVE_IOU = 0.5, (0.1, 0.4)
 _COPIES, _JITTER_SCALE, _BESIDE, _MIN_WIDTH = 2, 0.12, 2, 20.0
 _MIN_MARGIN = -1.3  # of the proposals to train on, lower than that of any box that is rescored
 _MAX_SHIFT = 0.6  # of an edge of a positive box, as a fraction of the box's side
+# Random contrast of edges and saturation of colors (standard deviations of their logarithms), and tint.
+_CONTRAST, _SATURATION, _TINT = 0.25, 0.4, 0.1
 
 _MIRROR = np.concatenate([MIRROR_ORDER, np.arange(len(MIRROR_ORDER), N_INPUTS)])
 
@@ -138,8 +142,8 @@ def sample_boxes(
 def fit_network(samples: Samples, rng: np.random.Generator) -> Network:
     """Minimize the logistic loss and the error of the shifts: AdamW (Loshchilov and Hutter, ICLR 2019).
 
-    Half of the crops of a batch are mirrored, and some values of the dense layers are dropped out (Srivastava
-    et al., "Dropout", JMLR 2014).
+    Half of the crops of a batch are mirrored, their contrast and colors vary, and some values of the dense
+    layers are dropped out (Srivastava et al., "Dropout", JMLR 2014).
     """
     values = _initial_values(rng)
     means, squares = ([np.zeros_like(value) for value in values] for _ in range(2))
@@ -147,7 +151,7 @@ def fit_network(samples: Samples, rng: np.random.Generator) -> Network:
     batch = min(_BATCH, max(count // _MIN_STEPS, 1))
     steps = _EPOCHS * (count // batch)
     for step, rows in enumerate(_batches(count, batch, rng), 1):
-        gradients = _gradients(values, _draw(samples, rows, rng), rng)
+        gradients = _gradients(values, _vary(_draw(samples, rows, rng), rng), rng)
         # The rate rises linearly, then falls like a cosine.
         progress = step / steps
         rising = progress / _WARMUP
@@ -188,6 +192,18 @@ def _draw(samples: Samples, rows: NDArray[np.intp], rng: np.random.Generator) ->
     inputs[:, mirrored] = inputs[_MIRROR][:, mirrored, :, ::-1]
     shifts[mirrored] = shifts[mirrored][:, [2, 1, 0, 3]] * np.array([-1, 1, -1, 1], np.float32)
     return Samples(inputs, samples.is_vehicle[rows], shifts)
+
+
+def _vary(batch: Samples, rng: np.random.Generator) -> Samples:
+    """Vary the contrast of the crops' edges, and the saturation and tint of their colors."""
+
+    def draw(std: float, *shape: int) -> Singles:
+        return rng.normal(0, std, (*shape, len(batch.is_vehicle), 1, 1)).astype(np.float32)
+
+    edges, lightness, colors = np.split(batch.inputs, [N_CHANNELS, N_CHANNELS + 1])
+    edges = (edges - np.float32(EDGE_OFFSET)) * np.exp(draw(_CONTRAST, 1)) + np.float32(EDGE_OFFSET)
+    colors = colors * np.exp(draw(_SATURATION, 2)) + draw(_TINT, 2)
+    return replace(batch, inputs=np.concatenate([edges, lightness, colors]))
 
 
 def _gradients(values: list[Singles], batch: Samples, rng: np.random.Generator | None) -> list[Singles]:
