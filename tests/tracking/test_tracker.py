@@ -266,6 +266,21 @@ class TestLifeCycle:
                 tracks = tracker.update(found(beside, score=score), SHAPE)
                 assert tracks[0].misses == misses
 
+    def test_a_low_score_detection_of_another_size_does_not_change_the_box(self):
+        """Such as one around a car and the lamp post above it."""
+        height = CAR[3] - CAR[1]
+        for above, misses in ((0.5, 0), (1.4, 9)):
+            tracker = Tracker()
+            for _ in range(10):
+                tracker.update(found(CAR, score=3.0), SHAPE)
+            for _ in range(8):
+                tracker.update(found(), SHAPE)
+            taller = np.array(CAR) - np.array([0, above * height, 0, 0])
+            (track,) = tracker.update(found(taller, score=-1.0), SHAPE)
+            assert track.misses == misses
+            if misses:
+                np.testing.assert_allclose(track.box, CAR, atol=2)
+
     def test_a_vehicle_that_stops_growing_is_not_overshot(self):
         """A vehicle that enters from the left, fast at first: its box must not move beyond it later."""
         rng = np.random.default_rng(0)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer, check_number, check_type
-from vehicle_detection.boxes import Detections, Floats, Platt, box_areas, on_one_vehicle
+from vehicle_detection.boxes import Detections, Floats, Platt, box_areas, iou_matrix, on_one_vehicle
 from vehicle_detection.camera import (
     UNKNOWN_LENS_STD,
     Camera,
@@ -58,6 +58,9 @@ _EXIT_TIME = 0.5
 _MAX_COAST_DISTANCE = 0.5
 # Factors of `max_distance` for tentative tracks, and for low-score detections.
 _TENTATIVE_DISTANCE, _LOW_SCORE_DISTANCE = 0.6, 0.5
+# Smallest IoU of a confirmed track with a low-score detection: a box that also covers the lamp post above a
+# vehicle says nothing about its height (as in ByteTrack, Zhang et al., ECCV 2022).
+_LOW_SCORE_IOU = 0.5
 _LOG_ODDS = Platt(-1.0, 0.0)
 # Difference of the scores of two tracks on one vehicle from which on the lower one shows a part of it.
 _PART_GAP = 2.0
@@ -326,8 +329,11 @@ class Tracker:
         merged, shared = merged_detections(predicted[:confirmed], boxes[:high], own)
         # 2. Remaining confirmed tracks with low-score detections.
         rows = [row for row in range(confirmed) if row not in own and row not in shared]
-        for row, column in match(predicted[rows], boxes[high:], _LOW_SCORE_DISTANCE * max_distance[rows]):
-            own[rows[row]] = high + column
+        weak = boxes[high:]
+        iou = iou_matrix(predicted[rows], weak)
+        for row, column in match(predicted[rows], weak, _LOW_SCORE_DISTANCE * max_distance[rows]):
+            if iou[row, column] >= _LOW_SCORE_IOU:
+                own[rows[row]] = high + column
         # 3. Tentative tracks with all remaining detections.
         taken = set(own.values())
         columns = [column for column in range(len(boxes)) if column not in taken]
