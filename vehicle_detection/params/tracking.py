@@ -24,7 +24,7 @@ class TrackParams:
     high_threshold, low_threshold
         Detections from `high_threshold` on can start tracks. Detections between the two thresholds only
         continue tracks that have no better detection, and confirmed tracks only within half of
-        `max_distance` (as in ByteTrack). Lower ones are dropped.
+        `max_distance` and at an IoU of at least 0.5 (as in ByteTrack). Lower ones are dropped.
     confirm_score
         Average score at which a track is confirmed. A vehicle with constant score `s` reaches it after
         ``score_time_constant * log(s / (s - confirm_score))`` seconds, and never if `s` is lower. Both

@@ -58,8 +58,8 @@ _EXIT_TIME = 0.5
 _MAX_COAST_DISTANCE = 0.5
 # Factors of `max_distance` for tentative tracks, and for low-score detections.
 _TENTATIVE_DISTANCE, _LOW_SCORE_DISTANCE = 0.6, 0.5
-# Smallest IoU of a confirmed track with a low-score detection: a box that also covers the lamp post above a
-# vehicle says nothing about its height (as in ByteTrack, Zhang et al., ECCV 2022).
+# Smallest IoU of a confirmed track with a low-score detection, that of ByteTrack's code: a box that also
+# covers the lamp post above a vehicle says nothing about its height.
 _LOW_SCORE_IOU = 0.5
 _LOG_ODDS = Platt(-1.0, 0.0)
 # Difference of the scores of two tracks on one vehicle from which on the lower one shows a part of it.
