@@ -1,5 +1,7 @@
+import contextlib
 import errno
 import os
+import signal
 import stat
 import subprocess
 import sys
@@ -8,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from vehicle_detection._common import atomic_write, check_target, temporary_folder
+from vehicle_detection._common import atomic_write, check_target, files, temporary_folder
 from vehicle_detection.errors import InvalidInputError, OutputError
 
 
@@ -249,3 +251,49 @@ def test_a_file_system_without_locks(tmp_path, monkeypatch):
         part.write_text("new")
         assert folder.is_dir()
     assert names(tmp_path) == ["out.csv"]
+
+
+def run_interrupted(function, number):
+    """Call a function with an interrupt before instruction `number`; False if it ends before."""
+    left = number
+
+    def trace(frame, event, _):
+        nonlocal left
+        if frame.f_code.co_filename not in (files.__file__, contextlib.__file__):
+            return None
+        frame.f_trace_opcodes = True
+        if event == "opcode":
+            left -= 1
+            if left == 0:
+                signal.raise_signal(signal.SIGINT)
+        return trace
+
+    before, handler = sys.gettrace(), signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        sys.settrace(trace)
+        function()
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.settrace(before)
+        signal.signal(signal.SIGINT, handler)
+    return left <= 0
+
+
+@pytest.mark.skipif(threading.current_thread() is not threading.main_thread(), reason="needs the main thread")
+def test_an_interrupt_at_any_time_leaves_no_temporary_files(tmp_path):
+    def write():
+        with atomic_write(tmp_path / "out.csv") as part:
+            part.write_text("whole")
+
+    def use_folder():
+        with temporary_folder(tmp_path, "demo") as folder:
+            (folder / "clip.mp4").write_text("half")
+
+    for function in (write, use_folder):
+        number = 1
+        while run_interrupted(function, number):
+            assert names(tmp_path) in ([], ["out.csv"]), f"{function.__name__}, instruction {number}"
+            number += 1
+        assert number > 100
+        assert (tmp_path / "out.csv").read_text() == "whole"

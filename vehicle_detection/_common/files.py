@@ -6,10 +6,14 @@ import contextlib
 import errno
 import os
 import shutil
+import signal
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 from vehicle_detection._common.checks import check_path
 from vehicle_detection.errors import InvalidInputError, OutputError, VehicleDetectionError
@@ -18,6 +22,7 @@ _FULL = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
 _DISK_ERRORS = (*_FULL, errno.EROFS, errno.EIO)
 # Processes that write one target at the same time, above which their leftovers are not removed.
 _MAX_PARTS = 100
+_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
 def check_target(target: str | os.PathLike[str], name: str = "target") -> Path:
@@ -57,10 +62,13 @@ def atomic_write(target: str | os.PathLike[str], name: str = "target") -> Iterat
         If the disk is full, or the target cannot be written for another reason.
     """
     path = check_target(target, name)
-    with contextlib.ExitStack() as stack:
-        with _output_errors(path, every=True):
+    # Two stacks: an interrupt can end the first removal, even before it begins.
+    with contextlib.ExitStack() as stack, contextlib.ExitStack() as first:
+        with _output_errors(path, every=True), _uninterrupted():
             part = _open_part(path, stack)
-        stack.callback(_remove, part)
+            parts = [part]
+            for each in (stack, first):
+                each.callback(_remove, parts)
         with _output_errors(path, part):
             yield part
         with _output_errors(path, every=True):
@@ -69,6 +77,41 @@ def atomic_write(target: str | os.PathLike[str], name: str = "target") -> Iterat
             os.umask(umask)
             part.chmod(0o666 & ~umask)
             part.replace(path)
+            parts.clear()  # from now on, the name may be that of another process's file
+
+
+@contextlib.contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Delay the handlers of signals that end a program, such as Ctrl-C, until the end of the block.
+
+    Python calls them in the main thread only; in another thread, the block runs as it is.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handlers: dict[int, Any] = {}
+    arrived: list[tuple[int, FrameType | None]] = []
+    delayed = True
+
+    def delay(number: int, frame: FrameType | None) -> None:
+        if delayed:
+            arrived.append((number, frame))
+        else:  # an interrupt has come before another handler was restored
+            handlers[number](number, frame)
+
+    try:
+        for number in _SIGNALS:
+            handler = signal.getsignal(number)
+            if callable(handler):  # neither ignored nor the default of the system
+                handlers[number] = handler
+                signal.signal(number, delay)
+        yield
+    finally:
+        delayed = False
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for number, frame in arrived:
+            handlers[number](number, frame)
 
 
 @contextlib.contextmanager
@@ -152,29 +195,37 @@ def _open_locked(part: Path) -> int | None:
         os.close(handle)
 
 
-def _remove(part: Path) -> None:
-    # The first error is the one to report.
-    with contextlib.suppress(OSError):
-        part.unlink()
+def _remove(parts: list[Path]) -> None:
+    """Remove each file once: its name may be used again by another process."""
+    if parts:
+        with contextlib.suppress(OSError):  # the first error is the one to report
+            parts[0].unlink()
+        parts.clear()
 
 
 @contextlib.contextmanager
 def temporary_folder(parent: Path, name: str) -> Iterator[Path]:
     """Create a hidden folder in `parent`, removed after the block; also remove those of killed processes."""
     prefix, suffix = f".{name}.", ".part"
-    with contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack, contextlib.ExitStack() as first:  # as in `atomic_write`
         if sys.platform != "win32":
             for old in parent.iterdir():
                 if old.name.startswith(prefix) and old.name.endswith(suffix) and old.is_dir():
                     _remove_abandoned(old)
-        with _output_errors(parent / name, every=True):
+        with _output_errors(parent / name, every=True), _uninterrupted():
             folder = Path(tempfile.mkdtemp(prefix=prefix, suffix=suffix, dir=parent))
-        stack.callback(shutil.rmtree, folder, ignore_errors=True)
+            for each in (stack, first):
+                each.callback(_remove_folder, folder)
         if sys.platform != "win32":
             with contextlib.suppress(OSError):  # a file system without locks
                 stack.callback(os.close, _lock_folder(folder))
         with _output_errors(parent / name):
             yield folder
+
+
+def _remove_folder(folder: Path) -> None:
+    with _uninterrupted():  # an interrupted `rmtree` may close a file twice
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _lock_folder(folder: Path) -> int:
@@ -193,5 +244,5 @@ def _lock_folder(folder: Path) -> int:
 def _remove_abandoned(folder: Path) -> None:
     with contextlib.suppress(OSError):  # in use
         handle = _lock_folder(folder)
-        shutil.rmtree(folder, ignore_errors=True)
+        _remove_folder(folder)
         os.close(handle)

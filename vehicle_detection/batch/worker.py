@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import _thread
+import gc
 import importlib
 import json
 import os
@@ -33,8 +34,12 @@ def main() -> None:
                 idle.set()
         # An interrupt that is meant for the last call may come after it.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+        return
     except (KeyboardInterrupt, BrokenPipeError):
-        os._exit(1)
+        pass
+    # The call's open generators, such as that of a temporary folder, are closed with the error's traceback.
+    gc.collect()
+    os._exit(1)
 
 
 def _receive(calls: queue.SimpleQueue[str | None], idle: threading.Event) -> None:

@@ -13,6 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection._common import temporary_folder
 from vehicle_detection.video.ffmpeg import VideoInfo, probe
 from vehicle_detection.video.frame_source import FrameSource
 from vehicle_detection.video.streams import AudioSource, FrameReader, Reader
@@ -59,10 +60,9 @@ class VideoSegments(FrameSource):
         """Join the sound of the segments; None if one of them has none."""
         if not self.info.has_audio:
             return None
-        with tempfile.NamedTemporaryFile(
-            "w", prefix="vehicle-segments-", suffix=".txt", encoding="utf-8", delete=False
-        ) as file:
-            self._on_close.callback(Path(file.name).unlink, missing_ok=True)
+        parent = Path(tempfile.gettempdir())
+        folder = self._on_close.enter_context(temporary_folder(parent, "vehicle-segments"))
+        with (folder / "segments.txt").open("w", encoding="utf-8") as file:
             for path, info in zip(self.files, self._infos, strict=True):
                 quoted = str(path.resolve()).replace("'", r"'\''")
                 # Sound may be longer than the frames, which would add up.
