@@ -18,6 +18,7 @@ from vehicle_detection.boxes import (
 )
 from vehicle_detection.camera import FrameShape
 from vehicle_detection.params import TrackParams
+from vehicle_detection.tracking.assignment import cheapest_pairs
 
 # A detection shows two vehicles if it covers more than this fraction of both, and has a lower IoU with both.
 _MIN_MERGED_COVERAGE, _MAX_MERGED_IOU = 0.7, 0.7
@@ -46,7 +47,7 @@ def match_boxes(predicted: Floats, measured: Floats, max_distance: Floats) -> li
     areas, others = (np.log(np.maximum(box_areas(boxes), 1.0)) for boxes in (predicted, measured))
     area_ratio = np.abs(areas[:, None] - others[None])
     cost = (1 - iou) + distance + 0.3 * area_ratio
-    return _cheapest_pairs(cost, (distance <= 1) & (area_ratio <= math.log(4)))
+    return cheapest_pairs(cost, (distance <= 1) & (area_ratio <= math.log(4)))
 
 
 def match_approaching(
@@ -71,19 +72,7 @@ def match_approaching(
         ],
         axis=1,
     )
-    return _cheapest_pairs(1 - iou, (growth >= 1) & (growth <= _MAX_GROWTH) & (iou >= _MIN_GROWN_IOU))
-
-
-def _cheapest_pairs(cost: Floats, allowed: Bools) -> list[tuple[int, int]]:
-    """Choose allowed pairs of rows and columns, each in one pair at most, with minimum total cost."""
-    if (allowed.sum(axis=0) <= 1).all() and (allowed.sum(axis=1) <= 1).all():
-        rows, columns = np.nonzero(allowed)
-    else:
-        # Imported here, because it takes 0.2 s and most frames do not need it.
-        from scipy.optimize import linear_sum_assignment
-
-        rows, columns = linear_sum_assignment(np.where(allowed, cost, 1e3))
-    return [(int(row), int(column)) for row, column in zip(rows, columns) if allowed[row, column]]
+    return cheapest_pairs(1 - iou, (growth >= 1) & (growth <= _MAX_GROWTH) & (iou >= _MIN_GROWN_IOU))
 
 
 def center_distances(first: Floats, second: Floats) -> Floats:
