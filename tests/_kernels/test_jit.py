@@ -1,3 +1,4 @@
+import gc
 import logging
 import os
 import shutil
@@ -8,17 +9,38 @@ from types import SimpleNamespace
 
 import vehicle_detection
 from vehicle_detection._kernels import suppress
-from vehicle_detection._kernels.jit import _Announcement
+from vehicle_detection._kernels.jit import _Compilation
 
 
 def test_compiling_kernels_is_logged_once_and_other_functions_are_not(caplog):
-    announcement = _Announcement()
+    compilation = _Compilation()
     functions = logging.getLogger, suppress, suppress
     with caplog.at_level(logging.INFO, "vehicle_detection._kernels"):
         for function in functions:
             dispatcher = SimpleNamespace(py_func=getattr(function, "py_func", function))
-            announcement.on_start(SimpleNamespace(data={"dispatcher": dispatcher}))
+            started = SimpleNamespace(data={"dispatcher": dispatcher})
+            compilation.on_start(started)
+            compilation.on_end(started)
     assert [record.getMessage()[:9] for record in caplog.records] == ["compiling"]
+
+
+def test_the_garbage_collector_pauses_while_kernels_are_compiled():
+    compilation = _Compilation()
+    started = SimpleNamespace(data={"dispatcher": SimpleNamespace(py_func=suppress.py_func)})
+    assert gc.isenabled()
+    compilation.on_start(started)
+    compilation.on_start(started)
+    compilation.on_end(started)
+    assert not gc.isenabled()
+    compilation.on_end(started)
+    assert gc.isenabled()
+    gc.disable()  # by the user
+    try:
+        compilation.on_start(started)
+        compilation.on_end(started)
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
 
 
 def test_a_change_of_another_kernel_file_is_noticed(tmp_path):
