@@ -72,6 +72,14 @@ def test_each_track_has_its_own_largest_distance():
     assert match_boxes(predicted, measured, np.array([0.7, 0.6])) == [(0, 0)]
 
 
+def test_pairs_that_overlap_too_little_leave_their_boxes_to_others():
+    # Without the limit, both tracks have a detection, the first one with an IoU of 1/3.
+    predicted, measured = boxes_at((50, 50), (80, 50)), boxes_at((70, 50), (100, 50))
+    largest = np.array([1.0, 1.0])
+    assert match_boxes(predicted, measured, largest) == [(0, 0), (1, 1)]
+    assert match_boxes(predicted, measured, largest, min_iou=0.5) == [(1, 0)]
+
+
 def test_the_total_cost_is_least_although_a_single_pair_is_not():
     # The nearest pair is (1, 0); it would leave the first track without a detection.
     predicted, measured = boxes_at((50, 50), (80, 50)), boxes_at((75, 50), (105, 50))

@@ -34,11 +34,14 @@ _MAX_GROWTH, _MIN_GROWN_IOU = 1.6, 0.6
 Bools = NDArray[np.bool_]
 
 
-def match_boxes(predicted: Floats, measured: Floats, max_distance: Floats) -> list[tuple[int, int]]:
+def match_boxes(
+    predicted: Floats, measured: Floats, max_distance: Floats, min_iou: float = 0.0
+) -> list[tuple[int, int]]:
     """Pairs ``(predicted, measured)`` of indices by the Hungarian method, with minimum total cost.
 
     The cost is the sum of ``1 - IoU``, of the distance between centers in units of `max_distance` ``(N,)``,
     and of the weighted logarithm of the ratio of areas (Kuhn, *Naval Research Logistics Quarterly*, 1955).
+    Pairs with an IoU below `min_iou` are not allowed.
     """
     if not len(predicted) or not len(measured):
         return []
@@ -47,7 +50,7 @@ def match_boxes(predicted: Floats, measured: Floats, max_distance: Floats) -> li
     areas, others = (np.log(np.maximum(box_areas(boxes), 1.0)) for boxes in (predicted, measured))
     area_ratio = np.abs(areas[:, None] - others[None])
     cost = (1 - iou) + distance + 0.3 * area_ratio
-    return cheapest_pairs(cost, (distance <= 1) & (area_ratio <= math.log(4)))
+    return cheapest_pairs(cost, (distance <= 1) & (area_ratio <= math.log(4)) & (iou >= min_iou))
 
 
 def match_approaching(

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vehicle_detection.boxes import Floats
+from vehicle_detection.boxes import Floats, iou_matrix
 from vehicle_detection.params import TrackParams
 from vehicle_detection.tracking.association import center_distances, match_boxes
 from vehicle_detection.tracking.kalman_filter import (
@@ -67,10 +67,13 @@ class NearestSmoother(HistorySmoother):
     """Moves each box a fraction of the way to the nearest detection (the course's first system)."""
 
     @staticmethod
-    def match(predicted: Floats, measured: Floats, max_distance: Floats) -> list[tuple[int, int]]:
-        """Pairs of indices by the distance of the centers alone, nearest first."""
+    def match(
+        predicted: Floats, measured: Floats, max_distance: Floats, min_iou: float = 0.0
+    ) -> list[tuple[int, int]]:
+        """Pairs of indices with at least this IoU, by the distance of the centers alone, nearest first."""
         pairs: list[tuple[int, int]] = []
         distance = center_distances(predicted, measured) / max_distance[:, None]
+        distance[iou_matrix(predicted, measured) < min_iou] = np.inf
         for flat in np.argsort(distance, axis=None, kind="stable"):
             row, column = divmod(int(flat), len(measured))
             if distance[row, column] <= 1 and all(row != r and column != c for r, c in pairs):

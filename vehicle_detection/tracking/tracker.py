@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer, check_number, check_type
-from vehicle_detection.boxes import Detections, Floats, Platt, box_areas, iou_matrix, on_one_vehicle
+from vehicle_detection.boxes import Detections, Floats, Platt, box_areas, on_one_vehicle
 from vehicle_detection.camera import (
     UNKNOWN_LENS_STD,
     Camera,
@@ -329,11 +329,9 @@ class Tracker:
         merged, shared = merged_detections(predicted[:confirmed], boxes[:high], own)
         # 2. Remaining confirmed tracks with low-score detections.
         rows = [row for row in range(confirmed) if row not in own and row not in shared]
-        weak = boxes[high:]
-        iou = iou_matrix(predicted[rows], weak)
-        for row, column in match(predicted[rows], weak, _LOW_SCORE_DISTANCE * max_distance[rows]):
-            if iou[row, column] >= _LOW_SCORE_IOU:
-                own[rows[row]] = high + column
+        near = _LOW_SCORE_DISTANCE * max_distance[rows]
+        for row, column in match(predicted[rows], boxes[high:], near, _LOW_SCORE_IOU):
+            own[rows[row]] = high + column
         # 3. Tentative tracks with all remaining detections.
         taken = set(own.values())
         columns = [column for column in range(len(boxes)) if column not in taken]
