@@ -23,8 +23,8 @@ _COMMAND = "python -m tools.train_default DATA -o {name}.safetensors --card {nam
 _METHOD = (
     "Each source was left out of training in turn, and single frames of it were searched with the default "
     "parameters, at an IoU of 0.5. F1, precision and recall are those at the threshold that is best for the "
-    "other sources, where a false box counts 1.4 times as much as a missed vehicle; best F1 is that of the best "
-    "threshold; AP is the average precision; false positives are "
+    "other sources, where a false box counts 1.4 times as much as a missed vehicle; best F1 is that of the "
+    "best threshold; AP is the average precision; false positives are "
     'counted per frame, and per frame without any label. "Region F1" and "region AP" do not score a box of '
     "which at least half lies in an ignored box: where labels put one ignored box around a group of "
     "vehicles, the other columns count each vehicle detected there as false. The threshold and the "

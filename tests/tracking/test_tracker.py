@@ -281,6 +281,13 @@ class TestLifeCycle:
             if misses:
                 np.testing.assert_allclose(track.box, CAR, atol=2)
 
+    def test_taller_low_score_detections_do_not_make_the_box_grow(self):
+        """Several of them, and no detection after them: the box would go on growing."""
+        tracker, taller = Tracker(), np.array(CAR) - np.array([0, 0.8 * (CAR[3] - CAR[1]), 0, 0])
+        for detections in [found(CAR, score=3.0)] * 10 + [found(taller, score=-0.8)] * 3 + [found()] * 12:
+            (track,) = tracker.update(detections, SHAPE)
+        np.testing.assert_allclose(track.box, CAR, atol=3)
+
     def test_a_vehicle_that_stops_growing_is_not_overshot(self):
         """A vehicle that enters from the left, fast at first: its box must not move beyond it later."""
         rng = np.random.default_rng(0)

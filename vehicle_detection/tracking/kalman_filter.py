@@ -106,6 +106,7 @@ class Measurements(NamedTuple):
     truncated: Bools  # (N, 4) edges at the frame's border
     lateral_px: Floats  # (N,) distance of the inner edge from the frame's middle column
     merged: Bools  # (N,) whether the box shows another vehicle too
+    unsure: Bools  # (N,) whether the box has a low score, so that it may show something else too
     covered: Floats  # (N,) fraction of the box that nearer vehicles cover
     hidden: Bools  # (N, 4) edges beyond which a nearer vehicle hides what follows
 
@@ -118,14 +119,17 @@ class Measurements(NamedTuple):
         camera: Camera | None = None,
         covered: ArrayLike = 0.0,
         hidden: ArrayLike = False,
+        unsure: ArrayLike = False,
     ) -> Measurements:
         """Measure boxes in a frame of this shape, seen by `camera` or, by default, a pinhole camera."""
-        merged = np.broadcast_to(np.asarray(merged, np.bool_), len(boxes))
+        merged, unsure = (
+            np.broadcast_to(np.asarray(each, np.bool_), len(boxes)) for each in (merged, unsure)
+        )
         covered = np.broadcast_to(np.asarray(covered, np.float64), len(boxes))
         hidden = np.broadcast_to(np.asarray(hidden, np.bool_), boxes.shape)
         road = boxes if camera is None else camera.rectify_boxes(boxes, frame)
         truncated, lateral_px = truncated_edges(boxes, frame), lateral_offsets(road, frame)
-        return cls(boxes, road, truncated, lateral_px, merged, covered, hidden)
+        return cls(boxes, road, truncated, lateral_px, merged, unsure, covered, hidden)
 
 
 class KalmanSmoother:
@@ -181,7 +185,8 @@ class KalmanSmoother:
         # A vehicle may reach behind a nearer one, so a hidden edge moves its box inwards only a little.
         noise = np.where(measured.hidden & is_outside, _HIDDEN_NOISE**2 * noise, noise)
         variance = np.where(beyond, UNKNOWN, noise)
-        corrected = KalmanStates(*update(*states[:3], boxes, variance, measured.merged, dt), *states[3:])
+        doubtful = measured.merged | measured.unsure
+        corrected = KalmanStates(*update(*states[:3], boxes, variance, doubtful, dt), *states[3:])
         again = np.array([track.last_gap > _MAX_VELOCITY_AGE for track in tracks]) & ~measured.merged
         if again.any():
             new = (*self.initiate(measured), np.zeros((len(boxes), 4)))

@@ -297,8 +297,11 @@ class Tracker:
         for track, fraction in zip(self._live, covered.tolist()):
             track.covered = fraction
         is_merged = [row in shared or row in merged for row in rows]
+        # A low-score box of a vehicle may also cover the lamp post above it.
+        low = scores < self.params.high_threshold
+        unsure = [self._live[row].id > 0 and low[source[row]] for row in rows]
         hidden = hidden_edges(boxes, predicted, rows, in_front)
-        measured = Measurements.from_boxes(boxes, frame, is_merged, self._lens, covered[rows], hidden)
+        measured = Measurements.from_boxes(boxes, frame, is_merged, self._lens, covered[rows], hidden, unsure)
         states = self._smoother.correct(self._states.take(rows), tracks, measured, dt)
         self._states = self._states.put(rows, self._update_distances(states, measured, dt))
         return unassigned
