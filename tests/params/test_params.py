@@ -393,8 +393,8 @@ def test_heat_thresholds_scale_with_the_density_of_the_windows():
         dense, bands=tuple(dataclasses.replace(band, overlap=(0.95, 0.95)) for band in dense.bands)
     )
     assert denser.window_density == dense.window_density
-    assert HeatParams().for_search(PyramidParams()).threshold == 0.25
-    assert HeatParams().for_search(PyramidParams(per_octave=10)).threshold == 0.5
+    assert HeatParams().for_search(PyramidParams()).threshold == 2.0
+    assert HeatParams().for_search(PyramidParams(per_octave=10)).threshold == 4.0
 
 
 def test_a_given_heat_threshold_is_kept_and_checked_against_the_density():
@@ -405,12 +405,12 @@ def test_a_given_heat_threshold_is_kept_and_checked_against_the_density():
         (dataclasses.replace(WHOLE, threshold=2.0), dense, "too many windows are hot.* expect 10 to 56;"),
         (dataclasses.replace(WHOLE, threshold=80.0), dense, "threshold 80 does not fit .*too few windows"),
         (
-            HeatParams(threshold=5.0),
+            HeatParams(threshold=20.0),
             PyramidParams(),
-            "expect 0 to 3; omit the threshold for the default of 0.25",
+            "expect 0 to 14; omit the threshold for the default of 2",
         ),
         (
-            HeatParams(threshold=5.0, weighting="count"),
+            HeatParams(threshold=20.0, weighting="count"),
             PyramidParams(),
             "weighting='count' and peak_fraction=0.35",
         ),

@@ -23,7 +23,7 @@ _BAND_HEAT = {
     ("score", False): HeatRange(12.0, 4.0, 40.0),
     ("count", False): HeatRange(16.0, 10.0, 56.0),
 }
-_PYRAMID_HEAT = {"score": HeatRange(0.25, 0.0, 3.0), "count": HeatRange(0.5, 0.0, 4.0)}
+_PYRAMID_HEAT = {"score": HeatRange(2.0, 0.0, 14.0), "count": HeatRange(4.0, 0.0, 16.0)}
 # Factor of the default thresholds of whole regions if all windows are of similar size.
 _SIMILAR_SIZES_FACTOR = 0.6
 # Windows of sides that differ by at most this factor fire on the same vehicle.
