@@ -277,7 +277,7 @@ class TestSettingsAndModel:
         with VehicleDetector(n_jobs=1, region_params=HeatParams(), horizon=0.5) as detector:
             text = write_report(tmp_path, FRAMES, detector=detector)
         assert "<summary>Regions (heat map)</summary>" in text
-        assert "<dt>threshold</dt><dd>0.25</dd>" in text
+        assert "<dt>threshold</dt><dd>2</dd>" in text
         assert "fitted boxes" not in text
         assert "<summary>Camera (assumed)</summary>" in text
         assert "<dt>horizon px</dt><dd>360</dd>" in text
