@@ -196,7 +196,7 @@ def _open_locked(part: Path) -> int | None:
 
 
 def _remove(parts: list[Path]) -> None:
-    """Remove each file once: its name may be used again by another process."""
+    """Remove the file, and empty the list: its name may be used again by another process."""
     if parts:
         with contextlib.suppress(OSError):  # the first error is the one to report
             parts[0].unlink()

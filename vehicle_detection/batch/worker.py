@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import _thread
+import contextlib
 import gc
 import importlib
 import json
@@ -26,7 +27,7 @@ def main() -> None:
     idle = threading.Event()
     idle.set()
     threading.Thread(target=_receive, args=(calls, idle), daemon=True).start()
-    try:
+    with contextlib.suppress(KeyboardInterrupt, BrokenPipeError):  # the parent process is gone
         while (line := calls.get()) is not None:
             answers.write(json.dumps(_call(json.loads(line))) + "\n")
             answers.flush()
@@ -35,8 +36,6 @@ def main() -> None:
         # An interrupt that is meant for the last call may come after it.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         return
-    except (KeyboardInterrupt, BrokenPipeError):
-        pass
     # The call's open generators, such as that of a temporary folder, are closed with the error's traceback.
     gc.collect()
     os._exit(1)
