@@ -287,18 +287,29 @@ def cell_means(planes, grids, means):
     """
     height, width = planes.shape[1:]
     rows, columns = means.shape[1:3]
+    sums, bounds = np.empty(width, np.int32), np.empty((columns, 2), np.int64)
     for number in range(len(grids)):
         left, top, step_x, step_y = grids[number]
+        for column in range(columns):
+            start = math.floor(left + column * step_x + 0.5)
+            bounds[column, 0] = start
+            bounds[column, 1] = max(math.floor(left + (column + 1) * step_x + 0.5), start + 1)
+        low = min(max(bounds[0, 0], 0), width - 1)
+        count = max(min(bounds[columns - 1, 1], width) - low, 1)
         for row in range(rows):
             start_y = math.floor(top + row * step_y + 0.5)
             stop_y = max(math.floor(top + (row + 1) * step_y + 0.5), start_y + 1)
-            for column in range(columns):
-                start_x = math.floor(left + column * step_x + 0.5)
-                stop_x = max(math.floor(left + (column + 1) * step_x + 0.5), start_x + 1)
-                for c in range(3):
+            for c in range(3):
+                # Down the columns of pixels first, many at a time.
+                for x in range(count):
+                    sums[x] = 0
+                for y in range(start_y, stop_y):
+                    line = planes[c, min(max(y, 0), height - 1), low : low + count]
+                    for x in range(count):
+                        sums[x] += line[x]
+                for column in range(columns):
+                    start_x, stop_x = bounds[column, 0], bounds[column, 1]
                     total = 0
-                    for y in range(start_y, stop_y):
-                        line = planes[c, min(max(y, 0), height - 1)]
-                        for x in range(start_x, stop_x):
-                            total += line[min(max(x, 0), width - 1)]
+                    for x in range(start_x, stop_x):
+                        total += sums[min(max(x - low, 0), count - 1)]
                     means[number, row, column, c] = total / ((stop_y - start_y) * (stop_x - start_x))
