@@ -56,6 +56,18 @@ def test_without_the_prior_the_sigmoid_is_plain_logistic_regression():
     assert platt.a == pytest.approx(calibrate_scores(scores, truth).a, rel=0.1)
 
 
+@pytest.mark.parametrize("prior", [True, False])
+def test_a_weight_counts_like_copies_of_a_sample(prior):
+    scores, truth = drawn_scores(-1.5, 0.3, count=300)
+    copies = np.arange(300) % 3 + 1
+    weighted = calibrate_scores(scores, truth, prior=prior, weights=copies)
+    repeated = calibrate_scores(np.repeat(scores, copies), np.repeat(truth, copies), prior=prior)
+    assert (weighted.a, weighted.b) == pytest.approx((repeated.a, repeated.b), abs=0.05)
+    same = calibrate_scores(scores, truth, prior=prior, weights=np.full(300, 0.1))
+    unweighted = calibrate_scores(scores, truth, prior=prior)
+    assert (same.a, same.b) == pytest.approx((unweighted.a, unweighted.b), rel=1e-4)
+
+
 @given(
     scores=st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=20),
     a=st.floats(-100, -1e-3),
@@ -85,6 +97,14 @@ def test_invalid_arguments_of_calibrate_scores():
     ):
         with pytest.raises(InvalidInputError, match=message):
             calibrate_scores(scores, truth)
+    for weights, message in (
+        ([1.0], "weights must be one number for each of the 2 scores"),
+        (["1", "2"], "weights must be one number for each of the 2 scores"),
+        ([1.0, 0.0], "weights must be positive and finite"),
+        ([1.0, math.nan], "weights must be positive and finite"),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            calibrate_scores([0.5, 1.0], [0, 1], weights=weights)
     with pytest.raises(InvalidInputError, match="a must be a number"):
         Platt(math.nan, 0.0)
     with pytest.raises(InvalidInputError, match="scores must be numbers without NaN"):

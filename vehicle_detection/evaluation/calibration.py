@@ -10,7 +10,9 @@ from vehicle_detection.boxes import Platt
 from vehicle_detection.errors import InvalidInputError
 
 
-def calibrate_scores(scores: ArrayLike, labels: ArrayLike, *, prior: bool = True) -> Platt:
+def calibrate_scores(
+    scores: ArrayLike, labels: ArrayLike, *, prior: bool = True, weights: ArrayLike | None = None
+) -> Platt:
     """Fit the sigmoid that turns scores into probabilities.
 
     Parameters
@@ -22,6 +24,9 @@ def calibrate_scores(scores: ArrayLike, labels: ArrayLike, *, prior: bool = True
     prior
         Smooth the labels with Platt's prior on both classes. False fits plain logistic regression, whose
         slope has no useful limit if the scores separate the classes.
+    weights
+        ``(N,)`` positive weights of the samples in the fit, for example to give several data sets of
+        different sizes the same influence. None: all the same.
 
     Returns
     -------
@@ -53,20 +58,36 @@ def calibrate_scores(scores: ArrayLike, labels: ArrayLike, *, prior: bool = True
     _check_truth(truth, values, "scores")
     if truth.min() == truth.max():
         raise InvalidInputError("labels must hold both classes: vehicles (1) and non-vehicles (0)")
+    sample_weight = _check_weights(weights, len(values))
     from sklearn.linear_model import LogisticRegression
 
     values, truth, scale = values.astype(np.float64), truth.astype(np.int64), 1.0
     if prior:
         # Each sample is split between both classes.
-        positives, negatives = np.bincount(truth)[::-1]
+        negatives, positives = np.bincount(truth, weights=sample_weight)
         target = np.where(truth == 1, (positives + 1) / (positives + 2), 1 / (negatives + 2))
         scale = float(values.std()) or 1.0
         samples, classes = np.tile(values / scale, 2), np.repeat([1, 0], len(values))
         regression = LogisticRegression(C=np.inf, tol=1e-8, max_iter=1000)
-        regression.fit(samples[:, None], classes, sample_weight=np.concatenate([target, 1 - target]))
+        split = np.concatenate([target, 1 - target]) * np.tile(sample_weight, 2)
+        regression.fit(samples[:, None], classes, sample_weight=split)
     else:
-        regression = LogisticRegression(C=1e6).fit(values[:, None], truth)
+        regression = LogisticRegression(C=1e6).fit(values[:, None], truth, sample_weight=sample_weight)
     return Platt(-float(regression.coef_[0, 0]) / scale, -float(regression.intercept_[0]))
+
+
+def _check_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64]:
+    """Weights with a mean of 1."""
+    if weights is None:
+        return np.ones(count)
+    values = check_array(weights, "weights")
+    if values.shape != (count,) or values.dtype.kind not in "iuf":
+        raise InvalidInputError(
+            f"weights must be one number for each of the {count} scores; got {describe(values)}"
+        )
+    if not (np.isfinite(values).all() and (values > 0).all()):
+        raise InvalidInputError("weights must be positive and finite; drop the samples that are not to count")
+    return np.asarray(values / values.mean(), np.float64)
 
 
 def _check_truth(truth: NDArray[np.generic], values: NDArray[np.generic], name: str) -> None:
