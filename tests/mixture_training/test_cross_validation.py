@@ -184,6 +184,17 @@ def test_log_odds_increase_with_the_margin():
     assert -0.5 < offset < 2.5
 
 
+def test_log_odds_give_sources_with_more_vehicles_no_more_influence():
+    margins = np.tile(np.linspace(-1, 1, 20), 5)
+    strict = fold_of(margins[:20], margins[:20] > 0.6, frames=20, source="strict")
+    easy = fold_of(margins, margins > -0.4, frames=100, source="easy")
+    slope, offset = fit_log_odds([strict, easy])
+    # Half-way between the two, and not near the larger one.
+    assert -offset / slope == pytest.approx(0.1, abs=0.12)
+    empty = fold_of([0.9], [False], frames=1, empty=1, source="empty")
+    assert fit_log_odds([strict, easy, empty]) == pytest.approx((slope, offset), rel=0.1)
+
+
 @pytest.mark.parametrize("hits", [[True, True], [False, False], [False, True], []])
 def test_log_odds_of_too_few_boxes(hits):
     # All right, all wrong, or the better box wrong: nothing to fit.

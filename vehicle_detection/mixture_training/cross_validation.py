@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import os
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
@@ -233,9 +234,27 @@ def best_threshold(folds: Sequence[FoldDetections]) -> float:
     margins, hits = _joined_hits(folds)
     above = margins[:, None] >= _THRESHOLDS
     right, shown = above[hits].sum(axis=0), above.sum(axis=0)
-    vehicles = sum(len(fold.matches.usable) for fold in folds)
+    vehicles = sum(_vehicle_counts(folds).values())
     scores = right / np.maximum(shown + _BETA_SQUARED * vehicles, 1e-9)
     return float(_THRESHOLDS[int(np.argmax(scores))])
+
+
+def fit_log_odds(folds: Sequence[FoldDetections]) -> tuple[float, float]:
+    """Slope and offset that turn margins into log-odds, fitted to the detections of all folds.
+
+    The detections in a source are weighted by the inverse of its number of vehicles, so that all sources
+    have a similar influence; one without vehicles counts like the largest.
+    """
+    margins, hits = _joined_hits(folds)
+    if len(set(hits.tolist())) < 2:
+        return 1.0, 0.0
+    counts = _vehicle_counts(folds)
+    weights = [
+        np.full(len(fold.hits[0]), 1 / (counts[fold.source] or max(counts.values()))) for fold in folds
+    ]
+    platt = calibrate_scores(margins, hits, prior=False, weights=np.concatenate(weights))
+    # Among few boxes the better ones may be false; a negative slope would reverse their order.
+    return (-platt.a, -platt.b) if platt.a < 0 else (1.0, 0.0)
 
 
 def _joined_hits(folds: Sequence[FoldDetections]) -> tuple[Floats, NDArray[np.bool_]]:
@@ -244,14 +263,12 @@ def _joined_hits(folds: Sequence[FoldDetections]) -> tuple[Floats, NDArray[np.bo
     return np.concatenate(margins), np.concatenate(hits)
 
 
-def fit_log_odds(folds: Sequence[FoldDetections]) -> tuple[float, float]:
-    """Slope and offset that turn margins into log-odds, fitted to the detections of all folds."""
-    margins, hits = _joined_hits(folds)
-    if len(set(hits.tolist())) < 2:
-        return 1.0, 0.0
-    platt = calibrate_scores(margins, hits, prior=False)
-    # Among few boxes the better ones may be false; a negative slope would reverse their order.
-    return (-platt.a, -platt.b) if platt.a < 0 else (1.0, 0.0)
+def _vehicle_counts(folds: Sequence[FoldDetections]) -> Counter[str]:
+    """Scored vehicles of each source."""
+    counts: Counter[str] = Counter()
+    for fold in folds:
+        counts[fold.source] += len(fold.matches.usable)
+    return counts
 
 
 def format_fold(values: Mapping[str, Any], *, missing: str = "") -> list[str]:
