@@ -65,26 +65,39 @@ def network_reference(network, crop):
 def test_the_networks_equal_the_reference(seed, count):
     rescorer = random_rescorer(seed)
     inputs = np.random.default_rng(seed).normal(0, 1, (23, count, 12, 12)).astype(np.float32)
-    log_odds, shifts = rescorer.predict(inputs)
-    each = [
-        [network_reference(network, inputs[:, row]) for row in range(count)] for network in rescorer.networks
-    ]
-    expected = np.mean(each, axis=0).reshape(-1, 5)
-    np.testing.assert_allclose(log_odds, expected[:, 0], atol=1e-4)
-    np.testing.assert_allclose(shifts, expected[:, 1:].clip(-0.4, 0.4), atol=1e-4)
+    margins = np.random.default_rng(seed).uniform(-2, 1, count)
+    log_odds, shifts = rescorer.predict(inputs, margins)
+    for row in range(count):
+        first, second = (network_reference(network, inputs[:, row]) for network in rescorer.networks)
+        # Only boxes that the first network leaves with a margin are shown to the second one.
+        after_first = margins[row] + 0.4 * first[0].clip(-6, 6)
+        expected = (first + second) / 2 if after_first >= -1.2 else first
+        np.testing.assert_allclose(log_odds[row], expected[0], atol=1e-4)
+        np.testing.assert_allclose(shifts[row], expected[1:].clip(-0.4, 0.4), atol=1e-4)
 
 
-def test_the_outputs_of_a_crop_depend_neither_on_the_others_nor_on_the_threads():
-    rescorer = random_rescorer()
-    inputs = np.random.default_rng(3).normal(0, 1, (23, 40, 12, 12)).astype(np.float32)
-    log_odds, shifts = rescorer.predict(inputs)
-    with contextlib.closing(ThreadTeam(2, name="networks")) as team:
-        for found, alone in zip(rescorer.predict(inputs, team), (log_odds, shifts)):
-            np.testing.assert_array_equal(found, alone)
+def test_the_outputs_of_a_crop_do_not_depend_on_the_others():
+    rescorer, rng = random_rescorer(), np.random.default_rng(3)
+    inputs, margins = rng.normal(0, 1, (23, 40, 12, 12)).astype(np.float32), rng.uniform(-2, 1, 40)
+    log_odds, shifts = rescorer.predict(inputs, margins)
     for rows in (slice(7, 8), slice(3, 30)):
-        part = rescorer.predict(np.ascontiguousarray(inputs[:, rows]))
+        part = rescorer.predict(np.ascontiguousarray(inputs[:, rows]), margins[rows])
         np.testing.assert_array_equal(part[0], log_odds[rows])
         np.testing.assert_array_equal(part[1], shifts[rows])
+
+
+@pytest.mark.parametrize("count", [1, 15, 16, 60])
+def test_rescoring_does_not_depend_on_the_threads(count):
+    rescorer, image, rng = random_rescorer(), noise(1), np.random.default_rng(5)
+    corners = rng.uniform(-10, 100, (count, 2))
+    boxes = np.hstack([corners, corners + rng.uniform(10, 60, (count, 2))])
+    margins = rng.uniform(-1, 1, count)
+    alone = rescorer.apply(EdgePyramid(image), boxes, margins)
+    for n_threads in (2, 3):
+        with contextlib.closing(ThreadTeam(n_threads, name="networks")) as team:
+            found = rescorer.apply(EdgePyramid(image, team=team), boxes, margins)
+        for one, other in zip(found, alone):
+            np.testing.assert_array_equal(one, other)
 
 
 def test_the_inputs_are_scaled_edges_and_colors():
@@ -105,7 +118,7 @@ def test_the_number_of_weights():
 def test_rescoring_adds_log_odds_and_corrects_boxes():
     rescorer, pyramid = random_rescorer(), EdgePyramid(noise(1))
     margins = np.array([0.5, -0.2, 1.0])
-    log_odds, shifts = rescorer.predict(network_inputs(*rescoring_features(pyramid, BOXES)))
+    log_odds, shifts = rescorer.predict(network_inputs(*rescoring_features(pyramid, BOXES)), margins)
     boxes, found = rescorer.apply(pyramid, BOXES, margins)
     np.testing.assert_allclose(found, margins + 0.4 * log_odds.clip(-6, 6))
     expected = BOXES + shifts * np.tile(BOXES[:, 2:] - BOXES[:, :2], 2)

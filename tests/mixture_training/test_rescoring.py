@@ -136,7 +136,7 @@ def test_a_trained_rescorer_separates_vehicles_from_clutter(small_mixture):
         vehicles, clutter = sample_boxes(frame.image, frame, search, SMALL_MIXTURE, rng)
         for boxes, values in (vehicles, right), (clutter, wrong):
             features = rescoring_features(EdgePyramid(frame.image), boxes)
-            values += rescorer.predict(network_inputs(*features))[0].tolist()
+            values += rescorer.predict(network_inputs(*features), np.zeros(len(boxes)))[0].tolist()
     right, wrong = np.array(right), np.array(wrong)
     assert (right > 0).mean() > 0.8
     assert (wrong < 0).mean() > 0.8

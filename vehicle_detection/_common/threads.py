@@ -149,6 +149,11 @@ class ThreadTeam:
         self._lock = threading.Lock()
         self._callers = 0
 
+    @property
+    def n_threads(self) -> int:
+        """Number of threads."""
+        return self._helpers + 1
+
     def map(
         self, function: Callable[[Item], Result], items: Sequence[Item], *, cost: Callable[[Item], float]
     ) -> list[Result]:

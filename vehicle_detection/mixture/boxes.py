@@ -22,7 +22,9 @@ _VOTE_IOU, _NMS_IOU, _NMS_COVER = 0.5, 0.35, 0.75
 DUPLICATE_IOU = 0.7
 # A window's vote is its margin above this one.
 _VOTE_MARGIN = -1.1
-_MAX_VEHICLES = 60
+MAX_PROPOSALS = 120
+"""Greatest number of boxes that are proposed in a frame."""
+
 # Of two boxes on one vehicle, one is a part if its margin is so much lower.
 _PART_GAP = 1.0
 _MIN_VISIBLE_FRACTION = 0.35
@@ -72,7 +74,7 @@ def mostly_inside(boxes: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 
 def vote_boxes(
-    windows: ScoredWindows, *, min_margin: float, max_boxes: int = _MAX_VEHICLES
+    windows: ScoredWindows, *, min_margin: float, max_boxes: int = MAX_PROPOSALS
 ) -> tuple[ScoredWindows, Floats]:
     """Keep the best window of each group, with the weighted mean box of the windows that overlap it.
 

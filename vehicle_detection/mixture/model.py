@@ -32,6 +32,7 @@ from vehicle_detection.classifier import VehicleClassifier, build_classifier
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.mixture.boxes import (
     DUPLICATE_IOU,
+    MAX_PROPOSALS,
     ScoredWindows,
     nms,
     vote_boxes,
@@ -218,12 +219,17 @@ class TemplateMixture:
         return FoundVehicles(boxes[rows], margins[rows], shift, perspective[rows])
 
     def propose_boxes(
-        self, pyramid: EdgePyramid, windows: ScoredWindows, *, min_margin: float
+        self,
+        pyramid: EdgePyramid,
+        windows: ScoredWindows,
+        *,
+        min_margin: float,
+        max_boxes: int = MAX_PROPOSALS,
     ) -> tuple[Floats, Floats]:
         """Boxes inside the frame and their margins before rescoring; several may cover one vehicle."""
         # The size prior and the votes add at most 2 units each.
         min_window = min_margin - 2 * self.size_prior_weight - 2 * self.vote_weight
-        grouped, vote_mass = vote_boxes(windows, min_margin=min_window)
+        grouped, vote_mass = vote_boxes(windows, min_margin=min_window, max_boxes=max_boxes)
         margins = grouped.margins + self.vote_weight * np.minimum(np.log1p(vote_mass) - 2, 2)
         boxes = clip_boxes(grouped.boxes, pyramid.shape)
         heights = np.maximum(boxes[:, 3] - boxes[:, 1], 1)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import CALLING_THREAD, ThreadTeam, check_number, finite_array
+from vehicle_detection._common import check_number, finite_array
 from vehicle_detection._kernels import Convolution, ConvolutionalNetwork
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import InvalidInputError
@@ -20,7 +21,7 @@ from vehicle_detection.mixture.features import N_CHANNELS, EdgePyramid
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-RESCORE_MIN = -1.0
+RESCORE_MIN = -1.1
 """Minimum margin of a proposed box that is rescored."""
 
 N_INPUTS = N_CHANNELS + 3
@@ -40,6 +41,10 @@ EDGE_OFFSET = -0.5
 
 # Range of edge channels to about -0.5 to 1.5, and of colors to about -1 to 1; log-odds are limited.
 _EDGE_SCALE, _COLOR_SCALE, _MAX_LOG_ODDS = 5, 0.5, 6
+# Minimum margin after the first network of a box that the other networks see.
+_NEXT_NETWORK_MIN = -1.2
+# Fewest boxes that a thread computes.
+_MIN_BOXES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,24 +127,41 @@ class Rescorer:
         layers = [layer for network in self.networks for layer in network.layers]
         return sum(layer.weights.size + layer.bias.size for layer in layers)
 
-    def predict(self, inputs: Singles, team: ThreadTeam = CALLING_THREAD) -> tuple[Floats, Floats]:
+    def predict(self, inputs: Singles, margins: Floats) -> tuple[Floats, Floats]:
         """Log-odds ``(N,)`` and shifts of the edges ``(N, 4)``, as fractions of a box's sides, of crops.
 
-        `inputs` are `network_inputs`. The threads of a team compute a network each.
+        `inputs` are `network_inputs`, and `margins` ``(N,)`` those of the templates. Boxes that the first
+        network scores too low to be shown are not passed to the others: a cascade (Viola and Jones, "Robust
+        real-time face detection", IJCV 2004).
         """
-        outputs = np.mean(
-            team.map(lambda network: network.outputs(inputs), self.networks, cost=lambda _: 1), axis=0
-        )
+        outputs = self.networks[0].outputs(inputs)
+        rows = np.flatnonzero(self._blend(margins, outputs[:, 0]) >= _NEXT_NETWORK_MIN)
+        if len(rows):
+            chosen = np.ascontiguousarray(inputs[:, rows])
+            others = [network.outputs(chosen) for network in self.networks[1:]]
+            outputs[rows] = np.mean([outputs[rows], *others], axis=0)
         return outputs[:, 0], np.clip(outputs[:, 1:], -MAX_CORRECTION, MAX_CORRECTION)
 
     def apply(self, pyramid: EdgePyramid, boxes: Floats, margins: Floats) -> tuple[Floats, Floats]:
-        """Corrected boxes, clipped to the frame, and their margins."""
+        """Corrected boxes, clipped to the frame, and their margins. The pyramid's threads share the boxes."""
         if not len(boxes):
             return boxes, margins
-        log_odds, shifts = self.predict(network_inputs(*rescoring_features(pyramid, boxes)), pyramid.team)
-        limited = np.clip(log_odds, -_MAX_LOG_ODDS, _MAX_LOG_ODDS)
+
+        def predict(rows: slice) -> tuple[Floats, Floats]:
+            inputs = network_inputs(*rescoring_features(pyramid, boxes[rows]))
+            return self.predict(inputs, margins[rows])
+
+        count = max(min(pyramid.team.n_threads, len(boxes) // _MIN_BOXES), 1)
+        bounds = [len(boxes) * part // count for part in range(count + 1)]
+        parts = [slice(*pair) for pair in pairwise(bounds)]
+        found = pyramid.team.map(predict, parts, cost=lambda rows: rows.stop - rows.start)
+        log_odds, shifts = (np.concatenate(each) for each in zip(*found))
         corrected = boxes + shifts * np.tile(boxes[:, 2:] - boxes[:, :2], 2)
-        return clip_boxes(corrected, pyramid.shape), np.asarray(margins + self.blend_weight * limited)
+        return clip_boxes(corrected, pyramid.shape), self._blend(margins, log_odds)
+
+    def _blend(self, margins: Floats, log_odds: Floats) -> Floats:
+        limited = np.clip(log_odds, -_MAX_LOG_ODDS, _MAX_LOG_ODDS)
+        return np.asarray(margins + self.blend_weight * limited)
 
     def tensors(self) -> dict[str, NDArray[Any]]:
         """Arrays for the model file by name."""
@@ -167,9 +189,16 @@ class Rescorer:
 
 def network_inputs(edges: Singles, colors: Singles) -> Singles:
     """Arrange `rescoring_features` as the network's inputs, ``(23, N, 12, 12)``."""
-    scaled = edges * np.float32(_EDGE_SCALE) + np.float32(EDGE_OFFSET), colors * np.float32(_COLOR_SCALE)
-    inputs = np.hstack(scaled).reshape(len(edges), N_INPUTS, CROP_CELLS, CROP_CELLS)
-    return np.ascontiguousarray(inputs.swapaxes(0, 1))
+    count = len(edges)
+    inputs = np.empty((N_INPUTS, count, CROP_CELLS**2), np.float32)
+    np.multiply(_channels_first(edges), np.float32(_EDGE_SCALE), out=inputs[:N_CHANNELS])
+    inputs[:N_CHANNELS] += np.float32(EDGE_OFFSET)
+    np.multiply(_channels_first(colors), np.float32(_COLOR_SCALE), out=inputs[N_CHANNELS:])
+    return inputs.reshape(N_INPUTS, count, CROP_CELLS, CROP_CELLS)
+
+
+def _channels_first(features: Singles) -> Singles:
+    return features.reshape(len(features), features.shape[1] // CROP_CELLS**2, CROP_CELLS**2).swapaxes(0, 1)
 
 
 def _convolutions(layers: Sequence[Layer]) -> list[Convolution]:

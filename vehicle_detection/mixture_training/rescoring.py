@@ -51,7 +51,8 @@ _BOX_WEIGHT, _SMOOTH = 1.0, 0.05
 _MIN_POSITIVE_IOU, _NEGATIVE_IOU = 0.5, (0.1, 0.4)
 # Positive copies of a labelled box and their jitter, negatives beside each box, and the narrowest label.
 _COPIES, _JITTER_SCALE, _BESIDE, _MIN_WIDTH = 2, 0.12, 2, 20.0
-_MIN_MARGIN = -1.3  # of the proposals to train on, lower than that of any box that is rescored
+# Minimum margin and greatest number of the proposals in a frame to train on.
+_MIN_MARGIN, _MAX_PROPOSALS = -1.3, 60
 _MAX_SHIFT = 0.6  # of an edge of a positive box, as a fraction of the box's side
 # Random contrast of edges and saturation of colors (standard deviations of their logarithms), and tint.
 _CONTRAST, _SATURATION, _TINT = 0.25, 0.4, 0.1
@@ -127,7 +128,9 @@ def sample_boxes(
 ) -> tuple[Floats, Floats]:
     """Positive boxes (proposals on vehicles, shifted labels) and negatives (other proposals, parts)."""
     _, windows = search.score_windows(image, PyramidParams(min_width=params.search.min_width))
-    proposals = search.model.propose_boxes(EdgePyramid(image), windows, min_margin=_MIN_MARGIN)[0]
+    proposals, _ = search.model.propose_boxes(
+        EdgePyramid(image), windows, min_margin=_MIN_MARGIN, max_boxes=_MAX_PROPOSALS
+    )
     right = iou_matrix(proposals, frame.boxes).max(axis=1, initial=0) >= _MIN_POSITIVE_IOU
     wrong = is_negative(proposals, frame) & ~right
     wide = frame.boxes[frame.boxes[:, 2] - frame.boxes[:, 0] >= _MIN_WIDTH]
