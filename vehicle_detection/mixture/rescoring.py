@@ -131,8 +131,8 @@ class Rescorer:
         """Log-odds ``(N,)`` and shifts of the edges ``(N, 4)``, as fractions of a box's sides, of crops.
 
         `inputs` are `network_inputs`, and `margins` ``(N,)`` those of the templates. Boxes that the first
-        network scores too low to be shown are not passed to the others: a cascade (Viola and Jones, "Robust
-        real-time face detection", IJCV 2004).
+        network leaves below a margin of -1.2 are not passed to the others: a cascade (Viola and Jones,
+        "Robust real-time face detection", IJCV 2004).
         """
         outputs = self.networks[0].outputs(inputs)
         rows = np.flatnonzero(self._blend(margins, outputs[:, 0]) >= _NEXT_NETWORK_MIN)

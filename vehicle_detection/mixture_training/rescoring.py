@@ -51,7 +51,7 @@ _BOX_WEIGHT, _SMOOTH = 1.0, 0.05
 _MIN_POSITIVE_IOU, _NEGATIVE_IOU = 0.5, (0.1, 0.4)
 # Positive copies of a labelled box and their jitter, negatives beside each box, and the narrowest label.
 _COPIES, _JITTER_SCALE, _BESIDE, _MIN_WIDTH = 2, 0.12, 2, 20.0
-# Minimum margin and greatest number of the proposals in a frame to train on.
+# Minimum margin and greatest number of the proposals in a frame to train on; more do not help.
 _MIN_MARGIN, _MAX_PROPOSALS = -1.3, 60
 _MAX_SHIFT = 0.6  # of an edge of a positive box, as a fraction of the box's side
 # Random contrast of edges and saturation of colors (standard deviations of their logarithms), and tint.
