@@ -17,7 +17,6 @@ Felzenszwalb et al. (PAMI 2010), section 3, for linear templates as filters over
 
 from __future__ import annotations
 
-import threading
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -97,7 +96,7 @@ class FrameSearch(ABC):
 
     def __init__(self, n_jobs: int | None) -> None:
         self._team = ThreadTeam(n_jobs, name="search")
-        self._local = threading.local()
+        self.workspace = Workspace()
 
     def find(
         self, frame: NDArray[np.uint8], params: Any = None, *, min_vehicle_score: float = 0.0
@@ -133,12 +132,6 @@ class FrameSearch(ABC):
         self, frame: NDArray[np.uint8], params: Any, min_vehicle_score: float
     ) -> tuple[Detections, Detections | None]:
         """Windows and vehicles of a valid frame."""
-
-    @property
-    def workspace(self) -> Workspace:
-        """Scratch arrays of the calling thread."""
-        workspace: Workspace = self._local.__dict__.setdefault("workspace", Workspace())
-        return workspace
 
     def close(self) -> None:
         """Stop the threads; they start again on the next search."""

@@ -1,3 +1,5 @@
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
@@ -68,3 +70,11 @@ def test_memory_with_an_unknown_end_is_copied():
 
 def test_the_spare_memory_is_enough_for_every_processor():
     assert max(float_block().columns, byte_block().columns) <= SPARE
+
+
+def test_threads_do_not_share_arrays():
+    workspace = Workspace()
+    own = workspace.take((3, 5), np.int32, "a")
+    with ThreadPoolExecutor(1) as pool:
+        assert not np.shares_memory(own, pool.submit(workspace.take, (3, 5), np.int32, "a").result())
+    assert workspace.take((3, 5), np.int32, "a") is own

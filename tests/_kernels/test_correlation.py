@@ -16,6 +16,7 @@ from vehicle_detection._kernels.vector import (
     byte_block,
     float_block,
     pack_bytes,
+    transposer,
     unpack_bytes,
 )
 
@@ -311,3 +312,19 @@ def test_code_for_another_processor_uses_no_special_instructions():
     with mock.patch.object(numba.config, "CPU_NAME", "generic"):
         assert float_block() == Block(4, 3, 4)
         assert byte_block() == Block(4, 3, 2)
+
+
+@pytest.mark.parametrize("lanes", [2, 4, 8, 16])
+def test_squares_of_numbers_are_transposed(lanes):
+    transpose = transposer(lanes)
+
+    @numba.njit
+    def run(values, out):
+        transpose(values, 5, 20, out, 3, 30)
+
+    values = np.random.default_rng(0).random((lanes + 2, 20), np.float32)
+    out = np.zeros((lanes + 1, 30), np.float32)
+    run(values.ravel(), out.reshape(-1))
+    expected = np.zeros_like(out)
+    expected[:lanes, 3 : 3 + lanes] = values.ravel()[5:-35].reshape(lanes, 20)[:, :lanes].T
+    np.testing.assert_array_equal(out, expected)

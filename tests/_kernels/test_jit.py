@@ -8,13 +8,13 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import vehicle_detection
-from vehicle_detection._kernels import suppress
+from vehicle_detection._kernels import group
 from vehicle_detection._kernels.jit import _Compilation
 
 
 def test_compiling_kernels_is_logged_once_and_other_functions_are_not(caplog):
     compilation = _Compilation()
-    functions = logging.getLogger, suppress, suppress
+    functions = logging.getLogger, group, group
     with caplog.at_level(logging.INFO, "vehicle_detection._kernels"):
         for function in functions:
             dispatcher = SimpleNamespace(py_func=getattr(function, "py_func", function))
@@ -26,7 +26,7 @@ def test_compiling_kernels_is_logged_once_and_other_functions_are_not(caplog):
 
 def test_the_garbage_collector_pauses_while_kernels_are_compiled():
     compilation = _Compilation()
-    started = SimpleNamespace(data={"dispatcher": SimpleNamespace(py_func=suppress.py_func)})
+    started = SimpleNamespace(data={"dispatcher": SimpleNamespace(py_func=group.py_func)})
     assert gc.isenabled()
     compilation.on_start(started)
     compilation.on_start(started)
@@ -48,9 +48,9 @@ def test_a_change_of_another_kernel_file_is_noticed(tmp_path):
     copy = tmp_path / "vehicle_detection"
     shutil.copytree(package, copy, ignore=shutil.ignore_patterns("__pycache__", "*.safetensors"))
     code = (
-        "import numpy as np; from vehicle_detection._kernels import suppress;"
-        "suppress(np.zeros((1, 4)), np.zeros(1, int), 0.5, 0.5, 1);"
-        "print(sum(suppress.stats.cache_hits.values()))"
+        "import numpy as np; from vehicle_detection._kernels import group;"
+        "group(np.zeros((4, 1)), np.zeros(1, int), 0.5, 0.5, 1, *map(np.zeros, (1, (0, 4), 0)));"
+        "print(sum(group.stats.cache_hits.values()))"
     )
 
     def hits():

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from vehicle_detection._common import Workspace
 from vehicle_detection._kernels import Convolution, ConvolutionalNetwork, network
 
 
@@ -56,11 +57,16 @@ def test_the_outputs_equal_the_reference(plain, shapes, channels, side, count, s
     rng = np.random.default_rng(seed)
     layers = random_layers(rng, channels, side, shapes)
     images = rng.normal(size=(channels, count, side, side)).astype(np.float32)
+    values = images.transpose(2, 0, 3, 1)
+    workspace = Workspace()
     with mock.patch.object(network, "_compiles", return_value=not plain):
-        outputs = ConvolutionalNetwork(layers)(images)
+        outputs = ConvolutionalNetwork(layers)(values)
+        ConvolutionalNetwork(layers)(1 - values, workspace)
+        repeated = ConvolutionalNetwork(layers)(values, workspace)
     expected = [reference(layers, images[:, number]) for number in range(count)]
     assert outputs.shape == (5, count)
     np.testing.assert_allclose(outputs.T, np.reshape(expected, (-1, 5)), rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(repeated, outputs)
 
 
 def test_the_kernel_is_used_here():
@@ -74,7 +80,7 @@ def test_a_kernel_that_does_not_compile_is_replaced(caplog):
     layer = Convolution(np.ones((1, 2, 2, 1), np.float32), np.float32([1]), 1)
     try:
         with mock.patch.object(network, "_run_layers", broken):
-            outputs = ConvolutionalNetwork([layer])(np.ones((1, 3, 2, 2), np.float32))
+            outputs = ConvolutionalNetwork([layer])(np.ones((2, 1, 2, 3), np.float32))
     finally:
         network._compiles.cache_clear()
     np.testing.assert_array_equal(outputs, [[5, 5, 5]])

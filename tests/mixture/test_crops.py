@@ -4,11 +4,10 @@ import pytest
 
 from vehicle_detection.mixture import (
     N_CHANNELS,
-    N_COLOR_FEATURES,
     N_EDGE_FEATURES,
     EdgePyramid,
     edge_features,
-    rescoring_features,
+    rescoring_inputs,
 )
 from vehicle_detection.mixture.crops import window_grid
 from vehicle_detection.synthetic import render_scene
@@ -51,41 +50,45 @@ def test_small_boxes_at_the_border_of_a_frame():
 def test_rescoring_has_edge_features():
     image = np.random.default_rng(0).integers(0, 256, (120, 160, 3), dtype=np.uint8)
     pyramid = EdgePyramid(image)
-    edges, colors = rescoring_features(pyramid, BOXES)
-    np.testing.assert_array_equal(edges, edge_features(pyramid, BOXES))
-    assert colors.shape == (3, N_COLOR_FEATURES)
-    assert edges.dtype == colors.dtype == np.float32
+    inputs = rescoring_inputs(pyramid, BOXES)
+    assert inputs.shape == (12, 23, 12, 3)
+    assert inputs.dtype == np.float32
+    edges = inputs[:, :20].transpose(3, 1, 0, 2).reshape(3, -1)
+    np.testing.assert_allclose(edges, edge_features(pyramid, BOXES) * 5 - 0.5, atol=1e-6)
 
 
 def test_no_boxes():
     pyramid = EdgePyramid(np.zeros((120, 160, 3), np.uint8))
     assert edge_features(pyramid, BOXES[:0]).shape == (0, N_EDGE_FEATURES)
-    for part, length in zip(rescoring_features(pyramid, BOXES[:0]), (N_EDGE_FEATURES, N_COLOR_FEATURES)):
-        assert part.shape == (0, length)
+    assert rescoring_inputs(pyramid, BOXES[:0]).shape == (12, 23, 12, 0)
+
+
+def colors_of(image, box):
+    """Lightness, a and b of the cells of a box."""
+    return rescoring_inputs(EdgePyramid(image), np.array([box]))[:, 20:, :, 0].swapaxes(0, 1)
 
 
 def test_colors_are_standardized_lightness_and_scaled_a_and_b():
     image = np.zeros((120, 120, 3), np.uint8)
     image[:, :60], image[:, 60:] = (200, 40, 40), (40, 40, 200)
-    _, (colors,) = rescoring_features(EdgePyramid(image), np.array([[20.0, 20.0, 100.0, 100.0]]))
-    lightness, a, b = colors.reshape(3, 12, 12)
+    lightness, a, b = colors_of(image, [20.0, 20.0, 100.0, 100.0])
     assert abs(float(lightness.mean())) < 1e-5
     expected = cv2.cvtColor(np.float32([[[200, 40, 40], [40, 40, 200]]]) / 255, cv2.COLOR_RGB2LAB)[0]
     for column, lab in ((2, expected[0]), (9, expected[1])):
-        np.testing.assert_allclose(a[:, column] * 20, lab[1], atol=0.1)
-        np.testing.assert_allclose(b[:, column] * 20, lab[2], atol=0.1)
-    # Half of the cells are darker by `step`; the divisor is the standard deviation and 5 more.
+        np.testing.assert_allclose(a[:, column] * 40, lab[1], atol=0.1)
+        np.testing.assert_allclose(b[:, column] * 40, lab[2], atol=0.1)
+    # Half of the cells are darker by `step`; the divisor is twice the standard deviation and 10 more.
     step = expected[0, 0] - expected[1, 0]
-    np.testing.assert_allclose(lightness[:, 2] - lightness[:, 9], step / (step / 2 + 5), rtol=0.01)
+    np.testing.assert_allclose(lightness[:, 2] - lightness[:, 9], step / (step + 10), rtol=0.01)
 
 
 def test_a_box_fills_the_cells_in_the_middle_of_its_crop():
     image = np.zeros((160, 160, 3), np.uint8)
     image[40:120, 32:128] = (200, 0, 0)
-    _, (colors,) = rescoring_features(EdgePyramid(image), np.array([[32.0, 40.0, 128.0, 120.0]]))
+    _, a, _ = colors_of(image, [32.0, 40.0, 128.0, 120.0])
     expected = np.zeros((12, 12), bool)
     expected[2:10, 2:10] = True
-    np.testing.assert_array_equal(colors.reshape(3, 12, 12)[1] > 1, expected)
+    np.testing.assert_array_equal(a > 0.5, expected)
 
 
 def test_the_grid_of_a_window_has_the_box_in_its_middle():
@@ -97,10 +100,8 @@ def test_the_grid_of_a_window_has_the_box_in_its_middle():
 
 def test_lightness_features_hardly_depend_on_exposure():
     ramp = np.tile(np.linspace(40, 200, 120)[None, :, None], (120, 1, 3))
-    box = np.array([[20.0, 20.0, 100.0, 100.0]])
     bright, dark = (
-        rescoring_features(EdgePyramid((ramp * exposure).astype(np.uint8)), box)[1][0, :144]
-        for exposure in (1.0, 0.6)
+        colors_of((ramp * exposure).astype(np.uint8), [20.0, 20.0, 100.0, 100.0])[0] for exposure in (1, 0.6)
     )
-    assert np.abs(bright - dark).max() < 0.2
-    assert bright.std() > 0.7
+    assert np.abs(bright - dark).max() < 0.1
+    assert bright.std() > 0.35

@@ -1,4 +1,6 @@
+import contextlib
 import math
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -294,7 +296,7 @@ def test_neither_memory_nor_threads_change_the_result():
             np.testing.assert_array_equal(one.sums, two.sums)
         grid = inner_grid(5.0, shape)
         packed = fresh.packed_channels(grid)
-        np.testing.assert_array_equal(reused.packed_channels(grid, workspace), packed)
+        np.testing.assert_array_equal(reused.packed_channels(grid), packed)
     team.close()
 
 
@@ -314,15 +316,35 @@ def test_octaves_halve_the_image():
     assert len(EdgePyramid(np.zeros((3, 5, 3), np.uint8)).octaves) == 1
 
 
+@pytest.mark.parametrize("shape", [(523, 301), (361, 40), (34, 33)])
+def test_an_octave_is_the_mean_of_2x2_pixels(shape):
+    # The first octave is computed in parts of the image.
+    image = noise(shape)
+    with contextlib.closing(ThreadTeam(2, name="test")) as team:
+        planes = [octave.planes for octave in EdgePyramid(image, team=team).octaves]
+    np.testing.assert_array_equal(planes[0], image.transpose(2, 0, 1))
+    for whole, half in pairwise(planes):
+        height, width = (2 * side for side in half.shape[1:])
+        padded = np.pad(whole, ((0, 0), (0, height), (0, width)), mode="edge")[:, :height, :width]
+        means = padded.reshape(3, height // 2, 2, width // 2, 2).mean(axis=(2, 4))
+        np.testing.assert_array_equal(half, np.floor(means + 0.5))
+
+
+def test_the_octaves_of_cells_of_several_sizes():
+    pyramid = EdgePyramid(noise((90, 160)))
+    sizes = np.random.default_rng(0).uniform(1, 60, 50)
+    found = pyramid.by_octave(sizes)
+    assert sorted(np.concatenate([rows for _, rows in found]).tolist()) == list(range(50))
+    for number, rows in found:
+        assert {octave_of(size, len(pyramid.octaves)) for size in sizes[rows].tolist()} == {number}
+
+
 def test_cells_have_at_most_three_squares_a_side():
     assert [octave_of(size, 9) for size in (2, 4, 11.9, 12, 23.9, 24, 48)] == [0, 0, 0, 1, 1, 2, 3]
     assert octave_of(500, 3) == 2
 
 
-def test_opencv_resizes_and_splits_into_the_given_arrays():
+def test_opencv_resizes_into_the_given_array():
     # The workspace saves nothing if OpenCV allocates an array of its own.
     memory = np.empty((20, 30), np.uint8)
     assert cv2.resize(noise((40, 60))[..., 0].copy(), (30, 20), dst=memory) is memory
-    planes, image = np.zeros((3, 40, 60), np.uint8), noise((40, 60))
-    cv2.split(image, list(planes))
-    np.testing.assert_array_equal(planes, image.transpose(2, 0, 1))

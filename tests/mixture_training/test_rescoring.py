@@ -5,8 +5,7 @@ import numpy as np
 
 from tests.helpers import SMALL_MIXTURE, drawn
 from vehicle_detection.boxes import iou_matrix
-from vehicle_detection.mixture import EdgePyramid, rescoring_features
-from vehicle_detection.mixture.rescoring import network_inputs
+from vehicle_detection.mixture import EdgePyramid, rescoring_inputs
 from vehicle_detection.mixture_training import FrameDataset, train_mixture
 from vehicle_detection.mixture_training import rescoring as training
 from vehicle_detection.mixture_training.rescoring import Samples, sample_boxes, train_rescorer
@@ -81,7 +80,7 @@ def test_a_mirrored_sample_is_that_of_the_mirrored_image():
     image = np.random.default_rng(3).integers(0, 256, (96, 96, 3), dtype=np.uint8)
     boxes = np.array([[16.0, 16.0, 80.0, 80.0]])
     seen, expected = (
-        network_inputs(*rescoring_features(EdgePyramid(np.ascontiguousarray(each)), boxes))
+        rescoring_inputs(EdgePyramid(np.ascontiguousarray(each)), boxes).transpose(1, 3, 0, 2)
         for each in (image, image[:, ::-1])
     )
     sample = Samples(seen, np.array([True]), np.float32([[0.1, 0.2, 0.3, 0.4]]))
@@ -135,8 +134,8 @@ def test_a_trained_rescorer_separates_vehicles_from_clutter(small_mixture):
     for frame in load_training_frames([FrameDataset("others", (drawn(range(12, 18)),))]):
         vehicles, clutter = sample_boxes(frame.image, frame, search, SMALL_MIXTURE, rng)
         for boxes, values in (vehicles, right), (clutter, wrong):
-            features = rescoring_features(EdgePyramid(frame.image), boxes)
-            values += rescorer.predict(network_inputs(*features), np.zeros(len(boxes)))[0].tolist()
+            inputs = rescoring_inputs(EdgePyramid(frame.image), boxes)
+            values += rescorer.predict(inputs, np.zeros(len(boxes)))[0].tolist()
     right, wrong = np.array(right), np.array(wrong)
     assert (right > 0).mean() > 0.8
     assert (wrong < 0).mean() > 0.8

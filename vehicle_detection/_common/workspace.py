@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,8 @@ SPARE = 64
 """Entries beyond the end of each array of a workspace: vectors are loaded there, and not used."""
 
 
-class Workspace:
-    """The scratch arrays of one thread, by name; with ``reuse=False`` each array is newly allocated."""
+class Workspace(threading.local):
+    """Scratch arrays by name, of each thread its own; with ``reuse=False`` each array is newly allocated."""
 
     def __init__(self, *, reuse: bool = True) -> None:
         self._reuse = reuse

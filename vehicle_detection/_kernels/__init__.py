@@ -11,7 +11,7 @@ from vehicle_detection._kernels.hog import (
 )
 from vehicle_detection._kernels.linear_svm import fit_svm, hinge_loss
 from vehicle_detection._kernels.network import Convolution, ConvolutionalNetwork
-from vehicle_detection._kernels.suppression import suppress, vote
+from vehicle_detection._kernels.suppression import group
 from vehicle_detection._kernels.vector import BYTE_LIMIT
 from vehicle_detection._kernels.yuv import channels_from_planes, planes_from_channels
 
@@ -27,10 +27,9 @@ __all__ = [
     "channels_from_planes",
     "degree_bounds",
     "fit_svm",
+    "group",
     "hinge_loss",
     "orientation_cotangents",
     "planes_from_channels",
     "sqrt_gradients",
-    "suppress",
-    "vote",
 ]

@@ -26,7 +26,10 @@ from vehicle_detection._kernels.vector import (
 )
 
 _FLOATS, _BYTES = float_block(), byte_block()
+_LANES = _FLOATS.lanes
 _add_products = block_adder(_FLOATS, _BYTES)
+# For at most one vector of each row.
+_add_few = block_adder(_FLOATS._replace(vectors=1), _BYTES._replace(vectors=1))
 
 Blocks = NDArray[np.int64]
 """What to multiply, one block of rows of a template in each row: first and last of its entries of `weights`,
@@ -267,9 +270,14 @@ def _sum_blocks(channels, weights, blocks, sums, stride, dilation, tile):
                 if x < width and row_start <= y < row_stop:
                     start = channel * total + y * columns + x
                     position, row_step = place + y * stride + x, dilation * stride
-                    _add_products(
-                        weights, first, last, cells, start, total, dilation, sums, position, row_step
-                    )
+                    if width - x > _LANES:
+                        _add_products(
+                            weights, first, last, cells, start, total, dilation, sums, position, row_step
+                        )
+                    else:
+                        _add_few(
+                            weights, first, last, cells, start, total, dilation, sums, position, row_step
+                        )
 
 
 @jit

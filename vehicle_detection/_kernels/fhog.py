@@ -12,13 +12,41 @@ import numba
 import numpy as np
 
 from vehicle_detection._kernels.jit import inlined, jit
-from vehicle_detection._kernels.vector import weighted_sum
+from vehicle_detection._kernels.vector import float_block, transposer, weighted_sum
 
 SQUARE, SMALL_SQUARE = 4, 2
 """Sides in pixels of the squares over which gradients are summed, and of those for crops of small cells."""
 
+# Numbers of a vector, and the transposition of a square of as many a side.
+_LANES = float_block().lanes
+_transpose = transposer(_LANES)
 # Replicated pixels left of the image in a row of square roots: a square, and a neighbor for its gradients.
 _LEFT = SQUARE + 1
+
+
+@jit
+def split_channels(image, first, last, channels, halves):
+    """Copy the channels of an image ``(H, W, 3)`` to ``(3, H, W)``, and average 2x2 pixels of each.
+
+    Only the rows from `first`, an even number, to before `last` are copied. An odd last row or column is
+    replicated. `halves` may have no rows: then nothing is averaged. OpenCV's functions take longer because
+    they do not leave the channels in the processor's cache in between.
+    """
+    height, width = channels.shape[1:]
+    for y in range(first, last):
+        row, red, green, blue = image[y].reshape(-1), channels[0, y], channels[1, y], channels[2, y]
+        for x in range(width):
+            red[x] = row[3 * x]
+            green[x] = row[3 * x + 1]
+            blue[x] = row[3 * x + 2]
+        if y // 2 < halves.shape[1] and (y % 2 or y + 1 == height):
+            for c in range(len(channels)):
+                above, below, half = channels[c, y - y % 2], channels[c, y], halves[c, y // 2]
+                for x in range(width // 2):
+                    sums = np.int32(above[2 * x]) + above[2 * x + 1] + below[2 * x] + below[2 * x + 1]
+                    half[x] = (sums + 2) >> 2
+                if width % 2:
+                    half[width // 2] = (np.int32(above[width - 1]) + below[width - 1] + 1) >> 1
 
 
 @jit
@@ -139,8 +167,8 @@ def _resample(sums, square, first, squares, grid, cells):
 
     `sums` and `square` are as in `orientation_sums`, with one column of squares beyond each side; `first` is
     the first row, and `squares` the number of rows that the image has. `grid` is ``(4,)`` float64: left, top,
-    width and height of its first cell in squares. `cells` is the output ``(16, rows + 2, columns + 2)``, in
-    gray levels of the mean gradient.
+    width and height of its first cell in squares. `cells` is the output ``(16, rows, columns)`` of at least
+    `_LANES` columns, in gray levels of the mean gradient.
     """
     _, rows, columns = cells.shape
     step_x, step_y = grid[2], grid[3]
@@ -158,6 +186,7 @@ def _resample(sums, square, first, squares, grid, cells):
     count = 16 * (high - low)
     flat = sums.reshape(len(sums), -1)
     line, row = np.empty(count, np.float32), np.empty((columns, 16), np.float32)
+    row_values, cell_values, size = row.reshape(-1), cells.reshape(-1), rows * columns
     scale = np.float32(1 / (square * square))
     for y in range(rows):
         for tap in range(taps_y):
@@ -176,10 +205,11 @@ def _resample(sums, square, first, squares, grid, cells):
                     line[i] += weight * source[i]
         for x in range(columns):
             weighted_sum(line, index_x[x], weights_x[x], taps_x, row[x])
-        for k in range(len(cells)):
-            out = cells[k, y]
-            for x in range(columns):
-                out[x] = row[x, k]
+        # The last squares of numbers overlap those before.
+        for k in range(0, len(cells), _LANES):
+            for first_x in range(0, columns, _LANES):
+                x = min(first_x, columns - _LANES)
+                _transpose(row_values, 16 * x + k, 16, cell_values, (k * rows + y) * columns + x, size)
 
 
 @inlined
@@ -236,24 +266,30 @@ def _normalize_row(cells, factors, y, channels):
             out[x] *= texture_scale
 
 
+def cells_shape(rows: int, columns: int) -> tuple[int, int, int]:
+    """Shape of the memory of `cell_channels`, with cells around the grid and at least a vector of columns."""
+    return 16, rows + 2, max(columns + 2, _LANES)
+
+
 @jit
-def cell_channels(sums, square, first, squares, grids, eps, scales, cells, channels, packed):
+def cell_channels(sums, square, first, squares, grids, chosen, eps, scales, cells, channels, packed):
     """FHOG channels of several grids of cells, as numbers or as bytes in words of 32 bits.
 
-    `sums`, `square`, `first` and `squares` are as in `_resample`, and `grids` is ``(N, 4)``. `eps` is added
-    to the energy of a block. `cells` is memory for one grid, ``(16, rows + 2, columns + 2)`` float32.
+    `sums`, `square`, `first` and `squares` are as in `_resample`, `grids` is ``(N, 4)``, and `chosen` lists
+    those to compute. `eps` is added to the energy of a block. `cells` is memory for one grid, float32 of the
+    shape that `cells_shape` returns.
 
     One of the outputs may be empty: `channels` is ``(N, 20, rows, columns)`` float32, and `packed`
     ``(N, 5, rows, columns)`` int32: the value of channel `k` is multiplied by ``scales[k]`` and rounded; the
     first of a word's 4 channels is in the lowest bits. Both are one kernel because most of the time of
     compiling it goes into what they share.
     """
-    _, rows, columns = cells.shape
-    rows, columns = rows - 2, columns - 2
-    factors = np.empty((rows + 1, columns + 1), np.float32)
+    rows = max(channels.shape[2], packed.shape[2])
+    columns = max(channels.shape[3], packed.shape[3])
+    factors = np.empty((rows + 1, cells.shape[2] - 1), np.float32)
     line = np.empty((20, columns), np.float32)
     half, limit = np.float32(0.5), np.float32(127)
-    for number in range(len(grids)):
+    for number in chosen:
         _resample(sums, square, first, squares, grids[number], cells)
         _block_factors(cells, eps, factors)
         for y in range(rows):
@@ -279,17 +315,18 @@ def cell_channels(sums, square, first, squares, grids, eps, scales, cells, chann
 
 
 @jit
-def cell_means(planes, grids, means):
+def cell_means(planes, grids, chosen, means):
     """Mean values of an image in the cells of several grids, with replicated borders.
 
     `planes` is ``(3, H, W)`` uint8, `grids` ``(N, 4)`` the left, top, width and height of their first cells
-    in pixels, and `means` the output ``(N, rows, columns, 3)`` float32. Cells are rounded to whole pixels.
+    in pixels, `chosen` those to compute, and `means` the output ``(N, rows, columns, 3)`` float32. Cells are
+    rounded to whole pixels.
     """
     height, width = planes.shape[1:]
     rows, columns = means.shape[1:3]
     sums, bounds = np.empty(width, np.int32), np.empty((columns, 2), np.int64)
-    for number in range(len(grids)):
-        left, top, step_x, step_y = grids[number]
+    for number in chosen:
+        left, top, step_x, step_y = grids[number, 0], grids[number, 1], grids[number, 2], grids[number, 3]
         for column in range(columns):
             start = math.floor(left + column * step_x + 0.5)
             bounds[column, 0] = start
@@ -299,7 +336,7 @@ def cell_means(planes, grids, means):
         for row in range(rows):
             start_y = math.floor(top + row * step_y + 0.5)
             stop_y = max(math.floor(top + (row + 1) * step_y + 0.5), start_y + 1)
-            for c in range(3):
+            for c in range(len(planes)):
                 # Down the columns of pixels first, many at a time.
                 for x in range(count):
                     sums[x] = 0

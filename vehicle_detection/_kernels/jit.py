@@ -26,6 +26,7 @@ def jit(function: Callable[..., Any], *, reorder: bool = False) -> Callable[...,
         nogil=True,
         error_model="numpy",
         boundscheck=False,
+        no_cfunc_wrapper=True,
         fastmath={"reassoc", "contract", "nsz"} if reorder else False,
     )
     try:

@@ -11,14 +11,17 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from vehicle_detection._common import NEW_ARRAYS, SPARE
+from vehicle_detection._common import NEW_ARRAYS, Workspace, with_spare
 from vehicle_detection._kernels.jit import compiles, inlined, jit
 from vehicle_detection._kernels.vector import block_adder, byte_block, float_block
 
 Singles = NDArray[np.float32]
 
 _BLOCK = float_block()
+_LANES = _BLOCK.lanes
 _add_products = block_adder(_BLOCK, byte_block())
+# For at most one vector of each row.
+_add_few = block_adder(_BLOCK._replace(vectors=1), byte_block())
 
 
 class Convolution(NamedTuple):
@@ -30,13 +33,13 @@ class Convolution(NamedTuple):
 
 
 class ConvolutionalNetwork:
-    """Layers of convolutions with rectified outputs, except for the last, which has one output per image.
+    """Layers of convolutions with rectified outputs, except for the last, which has one row and column.
 
     The outputs for an image do not depend on the others, and one thread computes them; except where the
     kernel does not compile, so that numpy computes them.
 
     >>> layer = Convolution(np.ones((1, 2, 2, 1), np.float32), np.float32([1]), 1)
-    >>> ConvolutionalNetwork([layer])(np.ones((1, 3, 2, 2), np.float32))
+    >>> ConvolutionalNetwork([layer])(np.ones((2, 1, 2, 3), np.float32))
     array([[5., 5., 5.]], dtype=float32)
     """
 
@@ -59,21 +62,35 @@ class ConvolutionalNetwork:
         self._table = np.array(table, np.int64)
         self._weights, self._biases = (np.concatenate(each).astype(np.float32) for each in (weights, biases))
 
-    def __call__(self, images: Singles) -> Singles:
-        """Return ``(outputs, N)`` of square images ``(channels, N, rows, columns)``."""
+    def __call__(self, images: Singles, workspace: Workspace = NEW_ARRAYS) -> Singles:
+        """Return ``(outputs, N)`` of square images ``(rows, channels, columns, N)``.
+
+        With a workspace, they are valid until the next call in the same thread.
+        """
         if not _compiles():
             return self._run_plain(images)
-        channels, count, side, _ = images.shape
-        stride = self._layers[0].stride
-        values = NEW_ARRAYS.take((side, channels, side, count), np.float32, "values")
-        values[...] = images[..., _phases(side, stride)].transpose(2, 0, 3, 1)
+        side, count = images.shape[0], images.shape[-1]
+        if self._layers[0].stride > 1:
+            images = images[:, :, _phases(side, self._layers[0].stride)]
+        memory = self._memory(side, count, workspace)
         weights = self._table, self._weights, self._biases
-        outputs = _run_layers(values.ravel(), side, count, *weights, _BLOCK.rows, _BLOCK.columns)
+        values = with_spare(images).reshape(-1)
+        outputs = _run_layers(values, side, count, *weights, _BLOCK.rows, _BLOCK.columns, *memory)
         return cast("Singles", outputs)
+
+    def _memory(self, side: int, count: int, workspace: Workspace) -> list[Singles]:
+        """Memory for the sums of a row of a layer, and for the outputs of every other layer."""
+        sizes = [0, 0, 0]
+        for number, (blocks, outputs, _, kernel, stride) in enumerate(self._table[:, 2:].tolist()):
+            side = (side - kernel) // stride + 1
+            sizes[0] = max(sizes[0], blocks * _BLOCK.rows * (side * count + _BLOCK.columns))
+            sizes[1 + number % 2] = max(sizes[1 + number % 2], side * outputs * side * count)
+        names = "sums", "even layers", "odd layers"
+        return [workspace.take((size,), np.float32, name) for size, name in zip(sizes, names)]
 
     def _run_plain(self, images: Singles) -> Singles:
         """Compute the outputs with numpy."""
-        values = images.transpose(0, 2, 3, 1)
+        values = images.transpose(1, 0, 2, 3)
         for number, (weights, bias, stride) in enumerate(self._layers, 1):
             side = weights.shape[1]
             cells = sliding_window_view(values, (side, side), axis=(1, 2))[:, ::stride, ::stride]
@@ -91,11 +108,12 @@ def _phases(columns: int, stride: int) -> NDArray[np.intp]:
 @functools.cache
 def _compiles() -> bool:
     line, size = numba.float32[::1], numba.intp
-    return compiles(_run_layers, line, size, size, numba.int64[:, ::1], line, line, size, size)
+    arguments = line, size, size, numba.int64[:, ::1], line, line, size, size, line, line, line
+    return compiles(_run_layers, *arguments)
 
 
 @jit
-def _run_layers(values, side, count, table, weights, biases, block, tile):
+def _run_layers(values, side, count, table, weights, biases, block, tile, sums, even, odd):
     """Compute the outputs of a `ConvolutionalNetwork`, row by row of each layer.
 
     `values` are those of `count` images, ``(rows, channels, columns, count)``: a row of outputs is a sum of
@@ -103,7 +121,8 @@ def _run_layers(values, side, count, table, weights, biases, block, tile):
     are read up to a tile beyond the end of a row, also of the last one; sums of them are not used.
 
     `table` lists for each layer the places of its weights and biases, the blocks of `block` outputs, the
-    outputs, the channels, the side of the kernel, and the stride. `tile` is the columns of a block.
+    outputs, the channels, the side of the kernel, and the stride. `tile` is the columns of a block. `sums`,
+    `even` and `odd` are memory for the sums of a row of a layer, and for the outputs of every other layer.
     """
     for number in range(len(table)):
         first, first_bias, blocks, outputs, channels, kernel, stride = table[number]
@@ -112,13 +131,12 @@ def _run_layers(values, side, count, table, weights, biases, block, tile):
         factors = factors.reshape(blocks * taps, channels, block)
         across = (side - kernel) // stride + 1
         length = across * count + tile
-        sums = np.empty(blocks * block * length, np.float32)
-        found = np.empty(across * outputs * across * count + SPARE, np.float32)
+        found = odd if number % 2 else even
         last = number + 1 == len(table)
         next_stride = 1 if last else table[number + 1, 6]
         lowest = np.float32(-np.inf if last else 0)
         for y in range(across):
-            for place in range(len(sums)):
+            for place in range(blocks * block * length):
                 sums[place] = 0
             for x in range(0, across * count, tile):
                 for part in range(blocks):
@@ -129,18 +147,14 @@ def _run_layers(values, side, count, table, weights, biases, block, tile):
                         for phase in range(stride):
                             stop = tap + (kernel - phase + stride - 1) // stride
                             place = start + _place(phase, side, stride) * count
-                            if tap < stop:
+                            step = side * count
+                            if tap < stop and across * count - x > _LANES:
                                 _add_products(
-                                    factors,
-                                    tap,
-                                    stop,
-                                    values,
-                                    place,
-                                    side * count,
-                                    count,
-                                    sums,
-                                    position,
-                                    length,
+                                    factors, tap, stop, values, place, step, count, sums, position, length
+                                )
+                            elif tap < stop:
+                                _add_few(
+                                    factors, tap, stop, values, place, step, count, sums, position, length
                                 )
                             tap = stop
             for output in range(outputs):

@@ -1,76 +1,68 @@
-"""Numba kernels of greedy non-maximum suppression and of the voting of windows."""
+"""Numba kernel of greedy non-maximum suppression and of the voting of boxes."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from vehicle_detection._kernels.jit import inlined, jit
+from vehicle_detection._kernels.jit import jit
 
 _TINY = float(np.finfo(np.float64).tiny)
 
 
-@inlined
-def _overlaps(boxes, best, iou, coverage):
-    """IoU of one box with all boxes, and the shared fraction of the smaller box of each pair."""
-    x1, y1, x2, y2 = boxes[best]
-    area = (x2 - x1) * (y2 - y1)
-    for row in range(len(boxes)):
-        width = max(min(boxes[row, 2], x2) - max(boxes[row, 0], x1), 0.0)
-        height = max(min(boxes[row, 3], y2) - max(boxes[row, 1], y1), 0.0)
-        shared = width * height
-        other = (boxes[row, 2] - boxes[row, 0]) * (boxes[row, 3] - boxes[row, 1])
-        iou[row] = shared / max(other + area - shared, _TINY)
-        coverage[row] = shared / max(min(other, area), _TINY)
-
-
 @jit
-def suppress(boxes, order, max_iou, max_coverage, max_boxes):
-    """Rows that greedy non-maximum suppression keeps, at most `max_boxes`, in the order of `order`.
+def group(sides, order, max_iou, max_coverage, max_groups, strengths, voted, mass):
+    """Group boxes by greedy non-maximum suppression, and let all boxes vote for the groups.
 
-    A row is dropped if its IoU with a kept box exceeds `max_iou`, or if they share more than the fraction
-    `max_coverage` of the smaller one.
+    `sides` is ``(4, N)``: left, top, right and bottom of the boxes. A box of `order` starts a group, unless
+    its IoU with the first box of another one exceeds `max_iou`, or they share more than the fraction
+    `max_coverage` of the smaller one. Returns the first boxes, at most `max_groups`.
+
+    The boxes that overlap a first box by more than `max_iou` vote with their `strengths` for its group. The
+    outputs are the mean boxes `voted` ``(K, 4)``, weighted by the squares of the strengths, and the sums of
+    the strengths `mass` ``(K,)``. Without rows of `voted` there is no vote.
     """
-    iou, coverage = np.empty(len(boxes)), np.empty(len(boxes))
-    dropped = np.empty(len(boxes), np.bool_)
-    dropped[:] = False
-    kept = np.empty(len(order), np.int64)
+    left, top, right, bottom = sides[0], sides[1], sides[2], sides[3]
+    areas, iou, sums = np.empty(len(left)), np.empty(len(left)), np.zeros(6)
+    for row in range(len(areas)):
+        areas[row] = (right[row] - left[row]) * (bottom[row] - top[row])
+    dropped = np.zeros(len(areas), np.bool_)
+    first = np.empty(len(order), np.int64)
     count = 0
-    for row in order:
-        if dropped[row]:
+    for best in order:
+        if dropped[best]:
             continue
-        if count == max_boxes:
+        if count == max_groups:
             break
-        kept[count] = row
+        x1, y1, x2, y2, area = left[best], top[best], right[best], bottom[best], areas[best]
+        # The compiler computes several at a time because there is one output only.
+        for row in range(len(areas)):
+            width = max(min(right[row], x2) - max(left[row], x1), 0.0)
+            height = max(min(bottom[row], y2) - max(top[row], y1), 0.0)
+            shared = width * height
+            iou[row] = shared / max(areas[row] + area - shared, _TINY)
+        for row in range(len(areas)):
+            # A box without an area does not overlap itself.
+            if iou[row] > max_iou or row == best:
+                dropped[row] = True
+                if len(voted):
+                    weight = strengths[row] * strengths[row] if iou[row] > max_iou else 0.0
+                    weight = max(weight, 1e-9) if row == best else weight
+                    # Sums in memory: the compiler would add zeros for all other rows.
+                    sums[0] += weight
+                    sums[1] += strengths[row] if iou[row] > max_iou else 0.0
+                    for side in range(len(sides)):
+                        sums[2 + side] += weight * sides[side, row]
+            elif max_coverage < 1:
+                width = max(min(right[row], x2) - max(left[row], x1), 0.0)
+                height = max(min(bottom[row], y2) - max(top[row], y1), 0.0)
+                if width * height / max(min(areas[row], area), _TINY) > max_coverage:
+                    dropped[row] = True
+        if len(voted):
+            for side in range(len(sides)):
+                voted[count, side] = sums[2 + side] / sums[0]
+            mass[count] = sums[1]
+            for place in range(len(sums)):
+                sums[place] = 0.0
+        first[count] = best
         count += 1
-        _overlaps(boxes, row, iou, coverage)
-        for other in range(len(boxes)):
-            if iou[other] > max_iou or coverage[other] > max_coverage:
-                dropped[other] = True
-    return kept[:count]
-
-
-@jit
-def vote(boxes, strengths, kept, min_iou, voted, mass):
-    """Let all windows vote for the boxes of the `kept` ones that they overlap by more than `min_iou`.
-
-    The outputs are the mean boxes ``(K, 4)``, weighted by the squares of the `strengths`, and the sums of the
-    strengths, ``(K,)``.
-    """
-    iou, coverage = np.empty(len(boxes)), np.empty(len(boxes))
-    for number in range(len(kept)):
-        best = kept[number]
-        _overlaps(boxes, best, iou, coverage)
-        total = mass[number] = 0.0
-        voted[number] = 0.0
-        for row in range(len(boxes)):
-            if iou[row] > min_iou or row == best:
-                weight = strengths[row] * strengths[row]
-                if row == best:
-                    weight = max(weight if iou[row] > min_iou else 0.0, 1e-9)
-                if iou[row] > min_iou:
-                    mass[number] += strengths[row]
-                total += weight
-                for side in range(4):
-                    voted[number, side] += weight * boxes[row, side]
-        for side in range(4):
-            voted[number, side] /= total
+    return first[:count]

@@ -261,6 +261,57 @@ def weighted_sum(_context: Any, values: Any, starts: Any, weights: Any, terms: A
     return signature, generate
 
 
+def transposer(lanes: int) -> Callable[..., None]:
+    """Build ``transpose(values, start, step, out, place, out_step)`` for squares of as many numbers a side.
+
+    For use in kernels. For all rows `r` and columns `c` of the square it does ::
+
+        out[place + c * out_step + r] = values[start + r * step + c]
+
+    Both arrays are 1-D, C-contiguous and float32, and `lanes` is a power of two. Nothing is checked. Parts of
+    1, 2, 4, ... numbers a side change places: Eklundh, "A fast computer method for matrix transposing" (IEEE
+    Transactions on Computers, 1972).
+    """
+    vector, masks = ir.VectorType(ir.FloatType(), lanes), ir.VectorType(ir.IntType(32), lanes)
+
+    @intrinsic
+    def transpose(
+        _context: Any, values: Any, start: Any, step: Any, out: Any, place: Any, out_step: Any
+    ) -> Any:
+        signature = types.void(values, types.intp, types.intp, out, types.intp, types.intp)
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            source, target = (
+                context.make_array(signature.args[number])(context, builder, arguments[number]).data
+                for number in (0, 3)
+            )
+            _, start, step, _, place, out_step = arguments
+
+            def address(array: Any, first: Any, step: Any, number: int) -> Any:
+                offset = builder.mul(step, context.get_constant(types.intp, number))
+                return builder.bitcast(builder.gep(array, [builder.add(first, offset)]), vector.as_pointer())
+
+            rows = [builder.load(address(source, start, step, number)) for number in range(lanes)]
+            for row in rows:
+                row.align = 4
+            for size in (1 << bit for bit in range(lanes.bit_length() - 1)):
+                upper = [lanes + lane - size if lane & size else lane for lane in range(lanes)]
+                lower = [lanes + lane if lane & size else lane + size for lane in range(lanes)]
+                for number in range(lanes):
+                    if not number & size:
+                        pair = rows[number], rows[number + size]
+                        rows[number] = builder.shuffle_vector(*pair, ir.Constant(masks, upper))
+                        rows[number + size] = builder.shuffle_vector(*pair, ir.Constant(masks, lower))
+            for number, row in enumerate(rows):
+                stored = builder.store(row, address(target, place, out_step, number))
+                stored.align = 4
+            return context.get_dummy_value()
+
+        return signature, generate
+
+    return transpose  # type: ignore[no-any-return]
+
+
 def _broadcast(builder: Any, value: Any, vector: Any) -> Any:
     """Vector whose elements are all `value`."""
     undefined, index = ir.Constant(vector, ir.Undefined), ir.IntType(32)

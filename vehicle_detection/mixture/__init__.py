@@ -3,10 +3,11 @@
 from vehicle_detection.mixture.boxes import mostly_inside, nms, vote_boxes
 from vehicle_detection.mixture.crops import (
     CROP_CELLS,
-    N_COLOR_FEATURES,
+    EDGE_OFFSET,
     N_EDGE_FEATURES,
+    N_INPUTS,
     edge_features,
-    rescoring_features,
+    rescoring_inputs,
     window_grid,
 )
 from vehicle_detection.mixture.denoise import denoise
@@ -21,16 +22,13 @@ from vehicle_detection.mixture.features import (
 from vehicle_detection.mixture.haze import prepare, reduce_haze
 from vehicle_detection.mixture.model import TemplateMixture, load_model
 from vehicle_detection.mixture.rescoring import (
-    EDGE_OFFSET,
     KERNEL,
-    N_INPUTS,
     RESCORE_MIN,
     STRIDES,
     Layer,
     Network,
     Rescorer,
     last_cells,
-    network_inputs,
 )
 from vehicle_detection.mixture.search import MixtureSearch, frame_grid
 from vehicle_detection.mixture.template import MixtureTemplate, smallest_box
@@ -41,7 +39,6 @@ __all__ = [
     "KERNEL",
     "MIRROR_ORDER",
     "N_CHANNELS",
-    "N_COLOR_FEATURES",
     "N_EDGE_FEATURES",
     "N_INPUTS",
     "RESCORE_MIN",
@@ -62,11 +59,10 @@ __all__ = [
     "load_model",
     "mirror_channels",
     "mostly_inside",
-    "network_inputs",
     "nms",
     "prepare",
     "reduce_haze",
-    "rescoring_features",
+    "rescoring_inputs",
     "smallest_box",
     "vote_boxes",
     "window_grid",

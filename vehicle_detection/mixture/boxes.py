@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._kernels import suppress, vote
+from vehicle_detection._kernels import group
 from vehicle_detection.boxes import box_areas, clip_boxes, on_one_vehicle
 
 MIN_MARGIN = -1.0
@@ -83,10 +83,11 @@ def vote_boxes(
     """
     strengths = np.maximum(windows.margins - _VOTE_MARGIN, 0)
     order = np.flatnonzero(windows.margins >= min_margin)
-    kept = suppress(windows.boxes, order, _VOTE_IOU, np.inf, max_boxes)
-    boxes, vote_mass = np.empty((len(kept), 4)), np.empty(len(kept))
-    vote(windows.boxes, strengths, kept, _VOTE_IOU, boxes, vote_mass)
-    return ScoredWindows(boxes, windows.margins[kept], windows.templates[kept]), vote_mass
+    boxes, vote_mass = np.empty((max_boxes, 4)), np.empty(max_boxes)
+    sides = np.ascontiguousarray(windows.boxes.T)
+    kept = group(sides, order, _VOTE_IOU, np.inf, max_boxes, strengths, boxes, vote_mass)
+    grouped = ScoredWindows(boxes[: len(kept)], windows.margins[kept], windows.templates[kept])
+    return grouped, vote_mass[: len(kept)]
 
 
 def nms(
@@ -103,7 +104,9 @@ def nms(
     covered.
     """
     order = np.argsort(-scores, kind="stable")
-    return np.asarray(suppress(boxes, order, iou, cover, len(boxes) if max_boxes is None else max_boxes))
+    count = len(boxes) if max_boxes is None else max_boxes
+    sides = np.ascontiguousarray(boxes.T)
+    return np.asarray(group(sides, order, iou, cover, count, scores, np.empty((0, 4)), np.empty(0)))
 
 
 def whole_vehicles(boxes: Floats, margins: Floats) -> NDArray[np.intp]:

@@ -12,9 +12,11 @@ pyramids for object detection" (PAMI 2014), for features between the octaves.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -37,13 +39,14 @@ _COTANGENTS = (np.cos(_BIN_BOUNDS) / np.sin(_BIN_BOUNDS)).astype(np.float32)
 # Added to the energy of a block, in squared gray levels of the mean gradient. Noise of one gray level on a
 # medium gray surface has about this energy, and must not be normalized to full contrast.
 _EPS = np.float32(2)
-# In place of an output of the kernel that is not wanted.
+# The only grid of several, and what takes the place of an output of the kernel that is not wanted.
+_FIRST = np.zeros(1, np.intp)
 _NO_CHANNELS, _NO_WORDS = np.empty((0, 0, 0, 0), np.float32), np.empty((0, 0, 0, 0), np.int32)
 # Smallest cell of every octave but the first, in pixels of the resized frame: cells have 1.5 to 3 squares a
 # side. And the shortest side of a resized frame.
 _MIN_CELL, _MIN_SIDE = 6.0, 16
-# Rows of squares that one thread computes at a time.
-_PART_ROWS = 24
+# Rows of squares, and of pixels, that one thread computes at a time; the latter is even.
+_PART_ROWS, _SPLIT_ROWS = 24, 180
 # Largest values of an orientation and of a texture sum: four and sixteen terms of 0.2, weighted.
 _LARGEST = np.where(np.arange(N_CHANNELS) < 16, 0.4, 0.2357 * 16 * 0.2)
 
@@ -69,6 +72,11 @@ class CellGrid:
     step_y: float
     rows: int
     columns: int
+
+    @functools.cached_property
+    def first_cell(self) -> NDArray[np.float64]:
+        """Corner and size of the first cell, ``(1, 4)``."""
+        return np.array([[self.left, self.top, self.step_x, self.step_y]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,14 +107,25 @@ class Octave:
     def channels_of(
         self,
         grids: NDArray[np.float64],
+        chosen: NDArray[np.intp],
         cells: NDArray[np.float32],
         channels: NDArray[np.float32],
         packed: NDArray[np.int32],
     ) -> None:
-        """Compute the channels of grids, in squares; see `cell_channels` for the memory."""
+        """Compute the channels of the chosen grids, in squares; see `cell_channels` for the memory."""
         squares = -(-self.planes.shape[1] // SQUARE)
         _fhog_kernels.cell_channels(
-            self.sums, SQUARE, self.first, squares, grids, _EPS, CHANNEL_SCALES, cells, channels, packed
+            self.sums,
+            SQUARE,
+            self.first,
+            squares,
+            grids,
+            chosen,
+            _EPS,
+            CHANNEL_SCALES,
+            cells,
+            channels,
+            packed,
         )
 
 
@@ -121,8 +140,8 @@ class EdgePyramid:
         For each octave, the rows of the frame whose sums are needed; None or beyond the end: all rows. Cells
         elsewhere take the nearest known rows.
     workspace, team
-        Memory and threads of a search; with that memory, a pyramid is valid until the next one. The threads
-        also compute what follows from the pyramid.
+        Memory and threads of a search; with that memory, a pyramid is valid until the next one. Both also
+        serve what follows from the pyramid.
     """
 
     def __init__(
@@ -133,14 +152,10 @@ class EdgePyramid:
         team: ThreadTeam = CALLING_THREAD,
     ) -> None:
         self.shape = image.shape[0], image.shape[1]
-        self.team = team
-        planes = workspace.take((3, *self.shape), np.uint8, "planes 0")
-        cv2.split(image, list(planes))
+        self.workspace, self.team = workspace, team
         self.octaves: list[Octave] = []
         parts: list[Octave] = []
-        for number in range(octave_count(self.shape)):
-            if number:
-                planes = _half_size(planes, workspace, f"planes {number}")
+        for number, planes in enumerate(_octave_planes(image, workspace, team)):
             scale, squares = 2**number * SQUARE, -(-planes.shape[1] // SQUARE)
             top, bottom = row_ranges[number] if number < len(row_ranges) else (0, self.shape[0])
             # One row of squares beyond the image is the replica of its border.
@@ -152,77 +167,84 @@ class EdgePyramid:
             parts += octave.split(_PART_ROWS)
         team.map(Octave.compute, parts, cost=lambda part: part.sums.size)
 
-    def octave_of(self, cell_size: float) -> int:
-        """Octave from which cells of a size in pixels of the frame are interpolated."""
-        return octave_of(cell_size, len(self.octaves))
+    def by_octave(self, sizes: NDArray[np.float64]) -> list[tuple[int, NDArray[np.intp]]]:
+        """Octaves, and which of several cells each of them serves; sizes are in pixels of the frame."""
+        octaves = np.log2(np.maximum(sizes, _MIN_CELL) / _MIN_CELL).astype(np.intp)
+        octaves = np.minimum(octaves, len(self.octaves) - 1)
+        return [(number, np.flatnonzero(octaves == number)) for number in set(octaves.tolist())]
 
     def crops(self, grids: NDArray[np.float64], rows: int, columns: int) -> NDArray[np.float32]:
         """FHOG channels of several grids of as many cells, ``(N, 20, rows, columns)``.
 
         `grids` is ``(N, 4)``: left, top, width and height of each grid's first cell in pixels of the frame.
-        Small cells are computed from the pixels, in more detail than those of `feature_map`.
+        Small cells are computed from the pixels, in more detail than those of `feature_map`. With a workspace
+        for the pyramid, the channels are valid until the next call in the same thread.
         """
-        channels = np.empty((len(grids), N_CHANNELS, rows, columns), np.float32)
+        channels = self.workspace.take((len(grids), N_CHANNELS, rows, columns), np.float32, "crops")
+        cells = np.empty(_fhog_kernels.cells_shape(rows, columns), np.float32)
         sizes = np.sqrt(grids[:, 2] * grids[:, 3])
-        numbers = np.array([octave_of(size, len(self.octaves)) for size in sizes.tolist()], np.intp)
-        numbers[sizes < _MIN_CELL] = -1
-        for number in np.unique(numbers).tolist():
-            chosen = numbers == number
-            found = np.empty((int(chosen.sum()), *channels.shape[1:]), np.float32)
-            if number < 0:
-                self._compute_small(grids[chosen], found)
-            else:
-                self._interpolate(number, grids[chosen], found)
-            channels[chosen] = found
+        for number, chosen in self.by_octave(sizes):
+            if number == 0:
+                self._compute_small(grids, np.flatnonzero(sizes < _MIN_CELL), cells, channels)
+                chosen = chosen[sizes[chosen] >= _MIN_CELL]
+            scaled = grids / (SQUARE * 2**number)
+            self.octaves[number].channels_of(scaled, chosen, cells, channels, _NO_WORDS)
         return channels
 
-    def _interpolate(self, number: int, grids: NDArray[np.float64], channels: NDArray[np.float32]) -> None:
-        octave, scaled = self.octaves[number], grids / (SQUARE * 2**number)
-        cells = np.empty(_cells_shape(channels.shape), np.float32)
-        octave.channels_of(scaled, cells, channels, _NO_WORDS)
-
-    def _compute_small(self, grids: NDArray[np.float64], channels: NDArray[np.float32]) -> None:
-        """FHOG channels of grids of small cells, from small squares of the pixels around each."""
+    def _compute_small(
+        self,
+        grids: NDArray[np.float64],
+        chosen: NDArray[np.intp],
+        cells: NDArray[np.float32],
+        channels: NDArray[np.float32],
+    ) -> None:
+        """FHOG channels of the chosen grids of small cells, from small squares of the pixels around each."""
         planes, square = self.octaves[0].planes, _fhog_kernels.SMALL_SQUARE
-        shape, steps = np.array(planes.shape[:0:-1]), grids[:, 2:]
+        shape, corners, steps = np.array(planes.shape[:0:-1]), grids[:, :2], grids[:, 2:]
         # Two cells and two squares around the grid; the image's own border is replicated.
-        ends = grids[:, :2] + (np.array(channels.shape[:1:-1]) + 2) * steps
-        low = (np.floor(grids[:, :2] - 2 * steps) - 2 * square).clip(0, shape - 1).astype(np.intp)
+        ends = corners + (np.array(channels.shape[:1:-1]) + 2) * steps
+        low = (np.floor(corners - 2 * steps) - 2 * square).clip(0, shape - 1).astype(np.intp)
         high = (np.ceil(ends) + 2 * square).clip(low + 1, shape).astype(np.intp)
-        scaled = np.hstack([grids[:, :2] - low, steps]) / square
-        cells = np.empty(_cells_shape(channels.shape), np.float32)
-        for number, ((left, top), (right, bottom)) in enumerate(zip(low.tolist(), high.tolist())):
+        scaled = np.hstack([corners - low, steps]) / square
+        squares = (high - low + 1) // square
+        memory = np.empty((squares[chosen] + 2).prod(axis=1).max(initial=0) * 16, np.float32)
+        regions = np.hstack([low, high, squares])[chosen].tolist()
+        for number, (left, top, right, bottom, across, down) in zip(chosen[:, None], regions):
             region = np.ascontiguousarray(planes[:, top:bottom, left:right])
-            down, across = (bottom - top + 1) // square, (right - left + 1) // square
-            sums = np.empty((down + 2, across + 2, 16), np.float32)
+            sums = memory[: (down + 2) * (across + 2) * 16].reshape(down + 2, across + 2, 16)
             _fhog_kernels.orientation_sums(region, _COTANGENTS, square, -1, sums)
-            outputs = channels[number : number + 1], _NO_WORDS
-            grid = scaled[number : number + 1]
-            _fhog_kernels.cell_channels(sums, square, -1, down, grid, _EPS, CHANNEL_SCALES, cells, *outputs)
+            _fhog_kernels.cell_channels(
+                sums, square, -1, down, scaled, number, _EPS, CHANNEL_SCALES, cells, channels, _NO_WORDS
+            )
 
     def feature_map(self, grid: CellGrid) -> FeatureMap:
         """FHOG channels of one grid."""
-        corner = np.array([[grid.left, grid.top, grid.step_x, grid.step_y]])
         channels = np.empty((1, N_CHANNELS, grid.rows, grid.columns), np.float32)
-        self._interpolate(self.octave_of(math.sqrt(grid.step_x * grid.step_y)), corner, channels)
+        cells = np.empty(_fhog_kernels.cells_shape(grid.rows, grid.columns), np.float32)
+        self._grid_channels(grid, cells, channels, _NO_WORDS)
         return FeatureMap(channels[0], grid)
 
-    def packed_channels(self, grid: CellGrid, workspace: Workspace = NEW_ARRAYS) -> NDArray[np.int32]:
+    def packed_channels(self, grid: CellGrid) -> NDArray[np.int32]:
         """FHOG channels of a grid, times `CHANNEL_SCALES` and rounded, as words of four channels.
 
         ``(words, rows, columns)``; the value of a word's first channel is in its lowest bits.
         """
-        number = self.octave_of(math.sqrt(grid.step_x * grid.step_y))
-        cells = workspace.take((16, grid.rows + 2, grid.columns + 2), np.float32, "cells")
-        packed = workspace.take((1, N_CHANNELS // 4, grid.rows, grid.columns), np.int32, "packed")
-        corner = np.array([[grid.left, grid.top, grid.step_x, grid.step_y]]) / (SQUARE * 2**number)
-        self.octaves[number].channels_of(corner, cells, _NO_CHANNELS, packed)
+        shape = _fhog_kernels.cells_shape(grid.rows, grid.columns)
+        cells = self.workspace.take(shape, np.float32, "cells")
+        packed = self.workspace.take((1, N_CHANNELS // 4, grid.rows, grid.columns), np.int32, "packed")
+        self._grid_channels(grid, cells, _NO_CHANNELS, packed)
         return np.asarray(packed[0])
 
-
-def _cells_shape(channels: tuple[int, ...]) -> tuple[int, ...]:
-    """Shape of the cells of a grid with channels of shape ``(N, 20, rows, columns)``, and those around it."""
-    return 16, channels[2] + 2, channels[3] + 2
+    def _grid_channels(
+        self,
+        grid: CellGrid,
+        cells: NDArray[np.float32],
+        channels: NDArray[np.float32],
+        packed: NDArray[np.int32],
+    ) -> None:
+        number = octave_of(math.sqrt(grid.step_x * grid.step_y), len(self.octaves))
+        first_cell = grid.first_cell / (SQUARE * 2**number)
+        self.octaves[number].channels_of(first_cell, _FIRST, cells, channels, packed)
 
 
 def octave_count(shape: tuple[int, ...]) -> int:
@@ -235,13 +257,32 @@ def octave_of(cell_size: float, count: int) -> int:
     return min(max(math.floor(math.log2(cell_size / _MIN_CELL)), 0), count - 1)
 
 
-def _half_size(planes: NDArray[np.uint8], workspace: Workspace, name: str) -> NDArray[np.uint8]:
+def _octave_planes(
+    image: NDArray[np.uint8], workspace: Workspace, team: ThreadTeam
+) -> list[NDArray[np.uint8]]:
+    """Channels of an image at 1, 1/2, 1/4, ... of its size, ``(3, H, W)`` each; sides are rounded up."""
+    height, width = image.shape[:2]
+    planes = []
+    for number in range(octave_count(image.shape)):
+        planes.append(workspace.take((3, height, width), np.uint8, f"planes {number}"))
+        height, width = -(-height // 2), -(-width // 2)
+    image = np.ascontiguousarray(image)
+    halves = planes[1] if len(planes) > 1 else np.empty((3, 0, 0), np.uint8)
+
+    def split(first: int) -> None:
+        last = min(first + _SPLIT_ROWS, len(image))
+        _fhog_kernels.split_channels(image, first, last, planes[0], halves)
+
+    team.map(split, range(0, len(image), _SPLIT_ROWS), cost=lambda first: -first)
+    for whole, half in pairwise(planes[1:]):
+        _half_size(whole, half)
+    return planes
+
+
+def _half_size(planes: NDArray[np.uint8], halves: NDArray[np.uint8]) -> None:
     """Average 2x2 pixels; an odd last row or column is replicated first."""
-    odd = planes.shape[1] % 2, planes.shape[2] % 2
-    if any(odd):
-        planes = np.pad(planes, ((0, 0), (0, odd[0]), (0, odd[1])), mode="edge")
-    height, width = planes.shape[1] // 2, planes.shape[2] // 2
-    half = workspace.take((3, height, width), np.uint8, name)
-    for plane, out in zip(planes, half):
-        cv2.resize(plane, (width, height), dst=out, interpolation=cv2.INTER_AREA)
-    return half
+    below, right = planes.shape[1] % 2, planes.shape[2] % 2
+    for plane, half in zip(planes, halves):
+        if below or right:
+            plane = cv2.copyMakeBorder(plane, 0, below, 0, right, cv2.BORDER_REPLICATE)
+        cv2.resize(plane, half.shape[::-1], dst=half, interpolation=cv2.INTER_AREA)

@@ -33,7 +33,10 @@ def relative_contrast(image: NDArray[np.uint8]) -> float:
     rows = image[_ROW_STEP // 2 :: _ROW_STEP, : count * size, 1]
     if not rows.size or count < 2:
         return 1.0
-    blocks = rows.reshape(len(rows), count, size).mean(axis=2, dtype=np.float32)
+    sums = np.zeros((len(rows), count), np.uint32)
+    for column in range(size):
+        sums += rows[:, column::size]
+    blocks = (sums / size).astype(np.float32)
     return float(np.abs(np.diff(blocks, axis=1)).mean() / (blocks.mean() + 1))
 
 

@@ -11,21 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_number, finite_array
+from vehicle_detection._common import NEW_ARRAYS, Workspace, check_number, finite_array
 from vehicle_detection._kernels import Convolution, ConvolutionalNetwork
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture.crops import CROP_CELLS, rescoring_features
-from vehicle_detection.mixture.features import N_CHANNELS, EdgePyramid
+from vehicle_detection.mixture.crops import CROP_CELLS, N_INPUTS, rescoring_inputs
+from vehicle_detection.mixture.features import EdgePyramid
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-RESCORE_MIN = -1.1
-"""Minimum margin of a proposed box that is rescored."""
-
-N_INPUTS = N_CHANNELS + 3
-"""Channels of a crop: edges and colors."""
+RESCORE_MIN, RESCORE_AGAIN_MIN = -1.05, -1.1
+"""Minimum margin of a proposed box that is rescored, and of a rescored one that is rescored again."""
 
 KERNEL, STRIDES = 3, (1, 2, 1)
 """Side of the convolutions in cells, and the step of each."""
@@ -36,13 +33,9 @@ MAX_CORRECTION = 0.4
 LAYERS = ("convolution 1", "convolution 2", "convolution 3", "hidden", "output")
 """Layers of the network."""
 
-EDGE_OFFSET = -0.5
-"""Input of the network where there is no edge."""
-
-# Range of edge channels to about -0.5 to 1.5, and of colors to about -1 to 1; log-odds are limited.
-_EDGE_SCALE, _COLOR_SCALE, _MAX_LOG_ODDS = 5, 0.5, 6
+_MAX_LOG_ODDS = 6  # that count
 # Minimum margin after the first network of a box that the other networks see.
-_NEXT_NETWORK_MIN = -1.2
+_NEXT_NETWORK_MIN = -1.0
 # Fewest boxes that a thread computes.
 _MIN_BOXES = 8
 
@@ -93,9 +86,9 @@ class Network:
         object.__setattr__(self, "layers", tuple(layers))
         object.__setattr__(self, "_kernel", ConvolutionalNetwork(_convolutions(layers)))
 
-    def outputs(self, inputs: Singles) -> Floats:
-        """Log-odds and shifts of the edges, ``(N, 5)``, of `network_inputs`."""
-        return self._kernel(inputs).T.astype(np.float64)
+    def outputs(self, inputs: Singles, workspace: Workspace = NEW_ARRAYS) -> Floats:
+        """Log-odds and shifts of the edges, ``(N, 5)``, of `rescoring_inputs`."""
+        return self._kernel(inputs, workspace).T.astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,18 +120,21 @@ class Rescorer:
         layers = [layer for network in self.networks for layer in network.layers]
         return sum(layer.weights.size + layer.bias.size for layer in layers)
 
-    def predict(self, inputs: Singles, margins: Floats) -> tuple[Floats, Floats]:
+    def predict(
+        self, inputs: Singles, margins: Floats, workspace: Workspace = NEW_ARRAYS
+    ) -> tuple[Floats, Floats]:
         """Log-odds ``(N,)`` and shifts of the edges ``(N, 4)``, as fractions of a box's sides, of crops.
 
-        `inputs` are `network_inputs`, and `margins` ``(N,)`` those of the templates. Boxes that the first
-        network leaves below a margin of -1.2 are not passed to the others: a cascade (Viola and Jones,
+        `inputs` are `rescoring_inputs`, and `margins` ``(N,)`` those of the templates. Boxes that the first
+        network leaves below a margin of -1 are not passed to the others: a cascade (Viola and Jones,
         "Robust real-time face detection", IJCV 2004).
         """
-        outputs = self.networks[0].outputs(inputs)
+        outputs = self.networks[0].outputs(inputs, workspace)
         rows = np.flatnonzero(self._blend(margins, outputs[:, 0]) >= _NEXT_NETWORK_MIN)
         if len(rows):
-            chosen = np.ascontiguousarray(inputs[:, rows])
-            others = [network.outputs(chosen) for network in self.networks[1:]]
+            chosen = workspace.take((*inputs.shape[:-1], len(rows)), np.float32, "chosen inputs")
+            np.take(inputs, rows, axis=-1, out=chosen, mode="clip")  # without a check of each row
+            others = [network.outputs(chosen, workspace) for network in self.networks[1:]]
             outputs[rows] = np.mean([outputs[rows], *others], axis=0)
         return outputs[:, 0], np.clip(outputs[:, 1:], -MAX_CORRECTION, MAX_CORRECTION)
 
@@ -148,8 +144,7 @@ class Rescorer:
             return boxes, margins
 
         def predict(rows: slice) -> tuple[Floats, Floats]:
-            inputs = network_inputs(*rescoring_features(pyramid, boxes[rows]))
-            return self.predict(inputs, margins[rows])
+            return self.predict(rescoring_inputs(pyramid, boxes[rows]), margins[rows], pyramid.workspace)
 
         count = max(min(pyramid.team.n_threads, len(boxes) // _MIN_BOXES), 1)
         bounds = [len(boxes) * part // count for part in range(count + 1)]
@@ -185,20 +180,6 @@ class Rescorer:
             layers = [Layer(tensors[f"{name}.weights"], tensors[f"{name}.bias"]) for name in names]
             networks.append(Network(tuple(layers)))
         return cls(tuple(networks), float(numbers["blend_weight"]))
-
-
-def network_inputs(edges: Singles, colors: Singles) -> Singles:
-    """Arrange `rescoring_features` as the network's inputs, ``(23, N, 12, 12)``."""
-    count = len(edges)
-    inputs = np.empty((N_INPUTS, count, CROP_CELLS**2), np.float32)
-    np.multiply(_channels_first(edges), np.float32(_EDGE_SCALE), out=inputs[:N_CHANNELS])
-    inputs[:N_CHANNELS] += np.float32(EDGE_OFFSET)
-    np.multiply(_channels_first(colors), np.float32(_COLOR_SCALE), out=inputs[N_CHANNELS:])
-    return inputs.reshape(N_INPUTS, count, CROP_CELLS, CROP_CELLS)
-
-
-def _channels_first(features: Singles) -> Singles:
-    return features.reshape(len(features), features.shape[1] // CROP_CELLS**2, CROP_CELLS**2).swapaxes(0, 1)
 
 
 def _convolutions(layers: Sequence[Layer]) -> list[Convolution]:

@@ -162,7 +162,7 @@ class MixtureSearch(FrameSearch):
 
     def _search_level(self, pyramid: EdgePyramid, level: _Level) -> NDArray[np.int32]:
         """Windows of all searches on the cells of one size, see `PackedSearch.find`."""
-        return level.search.find(pyramid.packed_channels(level.grid, self.workspace), self.workspace)
+        return level.search.find(pyramid.packed_channels(level.grid), self.workspace)
 
     def _to_windows(
         self, plan: _Plan, found: list[NDArray[np.int32]], shape: tuple[int, int]

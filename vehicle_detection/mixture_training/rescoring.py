@@ -28,8 +28,7 @@ from vehicle_detection.mixture import (
     Network,
     Rescorer,
     last_cells,
-    network_inputs,
-    rescoring_features,
+    rescoring_inputs,
 )
 from vehicle_detection.mixture_training.negatives import is_negative
 from vehicle_detection.mixture_training.positives import jitter_boxes
@@ -114,7 +113,7 @@ def _sample(
     if len(positives):
         labels = frame.boxes[iou_matrix(positives, frame.boxes).argmax(axis=1)]
         shifts[: len(positives)] = (labels - positives) / np.tile(positives[:, 2:] - positives[:, :2], 2)
-    inputs = network_inputs(*rescoring_features(EdgePyramid(image), boxes))
+    inputs = np.ascontiguousarray(rescoring_inputs(EdgePyramid(image), boxes).transpose(1, 3, 0, 2))
     is_vehicle = np.arange(len(boxes)) < len(positives)
     return Samples(inputs, is_vehicle, shifts.clip(-_MAX_SHIFT, _MAX_SHIFT))
 
