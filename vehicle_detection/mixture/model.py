@@ -40,7 +40,7 @@ from vehicle_detection.mixture.boxes import (
 )
 from vehicle_detection.mixture.features import EdgePyramid
 from vehicle_detection.mixture.perspective import perspective_ratios
-from vehicle_detection.mixture.rescoring import RESCORE_AGAIN_MIN, RESCORE_MIN, Rescorer
+from vehicle_detection.mixture.rescoring import RESCORE_MIN, Rescorer
 from vehicle_detection.mixture.template import MixtureTemplate
 from vehicle_detection.params import PyramidParams
 
@@ -254,7 +254,7 @@ class TemplateMixture:
         rows = nms(boxes, first)
         boxes, final = boxes[rows], first[rows]
         # Rows are sorted, best first.
-        again = slice(np.count_nonzero(final >= RESCORE_AGAIN_MIN))
+        again = slice(np.count_nonzero(final >= RESCORE_MIN))
         boxes[again], second = self.rescorer.apply(pyramid, boxes[again], margins[rows[again]])
         final[again] = (final[again] + second) / 2
         kept = nms(boxes, final)
