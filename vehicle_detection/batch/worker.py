@@ -26,8 +26,8 @@ def main() -> None:
     calls: queue.SimpleQueue[str | None] = queue.SimpleQueue()
     idle = threading.Event()
     idle.set()
-    threading.Thread(target=_receive, args=(calls, idle), daemon=True).start()
     with contextlib.suppress(KeyboardInterrupt, BrokenPipeError):  # the parent process is gone
+        threading.Thread(target=_receive, args=(calls, idle), daemon=True).start()
         while (line := calls.get()) is not None:
             answers.write(json.dumps(_call(json.loads(line))) + "\n")
             answers.flush()

@@ -33,7 +33,8 @@ MAX_CORRECTION = 0.4
 LAYERS = ("convolution 1", "convolution 2", "convolution 3", "hidden", "output")
 """Layers of the network."""
 
-_MAX_LOG_ODDS = 6  # that count
+# Log-odds of a network are limited.
+_MAX_LOG_ODDS = 6
 # Minimum margin after the first network of a box that the other networks see.
 _NEXT_NETWORK_MIN = -1.2
 # Fewest boxes that a thread computes.
