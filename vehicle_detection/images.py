@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 from pathlib import Path
 
@@ -27,10 +28,14 @@ _CUT_DIFFERENCE = 40.0
 
 def make_thumbnail(frame: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Gray thumbnail of a frame, ``(18, 32)`` float32, for `is_cut`; subsampling is enough for it."""
-    height, width = frame.shape[:2]
-    rows = np.linspace(0, height - 1, _THUMBNAIL_SHAPE[0]).astype(int)
-    columns = np.linspace(0, width - 1, _THUMBNAIL_SHAPE[1]).astype(int)
-    return np.asarray(frame[np.ix_(rows, columns)].mean(axis=2, dtype=np.float32))
+    return np.asarray(frame[_thumbnail_pixels(frame.shape[:2])].mean(axis=2, dtype=np.float32))
+
+
+@functools.lru_cache(8)
+def _thumbnail_pixels(shape: tuple[int, ...]) -> tuple[NDArray[np.intp], ...]:
+    """Rows and columns of the pixels of a thumbnail."""
+    sides = zip(shape, _THUMBNAIL_SHAPE)
+    return np.ix_(*(np.linspace(0, side - 1, count).astype(np.intp) for side, count in sides))
 
 
 def is_cut(first: NDArray[np.float32], second: NDArray[np.float32]) -> bool:

@@ -50,9 +50,9 @@ def split_channels(image, first, last, channels, halves):
 
 
 @jit
-def _sqrt_row(row, roots):
-    """Write ``sqrt(255 * value)`` of a row of pixels after `_LEFT` others, and replicate its ends."""
-    width = len(row)
+def _sqrt_row(row, left, right, roots):
+    """Write ``sqrt(255 * value)`` of a part of a row of pixels after `_LEFT` others; replicate its ends."""
+    width, row = right - left, row[left:right]
     scale = np.float32(255)
     inner = roots[_LEFT:]
     for x in range(width):
@@ -64,13 +64,15 @@ def _sqrt_row(row, roots):
 
 
 @jit
-def orientation_sums(channels, cotangents, square, first, sums):
+def orientation_sums(channels, regions, cotangents, square, sums):
     """Sum gradient magnitudes by 16 signed orientations over squares of `square` pixels a side.
 
     `channels` is ``(3, H, W)`` uint8, `cotangents` ``(8,)`` float32 of the angles 11.25, 33.75, ..., 168.75
-    degrees, and `square` 4 or 2. `sums` is the output ``(rows, columns, 16)`` float32: of the rows of squares
-    from `first` on, and of the columns from -1 on. Squares may lie beyond the image, whose borders are
-    replicated.
+    degrees, and `square` 4 or 2. `regions` ``(N, 8)`` are parts of the image: left, top, right and bottom in
+    pixels; the first row of squares whose sums are computed, from -1 on, and the number of rows; the number
+    of columns, of which the first is -1; and the place of the region's first sum in `sums`, the output, a
+    float32 array ``(rows, columns, 16)`` for each region. Squares may lie beyond the region, whose borders
+    are replicated.
 
     The gradients are those of ``sqrt(255 * value)``, which gives dark regions more weight; of the three
     channels, the one with the longest gradient is used (Dalal and Triggs, CVPR 2005, sections 6.1 and 6.2).
@@ -78,65 +80,71 @@ def orientation_sums(channels, cotangents, square, first, sums):
     edges are in the middle of a bin, and mirroring an image permutes the bins. A gradient is beyond a bound
     if the ratio ``gx / gy`` is at most its cotangent; the number of these bounds is its bin.
     """
-    height, width = channels.shape[1:]
-    rows, columns = sums.shape[:2]
-    wide, skipped = square * columns, SQUARE - square
+    skipped = SQUARE - square
+    widest = longest = 0
+    for region in regions:
+        widest = max(widest, square * region[6])
+        longest = max(longest, widest + skipped + 2, region[2] - region[0] + _LEFT + 1)
     # Square roots of three successive rows, in a ring; row y is in place (y + 6) % 3, which is not negative.
-    roots = np.empty((3, 3, max(wide + skipped + 2, width + _LEFT + 1)), np.float32)
-    for y in range(square * first - 1, square * first + 1):
-        for c in range(3):
-            _sqrt_row(channels[c, min(max(y, 0), height - 1)], roots[(y + 6) % 3, c])
-    magnitudes, bins = np.empty(wide, np.float32), np.empty(wide, np.int32)
+    roots = np.empty((3, 3, longest), np.float32)
+    magnitudes, bins = np.empty(widest, np.float32), np.empty(widest, np.int32)
     c0, c1, c2, c3 = cotangents[0], cotangents[1], cotangents[2], cotangents[3]
     c4, c5, c6, c7 = cotangents[4], cotangents[5], cotangents[6], cotangents[7]
     zero, infinite = np.float32(0), np.float32(np.inf)
-    flat = sums.reshape(rows, -1)
-    for row in range(rows):
-        out = flat[row]
-        for i in range(16 * columns):
-            out[i] = zero
-        for part in range(square):
-            y = square * (first + row) + part
+    for region in regions:
+        left, top, right, bottom = region[0], region[1], region[2], region[3]
+        first, rows, columns, place = region[4], region[5], region[6], region[7]
+        wide = square * columns
+        for y in range(square * first - 1, square * first + 1):
             for c in range(3):
-                _sqrt_row(channels[c, min(max(y + 1, 0), height - 1)], roots[(y + 7) % 3, c])
-            middle, up, down = roots[(y + 6) % 3], roots[(y + 5) % 3], roots[(y + 7) % 3]
-            left0, left1, left2 = middle[0, skipped:], middle[1, skipped:], middle[2, skipped:]
-            right0, right1, right2 = left0[2:], left1[2:], left2[2:]
-            up0, up1, up2 = up[0, skipped + 1 :], up[1, skipped + 1 :], up[2, skipped + 1 :]
-            down0, down1, down2 = down[0, skipped + 1 :], down[1, skipped + 1 :], down[2, skipped + 1 :]
-            for x in range(wide):
-                gx, gy = right0[x] - left0[x], down0[x] - up0[x]
-                squared = gx * gx + gy * gy
-                hx, hy = right1[x] - left1[x], down1[x] - up1[x]
-                other = hx * hx + hy * hy
-                gx = hx if other > squared else gx
-                gy = hy if other > squared else gy
-                squared = other if other > squared else squared
-                hx, hy = right2[x] - left2[x], down2[x] - up2[x]
-                other = hx * hx + hy * hy
-                gx = hx if other > squared else gx
-                gy = hy if other > squared else gy
-                magnitudes[x] = np.sqrt(other if other > squared else squared)
-                # A horizontal gradient counts as angle 0 here; its sign selects the half circle.
-                q = gx / gy if gy != zero else infinite
-                low = np.int32(q <= c0) + np.int32(q <= c1) + np.int32(q <= c2) + np.int32(q <= c3)
-                high = np.int32(q <= c4) + np.int32(q <= c5) + np.int32(q <= c6) + np.int32(q <= c7)
-                half = np.int32(0) if (gx if gy == zero else gy) > zero else np.int32(8)
-                # Beyond the last bound lies the first bin of the other half circle.
-                bins[x] = (low + high + half) & np.int32(15)
-            # Unsigned places: a signed one might be negative, which takes a test.
-            if square == SQUARE:
-                for x in range(columns):
-                    place = np.uint64(16 * x)
-                    out[place + np.uint64(bins[4 * x])] += magnitudes[4 * x]
-                    out[place + np.uint64(bins[4 * x + 1])] += magnitudes[4 * x + 1]
-                    out[place + np.uint64(bins[4 * x + 2])] += magnitudes[4 * x + 2]
-                    out[place + np.uint64(bins[4 * x + 3])] += magnitudes[4 * x + 3]
-            else:
-                for x in range(columns):
-                    place = np.uint64(16 * x)
-                    out[place + np.uint64(bins[2 * x])] += magnitudes[2 * x]
-                    out[place + np.uint64(bins[2 * x + 1])] += magnitudes[2 * x + 1]
+                _sqrt_row(channels[c, min(max(top + y, top), bottom - 1)], left, right, roots[(y + 6) % 3, c])
+        for row in range(rows):
+            out = sums[place + 16 * columns * row : place + 16 * columns * (row + 1)]
+            for i in range(16 * columns):
+                out[i] = zero
+            for part in range(square):
+                y = square * (first + row) + part
+                for c in range(3):
+                    line = channels[c, min(max(top + y + 1, top), bottom - 1)]
+                    _sqrt_row(line, left, right, roots[(y + 7) % 3, c])
+                middle, up, down = roots[(y + 6) % 3], roots[(y + 5) % 3], roots[(y + 7) % 3]
+                left0, left1, left2 = middle[0, skipped:], middle[1, skipped:], middle[2, skipped:]
+                right0, right1, right2 = left0[2:], left1[2:], left2[2:]
+                up0, up1, up2 = up[0, skipped + 1 :], up[1, skipped + 1 :], up[2, skipped + 1 :]
+                down0, down1, down2 = down[0, skipped + 1 :], down[1, skipped + 1 :], down[2, skipped + 1 :]
+                for x in range(wide):
+                    gx, gy = right0[x] - left0[x], down0[x] - up0[x]
+                    squared = gx * gx + gy * gy
+                    hx, hy = right1[x] - left1[x], down1[x] - up1[x]
+                    other = hx * hx + hy * hy
+                    gx = hx if other > squared else gx
+                    gy = hy if other > squared else gy
+                    squared = other if other > squared else squared
+                    hx, hy = right2[x] - left2[x], down2[x] - up2[x]
+                    other = hx * hx + hy * hy
+                    gx = hx if other > squared else gx
+                    gy = hy if other > squared else gy
+                    magnitudes[x] = np.sqrt(other if other > squared else squared)
+                    # A horizontal gradient counts as angle 0 here; its sign selects the half circle.
+                    q = gx / gy if gy != zero else infinite
+                    low = np.int32(q <= c0) + np.int32(q <= c1) + np.int32(q <= c2) + np.int32(q <= c3)
+                    high = np.int32(q <= c4) + np.int32(q <= c5) + np.int32(q <= c6) + np.int32(q <= c7)
+                    half = np.int32(0) if (gx if gy == zero else gy) > zero else np.int32(8)
+                    # Beyond the last bound lies the first bin of the other half circle.
+                    bins[x] = (low + high + half) & np.int32(15)
+                # Unsigned places: a signed one might be negative, which takes a test.
+                if square == SQUARE:
+                    for x in range(columns):
+                        start = np.uint64(16 * x)
+                        out[start + np.uint64(bins[4 * x])] += magnitudes[4 * x]
+                        out[start + np.uint64(bins[4 * x + 1])] += magnitudes[4 * x + 1]
+                        out[start + np.uint64(bins[4 * x + 2])] += magnitudes[4 * x + 2]
+                        out[start + np.uint64(bins[4 * x + 3])] += magnitudes[4 * x + 3]
+                else:
+                    for x in range(columns):
+                        start = np.uint64(16 * x)
+                        out[start + np.uint64(bins[2 * x])] += magnitudes[2 * x]
+                        out[start + np.uint64(bins[2 * x + 1])] += magnitudes[2 * x + 1]
 
 
 @inlined
@@ -165,10 +173,10 @@ def _tent_taps(start, step, squares, taps, index, weights):
 def _resample(sums, square, first, squares, grid, cells):
     """Interpolate the sums of squares at the cells of a grid, and at one cell more on each side.
 
-    `sums` and `square` are as in `orientation_sums`, with one column of squares beyond each side; `first` is
-    the first row, and `squares` the number of rows that the image has. `grid` is ``(4,)`` float64: left, top,
-    width and height of its first cell in squares. `cells` is the output ``(16, rows, columns)`` of at least
-    `_LANES` columns, in gray levels of the mean gradient.
+    `sums` ``(rows, columns, 16)`` are `orientation_sums` of a region, with one column of squares beyond each
+    side; `first` is the first row, and `squares` the number of rows that the region has. `grid` is ``(4,)``
+    float64: left, top, width and height of its first cell in squares. `cells` is the output
+    ``(16, rows, columns)`` of at least `_LANES` columns, in gray levels of the mean gradient.
     """
     _, rows, columns = cells.shape
     step_x, step_y = grid[2], grid[3]
@@ -272,12 +280,13 @@ def cells_shape(rows: int, columns: int) -> tuple[int, int, int]:
 
 
 @jit
-def cell_channels(sums, square, first, squares, grids, chosen, eps, scales, cells, channels, packed):
+def cell_channels(sums, regions, square, grids, chosen, eps, scales, cells, channels, packed):
     """FHOG channels of several grids of cells, as numbers or as bytes in words of 32 bits.
 
-    `sums`, `square`, `first` and `squares` are as in `_resample`, `grids` is ``(N, 4)``, and `chosen` lists
-    those to compute. `eps` is added to the energy of a block. `cells` is memory for one grid, float32 of the
-    shape that `cells_shape` returns.
+    `sums`, `regions` and `square` are as in `orientation_sums`, `grids` is ``(N, 4)``, in squares from the
+    corner of a region, and `chosen` lists those to compute. There is a region for each of these, or one for
+    all. `eps` is added to the energy of a block. `cells` is memory for one grid, float32 of the shape that
+    `cells_shape` returns.
 
     One of the outputs may be empty: `channels` is ``(N, 20, rows, columns)`` float32, and `packed`
     ``(N, 5, rows, columns)`` int32: the value of channel `k` is multiplied by ``scales[k]`` and rounded; the
@@ -289,16 +298,22 @@ def cell_channels(sums, square, first, squares, grids, chosen, eps, scales, cell
     factors = np.empty((rows + 1, cells.shape[2] - 1), np.float32)
     line = np.empty((20, columns), np.float32)
     half, limit = np.float32(0.5), np.float32(127)
-    for number in chosen:
-        _resample(sums, square, first, squares, grids[number], cells)
+    for k in range(len(chosen)):
+        number = chosen[k]
+        region = regions[k if len(regions) > 1 else 0]
+        high, wide, start = region[5], region[6], region[7]
+        of_region = sums[start : start + 16 * high * wide].reshape(high, wide, 16)
+        squares = (region[3] - region[1] + square - 1) // square
+        _resample(of_region, square, region[4], squares, grids[number], cells)
         _block_factors(cells, eps, factors)
         for y in range(rows):
             _normalize_row(cells, factors, y, line)
             if len(packed):
                 for word in range(packed.shape[1]):
-                    out, k = packed[number, word, y], 4 * word
-                    a, b, c, d = line[k], line[k + 1], line[k + 2], line[k + 3]
-                    sa, sb, sc, sd = scales[k], scales[k + 1], scales[k + 2], scales[k + 3]
+                    out, channel = packed[number, word, y], 4 * word
+                    a, b, c, d = line[channel], line[channel + 1], line[channel + 2], line[channel + 3]
+                    sa, sb = scales[channel], scales[channel + 1]
+                    sc, sd = scales[channel + 2], scales[channel + 3]
                     for x in range(columns):
                         low = numba.int32(min(a[x] * sa + half, limit)) | (
                             numba.int32(min(b[x] * sb + half, limit)) << 8
@@ -308,8 +323,8 @@ def cell_channels(sums, square, first, squares, grids, chosen, eps, scales, cell
                         )
                         out[x] = low | (high << 16)
             else:
-                for k in range(channels.shape[1]):
-                    source, target = line[k], channels[number, k, y]
+                for channel in range(channels.shape[1]):
+                    source, target = line[channel], channels[number, channel, y]
                     for x in range(columns):
                         target[x] = source[x]
 

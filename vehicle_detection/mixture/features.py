@@ -102,7 +102,13 @@ class Octave:
 
     def compute(self) -> None:
         """Compute the sums, in place."""
-        _fhog_kernels.orientation_sums(self.planes, _COTANGENTS, SQUARE, self.first, self.sums)
+        _fhog_kernels.orientation_sums(self.planes, self._region, _COTANGENTS, SQUARE, self.sums.reshape(-1))
+
+    @functools.cached_property
+    def _region(self) -> NDArray[np.intp]:
+        """Place of the sums, see `orientation_sums`: a region that is the whole image."""
+        (_, height, width), (rows, columns, _) = self.planes.shape, self.sums.shape
+        return np.array([[0, 0, width, height, self.first, rows, columns, 0]], np.intp)
 
     def channels_of(
         self,
@@ -113,19 +119,9 @@ class Octave:
         packed: NDArray[np.int32],
     ) -> None:
         """Compute the channels of the chosen grids, in squares; see `cell_channels` for the memory."""
-        squares = -(-self.planes.shape[1] // SQUARE)
+        sums = self.sums.reshape(-1)
         _fhog_kernels.cell_channels(
-            self.sums,
-            SQUARE,
-            self.first,
-            squares,
-            grids,
-            chosen,
-            _EPS,
-            CHANNEL_SCALES,
-            cells,
-            channels,
-            packed,
+            sums, self._region, SQUARE, grids, chosen, _EPS, CHANNEL_SCALES, cells, channels, packed
         )
 
 
@@ -206,16 +202,18 @@ class EdgePyramid:
         low = (np.floor(corners - 2 * steps) - 2 * square).clip(0, shape - 1).astype(np.intp)
         high = (np.ceil(ends) + 2 * square).clip(low + 1, shape).astype(np.intp)
         scaled = np.hstack([corners - low, steps]) / square
-        squares = (high - low + 1) // square
-        memory = np.empty((squares[chosen] + 2).prod(axis=1).max(initial=0) * 16, np.float32)
-        regions = np.hstack([low, high, squares])[chosen].tolist()
-        for number, (left, top, right, bottom, across, down) in zip(chosen[:, None], regions):
-            region = np.ascontiguousarray(planes[:, top:bottom, left:right])
-            sums = memory[: (down + 2) * (across + 2) * 16].reshape(down + 2, across + 2, 16)
-            _fhog_kernels.orientation_sums(region, _COTANGENTS, square, -1, sums)
-            _fhog_kernels.cell_channels(
-                sums, square, -1, down, scaled, number, _EPS, CHANNEL_SCALES, cells, channels, _NO_WORDS
-            )
+        regions = np.zeros((len(chosen), 8), np.intp)
+        regions[:, :2], regions[:, 2:4], regions[:, 4] = low[chosen], high[chosen], -1
+        regions[:, 6:4:-1] = (high - low + 1)[chosen] // square + 2
+        ends = 16 * (regions[:, 5] * regions[:, 6]).cumsum()
+        regions[1:, 7] = ends[:-1]
+        # A power of two: few different sizes of memory.
+        size = 1 << int(ends[-1]).bit_length() if len(ends) else 0
+        sums = self.workspace.take((size,), np.float32, "small sums")
+        _fhog_kernels.orientation_sums(planes, regions, _COTANGENTS, square, sums)
+        _fhog_kernels.cell_channels(
+            sums, regions, square, scaled, chosen, _EPS, CHANNEL_SCALES, cells, channels, _NO_WORDS
+        )
 
     def feature_map(self, grid: CellGrid) -> FeatureMap:
         """FHOG channels of one grid."""
