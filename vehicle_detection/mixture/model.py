@@ -40,7 +40,7 @@ from vehicle_detection.mixture.boxes import (
 )
 from vehicle_detection.mixture.features import EdgePyramid
 from vehicle_detection.mixture.perspective import perspective_ratios
-from vehicle_detection.mixture.rescoring import RESCORE_MIN, Rescorer
+from vehicle_detection.mixture.rescoring import RESCORE_AGAIN_MIN, RESCORE_MIN, Rescorer
 from vehicle_detection.mixture.template import MixtureTemplate
 from vehicle_detection.params import PyramidParams
 
@@ -48,6 +48,9 @@ if TYPE_CHECKING:
     from vehicle_detection.mixture.search import MixtureSearch
 
 Floats = NDArray[np.float64]
+
+WINDOW_MARGIN = -0.38
+"""Margin of a window whose score is 0; heat with the default thresholds is best with windows from there."""
 
 # Height in pixels of a box, and number of candidates plus one, that leave a margin as it is.
 _USUAL_HEIGHT, _USUAL_COUNT = 64.0, 8
@@ -200,6 +203,17 @@ class TemplateMixture:
         """Margin of a score: the inverse of `scores`."""
         return (score + self.threshold - self.offset) / self.slope
 
+    def window_scores(self, margins: Floats) -> Floats:
+        """Convert the margins of windows to log-odds above those of `WINDOW_MARGIN`.
+
+        The threshold is that of boxes, whose margins the second stage has changed.
+        """
+        return self.slope * (margins - WINDOW_MARGIN)
+
+    def window_margin(self, score: float) -> float:
+        """Margin of a window's score: the inverse of `window_scores`."""
+        return score / self.slope + WINDOW_MARGIN
+
     def detect_vehicles(
         self, pyramid: EdgePyramid, windows: ScoredWindows, *, min_margin: float
     ) -> FoundVehicles:
@@ -254,7 +268,7 @@ class TemplateMixture:
         rows = nms(boxes, first)
         boxes, final = boxes[rows], first[rows]
         # Rows are sorted, best first.
-        again = slice(np.count_nonzero(final >= RESCORE_MIN))
+        again = slice(np.count_nonzero(final >= RESCORE_AGAIN_MIN))
         boxes[again], second = self.rescorer.apply(pyramid, boxes[again], margins[rows[again]])
         final[again] = (final[again] + second) / 2
         kept = nms(boxes, final)

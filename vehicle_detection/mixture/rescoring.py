@@ -21,8 +21,8 @@ from vehicle_detection.mixture.features import EdgePyramid
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-RESCORE_MIN = -1.1
-"""Minimum margin of a proposed box that is rescored."""
+RESCORE_MIN, RESCORE_AGAIN_MIN = -1.05, -1.1
+"""Minimum margin of a proposed box that is rescored, and of a rescored one that is rescored again."""
 
 KERNEL, STRIDES = 3, (1, 2, 1)
 """Side of the convolutions in cells, and the step of each."""
@@ -36,7 +36,7 @@ LAYERS = ("convolution 1", "convolution 2", "convolution 3", "hidden", "output")
 # Log-odds of a network are limited.
 _MAX_LOG_ODDS = 6
 # Minimum margin after the first network of a box that the other networks see.
-_NEXT_NETWORK_MIN = -1.2
+_NEXT_NETWORK_MIN = -1.0
 # Fewest boxes that a thread computes.
 _MIN_BOXES = 8
 
@@ -127,7 +127,7 @@ class Rescorer:
         """Log-odds ``(N,)`` and shifts of the edges ``(N, 4)``, as fractions of a box's sides, of crops.
 
         `inputs` are `rescoring_inputs`, and `margins` ``(N,)`` those of the templates. Boxes that the first
-        network leaves below a margin of -1.2 are not passed to the others: a cascade (Viola and Jones,
+        network leaves below a margin of -1 are not passed to the others: a cascade (Viola and Jones,
         "Robust real-time face detection", IJCV 2004).
         """
         outputs = self.networks[0].outputs(inputs, workspace)

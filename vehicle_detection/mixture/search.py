@@ -133,7 +133,7 @@ class MixtureSearch(FrameSearch):
         with single_threaded_opencv():
             pyramid, found = self.score_windows(prepare(frame), params)
             vehicles = model.detect_vehicles(pyramid, found, min_margin=model.margin_of(min_vehicle_score))
-        scores = model.scores(found.margins + vehicles.shift)
+        scores = model.window_scores(found.margins + vehicles.shift)
         shown = scores >= params.min_score
         return (
             Detections(found.boxes[shown], scores[shown]),
@@ -148,7 +148,7 @@ class MixtureSearch(FrameSearch):
         Sensor noise and haze are not removed here. The pyramid is valid until the next search in the same
         thread.
         """
-        min_margin = min(MIN_MARGIN, self.model.margin_of(params.min_score))
+        min_margin = min(MIN_MARGIN, self.model.window_margin(params.min_score))
         plan = self._plan((image.shape[0], image.shape[1]), params, min_margin)
         with single_threaded_opencv():
             pyramid = EdgePyramid(image, plan.row_ranges, self.workspace, self._team)
