@@ -128,7 +128,7 @@ INTERNAL = {
     "PyramidParams.heat_range", "PyramidParams.rows", "PyramidParams.sizes", "PyramidParams.smallest_width",
     "SearchBand.place", "SearchParams.heat_range", "SearchParams.place", "TemplateMixture.detect_vehicles",
     "TemplateMixture.margin_of", "TemplateMixture.propose_boxes", "TemplateMixture.rescore_boxes",
-    "TemplateMixture.scores",
+    "TemplateMixture.scores", "TemplateMixture.window_margin", "TemplateMixture.window_scores",
     "VehicleDetector.interpolate", "VehicleDetector.skip",
 }  # fmt: skip
 """Methods that only the library calls, with its own results."""
