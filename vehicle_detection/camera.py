@@ -125,7 +125,7 @@ class Camera:
     vehicle_width_m: float = 1.8
     vehicle_width_std_m: float = 0.25
     vehicle_height_m: float = 1.5
-    vehicle_length_m: float = 4.0
+    vehicle_length_m: float = 4.5
     vehicle_length_std_m: float = 0.8
     bottom_std_px: float = 2.5
     pitch_std_px: float = 3.0

@@ -27,12 +27,12 @@ class TestPosition:
         assert abs(position.lateral_m - lateral) < 0.35
 
     def test_where_the_frame_truncates_the_near_end(self):
-        """The visible far end of the side gives the position: here 4 m behind the near end, at 150 px."""
+        """The visible far end of the side gives the position: here 4.5 m behind the near end, at 150 px."""
         known = track((790, 380, 1280, 600), distance_m=4.0, distance_std_m=0.5)
         position = road_position(known, CAMERA, SHAPE)
-        assert position.lateral_m == pytest.approx(0.150 * 8 + 0.9)
+        assert position.lateral_m == pytest.approx(0.150 * 8.5 + 0.9)
         mirrored = track((0, 380, 490, 600), distance_m=4.0, distance_std_m=0.5)
-        assert road_position(mirrored, CAMERA, SHAPE).lateral_m == pytest.approx(-(0.150 * 8 + 0.9))
+        assert road_position(mirrored, CAMERA, SHAPE).lateral_m == pytest.approx(-(0.150 * 8.5 + 0.9))
 
     def test_the_error_is_larger_along_the_ray(self):
         position = road_position(track((600, 400, 680, 460), distance_std_m=2.0), CAMERA, SHAPE)

@@ -24,14 +24,17 @@ def found(*boxes, score=1.0):
     return Detections(np.array(boxes, float).reshape(-1, 4), np.full(len(boxes), float(score)))
 
 
-def on_road(distance, *, x=0.0, width=1.8, height=1.5):
-    """Box of a vehicle `distance` meters ahead and `x` meters to the right; None behind the camera."""
+def on_road(distance, *, x=0.0, width=1.8, height=1.5, length=0.0):
+    """Box of a vehicle `distance` meters ahead and `x` meters to the right; None behind the camera.
+
+    With a length, the box shows the side of a vehicle in another lane.
+    """
     if distance < 1:
         return None
-    pixel = CAMERA.focal_px / distance
-    bottom, center = CAMERA.horizon_px + pixel * CAMERA.height_m, 640 + pixel * x
-    half = pixel * width / 2
-    return np.array([center - half, bottom - pixel * height, center + half, bottom])
+    pixel, far = CAMERA.focal_px / distance, CAMERA.focal_px / (distance + length)
+    bottom, left, right = CAMERA.horizon_px + pixel * CAMERA.height_m, x - width / 2, x + width / 2
+    left, right = left * (far if left > 0 else pixel), right * (far if right < 0 else pixel)
+    return np.array([640 + left, bottom - pixel * height, 640 + right, bottom])
 
 
 def play(
@@ -736,7 +739,10 @@ class TestDistance:
     @pytest.mark.parametrize("seed", range(3))
     def test_the_horizon_of_an_unknown_camera_is_estimated(self, seed):
         """The initial guess is wrong by 43 px, which changes a distance of 30 m to 50 m or 22 m."""
-        scene = {"near": lambda t: on_road(14 + 2 * t), "far": lambda t: on_road(45 - 3 * t, x=3.6)}
+        scene = {
+            "near": lambda t: on_road(14 + 2 * t),
+            "far": lambda t: on_road(45 - 3 * t, x=3.6, length=4.4),
+        }
         wrong = Camera.for_frame(SHAPE, horizon=0.5, horizon_std_px=43.0)
         steps = play(scene, 6, seed=seed, noise=0.04, camera=wrong)
         for name, distance in (("near", 26.0), ("far", 27.0)):

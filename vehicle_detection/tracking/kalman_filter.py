@@ -302,6 +302,9 @@ _MAX_RANGE_STD, _MAX_RANGE_AGE, _MAX_RANGE_SPEED_STD = 0.4, 0.5, 6.0
 # Fraction of a box that nearer vehicles cover, from which on it is no measurement, and relative error of the
 # width of a box that they cover less.
 _MAX_COVERED, _COVERED_STD = 0.3, 0.15
+# Approach speed (m/s) from which on a vehicle in another lane is oncoming. A barrier may hide its wheels and a
+# part of its side: by so much (m) the side in its boxes is shorter, and relative error of their bottom edge.
+_ONCOMING_SPEED, _ONCOMING_CUT, _ONCOMING_BOTTOM_STD = 15.0, 1.0, 0.3
 # Aspect ratio above which a detector's boxes are narrower than the vehicle with its side.
 _MAX_ASPECT = 1.5
 
@@ -352,7 +355,8 @@ def update_distances(
     below_horizon = boxes[:, 3] - camera.horizon_px
 
     bottom_scale = camera.focal_px * camera.height_m
-    width_scale = camera.width_times_distance(lateral_px)
+    oncoming = (mean[:, 1] < -_ONCOMING_SPEED) & (lateral_px > 0)
+    width_scale = camera.width_times_distance(lateral_px) - oncoming * _ONCOMING_CUT * lateral_px
     unknown = cov[:, 0, 0] > _INITIAL_DISTANCE_STD**2 / 2
     if unknown.any():
         # Linearize at the first measurement itself.
@@ -369,7 +373,8 @@ def update_distances(
 
     # Pixels below the horizon: bottom_scale / distance.
     expected = bottom_scale / mean[:, 0]
-    systematic = horizon_std**2 + np.square(expected * camera.height_std_m / camera.height_m)
+    bottom_std = np.hypot(camera.height_std_m / camera.height_m, oncoming * _ONCOMING_BOTTOM_STD)
+    systematic = horizon_std**2 + np.square(expected * bottom_std)
     variance = np.square(edge_std[:, 1]) * box_frames + systematic * pitch_frames
     jacobian = np.zeros_like(mean)
     jacobian[:, 0] = -expected / mean[:, 0]
