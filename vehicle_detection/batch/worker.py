@@ -12,15 +12,20 @@ import queue
 import signal
 import sys
 import threading
+import time
+from types import FrameType
 from typing import Any
 
 # Seconds that the current call has to clean up after the parent process has ended.
 _GRACE = 15.0
+# Module whose functions are called from C, which prints their exceptions and goes on; and seconds after which
+# an interrupt in them is repeated.
+_CALLED_FROM_C, _REPEAT = "llvmlite.binding.executionengine", 0.02
 
 
 def main() -> None:
     """Answer each line ``{"call": "module:function", "args": [...]}`` with a line of JSON."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGINT, _interrupt)
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # whatever a library prints must not be taken for an answer
     calls: queue.SimpleQueue[str | None] = queue.SimpleQueue()
@@ -39,6 +44,21 @@ def main() -> None:
     # The call's open generators, such as that of a temporary folder, are closed with the error's traceback.
     gc.collect()
     os._exit(1)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt, but not while the compiler of the kernels calls back: it would be lost."""
+    while frame is not None:
+        if frame.f_globals.get("__name__") == _CALLED_FROM_C:
+            _thread.start_new_thread(_repeat_interrupt, (number,))
+            return
+        frame = frame.f_back
+    raise KeyboardInterrupt
+
+
+def _repeat_interrupt(number: int) -> None:
+    time.sleep(_REPEAT)
+    _thread.interrupt_main(signal.Signals(number))
 
 
 def _receive(calls: queue.SimpleQueue[str | None], idle: threading.Event) -> None:
