@@ -93,7 +93,7 @@ def test_the_estimate_is_the_median_of_a_difference_of_laplacians():
 @pytest.mark.parametrize(("noise", "weight"), [(3.0, 0.0), (4.5, 0.5), (6.0, 1.0), (9.0, 1.0)])
 def test_the_weight_of_the_smoothing_depends_on_the_noise(monkeypatch, noise, weight):
     image = noisy(90, 9)
-    monkeypatch.setitem(denoise.__globals__, "estimate_noise", lambda image: noise)
+    monkeypatch.setitem(denoise.__globals__, "_noise_of", lambda differences: noise)
     smooth = cv2.GaussianBlur(image, (5, 5), 0.9).astype(float)
     np.testing.assert_allclose(denoise(image), weight * smooth + (1 - weight) * image, atol=0.51)
 

@@ -31,8 +31,7 @@ def estimate_noise(image: NDArray[np.uint8]) -> float:
     >>> estimate_noise(gray.astype(np.uint8)), round(estimate_noise(noisy.astype(np.uint8)))
     (0.0, 4)
     """
-    differences = _differences(image)
-    return float(np.median(differences)) / _MEDIAN if differences.size else 0.0
+    return _noise_of(_differences(image))
 
 
 def denoise(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -46,12 +45,16 @@ def denoise(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     differences = _differences(image)
     if 2 * np.count_nonzero(differences > _NOISE_MIN * _MEDIAN) < differences.size:
         return image
-    weight = (estimate_noise(image) - _NOISE_MIN) / (_NOISE_FULL - _NOISE_MIN)
+    weight = (_noise_of(differences) - _NOISE_MIN) / (_NOISE_FULL - _NOISE_MIN)
     if weight <= 0:
         return image
     weight = min(weight, 1.0)
     smooth = cv2.GaussianBlur(image, (5, 5), _SIGMA)
     return np.asarray(cv2.addWeighted(smooth, weight, image, 1 - weight, 0), np.uint8)
+
+
+def _noise_of(differences: NDArray[np.float32]) -> float:
+    return float(np.median(differences)) / _MEDIAN if differences.size else 0.0
 
 
 def _differences(image: NDArray[np.uint8]) -> NDArray[np.float32]:

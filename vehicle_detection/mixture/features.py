@@ -202,13 +202,12 @@ class EdgePyramid:
         low = (np.floor(corners - 2 * steps) - 2 * square).clip(0, shape - 1).astype(np.intp)
         high = (np.ceil(ends) + 2 * square).clip(low + 1, shape).astype(np.intp)
         scaled = np.hstack([corners - low, steps]) / square
-        regions = np.zeros((len(chosen), 8), np.intp)
-        regions[:, :2], regions[:, 2:4], regions[:, 4] = low[chosen], high[chosen], -1
-        regions[:, 6:4:-1] = (high - low + 1)[chosen] // square + 2
-        ends = 16 * (regions[:, 5] * regions[:, 6]).cumsum()
-        regions[1:, 7] = ends[:-1]
+        columns, rows = ((high - low + 1)[chosen] // square + 2).T
+        counts = 16 * rows * columns
+        first, places = np.full_like(rows, -1), counts.cumsum() - counts
+        regions = np.column_stack([low[chosen], high[chosen], first, rows, columns, places])
         # A power of two: few different sizes of memory.
-        size = 1 << int(ends[-1]).bit_length() if len(ends) else 0
+        size = 1 << int(counts.sum()).bit_length()
         sums = self.workspace.take((size,), np.float32, "small sums")
         _fhog_kernels.orientation_sums(planes, regions, _COTANGENTS, square, sums)
         _fhog_kernels.cell_channels(

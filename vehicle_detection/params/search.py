@@ -308,8 +308,8 @@ class PyramidParams:
     horizon_tolerance
         Maximum error of the horizon as a fraction of the frame's height; the default suits any dash-cam.
     min_score
-        Minimum score of the windows that a search returns, in log-odds; those of a window with a score of 0
-        are fixed, whatever the threshold of the model for boxes.
+        Minimum score of the windows that a search returns, in log-odds above those of a fixed margin. It does
+        not depend on the model's threshold, which is one for boxes.
 
     Examples
     --------

@@ -302,8 +302,8 @@ _MAX_RANGE_STD, _MAX_RANGE_AGE, _MAX_RANGE_SPEED_STD = 0.4, 0.5, 6.0
 # Fraction of a box that nearer vehicles cover, from which on it is no measurement, and relative error of the
 # width of a box that they cover less.
 _MAX_COVERED, _COVERED_STD = 0.3, 0.15
-# Approach speed (m/s) from which on a vehicle in another lane is oncoming. A barrier may hide its wheels and
-# a part of its side: the side in its boxes is so much shorter (m); relative error of their bottom edge.
+# Vehicles in another lane that approach fast are mostly oncoming, and a barrier may hide their wheels:
+# minimum speed (m/s), length (m) of the side that their boxes lack, and relative error of the bottom edge.
 _ONCOMING_SPEED, _ONCOMING_CUT, _ONCOMING_BOTTOM_STD = 15.0, 1.0, 0.3
 # Aspect ratio above which a detector's boxes are narrower than the vehicle with its side.
 _MAX_ASPECT = 1.5
