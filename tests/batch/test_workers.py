@@ -13,7 +13,7 @@ import pytest
 from tests.helpers import ROOT
 from tests.video.clips import child_processes
 from vehicle_detection import open_dask
-from vehicle_detection.batch import worker, workers
+from vehicle_detection.batch import workers
 from vehicle_detection.batch.workers import WorkerLost, WorkerPool
 
 
@@ -124,18 +124,3 @@ def test_a_dask_cluster_has_single_threads_and_may_lose_workers(monkeypatch):
     assert (seen["n_workers"], seen["threads_per_worker"], seen["processes"]) == (3, 1, True)
     assert seen["failures"] >= 20
     assert seen["env"]["VEHICLE_DETECTION_JOBS"] == "1"
-
-
-def test_an_interrupt_in_a_callback_of_the_compiler_is_repeated_after_it():
-    """An exception in the callback would be printed and lost."""
-    names = {"__name__": "llvmlite.binding.executionengine", "signal": signal, "time": time}
-    exec("def call():\n    signal.raise_signal(signal.SIGINT)\n    time.sleep(0.1)\n    return 1", names)
-    before = signal.signal(signal.SIGINT, worker._interrupt)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-        assert names["call"]() == 1
-        with pytest.raises(KeyboardInterrupt):
-            time.sleep(10)
-    finally:
-        signal.signal(signal.SIGINT, before)

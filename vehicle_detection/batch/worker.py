@@ -12,15 +12,13 @@ import queue
 import signal
 import sys
 import threading
-import time
 from types import FrameType
 from typing import Any
 
+from vehicle_detection._signals import postpone
+
 # Seconds that the current call has to clean up after the parent process has ended.
 _GRACE = 15.0
-# Module whose functions are called from C, which prints their exceptions and goes on; and seconds after which
-# an interrupt in them is repeated.
-_CALLED_FROM_C, _REPEAT = "llvmlite.binding.executionengine", 0.02
 
 
 def main() -> None:
@@ -47,18 +45,8 @@ def main() -> None:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, but not while the compiler of the kernels calls back: it would be lost."""
-    while frame is not None:
-        if frame.f_globals.get("__name__") == _CALLED_FROM_C:
-            _thread.start_new_thread(_repeat_interrupt, (number,))
-            return
-        frame = frame.f_back
-    raise KeyboardInterrupt
-
-
-def _repeat_interrupt(number: int) -> None:
-    time.sleep(_REPEAT)
-    _thread.interrupt_main(signal.Signals(number))
+    if not postpone(number, frame):
+        raise KeyboardInterrupt
 
 
 def _receive(calls: queue.SimpleQueue[str | None], idle: threading.Event) -> None:

@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import NoReturn
 
+from vehicle_detection._signals import postpone
+
 # SIGHUP: the terminal was closed.
 _SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 # Seconds after a signal in which others are ignored, so that a second Ctrl-C does not interrupt the cleanup.
@@ -40,6 +42,8 @@ def raise_on_signals() -> Iterator[None]:
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         nonlocal last
+        if postpone(number, frame):
+            return
         previous, last = last, time.monotonic()
         if last - previous > _CLEANUP_SECONDS:
             raise Interrupted(number)
