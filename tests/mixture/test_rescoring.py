@@ -34,7 +34,7 @@ def random_network(seed=0):
 
 
 def random_rescorer(seed=0, blend_weight=0.4):
-    return Rescorer((random_network(seed), random_network(seed + 1)), blend_weight)
+    return Rescorer(tuple(random_network(seed + number) for number in range(3)), blend_weight)
 
 
 def one_template_mixture(**options):
@@ -68,12 +68,10 @@ def test_the_networks_equal_the_reference(seed, count):
     margins = np.random.default_rng(seed).uniform(-2, 1, count)
     log_odds, shifts = rescorer.predict(inputs, margins)
     for row in range(count):
-        first, second = (
-            network_reference(network, inputs[..., row].swapaxes(0, 1)) for network in rescorer.networks
-        )
-        # Only boxes that the first network leaves with a margin are shown to the second one.
-        after_first = margins[row] + 0.4 * first[0].clip(-6, 6)
-        expected = (first + second) / 2 if after_first >= -1 else first
+        outputs = [network_reference(net, inputs[..., row].swapaxes(0, 1)) for net in rescorer.networks]
+        # Only boxes that the first network leaves with a margin are shown to the others.
+        after_first = margins[row] + 0.4 * outputs[0][0].clip(-6, 6)
+        expected = np.mean(outputs, axis=0) if after_first >= -1 else outputs[0]
         np.testing.assert_allclose(log_odds[row], expected[0], atol=1e-4)
         np.testing.assert_allclose(shifts[row], expected[1:].clip(-0.4, 0.4), atol=1e-4)
 
@@ -104,7 +102,7 @@ def test_rescoring_does_not_depend_on_the_threads(count):
 
 def test_the_number_of_weights():
     per_network = sum(outputs * (inputs + 1) for outputs, inputs in SHAPES)
-    assert random_rescorer().n_weights == 2 * per_network
+    assert random_rescorer().n_weights == 3 * per_network
 
 
 def test_rescoring_adds_log_odds_and_corrects_boxes():
