@@ -7,8 +7,8 @@ import signal
 import time
 from types import FrameType
 
-# Modules whose functions C calls back, such as the compiler of the kernels when it has made an object, and
-# the method that Python calls when it removes an object.
+# Modules whose functions are called from C, by the compiler of the kernels and for weak references, and the
+# method that finalizes an object.
 _CALLBACKS, _FINALIZER = ("llvmlite.binding.executionengine", "weakref"), "__del__"
 _REPEAT = 0.02  # seconds
 
