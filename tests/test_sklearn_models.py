@@ -12,6 +12,7 @@ from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import MaxAbsScaler, MinMaxScaler, RobustScaler, StandardScaler
 from sklearn.svm import SVC, LinearSVC
 
+from vehicle_detection import course
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PatchFeatures, extract_features
@@ -184,3 +185,33 @@ def test_pipelines_that_cannot_be_converted(patches, labels):
         match=rf"on the {SMALL.length} features .*; its StandardScaler .* 5",
     ):
         take(short)
+
+
+@pytest.mark.parametrize("scaler", [StandardScaler, RobustScaler, MinMaxScaler, MaxAbsScaler])
+@pytest.mark.parametrize("color_space", ["RGB", "YUV", "YCrCb", "HSV", "HLS", "LUV", "LAB"])
+def test_a_model_of_images_with_values_0_to_1_is_rejected(patches, labels, color_space, scaler):
+    """The course reads PNG files as such images; the scores of uint8 images would be useless."""
+    params = dataclasses.replace(SMALL, color_space=color_space, hist_feat=False, spatial_order="interleaved")
+    options = {"color_space": color_space, "hist_feat": False, "spatial_size": (params.spatial_size,) * 2}
+    options |= {"orient": 4, "pix_per_cell": 16, "hog_channel": 0}
+    for images, is_float in ((patches, False), (patches.astype(np.float32) / 255, True)):
+        features = np.stack(course.extract_features(images, **options))
+        fitted = scaler().fit(features)
+        model = LinearSVC(C=1e-3).fit(fitted.transform(features), labels), fitted
+        if is_float:
+            with pytest.raises(
+                InvalidInputError, match=r"fitted on values 0-1.*read_image to extract_features"
+            ):
+                VehicleClassifier.from_pipeline(model, params)
+        else:
+            assert VehicleClassifier.from_pipeline(model, params).score(patches, labels) > 0.9
+
+
+def test_a_model_whose_histograms_have_one_bin_is_rejected(patches, labels):
+    params = FeatureParams(spatial_feat=False)
+    options = {"color_space": "YCrCb", "hog_channel": "ALL", "spatial_feat": False}
+    features = np.stack(course.extract_features(patches.astype(np.float32) / 255, **options))
+    scaler = StandardScaler().fit(features)
+    model = LinearSVC(C=1e-3).fit(scaler.transform(features), labels), scaler
+    with pytest.raises(InvalidInputError, match="fitted on values 0-1"):
+        VehicleClassifier.from_pipeline(model, params)

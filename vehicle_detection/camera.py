@@ -61,7 +61,7 @@ LENSES: dict[str, tuple[float, bool]] = {
     "fisheye-140": (140.0, True),
     "fisheye-170": (170.0, True),
 }
-"""Typical lenses: horizontal field of view in degrees, and whether the lens is a fisheye.
+"""Typical lenses: field of view along the longer side in degrees, and whether the lens is a fisheye.
 
 Their errors are those of a guess; a calibrated camera (`read_camera`) is better.
 """
@@ -86,7 +86,7 @@ class Camera:
     Attributes
     ----------
     focal_px
-        Focal length in pixels: the frame's width over ``2 * tan(half the horizontal field of view)``.
+        Focal length in pixels: the frame's longer side over ``2 * tan(half the field of view along it)``.
     horizon_px, horizon_std_px
         Row of the horizon, and its standard error if the row is a guess (0 if it was measured). The tracker
         estimates the row from the vehicles it tracks, with this prior.

@@ -216,8 +216,9 @@ class VehicleClassifier:
         Raises
         ------
         InvalidInputError
-            If a step is of another kind or not fitted, the features have another length, or `params` differ
-            from those of the pipeline's `PatchFeatures`.
+            If a step is of another kind or not fitted, the features have another length, `params` differ
+            from those of the pipeline's `PatchFeatures`, or the scaler was fitted on features of images with
+            values 0-1, as which the course reads PNG files. HOG alone does not show this.
 
         Examples
         --------
@@ -230,7 +231,12 @@ class VehicleClassifier:
         >>> VehicleClassifier.from_pipeline(pipeline.fit(patches, labels)).score(patches, labels)
         1.0
         """
-        from vehicle_detection.sklearn_models import check_equal_scores, fold_estimators, split_pipeline
+        from vehicle_detection.sklearn_models import (
+            check_equal_scores,
+            check_uint8,
+            fold_estimators,
+            split_pipeline,
+        )
 
         known, steps = split_pipeline(pipeline)
         params = known if params is None else params
@@ -247,6 +253,8 @@ class VehicleClassifier:
             )
         template = fold_estimators(steps, params.length)
         check_equal_scores(template, steps)
+        if len(steps) > 1:
+            check_uint8(template, params)
         return cls(params, (template,), metadata or {})
 
     def to_pipeline(self) -> Pipeline:

@@ -150,9 +150,9 @@ class VehicleDetector:
         `write_camera`; or the name of a lens, as in `Camera.for_frame`. By default a dash-cam with the
         search's horizon, as an estimate that tracking refines.
     field_of_view, camera_height_m
-        Horizontal angle of view in degrees of a lens without distortion, and height of the lens above the
-        road in meters, without a `Camera` or a file. If the lens is unknown, distances assume 58 degrees and
-        have a standard error of at least 25%.
+        Angle of view along the frame's longer side in degrees of a lens without distortion, and height of the
+        lens above the road in meters, without a `Camera` or a file. If the lens is unknown, distances assume
+        58 degrees and have a standard error of at least 25%.
     horizon
         Height of the horizon as a fraction of the frame's height; overrides that of `search_params`.
     n_jobs

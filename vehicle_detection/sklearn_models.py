@@ -13,7 +13,12 @@ from vehicle_detection.classifier import Template
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import FeatureParams
 
+Floats = NDArray[np.float64]
+
 _SCALERS = ("StandardScaler", "RobustScaler", "MinMaxScaler", "MaxAbsScaler")
+# Greatest sum of mean and scale of a spatial bin with values 0-1. Greatest mean of the last channel of LUV or
+# LAB in float images, where gray is 0, and least sum with the scale in uint8 images, where it is at least 128.
+_MAX_UNIT, _MAX_FLOAT_MEAN, _GRAY = 2.5, 64.0, 128.0
 
 
 def split_pipeline(model: Any) -> tuple[FeatureParams | None, list[Any]]:
@@ -182,3 +187,41 @@ def check_equal_scores(template: Template, steps: Sequence[Any]) -> None:
     if not np.allclose(scores, expected, rtol=1e-3, atol=1e-3 * float(np.abs(expected).max())):
         names = " and ".join(type(step).__name__ for step in steps)
         raise InvalidInputError(f"pipeline must score by a weighted sum of the features; {names} does not")
+
+
+def check_uint8(template: Template, params: FeatureParams) -> None:
+    """Check that scaled features are not those of images with values 0-1, as the course reads PNG files.
+
+    Such a template is useless for uint8 images. Its spatial bins can be converted, but not the HOG of a color
+    channel, whose small differences the rounding to uint8 removes.
+
+    Raises
+    ------
+    InvalidInputError
+        If the spatial bins, or the histogram where all values are in the first bins, show it.
+    """
+    mean, scale = template.mean, template.scale
+    if _has_float_bins(mean, scale, params) or _has_empty_bins(mean, scale, params):
+        raise InvalidInputError(
+            "pipeline must be fitted on features of uint8 images; it was fitted on values 0-1, as which the "
+            "course reads PNG files. Pass imread=vehicle_detection.read_image to extract_features, and fit "
+            "the scaler and the classifier again"
+        )
+
+
+def _has_float_bins(mean: Floats, scale: Floats, params: FeatureParams) -> bool:
+    """Whether the spatial bins are those of float images."""
+    if not params.spatial_feat:
+        return False
+    means, scales = (params.spatial_planes(values[: params.spatial_length]) for values in (mean, scale))
+    if params.spatial_space in ("LUV", "LAB"):
+        return bool(means[2].max() < _MAX_FLOAT_MEAN and (means + scales)[2].min() < _GRAY)
+    return bool((np.abs(means[1:]) + scales[1:]).max() < _MAX_UNIT)
+
+
+def _has_empty_bins(mean: Floats, scale: Floats, params: FeatureParams) -> bool:
+    """Whether all values are in the first bin of each channel's histogram of the range 0-256."""
+    bins = slice(params.spatial_length, params.spatial_length + params.hist_length)
+    rest = (values[bins].reshape(-1, params.hist_bins)[:, 1:] for values in (mean, scale))
+    means, scales = rest
+    return means.size > 0 and bool((means == 0).all() and (scales == 1).all())

@@ -80,6 +80,24 @@ def test_a_second_run_does_what_is_missing_or_changed(card, model, tmp_path):
     check_whole(out, done=3, failed=0)
 
 
+def test_results_may_lie_beside_the_sources(card, model, tmp_path):
+    above = tmp_path / "drive"
+    folder = above / "videos"  # its name is that of a folder of results
+    folder.mkdir(parents=True)
+    shutil.copy2(next(card.glob("*.mp4")), folder / "20260131_081500_F.mp4")
+    options = {"options": {"every": 10}}
+    for out in (above, folder):
+        assert counts(run(out, out, model, **options)) == (1, 0, 0, 0)
+        assert counts(run(out, out, model, **options)) == (0, 0, 0, 1)
+        assert len(records(out)) == 1
+        if out == above:
+            shutil.rmtree(next(folder.glob("date=*")))
+    with pytest.raises(
+        InvalidInputError, match="holds only videos that a batch wrote to .*; pass the videos"
+    ):
+        run(next(folder.glob("videos/date=*")), folder, model)
+
+
 def test_another_camera_file_changes_the_results(card, model, tmp_path):
     camera, one = tmp_path / "camera.json", str(card / "*0930*")
     options = {"tracks_only": True, "options": {"camera": str(camera)}}

@@ -69,6 +69,17 @@ def test_csv_of_predictions(tmp_path):
     assert len(read_labels(written(tmp_path, header))) == 0
 
 
+@pytest.mark.parametrize("name", ["track", "track_id"])
+def test_csv_labels_need_only_frames_tracks_and_boxes(tmp_path, name):
+    labels = read_labels(written(tmp_path, f"frame,{name},x1,y1,x2,y2\n0,1,0,0,9,9\n1,1,1,0,9,9\n"))
+    assert labels.tracks.tolist() == [1, 1]
+    assert labels.scores is None
+    assert not labels.ignore.any()
+    assert not labels.occluded.any()
+    ignored = read_labels(written(tmp_path, f"frame,{name},x1,y1,x2,y2,ignore\n0,1,0,0,9,9,1\n"))
+    assert ignored.ignore.tolist() == [True]
+
+
 def test_csv_frames_with_leading_zeros_are_names(tmp_path):
     text = f"{HEADER}\n007,1,0,0,9,9,0,0,0\n"
     assert read_labels(written(tmp_path, text)).frames == ("007",)
@@ -79,10 +90,12 @@ def test_csv_frames_with_leading_zeros_are_names(tmp_path):
     [
         ("", "lacks the columns frame, track, .* found an empty file"),
         (
-            "frame,track,x1,y1,x2,y2\n",
-            "lacks the columns occluded, truncated, ignore; found frame, track, x1",
+            "frame,x1,y1,x2,y2\n",
+            "lacks the columns track; found frame, x1, .*labels have frame,track,x1,y1,x2,y2 and, optionally, "
+            "occluded,truncated,ignore; predictions frame,track_id",
         ),
-        ("frame,track_id,x1,y1,x2,y2\n", "lacks the columns score; found frame"),
+        (f"{HEADER}\n0,1,0,0,9,9,,0,0\n", "line 2: occluded must be a finite number, got ''"),
+        (f"{HEADER}\n0,1,0,0,9,9,0,0,\n", "line 2: ignore must be 0 or 1, got ''"),
         ("frame,score,x1,y1,x2,y2\n", "lacks the columns track_id; found"),
         ("0,1,2,3,4,5,0,0,0\n", "lacks the columns frame.* found 0, 1, 2"),
         (HEADER + ",x1\n", "has the column x1 more than once"),

@@ -127,7 +127,8 @@ def run_batch(
     Parameters
     ----------
     sources
-        Video files, folders, patterns and URLs. Consecutive segments are one trip, see `find_trips`.
+        Video files, folders, patterns and URLs. Consecutive segments are one trip, see `find_trips`. The
+        annotated videos in `out` are left out.
     out
         Folder to write, or a URL of storage that fsspec knows, such as ``"s3://bucket/results"``. Several
         runs, also on several machines, may use one folder at the same time; at a URL, which has no locks, two
@@ -294,7 +295,12 @@ def _plan(
     part: tuple[int, int],
 ) -> list[dict[str, Any]]:
     """Describe the work on each trip of this shard."""
-    files = [each for each in listed if not each.startswith((f"{store.name}/", f"{store.name}{os.sep}"))]
+    own = tuple(f"{store.name}{separator}videos{separator}date=" for separator in {"/", os.sep})
+    files = [each for each in listed if not each.startswith(own)]
+    if not files:
+        raise InvalidInputError(
+            f"sources holds only videos that a batch wrote to {store.name}; pass the videos to process"
+        )
     trips = group_files(files, group)
     fingerprint = _fingerprint(settings)
     earlier: dict[str, list[str]] = {}  # keys of records by the identity of their trip

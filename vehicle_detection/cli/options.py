@@ -55,7 +55,7 @@ FieldOfView = Annotated[
     Option(
         "--fov",
         metavar="DEG",
-        help="Horizontal field of view in degrees, such as 90; default: 58, with a warning.",
+        help="Field of view along the longer side in degrees, such as 90; default: 58, with a warning.",
         rich_help_panel=CAMERA,
     ),
 ]

@@ -35,7 +35,8 @@ from vehicle_detection.evaluation.frame_boxes import (
 )
 from vehicle_detection.export import BOX_COLUMNS, FOLDER_FORMATS, FORMATS
 
-LABEL_COLUMNS = ("frame", "track", "x1", "y1", "x2", "y2", "occluded", "truncated", "ignore")
+REQUIRED_LABEL_COLUMNS = ("frame", "track", "x1", "y1", "x2", "y2")
+LABEL_COLUMNS = (*REQUIRED_LABEL_COLUMNS, "occluded", "truncated", "ignore")
 
 FRAME_NUMBER = re.compile(r"-?(0|[1-9][0-9]*)(\.0*)?")
 """Frame of a CSV file that is a number. One with leading zeros is a file name."""
@@ -191,14 +192,15 @@ def _typed_rows(source: Path, records: Sequence[tuple[str, Mapping[str, Any]]]) 
 
 def _check_columns(source: Path, names: Sequence[str]) -> bool:
     """Check that all columns are there; return whether they are those of predictions."""
-    predicted = "track" not in names and ("score" in names or ("track_id" in names and "ignore" not in names))
-    expected = BOX_COLUMNS if predicted else LABEL_COLUMNS
+    predicted = "track" not in names and "score" in names
+    expected = BOX_COLUMNS if predicted else REQUIRED_LABEL_COLUMNS
     given = {*names} | ({"track"} if "track_id" in names else set())
     missing = [name for name in expected if name not in given]
     if missing:
         raise DatasetError(
             f"{source} lacks the columns {', '.join(missing)}; found {', '.join(names) or 'an empty file'}; "
-            f"labels have {','.join(LABEL_COLUMNS)}, predictions {','.join(BOX_COLUMNS)}"
+            f"labels have {','.join(REQUIRED_LABEL_COLUMNS)} and, optionally, "
+            f"{','.join(LABEL_COLUMNS[len(REQUIRED_LABEL_COLUMNS) :])}; predictions {','.join(BOX_COLUMNS)}"
         )
     return predicted
 
@@ -207,7 +209,7 @@ def _table_row(where: str, record: dict[str, str], predicted: bool, counted: boo
     """Row of a table; `record` holds the text of each cell by the name of its column."""
 
     def text(name: str, default: str = "") -> str:
-        return record.get(name, "") or default
+        return record.get(name, default) or (default if predicted else "")
 
     if not text("frame"):
         raise DatasetError(f"{where}: frame is empty; enter its number from 0 or its file name")
@@ -215,11 +217,10 @@ def _table_row(where: str, record: dict[str, str], predicted: bool, counted: boo
     x1, y1, x2, y2 = (_number(text(name), name, where) for name in ("x1", "y1", "x2", "y2"))
     name = "track_id" if "track_id" in record else "track"
     track = _integer(text(name, str(NO_TRACK) if predicted else ""), name, where, low=NO_TRACK)
-    # Predictions may lack these columns, labels may not have empty cells in them.
-    zero = "0" if predicted else ""
-    occluded = _integer(text("occluded", zero), "occluded", where, low=0)
-    truncated = _number(text("truncated", zero), "truncated", where, low=0, high=1)
-    ignored = text("ignore", zero)
+    # These columns may be missing, but cells of labels may not be empty.
+    occluded = _integer(text("occluded", "0"), "occluded", where, low=0)
+    truncated = _number(text("truncated", "0"), "truncated", where, low=0, high=1)
+    ignored = text("ignore", "0")
     flag = {"0": False, "1": True, "false": False, "true": True}.get(ignored.lower())
     if flag is None:
         raise DatasetError(f"{where}: ignore must be 0 or 1, got {ignored!r}")
