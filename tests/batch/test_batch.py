@@ -93,7 +93,7 @@ def test_results_may_lie_beside_the_sources(card, model, tmp_path):
         if out == above:
             shutil.rmtree(next(folder.glob("date=*")))
     with pytest.raises(
-        InvalidInputError, match="holds only videos that a batch wrote to .*; pass the videos"
+        InvalidInputError, match=r"holds only videos that a batch wrote to .*; pass the videos"
     ):
         run(next(folder.glob("videos/date=*")), folder, model)
 

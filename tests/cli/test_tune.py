@@ -54,7 +54,7 @@ def test_a_grid_becomes_a_table_and_a_figure(patches, tmp_path, monkeypatch):
     assert list(table["orient"]) == [3, 0, 4]
     assert list(table["status"]) == ["ok", "failed", "ok"]
     assert list(table["split"].fillna("")) == ["sequences", "", "sequences"]
-    assert re.search(r"2 measured; \* none is both more accurate and faster", result.stdout)
+    assert re.search(r"2 measured; \*: no other is as accurate and faster,", result.stdout)
     assert re.search(r"(?m)^ *\* +\S.*orient=\d", result.stdout)
     assert re.search(r"orient=0.* failed: orient must be an integer from 1 to 180", result.stdout)
     assert result.stdout.endswith(f"wrote {out}, {plot}\n")
@@ -138,3 +138,15 @@ def test_tune_refuses_bad_input(patches, material, tmp_path):
     same = ("--vehicles", tmp_path / "table.csv", *patches[2:])
     assert "is also --vehicles" in refuse(*same, *grid, *table)
     assert (tmp_path / "table.csv").read_text() == "a,b\n1,2\n"
+
+
+def test_a_grid_that_cannot_be_trained_is_an_error(material, tmp_path):
+    words = ("--vehicles", material / "vehicles", "--non-vehicles", material / "non-vehicles")
+    words += ("--grid", f"{SMALL} C=-1", "-o", tmp_path / "t.csv")
+    for _ in range(2):  # the second time from the stored results
+        result = run(*words)
+        assert result.exit_code == 2
+        assert "failed: C must be" in result.stdout
+        assert result.stderr.splitlines()[-1] == (
+            f"error: --grid has no configuration that can be trained; see above and {tmp_path / 't.csv'}"
+        )

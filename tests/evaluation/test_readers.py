@@ -91,8 +91,8 @@ def test_csv_frames_with_leading_zeros_are_names(tmp_path):
         ("", "lacks the columns frame, track, .* found an empty file"),
         (
             "frame,x1,y1,x2,y2\n",
-            "lacks the columns track; found frame, x1, .*labels have frame,track,x1,y1,x2,y2 and, optionally, "
-            "occluded,truncated,ignore; predictions frame,track_id",
+            "lacks the columns track; found frame, x1, .*labels have frame,track,x1,y1,x2,y2 and, "
+            "optionally, occluded,truncated,ignore; predictions frame,track_id",
         ),
         (f"{HEADER}\n0,1,0,0,9,9,,0,0\n", "line 2: occluded must be a finite number, got ''"),
         (f"{HEADER}\n0,1,0,0,9,9,0,0,\n", "line 2: ignore must be 0 or 1, got ''"),

@@ -25,8 +25,8 @@ def search_everywhere(model: Any, conf: float | None) -> VehicleDetector:
 def warn_of_horizon(horizon: str | float, found: HorizonEstimate | None) -> None:
     """Print what a search of all rows found where none was found below a given horizon."""
     message = (
-        f"warning: no vehicle was found with --horizon {horizon}; leave it out if there are some (a search of "
-        "all rows found too few vehicles to estimate it)"
+        f"warning: no vehicle was found with --horizon {horizon}; leave it out if there are some "
+        "(a search of all rows found too few vehicles to estimate it)"
     )
     if found is not None:
         message = (

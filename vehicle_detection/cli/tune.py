@@ -104,6 +104,8 @@ def tune(
         write_results(table, output)
     final = table[table["stage"] == ("final" if halving else "compare")]
     _show(final, table)
+    if final["accuracy"].isna().all():
+        raise InvalidInputError(f"--grid has no configuration that can be trained; see above and {output}")
     if plot is not None:
         _draw(final, plot)
     typer.echo(f"wrote {', '.join(map(str, targets.values()))}")
@@ -135,8 +137,9 @@ def _show(final: DataFrame, table: DataFrame) -> None:
         cells += [_text(row["search_ms"], 1)]
         rows.append(cells + ([_text(row["frame_f1"], 3), _text(row["frame_best_f1"], 3)] if scored else []))
     heads += ["frames F1", "best F1"] if scored else []
-    title = f"{len(measured)} measured; * none is both more accurate and faster"
-    print_table(title, heads, rows)
+    title = f"{len(measured)} measured; *: no other is as accurate and faster, or as fast and more accurate"
+    if rows:
+        print_table(title, heads, rows)
     for row in table[table["message"].notna()].drop_duplicates("configuration").to_dict("records"):
         typer.echo(f"{row['configuration']} {row['status']}: {row['message']}")
 
