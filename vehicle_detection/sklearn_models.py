@@ -16,8 +16,8 @@ from vehicle_detection.params import FeatureParams
 Floats = NDArray[np.float64]
 
 _SCALERS = ("StandardScaler", "RobustScaler", "MinMaxScaler", "MaxAbsScaler")
-# Greatest sum of mean and scale of a spatial bin with values 0-1. For the last channel of LUV and LAB: greatest
-# mean in float images, where gray is 0, and least sum in uint8 images, where gray is 128 or more.
+# Greatest sum of mean and scale of a spatial bin with values 0-1. For the last channel of LUV and LAB: the
+# greatest mean in float images, where gray is 0, and the least sum in uint8 images, where gray is over 127.
 _MAX_UNIT, _MAX_FLOAT_MEAN, _GRAY = 2.5, 64.0, 128.0
 
 

@@ -163,7 +163,7 @@ def track(
     InvalidInputError
         If an argument is invalid.
     VideoError
-        If the source cannot be decoded; while reading, if it is incomplete.
+        If the source cannot be decoded; while reading, if a server sends only a part of it.
 
     Examples
     --------

@@ -487,13 +487,27 @@ def test_detect_refuses_bad_input_and_changes_no_file(material, tmp_path):
     assert (material / "road.png").read_bytes() == original
 
 
-def test_one_bad_image_prevents_the_table(picture, material, tmp_path):
+def test_images_that_cannot_be_decoded_are_left_out(picture, material, tmp_path):
+    bad = [material / "cut_road.png", material / "text.png"]
+    words = ("--boxes", tmp_path / "boxes.csv", "-o", tmp_path / "found")
+    result = run("detect", bad[0], picture, bad[1], *words)
+    assert result.exit_code == 3
+    for line, path in zip(result.stderr.splitlines(), bad, strict=True):
+        assert line.startswith(f"warning: image file {path} must be a complete image file")
+        assert line.endswith("; left out")
+    assert succeed("detect", picture, "--boxes", tmp_path / "alone.csv")
+    assert (tmp_path / "boxes.csv").read_text() == (tmp_path / "alone.csv").read_text()
+    assert contents(tmp_path / "found") == [picture.name]
+    # A horizon that hides all vehicles is checked with the other images.
+    assert run("detect", bad[0], picture, "--horizon", 0.95).exit_code == 3
+
+
+def test_no_image_that_can_be_decoded_prevents_the_table(material, tmp_path):
     (tmp_path / "boxes.csv").write_text("earlier")
-    result = run("detect", picture, material / "cut_road.png", "--boxes", tmp_path / "boxes.csv")
-    note, error = result.stderr.splitlines()
+    words = (material / "text.png", material / "cut_road.png", "--boxes", tmp_path / "boxes.csv")
+    result = run("detect", *words)
     assert result.exit_code == 2
-    assert note.startswith("note: ")
-    assert error.startswith("error: ")
+    assert [line.partition(":")[0] for line in result.stderr.splitlines()] == ["note", "warning", "error"]
     assert (tmp_path / "boxes.csv").read_text() == "earlier"
     assert contents(tmp_path) == ["boxes.csv"]
 
@@ -656,6 +670,23 @@ def test_existing_files_are_replaced_with_a_note(clip, picture, tmp_path):
         notes = [run(*words).stderr.count(f"note: {path} will be replaced when") for _ in range(2)]
         assert notes == [0, 1]
     assert "note" not in run(*runs[0], "--quiet").stderr
+    for words, refused in ((runs[0], ["--jobs", 0]), (runs[0], ["--fov", 200]), (runs[1], ["--horizon", 9])):
+        assert refuse(*words, *refused).startswith("error: --")
+
+
+def test_pixels_that_are_not_square_give_a_warning(tmp_path):
+    drive = render_drive(frames=20, random_state=1)
+    frames = [drive[index].image for index in range(20)]
+    warning = (
+        "warning: the pixels of this video are not square (width to height 4/3), so distances are wrong;"
+    )
+    for name, aspect in (("square", "1"), ("wide", "4/3")):
+        clip = write_clip(tmp_path / f"{name}.mp4", frames, options=["-vf", f"setsar={aspect}"])
+        words = ("video", clip, "--tracks", tmp_path / "t.csv", "--fov", 60)
+        result = run(*words)
+        assert result.exit_code == 0
+        assert (warning in result.stderr) == (name == "wide")
+        assert "warning" not in run(*words, "--quiet").stderr
 
 
 def test_a_damaged_video_has_an_exit_code_of_its_own(clip, tmp_path):

@@ -223,14 +223,18 @@ def test_colors_are_unchanged_after_writing_and_reading(tmp_path):
 @pytest.mark.parametrize(
     ("name", "options"), [("truncated.mp4", ["-movflags", "+faststart", "-g", 10]), ("truncated.mkv", [])]
 )
-def test_the_error_for_an_incomplete_file_states_the_readable_part(truncated, tmp_path, name, options):
+def test_the_readable_part_of_an_incomplete_file_is_processed(truncated, tmp_path, name, options):
     source, target = truncated(name, *options), tmp_path / "out.mp4"
     target.write_bytes(b"an existing file")
-    message = r"is incomplete: (\d+) of about 100 frames can be decoded; .* or end at ([\d.]+) s"
+    message = r"is incomplete: (\d+) of about 100 frames can be decoded; copy it again"
     with pytest.raises(VideoError, match=message) as caught:
-        process_video(source, target, StubDetector())
+        process_video(source, target, StubDetector(), strict=True)
     assert target.read_bytes() == b"an existing file"
-    frames, end = re.search(message, str(caught.value)).groups()
-    assert 20 < int(frames) < 90
-    # The remedy works, and processes all readable frames.
-    assert process_video(source, target, StubDetector(), end=float(end)).frames == int(frames)
+    frames = int(re.search(message, str(caught.value))[1])
+    assert 20 < frames < 90
+    report = process_video(source, target, StubDetector())
+    assert report.frames == frames
+    assert report.damage == str(caught.value)
+    with read_frames(target) as written:
+        assert len(list(written)) == frames
+    assert not process_video(source, target, StubDetector(), end=0.2).damage

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -44,10 +45,13 @@ from vehicle_detection.cli.output import (
 from vehicle_detection.cli.signals import raise_on_signals
 from vehicle_detection.cli.train import fetch, info, train, train_frames
 from vehicle_detection.cli.tune import tune
-from vehicle_detection.cli.video import video
+from vehicle_detection.cli.video import DAMAGED, video
 from vehicle_detection.errors import DatasetError, InvalidInputError, VehicleDetectionError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from vehicle_detection.boxes import Detections
     from vehicle_detection.detector import VehicleDetector
 
@@ -190,7 +194,10 @@ def detect(
     line_width: LineWidth = None,
     blur: Blur = None,
 ) -> None:
-    """Detect the vehicles of images."""
+    """Detect the vehicles of images.
+
+    Exit code 3: some images cannot be decoded, and are left out.
+    """
     from vehicle_detection._common import check_choice, check_integer
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.export import write_boxes
@@ -199,14 +206,16 @@ def detect(
     if line_width is not None:
         check_integer(line_width, "line_width", low=1, high=1000)
     _check_images(images, output, boxes)
-    announce_replaced([boxes])
+    undecodable: list[Path] = []
     with (
         VehicleDetector(model, conf=conf, horizon=horizon, blur=parse_blur(blur)) as detector,
         output_folder(output, "--output"),
         output_folder(why, "--why"),
     ):
-        found = _detect_each(images, detector, output, why, scores=labels == "score", line_width=line_width)
-        found = _warn_if_empty(found, images, detector, horizon)
+        announce_replaced([boxes])
+        readable = _read_each(images, undecodable)
+        found = _detect_each(readable, detector, output, why, scores=labels == "score", line_width=line_width)
+        found = _warn_if_empty(found, images, undecodable, detector, horizon)
         if boxes is None:
             for _ in found:
                 pass
@@ -214,6 +223,8 @@ def detect(
             with option_names(path="--boxes"):
                 rows = write_boxes(found, boxes)
             typer.echo(f"wrote {rows} boxes to {boxes}")
+    if undecodable:
+        raise typer.Exit(DAMAGED)
 
 
 def _check_images(images: list[Path], output: Path | None, boxes: Path | None) -> None:
@@ -244,6 +255,7 @@ def _check_images(images: list[Path], output: Path | None, boxes: Path | None) -
 def _warn_if_empty(
     found: Iterator[tuple[str, Detections]],
     images: list[Path],
+    undecodable: list[Path],
     detector: VehicleDetector,
     horizon: float | None,
 ) -> Iterator[tuple[str, Detections]]:
@@ -261,7 +273,8 @@ def _warn_if_empty(
         return
     boxes, shape = [np.empty((0, 4))], (1, 1)
     with search_everywhere(detector.model, None) as everywhere:
-        for image in map(read_image, images[:_CHECKED_IMAGES]):
+        decodable = (path for path in images if path not in undecodable)
+        for image in map(read_image, itertools.islice(decodable, _CHECKED_IMAGES)):
             if image.shape[:2] == shape or shape == (1, 1):
                 shape = image.shape[:2]
                 boxes.append(everywhere.detect(image).boxes)
@@ -271,8 +284,27 @@ def _warn_if_empty(
     warn_of_horizon(horizon, estimate)
 
 
+def _read_each(images: list[Path], undecodable: list[Path]) -> Iterator[tuple[Path, NDArray[np.uint8]]]:
+    """Yield the images that can be decoded, warn of others and list them; it is an error if all are such."""
+    from vehicle_detection.images import read_image
+
+    for path in images:
+        try:
+            with capture_stderr() as messages:
+                image = read_image(path)
+        except InvalidInputError as error:
+            undecodable.append(path)
+            if len(undecodable) == len(images):
+                raise
+            print_error(f"warning: {error}; left out")
+            continue
+        for message in messages:
+            print_error(f"warning: {path}: {message}")
+        yield path, image
+
+
 def _detect_each(
-    images: list[Path],
+    images: Iterable[tuple[Path, NDArray[np.uint8]]],
     detector: VehicleDetector,
     output: Path | None,
     why: Path | None,
@@ -285,13 +317,9 @@ def _detect_each(
 
     from vehicle_detection._common import pluralize
     from vehicle_detection.drawing import blur_boxes, draw_detections, score_texts
-    from vehicle_detection.images import read_image, write_image
+    from vehicle_detection.images import write_image
 
-    for path in images:
-        with capture_stderr() as messages:
-            image = read_image(path)
-        for message in messages:
-            print_error(f"warning: {path}: {message}")
+    for path, image in images:
         found = detector.detect(image)
         listed = "".join(
             f"  [{' '.join(f'{side:.0f}' for side in box)}] {text}"

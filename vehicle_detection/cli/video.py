@@ -49,6 +49,10 @@ _UNKNOWN_LENS = (
     "warning: distances assume a lens of 58 degrees, and may be wrong by a factor of 2 or more; "
     "pass --fov or --camera"
 )
+_NOT_SQUARE = (
+    "warning: the pixels of this video are not square (width to height {}), so distances are wrong; "
+    "convert it first: ffmpeg -i IN -vf scale=iw*sar:ih,setsar=1 OUT"
+)
 
 
 @option_names(target="--output", workers="--jobs", field_of_view="--fov", camera_height_m="--camera-height")
@@ -254,8 +258,6 @@ def video(
     draw_params = _draw_params(labels, line_width=line_width, color_by=color_by, panel=panel, units=units)
     speed = read_speed(own_speed, gpx, gpx_offset)
     side_outputs = SideOutputs(events, clips, srt)
-    if not quiet:
-        announce_replaced(outputs.values())
     with name_kept_files(outputs.values()), contextlib.ExitStack() as stack:
         stack.enter_context(output_folder(clips, "--clips"))
         writers: list[Callable[[Any], object]] = []
@@ -302,6 +304,10 @@ def video(
         if tracks is not None:
             with option_names(path="--tracks"):
                 writers.append(stack.enter_context(TrackWriter(tracks, shape=opened.info.shape)))
+        if not quiet:
+            # After the other checks: what is refused replaces nothing.
+            VideoRun(opened, detector, target=output, audio=not no_audio, **settings)
+            announce_replaced(outputs.values())
         done = process_video(
             opened,
             output,
@@ -324,6 +330,8 @@ def video(
             warn_of_horizon(horizon, estimate_video_horizon(source, everywhere, start=start, end=end))
     if done.tracks and not detector.lens_is_known and not quiet:
         print_error(_UNKNOWN_LENS)
+    if done.tracks and opened.info.pixel_aspect != 1 and not quiet:
+        print_error(_NOT_SQUARE.format(opened.info.pixel_aspect))
     if not quiet or profile:
         lines = str(done).splitlines()
         typer.echo("\n".join(lines if profile else lines[:1]))

@@ -195,8 +195,7 @@ def process_video(
     InvalidInputError
         If an argument is invalid.
     VideoError
-        If the source is not a video or is incomplete, or is damaged and `strict` is set, or the target cannot
-        be written.
+        If the source is not a video, or is damaged and `strict` is set, or the target cannot be written.
 
     Examples
     --------

@@ -74,7 +74,7 @@ def read_frames(
     InvalidInputError
         If the file is missing, or there is no frame between `start` and `end`.
     VideoError
-        If the file is not a video; while reading, if it is incomplete.
+        If the file is not a video.
 
     Examples
     --------

@@ -185,14 +185,12 @@ class FrameReader(_FfmpegStream):
             return
         end, name = self._first + self.frames_read, source_name(self._path)
         complete = self._count is not None and self.frames_read >= self._count
+        incomplete = ""
         if not complete and end < self.info.frames - 1 and _TRUNCATED.search(log):
-            seconds = math.floor(end / self.info.fps * 100) / 100
-            message = (
-                f"{name} is incomplete: {end} of about {self.info.frames} frames can be decoded; "
-                f"copy the file again, or end at {seconds:g} s to process the readable part"
-            )
-            raise video_error(message, self._path, code, log)
-        if code and not complete:
+            incomplete = f"{name} is incomplete: {end} of about {self.info.frames} frames can be decoded"
+        if incomplete and isinstance(self._path, str):  # the server or the network may be to blame
+            raise video_error(f"{incomplete}; try again", self._path, code, log)
+        if code and not complete and not incomplete:
             message = (
                 f"{name} cannot be decoded after frame {end}: {exit_reason(code, log)}; "
                 "if this happens again, copy the file again"
@@ -204,7 +202,11 @@ class FrameReader(_FfmpegStream):
         # After a jump into the file, the first frames may refer to frames before it, which is no damage.
         errors = "" if self._sought else log
         stop = None if self._count is None else self._first + self._count
-        self.damage = find_damage(self._path, self.info, end, errors, stop=stop)
+        self.damage = (
+            f"{incomplete}; copy it again"
+            if incomplete
+            else find_damage(self._path, self.info, end, errors, stop=stop)
+        )
         if self.damage and self._strict:
             raise VideoError(self.damage)
         if self.damage:
