@@ -734,7 +734,7 @@ def test_an_unknown_lens_gives_a_large_error(wide_scenes):
     [
         ({"field_of_view": 200}, "field_of_view must be a number, at least 1 and at most 170; got 200"),
         ({"camera_height_m": 0}, "camera_height_m must be a number, greater than 0"),
-        ({"camera": "wide-90", "field_of_view": 90}, "field_of_view must be None with a camera"),
+        ({"camera": "wide-90", "field_of_view": 90}, "field_of_view must be omitted with a camera"),
         (
             {"camera": Camera.for_frame((72, 128)), "camera_height_m": 1},
             "camera_height_m must be None with a",

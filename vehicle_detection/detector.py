@@ -751,7 +751,7 @@ def _check_lens(camera: object, field_of_view: float | None, camera_height_m: fl
     """Arguments of `Camera.for_frame` that do not depend on the frame."""
     if camera is not None and field_of_view is not None:
         raise InvalidInputError(
-            f"field_of_view must be None with a camera, which has one; got {field_of_view}; omit one of them"
+            f"field_of_view must be omitted with a camera, which has one; got {field_of_view}"
         )
     named = camera is None or (isinstance(camera, str) and camera in LENSES)
     if not named and not isinstance(camera, Camera) and not os.path.isfile(str(camera)):

@@ -382,7 +382,7 @@ def test_video_takes_the_camera(tmp_path):
         (("--units", "nautical"), "--units must be one of 'metric', 'imperial'; got 'nautical'"),
         (("--camera-height", 0), "--camera-height must be a number"),
         (("--camera", "missing.json"), "--camera must be a Camera, a file or one of standard-58, "),
-        (("--camera", "wide-90", "--fov", 90), "--fov must be None with a camera"),
+        (("--camera", "wide-90", "--fov", 90), "--fov must be omitted with a camera"),
     ):
         result = run("video", clip, "-o", tmp_path / "out.mp4", *words)
         assert result.exit_code == 2
@@ -847,7 +847,7 @@ def test_video_refuses_bad_input_before_it_estimates_the_horizon(material, tmp_p
     lens = tmp_path / "lens.json"
     lens.write_text('{"image_size": [640, 480], "focal_px": 600}')
     cases = bad_videos(material, tmp_path) | {
-        r"--fov must be None with a camera": [clip, "-o", target, "--camera", "wide-90", "--fov", 90],
+        r"--fov must be omitted with a camera": [clip, "-o", target, "--camera", "wide-90", "--fov", 90],
         r"--fov must be a number": [clip, "-o", target, "--fov", 500],
         r"lens.json: image_size must have the aspect ratio": [clip, "-o", target, "--camera", lens],
         r"--conf must be a number": [clip, "-o", target, "--conf", 2],
@@ -1197,7 +1197,7 @@ def test_train_frames_refuses_bad_input_before_it_trains(drawn_roads, tmp_path, 
     cases = {
         r"folder \S+none does not exist; pass the folder of the labelled": [tmp_path / "none", "-o", model],
         r"folder \S+empty has no labels/NAME.csv": [tmp_path / "empty", "-o", model],
-        r"DATA must be at least two, .*; got 1": [one, "-o", model],
+        r"DATA must hold at least two data sets, .*; got 1": [one, "-o", model],
         r"--output needs an existing folder": [drawn_roads, "-o", tmp_path / "none" / "m.safetensors"],
         r"--output must be a file, got the folder": [drawn_roads, "-o", tmp_path],
         r"--curves \S+ is also --output \S+;": [drawn_roads, "-o", model, "--curves", model],
@@ -1259,3 +1259,30 @@ def test_the_course_clip_by_command(real_data, tmp_path):
     track_scores = json.loads(scores.read_text())["tracks"]
     assert track_scores["f1"] == 1.0
     assert track_scores["mean_iou"] >= 0.7
+
+
+def test_a_piped_video_whose_index_is_at_its_end_is_refused(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (20, 180, 320, 3), np.uint8)
+    clip = write_clip(tmp_path / "noise.mp4", list(noise))
+    words = [sys.executable, "-m", "vehicle_detection", "video", "-", "-o", str(tmp_path / "out.mp4")]
+    result = subprocess.run(words, input=clip.read_bytes(), capture_output=True, check=False)
+    assert result.returncode == 2
+    assert b"a pipe needs MPEG-TS, or MP4 with its index at the start; pass the file's path" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["detcet"], r"No such command 'detcet'.*; see \S+ --help"),
+        (["--fast"], r"No such option: --fast; see \S+ --help"),
+        (["detect", "--fast"], r"No such option: --fast; see \S+ detect --help"),
+        (["detect"], r"Missing argument 'IMAGE...'; see \S+ detect --help"),
+        (
+            ["video", "a.mp4", "--jobs", "many"],
+            r"Invalid value for '--jobs': Input should be a valid integer; .*",
+        ),
+        (["video", "a.mp4", "--labels"], r"Option '--labels' requires an argument; see \S+ --help"),
+    ],
+)
+def test_a_wrong_call_is_an_error_of_one_line(words, message):
+    assert re.fullmatch(f"error: {message}\n", refuse(*words))

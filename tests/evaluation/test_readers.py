@@ -226,7 +226,11 @@ def test_coco_file(tmp_path):
             coco(annotations=[{"image_id": 5, "category_id": 1, "bbox": [1, 2, 0, 5]}]),
             "annotation 0: a box needs x1 < x2",
         ),
-        ("a.json", coco(categories=[{"id": 1, "name": "boat"}]), "no category among car, .* found 'boat'"),
+        (
+            "a.json",
+            coco(categories=[{"id": 1, "name": "boat"}]),
+            "no category among bus, car, .* found 'boat'",
+        ),
         ("a.jsonl", '{"frame": 0}\n', "lacks the columns track, x1, .*; found frame"),
         ("a.jsonl", "{", "line 1: not a JSON object"),
         ("a.jsonl", "\n[]", "line 2: expected a JSON object, found"),
@@ -400,6 +404,29 @@ def test_a_yolo_folder(tmp_path, name, text):
     np.testing.assert_allclose(found.boxes, [[80, 30, 120, 70]])
     assert found.scores is None
     assert len(read_labels(tmp_path, shape=(100, 200), classes=["person", "car"])) == 2
+
+
+def test_a_yolo_folder_without_names(tmp_path):
+    (tmp_path / "a.txt").write_text("1 0.5 0.5 0.2 0.4\n0 0.5 0.5 0.1 0.1\n")
+    options = {"format": "yolo", "shape": (100, 200)}
+    assert len(read_labels(tmp_path, **options)) == 2
+    np.testing.assert_allclose(read_labels(tmp_path, **options, classes=["1"]).boxes, [[80, 30, 120, 70]])
+
+
+def test_files_without_a_class_of_vehicles_are_refused(tmp_path):
+    options = {"format": "yolo", "shape": (100, 200)}
+    (tmp_path / "a.txt").write_text("0 0.5 0.5 0.2 0.4\n")
+    (tmp_path / "classes.txt").write_text("auto\nlkw\n")
+    message = r"no class among bus, car, .* found 'auto', 'lkw'; name those of vehicles with classes="
+    with pytest.raises(DatasetError, match=message):
+        read_labels(tmp_path, **options)
+    assert len(read_labels(tmp_path, **options, classes=["Auto"])) == 1
+    with pytest.raises(DatasetError, match=r"no class among foo; found 'auto', 'lkw'"):
+        read_labels(tmp_path, **options, classes=["foo"])
+    (tmp_path / "mot.txt").write_text("1,1,1,1,9,9,1,3,1\n")
+    with pytest.raises(DatasetError, match=r"no class among car; found '3'"):
+        read_labels(tmp_path / "mot.txt", classes=["car"])
+    assert len(read_labels(tmp_path / "mot.txt", classes=["3"])) == 1
 
 
 @pytest.mark.parametrize(

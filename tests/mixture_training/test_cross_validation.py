@@ -101,7 +101,8 @@ def test_extra_sources_are_never_evaluated(sources):
 
 def test_too_few_sources(sources):
     with pytest.raises(
-        InvalidInputError, match="sources must be at least two, so that one can be left out; got 1"
+        InvalidInputError,
+        match="sources must hold at least two data sets, so that one can be left out; got 1",
     ):
         cross_validate_mixture(sources[:1], SMALL_MIXTURE)
     twin = dataclasses.replace(sources[1], name="one")

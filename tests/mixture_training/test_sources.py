@@ -63,7 +63,7 @@ def test_invalid_folders(tmp_path):
     labels = tmp_path / "labels" / "town.csv"
     rows = labels.read_text()
     labels.write_text(rows.replace("00", "99"))
-    with pytest.raises(InvalidInputError, match=r"town.csv: labels contain none of the frames"):
+    with pytest.raises(InvalidInputError, match=r"town.csv: labels must name the frames, such as "):
         find_sources(tmp_path)
     labels.write_text(rows)
     (tmp_path / "labels" / "other.csv").write_text(rows)

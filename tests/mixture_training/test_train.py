@@ -96,7 +96,9 @@ def test_the_svm_solver_agrees_with_scikit_learn():
 
 
 def test_invalid_training_arguments(drawn_source):
-    with pytest.raises(InvalidInputError, match="sources must be at least one; got 0: add labelled frames"):
+    with pytest.raises(
+        InvalidInputError, match="sources must hold at least one data set; got 0: add labelled frames"
+    ):
         train_mixture([])
     with pytest.raises(InvalidInputError, match="sources must be a list of FrameDataset, got"):
         train_mixture(drawn_source)

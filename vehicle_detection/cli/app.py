@@ -59,13 +59,35 @@ BAD_INPUT, INTERRUPTED = 2, 130  # exit codes
 _CHECKED_IMAGES = 20  # images that are searched again if no vehicle was found
 
 
+# Of an unknown command or option, or a value of another type; typer has no public name for this class.
+_UsageError: type[Any] = typer.BadParameter.__bases__[0]
+
+
+@contextlib.contextmanager
+def _print_usage_error() -> Iterator[None]:
+    """Print an error in how a command is called as one line, instead of a box, and exit."""
+    try:
+        yield
+    except _UsageError as error:
+        if type(error).__name__ == "NoArgsIsHelpError":
+            raise
+        message = " ".join(error.format_message().split()).rstrip(".")
+        command = "vehicle-detection" if error.ctx is None else error.ctx.command_path
+        print_error(f"error: {message.partition(', unable to parse')[0]}; see {command} --help")
+        raise typer.Exit(BAD_INPUT) from None
+
+
 class _Commands(TyperGroup):
     """Commands whose expected errors become one line on standard error."""
+
+    def make_context(self, *args: Any, **options: Any) -> Any:
+        with _print_usage_error():
+            return super().make_context(*args, **options)
 
     def invoke(self, ctx: Any) -> Any:
         replace_unprintable()
         try:
-            with raise_on_signals(), print_warnings():
+            with raise_on_signals(), print_warnings(), _print_usage_error():
                 return super().invoke(ctx)
         except (InvalidInputError, DatasetError) as error:
             print_error(f"error: {rename_argument(str(error), self._option_names(ctx))}")

@@ -68,7 +68,8 @@ class SideOutputs:
         unknown = 0.0 if speeds is None or not len(speeds) else float(np.isnan(speeds).mean())
         if unknown > _MAX_UNKNOWN and not quiet:
             print_error(
-                f"warning: the own speed is known for {1 - unknown:.0%} of the video; check --gpx-offset"
+                f"warning: the own speed is known for {1 - unknown:.0%} of the video; check --gpx-offset, "
+                "and that the file has no gaps of over 5 s"
             )
         camera = detector.camera_of(report.shape)
         return find_events(

@@ -70,10 +70,9 @@ class LabelledFrames:
             raise InvalidInputError("frames must hold at least one image, got none")
         check_type(labels, "labels", FrameBoxes, "read a file with read_labels")
         if not set(keys) & set(labels.frame_keys):
-            other = f"such as {labels.frame_keys[0]!r}" if labels.frame_keys else "but it is empty"
+            named = f"names {labels.frame_keys[0]!r}" if labels.frame_keys else "is empty"
             raise InvalidInputError(
-                f"labels contain none of the frames, such as {keys[0]!r}, {other}; "
-                "use the same keys on both sides"
+                f"labels must name the frames, such as {keys[0]!r}; it {named}; use the same names in both"
             )
         if self.horizon is not None:
             check_number(self.horizon, "horizon", low=0, high=1)

@@ -269,7 +269,22 @@ def _kitti_row(
 
 
 def _read_mot(source: Path, classes: Collection[str] | None) -> Rows:
-    return [row for row, number in _mot_rows(_read_lines(source)) if classes is None or number in classes], []
+    rows = list(_mot_rows(_read_lines(source)))
+    if classes is not None and rows:
+        _check_classes(source, {number for _, number in rows if number is not None}, classes)
+    return [row for row, number in rows if classes is None or number in classes], []
+
+
+def _check_classes(
+    source: Path, found: Collection[str], wanted: Collection[str], kind: str = "class"
+) -> None:
+    """Refuse a file in which no class is that of vehicles: it would have no box."""
+    if not any(name in wanted for name in found):
+        listed = ", ".join(map(repr, sorted(found))) or "none"
+        raise DatasetError(
+            f"{source} has no {kind} among {', '.join(sorted(wanted))}; found {listed}; "
+            "name those of vehicles with classes="
+        )
 
 
 def _mot_rows(lines: Iterable[tuple[str, str]], *, first_pixel: int = 1) -> Iterator[tuple[Row, str | None]]:
@@ -298,6 +313,8 @@ def _read_mot_zip(source: Path, classes: Collection[str] | None) -> Rows:
         raise DatasetError(f"{source} is not an archive of CVAT: it lacks gt/gt.txt; export MOT 1.1 there")
     wanted = VEHICLE_CLASSES if classes is None else classes
     labels = None if names is None else [name.strip().lower() for name in names.splitlines() if name.strip()]
+    if labels:
+        _check_classes(source, labels, wanted)
     lines = ((f"{source} line {n}", line) for n, line in enumerate(text.splitlines(), 1) if line.strip(", "))
     rows = []
     for row, number in _mot_rows(lines, first_pixel=0):
@@ -344,6 +361,8 @@ def _read_yolo(source: Path, classes: Collection[str] | None, shape: tuple[int, 
         raise DatasetError(f"{folder} holds no .txt file; name a folder of YOLO labels")
     names = _yolo_names(source)
     wanted = VEHICLE_CLASSES if classes is None else classes
+    if names:
+        _check_classes(source, names.values(), wanted)
     numbered = all(file.stem.isdecimal() and file.stem == f"{int(file.stem):06d}" for file in files)
     keys: list[FrameKey] = []
     rows: list[Row] = []
@@ -351,7 +370,8 @@ def _read_yolo(source: Path, classes: Collection[str] | None, shape: tuple[int, 
         keys.append(int(file.stem) if numbered else file.stem)
         for where, line in _read_lines(file):
             name, row = _yolo_row(where, keys[-1], line.split(), shape)
-            if not names or names.get(name, name) in wanted:
+            # Without names, classes are numbers, and by default all of them are vehicles.
+            if (not names and classes is None) or names.get(name, name) in wanted:
                 rows.append(row)
     return rows, keys
 
@@ -444,12 +464,8 @@ def vehicle_categories(file: CocoFile, source: Path, classes: Collection[str] | 
     """Ids of the categories that are vehicles; raise if there are annotations but no such category."""
     wanted = VEHICLE_CLASSES if classes is None else classes
     found = {number for number, name in file.categories.items() if name in wanted}
-    if file.annotations and not found:
-        listed = ", ".join(map(repr, file.categories.values())) or "none"
-        raise DatasetError(
-            f"{source} has no category among {', '.join(wanted)}; found {listed}; "
-            "name those of vehicles with classes="
-        )
+    if file.annotations:
+        _check_classes(source, file.categories.values(), wanted, "category")
     return found
 
 

@@ -65,8 +65,10 @@ def check_sources(sources: object, *, min_count: int = 1) -> tuple[FrameDataset,
         check_type(source, "sources", FrameDataset, "wrap the frames of each camera or country in one")
     names = [source.name for source in sources]
     if len(names) < min_count:
-        expected = "at least two, so that one can be left out" if min_count > 1 else "at least one"
-        raise InvalidInputError(f"sources must be {expected}; got {len(names)}: add labelled frames")
+        expected = "two data sets, so that one can be left out" if min_count > 1 else "one data set"
+        raise InvalidInputError(
+            f"sources must hold at least {expected}; got {len(names)}: add labelled frames"
+        )
     twice = {name for name in names if names.count(name) > 1}
     if twice:
         raise InvalidInputError(

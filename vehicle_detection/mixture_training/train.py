@@ -142,7 +142,7 @@ class _Training:
             if not len(rows):
                 raise InvalidInputError(
                     f"sources must hold vehicles of every shape, got none like {width:g}x{height:g} that is "
-                    f"at least {params.min_width:g} pixels wide; label more, or train without that shape"
+                    f"at least {params.min_width:g} pixels wide; label more, or leave out that shape"
                 )
         if len(patches):
             more = patch_features(

@@ -75,7 +75,12 @@ class _LiveProcess:
                 )
             code = self.process.wait()
             check_frame_size(self.name, self.process.log())
-            message = f"{self.name} is not a video that ffmpeg can read ({self.reason()}); check the source"
+            remedy = "check the source"
+            if "received no packets" in self.reason() and self.name == "-":
+                remedy = (
+                    "a pipe needs MPEG-TS, or MP4 with its index at the start; pass the file's path instead"
+                )
+            message = f"{self.name} is not a video that ffmpeg can read ({self.reason()}); {remedy}"
             raise video_error(message, self.name, code, self.process.log())
         width, height, numerator, denominator = (int(number) for number in size.groups())
         return VideoInfo(
