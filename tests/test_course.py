@@ -689,6 +689,10 @@ def test_every_call_form_binds(call_data, form, is_right):
             "search_windows(d.image, d.boxes, d.scaler, d.svc, **d.options)",
             "classifier must have a method predict",
         ),
+        (
+            "find_cars(d.image, 90, 200, 1, d.svc, StandardScaler(), 9, 8, 2, 16, 16)",
+            "scaler must be fitted; got an unfitted StandardScaler: call fit first",
+        ),
         ("find_cars(d.image, 90, 90, 1, d.svc, d.scaler, 9, 8, 2, 16, 16)", "ystart and ystop"),
         ("find_cars(d.image, 90, 200, 0, d.svc, d.scaler, 9, 8, 2, 16, 16)", "scale must be a number"),
         ("find_cars(d.image, 90, 200, 1, d.svc, d.scaler, 9, 64, 2, 16, 16)", "must fit into a window"),
@@ -719,7 +723,7 @@ def test_bad_input_raises_an_error_of_the_library(call_data, models, form, messa
     )
     data.read_only.setflags(write=False)
     with pytest.raises(InvalidInputError, match=message):
-        eval(form, {**vars(lesson), "np": np, "d": data})
+        eval(form, {**vars(lesson), "np": np, "StandardScaler": StandardScaler, "d": data})
 
 
 def test_a_band_without_room_for_a_window(models):

@@ -542,9 +542,19 @@ def _predicts_car(features: NDArray[np.float64], clf: Any, scaler: Any) -> NDArr
 
 def _check_estimators(clf: Any, scaler: Any, options: FeatureOptions, image: Image) -> None:
     """Check that a classifier and its scaler fit the features, and the range of an image's values."""
+    from sklearn.exceptions import NotFittedError
+    from sklearn.utils.validation import check_is_fitted
+
     for estimator, name, method in ((clf, "classifier", "predict"), (scaler, "scaler", "transform")):
         if not hasattr(estimator, method):
             raise InvalidInputError(f"the {name} must have a method {method}; got {describe(estimator)}")
+        if type(estimator).__module__.startswith("sklearn."):
+            try:
+                check_is_fitted(estimator)
+            except NotFittedError:
+                raise InvalidInputError(
+                    f"the {name} must be fitted; got an unfitted {type(estimator).__name__}: call fit first"
+                ) from None
     if options.hog_feat and options.blocks < 1:
         raise InvalidInputError(
             f"a block of {options.cell_per_block} cells of {options.pix_per_cell} pixels must fit into a "
