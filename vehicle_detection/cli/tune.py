@@ -88,8 +88,10 @@ def tune(
     labelled = _read_frames(frames, labels, horizon)
     # Rows cannot be appended to Parquet, so they are stored in a .jsonl file beside it.
     parquet = output.suffix.lower() == ".parquet"
-    options: dict[str, Any] = {"store": output.with_suffix(".jsonl") if parquet else output}
-    options |= {"options": TrialOptions(frames=labelled, cache=cache), "progress": True}
+    store = output.with_suffix(".jsonl") if parquet else output
+    is_new = not store.exists()
+    options: dict[str, Any] = {"store": store, "options": TrialOptions(frames=labelled, cache=cache)}
+    options["progress"] = True
 
     def work() -> DataFrame:
         patches = load_training_patches(vehicles, non_vehicles, progress=sys.stderr.isatty())
@@ -100,12 +102,14 @@ def tune(
         return compare_configurations(patches, expand_grid(values), splits=split, seeds=(seed,), **options)
 
     table = run_interruptible(work)
-    if parquet:
-        write_results(table, output)
     final = table[table["stage"] == ("final" if halving else "compare")]
     _show(final, table)
     if final["accuracy"].isna().all():
-        raise InvalidInputError(f"--grid has no configuration that can be trained; see above and {output}")
+        if is_new:
+            store.unlink(missing_ok=True)
+        raise InvalidInputError("--grid has no configuration that can be trained, for the reasons above")
+    if parquet:
+        write_results(table, output)
     if plot is not None:
         _draw(final, plot)
     typer.echo(f"wrote {', '.join(map(str, targets.values()))}")
