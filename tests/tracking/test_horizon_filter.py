@@ -178,13 +178,3 @@ def test_vehicles_of_long_ago_are_forgotten():
     # The first weight decays by exp(-t / 30 s); the others sum to 3.5 of its initial value.
     assert known[1:20] == [2] * 19
     assert known[25:] == [1] * 5
-
-
-def test_the_lowest_row_is_that_of_the_prior_or_of_the_estimate():
-    assert HorizonFilter(TRUE).lowest_px == TRUE.horizon_px + TRUE.total_horizon_std_px
-    for camera in (GUESS, Camera.for_frame(FRAME, horizon=0.62, horizon_std_px=5)):
-        horizon = HorizonFilter(camera)
-        for step in range(100):
-            horizon.update(np.array([1]), np.array([on_road(50 - 0.4 * step)]), FRAME, 0.04)
-        known = max(camera.horizon_px + camera.total_horizon_std_px, horizon.camera.horizon_px)
-        assert known <= horizon.lowest_px < known + 10

@@ -98,12 +98,3 @@ def test_the_end_of_a_track():
     assert not confirmed(time_since_update=99.0).is_expired(PARAMS)
     assert not TrackState(score=1.0, time_since_update=PARAMS.tentative_coast).is_expired(PARAMS)
     assert TrackState(score=1.0, time_since_update=PARAMS.tentative_coast + later).is_expired(PARAMS)
-
-
-def test_what_is_above_the_road_is_neither_shown_nor_confirmed():
-    assert confirmed().shown
-    assert not confirmed(elevated=True).shown
-    ready = TrackState(score=2.0, hits=PARAMS.confirm_hits + 1, age=1.0)
-    assert ready.can_confirm(PARAMS)
-    ready.elevated = True
-    assert not ready.can_confirm(PARAMS)

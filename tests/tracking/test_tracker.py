@@ -961,27 +961,6 @@ class TestArguments:
         assert tracks[0].box.dtype == np.float64
 
 
-def test_a_sign_that_comes_near_is_not_shown():
-    def sign(time):
-        distance = 60 - 25 * time
-        return on_road(distance, x=4, height=1) - [0, 2 * CAMERA.focal_px / distance] * 2
-
-    steps = play({"sign": sign}, 1.8, noise=0.02)
-    times = [time for time, _, track in matched(steps, "sign") if track]
-    assert max(times, default=0) < 0.8
-
-
-@pytest.mark.parametrize("height", [1.5, 3.9])
-def test_an_oncoming_vehicle_on_a_bumpy_road_is_shown(height):
-    """The image moves by 5 px up and down three times a second, and at most by 94 px/s."""
-
-    def vehicle(time):
-        return on_road(80 - 30 * time, x=-3.5, height=height) + [0, 5 * np.sin(6 * np.pi * time)] * 2
-
-    steps = play({"car": vehicle}, 2.0, noise=0.01)
-    assert all(track for time, _, track in matched(steps, "car") if time > 0.5)
-
-
 def test_a_track_that_moves_out_of_the_frame_ends_at_once():
     tracker = Tracker(fps=25)
     for frame in range(12):

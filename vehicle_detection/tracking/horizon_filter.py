@@ -45,14 +45,6 @@ class HorizonFilter:
         # Weighted sums of 1, width, width², bottom and width * bottom for each vehicle.
         self._sums = np.empty((0, 5))
 
-    @property
-    def lowest_px(self) -> float:
-        """Lowest likely row of the horizon, one standard error below the prior or the estimate.
-
-        The prior counts because the estimate may come from what is no vehicle.
-        """
-        return max(each.horizon_px + each.total_horizon_std_px for each in (self.prior_camera, self.camera))
-
     def update(self, ids: NDArray[np.int64], boxes: Floats, frame: FrameShape, dt: float) -> None:
         """Add the vehicles of a frame: ids ``(N,)`` and boxes ``(N, 4)`` that are not truncated."""
         if not self.prior_camera.horizon_std_px or not len(boxes):

@@ -78,7 +78,6 @@ class TrackState:
     hidden: bool = False  # whether another vehicle explains the missing detection
     covered: float = 0.0  # fraction of its box that nearer vehicles cover
     lost: bool = False  # whether its predicted position is only a guess
-    elevated: bool = False  # whether it moves like a thing above the road
     past_boxes: list[tuple[float, Floats]] = field(default_factory=list)  # for the smoother "history"
 
     @property
@@ -91,7 +90,7 @@ class TrackState:
     @property
     def shown(self) -> bool:
         """Whether to draw it."""
-        if not self.id or self.lost or self.elevated:
+        if not self.id or self.lost:
             return False
         if not self.misses:
             return True
@@ -129,7 +128,7 @@ class TrackState:
 
     def can_confirm(self, params: TrackParams) -> bool:
         """Whether a tentative track meets the conditions of confirmation in this frame."""
-        if self.id or self.misses or self.elevated:
+        if self.id or self.misses:
             return False
         return self.confirm_at_birth or (
             self.hits - self.all_misses >= params.confirm_hits

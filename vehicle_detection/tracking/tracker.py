@@ -34,7 +34,6 @@ from vehicle_detection.tracking.association import (
     merged_detections,
     nearer_cover,
 )
-from vehicle_detection.tracking.elevation import are_elevated
 from vehicle_detection.tracking.horizon_filter import HorizonFilter
 from vehicle_detection.tracking.kalman_filter import (
     OUTWARD,
@@ -200,7 +199,6 @@ class Tracker:
             unassigned = self._correct(boxes, scores, frame, dt)
             self._end_lost_tracks(frame, dt)
             self._end_parts(frame)
-            self._mark_elevated(frame)
         self._start(boxes[unassigned], scores[unassigned], frame, dt)
         self._confirm(frame)
         self._update_horizon(frame, dt)
@@ -383,13 +381,6 @@ class Tracker:
         if ended.any():
             self._keep(np.flatnonzero(~ended).tolist())
 
-    def _mark_elevated(self, frame: FrameShape) -> None:
-        """Hide tracks of things above the road, such as signs, for as long as they move like these."""
-        horizon = self._horizon
-        elevated = are_elevated(self._states.mean, frame, horizon.camera, horizon.lowest_px, self._lens)
-        for track, is_elevated in zip(self._live, elevated.tolist()):
-            track.elevated = is_elevated and track.covered == 0
-
     def _mark_missed(self, whole: Floats, inside: Floats, dt: float) -> None:
         """Account for missing detections, given the boxes of all tracks and their parts inside the frame."""
         in_front = np.array([track.id > 0 and track.misses == 0 for track in self._live])
@@ -442,8 +433,7 @@ class Tracker:
         """Update the horizon from confirmed tracks that are fully visible in this frame."""
         boxes, ids = self._states.boxes(), np.array([track.id for track in self._live], np.int64)
         visible = np.array(
-            [track.state == "confirmed" and track.shown and track.covered == 0 for track in self._live],
-            np.bool_,
+            [track.id > 0 and track.misses == 0 and track.covered == 0 for track in self._live], np.bool_
         )
         visible &= ~truncated_edges(boxes, frame).any(axis=1)
         road_boxes = boxes[visible]
