@@ -737,7 +737,7 @@ def test_an_unknown_lens_gives_a_large_error(wide_scenes):
         ({"camera": "wide-90", "field_of_view": 90}, "field_of_view must be omitted with a camera"),
         (
             {"camera": Camera.for_frame((72, 128)), "camera_height_m": 1},
-            "camera_height_m must be None with a",
+            "camera_height_m must be omitted with a",
         ),
         ({"camera": 7}, "camera must be a Camera or str or PathLike, got 7"),
     ],

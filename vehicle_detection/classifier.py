@@ -218,7 +218,8 @@ class VehicleClassifier:
         InvalidInputError
             If a step is of another kind or not fitted, the features have another length, `params` differ
             from those of the pipeline's `PatchFeatures`, or the scaler was fitted on features of images with
-            values 0-1, as which the course reads PNG files. HOG alone does not show this.
+            values 0-1, as which the course reads PNG files. HOG alone, and histograms of LUV and LAB, do not
+            show this.
 
         Examples
         --------

@@ -760,8 +760,8 @@ def _check_lens(camera: object, field_of_view: float | None, camera_height_m: fl
         )
     if camera_height_m is not None and not named:
         raise InvalidInputError(
-            f"camera_height_m must be None with a Camera or a file, which have one; got {camera_height_m}; "
-            "change it there"
+            f"camera_height_m must be omitted with a Camera or a file, which have one; "
+            f"got {camera_height_m}; change it there"
         )
     known: dict[str, Any] = {"focal_std": UNKNOWN_LENS_STD} if camera is None else {}
     if field_of_view is not None:

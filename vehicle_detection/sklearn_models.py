@@ -16,6 +16,8 @@ from vehicle_detection.params import FeatureParams
 Floats = NDArray[np.float64]
 
 _SCALERS = ("StandardScaler", "RobustScaler", "MinMaxScaler", "MaxAbsScaler")
+# Channels whose values are 0-1 in float images. Those of LUV and LAB have other ranges.
+_UNIT_CHANNELS = dict.fromkeys(("RGB", "YUV", "YCrCb"), (0, 1, 2)) | {"HSV": (1, 2), "HLS": (1, 2)}
 # Greatest sum of mean and scale of a spatial bin with values 0-1. For the last channel of LUV and LAB: the
 # greatest mean in float images, where gray is 0, and the least sum in uint8 images, where gray is over 127.
 _MAX_UNIT, _MAX_FLOAT_MEAN, _GRAY = 2.5, 64.0, 128.0
@@ -201,7 +203,7 @@ def check_uint8(template: Template, params: FeatureParams) -> None:
         If the spatial bins, or the histogram where all values are in the first bins, show it.
     """
     mean, scale = template.mean, template.scale
-    if _has_float_bins(mean, scale, params) or _has_empty_bins(mean, scale, params):
+    if _has_float_bins(mean, scale, params) or _has_first_bins_only(mean, scale, params):
         raise InvalidInputError(
             "pipeline must be fitted on features of uint8 images; it was fitted on values 0-1, as which the "
             "course reads PNG files. Pass imread=vehicle_detection.read_image to extract_features, and fit "
@@ -210,18 +212,22 @@ def check_uint8(template: Template, params: FeatureParams) -> None:
 
 
 def _has_float_bins(mean: Floats, scale: Floats, params: FeatureParams) -> bool:
-    """Whether the spatial bins are those of float images."""
+    """Whether the spatial bins are those of float images; False for LUV and LAB if nothing is subtracted."""
     if not params.spatial_feat:
         return False
     means, scales = (params.spatial_planes(values[: params.spatial_length]) for values in (mean, scale))
-    if params.spatial_space in ("LUV", "LAB"):
-        return bool(means[2].max() < _MAX_FLOAT_MEAN and (means + scales)[2].min() < _GRAY)
-    return bool((np.abs(means[1:]) + scales[1:]).max() < _MAX_UNIT)
+    if params.spatial_space in _UNIT_CHANNELS:
+        channels = _UNIT_CHANNELS[params.spatial_space]
+        return bool((np.abs(means) + scales)[list(channels)].max() < _MAX_UNIT)
+    gray = bool(means[2].max() < _MAX_FLOAT_MEAN and (means + scales)[2].min() < _GRAY)
+    return gray and bool(means.any())
 
 
-def _has_empty_bins(mean: Floats, scale: Floats, params: FeatureParams) -> bool:
-    """Whether all values are in the first bin of each channel's histogram of the range 0-256."""
+def _has_first_bins_only(mean: Floats, scale: Floats, params: FeatureParams) -> bool:
+    """Whether all values of the channels with the range 0-1 are in the first bin of a histogram of 0-256."""
     bins = slice(params.spatial_length, params.spatial_length + params.hist_length)
-    rest = (values[bins].reshape(-1, params.hist_bins)[:, 1:] for values in (mean, scale))
-    means, scales = rest
-    return means.size > 0 and bool((means == 0).all() and (scales == 1).all())
+    channels = list(_UNIT_CHANNELS.get(params.hist_space, ()))
+    if not params.hist_feat or params.hist_bins == 1 or not channels:
+        return False
+    means, scales = (values[bins].reshape(3, -1)[channels, 1:] for values in (mean, scale))
+    return bool((means == 0).all() and (scales == 1).all())

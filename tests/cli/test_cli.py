@@ -1267,7 +1267,10 @@ def test_a_piped_video_whose_index_is_at_its_end_is_refused(tmp_path):
     words = [sys.executable, "-m", "vehicle_detection", "video", "-", "-o", str(tmp_path / "out.mp4")]
     result = subprocess.run(words, input=clip.read_bytes(), capture_output=True, check=False)
     assert result.returncode == 2
-    assert b"a pipe needs MPEG-TS, or MP4 with its index at the start; pass the file's path" in result.stderr
+    assert (
+        b"pass the file's path, because MP4 needs its index at the start to come through a pipe"
+        in result.stderr
+    )
 
 
 @pytest.mark.parametrize(

@@ -411,6 +411,8 @@ def test_a_yolo_folder_without_names(tmp_path):
     options = {"format": "yolo", "shape": (100, 200)}
     assert len(read_labels(tmp_path, **options)) == 2
     np.testing.assert_allclose(read_labels(tmp_path, **options, classes=["1"]).boxes, [[80, 30, 120, 70]])
+    with pytest.raises(DatasetError, match="no class among car; found '0', '1'"):
+        read_labels(tmp_path, **options, classes=["car"])
 
 
 def test_files_without_a_class_of_vehicles_are_refused(tmp_path):
@@ -427,6 +429,9 @@ def test_files_without_a_class_of_vehicles_are_refused(tmp_path):
     with pytest.raises(DatasetError, match=r"no class among car; found '3'"):
         read_labels(tmp_path / "mot.txt", classes=["car"])
     assert len(read_labels(tmp_path / "mot.txt", classes=["3"])) == 1
+    (tmp_path / "mot.txt").write_text("1,1,1,1,9,9,0.5,-1,-1,-1\n")
+    with pytest.raises(DatasetError, match="holds predictions, which have no classes; leave out classes="):
+        read_labels(tmp_path / "mot.txt", classes=["3"])
 
 
 @pytest.mark.parametrize(

@@ -238,3 +238,21 @@ def test_the_readable_part_of_an_incomplete_file_is_processed(truncated, tmp_pat
     with read_frames(target) as written:
         assert len(list(written)) == frames
     assert not process_video(source, target, StubDetector(), end=0.2).damage
+
+
+def test_only_the_last_segment_of_a_trip_may_be_cut_off(truncated, tmp_path):
+    """After another one, the times and the sound of what follows would be wrong."""
+    cut, target = truncated("cut.mkv"), tmp_path / "out.mp4"
+    whole = cut.with_name("whole_cut.mkv")
+    with pytest.raises(VideoError, match=r"cut\.mkv is incomplete: .*; copy it again, or leave it out"):
+        process_video([cut, whole], target, StubDetector())
+    assert not target.exists()
+    report = process_video([whole, cut], target, StubDetector())
+    assert 120 < report.frames < 190
+    assert "cut.mkv is incomplete" in report.damage
+
+
+def test_a_start_after_the_readable_part_says_that_the_file_is_incomplete(truncated, tmp_path):
+    cut = truncated("cut_late.mkv")
+    with pytest.raises(VideoError, match=r"is incomplete: .*; choose an earlier start"):
+        process_video(cut, tmp_path / "out.mp4", StubDetector(), start=3.8)

@@ -59,7 +59,7 @@ BAD_INPUT, INTERRUPTED = 2, 130  # exit codes
 _CHECKED_IMAGES = 20  # images that are searched again if no vehicle was found
 
 
-# Of an unknown command or option, or a value of another type; typer has no public name for this class.
+# Raised for an unknown command or option, or a value of another type; typer has no public name for it.
 _UsageError: type[Any] = typer.BadParameter.__bases__[0]
 
 

@@ -271,7 +271,10 @@ def _kitti_row(
 def _read_mot(source: Path, classes: Collection[str] | None) -> Rows:
     rows = list(_mot_rows(_read_lines(source)))
     if classes is not None and rows:
-        _check_classes(source, {number for _, number in rows if number is not None}, classes)
+        found = {number for _, number in rows if number is not None}
+        if not found:
+            raise DatasetError(f"{source} holds predictions, which have no classes; leave out classes=")
+        _check_classes(source, found, classes)
     return [row for row, number in rows if classes is None or number in classes], []
 
 
@@ -366,13 +369,17 @@ def _read_yolo(source: Path, classes: Collection[str] | None, shape: tuple[int, 
     numbered = all(file.stem.isdecimal() and file.stem == f"{int(file.stem):06d}" for file in files)
     keys: list[FrameKey] = []
     rows: list[Row] = []
+    numbers: set[str] = set()
     for file in sorted(files, key=lambda file: frame_order(file.name)):
         keys.append(int(file.stem) if numbered else file.stem)
         for where, line in _read_lines(file):
             name, row = _yolo_row(where, keys[-1], line.split(), shape)
             # Without names, classes are numbers, and by default all of them are vehicles.
+            numbers.add(name)
             if (not names and classes is None) or names.get(name, name) in wanted:
                 rows.append(row)
+    if not names and classes is not None and numbers:
+        _check_classes(source, numbers, wanted)
     return rows, keys
 
 
@@ -516,8 +523,9 @@ def read_labels(
     Parameters
     ----------
     path
-        A CSV file (``frame,track,x1,y1,x2,y2,occluded,truncated,ignore`` or, for predictions,
-        ``frame,track_id,x1,y1,x2,y2,score[,distance_m,speed_mps]``, separated by commas, semicolons or tabs),
+        A CSV file (``frame,track,x1,y1,x2,y2[,occluded,truncated,ignore]``, where ``track_id`` may stand for
+        ``track``, or, for predictions, ``frame,track_id,x1,y1,x2,y2,score[,distance_m,speed_mps]``; separated
+        by commas, semicolons or tabs),
         a JSON Lines or Parquet (needs pyarrow) file with these columns, a KITTI ``label_2`` folder, a
         MOTChallenge text file, the MOT archive of CVAT, a COCO JSON file, a list of COCO results, or a YOLO
         folder: ``labels/*.txt``, with class names in ``data.yaml`` or ``classes.txt``.
@@ -525,9 +533,9 @@ def read_labels(
         ``"csv"``, ``"jsonl"``, ``"parquet"``, ``"kitti"``, ``"mot"``, ``"mot_zip"``, ``"coco"``,
         ``"coco_results"`` or ``"yolo"``; None chooses by suffix and content.
     classes
-        KITTI types, COCO category names, class names of CVAT and YOLO, or MOT class numbers that are
-        vehicles, in upper or lower case.
-        None takes car, van, truck, bus and vehicle, and every row of a MOT file.
+        KITTI types, COCO category names, class names of CVAT and YOLO, or class numbers of MOT files and of
+        YOLO folders without names, that are vehicles, in upper or lower case. None takes car, van, truck, bus
+        and vehicle, and every row of files with numbers.
     shape
         ``(height, width, ...)`` of the frames, to which boxes are clipped. None does not clip them. YOLO
         needs it.
@@ -545,8 +553,8 @@ def read_labels(
     Raises
     ------
     DatasetError
-        If the file is missing, has none of these formats, or holds an invalid row; the message names the
-        line.
+        If the file is missing, has none of these formats, names no class of vehicles, or holds an invalid
+        row; the message names the line.
     InvalidInputError
         If `path`, `format` or `shape` is none of the values above, or pyarrow is missing.
 

@@ -78,7 +78,7 @@ class _LiveProcess:
             remedy = "check the source"
             if "received no packets" in self.reason() and self.name == "-":
                 remedy = (
-                    "a pipe needs MPEG-TS, or MP4 with its index at the start; pass the file's path instead"
+                    "pass the file's path, because MP4 needs its index at the start to come through a pipe"
                 )
             message = f"{self.name} is not a video that ffmpeg can read ({self.reason()}); {remedy}"
             raise video_error(message, self.name, code, self.process.log())

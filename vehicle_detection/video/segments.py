@@ -119,7 +119,9 @@ class _SegmentReader:
             if self._killed or not self._segments:
                 raise StopIteration
             path, info = self._segments.pop(0)
-            self._reader = FrameReader(path, info, first=self._first, strict=self._strict)
+            # After a segment that is cut off, times and sound of the next one would be wrong.
+            whole = bool(self._segments)
+            self._reader = FrameReader(path, info, first=self._first, strict=self._strict, whole=whole)
             self._first = 0
             return self._reader
 

@@ -122,11 +122,12 @@ class FrameReader(_FfmpegStream):
         first: int = 0,
         count: int | None = None,
         strict: bool = False,
+        whole: bool = False,
     ) -> None:
         self.info = info
         self.frames_read = 0
         self.damage = ""
-        self._strict = strict
+        self._strict, self._whole = strict, whole
         self._killed = False
         self._path, self._first, self._count = path, first, count
         # A stream may change its frame size; all frames get the size of the first one.
@@ -190,6 +191,8 @@ class FrameReader(_FfmpegStream):
             incomplete = f"{name} is incomplete: {end} of about {self.info.frames} frames can be decoded"
         if incomplete and isinstance(self._path, str):  # the server or the network may be to blame
             raise video_error(f"{incomplete}; try again", self._path, code, log)
+        if incomplete and self._whole:
+            raise VideoError(f"{incomplete}; copy it again, or leave it out")
         if code and not complete and not incomplete:
             message = (
                 f"{name} cannot be decoded after frame {end}: {exit_reason(code, log)}; "
@@ -198,7 +201,8 @@ class FrameReader(_FfmpegStream):
             raise video_error(message, self._path, code, log)
         if not self.frames_read:
             start = float(self._first / self.info.fps)
-            raise VideoError(f"{name} has no frame after {start:g} s; choose an earlier start")
+            what = incomplete or f"{name} has no frame after {start:g} s"
+            raise VideoError(f"{what}; choose an earlier start")
         # After a jump into the file, the first frames may refer to frames before it, which is no damage.
         errors = "" if self._sought else log
         stop = None if self._count is None else self._first + self._count
