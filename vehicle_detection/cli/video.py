@@ -51,7 +51,7 @@ _UNKNOWN_LENS = (
 )
 _NOT_SQUARE = (
     "warning: the pixels of this video are not square (width to height {}), so distances are wrong; "
-    "convert it first: ffmpeg -i IN -vf scale=trunc(iw*sar/2)*2:ih,setsar=1 OUT"
+    'convert it first: ffmpeg -i IN -vf "scale=trunc(iw*sar/2)*2:ih,setsar=1" OUT'
 )
 
 
