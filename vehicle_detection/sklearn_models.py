@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import describe
+from vehicle_detection.boxes import Floats
 from vehicle_detection.classifier import Template
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import FeatureParams
-
-Floats = NDArray[np.float64]
 
 _SCALERS = ("StandardScaler", "RobustScaler", "MinMaxScaler", "MaxAbsScaler")
 # Channels whose values are 0-1 in float images. Those of LUV and LAB have other ranges.
@@ -219,8 +218,8 @@ def _has_float_bins(mean: Floats, scale: Floats, params: FeatureParams) -> bool:
     if params.spatial_space in _UNIT_CHANNELS:
         channels = _UNIT_CHANNELS[params.spatial_space]
         return bool((np.abs(means) + scales)[list(channels)].max() < _MAX_UNIT)
-    gray = bool(means[2].max() < _MAX_FLOAT_MEAN and (means + scales)[2].min() < _GRAY)
-    return gray and bool(means.any())
+    is_centered = bool(means.any())
+    return is_centered and bool(means[2].max() < _MAX_FLOAT_MEAN and (means + scales)[2].min() < _GRAY)
 
 
 def _has_first_bins_only(mean: Floats, scale: Floats, params: FeatureParams) -> bool:

@@ -52,9 +52,26 @@ def test_a_track_is_shown_from_its_first_detection_on():
     (found,) = interpolate_tracks([tentative], [confirmed], 0.04, 0.04, SHAPE)
     np.testing.assert_allclose(found.box, [102, 200, 152, 260])
     assert (found.id, found.age) == (5, pytest.approx(0.26))
-    # One that was detected for the first time after this frame is not shown, and neither are tentative ones.
+    # Not one that was detected for the first time after this frame.
     new = track(5, [104, 200, 154, 260], age=0.0)
-    assert interpolate_tracks([tentative], [new, track(0, [0, 0, 9, 9])], 0.04, 0.04, SHAPE) == ()
+    assert interpolate_tracks([], [new], 0.04, 0.04, SHAPE) == ()
+
+
+def test_tentative_tracks_are_interpolated_too():
+    """Otherwise their vehicles would be blurred in searched frames only."""
+    before = [replace(track(0, [left, 200, left + 50, 260], key=key), shown=False) for key, left in
+              ((7, 100), (8, 300), (9, 500))]  # fmt: skip
+    confirmed = track(2, [900, 200, 950, 260], key=1)
+    after = [
+        confirmed,
+        track(1, [504, 200, 554, 260], key=9),
+        before[0],
+        track(0, [0, 0, 9, 9], age=0.0, key=10),
+    ]
+    found = interpolate_tracks([confirmed, *before], after, 0.04, 0.04, SHAPE)
+    # Confirmed, confirmed in the second frame, tentative in both, and ended.
+    assert [(each.id, each.key) for each in found] == [(2, 1), (1, 9), (0, 7), (0, 8)]
+    assert not any(each.shown for each in found if not each.id)
 
 
 def test_a_track_is_backfilled_with_what_is_known_later():

@@ -27,22 +27,30 @@ _INTERPOLATED = (
 def interpolate_tracks(
     before: Sequence[Track], after: Sequence[Track], dt: float, dt_after: float, shape: tuple[int, ...]
 ) -> tuple[Track, ...]:
-    """Estimate the confirmed tracks of a frame between two frames by linear interpolation.
+    """Estimate the tracks of a frame between two frames by linear interpolation, confirmed ones first.
 
     The frame is `dt` seconds after the tracks `before` and `dt_after` seconds before the tracks `after`;
     `shape` is its ``(height, width, ...)``. A track that has ended in `after`, or that was not confirmed yet
-    in `before`, moves at its velocity, unless it is outside the frame.
+    in `before`, moves at its velocity, unless it is outside the frame. Tentative tracks are included, so that
+    their vehicles can be blurred.
     """
-    following = {track.id: track for track in after}
+    confirmed = {track.key for track in after if track.id}
+    following = {_identity(track): track for track in after}
     found = []
     for track in before:
-        other = following.pop(track.id, None)
-        if track.id:
+        other = following.pop(_identity(track), None)
+        if track.id or track.key not in confirmed:
             found.append(_move(track, dt, shape) if other is None else _mean(track, other, dt, dt_after))
     # Detected before this frame, but confirmed after it.
-    started = [track for track in following.values() if track.id and track.age >= dt_after - TIME_TOLERANCE]
+    started = [track for track in following.values() if track.age >= dt_after - TIME_TOLERANCE]
     found += [_move(track, -dt_after, shape) for track in started]
+    found.sort(key=lambda track: track.id == 0)
     return tuple(track for track in found if (track.box[2:] - track.box[:2]).min() >= 1)
+
+
+def _identity(track: Track) -> tuple[int, int]:
+    """Return what identifies a confirmed or a tentative track in two frames."""
+    return (track.id, 0) if track.id else (0, track.key)
 
 
 def backfill_tracks(earlier: Sequence[Track], later: Sequence[Track]) -> tuple[Track, ...]:
