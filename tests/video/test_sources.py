@@ -16,6 +16,7 @@ from moviepy.config import FFMPEG_BINARY
 
 from tests.helpers import StubDetector, start_interruptible
 from tests.video.clips import (
+    beeps,
     child_processes,
     damage_sizes,
     ffmpeg,
@@ -23,6 +24,7 @@ from tests.video.clips import (
     gray_frames,
     running_threads,
     sound_seconds,
+    write_beep,
     write_clip,
 )
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
@@ -72,6 +74,19 @@ def test_a_part_of_a_trip(card, tmp_path, start, end):
     expected = list(range(20))[int(start * 8) : None if end is None else int(end * 8)]
     assert frame_numbers(target) == expected
     assert sound_seconds(target) == pytest.approx(len(expected) / 8, abs=0.15)
+
+
+@pytest.mark.parametrize(("suffix", "delay"), [("mp4", 0.0), ("mkv", 0.3), ("ts", 0.0), ("ts", 0.3)])
+def test_sound_of_a_trip_stays_with_its_frames(tmp_path, suffix, delay):
+    segments = [write_beep(tmp_path / f"{n}.{suffix}", delay=delay, longer=0.4) for n in range(3)]
+    with open_source(segments) as source:
+        assert source.info.frames == 72
+    process_video(segments, tmp_path / "trip.mp4", StubDetector())
+    assert frame_numbers(tmp_path / "trip.mp4") == [*range(24)] * 3
+    assert beeps(tmp_path / "trip.mp4") == pytest.approx([0.6, 1.6, 2.6], abs=0.02)
+    process_video(segments, tmp_path / "part.mp4", StubDetector(), start=1.25)
+    assert frame_numbers(tmp_path / "part.mp4") == [*range(6, 24), *range(24)]
+    assert beeps(tmp_path / "part.mp4") == pytest.approx([0.35, 1.35], abs=0.02)
 
 
 def test_segments_of_another_rate_and_size(tmp_path):

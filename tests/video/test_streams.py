@@ -13,11 +13,13 @@ from tests.helpers import StubDetector
 from tests.video.clips import (
     LEVELS,
     NTSC,
+    beeps,
     child_processes,
     ffmpeg,
     frame_numbers,
     gray_frames,
     sound_seconds,
+    write_beep,
     write_clip,
 )
 from vehicle_detection.errors import VideoError
@@ -96,12 +98,66 @@ def test_frames_of_a_video_that_starts_after_its_sound(folder):
     target = folder / "late_out.mp4"
     process_video(late, target, StubDetector())
     assert frame_numbers(target) == list(range(10))
-    assert probe_video(target).start_time == pytest.approx(0.4, abs=0.03)
+    assert probe_video(target).start_time == 0  # so that subtitles and reports are in time
     with read_frames(late, start=0.2, end=0.3) as frames:
         assert [index for index, _, _ in frames] == [5, 6, 7]
     process_video(late, target, StubDetector(), start=0.2)
     assert frame_numbers(target) == [5, 6, 7, 8, 9]
     assert sound_seconds(target) == pytest.approx(0.4, abs=0.06)
+
+
+CODECS = {"vob": ("mpeg2video", "-q:v", 2), "avi": ("mjpeg", "-q:v", 2), "wmv": ("wmv2", "-q:v", 2)}
+
+
+@pytest.mark.parametrize("fps", [24, 25, 30])
+@pytest.mark.parametrize("suffix", ["ts", "m2ts", "vob", "flv", "avi", "wmv", "mkv", "mp4"])
+def test_any_frame_of_any_container_can_be_the_first_one(tmp_path, suffix, fps):
+    codec = CODECS.get(suffix, ("libx264",))
+    path = write_clip(
+        tmp_path / f"clip.{suffix}", gray_frames(24), fps=fps, options=("-g", 16, "-c:v", *codec)
+    )
+    for first in range(1, 20, 2):
+        with read_frames(path, start=first / fps, end=(first + 1) / fps) as frames:
+            found = [round((float(frame.mean()) - 10) / LEVELS) for _, _, frame in frames]
+        assert found == [first]
+
+
+@pytest.mark.parametrize("sound", [False, True])
+def test_matroska_whose_times_do_not_start_at_0(tmp_path, sound):
+    clip = write_clip(tmp_path / "clip.mp4", gray_frames(20), sound=sound)
+    path = tmp_path / "later.mkv"
+    ffmpeg("-i", clip, "-c", "copy", "-output_ts_offset", 7, path)
+    info = probe_video(path)
+    assert info.constant_rate
+    assert info.frames == pytest.approx(20, abs=1)
+    with read_frames(path) as frames:
+        assert len(list(frames)) == 20
+    assert not frames.damage
+    assert frame_numbers(path) == list(range(20))
+
+
+def test_no_frame_is_lost_beside_a_gap_in_the_times(tmp_path):
+    later = ["-vf", "setpts='if(gt(N,9),PTS+0.6/TB,PTS)'", "-fps_mode", "passthrough", "-bf", 0]
+    clip = write_clip(tmp_path / "clip.mp4", gray_frames(20), options=later)
+    ffmpeg("-i", clip, "-c", "copy", tmp_path / "gap.mkv")  # states the mean rate
+    info = probe_video(tmp_path / "gap.mkv")
+    assert not info.constant_rate
+    assert info.fps == 25
+    assert frame_numbers(tmp_path / "gap.mkv") == [*range(9), *[9] * 16, *range(10, 20)]
+
+
+@pytest.mark.parametrize("target", ["out.mp4", "out.mkv"])
+@pytest.mark.parametrize("delay", [-0.3, 0.0, 0.3])
+@pytest.mark.parametrize("suffix", ["mp4", "mkv", "ts"])
+def test_sound_stays_with_its_frames(tmp_path, suffix, delay, target):
+    source = write_beep(tmp_path / f"clip.{suffix}", delay=delay)
+    process_video(source, tmp_path / target, StubDetector())
+    assert beeps(tmp_path / target) == pytest.approx([0.6], abs=0.02)
+    assert probe_video(tmp_path / target).start_time == 0
+    process_video(source, tmp_path / target, StubDetector(), start=0.25)
+    assert beeps(tmp_path / target) == pytest.approx([0.35], abs=0.02)
+    process_video(source, tmp_path / target, StubDetector(), start=0.375, end=0.875)
+    assert beeps(tmp_path / target) == pytest.approx([0.225], abs=0.02)
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "mkv"])

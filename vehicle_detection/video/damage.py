@@ -56,9 +56,9 @@ def _announced_frames(path: Path | str, info: VideoInfo, end: int, *, exact: boo
     if info.frames <= end + (0 if exact else 1):
         return end
     # The file's duration is that of its longest stream, which may be the sound.
-    duration = _stream_duration(path)
+    duration = stream_duration(path, info)
     if duration is None:
-        duration = 0.0 if info.has_audio else info.duration
+        duration = 0.0 if info.has_audio else info.duration - info.start_time
     expected = round(duration * info.fps)
     # With a varying rate, the duration of the last frame is unknown.
     tolerance = (0 if exact else 1) + duration * float(_RATE_ERROR)
@@ -66,7 +66,7 @@ def _announced_frames(path: Path | str, info: VideoInfo, end: int, *, exact: boo
     return expected if expected - end > math.floor(tolerance) else end
 
 
-def _stream_duration(path: Path | str) -> float | None:
+def stream_duration(path: Path | str, info: VideoInfo) -> float | None:
     """Duration of the video stream in seconds; None if the file does not state it."""
     options = ("-nostdin", *input_options(path), "-map", "0:V:0", "-c", "copy", "-frames:v", "1")
     with contextlib.closing(Process((*options, "-f", "null", "-"), level="trace")) as process:
@@ -77,6 +77,9 @@ def _stream_duration(path: Path | str) -> float | None:
     exact = re.search(rf"stream {index}: start_time: \S+ duration: ([\d.]+)", log)
     if exact:
         return float(exact[1])
-    # Matroska states it in a tag, which the log repeats for the output.
+    # Matroska states the stream's end in a tag, which the log repeats for the output.
     tag = re.findall(r"DURATION +: (\d+):(\d+):([\d.]+)", log)
-    return int(tag[-1][0]) * 3600 + int(tag[-1][1]) * 60 + float(tag[-1][2]) if tag else None
+    if not tag:
+        return None
+    end = int(tag[-1][0]) * 3600 + int(tag[-1][1]) * 60 + float(tag[-1][2])
+    return end - info.first_timestamp

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 import os
 import re
 import shutil
 import signal
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -37,6 +39,11 @@ _NETWORK_FAULT = re.compile(
     r"|Failed to resolve|Network is unreachable|No route to host|Input/output error|ends prematurely"
     r"|Broken pipe"
 )
+# Containers whose streams ffmpeg counts from their own starts, if it reads one of them alone.
+_OWN_STARTS = ("mpegts", "mpeg")
+_STREAM_START = r", start (-?[\d.]+)"
+# How ffmpeg prints that a time is unknown.
+_UNKNOWN_TICK = -(1 << 63)
 NETWORK_TIMEOUT = 10.0
 """Seconds without data after which a server has failed."""
 
@@ -61,13 +68,19 @@ class VideoInfo:
     constant_rate
         Whether the file's frame rate is constant.
     start_time
-        Time of the first frame in seconds, if the sound starts earlier; otherwise 0.0.
+        Time of the first frame in seconds after the file's start, if the sound starts earlier; otherwise 0.0.
     pixel_aspect
         Width over height of a pixel; other than 1 for anamorphic video.
     pixel_format
         ffmpeg's name of the pixel format, such as ``"yuv420p"``; empty if unknown.
     color_encoding
         How luma and chroma encode colors.
+    container
+        ffmpeg's names of the container format, such as ``"matroska,webm"``; empty if unknown.
+    first_timestamp
+        Timestamp of the first frame in seconds, as stored in the file.
+    pictures_from, sound_from
+        Time in seconds after the file's start from which ffmpeg counts, if it reads one of them alone.
     audio_track, audio_codec
         Index and codec (such as ``"aac"``) of the first audio track that can be decoded; None without one.
 
@@ -89,6 +102,10 @@ class VideoInfo:
     pixel_aspect: Fraction = Fraction(1)
     pixel_format: str = ""
     color_encoding: ColorEncoding = field(default_factory=ColorEncoding)
+    container: str = ""
+    first_timestamp: float = 0.0
+    pictures_from: float = 0.0
+    sound_from: float = 0.0
     audio_track: int | None = None
     audio_codec: str | None = None
 
@@ -134,7 +151,8 @@ def _probe(path: Path | str) -> VideoInfo:
         raise video_error(f"{name} cannot be read: {exit_reason(code, log)}", path, code, log)
     check_frame_size(name, log)
     header, mapped, decoded = log.partition("Stream mapping:")
-    if not re.search(r"^Input #0", header, re.MULTILINE):
+    container = re.search(r"^Input #0, (\S+),", header, re.MULTILINE)
+    if container is None:
         if _is_text(Path(path)):
             raise VideoError(f"{name} is a text file, not a video; choose the video")
         truncated = "moov atom not found" in log
@@ -147,36 +165,53 @@ def _probe(path: Path | str) -> VideoInfo:
     if frame is None:
         message = f"{name} has no frame that can be decoded ({last_line(log)}); copy it again"
         raise video_error(message, path, code, log)
-    start_time, width, height = frame[1], int(frame[4]), int(frame[5])
+    width, height = int(frame[4]), int(frame[5])
     aspect = int(frame[2]), int(frame[3])
     pixel_format = re.search(r"n: *0 .*? fmt:(\w+)", decoded)
     colors = re.search(r"color_range:(\w+) color_space:(\w+)", decoded)
     index = re.search(r"Stream #0:(\d+)", decoded)
     stream = _stream_lines(header, int(index[1]) if index else 0)
     fps, constant = frame_rate(decoded, stream)
-    if re.search(r"^Input #0, matroska", header, re.MULTILINE):  # the rate in its header may be wrong
-        fps, constant = _rate_of_times(fps, _frame_times(path))
     length = re.search(r"^  Duration: (\d+):(\d+):([\d.]+)", header, re.MULTILINE)
     duration = int(length[1]) * 3600 + int(length[2]) * 60 + float(length[3]) if length else 0.0
+    begin = _number(r"^  Duration: .*?, start: (-?[\d.]+)", header)
+    if container[1].startswith("matroska"):  # states its end as its duration, and perhaps a wrong rate
+        duration = max(duration - begin, 0.0)
+        fps, constant = _rate_of_times(fps, packet_times(path))
     rotation = re.search(r"rotation of (-?[\d.]+) degrees", stream)
-    codecs = re.findall(r"^  Stream #0:\d+.*?: Audio: (\w+)", header, re.MULTILINE)
-    track = next((number for number, codec in enumerate(codecs) if codec != "none"), None)
+    audio = re.findall(r"^  Stream #0:\d+.*?: Audio: (\w+)(.*)", header, re.MULTILINE)
+    track = next((number for number, (codec, _) in enumerate(audio) if codec != "none"), None)
+    pictures_from, sound_from = 0.0, 0.0
+    if container[1] in _OWN_STARTS:
+        start_time = pictures_from = _number(_STREAM_START, stream, begin) - begin
+        sound_from = 0.0 if track is None else _number(_STREAM_START, audio[track][1], begin) - begin
+    else:  # with a varying rate, the gap before the first frame is filled with copies of it
+        start_time = float(frame[1]) if constant and frame[1][-1].isdigit() else 0.0
     return VideoInfo(
         width=width,
         height=height,
         fps=fps,
-        frames=round(duration * fps),
+        frames=round(max(duration - start_time, 0.0) * fps),
         duration=duration,
         rotation=round(-float(rotation[1])) % 360 if rotation else 0,
         constant_rate=constant,
-        # With a varying rate, the gap before the first frame is filled with copies of it.
-        start_time=float(start_time) if constant and start_time[-1].isdigit() else 0.0,
+        start_time=start_time,
         pixel_aspect=Fraction(*aspect) if all(aspect) else Fraction(1),
         pixel_format=pixel_format[1] if pixel_format else "",
         color_encoding=ColorEncoding(colors[2], colors[1] == "pc") if colors else ColorEncoding(),
+        container=container[1],
+        first_timestamp=begin + start_time,
+        pictures_from=pictures_from,
+        sound_from=sound_from,
         audio_track=track,
-        audio_codec=None if track is None else codecs[track],
+        audio_codec=None if track is None else audio[track][0],
     )
+
+
+def _number(pattern: str, text: str, default: float = 0.0) -> float:
+    """Return the number that a pattern's group finds."""
+    found = re.search(pattern, text, re.MULTILINE)
+    return float(found[1]) if found else default
 
 
 def _is_text(path: Path) -> bool:
@@ -212,21 +247,37 @@ def frame_rate(decoded: str, stream: str) -> tuple[Fraction, bool]:
     return (rate if constant else _resampling_rate(rate, mean)), constant
 
 
-def _frame_times(path: Path | str) -> list[float]:
-    """List the times of all frames in seconds, without decoding them."""
-    options = ("-nostdin", *input_options(path), "-map", "0:V:0", "-c", "copy", "-f", "framecrc", "pipe:1")
-    with contextlib.closing(Process(options, stdout=True)) as process:
+def packet_times(path: Path | str, *, seek: float = 0.0, count: int | None = None) -> list[float]:
+    """List the times of frames in seconds, without decoding them: of all, or of `count` after a seek.
+
+    With `seek`, times count from there, and the list begins with the frame that decoding would begin with.
+    It is empty if that frame's time is unknown.
+    """
+    options = ["-ss", f"{seek:.6f}"] if seek else []
+    options += [*input_options(path), "-map", "0:V:0", "-c", "copy"]
+    options += [] if count is None else ["-frames:v", str(count)]
+    with contextlib.closing(
+        Process(("-nostdin", *options, "-f", "framecrc", "pipe:1"), stdout=True)
+    ) as process:
         listing = process.stdout.read().decode()
         process.wait()
     unit = re.search(r"^#tb 0: (\d+)/(\d+)", listing, re.MULTILINE)
-    ticks = re.findall(r"^0, +-?\d+, +(-?\d+),", listing, re.MULTILINE)
-    return sorted(int(tick) * int(unit[1]) / int(unit[2]) for tick in ticks) if unit else []
+    ticks = [int(tick) for tick in re.findall(r"^0, +-?\d+, +(-?\d+),", listing, re.MULTILINE)]
+    if unit is None or _UNKNOWN_TICK in ticks:
+        return []
+    return sorted(tick * int(unit[1]) / int(unit[2]) for tick in ticks)
 
 
 def _rate_of_times(rate: Fraction, times: Sequence[float]) -> tuple[Fraction, bool]:
     """Frame rate, and whether it is constant, from a nominal rate and the times of all frames."""
     if all(abs((moment - times[0]) * float(rate) - n) < 0.75 for n, moment in enumerate(times)):
         return rate, True
+    # Without gaps: a nominal rate that includes them would drop frames between them.
+    steps = [after - before for before, after in itertools.pairwise(times)]
+    usual = [step for step in steps if step < 1.5 * statistics.median(steps)]
+    mean = Fraction(len(usual) / (sum(usual) or 1.0))
+    if rate < mean * Fraction(99, 100):
+        return mean.limit_denominator(1001), False
     return _resampling_rate(rate, Fraction((len(times) - 1) / ((times[-1] - times[0]) or 1.0))), False
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import temporary_folder
+from vehicle_detection.video.damage import stream_duration
 from vehicle_detection.video.ffmpeg import VideoInfo, probe
 from vehicle_detection.video.frame_source import FrameSource
 from vehicle_detection.video.streams import AudioSource, FrameReader, Reader
@@ -25,25 +26,29 @@ class VideoSegments(FrameSource):
     def __init__(self, paths: Sequence[Path]) -> None:
         infos = [probe(path) for path in paths]
         first = infos[0]
+        # Sound may be longer than the frames, which would add up.
+        lengths = [
+            (stream_duration(path, info) if info.has_audio else None) or info.duration - info.start_time
+            for path, info in zip(paths, infos, strict=True)
+        ]
         self._infos = [
             replace(
                 info,
                 width=first.width,
                 height=first.height,
                 fps=first.fps,
-                frames=round(info.duration * first.fps),
+                frames=round(length * first.fps),
                 constant_rate=info.constant_rate and info.fps == first.fps,
             )
-            for info in infos
+            for info, length in zip(infos, lengths, strict=True)
         ]
-        duration = sum(info.duration for info in infos)
         sound = all(info.has_audio for info in infos)
         super().__init__(
             f"{paths[0]} to {paths[-1].name}",
             replace(
                 first,
                 frames=sum(info.frames for info in self._infos),
-                duration=duration,
+                duration=sum(lengths),
                 audio_track=first.audio_track if sound else None,
                 audio_codec=first.audio_codec if sound else None,
                 start_time=0.0,
@@ -65,12 +70,12 @@ class VideoSegments(FrameSource):
         with (folder / "segments.txt").open("w", encoding="utf-8") as file:
             for path, info in zip(self.files, self._infos, strict=True):
                 quoted = str(path.resolve()).replace("'", r"'\''")
-                # Sound may be longer than the frames, which would add up.
                 seconds = float(info.frames / info.fps)
-                file.write(f"file '{quoted}'\noutpoint {seconds:.6f}\nduration {seconds:.6f}\n")
-        options = ("-f", "concat", "-safe", "0", "-i", f"file:{file.name}")
-        if not first and length is None:
-            return AudioSource(input=options)
+                begin = info.first_timestamp
+                file.write(f"file '{quoted}'\ninpoint {begin:.6f}\n")
+                file.write(f"outpoint {begin + seconds:.6f}\nduration {seconds:.6f}\n")
+        # Times as in the list: the first sound may lie before 0, which ffmpeg would take for the start.
+        options = ("-seek_timestamp", "1", "-f", "concat", "-safe", "0", "-i", f"file:{file.name}")
         return AudioSource(input=options, start=float(first / self.info.fps), length=length)
 
 

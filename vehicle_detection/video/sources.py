@@ -40,10 +40,13 @@ class _VideoFile(FrameSource):
     def audio(self, first: int = 0, length: float | None = None) -> AudioSource | None:
         if not self.info.has_audio:
             return None
-        if not first and length is None:
-            return AudioSource(input=input_options(self._path))
-        start = float(first / self.info.fps) + self.info.start_time
-        return AudioSource(input=input_options(self._path), start=start, length=length)
+        return AudioSource(
+            input=input_options(self._path),
+            start=self.info.start_time + float(first / self.info.fps),
+            counted_from=self.info.sound_from,
+            length=length,
+            copyable=not first and length is None,
+        )
 
 
 class _Stream(FrameSource):

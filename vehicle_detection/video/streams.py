@@ -30,6 +30,7 @@ from vehicle_detection.video.ffmpeg import (
     source_name,
     video_error,
 )
+from vehicle_detection.video.seeking import find_seek_time
 from vehicle_detection.video.yuv import FORMATS, planes_from_rgb, rgb_from_planes
 
 _LOGGER = logging.getLogger(__name__)
@@ -40,6 +41,10 @@ CONTAINERS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
 # Codecs that are copied instead of encoded again: those that every browser plays; Matroska holds any.
 _COPIED_AUDIO = {"mp4": {"aac", "mp3"}, "mov": {"aac", "mp3"}}
 _COPIED_AUDIO["matroska"] = {*_COPIED_AUDIO["mp4"], "ac3", "eac3", "flac", "opus", "vorbis"}
+# Sound is cut and filled where its times differ by more than 20 ms from its length.
+_SYNCHRONIZED = "aresample=async=1:min_hard_comp=0.02"
+# Part of a frame by which reading starts early: less than half, because ffmpeg rounds to the nearest frame.
+_EARLY = Fraction(2, 5)
 # Maximum duration in seconds of one frame of a video with a varying rate, when reading starts inside it.
 _MAX_FRAME_DURATION = 5
 # More threads wait for each other, and the search needs the cores.
@@ -132,14 +137,18 @@ class FrameReader(_FfmpegStream):
         self._path, self._first, self._count = path, first, count
         # A stream may change its frame size; all frames get the size of the first one.
         filters = [f"scale={info.width}:{info.height}:flags=bicubic"]
-        if info.constant_rate:  # half a frame early, so that rounding cannot select the next frame
-            seek = float((first - Fraction(1, 2)) / info.fps) + info.start_time if first else 0.0
-        else:  # some seconds early, to decode the frame that is still shown at the start
-            early = min(first, math.ceil(_MAX_FRAME_DURATION * info.fps))
-            seek = float((first - early) / info.fps)
-            filters = [f"fps={info.fps}:start_time=0", f"trim=start_frame={early}", *filters]
-        options = ["-ss", f"{seek:.6f}"] if seek else []
-        self._sought = bool(seek)
+        early = _EARLY
+        if not info.constant_rate:  # some seconds, to decode the frame that is still shown at the start
+            early = Fraction(min(first, math.ceil(_MAX_FRAME_DURATION * info.fps)))
+        wanted = info.start_time + float((first - early) / info.fps)
+        seek = find_seek_time(path, info, wanted) if first else info.pictures_from
+        if not info.constant_rate:
+            shown = [f"fps={info.fps}:start_time={wanted - seek:.6f}", f"trim=start_frame={early}"]
+            filters = [*shown, *filters]
+        elif first:
+            filters = [f"trim=start={wanted - seek:.6f}", *filters]
+        options = ["-ss", f"{seek:.6f}"] if seek > info.pictures_from else []
+        self._sought = bool(options)
         options += ["-threads", _DECODER_THREADS, *pixel_limit(), *input_options(path)]
         options += ["-map", "0:V:0", "-vf", ",".join(filters)]
         if count is not None:
@@ -228,14 +237,27 @@ class FrameReader(_FfmpegStream):
 
 @dataclass(frozen=True, kw_only=True)
 class AudioSource:
-    """Audio for a written video: all of a file's, or a part from `start` on, `length` seconds long.
+    """Sound for a written video.
 
-    `input` are ffmpeg's options that open it.
+    Attributes
+    ----------
+    input
+        Options of ffmpeg that open it.
+    start
+        Time of the first written frame in the file in seconds.
+    counted_from
+        Time from which ffmpeg counts in the file; later than `start` if the sound starts later.
+    length
+        Maximum length in seconds; None for all.
+    copyable
+        Whether it may be copied without decoding: it is not cut, and not joined from several files.
     """
 
     input: tuple[str, ...]
-    start: float | None = None
+    start: float = 0.0
+    counted_from: float = 0.0
     length: float | None = None
+    copyable: bool = False
 
 
 class FrameWriter(_FfmpegStream):
@@ -249,8 +271,7 @@ class FrameWriter(_FfmpegStream):
         container = CONTAINERS[path.suffix.lower()]
         self.frames_written = 0
         self._path, self._has_sound = path, audio is not None
-        # Seconds of sound for n written frames: those before the first frame, and n / fps.
-        self._delay, self._fps = 0.0, info.fps
+        self._fps = info.fps
         width, height = info.width + info.width % 2, info.height + info.height % 2
         self._planes = np.empty((height * 3 // 2, width), np.uint8)
         self._channels = np.empty((3, height, width), np.uint8)
@@ -259,16 +280,16 @@ class FrameWriter(_FfmpegStream):
         sound: list[str] = []
         mapped = ["-map", "0:v:0"]
         if audio is not None:
-            whole = audio.start is None and audio.length is None
-            if whole and info.start_time:  # keep the delay of the first frame after the sound
-                self._delay = info.start_time
-                video += ["-itsoffset", f"{self._delay:.6f}"]
-            sound += [] if audio.start is None else ["-ss", f"{audio.start:.6f}"]
+            lead = audio.start - audio.counted_from
+            sound += ["-ss", f"{audio.start:.6f}"] if lead > 0 else []
+            sound += ["-itsoffset", f"{-lead:.6f}"] if lead < 0 else []
             sound += [] if audio.length is None else ["-t", f"{audio.length:.6f}"]
             sound += ["-vn", *audio.input]
-            copied = whole and info.audio_codec in _COPIED_AUDIO[container]
+            # Matroska has no times before 0, for the part of a packet before the first frame.
+            copyable = audio.copyable and (lead <= 0 or container != "matroska")
+            copied = copyable and info.audio_codec in _COPIED_AUDIO[container]
             mapped += ["-map", f"1:a:{info.audio_track}"]
-            mapped += ["-c:a", "copy"] if copied else ["-c:a", "aac", "-b:a", "192k"]
+            mapped += ["-c:a", "copy"] if copied else ["-c:a", "aac", "-b:a", "192k", "-af", _SYNCHRONIZED]
         filters = "setparams=colorspace=smpte170m:color_primaries=bt709:color_trc=bt709:range=tv"
         if info.pixel_aspect != 1:
             filters += f",setsar={info.pixel_aspect}"
@@ -308,7 +329,7 @@ class FrameWriter(_FfmpegStream):
 
     def _trim_sound(self) -> None:
         """Copy the file with the sound up to the end of the last frame."""
-        seconds = self._delay + float(self.frames_written / self._fps)
+        seconds = float(self.frames_written / self._fps)
         whole = ("-i", f"file:{self._path}")
         with temporary_folder(self._path.parent, self._path.stem) as folder:
             trimmed = folder / self._path.name
