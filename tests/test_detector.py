@@ -21,6 +21,7 @@ from vehicle_detection.params import (
     DrawParams,
     FeatureParams,
     HeatParams,
+    PyramidParams,
     RegionParams,
     SearchBand,
     SearchParams,
@@ -727,6 +728,25 @@ def test_an_unknown_lens_gives_a_large_error(wide_scenes):
     assert not detector.lens_is_known
     assert track.distance_m > 1.3 * 9.0
     assert track.distance_std_m >= 0.25 * track.distance_m
+
+
+def test_the_search_takes_a_measured_horizon_of_the_camera(tmp_path):
+    shape = (720, 1280)
+    default = PyramidParams()
+    measured, guessed = (Camera.for_frame(shape, horizon=0.4, horizon_std_px=std) for std in (0.0, 20.0))
+    write_camera(measured, tmp_path / "camera.json", shape)
+    (tmp_path / "lens.json").write_text('{"field_of_view": 90}')
+    for camera in (measured, tmp_path / "camera.json"):
+        assert VehicleDetector(camera=camera).search_params_of(shape) == dataclasses.replace(
+            default, horizon=0.4
+        )
+        given = VehicleDetector(camera=camera, horizon=0.6).search_params_of(shape)
+        assert given == default.with_horizon(0.6)
+        assert VehicleDetector(camera=camera, search_params=default).search_params_of(shape) == default
+    for camera in (None, guessed, tmp_path / "lens.json", "wide-90"):
+        assert VehicleDetector(camera=camera).search_params_of(shape) == default
+    bands = VehicleDetector("highway", camera=measured).search_params_of(shape)
+    assert bands == SearchParams.default().with_horizon(0.4)
 
 
 @pytest.mark.parametrize(

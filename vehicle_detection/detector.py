@@ -148,7 +148,8 @@ class VehicleDetector:
     camera
         The camera, for distances and boxes: a `Camera`, which fits frames of one size; a file of
         `write_camera`; or the name of a lens, as in `Camera.for_frame`. By default a dash-cam with the
-        search's horizon, as an estimate that tracking refines.
+        search's horizon, as an estimate that tracking refines. A measured horizon of the camera is that of
+        the search, too.
     field_of_view, camera_height_m
         Angle of view along the frame's longer side in degrees of a lens without distortion, and height of the
         lens above the road in meters, without a `Camera` or a file. If the lens is unknown, distances assume
@@ -235,6 +236,7 @@ class VehicleDetector:
         self._lens = _check_lens(camera, field_of_view, camera_height_m)
         self._cameras: dict[tuple[int, int], Camera] = {}
         self._horizon_given = horizon is not None
+        self._default_horizon = horizon is None and search_params is None
         self.own_speed = own_speed
         self.diagnostics = diagnostics
         if blur is not None:
@@ -285,7 +287,8 @@ class VehicleDetector:
         # Low scores are for the tracker, which continues confirmed tracks with them.
         track = self.track_params
         min_score = min(0.0, track.low_threshold, track.high_threshold)
-        return self._search.find(frame, self.search_params, min_vehicle_score=min_score)
+        params = self.search_params_of(frame.shape)
+        return self._search.find(frame, params, min_vehicle_score=min_score)
 
     def detect(self, image: NDArray[np.uint8] | Path) -> Detections:
         """Detect the vehicles of a single image; the state of a video is neither used nor changed.
@@ -319,6 +322,26 @@ class VehicleDetector:
             vehicles = find_vehicles(found.windows, camera, found.shape, self.region_params)
         assert self._calibration is not None
         return Detections(vehicles.boxes, vehicles.scores, self._calibration.probability(vehicles.scores))
+
+    def search_params_of(self, shape: tuple[int, ...]) -> SearchParams | PyramidParams | FunctionParams:
+        """Return the parameters of the search for frames of ``(height, width, ...)``.
+
+        They are `search_params`, with the horizon of a camera whose horizon was measured, unless `horizon` or
+        `search_params` were given.
+
+        >>> camera = Camera.for_frame((720, 1280), horizon=0.4)
+        >>> VehicleDetector(camera=camera).search_params_of((720, 1280)).horizon
+        0.4
+        """
+        shape = check_shape(shape)
+        if not self._default_horizon or self.camera is None or self.camera in LENSES:
+            return self.search_params
+        camera = self.camera_of(shape)
+        horizon = camera.horizon_px / shape[0]
+        if camera.horizon_std_px or not 0 <= horizon <= 1:
+            return self.search_params
+        # Not `with_horizon`, which narrows the search: the road is not level everywhere.
+        return replace(self.search_params, horizon=horizon)
 
     def camera_of(self, shape: tuple[int, ...]) -> Camera:
         """Return the camera for frames of ``(height, width, ...)``: as given, or what is assumed.

@@ -223,7 +223,7 @@ def _best_overlap(box: Floats, boxes: Floats, min_iou: float) -> int | None:
 def _explain_mixture(
     detector: VehicleDetector, model: TemplateMixture, image: NDArray[np.uint8], box: Floats
 ) -> Explanation:
-    params: Any = detector.search_params
+    params: Any = detector.search_params_of(image.shape)
     vehicles = detector.search(image).vehicles
     assert vehicles is not None
     row = _best_overlap(box, vehicles.boxes, _MIN_IOU)

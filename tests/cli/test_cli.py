@@ -394,6 +394,10 @@ def test_video_warns_of_a_wrong_horizon(clip, tmp_path, monkeypatch):
     monkeypatch.setattr(video, "estimate_video_horizon", lambda *_, **__: found)
     result = run("video", clip, "-o", tmp_path / "out.mp4", "--end", 0.12, "--horizon", 0.95)
     assert "warning: no vehicle was found with --horizon 0.95, but a search of all rows" in result.stderr
+    camera = tmp_path / "camera.json"
+    camera.write_text('{"field_of_view": 58, "horizon": 0.95}')
+    result = run("video", clip, "-o", tmp_path / "out.mp4", "--end", 0.12, "--camera", camera)
+    assert f"warning: no vehicle was found with the horizon of --camera {camera}, but" in result.stderr
 
 
 def test_detect_accepts_every_kind_of_image(picture, tmp_path):

@@ -303,7 +303,7 @@ def _warn_if_empty(
     estimate = None
     with contextlib.suppress(InvalidInputError):  # too few boxes
         estimate = estimate_horizon(np.concatenate(boxes), shape)
-    warn_of_horizon(horizon, estimate)
+    warn_of_horizon(f"--horizon {horizon}", estimate)
 
 
 def _read_each(images: list[Path], undecodable: list[Path]) -> Iterator[tuple[Path, NDArray[np.uint8]]]:

@@ -22,15 +22,15 @@ def search_everywhere(model: Any, conf: float | None) -> VehicleDetector:
     return VehicleDetector(model, conf=conf, search_params=model.search_params_type.default().everywhere())
 
 
-def warn_of_horizon(horizon: str | float, found: HorizonEstimate | None) -> None:
-    """Print what a search of all rows found where none was found below a given horizon."""
+def warn_of_horizon(given: str, found: HorizonEstimate | None) -> None:
+    """Print what a search of all rows found where none was found with a horizon that was `given` so."""
     message = (
-        f"warning: no vehicle was found with --horizon {horizon}; leave it out if there are some "
+        f"warning: no vehicle was found with {given}; leave it out if there are some "
         "(a search of all rows found too few vehicles to estimate it)"
     )
     if found is not None:
         message = (
-            f"warning: no vehicle was found with --horizon {horizon}, but a search of all rows found "
+            f"warning: no vehicle was found with {given}, but a search of all rows found "
             f"{found.n_boxes} boxes, whose horizon is {found.horizon:.2f}; use --horizon {found.horizon:.2f}"
         )
     print_error(message)

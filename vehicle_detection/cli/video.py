@@ -325,9 +325,12 @@ def video(
             # After the tracks, whose file is complete when its writer closes.
             stack.close()
             page.finish(done, events=found, pictures=explain_vehicles(detector, source, log) if why else ())
-    if not done.tracks and horizon not in (None, "auto") and not quiet and opened.rereadable:
+    given = None if horizon in (None, "auto") else f"--horizon {horizon}"
+    if horizon is None and detector.search_params_of(opened.info.shape) != detector.search_params:
+        given = f"the horizon of --camera {camera}"
+    if not done.tracks and given is not None and not quiet and opened.rereadable:
         with search_everywhere(loaded, conf) as everywhere:
-            warn_of_horizon(horizon, estimate_video_horizon(source, everywhere, start=start, end=end))
+            warn_of_horizon(given, estimate_video_horizon(source, everywhere, start=start, end=end))
     if done.tracks and not detector.lens_is_known and not quiet:
         print_error(_UNKNOWN_LENS)
     if done.tracks and opened.info.pixel_aspect != 1 and not quiet:
