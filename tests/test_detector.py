@@ -1,4 +1,6 @@
+import copy
 import dataclasses
+import pickle
 import random
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -698,6 +700,19 @@ def track_cars(scenes, **options):
 
 def median_distance(tracks):
     return float(np.median([track.distance_m for track in tracks]))
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda each: pickle.loads(pickle.dumps(each))])
+@pytest.mark.parametrize("regions", ["fitted", "heat"])
+def test_a_copy_goes_on_where_its_original_was(copied, regions):
+    detector = make(regions=regions)
+    frames = drive()
+    for frame in frames[:6]:
+        detector.process(frame)
+    copy_of_it = copied(detector)
+    for frame in frames[6:]:
+        expected, found = detector.process(frame), copy_of_it.process(frame)
+        assert [str(each) for each in found.tracks] == [str(each) for each in expected.tracks]
 
 
 @pytest.fixture(scope="module")

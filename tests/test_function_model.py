@@ -1,3 +1,5 @@
+import copy
+import pickle
 import threading
 import time
 from types import SimpleNamespace
@@ -242,3 +244,12 @@ def test_a_function_as_the_model_names_the_remedy():
 def test_an_estimator_as_the_model_names_the_remedy():
     with pytest.raises(InvalidInputError, match=r"not be an estimator of scikit-learn.*from_pipeline"):
         VehicleDetector(LinearSVC())
+
+
+def test_copies_share_the_function_and_other_processes_get_it():
+    detector = detector_from(find_red, score="probability")
+    frame = frame_with(BOX)
+    assert copy.deepcopy(detector).model is detector.model
+    other = pickle.loads(pickle.dumps(detector))
+    assert other.detect(frame).boxes.tolist() == detector.detect(frame).boxes.tolist() == [BOX]
+    assert other.model.function is find_red

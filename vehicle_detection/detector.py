@@ -243,12 +243,21 @@ class VehicleDetector:
             check_choice(blur, "blur", BLUR_REGIONS)
         self.blur = blur
         self.every = None if every is None else check_integer(every, "every", low=1, high=1000)
-        self._search: FrameSearch = self.model.open_search(n_jobs, method)
+        self._search_options = n_jobs, method
+        self._search: FrameSearch = self.model.open_search(*self._search_options)
         self._heat_params = region_params if isinstance(region_params, HeatParams) else None
         # The heat of a region is no log-odds.
         self._calibration = self.model.calibration if self._heat_params is None else None
         self._speed_warning = True
         self.reset()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return everything but the threads of the search, for copies and other processes."""
+        return {name: value for name, value in vars(self).items() if name != "_search"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._search = self.model.open_search(*self._search_options)
 
     def reset(self, *, fps: float | None = None) -> None:
         """Forget all frames, before the first frame of another video.

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 import threading
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +58,14 @@ class FunctionModel:
         object.__setattr__(self, "score", check_score_scale(self.score, self.threshold))
         object.__setattr__(self, "name", name)
         object.__setattr__(self, "_lock", contextlib.nullcontext() if self.thread_safe else threading.Lock())
+
+    def __deepcopy__(self, _: object) -> Self:
+        """Return the model itself: copies of it would call the function at the same time."""
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        values = {each.name: getattr(self, each.name) for each in fields(self) if each.init}
+        return functools.partial(type(self), **values), ()
 
     @property
     def calibration(self) -> Platt:

@@ -1,6 +1,7 @@
 """The data that a report keeps of a run."""
 
 import math
+import pickle
 from itertools import pairwise
 
 import numpy as np
@@ -36,6 +37,14 @@ def test_the_log_keeps_the_frames_and_values_of_each_track(frames):
         assert all(stop < start for (_, stop), (start, _) in pairwise(spans))
     order = [(each.first, each.id) for each in histories]
     assert order == sorted(order)
+
+
+def test_a_log_can_be_pickled():
+    log = log_of([{1}, {1, 2}])
+    copied = pickle.loads(pickle.dumps(log))
+    copied.add(2, None, [track(3)])
+    assert [each.id for each in copied.histories()] == [1, 2, 3]
+    assert [each.id for each in log.histories()] == [1, 2]
 
 
 @given(st.sets(st.integers(0, 60), min_size=1), st.integers(1, 10), st.data())

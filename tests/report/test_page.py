@@ -374,6 +374,7 @@ def test_events_are_in_the_units_of_the_page(tmp_path):
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "<td>41.0 ± 4.9 ft</td>\n<td>45 ± 2 mph, oncoming</td>" in page
     assert "distance 41.0 ± 4.9 ft: show in the video" in page
+    assert "12.5 ± 1.5 m" not in page
 
 
 def test_pictures_are_part_of_the_page(tmp_path):

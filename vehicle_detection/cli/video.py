@@ -154,7 +154,8 @@ def video(
         float,
         Option(
             metavar="S",
-            help="Seconds from the first point of --gpx to the start of the video, such as 12.5 or -3.",
+            help="Time of the video's start in --gpx: seconds after the first point of a track, or the "
+            "time_s of a table, such as 12.5 or -3.",
             rich_help_panel=INPUT,
         ),
     ] = 0.0,

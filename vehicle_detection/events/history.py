@@ -109,9 +109,7 @@ class TrackLog:
         self.first_time: float | None = None  # of the first frame in the source, in seconds
         self.counts = array("q")  # shown tracks in each frame
         # Frames and columns of each track.
-        self._tracks: dict[int, list[array[Any]]] = defaultdict(
-            lambda: [array("q"), *(array("d") for _ in COLUMNS)]
-        )
+        self._tracks: defaultdict[int, list[array[Any]]] = defaultdict(_empty_columns)
 
     def __call__(self, result: Any) -> None:
         """Add one frame's result: for ``process_video(..., on_result=log)``."""
@@ -148,6 +146,11 @@ class TrackLog:
             for track_id, (frames, *columns) in self._tracks.items()
         ]
         return sorted(histories, key=lambda track: (track.first, track.id))
+
+
+def _empty_columns() -> list[array[Any]]:
+    """Frames and columns of a new track."""
+    return [array("q"), *(array("d") for _ in COLUMNS)]
 
 
 def _rows(tracks: object) -> Iterator[tuple[int, list[float]]]:

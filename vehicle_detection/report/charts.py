@@ -18,6 +18,7 @@ from vehicle_detection.boxes import Floats
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.events import KINDS, Event, TrackHistory, bin_means, split_runs
 from vehicle_detection.report.formatting import format_time, format_value, svg_element
+from vehicle_detection.units import Units
 
 MAX_ROWS = 14
 """Largest number of tracks that get a row each in `gantt`; more tracks share rows."""
@@ -152,7 +153,7 @@ def gantt(tracks: Sequence[TrackHistory], axis: TimeAxis, *, label: str) -> str:
     return _graph(row_names, [*bars, *names], axis, height, role="group", label=label)
 
 
-def event_markers(events: Sequence[Event], axis: TimeAxis, *, label: str) -> str:
+def event_markers(events: Sequence[Event], axis: TimeAxis, units: Units, *, label: str) -> str:
     """Draw a marker for each event, below the name of its kind."""
     kinds = [kind for kind in KINDS if any(event.kind == kind for event in events)]
     names, markers = [], []
@@ -166,12 +167,13 @@ def event_markers(events: Sequence[Event], axis: TimeAxis, *, label: str) -> str
         for event in events:
             if event.kind != kind:
                 continue
+            text = event.text(units)
             x, color = axis.percent(event.frame), f"c{(event.track_id - 1) % len(TRACK_COLORS)}"
             parts = [
-                svg_element("title", str(event)),
+                svg_element("title", text),
                 svg_element("circle", cx=x, cy=top + 24, r=5),
             ]
-            button = {"role": "button", "tabindex": 0, "aria_label": f"{event}: show in the video"}
+            button = {"role": "button", "tabindex": 0, "aria_label": f"{text}: show in the video"}
             seek = {"data_frame": event.frame, "data_track": event.track_id}
             markers.append(svg_element("g", *parts, class_=f"bar {color}", **button, **seek))
     return _graph([], [*names, *markers], axis, _KIND_HEIGHT * len(kinds), role="group", label=label)

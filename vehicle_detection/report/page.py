@@ -212,7 +212,7 @@ def _figures(
     label = f"Bars of {pluralize(len(tracks), 'track')}: when each was shown, as in the table of tracks."
     distances = [track.columns["distance_m"] for track in tracks]
     speeds = [bin_means(track.frames, track.columns["speed_mps"], axis.bin_width)[1] for track in tracks]
-    marked = event_markers(events, axis, label=f"Markers of {pluralize(len(events), 'event')}.")
+    marked = event_markers(events, axis, units, label=f"Markers of {pluralize(len(events), 'event')}.")
     return [
         Figure("Tracks", "When each vehicle was shown", gantt(tracks, axis, label=label)),
         *([Figure("Events", "What the table of events lists", marked)] if events else []),
