@@ -249,13 +249,16 @@ def test_the_segments_of_a_card_become_one_video(material, tmp_path):
     assert contents(tmp_path)[-2:] == ["t.csv", "trip.mp4"]
 
 
-def test_video_needs_something_to_do(material, tmp_path):
+def test_video_needs_something_to_do(material, picture, tmp_path):
     clip = material / "clip.mp4"
     assert "--output must name the video to write; or use --show" in refuse("video", clip)
     assert "--output must name a video for --report" in refuse("video", clip, "--report", tmp_path / "r.html")
     assert "--output must name a video for --clips" in refuse(
         "video", clip, "--show", "--clips", tmp_path / "clips"
     )
+    tracks = ["--tracks", tmp_path / "t.csv"]
+    assert "--output must name a video for --blur" in refuse("video", clip, *tracks, "--blur", "plates")
+    assert "--output must name a folder for --blur" in refuse("detect", picture, "--blur", "plates")
     out = succeed("video", clip, "--tracks", tmp_path / "t.parquet", "--model", "highway")
     assert out.endswith(f"wrote {tmp_path / 't.parquet'}\n")
     assert contents(tmp_path) == ["t.parquet"]

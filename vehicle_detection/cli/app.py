@@ -228,9 +228,14 @@ def detect(
     if line_width is not None:
         check_integer(line_width, "line_width", low=1, high=1000)
     _check_images(images, output, boxes)
+    region = parse_blur(blur)
+    if region is not None and output is None and why is None:
+        raise InvalidInputError(
+            "--output must name a folder for --blur, which blurs annotated images; add it"
+        )
     undecodable: list[Path] = []
     with (
-        VehicleDetector(model, conf=conf, horizon=horizon, blur=parse_blur(blur)) as detector,
+        VehicleDetector(model, conf=conf, horizon=horizon, blur=region) as detector,
         output_folder(output, "--output"),
         output_folder(why, "--why"),
     ):

@@ -256,6 +256,8 @@ def video(
     check_distinct_paths(outputs, sources)
     _check_outputs(outputs, clips, show=show, why=why)
     region = parse_blur(blur)
+    if region is not None and output is None and not show:
+        raise InvalidInputError("--output must name a video for --blur, which blurs its vehicles; add it")
     draw_params = _draw_params(labels, line_width=line_width, color_by=color_by, panel=panel, units=units)
     speed = read_speed(own_speed, gpx, gpx_offset)
     side_outputs = SideOutputs(events, clips, srt)
