@@ -704,7 +704,7 @@ def median_distance(tracks):
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda each: pickle.loads(pickle.dumps(each))])
 @pytest.mark.parametrize("regions", ["fitted", "heat"])
-def test_a_copy_goes_on_where_its_original_was(copied, regions):
+def test_a_copy_continues_the_tracks(copied, regions):
     detector = make(regions=regions)
     frames = drive()
     for frame in frames[:6]:
@@ -745,22 +745,22 @@ def test_an_unknown_lens_gives_a_large_error(wide_scenes):
     assert track.distance_std_m >= 0.25 * track.distance_m
 
 
-def test_the_search_takes_a_measured_horizon_of_the_camera(tmp_path):
+def test_the_search_takes_the_horizon_of_a_camera_file(tmp_path):
     shape = (720, 1280)
     default = PyramidParams()
-    measured, guessed = (Camera.for_frame(shape, horizon=0.4, horizon_std_px=std) for std in (0.0, 20.0))
-    write_camera(measured, tmp_path / "camera.json", shape)
+    camera = Camera.for_frame(shape, horizon=0.4)
+    write_camera(camera, tmp_path / "camera.json", shape)
     (tmp_path / "lens.json").write_text('{"field_of_view": 90}')
-    for camera in (measured, tmp_path / "camera.json"):
-        assert VehicleDetector(camera=camera).search_params_of(shape) == dataclasses.replace(
-            default, horizon=0.4
-        )
-        given = VehicleDetector(camera=camera, horizon=0.6).search_params_of(shape)
-        assert given == default.with_horizon(0.6)
-        assert VehicleDetector(camera=camera, search_params=default).search_params_of(shape) == default
-    for camera in (None, guessed, tmp_path / "lens.json", "wide-90"):
-        assert VehicleDetector(camera=camera).search_params_of(shape) == default
-    bands = VehicleDetector("highway", camera=measured).search_params_of(shape)
+    file = {"camera": tmp_path / "camera.json"}
+    for size in (shape, (360, 640)):
+        found = VehicleDetector(**file).search_params_of(size)
+        assert found == dataclasses.replace(default, horizon=0.4)
+    given = VehicleDetector(**file, horizon=0.6).search_params_of(shape)
+    assert given == default.with_horizon(0.6)
+    assert VehicleDetector(**file, search_params=default).search_params_of(shape) == default
+    for other in (None, camera, tmp_path / "lens.json", "wide-90"):
+        assert VehicleDetector(camera=other).search_params_of(shape) == default
+    bands = VehicleDetector("highway", **file).search_params_of(shape)
     assert bands == SearchParams.default().with_horizon(0.4)
 
 

@@ -249,7 +249,8 @@ def test_an_estimator_as_the_model_names_the_remedy():
 def test_copies_share_the_function_and_other_processes_get_it():
     detector = detector_from(find_red, score="probability")
     frame = frame_with(BOX)
-    assert copy.deepcopy(detector).model is detector.model
+    assert copy.deepcopy(detector).model is copy.copy(detector.model) is detector.model
+    assert VehicleDetector(detector.model, conf=0.4).model._lock is detector.model._lock
     other = pickle.loads(pickle.dumps(detector))
     assert other.detect(frame).boxes.tolist() == detector.detect(frame).boxes.tolist() == [BOX]
     assert other.model.function is find_red

@@ -148,8 +148,8 @@ class VehicleDetector:
     camera
         The camera, for distances and boxes: a `Camera`, which fits frames of one size; a file of
         `write_camera`; or the name of a lens, as in `Camera.for_frame`. By default a dash-cam with the
-        search's horizon, as an estimate that tracking refines. A measured horizon of the camera is that of
-        the search, too.
+        search's horizon, as an estimate that tracking refines. The horizon of a file is that of the search,
+        too.
     field_of_view, camera_height_m
         Angle of view along the frame's longer side in degrees of a lens without distortion, and height of the
         lens above the road in meters, without a `Camera` or a file. If the lens is unknown, distances assume
@@ -335,15 +335,15 @@ class VehicleDetector:
     def search_params_of(self, shape: tuple[int, ...]) -> SearchParams | PyramidParams | FunctionParams:
         """Return the parameters of the search for frames of ``(height, width, ...)``.
 
-        They are `search_params`, with the horizon of a camera whose horizon was measured, unless `horizon` or
+        They are `search_params`, with the horizon that a camera file states, unless `horizon` or
         `search_params` were given.
 
-        >>> camera = Camera.for_frame((720, 1280), horizon=0.4)
-        >>> VehicleDetector(camera=camera).search_params_of((720, 1280)).horizon
-        0.4
+        >>> VehicleDetector().search_params_of((720, 1280)).horizon
+        0.5
         """
         shape = check_shape(shape)
-        if not self._default_horizon or self.camera is None or self.camera in LENSES:
+        # A `Camera` may be one for frames of another size.
+        if not self._default_horizon or isinstance(self.camera, Camera | None) or self.camera in LENSES:
             return self.search_params
         camera = self.camera_of(shape)
         horizon = camera.horizon_px / shape[0]

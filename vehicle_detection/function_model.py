@@ -43,7 +43,8 @@ class FunctionModel:
     thread_safe: bool = False
     name: str | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
-    _lock: contextlib.AbstractContextManager[Any] = field(init=False, repr=False)
+    # Of the function, so it is kept by `dataclasses.replace`.
+    _lock: contextlib.AbstractContextManager[Any] | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not callable(self.function):
@@ -57,14 +58,18 @@ class FunctionModel:
         name = self.name or getattr(self.function, "__name__", type(self.function).__name__)
         object.__setattr__(self, "score", check_score_scale(self.score, self.threshold))
         object.__setattr__(self, "name", name)
-        object.__setattr__(self, "_lock", contextlib.nullcontext() if self.thread_safe else threading.Lock())
+        lock = self._lock or (contextlib.nullcontext() if self.thread_safe else threading.Lock())
+        object.__setattr__(self, "_lock", lock)
+
+    def __copy__(self) -> Self:
+        """Return the model itself, because a copy would have a lock of its own."""
+        return self
 
     def __deepcopy__(self, _: object) -> Self:
-        """Return the model itself: copies of it would call the function at the same time."""
         return self
 
     def __reduce__(self) -> tuple[Any, ...]:
-        values = {each.name: getattr(self, each.name) for each in fields(self) if each.init}
+        values = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "_lock"}
         return functools.partial(type(self), **values), ()
 
     @property
@@ -99,6 +104,7 @@ class FunctionModel:
         """Call the function on a copy of a frame: boxes clipped to it, with log-odds."""
         height, width = frame.shape[:2]
         try:
+            assert self._lock is not None
             with self._lock:
                 returned = self.function(frame.copy())
         except Exception as error:

@@ -50,14 +50,14 @@ def sound_seconds(path):
     return len(ffmpeg("-i", path, "-map", "0:a:0", "-f", "s16le", "-ac", 1, "-ar", 8000, "-")) / 16000
 
 
-def write_beep(path, *, delay=0.0, longer=0.2):
+def write_beep(path, *, delay=0.0, longer=0.2, options=()):
     """Write a video of 24 frames, one second, with a beep 0.6 s after the first frame.
 
     The frames begin `delay` seconds after the sound, which is `longer` than they are.
     """
     early, late = max(delay, 0.0), max(-delay, 0.0)
     beep = f"sin(6000*t)*between(t,{0.6 + early - late},{0.7 + early - late})"
-    flat = write_clip(path.with_name(f"pictures_{path.stem}.mp4"), gray_frames(24), fps=24)
+    flat = write_clip(path.with_name(f"pictures_{path.stem}.mp4"), gray_frames(24), fps=24, options=options)
     tone = ["-itsoffset", late, "-f", "lavfi", "-t", 1 + longer + early, "-i", f"aevalsrc='{beep}'"]
     ffmpeg("-itsoffset", early, "-i", flat, *tone, "-c:v", "copy", "-c:a", "aac", path)
     return path

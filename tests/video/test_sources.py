@@ -89,6 +89,30 @@ def test_sound_of_a_trip_stays_with_its_frames(tmp_path, suffix, delay):
     assert beeps(tmp_path / "part.mp4") == pytest.approx([0.35, 1.35], abs=0.02)
 
 
+def test_segments_with_different_sound_become_a_video_without(tmp_path, caplog):
+    segments = [write_beep(tmp_path / f"{n}.mp4") for n in range(2)]
+    other = tmp_path / "other.mp4"
+    ffmpeg("-i", segments[0], "-c:v", "copy", "-ar", 22050, other)
+    with open_source([*segments, other]) as source:
+        assert not source.info.has_audio
+    assert "different sound; the video has none" in caplog.text
+    with open_source(segments) as source:
+        assert source.info.has_audio
+
+
+def test_segments_of_unknown_length(tmp_path):
+    options = ("-c:v", "mjpeg", "-q:v", 2)
+    segments = [write_clip(tmp_path / f"{n}.mjpeg", gray_frames(4), options=options) for n in range(2)]
+    assert numbers(segments)[2] == (0, 1, 2, 3) * 2
+
+
+def test_segments_with_a_line_break_in_the_name(tmp_path):
+    clip = write_clip(tmp_path / "a.mp4", gray_frames(2))
+    broken = clip.rename(tmp_path / "a\nb.mp4")
+    with pytest.raises(InvalidInputError, match=r"a\\nb.mp4' has a line break in its name; rename"):
+        open_source([broken, broken])
+
+
 def test_segments_of_another_rate_and_size(tmp_path):
     first = write_clip(tmp_path / "a.mp4", gray_frames(4), fps=8)
     second = write_clip(tmp_path / "b.mp4", gray_frames(8, 128, 96), fps=16)

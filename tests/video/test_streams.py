@@ -106,6 +106,12 @@ def test_frames_of_a_video_that_starts_after_its_sound(folder):
     assert sound_seconds(target) == pytest.approx(0.4, abs=0.06)
 
 
+def numbers_from(path, first, count=1, fps=25):
+    """Return which frames of `gray_frames` are read from the frame with the number `first` on."""
+    with read_frames(path, start=first / fps, end=(first + count) / fps) as frames:
+        return [round((float(frame.mean()) - 10) / LEVELS) for _, _, frame in frames]
+
+
 CODECS = {"vob": ("mpeg2video", "-q:v", 2), "avi": ("mjpeg", "-q:v", 2), "wmv": ("wmv2", "-q:v", 2)}
 
 
@@ -117,9 +123,46 @@ def test_any_frame_of_any_container_can_be_the_first_one(tmp_path, suffix, fps):
         tmp_path / f"clip.{suffix}", gray_frames(24), fps=fps, options=("-g", 16, "-c:v", *codec)
     )
     for first in range(1, 20, 2):
-        with read_frames(path, start=first / fps, end=(first + 1) / fps) as frames:
-            found = [round((float(frame.mean()) - 10) / LEVELS) for _, _, frame in frames]
-        assert found == [first]
+        assert numbers_from(path, first, fps=fps) == [first]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("clip.mp4", "-movflags", "frag_keyframe+empty_moov", "-bf", 2, "-g", 8),
+        ("clip.ts", "-x264-params", "intra-refresh=1:keyint=8", "-bf", 0),
+        ("clip.h264", "-bf", 0, "-g", 8),
+        ("clip.mjpeg", "-c:v", "mjpeg", "-q:v", 2),
+    ],
+)
+def test_any_frame_of_streams_without_exact_key_frames_can_be_the_first_one(tmp_path, options):
+    name, *options = options
+    path = write_clip(tmp_path / name, gray_frames(24), options=options)
+    for first in range(1, 20):
+        assert numbers_from(path, first) == [first]
+
+
+def test_a_stream_cut_before_its_first_key_frame(tmp_path):
+    clip = write_beep(tmp_path / "clip.ts", options=("-g", 8, "-bf", 0))
+    data = clip.read_bytes()
+    cut = tmp_path / "cut.ts"
+    start = len(data) // 5 // 188 * 188
+    cut.write_bytes(data[: 3 * 188] + data[start:])
+    (begin,) = numbers_from(cut, 0, fps=24)
+    assert begin == 8
+    for first in range(1, 6):
+        assert numbers_from(cut, first, fps=24) == [begin + first]
+    target = tmp_path / "out.mp4"
+    process_video(cut, target, StubDetector())
+    assert beeps(target) == pytest.approx([0.6 - begin / 24], abs=0.02)
+
+
+def test_frames_that_arrive_in_bursts_keep_a_usual_rate(tmp_path):
+    bursts = ["-vf", "settb=1/1000,setpts='floor(N/3)*120+mod(N,3)'", "-fps_mode", "passthrough"]
+    bursts += ["-enc_time_base", "1/1000", "-bf", 0]
+    info = probe_video(write_clip(tmp_path / "bursts.mkv", gray_frames(24), options=bursts))
+    assert not info.constant_rate
+    assert info.fps <= 30
 
 
 @pytest.mark.parametrize("sound", [False, True])
@@ -158,6 +201,8 @@ def test_sound_stays_with_its_frames(tmp_path, suffix, delay, target):
     assert beeps(tmp_path / target) == pytest.approx([0.35], abs=0.02)
     process_video(source, tmp_path / target, StubDetector(), start=0.375, end=0.875)
     assert beeps(tmp_path / target) == pytest.approx([0.225], abs=0.02)
+    process_video(source, tmp_path / target, StubDetector(), end=0.75)
+    assert sound_seconds(tmp_path / target) == pytest.approx(0.75 - max(-delay, 0), abs=0.07)
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "mkv"])

@@ -23,7 +23,7 @@ def search_everywhere(model: Any, conf: float | None) -> VehicleDetector:
 
 
 def warn_of_horizon(given: str, found: HorizonEstimate | None) -> None:
-    """Print what a search of all rows found where none was found with a horizon that was `given` so."""
+    """Warn that no vehicle was found, and print what a search of all rows found; `given` set the horizon."""
     message = (
         f"warning: no vehicle was found with {given}; leave it out if there are some "
         "(a search of all rows found too few vehicles to estimate it)"

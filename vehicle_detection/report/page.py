@@ -291,6 +291,8 @@ def _settings(detector: Any, shape: tuple[int, ...]) -> list[Group]:
     search, regions, tracks = (
         getattr(detector, name, None) for name in ("search_params", "region_params", "track_params")
     )
+    if hasattr(detector, "search_params_of"):
+        search = detector.search_params_of(shape)
     bands = getattr(search, "bands", ())
     groups = {"Search": search}
     if isinstance(regions, HeatParams):

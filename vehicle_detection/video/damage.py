@@ -58,7 +58,7 @@ def _announced_frames(path: Path | str, info: VideoInfo, end: int, *, exact: boo
     # The file's duration is that of its longest stream, which may be the sound.
     duration = stream_duration(path, info)
     if duration is None:
-        duration = 0.0 if info.has_audio else info.duration - info.start_time
+        duration = 0.0 if info.has_audio else float(info.frames / info.fps)
     expected = round(duration * info.fps)
     # With a varying rate, the duration of the last frame is unknown.
     tolerance = (0 if exact else 1) + duration * float(_RATE_ERROR)

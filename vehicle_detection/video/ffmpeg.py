@@ -39,11 +39,13 @@ _NETWORK_FAULT = re.compile(
     r"|Failed to resolve|Network is unreachable|No route to host|Input/output error|ends prematurely"
     r"|Broken pipe"
 )
-# Containers whose streams ffmpeg counts from their own starts, if it reads one of them alone.
-_OWN_STARTS = ("mpegts", "mpeg")
+# Containers in which ffmpeg's time 0 is the start of the only stream that is read, not that of the file.
+_OWN_STARTS = ("mpegts", "mpeg", "hls", "ogg")
 _STREAM_START = r", start (-?[\d.]+)"
-# How ffmpeg prints that a time is unknown.
-_UNKNOWN_TICK = -(1 << 63)
+# Containers whose duration counts from time 0 instead of from the file's start.
+_DURATION_IS_END = ("matroska,webm", "flv")
+# Rate in Hz above which a rate may be that of a clock, or of frames that arrive in bursts.
+_MAX_RATE = 60
 NETWORK_TIMEOUT = 10.0
 """Seconds without data after which a server has failed."""
 
@@ -79,10 +81,13 @@ class VideoInfo:
         ffmpeg's names of the container format, such as ``"matroska,webm"``; empty if unknown.
     first_timestamp
         Timestamp of the first frame in seconds, as stored in the file.
-    pictures_from, sound_from
-        Time in seconds after the file's start from which ffmpeg counts, if it reads one of them alone.
+    video_offset, audio_offset
+        Start of the stream in seconds after the file's start, in containers in which it is ffmpeg's time 0 if
+        only that stream is read; 0.0 in others.
     audio_track, audio_codec
         Index and codec (such as ``"aac"``) of the first audio track that can be decoded; None without one.
+    audio_format
+        Stream number, codec, rate and channels of that track, as ffmpeg prints them; empty without one.
 
     Examples
     --------
@@ -104,10 +109,11 @@ class VideoInfo:
     color_encoding: ColorEncoding = field(default_factory=ColorEncoding)
     container: str = ""
     first_timestamp: float = 0.0
-    pictures_from: float = 0.0
-    sound_from: float = 0.0
+    video_offset: float = 0.0
+    audio_offset: float = 0.0
     audio_track: int | None = None
     audio_codec: str | None = None
+    audio_format: tuple[str, ...] = ()
 
     @property
     def has_audio(self) -> bool:
@@ -172,26 +178,31 @@ def _probe(path: Path | str) -> VideoInfo:
     index = re.search(r"Stream #0:(\d+)", decoded)
     stream = _stream_lines(header, int(index[1]) if index else 0)
     fps, constant = frame_rate(decoded, stream)
-    length = re.search(r"^  Duration: (\d+):(\d+):([\d.]+)", header, re.MULTILINE)
-    duration = int(length[1]) * 3600 + int(length[2]) * 60 + float(length[3]) if length else 0.0
+    stated = re.search(r"^  Duration: (\d+):(\d+):([\d.]+)", header, re.MULTILINE)
+    duration = int(stated[1]) * 3600 + int(stated[2]) * 60 + float(stated[3]) if stated else 0.0
     begin = _number(r"^  Duration: .*?, start: (-?[\d.]+)", header)
-    if container[1].startswith("matroska"):  # states its end as its duration, and perhaps a wrong rate
+    if container[1] in _DURATION_IS_END:
         duration = max(duration - begin, 0.0)
-        fps, constant = _rate_of_times(fps, packet_times(path))
+    if container[1] == "matroska,webm":  # its header may state a wrong rate
+        fps, constant = _rate_of_times(fps, _frame_times(path))
     rotation = re.search(r"rotation of (-?[\d.]+) degrees", stream)
-    audio = re.findall(r"^  Stream #0:\d+.*?: Audio: (\w+)(.*)", header, re.MULTILINE)
-    track = next((number for number, (codec, _) in enumerate(audio) if codec != "none"), None)
-    pictures_from, sound_from = 0.0, 0.0
+    audio = re.findall(r"^  Stream #0:(\d+).*?: Audio: (\w+)(.*)", header, re.MULTILINE)
+    track = next((number for number, (_, codec, _) in enumerate(audio) if codec != "none"), None)
+    video_offset, audio_offset = 0.0, 0.0
     if container[1] in _OWN_STARTS:
-        start_time = pictures_from = _number(_STREAM_START, stream, begin) - begin
-        sound_from = 0.0 if track is None else _number(_STREAM_START, audio[track][1], begin) - begin
-    else:  # with a varying rate, the gap before the first frame is filled with copies of it
-        start_time = float(frame[1]) if constant and frame[1][-1].isdigit() else 0.0
+        video_offset = _number(_STREAM_START, stream, begin) - begin
+        audio_offset = 0.0 if track is None else _number(_STREAM_START, audio[track][2], begin) - begin
+    # With a varying rate, the gap before the first frame is filled with copies of it.
+    start_time = float(frame[1]) if constant and frame[1][-1].isdigit() else 0.0
+    start_time += video_offset
+    # The duration in AVI files is that of the frames.
+    length = duration if container[1] == "avi" else max(duration - start_time, 0.0)
+    sound = re.search(r", (\d+) Hz, ([^,]+)", audio[track][2]) if track is not None else None
     return VideoInfo(
         width=width,
         height=height,
         fps=fps,
-        frames=round(max(duration - start_time, 0.0) * fps),
+        frames=round(length * fps),
         duration=duration,
         rotation=round(-float(rotation[1])) % 360 if rotation else 0,
         constant_rate=constant,
@@ -201,10 +212,11 @@ def _probe(path: Path | str) -> VideoInfo:
         color_encoding=ColorEncoding(colors[2], colors[1] == "pc") if colors else ColorEncoding(),
         container=container[1],
         first_timestamp=begin + start_time,
-        pictures_from=pictures_from,
-        sound_from=sound_from,
+        video_offset=video_offset,
+        audio_offset=audio_offset,
         audio_track=track,
-        audio_codec=None if track is None else audio[track][0],
+        audio_codec=None if track is None else audio[track][1],
+        audio_format=() if track is None else (*audio[track][:2], *(sound.groups() if sound else ())),
     )
 
 
@@ -247,43 +259,34 @@ def frame_rate(decoded: str, stream: str) -> tuple[Fraction, bool]:
     return (rate if constant else _resampling_rate(rate, mean)), constant
 
 
-def packet_times(path: Path | str, *, seek: float = 0.0, count: int | None = None) -> list[float]:
-    """List the times of frames in seconds, without decoding them: of all, or of `count` after a seek.
-
-    With `seek`, times count from there, and the list begins with the frame that decoding would begin with.
-    It is empty if that frame's time is unknown.
-    """
-    options = ["-ss", f"{seek:.6f}"] if seek else []
-    options += [*input_options(path), "-map", "0:V:0", "-c", "copy"]
-    options += [] if count is None else ["-frames:v", str(count)]
-    with contextlib.closing(
-        Process(("-nostdin", *options, "-f", "framecrc", "pipe:1"), stdout=True)
-    ) as process:
+def _frame_times(path: Path | str) -> list[float]:
+    """List the times of all frames in seconds, without decoding them."""
+    options = ("-nostdin", *input_options(path), "-map", "0:V:0", "-c", "copy", "-f", "framecrc", "pipe:1")
+    with contextlib.closing(Process(options, stdout=True)) as process:
         listing = process.stdout.read().decode()
         process.wait()
     unit = re.search(r"^#tb 0: (\d+)/(\d+)", listing, re.MULTILINE)
-    ticks = [int(tick) for tick in re.findall(r"^0, +-?\d+, +(-?\d+),", listing, re.MULTILINE)]
-    if unit is None or _UNKNOWN_TICK in ticks:
-        return []
-    return sorted(tick * int(unit[1]) / int(unit[2]) for tick in ticks)
+    ticks = re.findall(r"^0, +-?\d+, +(-?\d+),", listing, re.MULTILINE)
+    return sorted(int(tick) * int(unit[1]) / int(unit[2]) for tick in ticks) if unit else []
 
 
 def _rate_of_times(rate: Fraction, times: Sequence[float]) -> tuple[Fraction, bool]:
     """Frame rate, and whether it is constant, from a nominal rate and the times of all frames."""
     if all(abs((moment - times[0]) * float(rate) - n) < 0.75 for n, moment in enumerate(times)):
         return rate, True
-    # Without gaps: a nominal rate that includes them would drop frames between them.
+    mean = Fraction((len(times) - 1) / ((times[-1] - times[0]) or 1.0))
+    # A nominal rate that is the mean over gaps would drop frames between them.
     steps = [after - before for before, after in itertools.pairwise(times)]
     usual = [step for step in steps if step < 1.5 * statistics.median(steps)]
-    mean = Fraction(len(usual) / (sum(usual) or 1.0))
-    if rate < mean * Fraction(99, 100):
-        return mean.limit_denominator(1001), False
-    return _resampling_rate(rate, Fraction((len(times) - 1) / ((times[-1] - times[0]) or 1.0))), False
+    without_gaps = Fraction(len(usual) / (sum(usual) or 1.0))
+    if Fraction(101, 100) * rate < without_gaps <= _MAX_RATE:
+        return without_gaps.limit_denominator(1001), False
+    return _resampling_rate(rate, mean), False
 
 
 def _resampling_rate(rate: Fraction, mean: Fraction) -> Fraction:
     """Choose the constant rate for a varying one; screen recorders state their 1000 Hz clock as the rate."""
-    return mean.limit_denominator(1001) if rate > 60 and rate > 2 * mean else rate
+    return mean.limit_denominator(1001) if rate > _MAX_RATE and rate > 2 * mean else rate
 
 
 def pixel_limit() -> tuple[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import tempfile
 import threading
@@ -19,6 +20,8 @@ from vehicle_detection.video.ffmpeg import VideoInfo, probe
 from vehicle_detection.video.frame_source import FrameSource
 from vehicle_detection.video.streams import AudioSource, FrameReader, Reader
 
+_LOGGER = logging.getLogger(__name__)
+
 
 class VideoSegments(FrameSource):
     """Consecutive video files as one video, with the frame size and rate of the first one."""
@@ -28,7 +31,7 @@ class VideoSegments(FrameSource):
         first = infos[0]
         # Sound may be longer than the frames, which would add up.
         lengths = [
-            (stream_duration(path, info) if info.has_audio else None) or info.duration - info.start_time
+            (stream_duration(path, info) if info.has_audio else None) or float(info.frames / info.fps)
             for path, info in zip(paths, infos, strict=True)
         ]
         self._infos = [
@@ -42,7 +45,9 @@ class VideoSegments(FrameSource):
             )
             for info, length in zip(infos, lengths, strict=True)
         ]
-        sound = all(info.has_audio for info in infos)
+        sound = all(info.has_audio and info.audio_format == first.audio_format for info in infos)
+        if first.has_audio and not sound:
+            _LOGGER.warning("the segments from %s on have different sound; the video has none", paths[0])
         super().__init__(
             f"{paths[0]} to {paths[-1].name}",
             replace(
@@ -101,8 +106,8 @@ class _SegmentReader:
         self._lock = threading.Lock()
         self._killed = False
         self._reader: FrameReader | None = None
-        # Lengths of skipped segments are known from their headers only.
-        while len(self._segments) > 1 and first >= self._segments[0][1].frames:
+        # Lengths of skipped segments are known from their headers only, if at all.
+        while len(self._segments) > 1 and first >= (self._segments[0][1].frames or math.inf):
             first -= self._segments.pop(0)[1].frames
         self._first = first
 

@@ -43,7 +43,7 @@ class _VideoFile(FrameSource):
         return AudioSource(
             input=input_options(self._path),
             start=self.info.start_time + float(first / self.info.fps),
-            counted_from=self.info.sound_from,
+            audio_offset=self.info.audio_offset,
             length=length,
             copyable=not first and length is None,
         )
@@ -172,6 +172,9 @@ def _open_files(files: Sequence[Path], fps: float) -> FrameSource:
         )
     if len(files) == 1:
         return _VideoFile(files[0], probe(files[0]))
+    broken = next((path for path in files if "\n" in str(path) or "\r" in str(path)), None)
+    if broken is not None:  # the list of files for ffmpeg has a line for each
+        raise InvalidInputError(f"source {str(broken)!r} has a line break in its name; rename the file")
     return VideoSegments(files)
 
 

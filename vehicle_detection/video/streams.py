@@ -41,7 +41,7 @@ CONTAINERS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
 # Codecs that are copied instead of encoded again: those that every browser plays; Matroska holds any.
 _COPIED_AUDIO = {"mp4": {"aac", "mp3"}, "mov": {"aac", "mp3"}}
 _COPIED_AUDIO["matroska"] = {*_COPIED_AUDIO["mp4"], "ac3", "eac3", "flac", "opus", "vorbis"}
-# Sound is cut and filled where its times differ by more than 20 ms from its length.
+# Fills and cuts the sound where its times and its samples differ by more than 20 ms.
 _SYNCHRONIZED = "aresample=async=1:min_hard_comp=0.02"
 # Part of a frame by which reading starts early: less than half, because ffmpeg rounds to the nearest frame.
 _EARLY = Fraction(2, 5)
@@ -141,13 +141,13 @@ class FrameReader(_FfmpegStream):
         if not info.constant_rate:  # some seconds, to decode the frame that is still shown at the start
             early = Fraction(min(first, math.ceil(_MAX_FRAME_DURATION * info.fps)))
         wanted = info.start_time + float((first - early) / info.fps)
-        seek = find_seek_time(path, info, wanted) if first else info.pictures_from
+        seek = find_seek_time(path, info, wanted) if first else info.video_offset
+        begin = f"{wanted - seek:.6f}"
         if not info.constant_rate:
-            shown = [f"fps={info.fps}:start_time={wanted - seek:.6f}", f"trim=start_frame={early}"]
-            filters = [*shown, *filters]
+            filters = [f"fps={info.fps}:start_time={begin}", f"trim=start_frame={early}", *filters]
         elif first:
-            filters = [f"trim=start={wanted - seek:.6f}", *filters]
-        options = ["-ss", f"{seek:.6f}"] if seek > info.pictures_from else []
+            filters = [f"trim=start={begin}", *filters]
+        options = ["-ss", f"{seek:.6f}"] if seek > info.video_offset else []
         self._sought = bool(options)
         options += ["-threads", _DECODER_THREADS, *pixel_limit(), *input_options(path)]
         options += ["-map", "0:V:0", "-vf", ",".join(filters)]
@@ -245,17 +245,17 @@ class AudioSource:
         Options of ffmpeg that open it.
     start
         Time of the first written frame in the file in seconds.
-    counted_from
-        Time from which ffmpeg counts in the file; later than `start` if the sound starts later.
+    audio_offset
+        Time in the file that is ffmpeg's time 0; later than `start` if the sound starts later.
     length
         Maximum length in seconds; None for all.
     copyable
-        Whether it may be copied without decoding: it is not cut, and not joined from several files.
+        Whether it may be copied without decoding: it is the whole track of one file.
     """
 
     input: tuple[str, ...]
     start: float = 0.0
-    counted_from: float = 0.0
+    audio_offset: float = 0.0
     length: float | None = None
     copyable: bool = False
 
@@ -280,16 +280,18 @@ class FrameWriter(_FfmpegStream):
         sound: list[str] = []
         mapped = ["-map", "0:v:0"]
         if audio is not None:
-            lead = audio.start - audio.counted_from
+            lead = audio.start - audio.audio_offset
             sound += ["-ss", f"{audio.start:.6f}"] if lead > 0 else []
             sound += ["-itsoffset", f"{-lead:.6f}"] if lead < 0 else []
-            sound += [] if audio.length is None else ["-t", f"{audio.length:.6f}"]
             sound += ["-vn", *audio.input]
             # Matroska has no times before 0, for the part of a packet before the first frame.
             copyable = audio.copyable and (lead <= 0 or container != "matroska")
             copied = copyable and info.audio_codec in _COPIED_AUDIO[container]
             mapped += ["-map", f"1:a:{info.audio_track}"]
-            mapped += ["-c:a", "copy"] if copied else ["-c:a", "aac", "-b:a", "192k", "-af", _SYNCHRONIZED]
+            filters = (
+                _SYNCHRONIZED if audio.length is None else f"{_SYNCHRONIZED},atrim=end={audio.length:.6f}"
+            )
+            mapped += ["-c:a", "copy"] if copied else ["-c:a", "aac", "-b:a", "192k", "-af", filters]
         filters = "setparams=colorspace=smpte170m:color_primaries=bt709:color_trc=bt709:range=tv"
         if info.pixel_aspect != 1:
             filters += f",setsar={info.pixel_aspect}"
