@@ -535,7 +535,42 @@ def test_the_signature_is_the_lessons(name):
 def test_a_star_import_brings_the_lesson_functions():
     names = {}
     exec("from vehicle_detection.course import *", names)
-    assert set(SIGNATURES) | {"find_car_windows", "HeatmapDetector"} == set(names) - {"__builtins__"}
+    functions = set(SIGNATURES) | {"find_car_windows", "HeatmapDetector"}
+    modules = {"np": "numpy", "cv2": "cv2", "mpimg": "matplotlib.image", "hog": "skimage.feature._hog"}
+    assert functions | set(modules) == set(names) - {"__builtins__"}
+    for name, module in modules.items():
+        found = names[name]
+        assert getattr(found, "__module__", found.__name__) == module
+    with pytest.raises(AttributeError, match="has no attribute 'plt'"):
+        getattr(lesson, "plt")  # noqa: B009
+
+
+def test_what_the_lesson_accepts():
+    image, channel = FRAMES["uint8"], FRAMES["uint8"][..., 0]
+    assert (lesson.bin_spatial(channel, (16, 8)) == cv2.resize(channel, (16, 8)).ravel()).all()
+    # One number is the value of the first channel, as in OpenCV.
+    expected = lesson.draw_boxes(image, PAIRS, (255, 0, 0))
+    assert (lesson.draw_boxes(image, PAIRS, 255) == expected).all()
+    scored = [(*box, 0.7) for box in PAIRS]
+    for boxes in (scored, iter(PAIRS), zip(*zip(*PAIRS)), dict.fromkeys(PAIRS)):
+        assert (lesson.draw_boxes(image, boxes, (255, 0, 0)) == expected).all()
+    # Options of groups that are off are not read.
+    vector = lesson.single_img_features(PATCHES[0], hog_feat=False, orient=None, hog_channel=None)
+    assert len(vector) == 3 * 32**2 + 3 * 32
+    off = {"spatial_feat": False, "spatial_size": None, "hist_feat": False, "hist_bins": 0}
+    assert len(lesson.single_img_features(PATCHES[0], **off)) == 1764
+
+
+def test_labeled_boxes_are_drawn_on_a_part_of_an_image():
+    heat = reference.add_heat(np.zeros((208, 290)), PAIRS)
+    part = FRAMES["uint8"].copy()[:, 40:]
+    expected = lesson.draw_labeled_bboxes(part.copy(), label(heat))
+    assert lesson.draw_labeled_bboxes(part, label(heat)) is part
+    assert (part == expected).all()
+    part.flags.writeable = False  # as frames of moviepy are
+    assert lesson.draw_labeled_bboxes(part, label(np.zeros_like(heat))) is part
+    with pytest.raises(InvalidInputError, match="img must be writable and contiguous"):
+        lesson.draw_labeled_bboxes(part, label(heat))
 
 
 def is_vector(length):
@@ -660,7 +695,7 @@ def test_every_call_form_binds(call_data, form, is_right):
             "get_hog_features(-d.float_patch[..., 0], 9, 8, 2, transform_sqrt=True)",
             "transform_sqrt must be False",
         ),
-        ("bin_spatial(d.gray)", "img must be an .H, W, 3. RGB array"),
+        ("bin_spatial(d.gray[0])", "img must be an .H, W, 3. RGB array"),
         ("bin_spatial(d.patch, (1, 2, 3))", "size must be"),
         ("bin_spatial(d.patch, 8, 8)", "takes an image and a size; got 1 more"),
         ("bin_spatial(d.patch, order='rgb')", "order must be one of"),
@@ -712,7 +747,7 @@ def test_every_call_form_binds(call_data, form, is_right):
         ("apply_threshold(d.heat, None)", "threshold must be a number"),
         ("draw_boxes(d.image, d.boxes, color='red')", "color must be"),
         ("draw_boxes(d.image, d.boxes, thick=1.5)", "thick must be an integer"),
-        ("draw_labeled_bboxes(d.image[:, ::2], d.labels)", "writable and contiguous"),
+        ("draw_labeled_bboxes(d.image[:, ::-1], d.labels)", "writable and contiguous"),
         ("draw_labeled_bboxes(d.image.copy(), d.labels[0])", "labels must be the pair"),
         ("draw_labeled_bboxes(d.patch.copy(), d.labels)", "labels must be the pair"),
     ],

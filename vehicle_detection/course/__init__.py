@@ -11,15 +11,27 @@ Images are ``(H, W, 3)`` RGB, uint8 or float, as in the lesson; windows and boxe
 a ``StandardScaler``. Everything else takes the lesson's own steps: features, ``scaler.transform``,
 ``clf.predict``. Both ways agree within float32 precision.
 
+The names that the import of ``lesson_functions.py`` brings along are here as well: ``np``, ``cv2``, ``mpimg``
+(``matplotlib.image``) and scikit-image's ``hog``.
+
 The page ``docs/course.md`` lists the differences from the lesson and the counterpart of each function in the
 main API.
 """
+
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
 
 from vehicle_detection.course.detector import HeatmapDetector
 from vehicle_detection.course.features import bin_spatial, color_hist, convert_color, get_hog_features
 from vehicle_detection.course.heat import add_heat, apply_threshold, draw_boxes, draw_labeled_bboxes
 from vehicle_detection.course.vectors import extract_features, single_img_features
 from vehicle_detection.course.windows import find_car_windows, find_cars, search_windows, slide_window
+
+if TYPE_CHECKING:
+    from matplotlib import image as mpimg
+    from skimage.feature import hog
 
 __all__ = [
     "HeatmapDetector",
@@ -28,13 +40,30 @@ __all__ = [
     "bin_spatial",
     "color_hist",
     "convert_color",
+    "cv2",
     "draw_boxes",
     "draw_labeled_bboxes",
     "extract_features",
     "find_car_windows",
     "find_cars",
     "get_hog_features",
+    "hog",
+    "mpimg",
+    "np",
     "search_windows",
     "single_img_features",
     "slide_window",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    # Imported when they are used, because that takes long.
+    if name == "mpimg":
+        from matplotlib import image
+
+        return image
+    if name == "hog":
+        from skimage.feature import hog
+
+        return hog
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

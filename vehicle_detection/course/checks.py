@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -55,12 +56,23 @@ def box_rows(boxes: Any) -> Any:
     return getattr(boxes, "xyxy", boxes)
 
 
+def _first_corners(boxes: list[Any]) -> NDArray[Any]:
+    """Return the first two items of each box, its corners; an array of no boxes if there are none."""
+    try:
+        return np.array([(box[0], box[1]) for box in boxes])
+    except (TypeError, IndexError, KeyError, ValueError):
+        return np.array(None)
+
+
 def corner_array(boxes: Any, name: str) -> NDArray[np.int64]:
     """Return boxes as ``(N, 4)`` whole pixels, from corner pairs, an array or detections."""
+    rows = box_rows(boxes)
+    if isinstance(rows, Iterable) and not isinstance(rows, (str, np.ndarray)):
+        rows = list(rows)
     try:
-        array = np.asarray(box_rows(boxes))
-    except ValueError:  # rows of different lengths
-        array = np.array(None)
+        array = np.asarray(rows)
+    except ValueError:  # rows of different lengths, such as boxes with scores
+        array = _first_corners(rows)
     if array.size == 0:
         return np.empty((0, 4), np.int64)
     if array.shape[1:] not in ((4,), (2, 2)) or array.dtype.kind not in "iuf" or not np.isfinite(array).all():

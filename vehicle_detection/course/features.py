@@ -138,7 +138,7 @@ def get_hog_features(
 
 
 def bin_spatial(
-    img: Image,
+    img: Any,
     size: Size | str = (32, 32),
     *last_size: Size,
     color_space: str = "RGB",
@@ -149,7 +149,7 @@ def bin_spatial(
     Parameters
     ----------
     img
-        ``(H, W, 3)``, uint8 or float.
+        ``(H, W, 3)``, or one channel ``(H, W)``, uint8 or float.
     size
         ``(width, height)`` to resize to, or one number for both.
     last_size
@@ -164,7 +164,7 @@ def bin_spatial(
     Returns
     -------
     numpy.ndarray
-        ``(width * height * 3,)``, of the image's dtype.
+        ``(width * height * 3,)``, or ``(width * height,)`` of one channel, of the image's dtype.
 
     Examples
     --------
@@ -172,6 +172,9 @@ def bin_spatial(
     >>> bin_spatial(image, (2, 1)).tolist(), bin_spatial(image, (2, 1), order="channels").tolist()
     ([1, 2, 3, 1, 2, 3], [1, 1, 2, 2, 3, 3])
     """
+    if isinstance(img, np.ndarray) and img.ndim == 2:
+        vector = bin_spatial(np.stack([img] * 3, 2), size, *last_size, order="channels")
+        return np.asarray(vector.reshape(3, -1)[0])
     image = check_lesson_image(img)
     check_choice(order, "order", SPATIAL_ORDERS)
     check_type(color_space, "color_space", str, "pass a name such as 'YCrCb'")

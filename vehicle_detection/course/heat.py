@@ -107,7 +107,7 @@ def draw_labeled_bboxes(img: Image, labels: Any) -> Image:
     Raises
     ------
     InvalidInputError
-        If the image is read-only or not contiguous, or `labels` is not such a pair for its size.
+        If the image is read-only or its rows are not contiguous, or `labels` is not such a pair for its size.
 
     Examples
     --------
@@ -121,8 +121,7 @@ def draw_labeled_bboxes(img: Image, labels: Any) -> Image:
     from scipy.ndimage import find_objects
 
     check_lesson_image(img)
-    if not img.flags.writeable or not img.flags.c_contiguous:
-        raise InvalidInputError("img must be writable and contiguous to be drawn on; pass numpy.copy(img)")
+    rows = img.strides[0] > 0 and img.strides[1:] == (3 * img.itemsize, img.itemsize)
     array, count = labels if isinstance(labels, (tuple, list)) and len(labels) == 2 else (None, 0)
     if not isinstance(array, np.ndarray) or array.shape != img.shape[:2] or array.dtype.kind not in "iu":
         raise InvalidInputError(
@@ -131,13 +130,17 @@ def draw_labeled_bboxes(img: Image, labels: Any) -> Image:
         )
     regions = find_objects(array, max_label=check_integer(count, "the number of labels", low=0))
     corners = [[x.start, y.start, x.stop - 1, y.stop - 1] for y, x in filter(None, regions)]
+    if corners and not (img.flags.writeable and rows):
+        raise InvalidInputError("img must be writable and contiguous to be drawn on; pass numpy.copy(img)")
     _draw(img, corner_array(corners, "labels"), _BLUE, _THICKNESS)
     return img
 
 
 def _draw(image: Image, corners: NDArray[np.int64], color: Sequence[float], thick: int) -> None:
-    if check_array(color, "color").shape != (3,):
+    given = check_array(color, "color")
+    if given.shape not in ((), (3,)) or given.dtype.kind not in "iuf" or not np.isfinite(given).all():
         raise InvalidInputError(f"color must be (red, green, blue); got {describe(color)}")
+    values = [float(given), 0.0, 0.0] if given.ndim == 0 else given.astype(float).tolist()
     check_integer(thick, "thick", low=-1)
     for x1, y1, x2, y2 in corners.tolist():
-        cv2.rectangle(image, (x1, y1), (x2, y2), tuple(float(value) for value in color), thick)
+        cv2.rectangle(image, (x1, y1), (x2, y2), values, thick)

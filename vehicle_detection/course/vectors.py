@@ -40,6 +40,12 @@ Images = list[Image] | NDArray[Any]
 
 # Number of images that are read and processed at a time.
 _CHUNK = 4096
+# Values of the options of a group of features that is switched off.
+_UNUSED: dict[str, dict[str, Any]] = {
+    "spatial_feat": {"spatial_size": (32, 32)},
+    "hist_feat": {"hist_bins": 32, "hist_range": (0, 256)},
+    "hog_feat": {"orient": 9, "pix_per_cell": 8, "cell_per_block": 2, "hog_channel": 0},
+}
 
 
 def accept_cspace(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
@@ -207,6 +213,15 @@ class FeatureOptions:
     spatial_order: SpatialOrder
 
     def __post_init__(self) -> None:
+        for name in ("spatial_feat", "hist_feat", "hog_feat", "transform_sqrt"):
+            check_flags(**{name: getattr(self, name)})
+            object.__setattr__(self, name, bool(getattr(self, name)))
+        if not (self.spatial_feat or self.hist_feat or self.hog_feat):
+            raise InvalidInputError("spatial_feat, hist_feat and hog_feat are all False; switch one on")
+        for switch, unused in _UNUSED.items():  # the lesson's code does not read them
+            if not getattr(self, switch):
+                for name, value in unused.items():
+                    object.__setattr__(self, name, value)
         check_choice(self.color_space, "color_space", COLOR_SPACES)
         check_choice(self.hog_channel, "hog_channel", (0, 1, 2, "ALL"))
         check_choice(self.spatial_order, "spatial_order", SPATIAL_ORDERS)
@@ -214,11 +229,6 @@ class FeatureOptions:
         object.__setattr__(self, "hist_range", check_range(self.hist_range, "hist_range"))
         for name in ("hist_bins", "orient", "pix_per_cell", "cell_per_block"):
             object.__setattr__(self, name, check_integer(getattr(self, name), name, low=1))
-        for name in ("spatial_feat", "hist_feat", "hog_feat", "transform_sqrt"):
-            check_flags(**{name: getattr(self, name)})
-            object.__setattr__(self, name, bool(getattr(self, name)))
-        if not (self.spatial_feat or self.hist_feat or self.hog_feat):
-            raise InvalidInputError("spatial_feat, hist_feat and hog_feat are all False; switch one on")
 
     @classmethod
     def of(cls, arguments: dict[str, Any]) -> FeatureOptions:
