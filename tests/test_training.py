@@ -159,7 +159,7 @@ def test_impossible_splits_are_skipped():
     _, report = train_and_evaluate(single, params=SMALL, seeds=1)
     assert set(report.splits) == {"random"}
     assert "folder of two or more patches" in report.skipped["sequences"]
-    with pytest.raises(InvalidInputError, match="folder of two or more patches; use split_random"):
+    with pytest.raises(InvalidInputError, match="folder of two or more patches; add patches"):
         train_and_evaluate(single, params=SMALL, split="sequences")
 
 

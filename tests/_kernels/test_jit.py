@@ -1,3 +1,4 @@
+import errno
 import gc
 import logging
 import os
@@ -9,7 +10,7 @@ from types import SimpleNamespace
 
 import vehicle_detection
 from vehicle_detection._kernels import group
-from vehicle_detection._kernels.jit import _Compilation
+from vehicle_detection._kernels.jit import _Compilation, _save
 
 
 def test_compiling_kernels_is_logged_once_and_other_functions_are_not(caplog):
@@ -41,6 +42,16 @@ def test_the_garbage_collector_pauses_while_kernels_are_compiled():
         assert not gc.isenabled()
     finally:
         gc.enable()
+
+
+def test_a_kernel_that_cannot_be_kept_is_used(caplog):
+    def save(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with caplog.at_level(logging.INFO, "vehicle_detection._kernels"):
+        _save(save, None, None)
+    assert "compiled kernels are not kept: [Errno 28] No space left on device" in caplog.text
+    assert group._cache.save_overload.func is _save
 
 
 def test_a_change_of_another_kernel_file_is_noticed(tmp_path):

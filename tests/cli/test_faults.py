@@ -286,8 +286,23 @@ def test_variables_that_numba_fails_with(variable, value):
 def test_a_name_that_cannot_be_printed(tmp_path):
     image = tmp_path / os.fsdecode(b"\xff.png")
     write_image(image, render_scene(shape=(180, 320), vehicles=0, random_state=0).image)
-    result = run("detect", image, "--model", "highway")
-    assert (result.exit_code, "/?.png: 0 vehicles" in result.stdout) == (0, True)
+    boxes = tmp_path / "boxes.jsonl"
+    result = run("detect", image, "--model", "highway", "--boxes", boxes, "--conf", 0)
+    assert result.exit_code == 0
+    assert "/?.png: " in result.stdout
+    if boxes.read_text():
+        assert r'"\\udcff.png"' in boxes.read_text()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a shell")
+@pytest.mark.parametrize("closed", [">&-", "2>&-"])
+def test_closed_outputs(tmp_path, closed):
+    write_image(tmp_path / "road.png", render_scene(shape=(180, 320), vehicles=0, random_state=0).image)
+    for words in ("info", f"detect {tmp_path / 'road.png'} --model highway"):
+        command = f"{sys.executable} -m vehicle_detection {words} {closed}"
+        done = subprocess.run(["sh", "-c", command], cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        assert "Traceback" not in done.stderr
 
 
 def test_memory_that_runs_out(monkeypatch, clip, tmp_path):

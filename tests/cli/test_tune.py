@@ -150,3 +150,36 @@ def test_a_grid_that_cannot_be_trained_is_an_error(material, tmp_path):
         message = "error: --grid has no configuration that can be trained, for the reasons above"
         assert result.stderr.splitlines()[-1] == message
         assert not (tmp_path / "t.csv").exists()
+
+
+def test_a_table_that_windows_has_saved_is_continued(patches, tmp_path):
+    out = tmp_path / "table.csv"
+    words = (*patches, "--grid", f"orient=3 {SMALL}", "-o", out)
+    assert run(*words).exit_code == 0
+    out.write_bytes(b"\xef\xbb\xbf" + out.read_bytes().replace(b"\n", b"\r\n"))
+    words = (*patches, "--grid", f"orient=3,4 {SMALL}", "-o", out)
+    assert run(*words).exit_code == 0
+    assert list(read_results(out)["orient"]) == [3, 4]
+
+
+def test_a_single_patch_of_each_class(patches, tmp_path):
+    words = []
+    for name, folder in (("--vehicles", patches[1]), ("--non-vehicles", patches[3])):
+        (tmp_path / name).mkdir()
+        first = min(folder.rglob("*.png"))
+        write_image(tmp_path / name / "1.png", read_image(first))
+        words += [name, tmp_path / name]
+    message = refuse(*words, "--grid", "orient=3", "-o", tmp_path / "t.csv")
+    assert "--vehicles and --non-vehicles must hold a folder of two or more patches; add" in message
+
+
+def test_a_cache_on_a_full_disk(patches, tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise OSError("439872 requested and 16352 written")  # as numpy says it
+
+    monkeypatch.setattr(np, "save", fail)
+    words = ("--grid", f"orient=3 {SMALL}", "-o", tmp_path / "t.csv", "--cache", tmp_path / "cache")
+    result = run(*patches, *words)
+    assert result.exit_code == 2
+    message = result.stderr.splitlines()[-1]  # below the progress bar
+    assert re.search(r"\.npy cannot be written \(No space left on device\); free some space", message)

@@ -70,7 +70,7 @@ def test_a_sequence_split_tests_on_the_end_of_each_folder(entries, fraction):
     folders = [folder for folder, _ in entries]
     counts = {folder: folders.count(folder) for folder in folders}
     if max(counts.values()) < 2:
-        with pytest.raises(InvalidInputError, match=r"no folder of two or more patches; use split_random"):
+        with pytest.raises(InvalidInputError, match=r"a folder of two or more patches; add patches, or"):
             split_sequences(set_of(entries), test_size=fraction)
         return
     split = split_sequences(set_of(entries), test_size=fraction)
@@ -150,7 +150,7 @@ def test_a_split_by_groups_keeps_near_duplicates_together(entries, fraction, see
     try:
         split = split_groups(patches, test_size=fraction, random_state=seed)
     except InvalidInputError as error:
-        assert "no group of near duplicates" in str(error)  # noqa: PT017
+        assert "must hold a group of near duplicates" in str(error)  # noqa: PT017
         return
     assert_covers(split, len(entries))
     assert not set(seeds[split.train]) & set(seeds[split.test])
@@ -203,7 +203,7 @@ def test_groups_are_found_across_chunks():
         ({"test_size": 1}, r"test_size must be a fraction in \(0, 1\), got 1"),
         ({"threshold": 0}, "threshold must be a number, greater than 0 .*at most 1; got 0"),
         ({"random_state": None}, "random_state must be an integer"),
-        ({}, "no group of near duplicates .* fits into test_size=0.2 .*raise test_size or threshold"),
+        ({}, "a group of near duplicates that fits into the test part, 20% .*raise test_size or threshold"),
     ],
 )
 def test_an_impossible_split_by_groups(options, message):

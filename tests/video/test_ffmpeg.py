@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import sys
 import time
 from fractions import Fraction
@@ -13,7 +14,7 @@ from tests.helpers import StubDetector, start_interruptible
 from tests.video.clips import NTSC, child_processes, ffmpeg, gray_frames, write_clip
 from vehicle_detection.errors import VideoError
 from vehicle_detection.video import probe_video, process_video, read_frames
-from vehicle_detection.video.ffmpeg import Process, ffmpeg_binary, frame_rate
+from vehicle_detection.video.ffmpeg import Process, exit_reason, ffmpeg_binary, frame_rate
 
 
 @pytest.mark.parametrize("fps", [NTSC, Fraction(60000, 1001), Fraction(24000, 1001), 25, 30, Fraction(25, 2)])
@@ -171,3 +172,11 @@ def test_an_interrupt_while_ffmpeg_starts_leaves_no_process(clip, monkeypatch):
     while child_processes() and time.monotonic() < deadline:
         time.sleep(0.01)
     assert not child_processes()
+
+
+def test_reasons_of_signals():
+    assert exit_reason(-signal.SIGKILL, "") == (
+        "another process ended ffmpeg by the signal SIGKILL, perhaps because memory ran out"
+    )
+    if hasattr(signal, "SIGXFSZ"):
+        assert "the limit of the system for the size of a file" in exit_reason(-signal.SIGXFSZ, "")

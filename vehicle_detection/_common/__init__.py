@@ -24,7 +24,7 @@ from vehicle_detection._common.limits import Limit, check_regular_file, read_reg
 from vehicle_detection._common.model_file import FORMAT_VERSION, ModelData, read_model, write_model
 from vehicle_detection._common.parquet import ParquetRows, write_parquet
 from vehicle_detection._common.progress import progress_bar
-from vehicle_detection._common.text import pluralize
+from vehicle_detection._common.text import encodable, pluralize
 from vehicle_detection._common.threads import (
     CALLING_THREAD,
     JOBS_VARIABLE,
@@ -71,6 +71,7 @@ __all__ = [
     "check_type",
     "degrade_patches",
     "describe",
+    "encodable",
     "finite_array",
     "hide_credentials",
     "image_size",

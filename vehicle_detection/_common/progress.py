@@ -26,7 +26,8 @@ def progress_bar(
     """
     check_flags(progress=show)
     # Not left to tqdm, whose import takes a tenth of a second.
-    if not show or (terminal_only and not sys.stderr.isatty()):
+    terminal = sys.stderr is not None and sys.stderr.isatty()  # None: closed
+    if not show or (terminal_only and not terminal):
         return contextlib.nullcontext(_HIDDEN)
     from tqdm.auto import tqdm
 

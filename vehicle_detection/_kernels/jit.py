@@ -34,11 +34,20 @@ def jit(function: Callable[..., Any], *, reorder: bool = False) -> Callable[...,
     except RuntimeError:
         # Neither the package's folder nor the user's cache is writable: compile in every process.
         return compiler()(function)  # type: ignore[no-any-return]
-    # numba would notice changes of the kernel's own file only, not of those that it calls. Without this
-    # attribute, which is not public, it does that.
+    # numba would notice changes of the kernel's own file only, not of those that it calls, and fail if the
+    # disk is full. Without these attributes, which are not public, it does that.
     with contextlib.suppress(AttributeError):
         kernel._cache._cache_file._source_stamp = source_stamp()
+        kernel._cache.save_overload = functools.partial(_save, kernel._cache.save_overload)
     return kernel  # type: ignore[no-any-return]
+
+
+def _save(save: Callable[..., None], *overload: Any) -> None:
+    """Save a compiled kernel if there is space for it."""
+    try:
+        save(*overload)
+    except OSError as error:
+        log.info("compiled kernels are not kept: %s", error)
 
 
 inlined = functools.partial(numba.njit, inline="always")

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from vehicle_detection._common import pluralize
+from vehicle_detection._common import encodable, pluralize
 from vehicle_detection.batch.store import Store, open_store
 
 if TYPE_CHECKING:
@@ -214,7 +214,7 @@ def batch_summary(out: str | os.PathLike[str]) -> pandas.DataFrame:
 def _summary_row(key: str, record: Mapping[str, Any]) -> dict[str, Any]:
     sources, outputs = record["sources"], record.get("outputs", {})
     same = ("status", "camera", "date", "start", "frames", "video_seconds", "tracks", "message", "damage")
-    return {
+    row = {
         "key": key,
         "first_file": sources[0]["uri"],
         "files": len(sources),
@@ -223,3 +223,4 @@ def _summary_row(key: str, record: Mapping[str, Any]) -> dict[str, Any]:
         "video_file": outputs.get("video"),
         **{name: record.get(name) for name in same},
     }
+    return {name: encodable(value) if isinstance(value, str) else value for name, value in row.items()}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import atexit
 import gc
+import os
+import sys
 
 __all__ = [
     "main",
@@ -16,6 +18,7 @@ def main() -> None:
     # end would take a fifth of a short command's time.
     gc.set_threshold(50_000, 20, 20)
     atexit.register(gc.freeze)
+    _open_closed_streams()
     # The signals first: importing the commands takes some tenths of a second.
     from vehicle_detection.cli.signals import exit_on_signals
 
@@ -23,3 +26,13 @@ def main() -> None:
     from vehicle_detection.cli.app import app
 
     app(prog_name="vehicle-detection")
+
+
+def _open_closed_streams() -> None:
+    """Open the null device in place of closed standard streams, as services are started with.
+
+    In their order: each gets the lowest free number, which a file of the program would have otherwise.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import progress_bar, temporary_folder
 from vehicle_detection.detector import VehicleDetector
+from vehicle_detection.errors import OutputError
 from vehicle_detection.evaluation import TrackScores, evaluate_tracks, read_labels
 from vehicle_detection.export import TrackWriter
 from vehicle_detection.images import write_image
@@ -64,14 +65,19 @@ def draw_clip(drive: Drive, clip: Path, labels: Path, *, progress: bool = False)
 
     height, width = drive.shape
     truth = []
-    with (
-        FFMPEG_VideoWriter(str(clip), (width, height), drive.fps, preset="veryfast") as writer,
-        progress_bar(progress, len(drive), unit="frame", desc="drawing", terminal_only=True) as bar,
-    ):
-        for scene in drive:
-            truth.append(scored_truth(scene.truth))
-            writer.write_frame(scene.image)
-            bar.update()
+    try:
+        with (
+            FFMPEG_VideoWriter(str(clip), (width, height), drive.fps, preset="veryfast") as writer,
+            progress_bar(progress, len(drive), unit="frame", desc="drawing", terminal_only=True) as bar,
+        ):
+            for scene in drive:
+                truth.append(scored_truth(scene.truth))
+                writer.write_frame(scene.image)
+                bar.update()
+    except OSError as error:  # its text is ffmpeg's log
+        full = "No space left" in str(error)
+        reason = "no space left; free some" if full else "ffmpeg failed; check the folder"
+        raise OutputError(f"{clip} cannot be written: {reason}") from error
     write_labels(labels, enumerate(truth))
 
 

@@ -9,6 +9,9 @@ from typer import Option
 INPUT, CAMERA, SEARCH, DRAWING, OUTPUT = "Input", "Camera", "Search", "Drawing", "Output"
 """Panels of the options in ``--help``."""
 
+PATCHES = "--vehicles and --non-vehicles"
+"""The options that name training patches, in messages about all of them."""
+
 HORIZON_HELP = "Row of the horizon as a fraction of the frame's height, 0 at the top, such as 0.55."
 
 

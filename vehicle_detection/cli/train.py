@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
-from vehicle_detection.cli.options import flag
+from vehicle_detection.cli.options import PATCHES, flag
 from vehicle_detection.cli.output import (
     capture_stderr,
     check_distinct_paths,
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _HIDDEN_FOLD_COLUMNS = "best_f1", "strict_average_precision", "calibration_error"
 
 
-@option_names(random_state="--seed", patches_or_labels="--vehicles and --non-vehicles")
+@option_names(random_state="--seed", patches_or_labels=PATCHES, patch_set=PATCHES)
 def train(
     vehicles: Annotated[
         Path, Option(metavar="PATH", help="Folder or zip of patches of vehicles, such as vehicles.zip.")
@@ -75,7 +75,7 @@ def train(
     ] = None,
 ) -> None:
     """Train a model on patches, and evaluate it on held-out patches; by default like the model "highway"."""
-    from vehicle_detection._common import atomic_write, check_target
+    from vehicle_detection._common import atomic_write, check_target, encodable
     from vehicle_detection.datasets import load_training_patches
     from vehicle_detection.params import FeatureParams
     from vehicle_detection.training import model_card, train_and_evaluate
@@ -117,10 +117,8 @@ def train(
             words += ["-o", output.name, "--card", card.name]
             command = shlex.join(["vehicle-detection", "train", *words])
             with atomic_write(card) as part:
-                part.write_text(
-                    model_card(classifier, evaluated, name=output.stem, others=others, command=command),
-                    encoding="utf-8",
-                )
+                text = model_card(classifier, evaluated, name=output.stem, others=others, command=command)
+                part.write_text(encodable(text), encoding="utf-8")
     typer.echo(f"wrote {', '.join(map(str, targets.values()))}")
 
 

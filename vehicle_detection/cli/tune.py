@@ -10,8 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Option
 
-from vehicle_detection.cli.options import flag
-from vehicle_detection.cli.output import check_distinct_paths, option_names, print_table, run_interruptible
+from vehicle_detection.cli.options import PATCHES, flag
+from vehicle_detection.cli.output import (
+    check_distinct_paths,
+    option_names,
+    print_table,
+    run_interruptible,
+)
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -23,7 +28,14 @@ _TABLES, _FIGURES = (".csv", ".jsonl", ".parquet"), (".png", ".svg", ".pdf")
 _MAX_ROWS = 15
 
 
-@option_names(random_state="--seed", seeds="--seed", n_finalists="--finalists", store="--output")
+@option_names(
+    random_state="--seed",
+    seeds="--seed",
+    n_finalists="--finalists",
+    store="--output",
+    patches_or_labels=PATCHES,
+    patch_set=PATCHES,
+)
 def tune(
     vehicles: Annotated[
         Path, Option(metavar="PATH", help="Folder or zip of patches of vehicles, such as vehicles.zip.")

@@ -93,7 +93,7 @@ def split_random(
     except ValueError as error:
         raise InvalidInputError(
             f"{labels.sum()} vehicles and {(~labels).sum()} non-vehicles are too few for a test part of "
-            f"{fraction:.0%}; use more patches or another test_size"
+            f"{fraction:.0%}; use more patches"
         ) from error
     return Split(*map(np.sort, parts))
 
@@ -135,7 +135,9 @@ def split_sequences(patch_set: PatchSet, *, test_size: float = 0.2) -> Split:
         count = min(max(round(len(rows) * fraction), 1), len(rows) - 1)
         tested[rows[len(rows) - count :]] = True
     if not tested.any():
-        raise InvalidInputError("patch_set holds no folder of two or more patches; use split_random")
+        raise InvalidInputError(
+            "patch_set must hold a folder of two or more patches; add patches, or split at random"
+        )
     return Split(np.flatnonzero(~tested), np.flatnonzero(tested))
 
 
@@ -190,8 +192,8 @@ def split_groups(
             remaining -= needed
     if not tested.any():
         raise InvalidInputError(
-            f"no group of near duplicates in patch_set fits into test_size={fraction:g} of its folders; "
-            "raise test_size or threshold"
+            f"patch_set must hold a group of near duplicates that fits into the test part, {fraction:.0%} of "
+            "a folder; add patches, split at random, or raise test_size or threshold"
         )
     return Split(np.flatnonzero(~tested), np.flatnonzero(tested))
 

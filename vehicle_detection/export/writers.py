@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from vehicle_detection._common import encodable
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.export.files import FORMATS, RowFile, check_format, open_row_file
 from vehicle_detection.export.rows import (
@@ -136,7 +137,7 @@ def write_boxes(
         for item in check_items(boxes):
             given: list[Any] = [item]
             if isinstance(item, Sequence) and len(item) == 2 and hasattr(item[1], "scores"):
-                name, found = str(item[0]), item[1]
+                name, found = encodable(str(item[0])), item[1]
                 file.add_frame(name)
                 columns = zip(found.boxes, found.scores, _confidences(found))
                 given = [(name, None, *box, score, confidence) for box, score, confidence in columns]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import hashlib
 import json
 import logging
@@ -128,5 +129,8 @@ class FeatureCache:
         features = self._compute(params, mirrored, slice(None))
         if path is not None:
             with atomic_write(path, "cache") as part, part.open("wb") as file:
-                np.save(file, features, allow_pickle=False)
+                try:
+                    np.save(file, features, allow_pickle=False)
+                except OSError as error:  # numpy's has no number
+                    raise OSError(error.errno or errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
         return features

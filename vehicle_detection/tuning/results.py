@@ -239,7 +239,8 @@ def _parse(text: str, file: Path, suffix: str) -> tuple[list[str], list[dict[str
                 raise _damaged_line(file, number)
             rows.append(row)
         return list(dict.fromkeys(name for row in rows for name in row)), rows
-    header, *lines = csv.reader(io.StringIO(text)) if text else [[]]
+    # Programs on Windows may have added a byte order mark.
+    header, *lines = csv.reader(io.StringIO(text.removeprefix("\ufeff"))) if text else [[]]
     for number, cells in enumerate(lines, start=2):
         if len(cells) != len(header):
             raise _damaged_line(file, number)

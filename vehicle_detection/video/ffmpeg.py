@@ -478,6 +478,8 @@ def exit_reason(code: int, log: str) -> str:
         name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
         if -code in _CRASHES:
             return f"ffmpeg has crashed ({name})"
+        if name == "SIGXFSZ":
+            return "the file would exceed the limit of the system for the size of a file (ulimit -f)"
         hint = ", perhaps because memory ran out" if name == "SIGKILL" else ""
         return f"another process ended ffmpeg by the signal {name}{hint}"
     hint = "; free some disk space" if "No space left" in log else ""
