@@ -203,11 +203,12 @@ def evaluate_detections(
         by_size[name] = SizeScores(**counts, mean_iou=mean(found.iou[hit][tp]))
     precision, recall, _ = _curve(predictions, found)
     monotonic = np.maximum.accumulate(precision[::-1])[::-1]
+    area = float((np.diff(recall, prepend=0) * monotonic).sum())
     return DetectionScores(
         frames=len(keys),
         iou=min_iou,
         ignored=int(found.ignored.sum()),
-        average_precision=float((np.diff(recall, prepend=0) * monotonic).sum()),
+        average_precision=area if hit.any() or len(missed) else math.nan,  # unknown without labels
         false_positives_per_frame=ratio(int(false.sum()), len(keys)),
         mean_iou=mean(found.iou[hit]),
         by_size=by_size,
