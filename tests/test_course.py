@@ -695,6 +695,8 @@ def test_every_call_form_binds(call_data, form, is_right):
             "get_hog_features(-d.float_patch[..., 0], 9, 8, 2, transform_sqrt=True)",
             "transform_sqrt must be False",
         ),
+        ("bin_spatial(d.gray, 8, order='nope')", "order must be one of"),
+        ("bin_spatial(d.gray, 'HLS', 8)", "color_space must be RGB for one channel; got 'HLS'"),
         ("bin_spatial(d.gray[0])", "img must be an .H, W, 3. RGB array"),
         ("bin_spatial(d.patch, (1, 2, 3))", "size must be"),
         ("bin_spatial(d.patch, 8, 8)", "takes an image and a size; got 1 more"),

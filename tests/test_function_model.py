@@ -1,4 +1,5 @@
 import copy
+import dataclasses
 import pickle
 import threading
 import time
@@ -251,6 +252,9 @@ def test_copies_share_the_function_and_other_processes_get_it():
     frame = frame_with(BOX)
     assert copy.deepcopy(detector).model is copy.copy(detector.model) is detector.model
     assert VehicleDetector(detector.model, conf=0.4).model._lock is detector.model._lock
+    safe = dataclasses.replace(detector.model, thread_safe=True)
+    assert type(dataclasses.replace(safe, thread_safe=False)._lock) is type(detector.model._lock)
+    assert type(safe._lock) is not type(detector.model._lock)
     other = pickle.loads(pickle.dumps(detector))
     assert other.detect(frame).boxes.tolist() == detector.detect(frame).boxes.tolist() == [BOX]
     assert other.model.function is find_red

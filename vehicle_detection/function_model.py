@@ -43,7 +43,7 @@ class FunctionModel:
     thread_safe: bool = False
     name: str | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
-    # Of the function, so it is kept by `dataclasses.replace`.
+    # An argument, so that `dataclasses.replace` keeps it: copies call the same function.
     _lock: contextlib.AbstractContextManager[Any] | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -58,8 +58,10 @@ class FunctionModel:
         name = self.name or getattr(self.function, "__name__", type(self.function).__name__)
         object.__setattr__(self, "score", check_score_scale(self.score, self.threshold))
         object.__setattr__(self, "name", name)
-        lock = self._lock or (contextlib.nullcontext() if self.thread_safe else threading.Lock())
-        object.__setattr__(self, "_lock", lock)
+        if self.thread_safe:
+            object.__setattr__(self, "_lock", contextlib.nullcontext())
+        elif self._lock is None or isinstance(self._lock, contextlib.nullcontext):
+            object.__setattr__(self, "_lock", threading.Lock())
 
     def __copy__(self) -> Self:
         """Return the model itself, because a copy would have a lock of its own."""

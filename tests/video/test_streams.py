@@ -131,6 +131,8 @@ def test_any_frame_of_any_container_can_be_the_first_one(tmp_path, suffix, fps):
     [
         ("clip.mp4", "-movflags", "frag_keyframe+empty_moov", "-bf", 2, "-g", 8),
         ("clip.ts", "-x264-params", "intra-refresh=1:keyint=8", "-bf", 0),
+        ("clip.ts", "-c:v", "mpeg4", "-q:v", 2, "-bf", 0, "-g", 8),
+        ("clip.avi", "-c:v", "mpeg4", "-q:v", 2, "-bf", 2, "-g", 8),
         ("clip.h264", "-bf", 0, "-g", 8),
         ("clip.mjpeg", "-c:v", "mjpeg", "-q:v", 2),
     ],

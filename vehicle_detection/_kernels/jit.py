@@ -34,8 +34,8 @@ def jit(function: Callable[..., Any], *, reorder: bool = False) -> Callable[...,
     except RuntimeError:
         # Neither the package's folder nor the user's cache is writable: compile in every process.
         return compiler()(function)  # type: ignore[no-any-return]
-    # numba would notice changes of the kernel's own file only, not of those that it calls, and fail if the
-    # disk is full. Without these attributes, which are not public, it does that.
+    # These attributes are not public. Without them, numba notices changes of the kernel's own file only, not
+    # of those that it calls, and fails on a full disk.
     with contextlib.suppress(AttributeError):
         kernel._cache._cache_file._source_stamp = source_stamp()
         kernel._cache.save_overload = functools.partial(_save, kernel._cache.save_overload)

@@ -29,9 +29,9 @@ def main() -> None:
 
 
 def _open_closed_streams() -> None:
-    """Open the null device in place of closed standard streams, as services are started with.
+    """Open the null device in place of closed standard streams; services may start without them.
 
-    In their order: each gets the lowest free number, which a file of the program would have otherwise.
+    Standard input first, so that each gets its own descriptor: 0, 1 or 2, the lowest that is free.
     """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:

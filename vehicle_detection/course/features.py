@@ -172,16 +172,18 @@ def bin_spatial(
     >>> bin_spatial(image, (2, 1)).tolist(), bin_spatial(image, (2, 1), order="channels").tolist()
     ([1, 2, 3, 1, 2, 3], [1, 1, 2, 2, 3, 3])
     """
-    if isinstance(img, np.ndarray) and img.ndim == 2:
-        vector = bin_spatial(np.stack([img] * 3, 2), size, *last_size, order="channels")
-        return np.asarray(vector.reshape(3, -1)[0])
-    image = check_lesson_image(img)
+    one_channel = isinstance(img, np.ndarray) and img.ndim == 2
+    image = check_lesson_image(img[..., None].repeat(3, 2) if one_channel else img)
     check_choice(order, "order", SPATIAL_ORDERS)
     check_type(color_space, "color_space", str, "pass a name such as 'YCrCb'")
     if isinstance(size, str) and len(last_size) <= 1:
         color_space, size = size, last_size[0] if last_size else (32, 32)
     elif last_size:
         raise InvalidInputError(f"bin_spatial takes an image and a size; got {len(last_size)} more")
+    if one_channel:
+        if color_space != "RGB":
+            raise InvalidInputError(f"color_space must be RGB for one channel; got {describe(color_space)}")
+        return np.asarray(cv2.resize(image[..., 0], check_size(size, "size"))).ravel()
     if color_space != "RGB":
         image = convert_color(image, color_space)
     small = np.asarray(cv2.resize(image, check_size(size, "size")))

@@ -131,6 +131,8 @@ class FeatureCache:
             with atomic_write(path, "cache") as part, part.open("wb") as file:
                 try:
                     np.save(file, features, allow_pickle=False)
-                except OSError as error:  # numpy's has no number
-                    raise OSError(error.errno or errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
+                except OSError as error:
+                    if error.errno is None:  # numpy's, if it can write a part only
+                        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
+                    raise
         return features

@@ -229,6 +229,7 @@ def _complete_lines(file: Path) -> str:
 def _parse(text: str, file: Path, suffix: str) -> tuple[list[str], list[dict[str, Any]]]:
     """Column names and rows of a file's text."""
     rows: list[dict[str, Any]] = []
+    text = text.removeprefix("\ufeff")  # the mark that programs on Windows add
     if suffix == ".jsonl":
         for number, line in enumerate(text.splitlines(), start=1):
             try:
@@ -239,8 +240,7 @@ def _parse(text: str, file: Path, suffix: str) -> tuple[list[str], list[dict[str
                 raise _damaged_line(file, number)
             rows.append(row)
         return list(dict.fromkeys(name for row in rows for name in row)), rows
-    # Programs on Windows may have added a byte order mark.
-    header, *lines = csv.reader(io.StringIO(text.removeprefix("\ufeff"))) if text else [[]]
+    header, *lines = csv.reader(io.StringIO(text)) if text else [[]]
     for number, cells in enumerate(lines, start=2):
         if len(cells) != len(header):
             raise _damaged_line(file, number)

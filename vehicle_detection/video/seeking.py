@@ -40,10 +40,13 @@ def find_seek_time(path: Path | str, info: VideoInfo, wanted: float) -> float:
 
 
 def _first_time(path: Path | str, seek: float) -> float:
-    """Time of the first frame that is decoded after a seek, from there, in seconds; inf if it is unknown."""
+    """Time of the first frame that is decoded after a seek, from there, in seconds; inf if it is no key frame.
+
+    Some decoders begin with other frames, which are gray then.
+    """
     options = ("-noaccurate_seek", "-ss", f"{seek:.6f}", *input_options(path), "-map", "0:V:0")
     options += ("-frames:v", "1", "-vf", "showinfo", "-f", "null", "-")
     with contextlib.closing(Process(("-nostdin", *options), level="info")) as process:
         process.wait()
-        found = re.search(r"n: *0 .*?pts_time:(-?[\d.]+)", process.log())
+        found = re.search(r"n: *0 .*?pts_time:(-?[\d.]+).*? iskey:1 ", process.log())
     return float(found[1]) if found else math.inf

@@ -47,7 +47,9 @@ class VideoSegments(FrameSource):
         ]
         sound = all(info.has_audio and info.audio_format == first.audio_format for info in infos)
         if first.has_audio and not sound:
-            _LOGGER.warning("the segments from %s on have different sound; the video has none", paths[0])
+            _LOGGER.warning(
+                "the segments after %s have sound of another format, or none; the video has none", paths[0]
+            )
         super().__init__(
             f"{paths[0]} to {paths[-1].name}",
             replace(
