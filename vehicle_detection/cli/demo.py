@@ -76,9 +76,7 @@ def draw_clip(drive: Drive, clip: Path, labels: Path, *, progress: bool = False)
                 bar.update()
     except OSError as error:  # its text is ffmpeg's log
         full = "No space left" in str(error)
-        reason = (
-            "no space is left on the disk; free some space" if full else "ffmpeg failed; check the folder"
-        )
+        reason = "the disk is full; free some space" if full else "ffmpeg failed; check the folder"
         raise OutputError(f"{clip} cannot be written: {reason}") from error
     write_labels(labels, enumerate(truth))
 

@@ -82,8 +82,8 @@ class VideoInfo:
     first_timestamp
         Timestamp of the first frame in seconds, as stored in the file.
     video_offset, audio_offset
-        ffmpeg's time 0 in seconds after the file's start, if it reads only that stream. It is the start of the
-        stream in MPEG-TS and similar containers, and 0.0 in others.
+        ffmpeg's time 0 in seconds after the file's start, if it reads only that stream. It is the start of
+        the stream in MPEG-TS and similar containers, and 0.0 in others.
     audio_track, audio_codec
         Index and codec (such as ``"aac"``) of the first audio track that can be decoded; None without one.
     audio_format

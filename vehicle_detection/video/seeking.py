@@ -40,9 +40,9 @@ def find_seek_time(path: Path | str, info: VideoInfo, wanted: float) -> float:
 
 
 def _first_time(path: Path | str, seek: float) -> float:
-    """Time of the first frame that is decoded after a seek, from there, in seconds; inf if it is no key frame.
+    """Time of the first frame that is decoded after a seek, from there, in seconds.
 
-    Some decoders begin with other frames, which are gray then.
+    It is infinite if the frame is no key frame: some decoders begin with others, which are gray then.
     """
     options = ("-noaccurate_seek", "-ss", f"{seek:.6f}", *input_options(path), "-map", "0:V:0")
     options += ("-frames:v", "1", "-vf", "showinfo", "-f", "null", "-")
