@@ -288,10 +288,9 @@ class FrameWriter(_FfmpegStream):
             copyable = audio.copyable and (lead <= 0 or container != "matroska")
             copied = copyable and info.audio_codec in _COPIED_AUDIO[container]
             mapped += ["-map", f"1:a:{info.audio_track}"]
-            filters = (
-                _SYNCHRONIZED if audio.length is None else f"{_SYNCHRONIZED},atrim=end={audio.length:.6f}"
-            )
-            mapped += ["-c:a", "copy"] if copied else ["-c:a", "aac", "-b:a", "192k", "-af", filters]
+            end = "" if audio.length is None else f",atrim=end={audio.length:.6f}"
+            encoded = ["-c:a", "aac", "-b:a", "192k", "-af", _SYNCHRONIZED + end]
+            mapped += ["-c:a", "copy"] if copied else encoded
         filters = "setparams=colorspace=smpte170m:color_primaries=bt709:color_trc=bt709:range=tv"
         if info.pixel_aspect != 1:
             filters += f",setsar={info.pixel_aspect}"
