@@ -14,7 +14,8 @@ from tests.helpers import StubDetector, start_interruptible
 from tests.video.clips import NTSC, child_processes, ffmpeg, gray_frames, write_clip
 from vehicle_detection.errors import VideoError
 from vehicle_detection.video import probe_video, process_video, read_frames
-from vehicle_detection.video.ffmpeg import Process, exit_reason, ffmpeg_binary, frame_rate
+from vehicle_detection.video.ffmpeg import Process, exit_reason, ffmpeg_binary
+from vehicle_detection.video.probe import frame_rate
 
 
 @pytest.mark.parametrize("fps", [NTSC, Fraction(60000, 1001), Fraction(24000, 1001), 25, 30, Fraction(25, 2)])

@@ -1,10 +1,10 @@
 """Reading and writing video: sources, trips, own speed, ffmpeg, the pipeline and the annotated video."""
 
-from vehicle_detection.video.ffmpeg import VideoInfo
 from vehicle_detection.video.frame_source import FrameSource
 from vehicle_detection.video.horizon import estimate_video_horizon
 from vehicle_detection.video.own_speed import OwnSpeed, read_own_speed
 from vehicle_detection.video.pipeline import VideoDetector
+from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.process import PRESETS, VideoReport, VideoRun, cut_video, process_video
 from vehicle_detection.video.reading import probe_video, read_frames
 from vehicle_detection.video.remote import download, open_filesystem, with_retries

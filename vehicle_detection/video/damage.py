@@ -12,7 +12,8 @@ import sys
 from fractions import Fraction
 from pathlib import Path
 
-from vehicle_detection.video.ffmpeg import Process, VideoInfo, input_options, last_line, source_name
+from vehicle_detection.video.ffmpeg import Process, input_options, last_line, seconds_of, source_name
+from vehicle_detection.video.probe import VideoInfo
 
 # Error of a frame rate that ffmpeg has derived from the file's times.
 _RATE_ERROR = Fraction(6, 1000)
@@ -78,8 +79,5 @@ def stream_duration(path: Path | str, info: VideoInfo) -> float | None:
     if exact:
         return float(exact[1])
     # Matroska states the stream's end in a tag, which the log repeats for the output.
-    tag = re.findall(r"DURATION +: (\d+):(\d+):([\d.]+)", log)
-    if not tag:
-        return None
-    end = int(tag[-1][0]) * 3600 + int(tag[-1][1]) * 60 + float(tag[-1][2])
-    return end - info.first_timestamp
+    ends = re.findall(r"DURATION +: (\d+:\d+:[\d.]+)", log)
+    return seconds_of(ends[-1]) - info.first_timestamp if ends else None

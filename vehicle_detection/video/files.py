@@ -10,7 +10,7 @@ from typing import Any
 
 from vehicle_detection._common import check_path
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.video.ffmpeg import probe
+from vehicle_detection.video.probe import probe
 from vehicle_detection.video.trips import find_trips, is_video_file
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}

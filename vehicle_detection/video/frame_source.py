@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection.video.ffmpeg import VideoInfo
+from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.streams import AudioSource, Reader
 
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.images import read_image
-from vehicle_detection.video.ffmpeg import VideoInfo
 from vehicle_detection.video.frame_source import FrameSource
+from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.streams import Reader
 
 

@@ -21,12 +21,12 @@ from vehicle_detection.errors import TransientVideoError, VideoError
 from vehicle_detection.video.ffmpeg import (
     NETWORK_TIMEOUT,
     Process,
-    VideoInfo,
     check_frame_size,
     last_line,
     pixel_limit,
     video_error,
 )
+from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.yuv import ColorEncoding, rgb_from_planes
 
 _LOGGER = logging.getLogger(__name__)

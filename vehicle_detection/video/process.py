@@ -36,9 +36,9 @@ from vehicle_detection._common import (
     single_threaded_opencv,
 )
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.video.ffmpeg import VideoInfo
 from vehicle_detection.video.frame_source import FrameSource
 from vehicle_detection.video.pipeline import FramePipeline, Frames, VideoDetector
+from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.reading import check_span, frame_range
 from vehicle_detection.video.sources import Source, borrow_source, open_source
 from vehicle_detection.video.streams import CONTAINERS, AudioSource, FrameWriter

@@ -8,8 +8,8 @@ from fractions import Fraction
 
 from vehicle_detection._common import check_number
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.video.ffmpeg import VideoInfo, probe
 from vehicle_detection.video.files import check_file
+from vehicle_detection.video.probe import VideoInfo, probe
 from vehicle_detection.video.streams import FrameReader
 
 

@@ -7,7 +7,8 @@ import math
 import re
 from pathlib import Path
 
-from vehicle_detection.video.ffmpeg import Process, VideoInfo, input_options
+from vehicle_detection.video.ffmpeg import Process, input_options
+from vehicle_detection.video.probe import VideoInfo
 
 # Containers with an index of their key frames. It may hold the times of decoding, which are earlier than
 # those of display by this many seconds at most.

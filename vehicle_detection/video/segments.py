@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import temporary_folder
 from vehicle_detection.video.damage import stream_duration
-from vehicle_detection.video.ffmpeg import VideoInfo, probe
 from vehicle_detection.video.frame_source import FrameSource
+from vehicle_detection.video.probe import VideoInfo, probe
 from vehicle_detection.video.streams import AudioSource, FrameReader, Reader
 
 _LOGGER = logging.getLogger(__name__)

@@ -13,11 +13,12 @@ from urllib.parse import unquote
 
 from vehicle_detection._common import check_number, check_path, describe, temporary_folder
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.video.ffmpeg import NETWORK_TIMEOUT, VideoInfo, input_options, probe, source_name
+from vehicle_detection.video.ffmpeg import NETWORK_TIMEOUT, input_options, source_name
 from vehicle_detection.video.files import IMAGE_SUFFIXES, check_file, list_files
 from vehicle_detection.video.frame_source import FrameSource
 from vehicle_detection.video.image_sequence import ImageSequence
 from vehicle_detection.video.live import LiveReader, LiveStream
+from vehicle_detection.video.probe import VideoInfo, probe
 from vehicle_detection.video.remote import download
 from vehicle_detection.video.segments import VideoSegments
 from vehicle_detection.video.streams import AudioSource, FrameReader, Reader

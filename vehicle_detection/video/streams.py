@@ -23,13 +23,13 @@ from vehicle_detection.errors import TransientVideoError, VideoError
 from vehicle_detection.video.damage import find_damage
 from vehicle_detection.video.ffmpeg import (
     Process,
-    VideoInfo,
     exit_reason,
     input_options,
     pixel_limit,
     source_name,
     video_error,
 )
+from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.seeking import find_seek_time
 from vehicle_detection.video.yuv import FORMATS, planes_from_rgb, rgb_from_planes
 
