@@ -50,9 +50,9 @@ def test_without_the_prior_the_sigmoid_is_plain_logistic_regression():
     from sklearn.linear_model import LogisticRegression
 
     scores, truth = drawn_scores(-1.5, 0.3, count=300)
-    plain = LogisticRegression(C=1e6).fit(scores[:, None], truth)
+    plain = LogisticRegression(C=1e6, tol=1e-8).fit(scores[:, None], truth)
     platt = calibrate_scores(scores, truth, prior=False)
-    assert (platt.a, platt.b) == (-plain.coef_[0, 0], -plain.intercept_[0])
+    assert (platt.a, platt.b) == pytest.approx((-plain.coef_[0, 0], -plain.intercept_[0]), rel=1e-4)
     assert platt.a == pytest.approx(calibrate_scores(scores, truth).a, rel=0.1)
 
 
@@ -149,3 +149,13 @@ def test_calibration_error_lies_between_0_and_1(pairs, bins):
 def test_invalid_arguments_of_calibration_error(probabilities, labels, bins, message):
     with pytest.raises(InvalidInputError, match=message):
         calibration_error(probabilities, labels, bins=bins)
+
+
+@pytest.mark.parametrize("prior", [True, False])
+@pytest.mark.parametrize(("factor", "shift"), [(1.0, 1e4), (1e-4, 0.0), (1e3, -50.0)])
+def test_the_unit_of_the_scores_does_not_matter(prior, factor, shift):
+    scores, truth = drawn_scores(-1.5, 0.3, count=300)
+    expected = calibrate_scores(scores, truth, prior=prior).probability(scores)
+    moved = scores * factor + shift
+    found = calibrate_scores(moved, truth, prior=prior).probability(moved)
+    np.testing.assert_allclose(found, expected, atol=1e-3)

@@ -184,3 +184,38 @@ def test_a_table_is_taken_back_whole(tmp_path):
 def test_from_pandas_rejects_other_tables(table, message):
     with pytest.raises(InvalidInputError, match=message):
         FrameBoxes.from_pandas(table)
+
+
+def test_missing_cells_of_a_table_are_the_usual_values():
+    """As after a concatenation of tables with different columns."""
+    table = pd.DataFrame({"frame": [0.0, 1.0], "x1": [0, 5], "y1": [0, 0], "x2": [50, 55], "y2": [40, 40]})
+    table["ignore"], table["occluded"], table["track_id"] = [True, None], [1, np.nan], [np.nan, 7]
+    labels = FrameBoxes.from_pandas(table)
+    assert labels.frames == (0, 1)
+    assert (labels.ignore.tolist(), labels.occluded.tolist()) == ([True, False], [1, 0])
+    assert labels.tracks.tolist() == [-1, 7]
+    table["ignore"] = ["false", "True"]
+    assert FrameBoxes.from_pandas(table).ignore.tolist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("column", "values", "message"),
+    [
+        ("track_id", ["a", "b"], "table must hold numbers in the column track_id, got .*list"),
+        ("x1", ["a", 1.0], "table must hold numbers in the column x1"),
+        ("score", [1.0, None], "scores must be finite"),
+        ("ignore", [2, 0], "table must hold 0 or 1 in the column ignore"),
+        ("occluded", [0.5, 1], "table must hold whole numbers in the column occluded, got 0.5"),
+    ],
+)
+def test_malformed_columns_of_a_table(column, values, message):
+    table = pd.DataFrame({"frame": [0, 1], "x1": [0, 5], "y1": [0, 0], "x2": [50, 55], "y2": [40, 40]})
+    table[column] = values
+    with pytest.raises(InvalidInputError, match=message):
+        FrameBoxes.from_pandas(table)
+
+
+def test_single_rows():
+    labels = FrameBoxes([0, 3], [7, 8], [[0, 0, 50, 40], [5, 0, 55, 40]])
+    assert [row.frames for row in labels] == [(0,), (3,)]
+    assert (labels[0].tracks.tolist(), labels[np.int64(-1)].tracks.tolist()) == ([7], [8])

@@ -158,8 +158,8 @@ def test_kitti_folder(tmp_path):
     assert labels.frame_keys == ("000002", "000010")
     assert labels.boxes[0].tolist() == [599.41, 156.40, 649.25, 189.25]
     assert labels.ignore.tolist() == [False, True, True, True, True, True]
-    assert (labels.tracks[:-1] >= 0).all()
-    assert labels.tracks[-1] == -1
+    # KITTI has no tracks, but an ignored vehicle without one would be a region.
+    assert labels.tracks.tolist() == [-1, 1, 2, 3, 4, -1]
     assert len(read_labels(tmp_path / "000002.txt")) == 6
     assert (~read_labels(tmp_path, classes=["Tram"]).ignore).sum() == 1
     scored = written(tmp_path, "Car -1 -1 0 200 10 220 20 1 1 1 1 1 1 1 0.5\n", "000002.txt")
@@ -199,7 +199,7 @@ def test_coco_file(tmp_path):
     assert labels.frame_keys == ("a.jpg", "b.jpg")
     assert labels.boxes.tolist() == [[10, 20, 40, 60], [0, 0, 60, 40], [90, 0, 189, 40]]
     assert labels.ignore.tolist() == [False, True, True]
-    assert labels.tracks.tolist() == [0, 2, -1]
+    assert labels.tracks.tolist() == [-1, 2, -1]
     assert len(read_labels(written(tmp_path, coco(), "coco.txt"), classes=["person"])) == 2
     entry = {"image_id": 5, "category_id": 1, "bbox": [1, 2, 3, 4], "track_id": 9, "score": 0.5}
     found = read_labels(written(tmp_path, coco(annotations=[entry], images=[{"id": 5}]), "a.json"))
@@ -451,3 +451,66 @@ def test_invalid_yolo_files(tmp_path, line, message):
     (tmp_path / "a.txt").unlink()
     with pytest.raises(DatasetError, match=r"holds no \.txt file; name a folder of YOLO labels"):
         read_labels(tmp_path, format="yolo", shape=(100, 200))
+
+
+def test_labels_without_tracks_have_no_track_scores(tmp_path):
+    """KITTI and COCO have no identities; a track for each box would give wrong IDF1 and HOTA."""
+    for frame in range(2):
+        written(tmp_path, f"Car 0 0 0 {10 + frame} 10 90 70 1 1 1 1 1 1 1\n", f"{frame:06d}.txt")
+    labels = read_labels(tmp_path)
+    found = FrameBoxes(labels.frames, [1, 1], labels.boxes)
+    with pytest.raises(InvalidInputError, match="labels must have a track for every box"):
+        evaluate_tracks(found, labels)
+
+
+@pytest.mark.parametrize("track", ["track", "track_id"])
+def test_a_table_with_tracks_and_scores_holds_predictions(tmp_path, track):
+    text = f"frame,{track},x1,y1,x2,y2,score\n0,1,0,0,50,40,2.5\n0,2,200,0,250,40,0.1\n"
+    found = read_labels(written(tmp_path, text))
+    assert (found.tracks.tolist(), found.scores.tolist()) == ([1, 2], [2.5, 0.1])
+
+
+def test_a_text_file_without_boxes_is_one_of_predictions(tmp_path):
+    assert read_labels(written(tmp_path, "", "none.txt")).frame_keys == ()
+
+
+@pytest.mark.parametrize(
+    ("names", "text", "known"),
+    [
+        ("data.yaml", "names:\n  0: person\n  2: car  # sedans\n  7: truck\nnc: 8\n", True),
+        ("data.yaml", "names: {0: person, 2: 'Car', 7: truck}\n", True),
+        ("data.yaml", '{"names": {"0": "person", "2": "car", "7": "bus"}}', True),
+        ("data.yaml", "names:\n  0: person\n  2: car\n  7: van\nextra:\n  0: car\n", True),
+        ("data.yaml", "names: [person, x,\n car, x, x, x, x, truck]", True),
+        ("data.yaml", "names:\n- person # walks\n- x\n# cars\n- car\n- x\n- x\n- x\n- x\n- bus\n", True),
+        ("classes.txt", "person\nx\ncar\nx\nx\nx\nx\ntruck\n", True),
+        ("other.txt", "", False),
+    ],
+)
+def test_names_of_yolo_classes(tmp_path, names, text, known):
+    (tmp_path / "labels" / "train").mkdir(parents=True)
+    written(tmp_path, text, names)
+    rows = "0 .2 .5 .1 .1\n2.0 .5 .5 .1 .1\n7 .8 .5 .1 .1\n"
+    written(tmp_path / "labels" / "train", rows, "000000.txt")
+    labels = read_labels(tmp_path / "labels" / "train", format="yolo", shape=(100, 100))
+    assert labels.boxes[:, 0].round().tolist() == ([45, 75] if known else [15, 45, 75])
+
+
+def test_yolo_names_that_cannot_be_read(tmp_path):
+    written(tmp_path, "nc: 3\n", "data.yaml")
+    written(tmp_path, "0 .2 .5 .1 .1\n", "000000.txt")
+    with pytest.raises(DatasetError, match=r"data\.yaml names no class; write them as names"):
+        read_labels(tmp_path, format="yolo", shape=(100, 100))
+
+
+def test_numbers_that_only_python_reads(tmp_path):
+    with pytest.raises(DatasetError, match="x1 must be a finite number, got '1_0'"):
+        read_labels(written(tmp_path, "frame,track,x1,y1,x2,y2\n0,1,1_0,2,30,40\n"))
+    for name in ("a.jsonl", "a.json"):
+        with pytest.raises(DatasetError, match="a number has too many digits"):
+            read_labels(written(tmp_path, '{"frame": ' + "9" * 5000 + "}", name))
+
+
+def test_blank_lines_of_an_archive_of_cvat(tmp_path):
+    path = write_zip(tmp_path / "a.zip", "1,1,0,0,20,10,1,1,1\n,\t\n")
+    assert len(read_labels(path)) == 1

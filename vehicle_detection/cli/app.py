@@ -408,7 +408,7 @@ def evaluate(
     from json import dumps
 
     from vehicle_detection._common import atomic_write, check_target
-    from vehicle_detection.evaluation import evaluate_detections, evaluate_tracks, read_labels
+    from vehicle_detection.evaluation import NO_TRACK, evaluate_detections, evaluate_tracks, read_labels
 
     if json is not None:
         check_target(json, "--json")
@@ -417,9 +417,13 @@ def evaluate(
     scores: dict[str, Any] = {
         "detections": evaluate_detections(found, true, iou=iou, ignored_as_regions=ignored_as_regions)
     }
-    if (found.tracks >= 0).any() and (true.tracks >= 0).any():
+    unknown = [int(((boxes.tracks == NO_TRACK) & ~boxes.ignore).sum()) for boxes in (found, true)]
+    if not any(unknown):
         scores["tracks"] = evaluate_tracks(found, true, iou=iou)
     typer.echo("\n\n".join(each.summary() for each in scores.values()))
+    for boxes, count, file in zip((found, true), unknown, (predictions, labels)):
+        if 0 < count < (~boxes.ignore).sum():
+            print_error(f"note: the tracks are not scored, because {file} has {count} boxes without one")
     if json is not None:
         with atomic_write(json) as part:
             plain = {name: each.to_dict() for name, each in scores.items()}

@@ -61,19 +61,24 @@ def calibrate_scores(
     sample_weight = _check_weights(weights, len(values))
     from sklearn.linear_model import LogisticRegression
 
-    values, truth, scale = values.astype(np.float64), truth.astype(np.int64), 1.0
+    values, truth = values.astype(np.float64), truth.astype(np.int64)
+    # The solver needs values of usual size; it does not converge for scores far from 0.
+    center, scale = float(values.mean()), float(values.std()) or 1.0
+    values = (values - center) / scale
     if prior:
         # Each sample is split between both classes.
         negatives, positives = np.bincount(truth, weights=sample_weight)
         target = np.where(truth == 1, (positives + 1) / (positives + 2), 1 / (negatives + 2))
-        scale = float(values.std()) or 1.0
-        samples, classes = np.tile(values / scale, 2), np.repeat([1, 0], len(values))
+        samples, classes = np.tile(values, 2), np.repeat([1, 0], len(values))
         regression = LogisticRegression(C=np.inf, tol=1e-8, max_iter=1000)
         split = np.concatenate([target, 1 - target]) * np.tile(sample_weight, 2)
         regression.fit(samples[:, None], classes, sample_weight=split)
     else:
-        regression = LogisticRegression(C=1e6).fit(values[:, None], truth, sample_weight=sample_weight)
-    return Platt(-float(regression.coef_[0, 0]) / scale, -float(regression.intercept_[0]))
+        regression = LogisticRegression(C=1e6, tol=1e-8).fit(
+            values[:, None], truth, sample_weight=sample_weight
+        )
+    slope = -float(regression.coef_[0, 0]) / scale
+    return Platt(slope, -float(regression.intercept_[0]) - slope * center)
 
 
 def _check_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +35,10 @@ _TABLE_COLUMNS: dict[str, tuple[str, type]] = {
     "distance_m": ("distance_m", float),
     "speed_mps": ("speed_mps", float),
 }
+
+_FLAGS = {"false": False, "true": True}
+# Values of cells that are missing, as after a concatenation of tables.
+_USUAL = {"occluded": 0, "truncated": 0.0, "ignore": False, "track": NO_TRACK, "track_id": NO_TRACK}
 
 _ROW_COLUMNS = ("tracks", "boxes", "occluded", "truncated", "ignore", "scores", "distance_m", "speed_mps")
 
@@ -79,6 +83,35 @@ def none_if_unknown(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
 def count_noun(number: int, noun: str, ending: str = "s") -> str:
     """Format a number with its noun: ``1 box``, ``2 boxes``."""
     return f"{number} {noun}{ending * (number != 1)}"
+
+
+def _table_frames(table: pandas.DataFrame) -> list[FrameKey]:
+    """Frames of a table; whole numbers that a concatenation has made floats are numbers again."""
+    frames: list[Any] = table["frame"].tolist()
+    if all(isinstance(frame, (int, float)) and frame % 1 == 0 for frame in frames):
+        return [int(frame) for frame in frames]
+    return frames
+
+
+def _table_column(table: pandas.DataFrame, name: str, kind: type) -> NDArray[Any]:
+    """Return a column of a table as numbers; a missing flag, occlusion or track is the usual one."""
+    given = table[name]
+    if kind is bool:
+        given = given.map(lambda value: _FLAGS.get(str(value).lower(), value))
+    if name in _USUAL:
+        given = given.fillna(_USUAL[name])
+    try:
+        values = np.asarray(given, np.float64)
+    except (TypeError, ValueError):
+        raise InvalidInputError(
+            f"table must hold numbers in the column {name}, got {describe(table[name].tolist())}"
+        ) from None
+    if kind is not float and (values % 1 != 0).any():  # NaN, too
+        wrong = values[values % 1 != 0][0]
+        raise InvalidInputError(f"table must hold whole numbers in the column {name}, got {wrong:g}")
+    if kind is bool and not np.isin(values, (0, 1)).all():
+        raise InvalidInputError(f"table must hold 0 or 1 in the column {name}; convert it to bool")
+    return np.asarray(values, kind)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -234,9 +267,14 @@ class FrameBoxes:
     def _repr_html_(self) -> str:
         return f"<p>{self!r}</p>{self.to_pandas().to_html(max_rows=20)}"
 
-    def __getitem__(self, rows: slice | NDArray[Any] | list[int]) -> FrameBoxes:
-        """Select rows by a slice, a mask or a list of indices; `frame_keys` stay the same."""
-        return self._take(np.arange(len(self))[rows], self.frame_keys)
+    def __getitem__(self, rows: int | slice | NDArray[Any] | list[int]) -> FrameBoxes:
+        """Select rows by an index, a slice, a mask or a list of indices; `frame_keys` stay the same."""
+        taken = [rows] if isinstance(rows, (int, np.integer)) else rows
+        return self._take(np.arange(len(self))[taken], self.frame_keys)
+
+    def __iter__(self) -> Iterator[FrameBoxes]:
+        """Yield the rows, as `FrameBoxes` of one box each."""
+        return (self[row] for row in range(len(self)))
 
     def rows(self, key: FrameKey) -> NDArray[np.intp]:
         """Row numbers of a frame's boxes; empty for a frame without boxes."""
@@ -272,7 +310,13 @@ class FrameBoxes:
     def from_pandas(cls, table: pandas.DataFrame) -> FrameBoxes:
         """Take the boxes of a table with the columns of `to_pandas`; only frame and corners are required.
 
-        So ``pandas.read_csv`` of a file that `write_tracks` wrote is such a table. A missing track is -1.
+        So ``pandas.read_csv`` of a file that `write_tracks` wrote is such a table. A missing track is -1, and
+        missing occlusion, truncation and `ignore` are 0.
+
+        Raises
+        ------
+        InvalidInputError
+            If a column is missing or holds something else.
         """
         given: object = table
         names = set(getattr(given, "columns", ()))
@@ -282,16 +326,16 @@ class FrameBoxes:
                 f"table must be a pandas.DataFrame with the columns frame, {', '.join(_CORNERS)}; "
                 + (f"it lacks {', '.join(missing)}" if names else f"got {describe(given)}")
             )
-        columns = {
-            column: table[name].astype(kind).to_numpy()
+        columns: dict[str, Any] = {
+            column: _table_column(table, name, kind)
             for name, (column, kind) in _TABLE_COLUMNS.items()
             if name in names
         }
-        tracks = next((table[name] for name in ("track_id", "track") if name in names), None)
+        track = next((name for name in ("track_id", "track") if name in names), None)
         return cls(
-            table["frame"].tolist(),
-            None if tracks is None else tracks.fillna(NO_TRACK).to_numpy(np.int64),  # type: ignore[arg-type]
-            table[list(_CORNERS)].to_numpy(np.float64),
+            _table_frames(table),
+            None if track is None else _table_column(table, track, int),  # type: ignore[arg-type]
+            np.stack([_table_column(table, name, float) for name in _CORNERS], axis=1),
             **columns,
         )
 

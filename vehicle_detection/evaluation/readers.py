@@ -11,6 +11,7 @@ import re
 import zipfile
 import zlib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,6 +53,12 @@ _HIDDEN, _MAX_TRUNCATED, _MIN_WIDTH = 2, 0.7, 40.0
 _MIN_CONFIDENCE = 1e-6
 
 
+# An item of a list or a mapping in YAML, without its comment.
+_YAML_ITEM = re.compile(
+    r"""\s*(?:-\s+|["']?(?P<number>\d+)["']?\s*:\s*)?"""
+    r"""(?:"(?P<double>[^"]*)"|'(?P<single>[^']*)'|(?P<plain>[^\s#].*?)?)\s*(?:(?:^|\s|(?<=["']))#.*)?"""
+)
+
 _READ_FORMATS = (*dict.fromkeys(FORMATS.values()), "coco_results", *FOLDER_FORMATS)
 
 
@@ -81,9 +88,9 @@ def _read_text(file: Path) -> str:
         raise DatasetError(f"{file} is not UTF-8 text; save it as UTF-8") from None
 
 
-def _read_lines(file: Path) -> Iterator[tuple[str, str]]:
-    """Yield the lines that are not blank, each after its place for error messages."""
-    for number, line in enumerate(_read_text(file).splitlines(), 1):
+def _read_lines(file: Path, text: str | None = None) -> Iterator[tuple[str, str]]:
+    """Yield the lines of a file, or of a text in it, that are not blank, after their places for messages."""
+    for number, line in enumerate((_read_text(file) if text is None else text).splitlines(), 1):
         if line.strip(", \t"):
             yield f"{file} line {number}", line.strip()
 
@@ -96,7 +103,7 @@ def _split_words(line: str) -> list[str]:
 def _number(text: str, name: str, where: str, *, low: float = -math.inf, high: float = math.inf) -> float:
     """Parse a finite number in ``[low, high]``."""
     try:
-        value = float(text)
+        value = math.nan if "_" in text else float(text)  # Python reads 1_0 as 10
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
@@ -149,12 +156,18 @@ def _read_json_lines(source: Path) -> Rows:
         if line.strip():
             try:
                 records.append((where, json.loads(line)))
-            except (json.JSONDecodeError, RecursionError) as error:
-                reason = getattr(error, "msg", "nested too deeply")
-                raise DatasetError(f"{where}: not a JSON object ({reason})") from None
+            except (ValueError, RecursionError) as error:
+                raise DatasetError(f"{where}: not a JSON object ({_json_reason(error)})") from None
             if not isinstance(records[-1][1], dict):
                 raise DatasetError(f"{where}: expected a JSON object, found {line.strip()[:40]!r}")
     return _typed_rows(source, records)
+
+
+def _json_reason(error: ValueError | RecursionError) -> str:
+    """Say why a text cannot be parsed; Python refuses integers of thousands of digits."""
+    if isinstance(error, RecursionError):
+        return "nested too deeply"
+    return error.msg if isinstance(error, json.JSONDecodeError) else "a number has too many digits"
 
 
 def _read_parquet(source: Path) -> Rows:
@@ -192,9 +205,9 @@ def _typed_rows(source: Path, records: Sequence[tuple[str, Mapping[str, Any]]]) 
 
 def _check_columns(source: Path, names: Sequence[str]) -> bool:
     """Check that all columns are there; return whether they are those of predictions."""
-    predicted = "track" not in names and "score" in names
+    predicted = "score" in names
     expected = BOX_COLUMNS if predicted else REQUIRED_LABEL_COLUMNS
-    given = {*names} | ({"track"} if "track_id" in names else set())
+    given = {*names} | ({"track", "track_id"} if {"track", "track_id"} & {*names} else set())
     missing = [name for name in expected if name not in given]
     if missing:
         raise DatasetError(
@@ -249,7 +262,7 @@ def _read_kitti(source: Path, classes: Collection[str] | None) -> Rows:
 def _kitti_row(
     where: str, frame: str, number: int, words: list[str], classes: Collection[str] | None
 ) -> Row | None:
-    """One KITTI object; None for a person. KITTI images have no tracks, so every box gets its own number."""
+    """One KITTI object; None for a person. `number` marks an ignored vehicle, which has no track either."""
     if len(words) not in (15, 16):
         raise DatasetError(f"{where}: a KITTI object has 15 values (16 with a score), found {len(words)}")
     name = words[0].lower()
@@ -265,7 +278,8 @@ def _kitti_row(
     occluded = min(max(int(_number(words[2], "occluded", where)), 0), _HIDDEN)
     unscored = occluded >= _HIDDEN or truncated > _MAX_TRUNCATED or x2 - x1 < _MIN_WIDTH
     ignore = not wanted or (unscored and math.isnan(score))
-    return Row(where, frame, number, (x1, y1, x2, y2), occluded, truncated, ignore, score)
+    track = number if ignore else NO_TRACK  # an ignored box without a track would be a region
+    return Row(where, frame, track, (x1, y1, x2, y2), occluded, truncated, ignore, score)
 
 
 def _read_mot(source: Path, classes: Collection[str] | None) -> Rows:
@@ -318,9 +332,8 @@ def _read_mot_zip(source: Path, classes: Collection[str] | None) -> Rows:
     labels = None if names is None else [name.strip().lower() for name in names.splitlines() if name.strip()]
     if labels:
         _check_classes(source, labels, wanted)
-    lines = ((f"{source} line {n}", line) for n, line in enumerate(text.splitlines(), 1) if line.strip(", "))
     rows = []
-    for row, number in _mot_rows(lines, first_pixel=0):
+    for row, number in _mot_rows(_read_lines(source, text), first_pixel=0):
         if labels is not None and number is not None:
             index = _integer(number, "class", row.where, low=1)
             if index > len(labels):
@@ -360,7 +373,8 @@ def _read_yolo(source: Path, classes: Collection[str] | None, shape: tuple[int, 
         raise InvalidInputError("shape must be (height, width) of the frames for YOLO, got None; pass it")
     folder = source / "labels" if (source / "labels").is_dir() else source
     files = [file for file in folder.glob("*.txt") if file.name != "classes.txt"]
-    if not files:
+    without_frames = folder != source and not any(folder.iterdir())
+    if not files and not without_frames:
         raise DatasetError(f"{folder} holds no .txt file; name a folder of YOLO labels")
     names = _yolo_names(source)
     wanted = VEHICLE_CLASSES if classes is None else classes
@@ -399,23 +413,41 @@ def _yolo_row(where: str, frame: FrameKey, words: list[str], shape: tuple[int, .
         score = math.log(confidence / (1 - confidence))
     track = _integer(words[6], "track", where, low=NO_TRACK) if len(words) > 6 else NO_TRACK
     box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
-    return words[0], Row(where, frame, track, box, score=score)
+    name = words[0].partition(".")[0] if FRAME_NUMBER.fullmatch(words[0]) else words[0]
+    return name, Row(where, frame, track, box, score=score)
 
 
 def _yolo_names(source: Path) -> dict[str, str]:
     """Lower-case name of each class number, from ``data.yaml`` or ``classes.txt``; empty if unknown."""
-    for folder in (source, source.parent):
+    place = source.resolve()
+    for folder in (place, *place.parents[:2]):
         if (folder / "data.yaml").is_file():
-            block = _read_text(folder / "data.yaml").partition("names:")[2]
-            numbered = re.findall(r"^\s+(\d+)\s*:\s*(.+?)\s*$", block, re.MULTILINE)
-            listed = re.match(r"\s*\[(.*?)\]", block, re.DOTALL)
-            items = listed[1].split(",") if listed else re.findall(r"^\s*-\s*(.+?)\s*$", block, re.MULTILINE)
-            pairs = numbered or [(str(number), name) for number, name in enumerate(items)]
-            return {number: name.strip(" \"'\n").lower() for number, name in pairs}
+            names = _yaml_names(_read_text(folder / "data.yaml"))
+            if not names:
+                raise DatasetError(f"{folder / 'data.yaml'} names no class; write them as names: [car, bus]")
+            return names
         if (folder / "classes.txt").is_file():
             lines = _read_text(folder / "classes.txt").splitlines()
             return {str(number): name.strip().lower() for number, name in enumerate(lines)}
     return {}
+
+
+def _yaml_names(text: str) -> dict[str, str]:
+    """Value of ``names``, a list or a mapping from numbers, as a block or in brackets."""
+    key = re.search(r"""^[{ \t]*["']?names["']?[ \t]*:""", text, re.MULTILINE)
+    value = text[key.end() :] if key else ""
+    flow = re.match(r"\s*(?:\[(.*?)\]|\{(.*?)\})", value, re.DOTALL)
+    if flow:
+        items = re.findall(r"""(?:[^,"']|"[^"]*"|'[^']*')+""", flow[1] or flow[2] or "")
+    else:
+        items = list(takewhile(lambda line: not line.strip() or line[0] in " \t-#", value.splitlines()[1:]))
+    names: dict[str, str] = {}
+    for item in items:
+        entry = _YAML_ITEM.fullmatch(item)
+        if entry and any(entry.groups()):
+            number = entry["number"] or str(len(names))
+            names[number] = (entry["double"] or entry["single"] or entry["plain"] or "").lower()
+    return names
 
 
 class CocoFile(NamedTuple):
@@ -431,10 +463,9 @@ def read_coco_file(source: Path, truth: Path | None = None) -> CocoFile:
     """Read a COCO file; `truth` names the data set that a list of results belongs to."""
     try:
         data = json.loads(_read_text(source))
-    except json.JSONDecodeError as error:
-        raise DatasetError(f"{source} line {error.lineno}: not JSON text ({error.msg})") from None
-    except RecursionError:
-        raise DatasetError(f"{source}: not a COCO file, because its JSON is nested too deeply") from None
+    except (ValueError, RecursionError) as error:
+        line = f" line {error.lineno}" if isinstance(error, json.JSONDecodeError) else ""
+        raise DatasetError(f"{source}{line}: not JSON text ({_json_reason(error)})") from None
     if isinstance(data, list) and all(isinstance(entry, dict) and "image_id" in entry for entry in data):
         if truth is None:
             raise DatasetError(
@@ -494,12 +525,13 @@ def _read_coco(source: Path, classes: Collection[str] | None, truth: Path | None
         if category not in vehicles and name not in LOOKALIKE_CLASSES:
             continue
         score = math.nan if entry.get("score") is None else _number(str(entry["score"]), "score", where)
-        track = entry.get("track_id", number if math.isnan(score) else NO_TRACK)
+        ignore = bool(entry.get("iscrowd") or entry.get("ignore") or category not in vehicles)
+        # An ignored box without a track would be a region.
+        track = entry.get("track_id", number if ignore and math.isnan(score) else NO_TRACK)
         # A crowd is a region, except for the ignored vehicles of write_labels, which marks them twice.
         if track is None or (entry.get("iscrowd") and not (entry.get("ignore") and "track_id" in entry)):
             track = NO_TRACK
         track = _integer(str(track), "track_id", where, low=NO_TRACK)
-        ignore = bool(entry.get("iscrowd") or entry.get("ignore") or category not in vehicles)
         box = (x, y, x + width, y + height)
         optional: dict[str, Any] = {
             name: _number(str(entry[name]), name, where)
@@ -648,9 +680,9 @@ def _guess_format(source: Path) -> str:
     if suffix == ".tsv" or (suffix in FORMATS and suffix != ".txt"):
         return FORMATS.get(suffix, "csv")
     start = _read_text(source).lstrip()[:4096]
-    words = _split_words(start.splitlines()[0]) if start else [""]
+    words = _split_words(start.splitlines()[0]) if start else []
     if start.startswith(("{", "[")):
         return "coco"
-    if re.fullmatch(r"[0-9]+(\.0*)?", words[0]):
+    if not words or re.fullmatch(r"[0-9]+(\.0*)?", words[0]):
         return "mot"
-    return "kitti" if not start or (len(words) >= 15 and "frame" not in words) else "csv"
+    return "kitti" if len(words) >= 15 and "frame" not in words else "csv"
