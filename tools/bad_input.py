@@ -247,7 +247,7 @@ class _Valid:
             "source": patches, "params": params, "result": result, "results": [result], "n": 2,
             "random_state": 0, "path": folder / "out.csv", "log": log, "events": [], "video": clip,
             "focal_px": 500.0, "horizon_px": 40.0, "first": boxes, "second": boxes, "bboxes": boxes,
-            "X": patches, "y": labels, "metadata": {}, "horizon": 0.5, "images": [image], "index": 0,
+            "X": patches, "y": labels, "metadata": {}, "horizon": 0.5, "images": [image],
             "time": 0.0, "name": "a", "bbox_list": boxes, "files": [clip], "model": classifier,
             "key": 0, "sets": [patch_set], "frames": [image], "clip": moving,
             "before": result, "after": None, "times": [], "thumbnail": np.zeros((9, 16), np.float32),
@@ -257,7 +257,7 @@ class _Valid:
             "pairs": np.array([[0, 1]]),
             "parameter": "orient", "methods": {"a": [windows]}, "curves": (scores, scores, scores),
             "runs": {"a": [result]}, "out": folder / "out", "target": folder / "out.mp4",
-            "pipeline": classifier.to_pipeline(), "lateral_px": 10.0, "frame_index": 0, "imgs": [image],
+            "pipeline": classifier.to_pipeline(), "lateral_px": 10.0, "index": 0, "imgs": [image],
             "split": vd.Split(np.arange(10), np.arange(10, 20)), "number": 1, "speed": own_speed,
             "speed_mps": 25.0,
         }  # fmt: skip

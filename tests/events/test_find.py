@@ -225,3 +225,32 @@ def test_events_are_values():
     assert str(event) == "0.4 s: vehicle 1 met (oncoming), on the left"
     with pytest.raises(dataclasses.FrozenInstanceError):
         event.frame = 3
+
+
+def test_no_vehicle_is_followed_while_it_is_not_seen():
+    def box(frame):
+        return [620 - 0.1 * (frame % 2), 380, 660, 420]
+
+    frames = np.array([*range(8), *range(95, 103)])
+    boxes = np.array([box(frame) for frame in frames], float)
+    known = {"distance_m": 20.0, "distance_std_m": 1.0}
+    columns = {**dict(zip(("x1", "y1", "x2", "y2"), boxes.T))}
+    blank = simulated("highway", 0)[1].histories()[0].columns
+    columns |= {name: np.full(len(frames), known.get(name, np.nan)) for name in blank if name not in columns}
+    found = find_events([TrackHistory(1, frames, columns)], fps=25, shape=SHAPE)
+    assert not listed(found, "headway")
+
+
+def test_distances_of_a_fisheye_lens():
+    """A car in the next lane, whose box at the border of the image is far from that of a pinhole camera."""
+    camera = dataclasses.replace(CAMERA, fisheye=True)
+    (history,) = simulated("closing", 0)[1].histories()[:1]
+    moved = {**history.columns, "x1": history.columns["x1"] + 200, "x2": history.columns["x2"] + 200}
+    far = dataclasses.replace(history, columns={**moved, "distance_m": np.full(len(history.frames), np.nan)})
+    boxes = camera.rectify_boxes(far.boxes, SHAPE)
+    plain = dataclasses.replace(far, columns={**far.columns, **dict(zip(("x1", "y1", "x2", "y2"), boxes.T))})
+    found = estimate_motion(far, fps=FPS, shape=SHAPE, camera=camera)
+    expected = estimate_motion(plain, fps=FPS, shape=SHAPE, camera=CAMERA)
+    inside = boxes[:, 2] < 1200
+    assert inside.sum() > 20
+    np.testing.assert_allclose(found.distance[inside], expected.distance[inside])

@@ -53,6 +53,30 @@ class TestGpx:
         points = [(50 + lat, lon, time_of(second), "") for second, (lat, lon) in enumerate(places)]
         assert read_own_speed(write_gpx(tmp_path / "a.gpx", points)).at(np.arange(60)).max() < 0.3
 
+    def test_positions_on_both_sides_of_a_gap_give_no_speed(self, tmp_path):
+        """20 m/s; the receiver was off for 20 s, and for 60 s while the car stood."""
+        seconds = [*range(21), *range(41, 61), *range(121, 141)]
+        meters = [20 * second + (5000 if second > 20 else 0) for second in seconds[:41]]
+        meters += [meters[-1] + 20 * (second - 120) for second in seconds[41:]]
+        points = [(50 + way / DEGREE_M, 10, time_of(second), "") for second, way in zip(seconds, meters)]
+        found = read_own_speed(write_gpx(tmp_path / "a.gpx", points))
+        np.testing.assert_allclose(found.at(seconds), 20, rtol=1e-3)
+        assert np.isnan(found.at([30, 90])).all()
+
+    def test_a_new_segment_begins_anew(self, tmp_path):
+        points = [(50 + 20 * second / DEGREE_M, 10, time_of(second), "") for second in range(10)]
+        points += [(60 + 20 * second / DEGREE_M, 10, time_of(second), "") for second in range(12, 20)]
+        path = write_gpx(tmp_path / "a.gpx", points)
+        path.write_text(
+            path.read_text().replace('<trkpt lat="60.00', '</trkseg><trkseg><trkpt lat="60.00', 1)
+        )
+        np.testing.assert_allclose(read_own_speed(path).at([9, 12]), 20, rtol=1e-3)
+
+    def test_positions_too_far_apart(self, tmp_path):
+        points = [(50, 10 + second, time_of(second), "") for second in range(0, 60, 10)]
+        with pytest.raises(InvalidInputError, match="no positions at most 5 s apart to compute them"):
+            read_own_speed(write_gpx(tmp_path / "a.gpx", points))
+
     def test_the_offset_is_the_start_of_the_video(self, tmp_path):
         points = [(50, 10, time_of(second), f"<speed>{second}</speed>") for second in range(9)]
         path = write_gpx(tmp_path / "a.gpx", points)

@@ -226,8 +226,7 @@ def find_events(
     events: list[Event] = []
     for motion in motions:
         finder = _Finder(motion, rate, own_speed)
-        others = [each for each in motions if each is not motion]
-        events += [*finder.following(), *finder.closest(), *finder.closing(), *finder.cut_in(others)]
+        events += [*finder.following(), *finder.closest(), *finder.closing(), *finder.cut_in(motions)]
         events += finder.passing(starts_late=motion.track.first > 0.5 * rate)
     return tuple(sorted(events, key=lambda event: (event.frame, event.track_id, event.kind)))
 
@@ -287,7 +286,7 @@ class _Finder:
             hard = time[row] <= _HARD_TIME or deceleration >= _HARD_DECELERATION
             yield self._event("hard_closing" if hard else "closing", row, start, stop)
 
-    def cut_in(self, others: Sequence[Motion]) -> Iterable[Event]:
+    def cut_in(self, motions: Sequence[Motion]) -> Iterable[Event]:
         """Yield each time that the vehicle moved from another lane into that of the camera."""
         motion = self.motion
         with np.errstate(invalid="ignore"):
@@ -302,7 +301,7 @@ class _Finder:
             if np.nanmedian(np.abs(motion.lateral_rate[begin : start + 1])) > _MAX_LATERAL_SPEED:
                 continue
             if motion.lateral[begin] * motion.lateral[start] < -(LANE_HALF_WIDTH_M**2) or self._moved_alike(
-                others, begin, start
+                motions, begin, start
             ):
                 continue
             inside = np.flatnonzero(np.abs(motion.lateral[begin : start + 1]) < LANE_HALF_WIDTH_M)
@@ -310,12 +309,14 @@ class _Finder:
             side: Side = "right" if motion.lateral[begin] > 0 else "left"
             yield self._event("cut_in", row, begin, start + 1, side=side)
 
-    def _moved_alike(self, others: Sequence[Motion], begin: int, end: int) -> bool:
+    def _moved_alike(self, motions: Sequence[Motion], begin: int, end: int) -> bool:
         """Whether other vehicles moved sideways as this one did, which is a motion of the camera."""
         own = self.motion
         change = own.lateral[end] - own.lateral[begin]
         changes = []
-        for other in others:
+        for other in motions:
+            if other is own:
+                continue
             rows = np.flatnonzero(other.at(own.seconds[begin], own.seconds[end]) & (other.at_side == 0))
             if len(rows) and other.seconds[rows[-1]] - other.seconds[rows[0]] > 0.6 * (
                 own.seconds[end] - own.seconds[begin]
@@ -389,7 +390,7 @@ class _Finder:
         """Half-open ranges of rows where `mask` holds for so long; gaps up to 0.25 s are closed."""
         rows = np.flatnonzero(mask)
         step = max(int(0.25 * self.fps), 1)
-        runs = [rows[each] for each in split_runs(rows, step)]
+        runs = [rows[each] for each in split_runs(self.motion.track.frames[rows], step)]
         times = self.motion.seconds
         return [
             (int(run[0]), int(run[-1]) + 1)

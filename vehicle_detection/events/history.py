@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_integer, check_number, check_type, describe
+from vehicle_detection._common import check_integer, check_number, check_type, describe, pluralize
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video import OwnSpeed
@@ -111,6 +111,9 @@ class TrackLog:
         # Frames and columns of each track.
         self._tracks: defaultdict[int, list[array[Any]]] = defaultdict(_empty_columns)
 
+    def __repr__(self) -> str:
+        return f"TrackLog({pluralize(len(self._tracks), 'track')} in {pluralize(len(self.counts), 'frame')})"
+
     def __call__(self, result: Any) -> None:
         """Add one frame's result: for ``process_video(..., on_result=log)``."""
         self.add(result.index, result.time, result.tracks)
@@ -118,10 +121,10 @@ class TrackLog:
     def add(self, index: int, time: float | None, tracks: Iterable[Any]) -> None:
         """Add the tracks of the next frame."""
         expected = len(self.counts)
-        if check_integer(index, "frame_index", low=0) != expected:
+        if check_integer(index, "index", low=0) != expected:
             raise InvalidInputError(
-                f"frame_index must be {expected}, as frames are written in order from 0; got {index}; "
-                "use a new writer for another video"
+                f"index must be {expected}, as frames are added in order from 0; got {index}; "
+                "use a new TrackLog for another video"
             )
         if time is not None:
             check_number(time, "time", low=-1e12, high=1e12)

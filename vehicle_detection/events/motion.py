@@ -67,13 +67,14 @@ def estimate_motion(track: TrackHistory, *, fps: float, shape: tuple[int, int], 
     """Estimate the motion of a track in frames of this shape."""
     boxes, seconds = track.boxes, track.frames / fps
     truncated = truncated_edges(boxes, shape)
+    boxes = camera.rectify_boxes(boxes, shape)
     width, height = (np.maximum(boxes[:, axis + 2] - boxes[:, axis], 1.0) for axis in (0, 1))
     cut_above, cut_beside = truncated[:, [1, 3]].any(axis=1), truncated[:, [0, 2]].any(axis=1)
     # In other lanes a box shows the vehicle's side too, which makes its width unsuitable.
     size = np.where(cut_above, np.nan, height)
     scale, scale_std = _scale(track, size, camera)
     distance = scale / size
-    lateral, lateral_std = _lateral(boxes, width, distance, scale_std, shape, camera)
+    lateral, lateral_std = _lateral(boxes, distance, scale_std, shape, camera)
     ahead = (np.abs(lateral) < LANE_HALF_WIDTH_M) & ~cut_beside & ~cut_above
     inverse = np.where(ahead, 1 / np.sqrt(width * height), np.nan)
     # Both inverse sizes have the unit of the reciprocal height, so that a track may change between them.
@@ -115,18 +116,11 @@ def _scale(track: TrackHistory, size: Floats, camera: Camera) -> tuple[float, fl
 
 
 def _lateral(
-    boxes: Floats,
-    width: Floats,
-    distance: Floats,
-    distance_std: float,
-    shape: tuple[int, int],
-    camera: Camera,
+    boxes: Floats, distance: Floats, distance_std: float, shape: tuple[int, int], camera: Camera
 ) -> tuple[Floats, Floats]:
-    """Lateral position of the vehicle's near end, which lies at the outer edge of its box."""
-    if camera.fisheye:
-        boxes = camera.rectify_boxes(boxes, shape)
-        width = boxes[:, 2] - boxes[:, 0]
+    """Lateral position of the vehicle's near end, which lies at the outer edge of its rectified box."""
     middle = shape[1] / 2
+    width = np.maximum(boxes[:, 2] - boxes[:, 0], 1.0)
     face = np.minimum(camera.focal_px * camera.vehicle_width_m / distance, width)
     right = (boxes[:, 0] + boxes[:, 2]) / 2 > middle
     column = np.where(right, boxes[:, 2] - face / 2, boxes[:, 0] + face / 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
@@ -137,16 +138,21 @@ def _second_texts(
     nearest = _nearest_tracks(log.histories(), fps)
     start = log.first_time or 0.0
     own = np.full(seconds, np.nan) if own_speed is None else own_speed.at(start + 0.5 + np.arange(seconds))
+    shown: defaultdict[int, list[Event]] = defaultdict(list)
+    for event in events:
+        for second in range(int(event.time_s), int(event.time_s) + _EVENT_SECONDS):
+            shown[second].append(event)
     for second in range(seconds):
         first, last = (math.ceil(edge * fps - 1e-9) for edge in (second, second + 1))
+        frame_second = second
+        if first == last:  # the frame of an earlier second is still shown
+            first, frame_second = first - 1, math.floor((first - 1) / fps + 1e-9)
         speed = None if np.isnan(own[second]) else float(own[second])
         lines = [] if speed is None else [f"own speed {units.speed_text(speed, None, signed=False)}"]
-        lines.append(_vehicles(int(counts[first:last].max(initial=0)), nearest.get(second), speed, units))
-        lines += [
-            event.text(units, with_time=False)
-            for event in events
-            if int(event.time_s) <= second < int(event.time_s) + _EVENT_SECONDS
-        ]
+        lines.append(
+            _vehicles(int(counts[first:last].max(initial=0)), nearest.get(frame_second), speed, units)
+        )
+        lines += [event.text(units, with_time=False) for event in shown[second]]
         yield tuple(lines)
 
 

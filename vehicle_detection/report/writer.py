@@ -94,9 +94,9 @@ class ReportWriter:
         """Add one frame's result: for ``process_video(..., on_result=...)``."""
         self.write(result.index, result.time, result.tracks)
 
-    def write(self, frame_index: int, time: float | None, tracks: Iterable[Any]) -> None:
+    def write(self, index: int, time: float | None, tracks: Iterable[Any]) -> None:
         """Add the shown tracks of the next frame, numbered from 0; `time` is that in the source (s)."""
-        self.log.add(frame_index, time, tracks)
+        self.log.add(index, time, tracks)
 
     def finish(
         self,

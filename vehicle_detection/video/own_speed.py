@@ -213,6 +213,7 @@ class _TrackPoint:
 
     latitude: float
     longitude: float
+    segment: int
     time: float = math.nan
     speed: float = math.nan
 
@@ -222,6 +223,7 @@ class _GpxParser:
 
     def __init__(self) -> None:
         self.points: list[_TrackPoint] = []
+        self._segment = 0
         self._point: _TrackPoint | None = None
         self._text: list[str] | None = None
         self._parser = expat.ParserCreate()
@@ -238,10 +240,11 @@ class _GpxParser:
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
         name = tag.rpartition(":")[2]
-        if name == "trkpt":
-            self._point = _TrackPoint(
-                _parse_float(attributes.get("lat"), 90), _parse_float(attributes.get("lon"), 180)
-            )
+        if name == "trkseg":
+            self._segment += 1
+        elif name == "trkpt":
+            position = _parse_float(attributes.get("lat"), 90), _parse_float(attributes.get("lon"), 180)
+            self._point = _TrackPoint(*position, self._segment)
         elif self._point is not None and name in ("time", "speed"):
             self._text = []
 
@@ -295,8 +298,8 @@ def _read_gpx(data: bytes, name: str) -> tuple[Floats, Floats]:
     except InvalidInputError as error:
         raise InvalidInputError(f"path {name} is refused: {error}") from None
     points = np.array(
-        [(each.time, each.speed, each.latitude, each.longitude) for each in parser.points]
-    ).reshape(-1, 4)
+        [(each.time, each.speed, each.segment, each.latitude, each.longitude) for each in parser.points]
+    ).reshape(-1, 5)
     points = points[np.argsort(points[:, 0], kind="stable")]
     points = points[np.diff(points[:, 0], prepend=-np.inf) > 0]
     if len(points) < 2:
@@ -306,10 +309,15 @@ def _read_gpx(data: bytes, name: str) -> tuple[Floats, Floats]:
         )
     times, speeds = points[:, 0] - points[0, 0], points[:, 1]
     if np.isfinite(speeds).mean() < 0.5:
-        speeds = _speeds_of(times, *np.deg2rad(points[:, 2:]).T)
+        breaks = np.flatnonzero((np.diff(times) > _MAX_GAP) | (np.diff(points[:, 2]) != 0)) + 1
+        parts = np.split(np.column_stack([times, np.deg2rad(points[:, 3:])]), breaks)
+        speeds = np.concatenate([_speeds_of(*part.T) for part in parts])
     known = np.isfinite(speeds)
     if not known.any():
-        raise InvalidInputError(f"path {name} has no speeds, and too few positions to compute them")
+        raise InvalidInputError(
+            f"path {name} has no speeds, and no positions at most {_MAX_GAP:g} s apart to compute them; "
+            "record them every second"
+        )
     return times[known], np.minimum(speeds[known], _MAX_SPEED)
 
 
