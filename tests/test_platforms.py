@@ -41,8 +41,8 @@ GUARDED = {
     ("batch.store", "_lock_file", "fcntl"): "ImportError is caught",
     ("video.ffmpeg", "", "os.register_at_fork"): "hasattr",
     ("video.ffmpeg", "_enlarge", "fcntl"): "on Linux only",
-    ("video.ffmpeg", "wait", "os.WNOHANG"): "returns before on win32",
-    ("video.ffmpeg", "wait", "os.wait4"): "returns before on win32",
+    ("video.ffmpeg", "_poll", "os.WNOHANG"): "wait returns before on win32",
+    ("video.ffmpeg", "_poll", "os.wait4"): "wait returns before on win32",
 }
 """Uses of what only POSIX has, by module, function and name, and why they do no harm elsewhere."""
 

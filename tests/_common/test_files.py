@@ -297,3 +297,35 @@ def test_an_interrupt_at_any_time_leaves_no_temporary_files(tmp_path):
             number += 1
         assert number > 100
         assert (tmp_path / "out.csv").read_text() == "whole"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no locks of folders")
+@pytest.mark.parametrize("error", [FileNotFoundError, BlockingIOError])
+def test_a_new_folder_that_another_process_takes_for_abandoned(tmp_path, monkeypatch, error):
+    lock, folders = files._lock_folder, []
+
+    def lock_second(folder):
+        folders.append(folder)
+        if len(folders) == 1:  # before it is locked, another process removes it
+            folder.rmdir()
+            raise error(errno.ENOENT, "gone")
+        return lock(folder)
+
+    monkeypatch.setattr(files, "_lock_folder", lock_second)
+    with temporary_folder(tmp_path, "demo") as folder:
+        assert folder.is_dir()
+        assert len(folders) == 2
+    assert names(tmp_path) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no modes and links")
+def test_links_and_permissions_of_a_target_stay(tmp_path):
+    real, link = tmp_path / "real.csv", tmp_path / "link.csv"
+    real.write_text("old")
+    real.chmod(0o600)
+    link.symlink_to(real)
+    with atomic_write(link) as part:
+        part.write_text("new")
+    assert link.is_symlink()
+    assert (real.read_text(), stat.S_IMODE(real.stat().st_mode)) == ("new", 0o600)
+    assert names(tmp_path) == ["link.csv", "real.csv"]

@@ -110,3 +110,9 @@ def test_loops_of_symbolic_links(read, error, variable, tmp_path):
     loop.symlink_to(loop)
     with pytest.raises(error, match=r"does not exist|Too many levels of symbolic links"):
         read(loop)
+
+
+def test_a_limit_of_thousands_of_digits(monkeypatch):
+    monkeypatch.setenv(Limit.PIXELS.variable, "9" * 5000)
+    with pytest.raises(InvalidInputError, match="must be a number of pixels"):
+        Limit.PIXELS.current()

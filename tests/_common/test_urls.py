@@ -2,7 +2,7 @@
 
 import pytest
 
-from vehicle_detection._common import hide_credentials, stable_url
+from vehicle_detection._common import hide_credentials, local_path, stable_url
 
 HOST = "https://bucket.example/cards/a.mp4"
 S3 = "?X-Amz-Algorithm=AWS4&X-Amz-Credential=AKIA%2F2026&X-Amz-Date=20260131T081500Z&X-Amz-Signature=ab12"
@@ -43,3 +43,9 @@ def test_parameters_that_may_name_a_file_are_kept():
         assert stable_url(f"{HOST}{query}") == f"{HOST}{query}"
     assert stable_url("s3://bucket/a.mp4") == "s3://bucket/a.mp4"
     assert stable_url("https://anna:pa@ss@nas/a.mp4") == "https://anna@nas/a.mp4"
+
+
+def test_paths_of_file_urls():
+    assert local_path("file:///a%20b/c.mp4") == local_path("FILE:///a%20b/c.mp4") == "/a b/c.mp4"
+    assert local_path("http://host/a%20b") == "http://host/a%20b"
+    assert local_path("a%20b.mp4") == "a%20b.mp4"

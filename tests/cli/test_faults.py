@@ -254,7 +254,7 @@ def test_loops_of_links(clip, tmp_path):
     loop.symlink_to(loop)
     result = run("video", loop, "-o", tmp_path / "out.mp4")
     assert (result.exit_code, "loop.mp4 does not exist; check the path" in result.stderr) == (2, True)
-    # As a target it is replaced, like any link.
+    # As a target it is replaced.
     assert run("video", clip, "-o", loop, "--model", "highway", "-q").exit_code == 0
     assert probe_video(loop).frames == 10
 

@@ -201,7 +201,7 @@ def test_patches_of_another_size_are_named(tmp_path):
     ("options", "message"),
     [
         ({"size": 0}, "size must be an integer from 1 to 4096; got 0"),
-        ({"n_jobs": 0}, "n_jobs must be an integer at least 1; got 0"),
+        ({"n_jobs": 0}, "n_jobs must be an integer from 1 to 1024; got 0"),
     ],
 )
 def test_invalid_options(vehicles_zip, options, message):

@@ -3,6 +3,7 @@
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from fractions import Fraction
@@ -181,3 +182,21 @@ def test_reasons_of_signals():
     )
     if hasattr(signal, "SIGXFSZ"):
         assert "the limit of the system for the size of a file" in exit_reason(-signal.SIGXFSZ, "")
+
+
+def test_a_title_that_looks_like_a_part_of_the_log(tmp_path):
+    title = ["-metadata", "title=Stream mapping: demo"]
+    path = write_clip(tmp_path / "clip.mp4", gray_frames(10), sound=True, options=title)
+    info = probe_video(path)
+    assert (info.frames, info.has_audio) == (10, True)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGCHLD")
+def test_children_that_the_system_reaps(clip):
+    """Some supervisors start programs with SIGCHLD ignored, so that no exit code is known."""
+    code = "import sys, vehicle_detection; print(vehicle_detection.probe_video(sys.argv[1]).frames)"
+    ignored = "signal.signal(signal.SIGCHLD, signal.SIG_IGN)"
+    start = f"import os, signal, sys; {ignored}; os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
+    command = [sys.executable, "-c", start, "-c", code, str(clip)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.stdout, done.returncode) == ("20\n", 0), done.stderr

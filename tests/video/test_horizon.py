@@ -86,3 +86,11 @@ def test_the_horizon_of_real_clips(real_data, name, low, high):
 def test_a_missing_video(tmp_path):
     with pytest.raises(InvalidInputError, match=r"missing\.mp4 does not exist"):
         estimate_video_horizon(tmp_path / "missing.mp4", StubImageDetector(np.empty((0, 4))))
+
+
+def test_a_refused_pipe_is_not_read(clip):
+    with open_source(clip) as source:
+        source.rereadable = False
+        source.read = None
+        with pytest.raises(InvalidInputError, match="which is read only once; pass a fraction"):
+            estimate_video_horizon(source, StubImageDetector(np.empty((0, 4))))

@@ -28,6 +28,7 @@ from tests.video.clips import (
 from vehicle_detection.errors import InvalidInputError, VideoError
 from vehicle_detection.video import probe_video, process, process_video
 from vehicle_detection.video.frame_source import FrameSource
+from vehicle_detection.video.pipeline import _QueuedFrame
 
 
 def test_the_result_does_not_depend_on_the_number_of_workers(clip, tmp_path):
@@ -311,3 +312,43 @@ def test_live_sources_are_not_delayed(tmp_path, monkeypatch):
     process_video(source, None, detector, on_result=results.append)
     assert len(results) == 8
     assert not detector.seen
+
+
+def test_a_run_that_ends_before_its_first_frame_keeps_the_target(clip, tmp_path):
+    target = tmp_path / "out.mp4"
+    target.write_bytes(b"old")
+
+    class Empty(FrameSource):
+        def read(self, first=0, count=None, *, strict=False):
+            reader = process.open_source(clip).read()
+            reader.kill()  # as the user does while a camera starts
+            return reader
+
+    with pytest.raises(VideoError, match="no frame was read, so no video was written"):
+        process_video(Empty("camera", probe_video(clip)), target, StubDetector())
+    assert target.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["out.mp4"]
+
+
+@pytest.mark.parametrize("draw", [True, False])
+def test_frames_that_are_not_searched_are_kept_only_to_be_drawn(clip, tmp_path, draw):
+    class Sparse(StubDetector):
+        """Searches the first frame only."""
+
+        alive = 0
+
+        def search_interval(self, fps):
+            return 1000
+
+        def skip(self, thumbnail):
+            pass
+
+        def interpolate(self, before, after, times):
+            frames = [each for each in gc.get_objects() if isinstance(each, _QueuedFrame)]
+            self.alive = sum(each.frame is not None for each in frames)
+            return [Result(before.index + 1 + number, 0.0, time) for number, time in enumerate(times)]
+
+    detector = Sparse()
+    report = process_video(clip, tmp_path / "out.mp4" if draw else None, detector)
+    assert report.frames == 20
+    assert detector.alive == (19 if draw else 0)

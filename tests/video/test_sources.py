@@ -29,7 +29,7 @@ from tests.video.clips import (
 )
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection.images import write_image
-from vehicle_detection.video import live, open_source, probe_video, process_video, remote
+from vehicle_detection.video import live, open_source, probe_video, process_video, read_frames, remote
 
 
 def numbers(source, **options):
@@ -506,3 +506,28 @@ def test_copies_of_killed_processes_are_removed(clip, tmp_path, monkeypatch):
 )
 def test_names_of_local_copies(url, name):
     assert remote.file_name(url) == name
+
+
+def test_hidden_folders_are_left_out(tmp_path):
+    """The trash folders of memory cards hold deleted recordings."""
+    for folder in ("", ".Trash-1000/files", "$RECYCLE.BIN"):
+        (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+        for number in range(2):
+            write_image(tmp_path / folder / f"{number}.png", np.zeros((48, 64, 3), np.uint8))
+    with open_source(tmp_path) as source:
+        assert [path.name for path in source.files] == ["0.png", "1.png"]
+    with open_source(f"FILE://{tmp_path}") as source:
+        assert len(source.files) == 2
+
+
+@pytest.mark.parametrize(("fps", "rate"), [(np.float32(10), 10), (0.0004, 0.0004), (0.5, 0.5)])
+def test_frame_rates_of_images(fps, rate):
+    with open_source("test_images/*.jpg", fps=fps) as source:
+        assert float(source.info.fps) == pytest.approx(rate)
+
+
+def test_times_may_be_numbers_of_numpy(tmp_path):
+    clip = write_clip(tmp_path / "clip.mp4", gray_frames(10))
+    with read_frames(clip, start=np.float32(0.2), end=np.int64(1)) as frames:
+        assert [index for index, _, _ in frames] == [5, 6, 7, 8, 9]
+    process_video(clip, None, StubDetector(), end=np.float32(0.2))

@@ -18,7 +18,13 @@ from vehicle_detection._common.checks import (
     finite_array,
 )
 from vehicle_detection._common.environment import check_environment
-from vehicle_detection._common.files import atomic_write, check_suffix, check_target, temporary_folder
+from vehicle_detection._common.files import (
+    atomic_write,
+    check_suffix,
+    check_target,
+    is_hidden,
+    temporary_folder,
+)
 from vehicle_detection._common.image_size import image_size
 from vehicle_detection._common.limits import Limit, check_regular_file, read_regular_file
 from vehicle_detection._common.model_file import FORMAT_VERSION, ModelData, read_model, write_model
@@ -34,7 +40,7 @@ from vehicle_detection._common.threads import (
     resolve_jobs,
     single_threaded_opencv,
 )
-from vehicle_detection._common.urls import hide_credentials, is_url, stable_url
+from vehicle_detection._common.urls import hide_credentials, is_url, local_path, stable_url
 from vehicle_detection._common.workspace import NEW_ARRAYS, SPARE, Workspace, with_spare
 
 check_environment()
@@ -75,7 +81,9 @@ __all__ = [
     "finite_array",
     "hide_credentials",
     "image_size",
+    "is_hidden",
     "is_url",
+    "local_path",
     "mirror_patches",
     "pluralize",
     "progress_bar",

@@ -92,12 +92,12 @@ def _conversion_to_uint8(values: NDArray[Any], name: str) -> str:
     return f"convert it with {name}.astype(numpy.uint8) once its values lie in 0-255"
 
 
-def check_channel(channel: object, name: str = "img") -> NDArray[np.uint8]:
-    """Return `channel` if it is ``(H, W)`` uint8."""
+def check_channel(channel: object) -> NDArray[np.uint8]:
+    """Return the argument `img` if it is ``(H, W)`` uint8."""
     if isinstance(channel, np.ndarray) and channel.ndim == 2 and channel.dtype == np.uint8 and channel.size:
         return channel
     raise InvalidInputError(
-        f"{name} must be one (H, W) uint8 channel, got {describe(channel)}; pick a channel with image[..., 0]"
+        f"img must be one (H, W) uint8 channel, got {describe(channel)}; pick a channel with image[..., 0]"
     )
 
 

@@ -7,6 +7,7 @@ import errno
 import os
 import shutil
 import signal
+import stat
 import sys
 import tempfile
 import threading
@@ -48,6 +49,15 @@ def check_suffix(target: str | os.PathLike[str], name: str, suffixes: Sequence[s
     return path
 
 
+def is_hidden(name: str) -> bool:
+    """Whether a file or one of its folders is hidden, a macOS resource folder or the recycle bin of Windows.
+
+    `name` is relative to the folder that is listed, with slashes.
+    """
+    special = ("__MACOSX", "$RECYCLE.BIN")
+    return any(part.startswith(".") or part in special for part in name.split("/"))
+
+
 @contextlib.contextmanager
 def atomic_write(target: str | os.PathLike[str], name: str = "target") -> Iterator[Path]:
     """Yield a temporary path beside `target`, renamed to `target` if the block succeeds.
@@ -62,6 +72,8 @@ def atomic_write(target: str | os.PathLike[str], name: str = "target") -> Iterat
         If the disk is full, or the target cannot be written for another reason.
     """
     path = check_target(target, name)
+    if path.is_symlink() and path.exists():  # the link stays one
+        path = path.resolve()
     # Two stacks: an interrupt can end the first removal, even before it begins.
     with contextlib.ExitStack() as stack, contextlib.ExitStack() as first:
         with _output_errors(path, every=True), _uninterrupted():
@@ -72,12 +84,18 @@ def atomic_write(target: str | os.PathLike[str], name: str = "target") -> Iterat
         with _output_errors(path, part):
             yield part
         with _output_errors(path, every=True):
-            # The temporary file is private; give the output the permissions of any new file.
-            umask = os.umask(0)
-            os.umask(umask)
-            part.chmod(0o666 & ~umask)
+            part.chmod(_permissions(path))  # the temporary file is private
             part.replace(path)
             parts.clear()  # from now on, the name may be that of another process's file
+
+
+def _permissions(path: Path) -> int:
+    """Permissions of an existing file, or else those of any new one."""
+    with contextlib.suppress(OSError):  # it is missing, or a link that leads nowhere
+        return stat.S_IMODE(path.stat().st_mode)
+    umask = os.umask(0)
+    os.umask(umask)
+    return 0o666 & ~umask
 
 
 @contextlib.contextmanager
@@ -212,13 +230,13 @@ def temporary_folder(parent: Path, name: str) -> Iterator[Path]:
             for old in parent.iterdir():
                 if old.name.startswith(prefix) and old.name.endswith(suffix) and old.is_dir():
                     _remove_abandoned(old)
-        with _output_errors(parent / name, every=True), _uninterrupted():
-            folder = Path(tempfile.mkdtemp(prefix=prefix, suffix=suffix, dir=parent))
-            for each in (stack, first):
-                each.callback(_remove_folder, folder)
-        if sys.platform != "win32":
-            with contextlib.suppress(OSError):  # a file system without locks
-                stack.callback(os.close, _lock_folder(folder))
+        locked = False
+        while not locked:
+            with _output_errors(parent / name, every=True), _uninterrupted():
+                folder = Path(tempfile.mkdtemp(prefix=prefix, suffix=suffix, dir=parent))
+                for each in (stack, first):
+                    each.callback(_remove_folder, folder)
+            locked = sys.platform == "win32" or _keep_locked(folder, stack)
         with _output_errors(parent / name):
             yield folder
 
@@ -226,6 +244,17 @@ def temporary_folder(parent: Path, name: str) -> Iterator[Path]:
 def _remove_folder(folder: Path) -> None:
     with _uninterrupted():  # an interrupted `rmtree` may close a file twice
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _keep_locked(folder: Path, stack: contextlib.ExitStack) -> bool:
+    """Lock a new folder; False if another process has removed it before, as an abandoned one."""
+    try:
+        stack.callback(os.close, _lock_folder(folder))
+    except (BlockingIOError, FileNotFoundError):  # the other process is about to remove it, or has
+        return False
+    except OSError:  # a file system without locks
+        return True
+    return folder.exists()
 
 
 def _lock_folder(folder: Path) -> int:

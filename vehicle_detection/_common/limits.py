@@ -43,7 +43,7 @@ class Limit(Enum):
         text = os.environ.get(self.variable, "")
         if not text:
             return int(self.value[1])
-        if not text.isascii() or not text.isdecimal() or not 1 <= int(text[:16]) <= 10**15:
+        if not text.isascii() or not text.isdecimal() or len(text) > 16 or not 1 <= int(text) <= 10**15:
             raise InvalidInputError(
                 f"{self.variable} must be a number of {self.unit}, at least 1; got {text!r}"
             )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from urllib.parse import unquote_plus
+from urllib.parse import unquote, unquote_plus
 
 _URL = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+://")
 # A password may hold an "@": the host begins after the last one.
@@ -25,6 +25,12 @@ _AZURE = re.compile(r"sig|s[eprstv]|srt|spr|sip|sdd|sk(oid|tid|[estv])|saoid|suo
 def is_url(text: str) -> bool:
     """Whether a text is a URL rather than a path."""
     return _URL.match(text) is not None
+
+
+def local_path(text: str) -> str:
+    """Return the path of a ``file://`` URL, and any other text as it is."""
+    scheme = _URL.match(text)
+    return unquote(text[scheme.end() :]) if scheme and scheme[0].lower() == "file://" else text
 
 
 def hide_credentials(text: str) -> str:

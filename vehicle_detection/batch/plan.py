@@ -10,10 +10,17 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 from vehicle_detection import __version__
-from vehicle_detection._common import check_path, describe, hide_credentials, is_url, stable_url
+from vehicle_detection._common import (
+    check_path,
+    describe,
+    hide_credentials,
+    is_hidden,
+    is_url,
+    local_path,
+    stable_url,
+)
 from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
 from vehicle_detection.video import (
     Trip,
@@ -42,9 +49,7 @@ def list_videos(sources: Iterable[str | os.PathLike[str]]) -> dict[str, Facts]:
             raise InvalidInputError(
                 f"sources must be files, folders, patterns or URLs, got {describe(source)}; pass strings"
             )
-        text = os.fspath(source)
-        if text.startswith("file://"):
-            text = unquote(text.removeprefix("file://"))
+        text = local_path(os.fspath(source))
         if not is_url(text):
             check_path(text, "sources", kind="a file, folder or pattern")
         files = dict(_list_remote(text) if is_url(text) else _list_local(Path(text)))
@@ -77,7 +82,8 @@ def _walk(folder: Path) -> Iterator[Path]:
             f"sources {error.filename} cannot be listed ({error.strerror}); change its permissions"
         ) from error
 
-    for parent, _, names in os.walk(folder, onerror=refuse):
+    for parent, folders, names in os.walk(folder, onerror=refuse):
+        folders[:] = [name for name in folders if not is_hidden(name)]
         yield from (Path(parent, name) for name in names)
 
 

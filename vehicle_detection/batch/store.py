@@ -11,9 +11,8 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Protocol, TypeVar
-from urllib.parse import unquote
 
-from vehicle_detection._common import atomic_write, check_path, describe, hide_credentials, is_url
+from vehicle_detection._common import atomic_write, check_path, describe, hide_credentials, is_url, local_path
 from vehicle_detection.errors import InvalidInputError, OutputError, VehicleDetectionError
 from vehicle_detection.video import open_filesystem, with_retries
 
@@ -55,9 +54,7 @@ def open_store(out: str | os.PathLike[str], *, create: bool = False) -> Store:
     """Open the folder or URL of a batch; with `create`, make the folder."""
     if not isinstance(out, (str, os.PathLike)):
         raise InvalidInputError(f"out must be a folder or a URL, got {describe(out)}; pass its path")
-    text = os.fsdecode(out)
-    if text.startswith("file://"):
-        text = unquote(text.removeprefix("file://"))
+    text = local_path(os.fsdecode(out))
     if is_url(text):
         return RemoteStore(text)
     folder = Path(os.path.abspath(check_path(text, "out", kind="a folder or a URL")))

@@ -26,8 +26,10 @@ from vehicle_detection._common import (
     check_integer,
     check_path,
     check_regular_file,
+    is_hidden,
     progress_bar,
     read_regular_file,
+    resolve_jobs,
 )
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import decode_image
@@ -63,11 +65,6 @@ def natural_key(name: str) -> tuple[list[object], str]:
 def parent_folder(name: str) -> str:
     """Folder part of a patch's name."""
     return name.rpartition("/")[0]
-
-
-def is_hidden(name: str) -> bool:
-    """Whether a file is hidden or a macOS resource file."""
-    return any(part == "__MACOSX" or part.startswith(".") for part in name.split("/"))
 
 
 def is_image(name: str) -> bool:
@@ -185,7 +182,7 @@ def decode_listings(
 ) -> NDArray[np.uint8]:
     """Decode all images into one ``(N, size, size, 3)`` array, in the order of the listings."""
     check_integer(size, "size", low=1, high=4096)
-    jobs = check_integer(n_jobs, "n_jobs", low=1) if n_jobs is not None else min(os.cpu_count() or 1, 8)
+    jobs = resolve_jobs(n_jobs) if n_jobs is not None else min(resolve_jobs(None), 8)
     total = sum(len(listing.names) for listing in listings)
     patches = np.empty((total, size, size, 3), np.uint8)
     # OpenCV releases the GIL, so threads suffice. Each decodes a range of rows, as opening a zip takes time.

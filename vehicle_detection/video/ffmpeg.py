@@ -192,13 +192,20 @@ class Process:
         while True:
             with self._lock:
                 if self._popen.returncode is None:
-                    pid, status, usage = os.wait4(self._popen.pid, os.WNOHANG)
-                    if pid:
-                        self._popen.returncode = os.waitstatus_to_exitcode(status)
-                        self.cpu_seconds = usage.ru_utime + usage.ru_stime
+                    self._poll()
                 if self._popen.returncode is not None:
                     return self._popen.returncode
             time.sleep(0.002)
+
+    def _poll(self) -> None:
+        try:
+            pid, status, usage = os.wait4(self._popen.pid, os.WNOHANG)
+        except ChildProcessError:  # SIGCHLD is ignored, as under some supervisors: the code is unknown
+            self._popen.returncode = 0
+            return
+        if pid:
+            self._popen.returncode = os.waitstatus_to_exitcode(status)
+            self.cpu_seconds = usage.ru_utime + usage.ru_stime
 
     def kill(self) -> None:
         """End the process at once; threads that read from it or write to it stop waiting."""
@@ -254,7 +261,9 @@ def video_error(message: str, source: Path | str, code: int, log: str) -> VideoE
 def last_line(log: str) -> str:
     """Last message of ffmpeg's log, without the prefix ``[component @ address]``."""
     lines = [re.sub(r"^(\[[^\]]*\] *)+", "", line).strip() for line in log.splitlines()]
-    return next((line for line in reversed(lines) if line), "no reason given")
+    return next(
+        (line for line in reversed(lines) if line and line != "Conversion failed!"), "no reason given"
+    )
 
 
 def seconds_of(time: str) -> float:

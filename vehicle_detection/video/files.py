@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from vehicle_detection._common import check_path
+from vehicle_detection._common import check_path, is_hidden
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video.probe import probe
 from vehicle_detection.video.trips import find_trips, is_video_file
@@ -20,7 +20,8 @@ IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
 def list_files(path: Path) -> list[Path]:
     """List the files of a source: a file, or the videos of one trip or images of a folder or pattern."""
     if path.is_dir():
-        found = sorted(each for each in path.rglob("*") if each.is_file() and each.name[0] != ".")
+        found = sorted(each for each in path.rglob("*") if each.is_file())
+        found = [each for each in found if not is_hidden(each.relative_to(path).as_posix())]
     elif not path.exists() and glob.has_magic(str(path)):
         found = sorted(Path(each) for each in glob.glob(str(path), recursive=True))
         found = [each for each in found if each.is_file()]

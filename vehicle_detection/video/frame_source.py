@@ -46,6 +46,11 @@ class FrameSource:
         self.name, self.info, self.files = name, info, tuple(files)
         self._on_close = contextlib.ExitStack()
 
+    def __repr__(self) -> str:
+        info = self.info
+        length = f", {info.duration:g} s" if info.duration else ""
+        return f"FrameSource({self.name}, {info.width}x{info.height} at {float(info.fps):g} Hz{length})"
+
     def read(self, first: int = 0, count: int | None = None, *, strict: bool = False) -> Reader:
         """Open a reader of `count` frames from number `first` on; None: to the end.
 

@@ -38,17 +38,18 @@ def estimate_video_horizon(
     """
     boxes: list[NDArray[np.floating]] = []
     check_span(start, end)
-    with borrow_source(source) as opened, opened.read(*frame_range(opened.info, start, end)) as frames:
+    with borrow_source(source) as opened:
         if not opened.rereadable:
             raise InvalidInputError(
                 f"horizon cannot be estimated from {opened.name}, which is read only once; pass a fraction"
             )
         shape, step = opened.info.shape, _step(opened.info, start, end)
-        for count, (_, _, frame) in enumerate(frames):
-            if count >= step * _MAX_FRAMES or sum(map(len, boxes)) >= _ENOUGH_BOXES:
-                break
-            if count % step == 0:
-                boxes.append(detector.detect(frame).boxes)
+        with opened.read(*frame_range(opened.info, start, end)) as frames:
+            for count, (_, _, frame) in enumerate(frames):
+                if count >= step * _MAX_FRAMES or sum(map(len, boxes)) >= _ENOUGH_BOXES:
+                    break
+                if count % step == 0:
+                    boxes.append(detector.detect(frame).boxes)
     try:
         found = estimate_horizon(np.concatenate(boxes), shape)
     except InvalidInputError:  # too few boxes

@@ -22,7 +22,11 @@ class ImageSequence(FrameSource):
 
     def __init__(self, paths: Sequence[Path], fps: float) -> None:
         height, width = read_image(paths[0]).shape[:2]
-        rate = Fraction(fps).limit_denominator(1001)
+        rate = (
+            Fraction(fps).limit_denominator(1001)
+            if fps > 1
+            else 1 / Fraction(1 / fps).limit_denominator(1001)
+        )
         info = VideoInfo(
             width=width, height=height, fps=rate, frames=len(paths), duration=float(len(paths) / rate)
         )

@@ -79,7 +79,7 @@ class _TrackedFrame:
 @dataclass
 class _QueuedFrame:
     time: float
-    frame: Frame
+    frame: Frame | None  # None if it is neither drawn nor asked for
     thumbnail: NDArray[np.float32]
     search: Future[tuple[Any, float]] | None  # None: the frame is not searched
     missed: int = 0  # frames that a live source dropped before this one
@@ -161,6 +161,8 @@ class FramePipeline:
     `drawn_shape` is the shape of drawn frames, by default that of the frames themselves. Where a live source
     drops frames, the next frame is searched, and the written video repeats the last frame as often, so that
     its times stay those of the source.
+
+    Up to `lookahead` frames are decoded before they are needed.
     """
 
     def __init__(
@@ -173,6 +175,7 @@ class FramePipeline:
         drawn_shape: tuple[int, ...] | None = None,
         *,
         delay: int = 0,
+        lookahead: int = 8,
         frames: Frames = "none",
     ) -> None:
         self._seconds: defaultdict[str, float] = defaultdict(float)
@@ -180,9 +183,10 @@ class FramePipeline:
         self._detector: Any = detector
         self._workers, self._interval, self._drawn_shape = workers, interval, drawn_shape
         self._frames, self._delay = frames, delay
+        self._keeps_frames = open_writer is not None or frames != "none"
         self.missed_frames = 0
         """Number of frames that a live source dropped."""
-        self._searched: ClosableQueue[_QueuedFrame] = ClosableQueue(workers * interval + 1)
+        self._searched: ClosableQueue[_QueuedFrame] = ClosableQueue(lookahead)
         self._drawn: ClosableQueue[tuple[Frame, int]] = ClosableQueue(2)
         self._results: ClosableQueue[tuple[Frame | None, Any]] = ClosableQueue(4)
         self._reader: Reader | None = None
@@ -337,7 +341,9 @@ class FramePipeline:
         for name, seconds in result.seconds.items():
             if name != "search":  # measured here, because a detector may omit it
                 self._seconds[name] += seconds
-        drawn = self._draw(item.frame, result) if draw or self._frames == "drawn" else None
+        drawn = None
+        if item.frame is not None and (draw or self._frames == "drawn"):
+            drawn = self._draw(item.frame, result)
         if draw and drawn is not None:
             self._drawn.put((drawn, item.missed))
         self._results.put(({"none": None, "plain": item.frame, "drawn": drawn}[self._frames], result))
@@ -355,7 +361,9 @@ class FramePipeline:
                     search, skipped = pool.submit(self._search, frame), 0
                 else:
                     search = None
-                self._searched.put(_QueuedFrame(moment, frame, thumbnail, search, missed, last))
+                kept = frame if self._keeps_frames else None
+                self._searched.put(_QueuedFrame(moment, kept, thumbnail, search, missed, last))
+                del frame, kept
                 self.missed_frames += missed
                 last, expected = thumbnail, index + 1
         except QueueClosed:

@@ -37,6 +37,8 @@ _STREAM_START = r", start (-?[\d.]+)"
 _DURATION_IS_END = ("matroska,webm", "flv")
 # Rate in Hz above which a rate may be that of a clock, or of frames that arrive in bursts.
 _MAX_RATE = 60
+# Length of the beginning of a remote file whose times are read.
+_REMOTE_SECONDS = "30"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,7 +199,7 @@ def _read_log(path: Path | str) -> _Log:
     if code < 0:
         raise video_error(f"{name} cannot be read: {exit_reason(code, log)}", path, code, log)
     check_frame_size(name, log)
-    header, mapped, decoded = log.partition("Stream mapping:")
+    header, mapped, decoded = log.partition("\nStream mapping:\n")  # not a title in the metadata
     container = _find(r"^Input #0, (\S+),", header, "")
     if not container:
         if _is_text(Path(path)):
@@ -264,8 +266,10 @@ def frame_rate(decoded: str, stream: str) -> tuple[Fraction, bool]:
 
 
 def _frame_times(path: Path | str) -> list[float]:
-    """List the times of all frames in seconds, without decoding them."""
-    options = ("-nostdin", *input_options(path), "-map", "0:V:0", "-c", "copy", "-f", "framecrc", "pipe:1")
+    """List the times of all frames in seconds, without decoding them; of a URL those of its beginning."""
+    limit = () if isinstance(path, Path) else ("-t", _REMOTE_SECONDS)
+    options = ("-nostdin", *limit, *input_options(path), "-map", "0:V:0", "-c", "copy")
+    options += ("-f", "framecrc", "pipe:1")
     with contextlib.closing(Process(options, stdout=True)) as process:
         listing = process.stdout.read().decode()
         process.wait()

@@ -1,6 +1,7 @@
 """Annotate a video with its vehicles.
 
-The result does not depend on the number of workers, and only a few frames are in memory at any time.
+The result does not depend on the number of workers. In memory are a few frames, and those between two
+searched ones, which wait to be drawn.
 """
 
 from __future__ import annotations
@@ -48,6 +49,9 @@ PRESETS = (
     "ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow", "placebo",
 )  # fmt: skip
 """Presets of the H.264 encoder, from the fastest to the one with the smallest files."""
+
+# Maximum size of the frames that are decoded ahead of the search, unless each worker has only one.
+_LOOKAHEAD_BYTES = 256 << 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -304,14 +308,16 @@ class VideoRun:
         self._detector = detector
         fps = float(info.fps)
         delay = 0 if self.source.live else getattr(detector, "search_delay", lambda fps: 0)(fps)
+        interval = getattr(detector, "search_interval", lambda fps: 1)(fps)
         self._pipeline = FramePipeline(
             functools.partial(self.source.read, first, count, strict=strict),
             None if output is None else functools.partial(_open_writer, output, drawn, preset, sound),
             detector,
             workers,
             drawn_shape=drawn_shape,
-            interval=getattr(detector, "search_interval", lambda fps: 1)(fps),
+            interval=interval,
             delay=delay,
+            lookahead=max(workers, min(workers * interval, _LOOKAHEAD_BYTES // math.prod(info.shape))) + 1,
             frames=frames,
         )
 
@@ -387,7 +393,7 @@ def _stop_on_interrupt(run: VideoRun) -> Iterator[None]:
 
 def _sound(source: FrameSource, first: int, end: float | None) -> AudioSource | None:
     """Sound of a source from a frame up to an end in seconds."""
-    return source.audio(first, None if end is None else float(Fraction(end) - first / source.info.fps))
+    return source.audio(first, None if end is None else float(Fraction(float(end)) - first / source.info.fps))
 
 
 def cut_video(

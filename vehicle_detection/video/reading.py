@@ -110,7 +110,7 @@ def frame_range(info: VideoInfo, start: float | None, end: float | None) -> tupl
         )
     # Tolerance: a frame's rounded time selects that frame.
     first, last = (
-        None if value is None else math.ceil(Fraction(value) * info.fps - Fraction(1, 100))
+        None if value is None else math.ceil(Fraction(float(value)) * info.fps - Fraction(1, 100))
         for value in (start, end)
     )
     first = first or 0

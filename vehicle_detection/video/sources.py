@@ -9,9 +9,8 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from urllib.parse import unquote
 
-from vehicle_detection._common import check_number, check_path, describe, temporary_folder
+from vehicle_detection._common import check_number, check_path, describe, local_path, temporary_folder
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video.ffmpeg import NETWORK_TIMEOUT, input_options, source_name
 from vehicle_detection.video.files import IMAGE_SUFFIXES, check_file, list_files
@@ -125,7 +124,7 @@ def open_source(
     """
     if isinstance(source, FrameSource):
         return source
-    check_number(fps, "fps", above=0, high=1000)
+    fps = check_number(fps, "fps", above=0, high=1000)
     if isinstance(source, int) and not isinstance(source, bool):
         source = str(source)
     if isinstance(source, (list, tuple)):
@@ -215,7 +214,7 @@ def _open_url(url: str, scheme: str, fps: float, live: bool | None, reconnect: b
             return _VideoFile(url, info)
         return _open_stream(url, ("-i", url), live, reconnect)
     if scheme == "file":
-        return open_source(unquote(url.removeprefix("file://")), fps=fps, live=live)
+        return open_source(local_path(url), fps=fps, live=live)
     return _download(url)
 
 

@@ -322,6 +322,8 @@ class FrameWriter(_FfmpegStream):
 
         With `trim_sound`, for frames that end before the source does, the sound ends with them.
         """
+        if not self.frames_written:
+            raise VideoError("no frame was read, so no video was written")
         self._process.stdin.close()
         if self._process.wait():
             raise self._error()
