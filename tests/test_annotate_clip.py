@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from moviepy import (
     AudioClip,
+    ColorClip,
     CompositeVideoClip,
     ImageClip,
     ImageSequenceClip,
@@ -284,3 +285,12 @@ def test_a_view_beside_the_frame_widens_the_clip():
     assert width > SHAPE[1]
     assert tuple(clip.size) == (width, height)
     assert {frame.shape for frame in pictures(clip)} == {(height, width, 3)}
+
+
+def test_frames_of_effects_that_are_no_bytes(expected):
+    """Fading and rotating give fractions of gray levels, and single colors 64-bit integers."""
+    faded = clip_of().with_effects([vfx.FadeIn(0.2)])
+    assert faded.get_frame(0.1).dtype == np.float64
+    assert len(pictures(Recorder(faded).clip)) == 20
+    title = ColorClip((200, 120), (9, 9, 9), duration=0.2).with_fps(25)
+    assert len(pictures(Recorder(concatenate_videoclips([title, clip_of()])).clip)) == 25

@@ -21,6 +21,14 @@ from vehicle_detection.errors import InvalidInputError
 CAMERA = Camera.for_frame(SHAPE)
 
 
+@pytest.mark.parametrize(("name", "remedy"), [("focal_px", "field_of_view"), ("horizon_px", "horizon")])
+def test_for_frame_refuses_what_it_computes(name, remedy):
+    with pytest.raises(
+        InvalidInputError, match=f"{name} is not an argument of Camera.for_frame; pass {remedy}"
+    ):
+        Camera.for_frame(SHAPE, **{name: 300})
+
+
 def test_for_frame_places_horizon_and_focal_length():
     camera = Camera.for_frame((1000, 500, 3), horizon=0.4, field_of_view=90.0, height_m=1.5)
     assert camera.focal_px == pytest.approx(500)

@@ -780,3 +780,38 @@ def test_the_search_takes_the_horizon_of_a_camera_file(tmp_path):
 def test_invalid_camera_options(options, message):
     with pytest.raises(InvalidInputError, match=message):
         VehicleDetector(**options)
+
+
+def test_a_given_horizon_is_that_of_the_camera_too(tmp_path):
+    shape = (720, 1280)
+    camera = Camera.for_frame(shape, horizon=0.4)
+    write_camera(camera, tmp_path / "camera.json", shape)
+    found = [
+        VehicleDetector(camera=each, horizon=0.6).camera_of(shape)
+        for each in (camera, tmp_path / "camera.json")
+    ]
+    assert found[0] == found[1]
+    assert found[0].horizon_px == pytest.approx(432)
+    assert VehicleDetector(camera=camera).camera_of(shape) is camera
+
+
+def test_a_shallow_copy_shares_the_search_and_has_its_own_tracks():
+    detector, frames = make(), drive()
+    for frame in frames[:6]:
+        detector.process(frame)
+    other = copy.copy(detector)
+    assert other.model is detector.model
+    assert other._search is detector._search
+    other.process(np.zeros_like(frames[6]))  # a cut
+    assert detector.process(frames[6]).tracks
+    assert not other.process(np.zeros_like(frames[6])).tracks
+
+
+def test_short_descriptions():
+    detector = VehicleDetector()
+    result = detector.process(np.full((180, 320, 3), 90, np.uint8), 0.0)
+    assert repr(detector.model) == "TemplateMixture(6 templates, threshold -0.98 (log-odds))"
+    assert repr(detector) == f"VehicleDetector({detector.model!r}, 1 frame processed)"
+    assert repr(result) == "FrameResult(0 at 0.00 s: 0 detections, 0 vehicles shown)"
+    assert len(repr(load_model("highway"))) < 100
+    assert len(repr(detector.search(np.full((180, 320, 3), 90, np.uint8)))) < 200

@@ -9,7 +9,7 @@ import pytest
 
 from tests.helpers import random_mixture
 from tests.video.clips import child_processes, ffmpeg, running_threads
-from vehicle_detection import TrackWriter, VehicleDetector, process_video, track
+from vehicle_detection import FrameResult, TrackWriter, VehicleDetector, plotting, process_video, track
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.errors import InvalidInputError, VideoError
 from vehicle_detection.synthetic import render_drive
@@ -123,3 +123,14 @@ def test_bad_arguments(clip, detector, tmp_path):
     (tmp_path / "text.mp4").write_text("no video")
     with pytest.raises(VideoError, match="is a text file, not a video"):
         track(tmp_path / "text.mp4", detector, stream=True)
+
+
+def test_functions_of_results_take_tracked_frames(clip, detector):
+    found = list(track(clip, detector, stream=True, end=0.2))
+    plotting.plot_tracks(found)
+    plotting.plot_birds_eye(found)
+    plotting.plot_stage_times(found)
+    np.testing.assert_array_equal(detector.annotate(found[1].frame, found[1]), found[1].picture)
+    assert [each.index for each in detector.backfill(found)] == [each.index for each in found]
+    assert found[0].windows is found[0].result.windows
+    assert type(found[0].result) is FrameResult

@@ -70,13 +70,13 @@ LENS_STD, GIVEN_LENS_STD, UNKNOWN_LENS_STD = 0.08, 0.03, 0.25
 """Relative standard error of the focal length of a typical lens, of a given field of view, and of a guess."""
 
 
-def check_shape(shape: object, name: str = "shape") -> FrameShape:
+def check_shape(shape: object) -> FrameShape:
     """Return height and width of ``image.shape``, a tuple of two or more positive integers."""
     if not isinstance(shape, tuple) or len(shape) < 2:
         raise InvalidInputError(
-            f"{name} must be (height, width, ...), got {describe(shape)}; pass image.shape"
+            f"shape must be (height, width, ...), got {describe(shape)}; pass image.shape"
         )
-    return check_integer(shape[0], f"{name}[0]", low=1), check_integer(shape[1], f"{name}[1]", low=1)
+    return check_integer(shape[0], "shape[0]", low=1), check_integer(shape[1], "shape[1]", low=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,11 +182,12 @@ class Camera:
             field_of_view, fisheye = LENSES[lens]
             known = {"fisheye": fisheye} | known
         angle = check_number(field_of_view, "field_of_view", low=1, high=170)
-        unknown = sorted(known.keys() - cls.__dataclass_fields__.keys() | known.keys() & {"focal_px"})
+        derived = {"focal_px": "field_of_view", "horizon_px": "horizon"}
+        unknown = sorted(known.keys() - cls.__dataclass_fields__.keys() | known.keys() & derived.keys())
         if unknown:
             raise InvalidInputError(
-                f"{unknown[0]} is not an argument of Camera.for_frame; pass field_of_view, "
-                "or build Camera(...)"
+                f"{unknown[0]} is not an argument of Camera.for_frame; "
+                f"pass {derived.get(unknown[0], 'an attribute of Camera')}, or build Camera(...)"
             )
         half = math.radians(angle) / 2
         k1, k2 = (check_number(known.get(name, 0.0), name, low=-1, high=1) for name in ("k1", "k2"))

@@ -25,6 +25,7 @@ from vehicle_detection._common import (
     degrade_patches,
     describe,
     mirror_patches,
+    pluralize,
     read_model,
     write_model,
 )
@@ -87,7 +88,7 @@ class Template:
         return weights, float(self.intercept - weights @ self.mean)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class VehicleClassifier:
     """A linear classifier of 64x64 patches, or of feature vectors.
 
@@ -309,10 +310,12 @@ class VehicleClassifier:
         search = BandSearch if method == "shared" else ReferenceSearch
         return search(self, n_jobs=n_jobs)
 
+    def __repr__(self) -> str:
+        return f"VehicleClassifier({self.summary()[0]})"
+
     def summary(self) -> tuple[str, dict[str, str]]:
         """Describe the model for display: a title, and named facts."""
-        count = len(self.templates)
-        title = f"{self.params.length} features, {count} template{'s' * (count > 1)}"
+        title = f"{self.params.length} features, {pluralize(len(self.templates), 'template')}"
         return title, {name: str(value) for name, value in asdict(self.params).items()}
 
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -22,6 +22,7 @@ from vehicle_detection._common import (
     check_sequence,
     check_type,
     describe,
+    pluralize,
 )
 from vehicle_detection.boxes import Detections, ScoreScale
 from vehicle_detection.camera import (
@@ -75,7 +76,7 @@ _USUAL_FPS = 25.0
 _FRAME_TOLERANCE = 1e-5
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FrameResult:
     """The result of one frame of a video.
 
@@ -110,6 +111,12 @@ class FrameResult:
     def shown(self) -> tuple[Track, ...]:
         """The tracks to draw."""
         return tuple(track for track in self.tracks if track.shown)
+
+    def __repr__(self) -> str:
+        time = "" if self.time is None else f" at {self.time:.2f} s"
+        found = pluralize(len(self.detections), "detection") if self.searched else "not searched"
+        shown = f"{pluralize(len(self.shown), 'vehicle')} shown"
+        return f"{type(self).__name__}({self.index}{time}: {found}, {shown})"
 
     def to_supervision(self) -> Any:
         """Convert the shown tracks to ``supervision.Detections`` with their ids as ``tracker_id``."""
@@ -155,13 +162,15 @@ class VehicleDetector:
         lens above the road in meters, without a `Camera` or a file. If the lens is unknown, distances assume
         58 degrees and have a standard error of at least 25%.
     horizon
-        Height of the horizon as a fraction of the frame's height; overrides that of `search_params`.
+        Height of the horizon as a fraction of the frame's height; overrides that of `search_params` and that
+        of `camera`.
     n_jobs
         Threads of the search of one frame.
     every
         Search every n-th frame of a video, to save time. The tracks of the frames between are interpolated
-        by `process_video`, and predicted by `process`. None: `process_video` searches at least 12 frames per
-        second, but every frame for heat maps, `diagnostics` and functions; `process` searches every frame.
+        by `process_video`, which holds these frames in memory, and predicted by `process`. None:
+        `process_video` searches at least 12 frames per second, but every frame for heat maps, `diagnostics`
+        and functions; `process` searches every frame.
     own_speed
         Speed of the camera's own vehicle over the time of the video (`read_own_speed`). Where it is known,
         labels state speeds over ground, without a sign; otherwise speeds relative to the camera.
@@ -251,6 +260,9 @@ class VehicleDetector:
         self._speed_warning = True
         self.reset()
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.model!r}, {pluralize(self._index, 'frame')} processed)"
+
     def __getstate__(self) -> dict[str, Any]:
         """Return everything but the threads of the search, for copies and other processes."""
         return {name: value for name, value in vars(self).items() if name != "_search"}
@@ -258,6 +270,14 @@ class VehicleDetector:
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._search = self.model.open_search(*self._search_options)
+
+    def __copy__(self) -> VehicleDetector:
+        """Return a detector with the same model and search threads, and a state of its own."""
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
+        for name in ("_tracker", "_heat_history", "_drawer"):
+            setattr(other, name, copy.deepcopy(getattr(self, name)))
+        return other
 
     def reset(self, *, fps: float | None = None) -> None:
         """Forget all frames, before the first frame of another video.
@@ -359,7 +379,7 @@ class VehicleDetector:
         640
         """
         shape = check_shape(shape)
-        if isinstance(self.camera, Camera):
+        if isinstance(self.camera, Camera) and not self._horizon_given:
             return self.camera
         if shape not in self._cameras:
             self._cameras[shape] = self._open_camera(shape)
@@ -374,8 +394,7 @@ class VehicleDetector:
             known = {"horizon": params.horizon, "horizon_std_px": std * shape[0]}
         if self.camera is None or self.camera in LENSES:
             return Camera.for_frame(shape, **known, **self._lens)
-        assert not isinstance(self.camera, Camera)
-        camera = read_camera(self.camera, shape)
+        camera = self.camera if isinstance(self.camera, Camera) else read_camera(self.camera, shape)
         if self._horizon_given:
             row = known["horizon"] * shape[0]
             camera = replace(camera, horizon_px=row, horizon_std_px=known["horizon_std_px"])
@@ -670,7 +689,6 @@ class _ClipAnnotator:
     def __init__(
         self, detector: VehicleDetector, fps: float | None, on_result: Callable[[FrameResult], object] | None
     ) -> None:
-        # The copy shares the model and its threads; `reset` gives it a state of its own.
         self._detector = copy.copy(detector)
         self._fps, self._on_result = fps, on_result
         self._time: float | None = None
@@ -683,6 +701,8 @@ class _ClipAnnotator:
             if self._time is None or time < self._time:
                 self._detector.reset(fps=self._fps or _USUAL_FPS)
             frame = get_frame(time)
+            if frame.dtype != np.uint8:  # effects such as FadeIn return fractions of gray levels
+                frame = np.clip(frame, 0, 255).astype(np.uint8)
             result = self._detector.process(frame, time)
             self._picture, self._time = self._detector.annotate(frame, result), time
             if self._on_result is not None:

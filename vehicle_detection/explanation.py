@@ -44,7 +44,7 @@ _AROUND, _PICTURE_HEIGHT, _BOX_COLOR = 0.2, 180, (240, 228, 66)
 _MIN_WINDOW_IOU = 0.2
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Explanation:
     """How the score of a box comes about.
 
@@ -93,6 +93,9 @@ class Explanation:
         score = "not found" if self.score is None else f"score {self.score:.2f}"
         terms = " ".join(f"{value:+.2f} {name}" for name, value in self.terms.items())
         return f"{score}, template {self.template + 1}: margin {self.margin:.2f} = {terms}"
+
+    def __repr__(self) -> str:
+        return f"Explanation({self})"
 
 
 def explain(detector: VehicleDetector, image: NDArray[np.uint8], box: ArrayLike) -> Explanation:

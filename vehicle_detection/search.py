@@ -60,7 +60,7 @@ from vehicle_detection.params import (
 from vehicle_detection.windows import band_windows, search_windows
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SearchResult:
     """The result of searching one frame; it depends on no other frame.
 
@@ -84,6 +84,9 @@ class SearchResult:
     shape: tuple[int, int]
     thumbnail: NDArray[np.float32]
     seconds: float
+
+    def __repr__(self) -> str:
+        return f"SearchResult(windows={self.windows}, vehicles={self.vehicles}, shape={self.shape})"
 
 
 class FrameSearch(ABC):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, Literal, overload
 
@@ -13,79 +13,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_flags
-from vehicle_detection.boxes import Detections
 from vehicle_detection.confidence import Model
 from vehicle_detection.detector import FrameResult, VehicleDetector
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.tracking import Track
 from vehicle_detection.video import Source, VideoRun, open_viewer
 
 
-@dataclass(frozen=True, eq=False)
-class TrackedFrame:
-    """One frame of `track` with its vehicles.
-
-    It has the attributes of its `FrameResult`, so `TrackWriter` and the other functions that take results
-    accept it.
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class TrackedFrame(FrameResult):
+    """One frame of `track` with its vehicles: a `FrameResult` that holds the frame, too.
 
     Attributes
     ----------
     frame
         ``(H, W, 3)`` uint8 RGB.
-    result
-        Windows, detections and tracks of the frame.
 
     Examples
     --------
     >>> (first,) = track("test_images/*.jpg", "highway", stream=True, end=0.04)
-    >>> first.index, first.time, first.searched, first.frame.shape
-    (0, 0.0, True, (720, 1280, 3))
+    >>> first, first.frame.shape
+    (TrackedFrame(0 at 0.00 s: 2 detections, 2 vehicles shown), (720, 1280, 3))
     """
 
+    time: float
     frame: NDArray[np.uint8]
-    result: FrameResult
     _detector: VehicleDetector
 
     @property
-    def index(self) -> int:
-        """Number of the frame, from 0 at the first one that is processed."""
-        return self.result.index
-
-    @property
-    def time(self) -> float:
-        """Time of the frame in the source, in seconds."""
-        assert self.result.time is not None
-        return self.result.time
-
-    @property
-    def detections(self) -> Detections:
-        """Boxes of this frame before tracking; none if the frame was not searched."""
-        return self.result.detections
-
-    @property
-    def searched(self) -> bool:
-        """Whether the frame was searched; if not, its tracks are interpolated."""
-        return self.result.searched
-
-    @property
-    def tracks(self) -> tuple[Track, ...]:
-        """All tracks, including those not shown."""
-        return self.result.tracks
-
-    @property
-    def shown(self) -> tuple[Track, ...]:
-        """The tracks to draw."""
-        return self.result.shown
-
-    @property
-    def seconds(self) -> dict[str, float]:
-        """Time spent per stage."""
-        return self.result.seconds
+    def result(self) -> FrameResult:
+        """The result without the frame."""
+        return FrameResult(**{each.name: getattr(self, each.name) for each in fields(FrameResult)})
 
     @cached_property
     def picture(self) -> NDArray[np.uint8]:
-        """A copy of the frame with its vehicles, drawn when it is read first."""
-        return self._detector.annotate(self.frame, self.result)
+        """A copy of the frame with its vehicles, drawn on first access and then kept."""
+        return self._detector.annotate(self.frame, self)
 
 
 @overload
@@ -197,13 +159,13 @@ def track(
             f"source {run.source.name} has no end, so its results cannot be listed; pass stream=True, "
             "or an end in seconds"
         )
-    return [item.result for item in results if item is not None]
+    return [each.result if isinstance(each, TrackedFrame) else each for each in results if each is not None]
 
 
 def _frames(
     run: VideoRun, detector: VehicleDetector, *, close: bool, show: bool, progress: bool
-) -> Generator[TrackedFrame | None]:
-    """Yield None once, then the frames; close everything at the end."""
+) -> Generator[FrameResult | None]:
+    """Yield None once, then the results, with frames if the run keeps them; close everything at the end."""
     with contextlib.ExitStack() as stack:
         if close:
             stack.callback(detector.close)
@@ -212,7 +174,10 @@ def _frames(
         viewer = stack.enter_context(contextlib.closing(open_viewer(run.source.name))) if show else None
         results = stack.enter_context(contextlib.closing(run.results(progress=progress)))
         for frame, result in results:
-            tracked = TrackedFrame(frame, result, detector)  # type: ignore[arg-type]
+            if frame is None:
+                yield result
+                continue
+            tracked = TrackedFrame(**vars(result), frame=frame, _detector=detector)
             if viewer is not None:
                 viewer.show(tracked.picture)
             yield tracked

@@ -68,7 +68,6 @@ def test_nms_removes_the_weaker_of_two_overlapping_boxes(count, seed):
     assert nms(kept, scores[rows]).tolist() == list(range(len(rows)))
     expected = greedy_nms(boxes, scores, max_iou=0.35, max_coverage=0.75)
     np.testing.assert_array_equal(rows, expected)
-    np.testing.assert_array_equal(nms(boxes, scores, max_boxes=3), expected[:3])
 
 
 def test_the_minimum_margin_is_inclusive():
@@ -107,28 +106,6 @@ def test_boxes_on_a_part_of_a_vehicle_are_removed(other, margin, kept):
     assert whole_vehicles(boxes, np.array([2.0, margin])).tolist() == kept
     rows = whole_vehicles(boxes[::-1], np.array([margin, 2.0]))
     assert sorted((1 - rows).tolist()) == kept
-
-
-def test_no_windows():
-    empty = ScoredWindows.empty()
-    assert (len(empty), empty.boxes.shape, empty.margins.shape, empty.templates.shape) == (
-        0,
-        (0, 4),
-        (0,),
-        (0,),
-    )
-    assert whole_vehicles(empty.boxes, empty.margins).tolist() == []
-
-
-def test_windows_of_several_searches_are_joined_without_those_outside():
-    first, second = random_windows(3, 1), random_windows(2, 2)
-    outside = ScoredWindows(np.array([[-90.0, 0, -10, 40]]), np.array([1.0]), np.array([4]))
-    joined = ScoredWindows.join([first, ScoredWindows.empty(), outside, second], (300, 300, 3))
-    assert len(joined) == 5
-    np.testing.assert_array_equal(joined.boxes, np.vstack([first.boxes, second.boxes]))
-    np.testing.assert_array_equal(joined.margins, np.concatenate([first.margins, second.margins]))
-    np.testing.assert_array_equal(joined.templates, np.concatenate([first.templates, second.templates]))
-    assert len(ScoredWindows.join([], (300, 300))) == len(ScoredWindows.join([outside], (300, 300))) == 0
 
 
 def test_more_than_a_third_of_a_box_must_be_visible():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,22 +45,6 @@ class ScoredWindows:
     def __getitem__(self, rows: NDArray[Any] | slice) -> ScoredWindows:
         return ScoredWindows(self.boxes[rows], self.margins[rows], self.templates[rows])
 
-    @classmethod
-    def empty(cls) -> ScoredWindows:
-        """No windows."""
-        return cls(np.empty((0, 4)), np.empty(0), np.empty(0, np.intp))
-
-    @classmethod
-    def join(cls, parts: Sequence[ScoredWindows], shape: tuple[int, ...]) -> ScoredWindows:
-        """Concatenate the windows of several searches, without those mostly outside the frame."""
-        parts = [part for part in parts if len(part)] or [cls.empty()]
-        joined = cls(
-            np.concatenate([part.boxes for part in parts]),
-            np.concatenate([part.margins for part in parts]),
-            np.concatenate([part.templates for part in parts]),
-        )
-        return joined[np.flatnonzero(mostly_inside(joined.boxes, shape))]
-
     def best(self, count: int) -> ScoredWindows:
         """Keep the `count` best windows, best first; equal margins keep their order."""
         return self[np.argsort(-self.margins, kind="stable")[:count]]
@@ -96,17 +79,15 @@ def nms(
     *,
     iou: float = _NMS_IOU,
     cover: float = _NMS_COVER,
-    max_boxes: int | None = None,
 ) -> NDArray[np.intp]:
-    """Rows of the boxes that greedy suppression keeps, best first, at most `max_boxes`.
+    """Rows of the boxes that greedy suppression keeps, best first.
 
     A box is removed by a better one at an IoU above `iou`, or if more than `cover` of the smaller one is
     covered.
     """
     order = np.argsort(-scores, kind="stable")
-    count = len(boxes) if max_boxes is None else max_boxes
     sides = np.ascontiguousarray(boxes.T)
-    return np.asarray(group(sides, order, iou, cover, count, scores, np.empty((0, 4)), np.empty(0)))
+    return np.asarray(group(sides, order, iou, cover, len(boxes), scores, np.empty((0, 4)), np.empty(0)))
 
 
 def whole_vehicles(boxes: Floats, margins: Floats) -> NDArray[np.intp]:

@@ -79,7 +79,7 @@ class FoundVehicles(NamedTuple):
     perspective: Floats  # (N,) what perspective has added
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TemplateMixture:
     """A model of several templates, for vehicles on any road.
 
@@ -180,6 +180,9 @@ class TemplateMixture:
                 f"method must be 'shared' for a mixture of templates, got {method!r}; use the model 'highway'"
             )
         return MixtureSearch(self, n_jobs=n_jobs)
+
+    def __repr__(self) -> str:
+        return f"TemplateMixture({self.summary()[0]})"
 
     def summary(self) -> tuple[str, dict[str, str]]:
         """Describe the model for display: a title, and named facts."""

@@ -44,7 +44,7 @@ COLORS: tuple[Color, ...] = tuple((r / 255, g / 255, b / 255) for r, g, b in TRA
 LINE_COLORS: tuple[Color, ...] = tuple(COLORS[index] for index in (4, 5, 2, 6, 0, 1))
 """The same colors without yellow, which is hard to see on white."""
 
-ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = COLORS
+_, SKY, _, YELLOW, BLUE, VERMILION, _ = COLORS
 VEHICLE, OTHER = VERMILION, BLUE
 TRUTH = (1.0, 1.0, 1.0)
 LINESTYLES = ("-", "--", "-.", ":")

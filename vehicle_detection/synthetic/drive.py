@@ -181,6 +181,10 @@ class Drive:
         self._traffic = [(v, VehicleBody(v.kind, v.color, v.seed, v.view, config.light)) for v in traffic]
         self._pitch_phases = np.random.default_rng([config.seed, 8]).uniform(0, 2 * np.pi, 3)
 
+    def __repr__(self) -> str:
+        height, width = self.shape[:2]
+        return f"Drive({self._frames} frames of {width}x{height} at {self.fps:g} Hz)"
+
     def __len__(self) -> int:
         return self._frames
 
