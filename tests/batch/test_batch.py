@@ -7,11 +7,13 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pandas
 import pytest
 from typer.testing import CliRunner
 
 from tests.batch.helpers import check_whole, counts, files, records, run
+from tests.helpers import random_mixture
 from tests.video.clips import damage_sizes
 from vehicle_detection import batch_status, batch_summary, process_video, run_batch
 from vehicle_detection.batch import store
@@ -92,9 +94,7 @@ def test_results_may_lie_beside_the_sources(card, model, tmp_path):
         assert len(records(out)) == 1
         if out == above:
             shutil.rmtree(next(folder.glob("date=*")))
-    with pytest.raises(
-        InvalidInputError, match=r"holds only videos that a batch wrote to .*; pass the videos"
-    ):
+    with pytest.raises(InvalidInputError, match="holds only videos that a batch wrote; pass the videos"):
         run(next(folder.glob("videos/date=*")), folder, model)
 
 
@@ -285,3 +285,131 @@ def test_the_status_sums_up_the_records(tmp_path):
     status = batch_status(tmp_path)
     assert (status.done, status.frames, status.tracks) == (100, 150_000, 700)
     assert "1.7 hours of video" in str(status)
+
+
+def test_annotated_videos_are_no_sources(card, model, tmp_path):
+    """Also those of another batch, and by another path."""
+    options = {"options": {"every": 10}}
+    assert counts(run(card, card / "results", model, **options)) == (3, 0, 0, 0)
+    assert counts(run(card, card / "others", model, **options)) == (3, 0, 0, 0)
+    (tmp_path / "link").symlink_to(card)
+    assert counts(run(tmp_path / "link", card / "results", model, **options)) == (0, 0, 0, 3)
+    assert counts(run(card, tmp_path / "link" / "results", model, **options)) == (0, 0, 0, 3)
+
+
+def test_linked_folders_are_searched_once(card, tmp_path):
+    folder = tmp_path / "cards"
+    folder.mkdir()
+    (folder / "a").symlink_to(card)
+    (folder / "b").symlink_to(card)
+    (card / "loop").symlink_to(folder)
+    (card / ".Trash").mkdir()
+    shutil.copy(card / "20260131_093000_F.mp4", card / ".Trash")
+    assert [*list_videos([folder])] == sorted(str(file) for file in card.glob("*.mp4"))
+
+
+@pytest.mark.parametrize("changed", [False, True])
+def test_a_trip_whose_first_segment_is_gone(clip, model, tmp_path, changed):
+    """A camera that records in a loop deletes the oldest segment."""
+    card, out = tmp_path / "card", tmp_path / "out"
+    card.mkdir()
+    for second in range(5):
+        shutil.copy2(clip, card / f"20260131_08150{second}_F.mp4")
+    assert counts(run(card, out, model, tracks_only=True)) == (1, 0, 0, 0)
+    (card / "20260131_081500_F.mp4").unlink()
+    options = {"every": 3} if changed else {}
+    report = run(card, out, model, tracks_only=True, options=options)
+    assert counts(report) == ((1, 0, 0, 0) if changed else (0, 0, 0, 1))
+    found = check_whole(out, done=1, failed=0)
+    assert [len(each["sources"]) for each in found.values()] == [4 if changed else 5]
+    assert counts(run(card, out, model, tracks_only=True, options=options)) == (0, 0, 0, 1)
+
+
+def test_another_model_in_the_same_file(card, tmp_path):
+    """Workers that live longer than a run keep their detector."""
+    one, path = card / "20260131_093000_F.mp4", tmp_path / "own.safetensors"
+    rows = []
+    with ThreadPoolExecutor(1) as executor:
+        for seed in (0, 1):
+            random_mixture(offset=seed / 2).save(path)
+            run_batch(one, tmp_path / "out", executor, model=path, tracks_only=True, progress=False)
+            rows.append(parquet.read_table(tmp_path / "out" / "tracks")["score"].to_pylist())
+    random_mixture(offset=0.5).save(path)
+    run(one, tmp_path / "fresh", path, tracks_only=True)
+    assert parquet.read_table(tmp_path / "fresh" / "tracks")["score"].to_pylist() == rows[1] != rows[0]
+
+
+def test_another_model_file_on_a_worker_is_an_error(card, tmp_path, monkeypatch):
+    path = tmp_path / "own.safetensors"
+    random_mixture().save(path)
+
+    def elsewhere(task):
+        random_mixture(offset=0.5).save(path)
+        return trip_module.run_trip(task)
+
+    monkeypatch.setattr("vehicle_detection.batch.run.run_trip", elsewhere)
+    report = run(card / "20260131_093000_F.mp4", tmp_path / "out", path, tracks_only=True)
+    assert counts(report) == (0, 0, 1, 0)
+    assert "is not the one with which the batch was started" in next(iter(report.messages.values()))
+
+
+def test_records_of_runs_with_other_parameters_at_the_same_time(card, model, tmp_path):
+    one, out = card / "20260131_093000_F.mp4", tmp_path / "out"
+    run(one, out, model, tracks_only=True)
+    first = next((out / "records").iterdir()).read_text()
+    (key,) = records(out)
+    run(one, out, model, tracks_only=True, options={"every": 3})
+    # As if the first run had planned before, and finished after the second one had listed the records.
+    (out / "records" / f"{key}.json").write_text(first)
+    place = out / json.loads(first)["outputs"]["tracks"]
+    shutil.copy(next((out / "tracks").rglob("*.parquet")), place)
+    task = {"key": next(other for other in records(out) if other != key), "replaces": []}
+    record = records(out)[task["key"]]
+    trip_module._remove_earlier(store.open_store(out), {**record, **task}, record["outputs"])
+    check_whole(out, done=1, failed=0)
+
+
+def test_an_error_cancels_trips_that_have_not_begun(many, model, tmp_path):
+    def stop(record):
+        raise KeyError("stop")
+
+    began = []
+
+    class Counting(ThreadPoolExecutor):
+        def submit(self, function, task):
+            return super().submit(lambda: (began.append(task), function(task))[1])
+
+    with Counting(1) as executor, pytest.raises(KeyError, match="stop"):
+        run_batch(many, tmp_path / "out", executor, model=model, progress=False, on_record=stop)
+    assert len(began) < 5
+
+
+def test_options_of_other_types(card, model, tmp_path):
+    camera = tmp_path / "camera.json"
+    camera.write_text('{"field_of_view": 90}')
+    options = {"camera": camera, "conf": np.float32(0.5), "every": np.int64(3)}
+    one = card / "20260131_093000_F.mp4"
+    assert counts(run(one, tmp_path / "out", model, tracks_only=True, options=options)) == (1, 0, 0, 0)
+
+
+def test_a_summary_must_not_replace_a_source(card, model, tmp_path):
+    source = card / "20260131_093000_F.mp4"
+    before = source.read_bytes()
+    words = ["batch", "-o", str(tmp_path / "out"), "--tracks-only", "--summary", str(source), str(card)]
+    result = CliRunner().invoke(app, words)
+    assert (result.exit_code, source.read_bytes()) == (2, before)
+    assert "--summary must end in .csv" in result.stderr
+
+
+def test_an_unknown_lens_has_one_warning(card, model, tmp_path):
+    words = ["batch", "-o", str(tmp_path / "out"), "--tracks-only", "--model", str(model), "--jobs", "1"]
+    source = str(card / "20260131_093000_F.mp4")
+    assert "distances assume a lens of 58 degrees" in CliRunner().invoke(app, [*words, source]).stderr
+    known = CliRunner().invoke(app, [*words, "--fov", "90", source])
+    assert (known.exit_code, known.stderr) == (0, "")
+
+
+def test_a_damaged_record_does_not_stop_the_status(tmp_path):
+    (tmp_path / "records").mkdir()
+    (tmp_path / "records" / "a-b.json").write_text('{"status": "failed"}')
+    assert batch_status(tmp_path).failed == 0

@@ -138,3 +138,39 @@ def test_the_query_of_a_url_tells_no_time():
     names = [f"https://nas/card/20260131_08150{n}_F.mp4?X-Amz-Date=20300101T120000Z&sig=a/b" for n in (0, 1)]
     (trip,) = find_trips(names, duration=lambda _: 1.0)
     assert (trip.camera, len(trip.files), trip.start.year) == ("front", 2, 2026)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("car07_{}", "car08_{}"),
+        ("ch1_{}", "ch2_{}"),
+        ("{}_ch1", "{}_ch2"),
+        ("{}_1", "{}_2"),
+        ("Front_01_{}", "Front_02_{}"),
+        ("AB123CD_{}_F", "AB456CD_{}_F"),
+        ("123AB_{}_F", "456AB_{}_F"),
+    ],
+)
+def test_vehicles_and_channels_are_trips_of_their_own(names):
+    times = [f"20260131_0815{second:02}" for second in (0, 5, 10, 15)]
+    found = summary([f"{name.format(time)}.mp4" for name in names for time in times])
+    assert [files for _, files in found] == [[f"{name.format(time)}.mp4" for time in times] for name in names]
+
+
+@pytest.mark.parametrize(
+    ("form", "camera"),
+    [
+        ("2026_0131_0815{:02}_{:04}F.MP4", "front"),
+        ("NO20260131-0815{:02}-{:06}F.MP4", "front"),
+        ("DJI_202601310815{:02}_{:04}_D.MP4", "unknown"),
+        ("{1:04}_20260131_0815{0:02}.MP4", "unknown"),
+        ("2026_0131_0815{:02}_{:04}T.MP4", "unknown"),
+        ("260131_0815{:02}_{:03}_FH.MP4", "front"),
+        ("260131_0815{:02}_{:03}_RH.MP4", "rear"),
+    ],
+)
+def test_counters_of_files_are_no_names(form, camera):
+    names = [form.format(second, 7 + number) for number, second in enumerate((0, 5, 10, 15))]
+    assert summary(names) == [(camera, names)]
+    assert find_trips(names)[0].start == datetime(2026, 1, 31, 8, 15)

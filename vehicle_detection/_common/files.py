@@ -143,7 +143,10 @@ def _output_errors(path: Path, part: Path | None = None, *, every: bool = False)
     except VehicleDetectionError:
         raise
     except OSError as error:
-        concerned = error.errno in _DISK_ERRORS and error.filename in (None, str(part))
+        concerned = error.errno in _DISK_ERRORS and str(part) in (
+            error.filename or str(part),
+            error.filename2,
+        )
         if not every and not concerned:
             raise
         kept = "; the existing file is unchanged" if path.is_file() else ""

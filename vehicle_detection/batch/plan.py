@@ -8,15 +8,18 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from importlib import resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
 from vehicle_detection import __version__
 from vehicle_detection._common import (
+    available_cores,
     check_path,
     describe,
     hide_credentials,
-    is_hidden,
     is_url,
     local_path,
     stable_url,
@@ -28,6 +31,7 @@ from vehicle_detection.video import (
     is_video_file,
     open_filesystem,
     probe_video,
+    walk_files,
     with_retries,
 )
 
@@ -38,7 +42,7 @@ _NO_HEAD = (400, 401, 403, 405, 501)
 
 
 Facts = Mapping[str, Any]
-"""What storage tells about a file when it lists it, such as its size and entity tag; empty if unknown."""
+"""What storage states about a file when it lists it, such as its size and entity tag; empty if unknown."""
 
 
 def list_videos(sources: Iterable[str | os.PathLike[str]]) -> dict[str, Facts]:
@@ -63,7 +67,7 @@ def list_videos(sources: Iterable[str | os.PathLike[str]]) -> dict[str, Facts]:
 
 def _list_local(path: Path) -> Iterator[tuple[str, Facts]]:
     if path.is_dir():
-        files: Iterable[Path] = (each for each in _walk(path) if is_video_file(each))
+        files: Iterable[Path] = (each for each in walk_files(path, "sources") if is_video_file(each))
     elif path.exists():
         files = [path]
     elif glob.has_magic(str(path)):
@@ -71,20 +75,8 @@ def _list_local(path: Path) -> Iterator[tuple[str, Facts]]:
         files = (each for each in files if is_video_file(each))
     else:
         raise InvalidInputError(f"sources {path} does not exist; check the path")
-    return ((os.path.abspath(each), {}) for each in files if each.is_file())
-
-
-def _walk(folder: Path) -> Iterator[Path]:
-    """Yield the files of a folder and below; a folder that cannot be read is an error, not an empty one."""
-
-    def refuse(error: OSError) -> None:
-        raise InvalidInputError(
-            f"sources {error.filename} cannot be listed ({error.strerror}); change its permissions"
-        ) from error
-
-    for parent, folders, names in os.walk(folder, onerror=refuse):
-        folders[:] = [name for name in folders if not is_hidden(name)]
-        yield from (Path(parent, name) for name in names)
+    # The same file by another path of its folder is the same source. A link to a file keeps its own name.
+    return ((os.path.join(os.path.realpath(each.parent), each.name), {}) for each in files if each.is_file())
 
 
 def _list_remote(url: str) -> Iterator[tuple[str, Facts]]:
@@ -121,7 +113,12 @@ def group_files(files: Sequence[str], group: str) -> list[Trip]:
     named = [file if is_url(file) else Path(file) for file in files]
     if group == "file":
         return [trip for file in named for trip in find_trips([file])]
-    return find_trips(named, duration=_duration)
+    # Which durations are needed does not depend on them, so they are probed at the same time.
+    needed: dict[Path | str, float] = {}
+    find_trips(named, duration=lambda file: needed.setdefault(file, 0.0))
+    with ThreadPoolExecutor(available_cores(), thread_name_prefix="vehicle-probe") as pool:
+        needed = dict(zip(needed, pool.map(_duration, needed), strict=True))
+    return find_trips(named, duration=needed.__getitem__)
 
 
 def _duration(file: Path | str) -> float:
@@ -164,7 +161,22 @@ def plan_trip(
         "date": _date(trip, sources[0]),
         "start": None if trip.start is None else trip.start.isoformat(),
         "settings": dict(settings),
+        "fingerprint": fingerprint,
     }
+
+
+def fingerprint_of(settings: Mapping[str, Any]) -> str:
+    """Hash of the model's file, and of the camera's if there is one."""
+    shipped, camera = shipped_model(settings["model"]), settings["options"].get("camera")
+    data = shipped.read_bytes() if shipped.is_file() else Path(settings["model"]).read_bytes()
+    if os.path.isfile(str(camera)):
+        data += Path(camera).read_bytes()
+    return hashlib.sha256(data).hexdigest()
+
+
+def shipped_model(model: str) -> Traversable:
+    """File of a shipped model, if `model` is its name."""
+    return resources.files("vehicle_detection") / "models" / f"{model}.safetensors"
 
 
 def _shown(uri: str) -> str:

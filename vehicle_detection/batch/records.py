@@ -80,7 +80,7 @@ def with_source(source: str, message: str) -> str:
     >>> with_source("a.mp4", "a.mp4 is incomplete"), with_source("a.mp4", "its worker was killed")
     ('a.mp4 is incomplete', 'a.mp4: its worker was killed')
     """
-    return message if source in message else f"{source}: {message}"
+    return message if " ".join(source.split()) in message else f"{source}: {message}"
 
 
 def record_path(key: str) -> str:
@@ -106,7 +106,8 @@ def _parse(data: bytes) -> dict[str, Any] | None:
         record = json.loads(data)
     except ValueError:
         return None
-    return record if isinstance(record, dict) and "status" in record else None
+    whole = isinstance(record, dict) and "status" in record and bool(record.get("sources"))
+    return record if whole else None
 
 
 def _key(path: str) -> str:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import hashlib
+import contextlib
 import json
 import os
 import queue
 import re
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from vehicle_detection import __version__
 from vehicle_detection._common import (
     available_cores,
     check_choice,
@@ -29,7 +30,15 @@ from vehicle_detection._common import (
     pluralize,
     progress_bar,
 )
-from vehicle_detection.batch.plan import group_files, list_videos, plan_trip, source_id, trip_id
+from vehicle_detection.batch.plan import (
+    fingerprint_of,
+    group_files,
+    list_videos,
+    plan_trip,
+    shipped_model,
+    source_id,
+    trip_id,
+)
 from vehicle_detection.batch.records import (
     DONE,
     ERROR,
@@ -40,11 +49,11 @@ from vehicle_detection.batch.records import (
     write_record,
 )
 from vehicle_detection.batch.store import Store, open_store
-from vehicle_detection.batch.trip import BUSY, remove_replaced, run_trip, warm_up
+from vehicle_detection.batch.trip import BUSY, RECORDED, remove_replaced, run_trip, warm_up
 from vehicle_detection.batch.workers import WorkerPool
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.video import PRESETS
+from vehicle_detection.video import PRESETS, Trip
 
 # Attempts at a trip whose worker is lost.
 _ATTEMPTS = 3
@@ -199,14 +208,17 @@ def run_batch(
     own = None
     if executor is None and pending:
         executor = own = WorkerPool(
-            min(workers, len(pending)), (warm_up, (settings["model"], settings["options"]))
+            min(workers, len(pending)), (warm_up, (settings, fingerprint_of(settings)))
         )
     counts = {DONE: 0, FAILED: 0, ERROR: 0}
     frames = 0
     messages: dict[str, str] = {}
     try:
-        with progress_bar(progress, len(pending), unit="trip", terminal_only=True) as bar:
-            for made in _run(executor, pending, store):
+        with (
+            progress_bar(progress, len(pending), unit="trip", terminal_only=True) as bar,
+            contextlib.closing(_run(executor, pending, store)) as records,
+        ):
+            for made in records:
                 bar.update()
                 if not made["new"]:
                     skipped += 1
@@ -254,9 +266,9 @@ def _settings(model: object, options: Mapping[str, Any] | None, **others: Any) -
             "the model to a file"
         )
     name = os.fspath(model)
-    if not _shipped(name).is_file() and Path(name).exists():
+    if not shipped_model(name).is_file() and Path(name).exists():
         name = os.path.abspath(name)
-    given = dict(options or {})
+    given = {name: _plain(value) for name, value in dict(options or {}).items()}
     if os.path.isfile(str(given.get("camera"))):
         given["camera"] = os.path.abspath(given["camera"])
     settings = {"model": name, "options": given, **others}
@@ -273,18 +285,11 @@ def _settings(model: object, options: Mapping[str, Any] | None, **others: Any) -
     return settings
 
 
-def _shipped(model: str) -> Traversable:
-    """File of a shipped model, if `model` is its name."""
-    return resources.files("vehicle_detection") / "models" / f"{model}.safetensors"
-
-
-def _fingerprint(settings: Mapping[str, Any]) -> str:
-    """Hash of the model's file, and of the camera's if there is one."""
-    shipped, camera = _shipped(settings["model"]), settings["options"].get("camera")
-    data = shipped.read_bytes() if shipped.is_file() else Path(settings["model"]).read_bytes()
-    if os.path.isfile(str(camera)):
-        data += Path(camera).read_bytes()
-    return hashlib.sha256(data).hexdigest()
+def _plain(value: Any) -> Any:
+    """Return a path as text, and a number of NumPy as one of Python."""
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def _plan(
@@ -295,17 +300,15 @@ def _plan(
     part: tuple[int, int],
 ) -> list[dict[str, Any]]:
     """Describe the work on each trip of this shard."""
-    own = tuple(f"{store.name}{separator}videos{separator}date=" for separator in {"/", os.sep})
-    files = [each for each in listed if not each.startswith(own)]
+    files = [each for each in listed if not _is_result(each, store)]
     if not files:
-        raise InvalidInputError(
-            f"sources holds only videos that a batch wrote to {store.name}; pass the videos to process"
-        )
+        raise InvalidInputError("sources holds only videos that a batch wrote; pass the videos to process")
     trips = group_files(files, group)
-    fingerprint = _fingerprint(settings)
+    fingerprint = fingerprint_of(settings)
     earlier: dict[str, list[str]] = {}  # keys of records by the identity of their trip
     for key in record_keys(store):
         earlier.setdefault(key.partition("-")[0], []).append(key)
+    shortened = _shortened(trips, earlier, store)
     number, count = part
     tasks = []
     mine = [trip for trip in trips if int(trip_id(trip), 16) % count == number - 1]
@@ -316,10 +319,46 @@ def _plan(
         # A trip replaces the earlier ones that began with one of its files.
         ids = (source_id(str(file)) for file in trip.files)
         keys = [key for each in ids for key in earlier.get(each, ())]
-        task["recorded"] = task["key"] in keys
+        longer = shortened.get(str(trip.files[0]))
+        if longer is not None and _covers(longer, task, store):
+            task["key"] = longer["key"]
+        elif longer is not None:
+            keys.append(longer["key"])
+        task["recorded"] = task["key"] in keys or longer is not None
         task["replaces"] = [key for key in keys if key != task["key"]]
         tasks.append(task)
     return tasks
+
+
+def _is_result(file: str, store: Store) -> bool:
+    """Whether a file is an annotated video of this batch, or of another one in a folder."""
+    found = re.fullmatch(r"(.+)[/\\]videos[/\\]date=[^/\\]+[/\\]camera=[^/\\]+[/\\]([^/\\]+)\.mp4", file)
+    if found is None:
+        return False
+    return found[1] == store.name or os.path.isfile(f"{found[1]}/records/{found[2]}.json")
+
+
+def _shortened(
+    trips: Iterable[Trip], earlier: Mapping[str, Sequence[str]], store: Store
+) -> dict[str, dict[str, Any]]:
+    """Find records of trips whose first segments are gone, as in loop recording, by the first one left."""
+    first = {str(trip.files[0]) for trip in trips}
+    known = {source_id(str(file)) for trip in trips for file in trip.files}
+    gone = [key for identity, keys in earlier.items() if identity not in known for key in keys]
+    if not gone or all(source_id(each) in earlier for each in first):
+        return {}
+    found: dict[str, dict[str, Any]] = {}
+    for record in read_records(store, gone).values():
+        found |= {source["uri"]: record for source in record["sources"][1:] if source["uri"] in first}
+    return found
+
+
+def _covers(record: Mapping[str, Any], task: Mapping[str, Any], store: Store) -> bool:
+    """Whether a complete trip holds all files of another one, which would have the same parameters."""
+    same = all(record.get(name) == task[name] for name in ("settings", "fingerprint"))
+    current = record["status"] == DONE and record.get("version") == __version__
+    held = all(source in record["sources"] for source in task["sources"])
+    return same and current and held and is_complete(record, store.exists)
 
 
 def _pending(tasks: Iterable[dict[str, Any]], store: Store, retry_failed: bool) -> list[dict[str, Any]]:
@@ -339,8 +378,8 @@ def _pending(tasks: Iterable[dict[str, Any]], store: Store, retry_failed: bool) 
 
 def _run(
     executor: Executor | None, pending: Iterable[dict[str, Any]], store: Store
-) -> Iterator[Mapping[str, Any]]:
-    """Yield the record of each trip."""
+) -> Generator[Mapping[str, Any]]:
+    """Yield the record of each trip; closing it cancels those that have not begun."""
     attempts: Counter[str] = Counter()
     running: dict[Future[Any], dict[str, Any]] = {}
     finished: queue.SimpleQueue[Future[Any]] = queue.SimpleQueue()
@@ -378,6 +417,9 @@ def _run(
     except BrokenExecutor as error:  # such as a scheduler that was killed: the next run does the rest
         for task in (*waiting, *running.values(), *busy):
             yield _basic_record(task, f"{error}") | {"new": True}
+    finally:
+        for future in running:
+            future.cancel()
 
 
 def _outcome(
@@ -407,7 +449,7 @@ def _lost_record(task: Mapping[str, Any], error: Exception, store: Store) -> dic
 def _basic_record(task: Mapping[str, Any], message: str) -> dict[str, Any]:
     """Record of a trip without a result."""
     return {
-        **{name: task[name] for name in ("key", "sources", "camera", "date", "start", "settings")},
+        **{name: task[name] for name in RECORDED},
         "status": ERROR,
         "message": message,
         "started": time.time(),

@@ -55,6 +55,8 @@ def open_store(out: str | os.PathLike[str], *, create: bool = False) -> Store:
     if not isinstance(out, (str, os.PathLike)):
         raise InvalidInputError(f"out must be a folder or a URL, got {describe(out)}; pass its path")
     text = local_path(os.fsdecode(out))
+    if not text:
+        raise InvalidInputError("out must be a folder or a URL, got ''; pass its path")
     if is_url(text):
         return RemoteStore(text)
     folder = Path(os.path.abspath(check_path(text, "out", kind="a folder or a URL")))

@@ -14,6 +14,7 @@ from typing import Any
 
 from vehicle_detection import __version__
 from vehicle_detection._common import ParquetRows, hide_credentials, is_url, temporary_folder
+from vehicle_detection.batch.plan import fingerprint_of
 from vehicle_detection.batch.records import (
     DONE,
     ERROR,
@@ -38,24 +39,32 @@ from vehicle_detection.video import FrameSource, download, open_source, process_
 BUSY = "busy"
 """Status of a trip that another process is working on; it is not recorded."""
 
+RECORDED = ("key", "sources", "camera", "date", "start", "settings", "fingerprint")
+"""What the record of a trip takes from its task."""
+
 _COLUMNS = {
     "trip": "string", "frame": "int64", "time_s": "double", "track_id": "int64",
     **dict.fromkeys(DIGITS, "double"),
 }  # fmt: skip
 
 
-def warm_up(model: str, options: dict[str, Any]) -> None:
+def warm_up(settings: dict[str, Any], fingerprint: str) -> None:
     """Load the model and compile the kernels in this process."""
-    _detector({"model": model, "options": options}).warm_up((180, 320))
+    _detector(settings, fingerprint).warm_up((180, 320))
 
 
 _of_thread = threading.local()
 
 
-def _detector(settings: Mapping[str, Any]) -> VehicleDetector:
+def _detector(settings: Mapping[str, Any], fingerprint: str) -> VehicleDetector:
     """Detector of this thread, which keeps the last one: a detector holds the tracks of one video."""
-    wanted = settings["model"], settings["options"]
+    wanted = settings["model"], settings["options"], fingerprint
     if getattr(_of_thread, "wanted", None) != wanted:
+        if fingerprint_of(settings) != fingerprint:
+            raise TransientVideoError(
+                f"the file of the model {settings['model']}, or of the camera, is not the one with which the "
+                "batch was started; copy the same file to all machines, and start the batch again"
+            )
         _of_thread.detector, _of_thread.wanted = VehicleDetector(wanted[0], n_jobs=1, **wanted[1]), wanted
     detector: VehicleDetector = _of_thread.detector
     return detector
@@ -76,7 +85,7 @@ def run_trip(task: Mapping[str, Any]) -> dict[str, Any]:
             return record | {"new": False}
         started = time.time()
         record = {
-            **{name: task[name] for name in ("key", "sources", "camera", "date", "start", "settings")},
+            **{name: task[name] for name in RECORDED},
             "version": __version__,
             "host": platform.node(),
             "started": started,
@@ -124,7 +133,7 @@ def _replace(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
 def _process(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
     """Write the outputs of a trip; return the facts for its record."""
     settings, key = task["settings"], task["key"]
-    detector = _detector(settings)
+    detector = _detector(settings, task["fingerprint"])
     place = f"date={task['date']}/camera={task['camera']}/{key}"
     with _scratch(store, key) as folder:
         video = None if settings["tracks_only"] else folder / "video.mp4"
@@ -144,10 +153,10 @@ def _process(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
             raise type(error)(_with_urls(str(error), task, folder)) from error
         damage = _with_urls(report.damage, task, folder)
         outputs = {"tracks": f"tracks/{place}.parquet"}
-        store.publish(folder / "tracks.parquet", outputs["tracks"])
-        if video is not None:
+        if video is not None:  # the larger file first, for which there may be no space
             outputs["video"] = f"videos/{place}.mp4"
             store.publish(video, outputs["video"])
+        store.publish(folder / "tracks.parquet", outputs["tracks"])
     return {
         "status": DONE,
         "frames": report.frames,
@@ -204,6 +213,8 @@ def _check_access(file: str) -> None:
         with open(file, "rb") as opened:
             opened.read(1)
     except OSError as error:
+        if isinstance(error, FileNotFoundError):
+            raise TransientVideoError(f"{file} cannot be read (removed, renamed or unmounted)") from error
         reason = error.strerror or str(error)
         raise TransientVideoError(
             f"{file} cannot be read ({reason}); check its permissions and its disk"
@@ -250,9 +261,10 @@ def _remove_earlier(store: Store, task: Mapping[str, Any], outputs: Mapping[str,
         for path in record.get("outputs", {}).values():
             store.remove(path)
         store.remove(record_path(key))
-    # Outputs whose record a killed process did not write any more.
+    # Outputs of another run at the same time, or of a killed process that has not written their record.
     identity, place = task["key"].partition("-")[0], f"date={task['date']}/camera={task['camera']}"
     for kind in ("tracks", "videos"):
         for path in store.list_files(f"{kind}/{place}", f"{identity}-"):
             if path not in outputs.values():
                 store.remove(path)
+                store.remove(record_path(path.rpartition("/")[2].partition(".")[0]))

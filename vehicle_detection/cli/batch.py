@@ -22,7 +22,7 @@ from vehicle_detection.cli.options import (
     Preset,
     flag,
 )
-from vehicle_detection.cli.output import option_names, print_error
+from vehicle_detection.cli.output import UNKNOWN_LENS, option_names, print_error
 from vehicle_detection.errors import InvalidInputError
 
 
@@ -88,9 +88,9 @@ def batch(
 ) -> None:
     """Track the vehicles of many videos in parallel; run again to do what is missing or changed."""
     if summary is not None:
-        from vehicle_detection._common import check_target
+        from vehicle_detection._common import check_suffix
 
-        check_target(summary, "--summary")
+        check_suffix(summary, "--summary", (".csv",))
     if status:
         from vehicle_detection.batch import batch_status
 
@@ -135,6 +135,9 @@ def batch(
     for source, message in done.messages.items():
         print_error(f"warning: {with_source(source, message)}")
     _write_summary(output, summary)
+    lens_is_known = any(option is not None for option in (camera, fov))
+    if done.done and not lens_is_known and not quiet:
+        print_error(UNKNOWN_LENS)
     if not quiet:
         typer.echo(str(done))
         typer.echo(f"wrote {hide_credentials(output)}" + (f", {summary}" if summary else ""))

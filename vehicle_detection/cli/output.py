@@ -18,6 +18,12 @@ import typer
 
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
 
+UNKNOWN_LENS = (
+    "warning: distances assume a lens of 58 degrees, and may be wrong by a factor of 2 or more; "
+    "pass --fov or --camera"
+)
+"""Printed where distances are shown although nothing is known of the lens."""
+
 Result = TypeVar("Result")
 
 # Width of tables that are not printed to a terminal; fits a fingerprint in one line.

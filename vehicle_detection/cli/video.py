@@ -32,6 +32,7 @@ from vehicle_detection.cli.options import (
     parse_blur,
 )
 from vehicle_detection.cli.output import (
+    UNKNOWN_LENS,
     announce_replaced,
     check_distinct_paths,
     name_kept_files,
@@ -45,10 +46,6 @@ if TYPE_CHECKING:
     from vehicle_detection.params import DrawParams
 
 DAMAGED = 3  # exit code
-_UNKNOWN_LENS = (
-    "warning: distances assume a lens of 58 degrees, and may be wrong by a factor of 2 or more; "
-    "pass --fov or --camera"
-)
 _NOT_SQUARE = (
     "warning: the pixels of this video are not square (width to height {}), so distances are wrong; "
     'convert it first: ffmpeg -i IN -vf "scale=trunc(iw*sar/2)*2:ih,setsar=1" OUT'
@@ -335,7 +332,7 @@ def video(
         with search_everywhere(loaded, conf) as everywhere:
             warn_of_horizon(given, estimate_video_horizon(source, everywhere, start=start, end=end))
     if done.tracks and not detector.lens_is_known and not quiet:
-        print_error(_UNKNOWN_LENS)
+        print_error(UNKNOWN_LENS)
     if done.tracks and opened.info.pixel_aspect != 1 and not quiet:
         print_error(_NOT_SQUARE.format(opened.info.pixel_aspect))
     if not quiet or profile:

@@ -1,5 +1,6 @@
 """Reading and writing video: sources, trips, own speed, ffmpeg, the pipeline and the annotated video."""
 
+from vehicle_detection.video.files import walk_files
 from vehicle_detection.video.frame_source import FrameSource
 from vehicle_detection.video.horizon import estimate_video_horizon
 from vehicle_detection.video.own_speed import OwnSpeed, read_own_speed
@@ -37,5 +38,6 @@ __all__ = [
     "process_video",
     "read_frames",
     "read_own_speed",
+    "walk_files",
     "with_retries",
 ]

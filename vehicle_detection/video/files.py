@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,7 @@ IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
 def list_files(path: Path) -> list[Path]:
     """List the files of a source: a file, or the videos of one trip or images of a folder or pattern."""
     if path.is_dir():
-        found = sorted(each for each in path.rglob("*") if each.is_file())
-        found = [each for each in found if not is_hidden(each.relative_to(path).as_posix())]
+        found = sorted(each for each in walk_files(path) if each.is_file())
     elif not path.exists() and glob.has_magic(str(path)):
         found = sorted(Path(each) for each in glob.glob(str(path), recursive=True))
         found = [each for each in found if each.is_file()]
@@ -42,6 +42,26 @@ def list_files(path: Path) -> list[Path]:
             f"one with a pattern such as '{example}', or process all with vehicle-detection batch"
         )
     return [Path(file) for file in trips[0].files]
+
+
+def walk_files(folder: Path, name: str = "source") -> Iterator[Path]:
+    """Yield the files of a folder and below that are not hidden, each once, also where links lead to folders.
+
+    A folder that cannot be read is an error, not an empty one; `name` is that of the argument.
+    """
+
+    def refuse(error: OSError) -> None:
+        raise InvalidInputError(
+            f"{name} {error.filename} cannot be listed ({error.strerror}); change its permissions"
+        ) from error
+
+    visited = set[str]()
+    for parent, folders, files in os.walk(folder, onerror=refuse, followlinks=True):
+        place = os.path.realpath(parent)
+        folders[:] = [] if place in visited else [each for each in folders if not is_hidden(each)]
+        if place not in visited:
+            yield from (Path(parent, each) for each in files if not is_hidden(each))
+        visited.add(place)
 
 
 def _natural_order(path: Path) -> list[Any]:

@@ -1,8 +1,8 @@
 """Groups the files of dash-cams, which write segments of one to ten minutes, into trips.
 
-A file name tells the camera and either the time of the first frame (``20260131_081500_F.MP4``,
+A file name contains the camera and either the time of the first frame (``20260131_081500_F.MP4``,
 ``2026-01-31_08-15-00-front.mp4``) or a running number of four digits (``GRMN0001.MP4``, ``GX010042.MP4``).
-With a number, the modification times tell whether there is a gap, unless the files were copied without them.
+With a number, the modification times show whether there is a gap, unless the files were copied without them.
 """
 
 from __future__ import annotations
@@ -35,6 +35,10 @@ _MAX_SEGMENT = 660.0
 _TIME = re.compile(
     r"(?<!\d)(20\d{2})[-_.]?(\d{2})[-_.]?(\d{2})[-_. T]{0,3}(\d{2})[-_.h]?(\d{2})[-_.m]?(\d{2})(?!\d{6})"
 )
+# Nextbase, whose years have two digits: 260131_081500_001_FH.MP4.
+_SHORT_TIME = re.compile(r"^(\d{2})(\d{2})(\d{2})_(\d{2})(\d{2})(\d{2})(?=_\d{3}_[A-Z]{2}$)", re.IGNORECASE)
+# A number that counts the files of a camera, perhaps with a letter or two for the kind of recording.
+_COUNTER = re.compile(r"(?<![A-Za-z0-9])\d{3,}(?=[A-Za-z]{0,2}(?![A-Za-z0-9]))")
 _GOPRO = re.compile(r"^G[HXLP](\d{2})(\d{4})$", re.IGNORECASE)
 _CAMERA_WORDS = {
     "front": "front", "rear": "rear", "back": "rear", "left": "left", "right": "right",
@@ -43,16 +47,18 @@ _CAMERA_WORDS = {
     # BlackVue: an event letter before the camera's.
     "nf": "front", "ef": "front", "pf": "front", "mf": "front",
     "nr": "rear", "er": "rear", "pr": "rear", "mr": "rear",
+    # Nextbase, in high resolution; copies in low resolution are other trips.
+    "fh": "front", "rh": "rear",
 }  # fmt: skip
 # Folders with names of letters alone are not named after a camera.
 _CAMERA_FOLDERS = {word: camera for word, camera in _CAMERA_WORDS.items() if len(word) >= 4}
 UNKNOWN_CAMERA = "unknown"
-"""Camera of a file whose name does not tell it."""
+"""Camera of a file whose name does not contain it."""
 
 
 @dataclass(frozen=True)
 class _Segment:
-    """What the name of a file tells about it."""
+    """What the name of a file contains."""
 
     camera: str
     start: datetime | None
@@ -72,7 +78,7 @@ class Trip:
     camera
         ``"front"``, ``"rear"``, ``"left"``, ``"right"``, ``"interior"`` or ``"unknown"``.
     start
-        Time of the first frame by the camera's clock, if the name tells it.
+        Time of the first frame by the camera's clock, if the name contains it.
 
     Examples
     --------
@@ -161,21 +167,26 @@ def _parse_name(name: PurePosixPath) -> _Segment:
     if gopro:  # the chapter comes before the number of the recording
         return _Segment(_folder_camera(name), None, f"gopro {gopro[2]}", int(gopro[1]))
     start, rest = None, stem
-    found = _TIME.search(stem)
+    found = _TIME.search(stem) or _SHORT_TIME.search(stem)
     if found:
+        year, *others = (int(part) for part in found.groups())
         try:
-            start = datetime(*(int(part) for part in found.groups()))  # type: ignore[arg-type]
+            start = datetime(year if year >= 100 else 2000 + year, *others)  # type: ignore[arg-type]
         except ValueError:  # not a time after all
             start = None
         else:
-            rest = stem[: found.start()] + " " + stem[found.end() :]
+            # With a time, a counter adds nothing; other numbers are those of vehicles and channels.
+            rest = f"{stem[: found.start()]} {_COUNTER.sub('', stem[found.end() :])}"
     camera, rest = _take_camera(rest, codes=start is not None)
     if camera is None:
         camera = _folder_camera(name)
-    numbers = re.findall(r"\d{4,}", rest)
+    numbers = re.findall(r"\d{4,}", stem if start else rest)
     number = int(numbers[-1]) if numbers else None
-    # With a time, the number that counts the files of a camera adds nothing.
-    series = re.sub(r"\d+", "", rest) if start else re.sub(r"\d+(?=\D*$)", "#", rest)
+    series = (
+        re.sub(r"(?<![A-Za-z0-9])\d{3,}(?![A-Za-z0-9])", "", rest)
+        if start
+        else re.sub(r"\d+(?=\D*$)", "#", rest)
+    )
     return _Segment(camera, start, series.strip(" _-.").lower(), number)
 
 
