@@ -413,3 +413,26 @@ def test_a_damaged_record_does_not_stop_the_status(tmp_path):
     (tmp_path / "records").mkdir()
     (tmp_path / "records" / "a-b.json").write_text('{"status": "failed"}')
     assert batch_status(tmp_path).failed == 0
+
+
+def test_a_dry_run_changes_nothing(card, model, tmp_path):
+    out = tmp_path / "out"
+    options = {"tracks_only": True, "dry_run": True}
+    report = run(card, out, model, **options)
+    assert not out.exists()
+    assert str(report) == "3 trips: 3 to do, which replace 0 earlier results; 0 skipped"
+    assert [(len(trip["files"]), trip["camera"]) for trip in report.planned] == [
+        (2, "front"), (1, "front"), (2, "rear")
+    ]  # fmt: skip
+    run(card, out, model, tracks_only=True)
+    before = files(out)
+    os.utime(card / "20260131_093000_F.mp4", ns=(1, 2))
+    words = ["batch", "-o", str(out), "--model", str(model), "--tracks-only", "--dry-run", str(card)]
+    result = CliRunner().invoke(app, words)
+    assert result.stdout.splitlines() == [
+        f"2026-01-31 09:30:00  front  1 file from {card}/20260131_093000_F.mp4, replaces 1 earlier result",
+        "3 trips: 1 to do, which replace 1 earlier result; 2 skipped",
+    ]
+    assert files(out) == before
+    with pytest.raises(InvalidInputError, match="is not a folder"):
+        run(card, card / "20260131_093000_F.mp4", model, **options)

@@ -82,6 +82,9 @@ class BatchReport:
         Elapsed time.
     messages
         Message of each failed trip and each error of this run, by its first source.
+    planned
+        With `dry_run`, the trips that would be processed: ``files``, ``camera``, ``start`` and ``replaces``,
+        the keys of earlier results that the new ones would replace.
 
     Examples
     --------
@@ -99,8 +102,15 @@ class BatchReport:
     frames: int
     seconds: float
     messages: Mapping[str, str]
+    planned: tuple[Mapping[str, Any], ...] = ()
 
     def __str__(self) -> str:
+        if self.planned:
+            replaced = sum(len(each["replaces"]) for each in self.planned)
+            return (
+                f"{pluralize(self.trips, 'trip')}: {len(self.planned):,} to do, which replace "
+                f"{pluralize(replaced, 'earlier result')}; {self.skipped:,} skipped"
+            )
         rate = self.frames / self.seconds if self.seconds else 0.0
         return (
             f"{pluralize(self.trips, 'trip')}: {self.done:,} done, {self.failed:,} failed, "
@@ -123,6 +133,7 @@ def run_batch(
     audio: bool = True,
     preset: str = "veryfast",
     retry_failed: bool = False,
+    dry_run: bool = False,
     progress: bool = True,
     on_record: Callable[[Mapping[str, Any]], object] | None = None,
 ) -> BatchReport:
@@ -161,6 +172,8 @@ def run_batch(
         As in `process_video`.
     retry_failed
         Also process trips again whose source could not be processed.
+    dry_run
+        Only find out what is to be done: nothing is processed, written or removed.
     progress
         Show a progress bar if standard error is a terminal.
     on_record
@@ -186,7 +199,9 @@ def run_batch(
     started = time.perf_counter()
     check_choice(group, "group", ("trip", "file"))
     part = _parse_shard(shard)
-    check_flags(tracks_only=tracks_only, audio=audio, retry_failed=retry_failed, progress=progress)
+    check_flags(
+        tracks_only=tracks_only, audio=audio, retry_failed=retry_failed, dry_run=dry_run, progress=progress
+    )
     if executor is not None and not hasattr(executor, "submit"):
         raise InvalidInputError(
             f"executor must be an executor of concurrent.futures, got {describe(executor)}; omit it"
@@ -201,10 +216,25 @@ def run_batch(
     single = isinstance(sources, (str, os.PathLike))
     given = (sources,) if single else check_sequence(sources, "sources", "files, folders, patterns or URLs")
     listed = list_videos(given)
-    store = open_store(out, create=True)
+    store = open_store(out, create=not dry_run, exists=not dry_run)
     tasks = _plan(listed, store, settings, group, part)
-    pending = _pending(tasks, store, retry_failed)
+    pending, superseded = _pending(tasks, store, retry_failed)
     skipped = len(tasks) - len(pending)
+    if dry_run:
+        names = ("files", "camera", "start", "replaces")
+        return BatchReport(
+            trips=len(tasks),
+            done=0,
+            failed=0,
+            errors=0,
+            skipped=skipped,
+            frames=0,
+            seconds=time.perf_counter() - started,
+            messages={},
+            planned=tuple({name: task[name] for name in names} for task in pending),
+        )
+    for task, record in superseded:
+        remove_replaced(store, task, record)
     own = None
     if executor is None and pending:
         executor = own = WorkerPool(
@@ -361,19 +391,24 @@ def _covers(record: Mapping[str, Any], task: Mapping[str, Any], store: Store) ->
     return same and current and held and is_complete(record, store.exists)
 
 
-def _pending(tasks: Iterable[dict[str, Any]], store: Store, retry_failed: bool) -> list[dict[str, Any]]:
-    """Trips that are missing, incomplete or, with `retry_failed`, have failed."""
+def _pending(
+    tasks: Iterable[dict[str, Any]], store: Store, retry_failed: bool
+) -> tuple[list[dict[str, Any]], list[tuple[dict[str, Any], dict[str, Any]]]]:
+    """Select the trips that are missing, incomplete or, with `retry_failed`, have failed.
+
+    Also returns complete ones with their records that have replaced others, which are still there.
+    """
     records = read_records(store, (task["key"] for task in tasks if task["recorded"]))
     outputs = {path for kind in ("tracks", "videos") for path in store.list_files(kind)} if records else set()
-    pending = []
+    pending, superseded = [], []
     for task in tasks:
         record = records.get(task["key"])
         again = retry_failed and record is not None and record["status"] == FAILED
         if again or not is_complete(record, outputs.__contains__):
             pending.append({**task, "again": again})
         elif record is not None and task["replaces"]:  # such as an error while the source was away
-            remove_replaced(store, task, record)
-    return pending
+            superseded.append((task, record))
+    return pending, superseded
 
 
 def _run(

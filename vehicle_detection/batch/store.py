@@ -50,8 +50,11 @@ class Store(Protocol):
         """Lock a name against other processes during a block; yields whether that was possible."""
 
 
-def open_store(out: str | os.PathLike[str], *, create: bool = False) -> Store:
-    """Open the folder or URL of a batch; with `create`, make the folder."""
+def open_store(out: str | os.PathLike[str], *, create: bool = False, exists: bool = True) -> Store:
+    """Open the folder or URL of a batch; with `create`, make the folder, which otherwise must exist.
+
+    Without `exists`, a missing folder is like an empty one.
+    """
     if not isinstance(out, (str, os.PathLike)):
         raise InvalidInputError(f"out must be a folder or a URL, got {describe(out)}; pass its path")
     text = local_path(os.fsdecode(out))
@@ -68,7 +71,7 @@ def open_store(out: str | os.PathLike[str], *, create: bool = False) -> Store:
             raise InvalidInputError(
                 f"out must be a folder, {folder} cannot be created: {reason}; choose another"
             ) from error
-    elif not folder.is_dir():
+    elif (folder.exists() and not folder.is_dir()) or (exists and not folder.is_dir()):
         raise InvalidInputError(f"out {text} is not a folder; pass the folder or URL of a batch")
     return LocalStore(folder)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -29,6 +30,7 @@ from vehicle_detection.errors import InvalidInputError
 @option_names(
     out="--output",
     retry_failed="--retry-failed",
+    dry_run="--dry-run",
     field_of_view="--fov",
     camera_height_m="--camera-height",
 )
@@ -80,6 +82,7 @@ def batch(
     retry_failed: Annotated[
         bool, flag("--retry-failed", help="Process trips again whose source could not be processed.")
     ] = False,
+    dry_run: Annotated[bool, flag("--dry-run", help="Only list the trips that would be processed.")] = False,
     status: Annotated[bool, flag("--status", help="Only show what has been done.")] = False,
     summary: Annotated[
         Path | None, Option(metavar="FILE.csv", help="Table with a row for each trip that has been done.")
@@ -113,7 +116,7 @@ def batch(
     }
     with contextlib.ExitStack() as stack:
         executor = None
-        if dask is not None:
+        if dask is not None and not dry_run:
             executor, dashboard = stack.enter_context(open_dask(dask, jobs))
             if not quiet:
                 typer.echo(f"dashboard {dashboard}")
@@ -130,8 +133,14 @@ def batch(
             audio=not no_audio,
             preset=preset,
             retry_failed=retry_failed,
+            dry_run=dry_run,
             progress=not quiet,
         )
+    if dry_run:
+        for trip in done.planned:
+            _print_trip(trip)
+        typer.echo(str(done))
+        return
     for source, message in done.messages.items():
         print_error(f"warning: {with_source(source, message)}")
     _write_summary(output, summary)
@@ -143,6 +152,16 @@ def batch(
         typer.echo(f"wrote {hide_credentials(output)}" + (f", {summary}" if summary else ""))
     if done.errors:  # the machine's fault: a job that is started again does the rest
         raise typer.Exit(1)
+
+
+def _print_trip(trip: Mapping[str, Any]) -> None:
+    """Print a trip that would be processed: its start, camera and files."""
+    from vehicle_detection._common import encodable, hide_credentials, pluralize
+
+    start = (trip["start"] or "unknown start").replace("T", " ")
+    replaced = f", replaces {pluralize(len(trip['replaces']), 'earlier result')}" if trip["replaces"] else ""
+    first = encodable(hide_credentials(trip["files"][0]))
+    typer.echo(f"{start}  {trip['camera']}  {pluralize(len(trip['files']), 'file')} from {first}{replaced}")
 
 
 def _write_summary(output: str, summary: Path | None) -> None:
