@@ -598,11 +598,19 @@ def test_a_flipped_byte_in_the_header(tmp_path):
             load_classifier(path)
 
 
-@pytest.mark.parametrize("content", [b"", b"\x80\x04\x95", b"PK\x03\x04 zip", b"\xff" * 100, bytes(64)])
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 zip", b"\xff" * 100, bytes(64)])
 def test_another_kind_of_file(tmp_path, content):
-    path = tmp_path / "svc.pickle"
+    path = tmp_path / "svc.bin"
     path.write_bytes(content)
-    with pytest.raises(ModelFileError, match=r"svc.pickle is not a complete safetensors file"):
+    with pytest.raises(ModelFileError, match=r"svc.bin is not a complete safetensors file"):
+        load_classifier(path)
+
+
+@pytest.mark.parametrize(("name", "content"), [("svc.p", b""), ("svc", b"\x80\x04\x95"), ("a.JOBLIB", b"x")])
+def test_a_pickle_is_not_opened(tmp_path, name, content):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(ModelFileError, match=r"looks like a pickle.* to VehicleClassifier\.from_pipeline"):
         load_classifier(path)
 
 

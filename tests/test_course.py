@@ -1,5 +1,6 @@
 """The lesson functions equal their definition, and every published call form binds."""
 
+import copy
 import inspect
 from types import SimpleNamespace
 
@@ -12,7 +13,7 @@ from scipy.ndimage import label
 from sklearn.linear_model import LogisticRegression, SGDClassifier
 from sklearn.model_selection import GridSearchCV
 from sklearn.naive_bayes import GaussianNB
-from sklearn.preprocessing import MinMaxScaler, RobustScaler, StandardScaler
+from sklearn.preprocessing import FunctionTransformer, MinMaxScaler, RobustScaler, StandardScaler
 from sklearn.svm import SVC, LinearSVC
 from sklearn.tree import DecisionTreeClassifier
 
@@ -505,7 +506,8 @@ SIGNATURES = {
     "extract_features": "imgs, color_space='RGB', spatial_size=(32, 32), hist_bins=32, orient=9, "
     "pix_per_cell=8, cell_per_block=2, hog_channel=0, spatial_feat=True, hist_feat=True, hog_feat=True",
     "single_img_features": "img, color_space='RGB', spatial_size=(32, 32), hist_bins=32, orient=9, "
-    "pix_per_cell=8, cell_per_block=2, hog_channel=0, spatial_feat=True, hist_feat=True, hog_feat=True",
+    "pix_per_cell=8, cell_per_block=2, hog_channel=0, spatial_feat=True, hist_feat=True, hog_feat=True, "
+    "vis=False",  # of the walkthrough
     "slide_window": "img, x_start_stop=(None, None), y_start_stop=(None, None), xy_window=(64, 64), "
     "xy_overlap=(0.5, 0.5)",
     "draw_boxes": "img, bboxes, color=(0, 0, 255), thick=6",
@@ -777,3 +779,68 @@ def test_inputs_are_left_as_they_were(models):
     lesson.search_windows(image, PAIRS, *case.model, **case.options)
     lesson.draw_boxes(image, PAIRS)
     np.testing.assert_array_equal(image, FRAMES["uint8"])
+
+
+def test_features_of_an_image_with_a_picture_of_the_hog():
+    features, picture = lesson.single_img_features(PATCHES[0], "YUV", hog_channel=1, vis=True)
+    np.testing.assert_array_equal(features, lesson.single_img_features(PATCHES[0], "YUV", hog_channel=1))
+    channel = lesson.convert_color(PATCHES[0], "RGB2YUV")[..., 1]
+    np.testing.assert_array_equal(picture, lesson.get_hog_features(channel, 9, 8, 2, vis=True)[1])
+    for options in ({"hog_channel": "ALL"}, {"hog_feat": False}):
+        with pytest.raises(InvalidInputError, match="vis needs the HOG of one channel"):
+            lesson.single_img_features(PATCHES[0], **options, vis=True)
+
+
+def test_a_classifier_without_a_scaler(models):
+    """As in systems with HOG alone, whose values need no scaling."""
+    case = models["hog", "uint8"]
+    labels = np.arange(len(case.X)) % 2
+    svc = LinearSVC(random_state=0).fit(case.X, labels)
+    identity = FunctionTransformer().fit(case.X)
+    options = {"color_space": "YUV", "spatial_feat": False, "hist_feat": False, "divide_by": 1}
+    found, expected = (
+        lesson.find_car_windows(FRAMES["uint8"], 60, 200, 1, svc, scaler, 11, 16, 2, (32, 32), 32, **options)
+        for scaler in (None, identity)
+    )
+    assert found == expected != []
+    found, expected = (
+        lesson.search_windows(FRAMES["uint8"], PAIRS, svc, scaler, **case.options)
+        for scaler in (None, identity)
+    )
+    assert found == expected
+    with pytest.raises(InvalidInputError, match="the classifier was fitted on"):
+        lesson.search_windows(FRAMES["uint8"], PAIRS, svc, None)
+
+
+def test_labels_of_any_kind_and_number():
+    class Listing:
+        def predict(self, features):
+            return [1] * len(features)
+
+    class Constant:
+        def predict(self, features):
+            return 1
+
+    frame = FRAMES["uint8"]
+    windows = lesson.find_car_windows(frame, 0, 80, 1, Listing(), None, 9, 8, 2, (32, 32), 32, divide_by=1)
+    assert len(windows) == ((frame.shape[1] // 8 - 1) - 7) // 2
+    with pytest.raises(
+        InvalidInputError, match=r"must predict a label for each of .* from Constant\.predict"
+    ):
+        lesson.find_car_windows(frame, 0, 80, 1, Constant(), None, 9, 8, 2, (32, 32), 32, divide_by=1)
+
+
+def test_a_replaced_method_of_a_classifier_counts(models):
+    case = models["all", "uint8"]
+    svc, scaler = copy.deepcopy(case.model)
+    svc.predict = lambda features: np.zeros(len(features))
+    assert lesson.search_windows(FRAMES["uint8"], PAIRS, svc, scaler, **case.options) == []
+
+
+@pytest.mark.parametrize("space", ["HLS", "HSV", "LUV", "LAB"])
+def test_a_mismatch_warns_in_every_color_space(space):
+    options = {"color_space": space, "spatial_size": (16, 16), "hist_bins": 16}
+    for trained_on, given_as in ((PATCHES.astype(np.float32) / 255, "uint8"), (PATCHES, "0-1")):
+        svc, scaler = trained(np.array(lesson.extract_features(trained_on, **options)))
+        with pytest.warns(UserWarning, match="the scaler was fitted on values 0-"):
+            lesson.search_windows(FRAMES[given_as], PAIRS, svc, scaler, **options)

@@ -815,3 +815,14 @@ def test_short_descriptions():
     assert repr(result) == "FrameResult(0 at 0.00 s: 0 detections, 0 vehicles shown)"
     assert len(repr(load_model("highway"))) < 100
     assert len(repr(detector.search(np.full((180, 320, 3), 90, np.uint8)))) < 200
+
+
+def test_a_second_thread_is_refused():
+    detector, frames = make(), drive()
+    with detector._one_thread(), ThreadPoolExecutor(1) as pool:
+        detector.process(frames[0])  # the same thread may go on
+        for call in (detector.process, lambda frame: detector.track(detector.search(frame))):
+            with pytest.raises(InvalidInputError, match="frames must be processed one after the other"):
+                pool.submit(call, frames[1]).result()
+        assert len(pool.submit(detector.detect, frames[1]).result()) > 0
+    assert detector.process(frames[1]).index == 1

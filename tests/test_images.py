@@ -303,3 +303,8 @@ def test_writing_does_not_change_the_image(tmp_path, picture):
     write_image(tmp_path / "b.png", picture[::2, ::2])
     np.testing.assert_array_equal(picture, before)
     np.testing.assert_array_equal(read_image(tmp_path / "b.png"), picture[::2, ::2])
+
+
+def test_a_url_is_no_file():
+    with pytest.raises(InvalidInputError, match=r"image file https://host/a.jpg is a URL; download it first"):
+        read_image("https://host/a.jpg")

@@ -75,7 +75,7 @@ def on_one_vehicle(boxes: Floats) -> NDArray[np.bool_]:
     return np.asarray(at_one_distance & overlapping)
 
 
-def iou_matrix(first: ArrayLike, second: ArrayLike) -> Floats:
+def iou_matrix(first: Detections | ArrayLike, second: Detections | ArrayLike) -> Floats:
     """Intersection over union of each box of `first` with each box of `second`.
 
     Parameters
@@ -103,7 +103,7 @@ def iou_matrix(first: ArrayLike, second: ArrayLike) -> Floats:
     return overlap_matrices(a, b)[0]
 
 
-def clip_boxes(boxes: ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
+def clip_boxes(boxes: Detections | ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
     """Clip boxes to an image of `shape`; a box outside the image collapses onto its border.
 
     Parameters
@@ -176,7 +176,9 @@ def greedy_nms(
     return np.array([row for row, _ in islice(kept, max_boxes)], np.intp)
 
 
-def non_max_suppression(boxes: ArrayLike, scores: ArrayLike, *, threshold: float = 0.5) -> NDArray[np.intp]:
+def non_max_suppression(
+    boxes: Detections | ArrayLike, scores: ArrayLike, *, threshold: float = 0.5
+) -> NDArray[np.intp]:
     """Keep the best box of each group of overlapping boxes, greedily by score.
 
     Parameters

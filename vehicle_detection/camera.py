@@ -33,6 +33,7 @@ from vehicle_detection._common import (
     describe,
     read_regular_file,
 )
+from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 
 Floats = NDArray[np.float64]
@@ -426,7 +427,7 @@ class HorizonEstimate:
     n_boxes: int
 
 
-def estimate_horizon(boxes: ArrayLike, shape: tuple[int, ...]) -> HorizonEstimate:
+def estimate_horizon(boxes: Detections | ArrayLike, shape: tuple[int, ...]) -> HorizonEstimate:
     """Estimate the height of the horizon from the boxes of vehicles, of one frame or of many.
 
     On a flat road the bottom edge of a box lies below the horizon by the box's height times the ratio of the

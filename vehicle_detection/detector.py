@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import math
 import os
+import threading
 import time as clock
 import warnings
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeVar
 
@@ -258,23 +260,39 @@ class VehicleDetector:
         # The heat of a region is no log-odds.
         self._calibration = self.model.calibration if self._heat_params is None else None
         self._speed_warning = True
+        self._lock = threading.RLock()
         self.reset()
+
+    @contextlib.contextmanager
+    def _one_thread(self) -> Iterator[None]:
+        """Refuse a second thread during a block: tracks follow the order of the frames."""
+        if not self._lock.acquire(blocking=False):
+            raise InvalidInputError(
+                "frames must be processed one after the other, but another thread processes one; "
+                "call detect or search from several threads, or make a detector for each video"
+            )
+        try:
+            yield
+        finally:
+            self._lock.release()
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.model!r}, {pluralize(self._index, 'frame')} processed)"
 
     def __getstate__(self) -> dict[str, Any]:
         """Return everything but the threads of the search, for copies and other processes."""
-        return {name: value for name, value in vars(self).items() if name != "_search"}
+        return {name: value for name, value in vars(self).items() if name not in ("_search", "_lock")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
+        self._lock = threading.RLock()
         self._search = self.model.open_search(*self._search_options)
 
     def __copy__(self) -> VehicleDetector:
         """Return a detector with the same model and search threads, and a state of its own."""
         other = object.__new__(type(self))
         vars(other).update(vars(self))
+        other._lock = threading.RLock()
         for name in ("_tracker", "_heat_history", "_drawer"):
             setattr(other, name, copy.deepcopy(getattr(self, name)))
         return other
@@ -431,6 +449,10 @@ class VehicleDetector:
         DetectorError
             If the detector is a function that fails; the message names the frame.
         """
+        with self._one_thread():
+            return self._process(frame, time)
+
+    def _process(self, frame: NDArray[np.uint8], time: float | None) -> FrameResult:
         start = clock.perf_counter()
         _check_time(time)
         thumbnail = make_thumbnail(check_image(frame, "frame"))
@@ -518,6 +540,10 @@ class VehicleDetector:
         -----
         A cut to another scene, a frame of another size and a time that goes backwards end all tracks.
         """
+        with self._one_thread():
+            return self._track(found, time)
+
+    def _track(self, found: SearchResult, time: float | None) -> FrameResult:
         start = clock.perf_counter()
         check_type(found, "found", SearchResult, "pass what search returns")
         _check_time(time)

@@ -49,7 +49,7 @@ def _check_writable_heat(heatmap: object) -> NDArray[Any]:
     return heat
 
 
-def add_heat(heatmap: Heat, boxes: ArrayLike, *, scores: ArrayLike | None = None) -> Heat:
+def add_heat(heatmap: Heat, boxes: Detections | ArrayLike, *, scores: ArrayLike | None = None) -> Heat:
     """Add each window's heat to the pixels that it covers, in place.
 
     A window is added as four corner differences, and one cumulative sum follows, so the cost does not depend

@@ -16,7 +16,9 @@ from vehicle_detection._common import (
     atomic_write,
     check_image,
     check_path,
+    hide_credentials,
     image_size,
+    is_url,
     read_regular_file,
 )
 from vehicle_detection.errors import InvalidInputError
@@ -99,6 +101,8 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
     vehicle_detection.errors.InvalidInputError: image file missing.png does not exist; check the path
     """
     file = check_path(path)
+    if isinstance(path, str) and is_url(path):
+        raise InvalidInputError(f"image file {hide_credentials(path)} is a URL; download it first")
     name = f"image file {file}"
     return decode_image(read_regular_file(file, name, Limit.IMAGE_BYTES), name)
 

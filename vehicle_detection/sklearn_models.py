@@ -201,13 +201,17 @@ def check_uint8(template: Template, params: FeatureParams) -> None:
     InvalidInputError
         If the spatial bins, or the histogram where all values are in the first bins, show it.
     """
-    mean, scale = template.mean, template.scale
-    if _has_float_bins(mean, scale, params) or _has_first_bins_only(mean, scale, params):
+    if has_unit_range(template.mean, template.scale, params):
         raise InvalidInputError(
             "pipeline must be fitted on features of uint8 images; it was fitted on values 0-1, as which the "
             "course reads PNG files. Pass imread=vehicle_detection.read_image to extract_features, and fit "
             "the scaler and the classifier again"
         )
+
+
+def has_unit_range(mean: Floats, scale: Floats, params: FeatureParams) -> bool:
+    """Whether features with this mean and scale show that the images had values 0-1; HOG does not show it."""
+    return _has_float_bins(mean, scale, params) or _has_first_bins_only(mean, scale, params)
 
 
 def _has_float_bins(mean: Floats, scale: Floats, params: FeatureParams) -> bool:

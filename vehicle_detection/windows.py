@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import cv2
@@ -32,7 +33,7 @@ from vehicle_detection.features import (
 )
 from vehicle_detection.params import PATCH_SIZE, FeatureParams, PixelBand
 
-Range = tuple[int | None, int | None]
+Range = Sequence[int | None]
 
 
 class WindowArray(np.ndarray[Any, np.dtype[np.int64]]):
@@ -90,8 +91,8 @@ def slide_window(
     *,
     x_start_stop: Range = (None, None),
     y_start_stop: Range = (None, None),
-    xy_window: tuple[int, int] = (64, 64),
-    xy_overlap: tuple[float, float] = (0.5, 0.5),
+    xy_window: Sequence[int] = (64, 64),
+    xy_overlap: Sequence[float] = (0.5, 0.5),
 ) -> WindowArray:
     """List the windows of one size over a region of the image.
 
@@ -162,7 +163,7 @@ def _check_range(limits: Range, size: int, name: str) -> tuple[int, int]:
 
 def search_windows(
     image: NDArray[np.uint8],
-    windows: ArrayLike,
+    windows: Detections | ArrayLike,
     classifier: VehicleClassifier,
     *,
     border: Literal["window", "image"] = "window",

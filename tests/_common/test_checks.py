@@ -1,5 +1,6 @@
 import math
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -59,7 +60,11 @@ def test_check_image_returns_the_same_array():
     ("image", "remedy"),
     [
         ("road.png", "read files with vehicle_detection.read_image"),
-        ([[1, 2, 3]], "read files with vehicle_detection.read_image"),
+        ([[1, 2, 3]], "pass one image after the other"),
+        (SimpleNamespace(convert=None), r"numpy\.asarray\(image\.convert\('RGB'\)\)"),
+        (memoryview(IMAGE), "read files with vehicle_detection.read_image"),
+        (np.zeros((3, 4, 6), np.uint8), r"image\.transpose\(1, 2, 0\)"),
+        (np.full((4, 6, 3), -1.0), "map its values to 0-255; they are -1 to -1"),
         (None, "read files with vehicle_detection.read_image"),
         (IMAGE[..., 0], "COLOR_GRAY2RGB"),
         (IMAGE[..., :1], "COLOR_GRAY2RGB"),

@@ -62,14 +62,24 @@ def check_path(path: object, name: str = "path", *, kind: str = "a file name") -
 def check_image(image: object, name: str = "image") -> NDArray[np.uint8]:
     """Return `image` if it is ``(H, W, 3)`` uint8; the error says how to convert other arrays."""
     if not isinstance(image, np.ndarray):
+        remedy = "read files with vehicle_detection.read_image"
+        if hasattr(image, "convert"):
+            remedy = "convert it with numpy.asarray(image.convert('RGB'))"
+        elif hasattr(image, "__array__"):
+            remedy = "convert it with numpy.asarray(image)"
+        elif isinstance(image, (list, tuple)):
+            remedy = "pass one image after the other"
         raise InvalidInputError(
-            f"{name} must be an (H, W, 3) uint8 RGB array, got {describe(image)}; "
-            "read files with vehicle_detection.read_image"
+            f"{name} must be an (H, W, 3) uint8 RGB array, got {describe(image)}; {remedy}"
         )
     if image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 1):
         remedy = "convert a grayscale image with cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)"
     elif image.ndim == 3 and image.shape[2] == 4:
         remedy = "drop the alpha channel with image[..., :3]"
+    elif image.ndim == 4:
+        remedy = "pass one image after the other"
+    elif image.ndim == 3 and image.shape[2] != 3 and image.shape[0] == 3:
+        remedy = "put the channels last with image.transpose(1, 2, 0)"
     elif image.ndim != 3 or image.shape[2] != 3:
         remedy = "pass one image with three color channels"
     elif image.shape[0] == 0 or image.shape[1] == 0:
@@ -83,6 +93,8 @@ def check_image(image: object, name: str = "image") -> NDArray[np.uint8]:
 
 def _conversion_to_uint8(values: NDArray[Any], name: str) -> str:
     """Say how to convert an array of another type."""
+    if values.dtype.kind == "f" and not (values >= 0).all():
+        return f"map its values to 0-255; they are {values.min():g} to {values.max():g}"
     if values.dtype.kind == "f" and values.max(initial=0) > 1:
         return f"convert its values 0-255 with {name}.round().astype(numpy.uint8)"
     if values.dtype.kind == "f":

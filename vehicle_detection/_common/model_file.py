@@ -130,6 +130,11 @@ def _parse(data: bytes, name: str, kind: str | None) -> ModelData:
         length = int.from_bytes(data[:8], "little")
         header = json.loads(data[8 : 8 + length])["__metadata__"]
     except (SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
+        if data[:1] == b"\x80" or name.lower().endswith((".p", ".pkl", ".pickle", ".joblib", ".sav")):
+            raise ModelFileError(
+                f"{name} looks like a pickle, which is not opened because it may run any code; load it "
+                "yourself, and pass its classifier and scaler to VehicleClassifier.from_pipeline"
+            ) from error
         raise ModelFileError(
             f"{name} is not a complete safetensors file ({error}); download it again or train a model"
         ) from error

@@ -38,7 +38,7 @@ class HeatmapDetector(VehicleDetector):
     ----------
     clf
         ``"highway"``, the path of a model file, a `VehicleClassifier`, or any fitted classifier with
-        ``predict``, which needs `scaler`.
+        ``predict``, which needs `scaler` unless it is a pipeline.
     scaler
         The fitted scaler with ``transform`` of such a classifier.
     ystart, ystop
@@ -101,10 +101,11 @@ class HeatmapDetector(VehicleDetector):
                 )
             super().__init__(clf, search_params=search, region_params=heat)
         else:
-            if not hasattr(clf, "predict") or not hasattr(scaler, "transform"):
+            scaled = hasattr(scaler, "transform") or (scaler is None and hasattr(clf, "steps"))
+            if not hasattr(clf, "predict") or not scaled:
                 raise InvalidInputError(
                     "clf must be a model of the library, or a fitted classifier with a scaler; got "
-                    f"{describe(clf)} and {describe(scaler)}"
+                    f"{describe(clf)} and {describe(scaler)}; pass the scaler, or a pipeline of both"
                 )
             search_hits = _WindowSearch(clf, scaler, (ystart, ystop), tuple(scales), cells_per_step, options)
             model = FunctionModel(

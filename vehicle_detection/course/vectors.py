@@ -27,6 +27,7 @@ from vehicle_detection.course.features import (
     bin_spatial,
     color_hist,
     convert_color,
+    get_hog_features,
     hog_blocks,
     hog_maps,
 )
@@ -84,24 +85,48 @@ def single_img_features(
     spatial_feat: bool = True,
     hist_feat: bool = True,
     hog_feat: bool = True,
+    vis: bool = False,
     *,
     hist_range: tuple[float, float] | None = (0, 256),
     transform_sqrt: bool = False,
     spatial_order: SpatialOrder = "interleaved",
-) -> NDArray[np.float64]:
+) -> Any:
     """Feature vector of one image; the options are those of `extract_features`.
+
+    Parameters
+    ----------
+    vis
+        Return a picture of the HOG, too; for a single `hog_channel`.
 
     Returns
     -------
-    numpy.ndarray
-        1-D float64, ``[spatial | histogram | HOG]``.
+    numpy.ndarray, or a pair
+        1-D float64, ``[spatial | histogram | HOG]``; with `vis` also the picture, ``(H, W)`` float64.
+
+    Raises
+    ------
+    InvalidInputError
+        If `vis` is set without HOG, or with that of all channels, and where `extract_features` raises.
 
     Examples
     --------
     >>> single_img_features(np.zeros((64, 64, 3), np.uint8), "YCrCb", hog_channel="ALL").shape
     (8460,)
     """
-    return FeatureOptions.of(locals()).compute([check_lesson_image(img)])[0].astype(np.float64)
+    options, image = FeatureOptions.of(locals()), check_lesson_image(img)
+    check_flags(vis=vis)
+    features = options.compute([image])[0].astype(np.float64)
+    if not vis:
+        return features
+    if not options.hog_feat or options.hog_channel == "ALL":
+        raise InvalidInputError(
+            f"vis needs the HOG of one channel; got hog_feat={options.hog_feat} and "
+            f"hog_channel={options.hog_channel!r}, pass 0, 1 or 2"
+        )
+    channel = convert_color(image, options.color_space)[..., int(options.hog_channel)]
+    sizes = options.orient, options.pix_per_cell, options.cell_per_block
+    _, picture = get_hog_features(channel, *sizes, vis=True, transform_sqrt=options.transform_sqrt)
+    return features, picture
 
 
 @accept_cspace

@@ -35,7 +35,7 @@ from vehicle_detection.course.vectors import FeatureOptions, accept_cspace, are_
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import PATCH_SIZE, FeatureParams
 from vehicle_detection.search import BandSearch
-from vehicle_detection.sklearn_models import fold_estimators
+from vehicle_detection.sklearn_models import fold_estimators, has_unit_range
 
 Box = tuple[tuple[int, int], tuple[int, int]]
 Formula = Literal["old", "new"]
@@ -44,8 +44,6 @@ ResizeOrder = Literal["after conversion", "before conversion"]
 _FORMULAS = ("old", "new")
 # Number of windows whose features are in memory at a time.
 _CHUNK = 512
-# Color spaces whose three channels have values 0-1 in a float image and up to 255 in a uint8 image.
-_UNIT_SPACES = ("RGB", "YUV", "YCrCb")
 
 
 def slide_window(
@@ -163,7 +161,8 @@ def search_windows(
         Corner pairs from `slide_window`, an ``(N, 4)`` array, or `Detections`. Parts beyond the right and
         lower border of the image are cut off before resizing.
     clf, scaler
-        A fitted classifier with ``predict`` and a fitted scaler with ``transform``, of any kind.
+        A fitted classifier with ``predict`` and a fitted scaler with ``transform``, of any kind; None for a
+        classifier of features that are not scaled.
     hist_range
         As in `extract_features`; the lesson's code ignores it here.
     color_space, spatial_size, hist_bins, orient, pix_per_cell, cell_per_block, hog_channel
@@ -300,7 +299,8 @@ def find_car_windows(
     scale
         Side of a window divided by 64 pixels: the band is shrunk by this factor.
     svc, X_scaler
-        A fitted classifier with ``predict`` and a fitted scaler with ``transform``, of any kind.
+        A fitted classifier with ``predict`` and a fitted scaler with ``transform``, of any kind; None for a
+        classifier of features that are not scaled.
     orient, pix_per_cell, cell_per_block, spatial_size, hist_bins
         As in `extract_features`, of the features that the classifier was trained on.
     color_space, hog_channel, spatial_feat, hist_feat, hog_feat, hist_range, transform_sqrt, spatial_order
@@ -516,8 +516,9 @@ def _library_classifier(clf: Any, scaler: Any, params: FeatureParams) -> Vehicle
     """Return a linear classifier and its scaler as the library's classifier; None for other estimators."""
     global _last_model
     clf = getattr(clf, "best_estimator_", clf)  # of a GridSearchCV
-    # Only classes of scikit-learn: others may predict in another way.
-    if not all(type(estimator).__module__.startswith("sklearn.") for estimator in (clf, scaler)):
+    steps = [clf] if scaler is None else [scaler, clf]
+    # Only classes of scikit-learn: others may predict in another way, as does a replaced method.
+    if not all(type(step).__module__.startswith("sklearn.") for step in steps) or "predict" in vars(clf):
         return None
     state: list[Any] = [type(clf), type(scaler)]
     state += [getattr(each, name, None) for each in (clf, scaler) for name in _MODEL_STATE]
@@ -525,7 +526,7 @@ def _library_classifier(clf: Any, scaler: Any, params: FeatureParams) -> Vehicle
     if last is not None and last[1] == params and all(map(_equal, last[0], state)):
         return last[2]
     try:
-        classifier = VehicleClassifier(params, (fold_estimators([scaler, clf], params.length),))
+        classifier = VehicleClassifier(params, (fold_estimators(steps, params.length),))
     except InvalidInputError:
         return None
     _last_model = (copy.deepcopy(state), params, classifier)
@@ -537,7 +538,14 @@ def _equal(first: Any, second: Any) -> bool:
 
 
 def _predicts_car(features: NDArray[np.float64], clf: Any, scaler: Any) -> NDArray[np.bool_]:
-    return np.asarray(clf.predict(scaler.transform(features)) == 1)
+    scaled = features if scaler is None else scaler.transform(features)
+    labels = np.asarray(clf.predict(scaled)).reshape(-1)
+    if len(labels) != len(features):
+        raise InvalidInputError(
+            f"the classifier must predict a label for each of {len(features)} windows; got {len(labels)} "
+            f"from {type(clf).__name__}.predict"
+        )
+    return np.asarray(labels == 1)
 
 
 def _check_estimators(clf: Any, scaler: Any, options: FeatureOptions, image: Image) -> None:
@@ -546,6 +554,8 @@ def _check_estimators(clf: Any, scaler: Any, options: FeatureOptions, image: Ima
     from sklearn.utils.validation import check_is_fitted
 
     for estimator, name, method in ((clf, "classifier", "predict"), (scaler, "scaler", "transform")):
+        if scaler is None and name == "scaler":
+            continue
         if not hasattr(estimator, method):
             raise InvalidInputError(f"the {name} must have a method {method}; got {describe(estimator)}")
         if type(estimator).__module__.startswith("sklearn."):
@@ -560,17 +570,20 @@ def _check_estimators(clf: Any, scaler: Any, options: FeatureOptions, image: Ima
             f"a block of {options.cell_per_block} cells of {options.pix_per_cell} pixels must fit into a "
             f"window of {PATCH_SIZE} pixels"
         )
-    fitted = getattr(scaler, "n_features_in_", options.length)
+    first, name = (clf, "classifier") if scaler is None else (scaler, "scaler")
+    fitted = getattr(first, "n_features_in_", options.length)
     if fitted != options.length:
         raise InvalidInputError(
-            f"the scaler was fitted on {fitted} features, but these options give {options.length}; pass the "
+            f"the {name} was fitted on {fitted} features, but these options give {options.length}; pass the "
             "options that the classifier was trained with"
         )
-    means = getattr(scaler, "mean_", None)
-    if means is None or not options.spatial_feat or options.color_space not in _UNIT_SPACES:
+    params = options.library_params(options.color_space)
+    means, scales = (getattr(scaler, name, None) for name in ("mean_", "scale_"))
+    if params is None or means is None or scales is None:
         return
-    width, height = options.spatial_size
-    trained_on_255 = float(np.max(means[: 3 * width * height])) > 2
+    trained_on_255 = not has_unit_range(means, scales, params)
+    if trained_on_255 and not options.spatial_feat:  # a histogram or HOG does not show it
+        return
     largest = 255.0 if image.dtype == np.uint8 else float(image.max())
     # An almost black image may have either range.
     if largest > 0.1 and (largest > 2) != trained_on_255:

@@ -36,6 +36,8 @@ from vehicle_detection.images import decode_image
 
 _LOGGER = logging.getLogger(__name__)
 
+_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
+
 COURSE_URL = "https://s3.amazonaws.com/udacity-sdc/Vehicle_Tracking/"
 # Number of patches in each folder. Mirrors repack the archives, so there is no hash of the whole file.
 ARCHIVES: dict[str, dict[str, int]] = {
@@ -68,8 +70,8 @@ def parent_folder(name: str) -> str:
 
 
 def is_image(name: str) -> bool:
-    """Whether a file name is that of a PNG or JPEG that is not hidden."""
-    return name.lower().endswith((".png", ".jpg", ".jpeg")) and not is_hidden(name)
+    """Whether a file name is that of an image that is not hidden."""
+    return name.lower().endswith(_IMAGE_SUFFIXES) and not is_hidden(name)
 
 
 def open_archive(path: Path, shown: str | None = None) -> zipfile.ZipFile:

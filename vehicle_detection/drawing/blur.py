@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import check_boxes, check_choice, check_image
+from vehicle_detection.boxes import Detections
 
 BLUR_REGIONS = ("vehicles", "plates")
 """What `blur_boxes` can blur."""
@@ -21,7 +22,9 @@ _CELLS = {"vehicles": 8, "plates": 6}
 _PLATE_ROWS, _PLATE_COLUMNS, _SIDE_ASPECT = (0.4, 1.0), (0.12, 0.88), 1.5
 
 
-def blur_boxes(image: NDArray[np.uint8], boxes: ArrayLike, *, region: str = "vehicles") -> NDArray[np.uint8]:
+def blur_boxes(
+    image: NDArray[np.uint8], boxes: Detections | ArrayLike, *, region: str = "vehicles"
+) -> NDArray[np.uint8]:
     """Blur the vehicles in boxes, or the region of their license plates, on a copy of an image.
 
     The region is reduced to a few averaged cells, from which no characters can be recovered.

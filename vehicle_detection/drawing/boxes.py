@@ -22,7 +22,9 @@ from vehicle_detection.drawing.primitives import Color, Image, draw_outline, lin
 from vehicle_detection.errors import InvalidInputError
 
 
-def draw_boxes(image: Image, boxes: ArrayLike, *, color: Color = (0, 0, 255), thickness: int = 6) -> Image:
+def draw_boxes(
+    image: Image, boxes: Detections | ArrayLike, *, color: Color = (0, 0, 255), thickness: int = 6
+) -> Image:
     """Draw boxes on a copy of an image.
 
     Parameters

@@ -132,7 +132,8 @@ def open_source(
     if not isinstance(source, (str, os.PathLike)):
         raise InvalidInputError(
             f"source must be the path of a video file, a folder, a pattern, a list of files, a URL, '-' or a "
-            f"camera's number, got {describe(source)}; pass a file name"
+            f"camera's number, got {describe(source)}; pass a file name, or call detector.process(frame, "
+            "time) with frames of your own"
         )
     text = os.fsdecode(source)
     scheme = _URL.match(text)
