@@ -42,16 +42,22 @@ FrameShape = tuple[int, int]
 
 # Focal length in pixels of the reference camera, a 1280x720 dash-cam, for which pixel errors are given.
 _REFERENCE_FOCAL_PX = 0.9 * 1280
-# `estimate_horizon`: boxes required; prior of the camera's height (m) and standard deviation of the horizon
-# around the middle row (fraction of the frame's height).
+# The following constants are those of `estimate_horizon`. Number of boxes required.
 _MIN_BOXES = 4
-_CAMERA_HEIGHT, _CAMERA_HEIGHT_STD, _HORIZON_STD = 1.35, 0.3, 0.15
-# Standard error of a bottom edge in a frame 1280 wide, standard deviation of vehicles' heights as a fraction,
-# residual from which on a box is ignored, boxes that are as good as one because they show the same vehicle,
-# and 80th percentile of the absolute values of a normal distribution.
-_EDGE_STD_PX, _RELATIVE_STD, _BIWEIGHT, _CORRELATED_BOXES, _NORMAL_80 = 3.5, 0.12, 4.7, 3.0, 1.282
-
-
+# Prior of the camera's height (m), and its standard deviation.
+_CAMERA_HEIGHT, _CAMERA_HEIGHT_STD = 1.35, 0.3
+# Prior standard deviation of the horizon around the middle row, as a fraction of the frame's height.
+_HORIZON_STD = 0.15
+# Standard error of a bottom edge in pixels of a frame 1280 wide.
+_EDGE_STD_PX = 3.5
+# Standard deviation of vehicles' heights, as a fraction.
+_RELATIVE_STD = 0.12
+# Residual, in standard errors, from which on a box is ignored.
+_BIWEIGHT = 4.7
+# Number of boxes that count as one, because they show the same vehicle.
+_CORRELATED_BOXES = 3.0
+# 80th percentile of the absolute values of a normal distribution.
+_NORMAL_80 = 1.282
 # Largest angle from the optical axis (radians) at which boxes are converted to a pinhole camera.
 _MAX_ANGLE = math.radians(80)
 

@@ -512,9 +512,32 @@ class VehicleDetector:
             Results of the searched frames; `after` is None at the end of a video.
         times
             Times of the frames between, in seconds. `before` and `after` must have times too.
+
+        Returns
+        -------
+        list of FrameResult
+            A result for each time.
+
+        Raises
+        ------
+        InvalidInputError
+            If an argument is malformed, or the times do not lie between those of `before` and `after`.
         """
+        for name, result in (("before", before), ("after", after)):
+            if name == "before" or result is not None:
+                check_type(result, name, FrameResult, "pass what track returns")
+        times = [
+            check_number(each, "times", low=-1e12, high=1e12)
+            for each in check_sequence(times, "times", "numbers")
+        ]
         if self._shape is None or before.time is None or (after is not None and after.time is None):
             raise InvalidInputError("before and after must have times; pass time= to track")
+        last = math.inf if after is None or after.time is None else after.time
+        if not all(before.time < each < last for each in times):
+            raise InvalidInputError(
+                f"times must lie between those of before and after, {before.time:g} and {last:g} s; "
+                f"got {times}"
+            )
         results = []
         for number, time in enumerate(times):
             start = clock.perf_counter()

@@ -150,6 +150,10 @@ def explain(detector: VehicleDetector, image: NDArray[np.uint8], box: ArrayLike)
     )
 
 
+# Largest number of tracks that are explained, each of which takes a search of a frame.
+_MAX_EXPLAINED = 12
+
+
 class ExplainedTrack(NamedTuple):
     """A box of a track that is explained, and a picture of it."""
 
@@ -158,17 +162,18 @@ class ExplainedTrack(NamedTuple):
     explanation: Explanation
 
 
-def explain_tracks(
-    detector: VehicleDetector, source: Source, log: TrackLog, *, limit: int = 12
-) -> dict[int, ExplainedTrack]:
-    """Explain a box of each track of a video: its largest one that is inside the frame.
+def explain_tracks(detector: VehicleDetector, source: Source, log: TrackLog) -> dict[int, ExplainedTrack]:
+    """Explain a box of each of the twelve longest tracks of a video: its largest one inside the frame.
 
     Parameters
     ----------
     detector, source, log
         The detector, a source that can be read again, and the tracks of its frames.
-    limit
-        Largest number of tracks, those with most frames, which are listed by their ids.
+
+    Returns
+    -------
+    dict
+        Explained box of each track, by its id, in ascending order.
 
     Raises
     ------
@@ -177,7 +182,8 @@ def explain_tracks(
     VideoError
         If the source cannot be read.
     """
-    tracks = sorted(log.histories(), key=lambda track: -len(track.frames))[:limit]
+    known = [track for track in log.histories() if np.isfinite(track.boxes).all(axis=1).any()]
+    tracks = sorted(known, key=lambda track: -len(track.frames))[:_MAX_EXPLAINED]
     explained = {}
     with borrow_source(source) as opened:
         shape = opened.info.shape[:2]

@@ -126,13 +126,13 @@ def _on_other_vehicles(
 ) -> NDArray[np.bool_]:
     """Mark the groups whose face lies in the box of another group, because windows fire on sides too.
 
-    Of two groups that lie on each other the better one stays. A group that only lies on the other's side is
+    If two groups lie on each other, the better one stays. A group that only lies on the other's side is
     dropped even if it is the better one, unless the other is much weaker.
     """
     areas = box_areas(faces)
     lies_on = intersection_matrix(faces, boxes) > params.max_coverage * areas[:, None]
     np.fill_diagonal(lies_on, False)
-    # Of groups with equal peaks the first is the better one.
+    # If peaks are equal, the first group is the better one.
     rank = np.lexsort((np.arange(len(peaks)), -peaks)).argsort()
     better = rank[None, :] < rank[:, None]
     stronger = peaks[None, :] > params.flank_peak_ratio * peaks[:, None]

@@ -26,7 +26,7 @@ def test_an_image_is_described():
     [
         (np.full((2, 2, 3), 0.5, np.float32), (0.5, 0.5, 0.5), "scale its values 0-1"),
         (np.zeros((2, 2), np.uint8), (0,), "convert a grayscale image"),
-        (np.full((5, 2, 2, 3), 9, np.uint8), (9,), "pass one image with three color channels"),
+        (np.full((5, 2, 2, 3), 9, np.uint8), (9,), "pass one image after the other"),
     ],
 )
 def test_the_description_of_other_arrays_names_the_remedy(array, mean, problem):

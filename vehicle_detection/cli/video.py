@@ -43,7 +43,9 @@ from vehicle_detection.cli.output import (
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
+    from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.params import DrawParams
+    from vehicle_detection.video import FrameSource
 
 DAMAGED = 3  # exit code
 _NOT_SQUARE = (
@@ -287,7 +289,7 @@ def video(
             # The estimate takes seconds: refuse invalid options before it.
             with VehicleDetector(loaded, **options) as unsure:
                 unsure.camera_of(opened.info.shape)
-                VideoRun(opened, unsure, target=output, audio=False, **settings)
+                VideoRun(opened, unsure, target=output, audio=False, **settings).close()
             with search_everywhere(loaded, conf) as everywhere:
                 fraction = find_horizon(opened, everywhere, start, end, quiet)
         detector = stack.enter_context(VehicleDetector(loaded, horizon=fraction, **options))
@@ -300,13 +302,15 @@ def video(
                     report, video=output, source=source, detector=detector, units=draw_params.units
                 )
         log = page.log if page else TrackLog()
-        writers.append(page or log)
+        # A camera that never ends would fill the memory with tracks that nobody asked for.
+        if not quiet or any(path is not None for path in (report, events, clips, srt)):
+            writers.append(page or log)
         if tracks is not None:
             with option_names(path="--tracks"):
                 writers.append(stack.enter_context(TrackWriter(tracks, shape=opened.info.shape)))
         if not quiet:
             # After the other checks: what is refused replaces nothing.
-            VideoRun(opened, detector, target=output, audio=not no_audio, **settings)
+            VideoRun(opened, detector, target=output, audio=not no_audio, **settings).close()
             announce_replaced(outputs.values())
         done = process_video(
             opened,
@@ -328,13 +332,11 @@ def video(
     given = None if horizon in (None, "auto") else f"--horizon {horizon}"
     if horizon is None and detector.search_params_of(opened.info.shape) != detector.search_params:
         given = f"the horizon of --camera {camera}"
-    if not done.tracks and given is not None and not quiet and opened.rereadable:
+    if not quiet and not done.tracks and given is not None and opened.rereadable:
         with search_everywhere(loaded, conf) as everywhere:
             warn_of_horizon(given, estimate_video_horizon(source, everywhere, start=start, end=end))
-    if done.tracks and not detector.lens_is_known and not quiet:
-        print_error(UNKNOWN_LENS)
-    if done.tracks and opened.info.pixel_aspect != 1 and not quiet:
-        print_error(_NOT_SQUARE.format(opened.info.pixel_aspect))
+    if not quiet and done.tracks:
+        _warn_of_distances(detector, opened)
     if not quiet or profile:
         lines = str(done).splitlines()
         typer.echo("\n".join(lines if profile else lines[:1]))
@@ -345,6 +347,14 @@ def video(
             typer.echo(f"wrote {', '.join(map(str, written))}")
     if done.damage:
         raise typer.Exit(DAMAGED)
+
+
+def _warn_of_distances(detector: VehicleDetector, source: FrameSource) -> None:
+    """Warn if the distances are rough because of the camera, or wrong because of the file."""
+    if not detector.lens_is_known:
+        print_error(UNKNOWN_LENS)
+    if source.info.pixel_aspect != 1:
+        print_error(_NOT_SQUARE.format(source.info.pixel_aspect))
 
 
 def _check_outputs(outputs: Mapping[str, Path | None], clips: Path | None, *, show: bool, why: bool) -> None:

@@ -49,7 +49,7 @@ ARCHIVES: dict[str, dict[str, int]] = {
 }  # fmt: skip
 # Labels by folder name, without hyphens and underscores.
 CLASS_FOLDERS = {"vehicles": True, "cars": True, "nonvehicles": False, "notcars": False}
-# Of all members, unpacked; the course's have 60 MB each.
+# Maximum size of all unpacked members together; the course's have 60 MB each.
 _MAX_ARCHIVE_BYTES = 1_000_000_000
 STALE_SECONDS = 3600.0  # age from which a partial download counts as left behind by a killed process
 # Errors of zipfile on a damaged archive; RuntimeError if it is encrypted.

@@ -311,7 +311,7 @@ def make_thumbnails(patches: PatchSet | NDArray[np.uint8]) -> NDArray[np.float32
         vectors[row] = cv2.resize(gray, (16, 16), interpolation=cv2.INTER_AREA).ravel()
     vectors -= vectors.mean(axis=1, keepdims=True)
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    # Of a uniform patch only rounding errors remain: set them to 0.
+    # Only rounding errors remain of a uniform patch: set them to 0.
     return np.asarray(np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0.01))
 
 

@@ -7,6 +7,7 @@ those of the authors' package TrackEval.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -35,20 +36,21 @@ def hota_scores(frames: Sequence[Overlaps]) -> dict[str, Any]:
     n_boxes = sum(n_vehicles) + sum(n_tracks)
     if not n_boxes:
         return dict.fromkeys(("hota", "deta", "assa", "loca"), math.nan)
-    # Boxes of each vehicle and each track together.
-    counts = n_vehicles[:, None] + n_tracks[None]
-    alignment = _alignment(frames, vehicle_rows, track_rows, counts)
-    pairs, iou = _match(frames, vehicle_rows, track_rows, alignment)
+    alignment = _alignment(frames, vehicle_rows, track_rows, n_vehicles, n_tracks)
+    vehicles, tracks, iou = _match(frames, vehicle_rows, track_rows, alignment)
 
     matched = iou >= _ALPHAS[:, None] - _EPS  # (A, matches)
     tp = matched.sum(axis=1)
     detection = tp / (n_boxes - tp)
     localization = np.maximum((matched * iou).sum(axis=1), 1e-10) / np.maximum(tp, 1e-10)
+    pairs = vehicles * len(n_tracks) + tracks
     order = np.argsort(pairs, kind="stable")
     same, starts = np.unique(pairs[order], return_index=True)
     # Matches of each vehicle with each of its tracks, (A, pairs).
     matches = np.add.reduceat(matched[:, order], starts, axis=1) if len(pairs) else np.zeros((len(tp), 0))
-    jaccard = matches / np.maximum(counts.ravel()[same] - matches, 1)
+    # Boxes of the vehicle and the track together.
+    counts = n_vehicles[same // max(len(n_tracks), 1)] + n_tracks[same % max(len(n_tracks), 1)]
+    jaccard = matches / np.maximum(counts - matches, 1)
     association = (matches * jaccard).sum(axis=1) / np.maximum(tp, 1)
     hota = np.sqrt(detection * association)
     means = (float(values.mean()) for values in (hota, detection, association, localization))
@@ -66,32 +68,44 @@ def _alignment(
     frames: Sequence[Overlaps],
     vehicles: list[NDArray[np.intp]],
     tracks: list[NDArray[np.intp]],
-    counts: NDArray[np.intp],
-) -> Floats:
-    """Jaccard index of each vehicle with each track over the clip, before boxes are matched one to one."""
-    shared = np.zeros(counts.shape)
+    n_vehicles: NDArray[np.intp],
+    n_tracks: NDArray[np.intp],
+) -> list[Floats]:
+    """Jaccard index of the vehicles and tracks of each frame over the clip, before boxes are matched.
+
+    Only pairs that overlap are in memory: a table of all vehicles and tracks grows with the square of the
+    clip's length.
+    """
+    shared: defaultdict[tuple[int, int], float] = defaultdict(float)
     for rows, columns, (_, _, iou) in zip(vehicles, tracks, frames):
         union = iou.sum(axis=0) + iou.sum(axis=1)[:, None] - iou
         part = np.divide(iou, union, out=np.zeros_like(iou), where=union > _EPS)
-        shared[rows[:, None], columns] += part
-    return np.asarray(shared / (counts - shared))
+        for i, j in np.argwhere(part).tolist():
+            shared[rows[i], columns[j]] += part[i, j]
+    alignment = []
+    for rows, columns, (_, _, iou) in zip(vehicles, tracks, frames):
+        common = np.zeros_like(iou)
+        for i, j in np.argwhere(iou).tolist():
+            common[i, j] = shared[rows[i], columns[j]]
+        alignment.append(common / (n_vehicles[rows][:, None] + n_tracks[columns] - common))
+    return alignment
 
 
 def _match(
     frames: Sequence[Overlaps],
     vehicles: list[NDArray[np.intp]],
     tracks: list[NDArray[np.intp]],
-    alignment: Floats,
-) -> tuple[NDArray[np.intp], Floats]:
+    alignment: list[Floats],
+) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
     """Match each frame for the largest total IoU, weighted by the alignment, whatever the threshold.
 
-    Returns the pair of vehicle and track of each match as an index into `alignment`, and its IoU.
+    Returns the vehicle, the track and the IoU of each match.
     """
     from scipy.optimize import linear_sum_assignment
 
-    pairs, overlaps = [np.empty(0, np.intp)], [np.empty(0)]
-    for rows, columns, (_, _, iou) in zip(vehicles, tracks, frames):
-        chosen = linear_sum_assignment(alignment[rows[:, None], columns] * iou, maximize=True)
-        pairs.append(rows[chosen[0]] * alignment.shape[1] + columns[chosen[1]])
-        overlaps.append(iou[chosen])
-    return np.concatenate(pairs), np.concatenate(overlaps)
+    matches: list[tuple[NDArray[np.intp], NDArray[np.intp], Floats]] = []
+    for rows, columns, weights, (_, _, iou) in zip(vehicles, tracks, alignment, frames):
+        chosen = linear_sum_assignment(weights * iou, maximize=True)
+        matches.append((rows[chosen[0]], columns[chosen[1]], iou[chosen]))
+    matched_rows, matched_columns, overlaps = (np.concatenate(each) for each in zip(*matches))
+    return matched_rows, matched_columns, overlaps

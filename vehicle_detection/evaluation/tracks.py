@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate, groupby, pairwise
@@ -264,15 +264,32 @@ def _assign_rest(
 
 
 def _identity_true_positives(matched: list[_MatchedFrame]) -> int:
-    """Count the right boxes under the best one-to-one assignment of tracks to vehicles (IDTP)."""
-    from scipy.optimize import linear_sum_assignment
+    """Count the right boxes under the best one-to-one assignment of tracks to vehicles (IDTP).
 
-    pairs = np.array([pair for frame in matched for pair in frame.overlapping], np.int64).reshape(-1, 2)
+    Vehicles and tracks that overlap in no frame, directly or through others, are assigned separately: a table
+    of all of them grows with the square of the clip's length.
+    """
+    from scipy.optimize import linear_sum_assignment
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    counts = Counter(pair for frame in matched for pair in frame.overlapping)
+    if not counts:
+        return 0
+    pairs, boxes = np.array([*counts], np.int64), np.array([*counts.values()], np.int64)
     vehicles, rows = np.unique(pairs[:, 0], return_inverse=True)
     tracks, columns = np.unique(pairs[:, 1], return_inverse=True)
-    table = np.zeros((len(vehicles), len(tracks)))
-    np.add.at(table, (rows, columns), 1)
-    return int(table[linear_sum_assignment(table, maximize=True)].sum())
+    size = len(vehicles) + len(tracks)
+    graph = coo_array((boxes, (rows, columns + len(vehicles))), shape=(size, size))
+    _, groups = connected_components(graph, directed=False)
+    order = np.argsort(groups[rows], kind="stable")
+    total = 0
+    for group in np.split(order, np.flatnonzero(np.diff(groups[rows][order])) + 1):
+        (_, i), (_, j) = (np.unique(each[group], return_inverse=True) for each in (rows, columns))
+        table = np.zeros((i.max() + 1, j.max() + 1), np.int64)
+        table[i, j] = boxes[group]
+        total += int(table[linear_sum_assignment(table, maximize=True)].sum())
+    return total
 
 
 def _jitter(predictions: FrameBoxes, labels: FrameBoxes, matched: list[_MatchedFrame]) -> float:

@@ -39,8 +39,9 @@ _COTANGENTS = (np.cos(_BIN_BOUNDS) / np.sin(_BIN_BOUNDS)).astype(np.float32)
 # Added to the energy of a block, in squared gray levels of the mean gradient. Noise of one gray level on a
 # medium gray surface has about this energy, and must not be normalized to full contrast.
 _EPS = np.float32(2)
-# The only grid of several, and what takes the place of an output of the kernel that is not wanted.
+# Indices of a single grid.
 _FIRST = np.zeros(1, np.intp)
+# Empty arrays for outputs of the kernel that the caller does not need.
 _NO_CHANNELS, _NO_WORDS = np.empty((0, 0, 0, 0), np.float32), np.empty((0, 0, 0, 0), np.int32)
 # Smallest cell of every octave but the first, in pixels of the resized frame: cells have 1.5 to 3 squares a
 # side. And the shortest side of a resized frame.

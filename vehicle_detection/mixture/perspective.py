@@ -45,7 +45,7 @@ def perspective_ratios(boxes: Floats, margins: Floats, height: int) -> Floats:
         return np.empty(0)
     bottoms = boxes[:, 3] / height
     heights = np.maximum(boxes[:, 3] - boxes[:, 1], 1) / height
-    # Of each box under each horizon.
+    # Probability density of each box's height under each horizon.
     below = bottoms[:, None] - _HORIZONS
     log_ratios = np.log(heights)[:, None] - np.log(np.maximum(below, 1e-3))
     density = np.zeros_like(below)

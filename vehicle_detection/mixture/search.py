@@ -116,7 +116,7 @@ class MixtureSearch(FrameSearch):
         self._box_cells = np.array([each.box_cells for each in templates])
         self._paddings = np.array([each.padding for each in templates])
         self._biases = np.array([each.bias for each in templates])
-        # Of each place and template.
+        # Units of each place and template.
         self._units = np.zeros((len(self._filters), len(templates)))
         for units, numbers, filters in zip(self._units, self._numbers, self._filters):
             units[numbers] = filters.units

@@ -22,14 +22,18 @@ from vehicle_detection.tracking.assignment import cheapest_pairs
 
 # A detection shows two vehicles if it covers more than this fraction of both, and has a lower IoU with both.
 _MIN_MERGED_COVERAGE, _MAX_MERGED_IOU = 0.7, 0.7
-# Fraction of its size by which the box of a nearer vehicle is enlarged, and fraction of a vehicle's height by
-# which the bottom edge of a nearer one is lower.
-_COVER_MARGIN, _MIN_NEARER = 0.03, 0.1
+# Fraction of its size by which the box of a nearer vehicle is enlarged.
+_COVER_MARGIN = 0.03
+# Fraction of a vehicle's height by which the bottom edge of a nearer one is lower.
+_MIN_NEARER = 0.1
 # A nearer vehicle hides a left or right edge if it shares this fraction of the height, and covers the point
 # at this distance beyond the edge, as a fraction of the height.
-_MIN_SHARED_HEIGHT, _HIDING_DISTANCE = 0.5, 0.06
-# Growth of an approaching vehicle between two searched frames, and IoU of its grown box with the new one.
-_MAX_GROWTH, _MIN_GROWN_IOU = 1.6, 0.6
+_MIN_SHARED_HEIGHT = 0.5
+_HIDING_DISTANCE = 0.06
+# Largest growth of an approaching vehicle between two searched frames.
+_MAX_GROWTH = 1.6
+# Smallest IoU of its grown box with the new one.
+_MIN_GROWN_IOU = 0.6
 
 Bools = NDArray[np.bool_]
 
@@ -93,7 +97,7 @@ def covered_fractions(boxes: Floats, others: Floats) -> Floats:
 
 
 def nearer_cover(boxes: Floats, is_opaque: Bools) -> Floats:
-    """``(N,)`` fraction of each of `boxes` that the one of them covers most that is nearer and opaque.
+    """For each box, the largest fraction of it that a single nearer, opaque box covers; ``(N,)``.
 
     A vehicle is nearer if its bottom edge is lower. Its box is enlarged by a few percent, because a vehicle
     that only touches another one hides its edge.

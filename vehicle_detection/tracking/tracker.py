@@ -64,7 +64,7 @@ _LOW_SCORE_IOU = 0.5
 _LOG_ODDS = Platt(-1.0, 0.0)
 # Difference of the scores of two tracks on one vehicle from which on the lower one shows a part of it.
 _PART_GAP = 2.0
-# Seconds without a detection up to which that distance grows.
+# Seconds without a detection after which `max_distance` stops growing.
 _MAX_GAP = 2.0
 
 

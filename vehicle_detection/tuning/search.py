@@ -41,7 +41,7 @@ from vehicle_detection.tuning.trials import COLUMNS, TrialEvaluator, TrialOption
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-# Of the first round of successive halving: scores on fewer patches are too noisy to rank candidates.
+# Patches in the first round of successive halving: with fewer, scores are too noisy to rank candidates.
 _MIN_PATCHES = 300
 
 

@@ -24,7 +24,8 @@ def find_seek_time(path: Path | str, info: VideoInfo, wanted: float) -> float:
     """Return a time in the file from which ffmpeg decodes the frame at `wanted`, in seconds.
 
     In files without an index, such as MPEG-TS, ffmpeg seeks to a position near the time, and decoding begins
-    with the next key frame, which may be seconds after it. So the first decoded frame is looked at.
+    with the next key frame, which may be seconds after it. Therefore the time of the first decoded frame is
+    checked.
     """
     if not info.duration:  # raw streams have no times; ffmpeg's are wrong after a seek
         return info.video_offset
