@@ -426,6 +426,11 @@ class Detections:
         tracker_id
             ``(N,)`` numbers of the tracks, if known.
 
+        Returns
+        -------
+        supervision.Detections
+            With ``xyxy`` and ``confidence`` as float32.
+
         Raises
         ------
         InvalidInputError

@@ -181,6 +181,17 @@ class Camera:
             (pinhole), ``"fisheye-120"``, ``"fisheye-140"`` or ``"fisheye-170"`` (``focal_px * angle``).
         **known
             Other attributes of the class, such as ``focal_std=0.01`` for a calibrated lens.
+
+        Returns
+        -------
+        Camera
+            In pixels of frames of this shape.
+
+        Raises
+        ------
+        InvalidInputError
+            If an argument is unknown or out of range, or `k1` and `k2` make the radius at the edge of the
+            field of view negative or 0.
         """
         height, width = check_shape(shape)
         horizon = check_number(horizon, "horizon", low=-10, high=10)
@@ -228,10 +239,22 @@ class Camera:
         return np.asarray(self.focal_px * self.vehicle_width_m + self.vehicle_length_m * lateral)
 
     def rectify_boxes(self, boxes: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-        """Convert ``(N, 4)`` boxes to those of a pinhole camera with the same focal length.
+        """Convert boxes to those of a pinhole camera with the same focal length.
 
-        Boxes of a pinhole camera are returned as they are. The middles of a box's edges are converted, and
-        points farther than 80 degrees from the optical axis are moved there.
+        The middles of a box's edges are converted, and points farther than 80 degrees from the optical axis
+        are moved there.
+
+        Parameters
+        ----------
+        boxes
+            ``(N, 4)`` boxes ``[x1, y1, x2, y2]`` in pixels of the frame.
+        shape
+            ``(height, width, ...)`` of the frame.
+
+        Returns
+        -------
+        numpy.ndarray
+            ``(N, 4)`` boxes around the same middle of the frame; `boxes` itself for a pinhole camera.
 
         Examples
         --------
@@ -318,6 +341,11 @@ def read_camera(path: str | os.PathLike[str], shape: tuple[int, ...]) -> Camera:
         height). With pixels it needs ``image_size``, ``[width, height]``; they are scaled to `shape`.
     shape
         ``(height, width, ...)`` of the frames.
+
+    Returns
+    -------
+    Camera
+        In pixels of frames of `shape`. A lens or horizon that the file lacks has a large standard error.
 
     Raises
     ------
@@ -449,6 +477,11 @@ def estimate_horizon(boxes: Detections | ArrayLike, shape: tuple[int, ...]) -> H
         ``(N, 4)`` boxes ``[x1, y1, x2, y2]``, at least 4 of them not truncated.
     shape
         ``(height, width, ...)`` of the frames.
+
+    Returns
+    -------
+    HorizonEstimate
+        The horizon as a fraction of the height, its standard error, and the height of the camera.
 
     Raises
     ------

@@ -110,6 +110,7 @@ class VehicleClassifier:
     """
 
     search_params_type: ClassVar[type[SearchParams]] = SearchParams
+    searches_every_frame: ClassVar[bool] = False
 
     params: FeatureParams
     templates: tuple[Template, ...]
@@ -145,6 +146,11 @@ class VehicleClassifier:
         X
             ``(N, length)`` feature vectors, or ``(N, 64, 64, 3)`` uint8 RGB patches.
 
+        Returns
+        -------
+        numpy.ndarray
+            ``(N,)`` float64; with several templates, the maximum of their scores.
+
         Raises
         ------
         InvalidInputError
@@ -164,7 +170,25 @@ class VehicleClassifier:
         return (self.decision_function(X) > 0).astype(np.int64)
 
     def score(self, X: ArrayLike, y: ArrayLike) -> float:
-        """Accuracy: fraction of correct predictions for the labels `y`."""
+        """Accuracy: fraction of correct predictions.
+
+        Parameters
+        ----------
+        X
+            As in `decision_function`.
+        y
+            ``(N,)`` labels, 1 for a vehicle, 0 otherwise.
+
+        Returns
+        -------
+        float
+            In [0, 1].
+
+        Raises
+        ------
+        InvalidInputError
+            If `X` is malformed or empty, or `y` is of another length.
+        """
         labels, predicted = check_array(y, "y"), self.predict(X)
         if labels.shape != predicted.shape or not labels.size:
             raise InvalidInputError(
@@ -213,6 +237,11 @@ class VehicleClassifier:
             does not depend on the order, so that a wrong one cannot be detected, but the scores are wrong.
         metadata
             JSON values to keep in the model file.
+
+        Returns
+        -------
+        VehicleClassifier
+            A model with one template.
 
         Raises
         ------
@@ -298,6 +327,11 @@ class VehicleClassifier:
             Threads; the result does not depend on them.
         method
             ``"shared"``: the fast search; ``"windows"``: the reference, one patch per window.
+
+        Returns
+        -------
+        FrameSearch
+            A thread-safe context manager; its parameters are `SearchParams`.
 
         Raises
         ------
@@ -425,6 +459,11 @@ def train_classifier(
     metadata
         JSON values to keep in the model file.
 
+    Returns
+    -------
+    VehicleClassifier
+        A model with one template. Its metadata also hold the training options and the versions of libraries.
+
     Raises
     ------
     InvalidInputError
@@ -550,6 +589,11 @@ def load_classifier(path: str | os.PathLike[str] | None = None) -> VehicleClassi
     ----------
     path
         A ``.safetensors`` file written by `VehicleClassifier.save`; None loads ``"highway"``.
+
+    Returns
+    -------
+    VehicleClassifier
+        The model with its feature parameters and metadata.
 
     Raises
     ------

@@ -376,6 +376,18 @@ class VehicleDetector:
         They are `search_params`, with the horizon that a camera file states, unless `horizon` or
         `search_params` were given.
 
+        Returns
+        -------
+        SearchParams, PyramidParams or FunctionParams
+            The kind depends on the model: a classifier, a mixture or a function.
+
+        Raises
+        ------
+        InvalidInputError
+            If `shape` is malformed, or the camera file was made for frames of another aspect ratio.
+
+        Examples
+        --------
         >>> VehicleDetector().search_params_of((720, 1280)).horizon
         0.5
         """
@@ -427,7 +439,7 @@ class VehicleDetector:
         """Interval of the frames that `process_video` searches at a frame rate: 1 for every frame."""
         if self.every is not None:
             return self.every
-        if self._heat_params or self.diagnostics or isinstance(self.model, FunctionModel):
+        if self._heat_params or self.diagnostics or self.model.searches_every_frame:
             return 1
         fps = check_number(fps, "fps", above=0, high=1e6)
         return max(1, int(fps / _MIN_SEARCH_RATE + 0.01))  # 23.976 counts as 24
@@ -441,6 +453,11 @@ class VehicleDetector:
             ``(H, W, 3)`` uint8 RGB.
         time
             Time of the frame in seconds; None: one frame after the last one.
+
+        Returns
+        -------
+        FrameResult
+            With `every`, frames between two searched ones have predicted tracks only.
 
         Raises
         ------
@@ -559,6 +576,16 @@ class VehicleDetector:
         time
             Time of the frame in seconds; None: one frame after the last one.
 
+        Returns
+        -------
+        FrameResult
+            Detections of this frame and all tracks, including those not shown.
+
+        Raises
+        ------
+        InvalidInputError
+            If an argument is malformed, or another thread is processing a frame.
+
         Notes
         -----
         A cut to another scene, a frame of another size and a time that goes backwards end all tracks.
@@ -604,6 +631,23 @@ class VehicleDetector:
 
         Drawn in their order, the frames of a video have labels that keep their places, and trails in the
         bird's-eye view.
+
+        Parameters
+        ----------
+        frame
+            ``(H, W, 3)`` uint8 RGB.
+        result
+            What `process` or `track` returned for this frame.
+
+        Returns
+        -------
+        numpy.ndarray
+            A new uint8 RGB frame of the shape that `annotated_shape` returns.
+
+        Raises
+        ------
+        InvalidInputError
+            If an argument is malformed.
         """
         check_image(frame, "frame")
         check_type(result, "result", FrameResult, "pass what process or track returns")

@@ -35,6 +35,7 @@ class FunctionModel:
     """A function as a model; `detector_from` documents the arguments and creates one."""
 
     search_params_type: ClassVar[type[FunctionParams]] = FunctionParams
+    searches_every_frame: ClassVar[bool] = True
 
     function: DetectorFunction
     score: ScoreScale = "probability"

@@ -108,9 +108,16 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
 
 
 def write_image(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
-    """Write an ``(H, W, 3)`` uint8 RGB image; the suffix (``.png``, ``.jpg``, ...) sets the format.
+    """Write an image file.
 
     The file is written atomically: after an error, an existing file is unchanged.
+
+    Parameters
+    ----------
+    path
+        The file; its suffix (``.png``, ``.jpg``, ...) sets the format.
+    image
+        ``(H, W, 3)`` uint8 RGB.
 
     Raises
     ------

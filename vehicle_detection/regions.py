@@ -46,6 +46,11 @@ def find_vehicles(
     Detections
         Float boxes clipped to the frame; a box's score is the best score in its group.
 
+    Raises
+    ------
+    InvalidInputError
+        If an argument is malformed.
+
     Notes
     -----
     The grouping is one mean-shift step from the best window, in the space of positions and logarithmic sizes

@@ -15,7 +15,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_choice, check_integer, check_type, progress_bar, resolve_jobs
+from vehicle_detection._common import (
+    check_choice,
+    check_integer,
+    check_type,
+    pluralize,
+    progress_bar,
+    resolve_jobs,
+)
 from vehicle_detection.classifier import (
     DEFAULT_C,
     TrainingOptions,
@@ -426,8 +433,8 @@ def _card_accuracy(report: TrainingReport, others: Sequence[TrainingReport]) -> 
         "that of a training patch."
     )
     if "random" in report.splits:
-        seeds = len(report.splits["random"].accuracies)
-        method += f" The random split is the mean of {seeds} seed{'s' * (seeds > 1)}."
+        seeds = pluralize(len(report.splits["random"].accuracies), "seed")
+        method += f" The random split is the mean of {seeds}."
     text = ["## Accuracy", markdown_text(method), markdown_table(SCORE_COLUMNS, score_rows(report))]
     if report.calibration_error is not None:
         calibration = (

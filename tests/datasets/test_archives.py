@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.datasets.cases import OTHERS, VEHICLES, png, write_zip
+from vehicle_detection._common import natural_key
 from vehicle_detection.datasets import archives, fetch_patches, load_training_patches
 from vehicle_detection.errors import DatasetError, InvalidInputError
 
@@ -19,14 +20,14 @@ from vehicle_detection.errors import DatasetError, InvalidInputError
 @given(st.lists(st.integers(0, 10**30), min_size=1))
 def test_natural_order_is_the_order_of_the_numbers(numbers):
     names = [f"vehicles/GTI/image{number}.png" for number in numbers]
-    ordered = sorted(names, key=archives.natural_key)
+    ordered = sorted(names, key=natural_key)
     assert ordered == [f"vehicles/GTI/image{number}.png" for number in sorted(numbers)]
 
 
 @given(st.lists(st.text("a01/9-", max_size=6), unique=True))
 def test_natural_order_is_total(names):
     backwards = names[::-1]
-    assert sorted(names, key=archives.natural_key) == sorted(backwards, key=archives.natural_key)
+    assert sorted(names, key=natural_key) == sorted(backwards, key=natural_key)
 
 
 # Downloads from a local server

@@ -30,7 +30,7 @@ from vehicle_detection._common.limits import Limit, check_regular_file, read_reg
 from vehicle_detection._common.model_file import FORMAT_VERSION, ModelData, read_model, write_model
 from vehicle_detection._common.parquet import ParquetRows, write_parquet
 from vehicle_detection._common.progress import progress_bar
-from vehicle_detection._common.text import encodable, pluralize
+from vehicle_detection._common.text import encodable, natural_key, pluralize
 from vehicle_detection._common.threads import (
     CALLING_THREAD,
     JOBS_VARIABLE,
@@ -85,6 +85,7 @@ __all__ = [
     "is_url",
     "local_path",
     "mirror_patches",
+    "natural_key",
     "pluralize",
     "progress_bar",
     "read_model",

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import re
 
-def pluralize(count: int, noun: str) -> str:
+
+def pluralize(count: int, noun: str, ending: str = "s") -> str:
     """Format a count with its noun: "1 vehicle", "1,200 frames"."""
-    return f"{count:,} {noun}{'s' * (count != 1)}"
+    return f"{count:,} {noun}{ending * (count != 1)}"
+
+
+def natural_key(name: str) -> tuple[list[object], str]:
+    """Sort key that puts ``image2`` before ``image10``."""
+    parts = re.split(r"([0-9]+)", name)
+    return [int(part) if index % 2 else part for index, part in enumerate(parts)], name
 
 
 def encodable(text: str) -> str:

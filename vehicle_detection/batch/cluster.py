@@ -17,9 +17,19 @@ _ALLOWED_FAILURES = 20
 
 @contextlib.contextmanager
 def open_dask(address: str, jobs: int | None = None) -> Iterator[tuple[Executor, str]]:
-    """Connect to a Dask scheduler, or start one with `jobs` worker processes of one thread for ``"local"``.
+    """Connect to a Dask scheduler, or start one.
 
-    Yields the executor for `run_batch`, and the address of the dashboard.
+    Parameters
+    ----------
+    address
+        Address of a scheduler, such as ``"tcp://host:8786"``, or ``"local"`` to start one on this machine.
+    jobs
+        Number of worker processes, of one thread each, of a local scheduler; None: one per core.
+
+    Yields
+    ------
+    executor, dashboard
+        The executor for `run_batch`, and the address of the dashboard.
 
     Raises
     ------

@@ -139,6 +139,11 @@ def batch_status(out: str | os.PathLike[str]) -> BatchStatus:
     out
         Folder or URL of the batch.
 
+    Returns
+    -------
+    BatchStatus
+        The sums are 0 if no trip has been recorded.
+
     Raises
     ------
     InvalidInputError

@@ -130,7 +130,23 @@ class HeatmapDetector(VehicleDetector):
         return array, count
 
     def annotate(self, frame: NDArray[np.uint8], result: FrameResult) -> NDArray[np.uint8]:
-        """Draw the boxes of the hot regions on a copy of the frame, in the course's style."""
+        """Draw the boxes of the hot regions on a copy of the frame, in the course's style.
+
+        Parameters
+        ----------
+        frame, result
+            As in `VehicleDetector.annotate`.
+
+        Returns
+        -------
+        numpy.ndarray
+            A new frame of the same shape.
+
+        Raises
+        ------
+        InvalidInputError
+            If an argument is malformed.
+        """
         if self.diagnostics:
             return super().annotate(frame, result)
         check_type(result, "result", FrameResult, "pass what process or track returns")

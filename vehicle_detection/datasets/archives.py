@@ -27,6 +27,7 @@ from vehicle_detection._common import (
     check_path,
     check_regular_file,
     is_hidden,
+    natural_key,
     progress_bar,
     read_regular_file,
     resolve_jobs,
@@ -56,12 +57,6 @@ STALE_SECONDS = 3600.0  # age from which a partial download counts as left behin
 _ZIP_ERRORS = (
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, RuntimeError, ValueError, OSError,
 )  # fmt: skip
-
-
-def natural_key(name: str) -> tuple[list[object], str]:
-    """Sort key that puts ``image2`` before ``image10``."""
-    parts = re.split(r"([0-9]+)", name)
-    return [int(part) if index % 2 else part for index, part in enumerate(parts)], name
 
 
 def parent_folder(name: str) -> str:

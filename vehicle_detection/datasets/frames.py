@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_path
-from vehicle_detection.datasets.archives import is_image, natural_key
+from vehicle_detection._common import check_path, natural_key
+from vehicle_detection.datasets.archives import is_image
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import read_image
 

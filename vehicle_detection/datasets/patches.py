@@ -21,12 +21,12 @@ from vehicle_detection._common import (
     check_sequence,
     check_type,
     describe,
+    natural_key,
 )
 from vehicle_detection.datasets.archives import (
     decode_listings,
     infer_labels,
     list_patches,
-    natural_key,
     parent_folder,
 )
 from vehicle_detection.errors import InvalidInputError
@@ -183,6 +183,11 @@ def load_patches(
         Side in pixels that every patch must have; threads, None for one per core, at most 8; and whether to
         show a progress bar on standard error.
 
+    Returns
+    -------
+    PatchSet
+        Patches with their labels and names.
+
     Raises
     ------
     DatasetError
@@ -221,6 +226,11 @@ def load_training_patches(
     ----------
     vehicles, non_vehicles, n_jobs, progress
         A folder or zip file for each class; the others as in `load_patches`.
+
+    Returns
+    -------
+    PatchSet
+        Patches of 64x64 pixels, in natural order in each class.
 
     Raises
     ------

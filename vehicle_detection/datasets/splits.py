@@ -17,8 +17,9 @@ from vehicle_detection._common import (
     check_sequence,
     check_type,
     describe,
+    natural_key,
 )
-from vehicle_detection.datasets.archives import natural_key, parent_folder
+from vehicle_detection.datasets.archives import parent_folder
 from vehicle_detection.datasets.patches import PatchSet, check_labels
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import PATCH_SIZE
@@ -71,6 +72,11 @@ def split_random(
     test_size, random_state
         Fraction of test patches, in (0, 1), rounded up to whole patches; and the seed.
 
+    Returns
+    -------
+    Split
+        All rows.
+
     Raises
     ------
     InvalidInputError
@@ -112,6 +118,11 @@ def split_sequences(patch_set: PatchSet, *, test_size: float = 0.2) -> Split:
     test_size
         Fraction of each folder to test on, in (0, 1), rounded. A folder of two or more patches gives at least
         one to each part; a single patch goes to the training part.
+
+    Returns
+    -------
+    Split
+        All rows.
 
     Raises
     ------
@@ -158,6 +169,11 @@ def split_groups(
     threshold, random_state
         As in `find_near_duplicates`, and the seed. On the course's vehicles, most pairs at 0.9 show the same
         car; at 0.85 a quarter of all patches fall into one group by chance.
+
+    Returns
+    -------
+    Split
+        All rows.
 
     Raises
     ------
@@ -211,6 +227,11 @@ def split_sources(
     patch_set, train, test
         The patches, and prefixes of the sources of each part: ``"GTI"`` selects ``GTI``, ``GTI_Far`` and so
         on. Other sources are left out.
+
+    Returns
+    -------
+    Split
+        The rows of the named sources.
 
     Raises
     ------
@@ -353,6 +374,11 @@ def split_leakage(patch_set: PatchSet, split: Split, *, threshold: float = 0.95)
     ----------
     patch_set, split, threshold
         The patches, a split of them, and the threshold of `find_near_duplicates`.
+
+    Returns
+    -------
+    float
+        In [0, 1]; 0 for a split by `split_groups` at this threshold or a lower one.
 
     Raises
     ------

@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_array, check_boxes, check_sequence, check_type, describe
+from vehicle_detection._common import (
+    check_array,
+    check_boxes,
+    check_sequence,
+    check_type,
+    describe,
+    pluralize,
+)
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.export import check_items, is_result, shown_tracks
@@ -78,11 +85,6 @@ def _column(values: ArrayLike | None, name: str, rows: int, kinds: str, default:
 def none_if_unknown(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Return a column, or None if all values are NaN."""
     return None if np.isnan(values).all() else values
-
-
-def count_noun(number: int, noun: str, ending: str = "s") -> str:
-    """Format a number with its noun: ``1 box``, ``2 boxes``."""
-    return f"{number} {noun}{ending * (number != 1)}"
 
 
 def _table_frames(table: pandas.DataFrame) -> list[FrameKey]:
@@ -261,7 +263,7 @@ class FrameBoxes:
         return len(self.boxes)
 
     def __repr__(self) -> str:
-        boxes, frames = count_noun(len(self), "box", "es"), count_noun(len(self.frame_keys), "frame")
+        boxes, frames = pluralize(len(self), "box", "es"), pluralize(len(self.frame_keys), "frame")
         return f"FrameBoxes({boxes} in {frames})"
 
     def _repr_html_(self) -> str:
@@ -312,6 +314,11 @@ class FrameBoxes:
 
         So ``pandas.read_csv`` of a file that `write_tracks` wrote is such a table. A missing track is -1, and
         missing occlusion, truncation and `ignore` are 0.
+
+        Returns
+        -------
+        FrameBoxes
+            One box for each row.
 
         Raises
         ------

@@ -10,10 +10,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_image, check_integer, check_number, check_type, describe
+from vehicle_detection._common import (
+    check_image,
+    check_integer,
+    check_number,
+    check_type,
+    describe,
+    pluralize,
+)
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation.frame_boxes import FrameBoxes, FrameKey, count_noun
+from vehicle_detection.evaluation.frame_boxes import FrameBoxes, FrameKey
 
 Frames = Mapping[FrameKey, NDArray[np.uint8]] | FrameSet | Sequence[NDArray[np.uint8]]
 """Images by key, a `FrameSet`, or a list of images that are numbered from 0."""
@@ -79,7 +86,7 @@ class LabelledFrames:
         object.__setattr__(self, "labels", labels[sorted(row for key in keys for row in labels.rows(key))])
 
     def __repr__(self) -> str:
-        frames, boxes = count_noun(len(self), "frame"), count_noun(len(self.labels), "box", "es")
+        frames, boxes = pluralize(len(self), "frame"), pluralize(len(self.labels), "box", "es")
         return f"LabelledFrames({self.name!r}, {frames}, {boxes})"
 
     @property
@@ -114,6 +121,11 @@ class LabelledFrames:
             Step between the chosen frames; neighboring frames show nearly the same.
         name, horizon
             As in the class; None as `name` takes the file name without its suffix.
+
+        Returns
+        -------
+        LabelledFrames
+            Frames by number.
 
         Raises
         ------

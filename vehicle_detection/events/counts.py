@@ -77,6 +77,11 @@ def count_vehicles(events: Iterable[Event], log: TrackLog, *, fps: float) -> Veh
     fps
         Frame rate.
 
+    Returns
+    -------
+    VehicleCounts
+        Counts of the whole drive and of each of its minutes.
+
     Raises
     ------
     InvalidInputError

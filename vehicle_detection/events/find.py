@@ -131,7 +131,20 @@ class Event:
         return self.text(UNITS["metric"])
 
     def text(self, units: Units, *, with_time: bool = True) -> str:
-        """Describe the event in a line, with its known values in the given units."""
+        """Describe the event in a line, with its known values.
+
+        Parameters
+        ----------
+        units
+            Units of the distance, a value of ``vehicle_detection.units.UNITS``.
+        with_time
+            Start with the time of the event.
+
+        Returns
+        -------
+        str
+            Such as ``"12.0 s: vehicle 4 following, headway 0.6 ± 0.1 s, distance 14.2 ± 1.2 m"``.
+        """
         parts = [f"{self.time_s:.1f} s: " * with_time + f"vehicle {self.track_id} {KINDS[self.kind]}"]
         parts += [f"on the {self.side}"] if self.side else []
         listed = (

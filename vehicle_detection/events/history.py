@@ -119,7 +119,22 @@ class TrackLog:
         self.add(result.index, result.time, result.tracks)
 
     def add(self, index: int, time: float | None, tracks: Iterable[Any]) -> None:
-        """Add the tracks of the next frame."""
+        """Add the shown tracks of the next frame.
+
+        Parameters
+        ----------
+        index
+            Number of the frame, counted from 0 without gaps.
+        time
+            Time of the frame in the source in seconds; None if unknown.
+        tracks
+            `Track` objects; those that are not shown are skipped.
+
+        Raises
+        ------
+        InvalidInputError
+            If a frame is left out or repeated, two tracks have the same id, or an argument is malformed.
+        """
         expected = len(self.counts)
         if check_integer(index, "index", low=0) != expected:
             raise InvalidInputError(
@@ -137,7 +152,25 @@ class TrackLog:
                 column.append(value)
 
     def own_speeds(self, speed: OwnSpeed, fps: float) -> Floats:
-        """Speed of the own vehicle (m/s) in each frame; NaN where it is unknown."""
+        """Speed of the own vehicle in each frame.
+
+        Parameters
+        ----------
+        speed
+            Speed over the time of the source, as `read_own_speed` returns it.
+        fps
+            Frame rate.
+
+        Returns
+        -------
+        numpy.ndarray
+            ``(len(counts),)`` float64 in m/s; NaN where the speed is unknown.
+
+        Raises
+        ------
+        InvalidInputError
+            If `speed` is something else, or the frame rate is not a positive number.
+        """
         check_type(speed, "speed", OwnSpeed, "pass what read_own_speed returns")
         check_number(fps, "fps", above=0, high=1e6)
         return speed.at((self.first_time or 0.0) + np.arange(len(self.counts)) / fps)

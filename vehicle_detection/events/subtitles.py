@@ -11,7 +11,14 @@ from typing import Literal
 
 import numpy as np
 
-from vehicle_detection._common import atomic_write, check_choice, check_number, check_suffix, check_type
+from vehicle_detection._common import (
+    atomic_write,
+    check_choice,
+    check_number,
+    check_suffix,
+    check_type,
+    pluralize,
+)
 from vehicle_detection.drawing import MAX_SPEED_STD
 from vehicle_detection.events.find import Event, check_events
 from vehicle_detection.events.history import Floats, TrackHistory, TrackLog
@@ -158,7 +165,7 @@ def _second_texts(
 
 def _vehicles(count: int, nearest: _Nearest | None, own_mps: float | None, units: Units) -> str:
     """Describe the vehicles of a second."""
-    text = "no vehicle" if not count else f"{count} vehicle{'s' * (count > 1)}"
+    text = pluralize(count, "vehicle") if count else "no vehicle"
     if nearest is None:
         return text
     text += f", nearest #{nearest.id}: {units.distance_text(nearest.distance_m, nearest.distance_std_m)}"

@@ -194,9 +194,19 @@ class Explorer:
     ) -> None:
         """Change search parameters; None keeps a value.
 
-        `min_score` is the minimum score of positive windows, on which the boxes that a mixture predicts do
-        not depend; `horizon` a fraction of the frame's height; `bands` numbers the bands of
-        ``search_params.bands`` to search, from 0. An empty list finds nothing.
+        Parameters
+        ----------
+        min_score
+            Minimum score of positive windows. The boxes that a mixture predicts do not depend on it.
+        horizon
+            Row of the horizon as a fraction of the frame's height, 0-1.
+        bands
+            Numbers of the bands of ``search_params.bands`` to search, from 0. An empty list finds nothing.
+
+        Raises
+        ------
+        InvalidInputError
+            If a value is out of range, or `bands` is given for a model whose search has none.
         """
         params = self.search_params.with_horizon(horizon)
         if min_score is not None:
@@ -221,9 +231,19 @@ class Explorer:
     ) -> None:
         """Change how windows become boxes; None keeps a value.
 
-        `threshold`, `peak_fraction` and `weighting` are fields of `HeatParams`, for the method ``"heat"``;
-        `min_peak` and `min_evidence` are fields of `RegionParams`, for ``"groups"``, and have no effect if
-        the model predicts boxes.
+        Parameters
+        ----------
+        method
+            ``"groups"`` or ``"heat"``, see the attribute.
+        threshold, peak_fraction, weighting
+            Fields of `HeatParams`, for ``"heat"``.
+        min_peak, min_evidence
+            Fields of `RegionParams`, for ``"groups"``. They have no effect if the model predicts boxes.
+
+        Raises
+        ------
+        InvalidInputError
+            If `method` is unknown, or a value is out of range.
         """
         method = self.method if method is None else method
         check_choice(method, "method", METHODS)
@@ -276,7 +296,23 @@ class Explorer:
         return list(np.argsort(-self.boxes().scores, kind="stable").tolist())
 
     def box_at(self, x: float, y: float) -> int:
-        """Return the number of the smallest box that holds a point of the frame; 0 if none does."""
+        """Return the number of the smallest box that holds a point of the frame; 0 if none does.
+
+        Parameters
+        ----------
+        x, y
+            Column and row in pixels of the frame, not of the reduced image.
+
+        Returns
+        -------
+        int
+            Number as in `set_box`, from 1 for the box with the highest score.
+
+        Raises
+        ------
+        InvalidInputError
+            If a coordinate is not a finite number.
+        """
         check_number(x, "x")
         check_number(y, "y")
         boxes = self.boxes().boxes

@@ -215,6 +215,11 @@ def bin_spatial(
     numpy.ndarray
         ``(width * height * 3,)`` uint8.
 
+    Raises
+    ------
+    InvalidInputError
+        If an argument is malformed.
+
     Examples
     --------
     >>> bin_spatial(np.zeros((64, 64, 3), np.uint8), 16).shape
@@ -244,6 +249,11 @@ def color_hist(img: NDArray[np.uint8], nbins: int = 32) -> NDArray[np.int64]:
     -------
     numpy.ndarray
         ``(3 * nbins,)`` int64 counts.
+
+    Raises
+    ------
+    InvalidInputError
+        If the image is malformed, or `nbins` is not in 1-256.
 
     Examples
     --------

@@ -58,7 +58,23 @@ class PatchFeatures(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         return FeatureParams(**arguments)
 
     def fit(self, X: Any, y: Any = None) -> PatchFeatures:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Parameters
+        ----------
+        X, y
+            Patches and labels, which are ignored.
+
+        Returns
+        -------
+        PatchFeatures
+            This transformer.
+
+        Raises
+        ------
+        InvalidInputError
+            If a parameter is invalid.
+        """
         self.to_params()
         return self
 

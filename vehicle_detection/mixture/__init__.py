@@ -28,7 +28,7 @@ from vehicle_detection.mixture.rescoring import (
     Layer,
     Network,
     Rescorer,
-    last_cells,
+    inputs_after,
 )
 from vehicle_detection.mixture.search import MixtureSearch, frame_grid
 from vehicle_detection.mixture.template import MixtureTemplate, smallest_box
@@ -55,7 +55,7 @@ __all__ = [
     "denoise",
     "edge_features",
     "frame_grid",
-    "last_cells",
+    "inputs_after",
     "load_model",
     "mirror_channels",
     "mostly_inside",

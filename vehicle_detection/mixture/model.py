@@ -121,6 +121,7 @@ class TemplateMixture:
     """
 
     search_params_type: ClassVar[type[PyramidParams]] = PyramidParams
+    searches_every_frame: ClassVar[bool] = False
 
     templates: tuple[MixtureTemplate, ...]
     slope: float = 1.0
@@ -166,6 +167,11 @@ class TemplateMixture:
             Threads that share the sizes of a frame; the result does not depend on them.
         method
             ``"shared"``, the only search of this kind of model.
+
+        Returns
+        -------
+        MixtureSearch
+            A thread-safe context manager; its parameters are `PyramidParams`.
 
         Raises
         ------
@@ -220,7 +226,20 @@ class TemplateMixture:
     def detect_vehicles(
         self, pyramid: EdgePyramid, windows: ScoredWindows, *, min_margin: float
     ) -> FoundVehicles:
-        """Find the vehicles that the windows of a frame propose, best first."""
+        """Find the vehicles that the windows of a frame propose.
+
+        Parameters
+        ----------
+        pyramid, windows
+            As in `propose_boxes`.
+        min_margin
+            Minimum final margin of a vehicle.
+
+        Returns
+        -------
+        FoundVehicles
+            Boxes and final margins, best first.
+        """
         proposals, template_margins = self.propose_boxes(pyramid, windows, min_margin=RESCORE_MIN)
         boxes, margins, _ = self.rescore_boxes(pyramid, proposals, template_margins)
         count = np.count_nonzero(margins >= RESCORE_MIN)
@@ -243,7 +262,23 @@ class TemplateMixture:
         min_margin: float,
         max_boxes: int = MAX_PROPOSALS,
     ) -> tuple[Floats, Floats]:
-        """Boxes inside the frame and their margins before rescoring; several may cover one vehicle."""
+        """Group the windows of a frame into boxes, before rescoring; several boxes may cover one vehicle.
+
+        Parameters
+        ----------
+        pyramid, windows
+            What `MixtureSearch.score_windows` returns for the frame; the windows are sorted, best first.
+        min_margin
+            Minimum margin of a box, with the size prior and the votes.
+        max_boxes
+            Maximum number of boxes.
+
+        Returns
+        -------
+        boxes, margins : numpy.ndarray
+            ``(N, 4)`` float64 boxes ``[x1, y1, x2, y2]`` inside the frame, and their ``(N,)`` float64
+            margins, best first.
+        """
         # The size prior and the votes add at most 2 units each.
         min_window = min_margin - 2 * self.size_prior_weight - 2 * self.vote_weight
         grouped, vote_mass = vote_boxes(windows, min_margin=min_window, max_boxes=max_boxes)
@@ -259,10 +294,22 @@ class TemplateMixture:
     def rescore_boxes(
         self, pyramid: EdgePyramid, proposals: Floats, margins: Floats
     ) -> tuple[Floats, Floats, NDArray[np.intp]]:
-        """Boxes of different vehicles with their final margins, best first, and the rows of their proposals.
+        """Rescore and correct proposed boxes, and keep one for each vehicle.
 
         The second stage sees a box twice: as proposed, and as corrected, when it fits the vehicle better. The
         two margins are averaged. Correction in steps: Cai and Vasconcelos, "Cascade R-CNN" (CVPR 2018).
+
+        Parameters
+        ----------
+        pyramid
+            As in `propose_boxes`.
+        proposals, margins
+            What `propose_boxes` returns.
+
+        Returns
+        -------
+        boxes, margins, rows : numpy.ndarray
+            ``(M, 4)`` boxes and ``(M,)`` final margins, best first, and ``(M,)`` intp rows in `proposals`.
         """
         if self.rescorer is None:
             rows = nms(proposals, margins)
@@ -305,6 +352,11 @@ def load_model(path: str | os.PathLike[str] = "default") -> TemplateMixture | Ve
     ----------
     path
         ``"default"``, for any road; ``"highway"``, one template, the fastest; or a ``.safetensors`` file.
+
+    Returns
+    -------
+    TemplateMixture or VehicleClassifier
+        A mixture for ``"default"``, a classifier for ``"highway"``; otherwise the kind that the file holds.
 
     Raises
     ------

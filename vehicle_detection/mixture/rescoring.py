@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -79,7 +78,7 @@ class Network:
             weights = finite_array(layer.weights, f"rescorer.{name}", (outputs, inputs))
             bias = finite_array(layer.bias, f"rescorer.{name} bias", (outputs,))
             layers.append(Layer(weights, bias))
-            inputs = outputs * (KERNEL**2 if number < 2 else last_cells() if number == 2 else 1)
+            inputs = inputs_after(number, outputs)
         if len(layers[-1].bias) != 5:
             raise InvalidInputError(
                 f"rescorer.{LAYERS[-1]} must have 5 outputs, got {len(layers[-1].bias)}; train again"
@@ -190,16 +189,23 @@ def _convolutions(layers: Sequence[Layer]) -> list[Convolution]:
         weights = layer.weights.reshape(len(layer.bias), KERNEL, KERNEL, -1)
         convolutions.append(Convolution(weights, layer.bias, stride))
     hidden, output = layers[len(STRIDES) :]
-    side = math.isqrt(last_cells())
+    side = _last_side()
     weights = hidden.weights.reshape(len(hidden.bias), -1, side, side).transpose(0, 2, 3, 1)
     convolutions.append(Convolution(weights, hidden.bias, 1))
     convolutions.append(Convolution(output.weights[:, None, None], output.bias, 1))
     return convolutions
 
 
-def last_cells() -> int:
-    """Count the cells of a crop after the last convolution."""
+def inputs_after(number: int, outputs: int) -> int:
+    """Return the number of inputs of the layer after layer `number`, which has so many outputs."""
+    if number < 2:
+        return outputs * KERNEL**2
+    return outputs * (_last_side() ** 2 if number == 2 else 1)
+
+
+def _last_side() -> int:
+    """Side of a crop in cells after the last convolution."""
     side = CROP_CELLS
     for stride in STRIDES:
         side = (side - KERNEL) // stride + 1
-    return side**2
+    return side

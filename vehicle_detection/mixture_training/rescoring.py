@@ -27,7 +27,7 @@ from vehicle_detection.mixture import (
     MixtureSearch,
     Network,
     Rescorer,
-    last_cells,
+    inputs_after,
     rescoring_inputs,
 )
 from vehicle_detection.mixture_training.negatives import is_negative
@@ -176,7 +176,7 @@ def _initial_values(rng: np.random.Generator) -> list[Singles]:
         limit = 1 / np.sqrt(inputs)
         shapes = (outputs, inputs), (outputs,)
         values += [rng.uniform(-limit, limit, shape).astype(np.float32) for shape in shapes]
-        inputs = outputs * (KERNEL**2 if number < 2 else last_cells() if number == 2 else 1)
+        inputs = inputs_after(number, outputs)
     return values
 
 

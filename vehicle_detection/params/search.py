@@ -80,7 +80,23 @@ class SearchBand:
     def place(
         self, shape: tuple[int, ...], horizon: float, horizontal_padding: float = 0.0
     ) -> PixelBand | None:
-        """Place the band on a frame of `shape` (height, width); None if no window fits."""
+        """Place the band on a frame.
+
+        Parameters
+        ----------
+        shape
+            ``(height, width, ...)`` of the frame.
+        horizon
+            Row of the horizon as a fraction of the frame's height, 0 at the top.
+        horizontal_padding
+            Fraction of a window's width by which a band that ends at the frame's left or right border extends
+            beyond it.
+
+        Returns
+        -------
+        PixelBand or None
+            The band in pixels; None if no window fits, or windows are smaller than 16 pixels.
+        """
         height, width = shape[:2]
         scale = max(height, width) / REFERENCE_WIDTH
         window_w, window_h = (round(side * scale) for side in self.window)
@@ -374,17 +390,42 @@ class PyramidParams:
         return min(max(shape[1] / 40, 24.0), 32.0)
 
     def sizes(self, columns: float, rows: float, shape: tuple[int, ...]) -> list[float]:
-        """Cell sizes in pixels of the frame, for boxes of `columns` by `rows` cells in a frame of `shape`."""
+        """Sizes of the cells of a search, in pixels of the frame.
+
+        Parameters
+        ----------
+        columns, rows
+            Width and height of a vehicle's box in cells.
+        shape
+            ``(height, width, ...)`` of the frame.
+
+        Returns
+        -------
+        list of float
+            In ascending order, `per_octave` per doubling. At the first one, a box has the minimum width.
+        """
         smallest = self.smallest_width(shape) / columns
         largest = max(self.max_height * shape[0] / rows, smallest)
         count = math.floor(self.per_octave * math.log2(largest / smallest)) + 1
         return [smallest * 2 ** (step / self.per_octave) for step in range(count)]
 
     def rows(self, width: float, height: float, shape: tuple[int, ...]) -> tuple[int, int]:
-        """Half-open range of rows that boxes of `width` by `height` pixels can cover in a frame of `shape`.
+        """Range of rows that boxes of one size can cover.
 
         On a flat road, the bottom of a vehicle is below the horizon by its width in pixels times the ratio of
         the camera's height and the vehicle's width.
+
+        Parameters
+        ----------
+        width, height
+            Size of the boxes in pixels.
+        shape
+            ``(height, width, ...)`` of the frame.
+
+        Returns
+        -------
+        tuple of int
+            First row, and the row after the last one; all rows if `horizon` is None.
         """
         if self.horizon is None:
             return 0, shape[0]

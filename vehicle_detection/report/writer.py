@@ -95,7 +95,18 @@ class ReportWriter:
         self.write(result.index, result.time, result.tracks)
 
     def write(self, index: int, time: float | None, tracks: Iterable[Any]) -> None:
-        """Add the shown tracks of the next frame, numbered from 0; `time` is that in the source (s)."""
+        """Add the shown tracks of the next frame.
+
+        Parameters
+        ----------
+        index, time, tracks
+            As in `TrackLog.add`.
+
+        Raises
+        ------
+        InvalidInputError
+            As in `TrackLog.add`.
+        """
         self.log.add(index, time, tracks)
 
     def finish(
@@ -105,10 +116,23 @@ class ReportWriter:
         events: Iterable[Event] | None = None,
         pictures: Sequence[TrackPicture] = (),
     ) -> None:
-        """Write the page, completely or not at all, with the `report` that `process_video` returned.
+        """Write the page, completely or not at all.
 
-        `events` are those that `find_events` found in `log`; None: they are found here. `pictures` are
-        listed below the tracks.
+        Parameters
+        ----------
+        report
+            What `process_video` returned.
+        events
+            What `find_events` found in `log`; None: they are found here.
+        pictures
+            `TrackPicture` objects to list below the tracks.
+
+        Raises
+        ------
+        InvalidInputError
+            If an argument is malformed, or the folder of the page is missing or read-only.
+        OutputError
+            If the page cannot be written, for example because the disk is full.
         """
         check_type(report, "report", VideoReport, "pass what process_video returned")
         if events is None:

@@ -180,6 +180,11 @@ class Tracker:
         -------
         tuple of Track
             Confirmed tracks by id, then tentative ones.
+
+        Raises
+        ------
+        InvalidInputError
+            If an argument is malformed.
         """
         if hasattr(detections, "xyxy"):
             detections = Detections.from_supervision(detections)

@@ -12,6 +12,7 @@ import sys
 from fractions import Fraction
 from pathlib import Path
 
+from vehicle_detection._common import pluralize
 from vehicle_detection.video.ffmpeg import Process, input_options, last_line, seconds_of, source_name
 from vehicle_detection.video.probe import VideoInfo
 
@@ -33,7 +34,7 @@ def find_damage(path: Path | str, info: VideoInfo, end: int, log: str, *, stop: 
     if expected > end:
         parts.append(f"{expected - end} of {expected} frames cannot be decoded")
     if count:
-        parts.append(f"ffmpeg reports {count} decoding error{'s' * (count > 1)} ({message})")
+        parts.append(f"ffmpeg reports {pluralize(count, 'decoding error')} ({message})")
     return f"{source_name(path)} is damaged: {', and '.join(parts)}; copy or record it again" if parts else ""
 
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import glob
 import os
-import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from vehicle_detection._common import check_path, is_hidden
+from vehicle_detection._common import check_path, is_hidden, natural_key
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video.probe import probe
 from vehicle_detection.video.trips import find_trips, is_video_file
@@ -32,7 +30,7 @@ def list_files(path: Path) -> list[Path]:
         images = [each for each in found if each.suffix.lower() in IMAGE_SUFFIXES]
         if not images:
             raise InvalidInputError(f"source {path} holds no videos and no images; check the path")
-        return sorted(images, key=_natural_order)
+        return sorted(images, key=lambda image: natural_key(str(image)))
     trips = find_trips(videos, duration=lambda each: probe(each).duration)
     if len(trips) > 1:
         listed = "; ".join(f"{trip} from {Path(trip.files[0]).name}" for trip in trips[:4])
@@ -62,12 +60,6 @@ def walk_files(folder: Path, name: str = "source") -> Iterator[Path]:
         if place not in visited:
             yield from (Path(parent, each) for each in files if not is_hidden(each))
         visited.add(place)
-
-
-def _natural_order(path: Path) -> list[Any]:
-    """Sorting key of file names in which 9 comes before 10."""
-    parts = re.split(r"(\d+)", str(path))
-    return [int(part) if part.isdecimal() else part for part in parts]
 
 
 def check_file(path: str | os.PathLike[str]) -> Path:

@@ -52,14 +52,42 @@ class FrameSource:
         return f"FrameSource({self.name}, {info.width}x{info.height} at {float(info.fps):g} Hz{length})"
 
     def read(self, first: int = 0, count: int | None = None, *, strict: bool = False) -> Reader:
-        """Open a reader of `count` frames from number `first` on; None: to the end.
+        """Open a reader of some or all frames.
 
-        With `strict`, the reader raises an error after the last frame of a damaged file.
+        Parameters
+        ----------
+        first, count
+            Number of the first frame, from 0, and how many frames to read; None: to the end.
+        strict
+            Raise a `VideoError` after the last frame of a damaged file. Otherwise a warning is logged.
+
+        Returns
+        -------
+        Reader
+            An iterator of ``(index, time, frame)`` and a context manager, like that of `read_frames`.
+
+        Raises
+        ------
+        InvalidInputError
+            If the source is not `rereadable` and has been read.
         """
         raise NotImplementedError
 
     def audio(self, first: int = 0, length: float | None = None) -> AudioSource | None:
-        """Sound from frame `first` on, `length` seconds long; None if there is none."""
+        """Return the sound from a frame on; None if there is none.
+
+        Parameters
+        ----------
+        first
+            Number of the frame, from 0.
+        length
+            Length in seconds; None: to the end.
+
+        Returns
+        -------
+        AudioSource or None
+            Input of the writer of a video.
+        """
         return None
 
     def __iter__(self) -> Iterator[tuple[int, float, NDArray[np.uint8]]]:

@@ -123,6 +123,11 @@ def find_trips(
     list of Trip
         Ordered by folder, camera and time.
 
+    Raises
+    ------
+    InvalidInputError
+        If `files` is not a sequence of paths or URLs. Exceptions of `duration` are passed on.
+
     Examples
     --------
     >>> names = ["20260131_081500_F.MP4", "20260131_081600_F.MP4", "20260131_081700_F.MP4"]
