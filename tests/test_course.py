@@ -786,8 +786,11 @@ def test_features_of_an_image_with_a_picture_of_the_hog():
     np.testing.assert_array_equal(features, lesson.single_img_features(PATCHES[0], "YUV", hog_channel=1))
     channel = lesson.convert_color(PATCHES[0], "RGB2YUV")[..., 1]
     np.testing.assert_array_equal(picture, lesson.get_hog_features(channel, 9, 8, 2, vis=True)[1])
-    for options in ({"hog_channel": "ALL"}, {"hog_feat": False}):
-        with pytest.raises(InvalidInputError, match="vis needs the HOG of one channel"):
+    for options, message in (
+        ({"hog_channel": "ALL"}, "pass hog_channel=0"),
+        ({"hog_feat": False}, "omit vis"),
+    ):
+        with pytest.raises(InvalidInputError, match=f"vis needs .*; {message}"):
             lesson.single_img_features(PATCHES[0], **options, vis=True)
 
 
@@ -844,3 +847,12 @@ def test_a_mismatch_warns_in_every_color_space(space):
         svc, scaler = trained(np.array(lesson.extract_features(trained_on, **options)))
         with pytest.warns(UserWarning, match="the scaler was fitted on values 0-"):
             lesson.search_windows(FRAMES[given_as], PAIRS, svc, scaler, **options)
+
+
+@pytest.mark.parametrize("options", [{"spatial_size": (16, 32)}, {}])
+def test_a_mismatch_warns_whatever_the_scaler_and_the_bins(options):
+    options = {"color_space": "RGB", "spatial_size": (16, 16)} | options
+    scaler = StandardScaler(with_std="spatial_size" not in options)
+    svc, scaler = trained(np.array(lesson.extract_features(PATCHES / 255, **options)), scaler=scaler)
+    with pytest.warns(UserWarning, match="fitted on values 0-1"):
+        lesson.search_windows(FRAMES["uint8"], PAIRS, svc, scaler, **options)

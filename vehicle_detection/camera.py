@@ -52,7 +52,7 @@ _HORIZON_STD = 0.15
 _EDGE_STD_PX = 3.5
 # Standard deviation of vehicles' heights, as a fraction.
 _RELATIVE_STD = 0.12
-# Residual, in standard errors, from which on a box is ignored.
+# Boxes with a larger residual, in standard errors, are ignored.
 _BIWEIGHT = 4.7
 # Number of boxes that count as one, because they show the same vehicle.
 _CORRELATED_BOXES = 3.0

@@ -268,7 +268,7 @@ class VehicleDetector:
         """Refuse a second thread during a block: tracks follow the order of the frames."""
         if not self._lock.acquire(blocking=False):
             raise InvalidInputError(
-                "frames must be processed one after the other, but another thread processes one; "
+                "frames must be processed one after the other, but another thread is processing one; "
                 "call detect or search from several threads, or make a detector for each video"
             )
         try:

@@ -293,8 +293,8 @@ def test_annotated_videos_are_no_sources(card, model, tmp_path):
     assert counts(run(card, card / "results", model, **options)) == (3, 0, 0, 0)
     assert counts(run(card, card / "others", model, **options)) == (3, 0, 0, 0)
     (tmp_path / "link").symlink_to(card)
-    assert counts(run(tmp_path / "link", card / "results", model, **options)) == (0, 0, 0, 3)
     assert counts(run(card, tmp_path / "link" / "results", model, **options)) == (0, 0, 0, 3)
+    assert run(tmp_path / "link", tmp_path / "third", model, dry_run=True).trips == 3
 
 
 def test_linked_folders_are_searched_once(card, tmp_path):
@@ -303,9 +303,13 @@ def test_linked_folders_are_searched_once(card, tmp_path):
     (folder / "a").symlink_to(card)
     (folder / "b").symlink_to(card)
     (card / "loop").symlink_to(folder)
+    (card / "lost+found").mkdir()
     (card / ".Trash").mkdir()
     shutil.copy(card / "20260131_093000_F.mp4", card / ".Trash")
-    assert [*list_videos([folder])] == sorted(str(file) for file in card.glob("*.mp4"))
+    shutil.copy(card / "20260131_093000_F.mp4", card / "lost+found")
+    names = sorted(file.name for file in card.glob("*.mp4"))
+    assert [*list_videos([folder])] == [f"{folder}/a/{name}" for name in names]
+    assert [*list_videos([card, folder])] == [f"{card}/{name}" for name in names]
 
 
 @pytest.mark.parametrize("changed", [False, True])
@@ -320,9 +324,17 @@ def test_a_trip_whose_first_segment_is_gone(clip, model, tmp_path, changed):
     options = {"every": 3} if changed else {}
     report = run(card, out, model, tracks_only=True, options=options)
     assert counts(report) == ((1, 0, 0, 0) if changed else (0, 0, 0, 1))
-    found = check_whole(out, done=1, failed=0)
-    assert [len(each["sources"]) for each in found.values()] == [4 if changed else 5]
+    # What was processed of a file that is gone stays.
+    found = check_whole(out, done=1 + changed, failed=0)
+    assert sorted(len(each["sources"]) for each in found.values()) == ([4, 5] if changed else [5])
     assert counts(run(card, out, model, tracks_only=True, options=options)) == (0, 0, 0, 1)
+    for second in (5, 6):
+        shutil.copy2(clip, card / f"20260131_08150{second}_F.mp4")
+        assert counts(run(card, out, model, tracks_only=True, options=options)) == (1, 0, 0, 0)
+    found = check_whole(out, done=2, failed=0)
+    assert sorted(len(each["sources"]) for each in found.values()) == ([5, 6] if changed else [2, 5])
+    if not changed:
+        assert {each["start"] for each in found.values()} == {"2026-01-31T08:15:00", "2026-01-31T08:15:05"}
 
 
 def test_another_model_in_the_same_file(card, tmp_path):
@@ -420,7 +432,7 @@ def test_a_dry_run_changes_nothing(card, model, tmp_path):
     options = {"tracks_only": True, "dry_run": True}
     report = run(card, out, model, **options)
     assert not out.exists()
-    assert str(report) == "3 trips: 3 to do, which replace 0 earlier results; 0 skipped"
+    assert str(report) == "3 trips: 3 to process, 0 skipped"
     assert [(len(trip["files"]), trip["camera"]) for trip in report.planned] == [
         (2, "front"), (1, "front"), (2, "rear")
     ]  # fmt: skip
@@ -431,8 +443,12 @@ def test_a_dry_run_changes_nothing(card, model, tmp_path):
     result = CliRunner().invoke(app, words)
     assert result.stdout.splitlines() == [
         f"2026-01-31 09:30:00  front  1 file from {card}/20260131_093000_F.mp4, replaces 1 earlier result",
-        "3 trips: 1 to do, which replace 1 earlier result; 2 skipped",
+        "3 trips: 1 to process, 1 earlier result to replace, 2 skipped",
     ]
+    assert CliRunner().invoke(app, [*words, "--summary", "a.csv"]).exit_code == 2
+    run(card, out, model, tracks_only=True)
+    assert str(run(card, out, model, **options)) == "3 trips: 0 to process, 3 skipped"
+    before = files(out)
     assert files(out) == before
     with pytest.raises(InvalidInputError, match="is not a folder"):
         run(card, card / "20260131_093000_F.mp4", model, **options)

@@ -219,3 +219,23 @@ def test_single_rows():
     labels = FrameBoxes([0, 3], [7, 8], [[0, 0, 50, 40], [5, 0, 55, 40]])
     assert [row.frames for row in labels] == [(0,), (3,)]
     assert (labels[0].tracks.tolist(), labels[np.int64(-1)].tracks.tolist()) == ([7], [8])
+
+
+def test_exact_tracks_and_unusual_columns():
+    table = pd.DataFrame({"frame": [0, 1], "x1": [0, 5], "y1": [0, 0], "x2": [50, 55], "y2": [40, 40]})
+    table["track_id"], table["ignore"] = [2**60 + 1, 2**53 + 1], [1.0, np.nan]
+    labels = FrameBoxes.from_pandas(table)
+    assert labels.tracks.tolist() == [2**60 + 1, 2**53 + 1]
+    assert labels.ignore.tolist() == [True, False]
+    table["track_id"] = [np.inf, 1]
+    with pytest.raises(InvalidInputError, match="whole numbers in the column track_id, got inf"):
+        FrameBoxes.from_pandas(table)
+    table["track_id"] = pd.Categorical(["a", None])
+    with pytest.raises(InvalidInputError, match="numbers in the column track_id"):
+        FrameBoxes.from_pandas(table)
+    del table["track_id"]
+    with pytest.raises(InvalidInputError, match="each column once; got x1 more than once"):
+        FrameBoxes.from_pandas(pd.concat([table, table[["x1"]]], axis=1))
+    table["frame"] = [True, False]
+    with pytest.raises(InvalidInputError, match="frames must be all int or all str, got bool"):
+        FrameBoxes.from_pandas(table)

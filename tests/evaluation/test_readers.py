@@ -483,6 +483,9 @@ def test_a_text_file_without_boxes_is_one_of_predictions(tmp_path):
         ("data.yaml", "names:\n  0: person\n  2: car\n  7: van\nextra:\n  0: car\n", True),
         ("data.yaml", "names: [person, x,\n car, x, x, x, x, truck]", True),
         ("data.yaml", "names:\n- person # walks\n- x\n# cars\n- car\n- x\n- x\n- x\n- x\n- bus\n", True),
+        ("data.yaml", "names: ['person', x,  # 0-1\n car, # 2, the cars\n x, x, x, x, 'bus'] # 3-7\n", True),
+        ("data.yaml", '{"nc": 8, "names": ["a", "b", "car", "c", "d", "e", "f", "truck"]}', True),
+        ("data.yaml", "names: [driver's seat, 'x [y]', car, x, x, x, x, bus]\n---\n- a\n", True),
         ("classes.txt", "person\nx\ncar\nx\nx\nx\nx\ntruck\n", True),
         ("other.txt", "", False),
     ],
@@ -514,3 +517,11 @@ def test_numbers_that_only_python_reads(tmp_path):
 def test_blank_lines_of_an_archive_of_cvat(tmp_path):
     path = write_zip(tmp_path / "a.zip", "1,1,0,0,20,10,1,1,1\n,\t\n")
     assert len(read_labels(path)) == 1
+
+
+def test_an_empty_column_of_scores_is_one_of_labels(tmp_path):
+    text = "frame,track,x1,y1,x2,y2,score\n0,3,1,2,30,40,\n"
+    labels = read_labels(written(tmp_path, text))
+    assert (labels.tracks.tolist(), labels.scores) == ([3], None)
+    with pytest.raises(DatasetError, match="score must be a finite number, got ''"):
+        read_labels(written(tmp_path, f"{text}0,4,1,2,30,40,0.5\n"))

@@ -72,6 +72,12 @@ class TestGpx:
         )
         np.testing.assert_allclose(read_own_speed(path).at([9, 12]), 20, rtol=1e-3)
 
+    def test_a_segment_for_each_point(self, tmp_path):
+        points = [(50 + 20 * second / DEGREE_M, 10, time_of(second), "") for second in range(10)]
+        path = write_gpx(tmp_path / "a.gpx", points)
+        path.write_text(path.read_text().replace("</trkpt><trkpt", "</trkpt></trkseg><trkseg><trkpt"))
+        np.testing.assert_allclose(read_own_speed(path).at(np.arange(10)), 20, rtol=1e-3)
+
     def test_positions_too_far_apart(self, tmp_path):
         points = [(50, 10 + second, time_of(second), "") for second in range(0, 60, 10)]
         with pytest.raises(InvalidInputError, match="no positions at most 5 s apart to compute them"):

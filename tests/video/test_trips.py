@@ -168,9 +168,17 @@ def test_vehicles_and_channels_are_trips_of_their_own(names):
         ("2026_0131_0815{:02}_{:04}T.MP4", "unknown"),
         ("260131_0815{:02}_{:03}_FH.MP4", "front"),
         ("260131_0815{:02}_{:03}_RH.MP4", "rear"),
+        ("20260131_0815{:02}_REC{:04}.MP4", "unknown"),
+        ("20260131_0815{:02}_N{:03}F.MP4", "front"),
     ],
 )
 def test_counters_of_files_are_no_names(form, camera):
     names = [form.format(second, 7 + number) for number, second in enumerate((0, 5, 10, 15))]
     assert summary(names) == [(camera, names)]
     assert find_trips(names)[0].start == datetime(2026, 1, 31, 8, 15)
+
+
+def test_a_short_year_that_looks_like_a_long_one():
+    names = [f"200108_081{minute}00_00{minute}_FH.MP4" for minute in range(5, 8)]
+    assert summary(names) == [("front", names)]
+    assert find_trips(names)[0].start == datetime(2020, 1, 8, 8, 15)

@@ -26,6 +26,9 @@ _MAX_PARTS = 100
 _SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
+_SYSTEM_FOLDERS = ("__macosx", "$recycle.bin", "system volume information", "lost+found")
+
+
 def check_target(target: str | os.PathLike[str], name: str = "target") -> Path:
     """Return the path of a file to write, after checking that it is no device, and its folder is writable."""
     path = check_path(target, name)
@@ -50,12 +53,11 @@ def check_suffix(target: str | os.PathLike[str], name: str, suffixes: Sequence[s
 
 
 def is_hidden(name: str) -> bool:
-    """Whether a file or one of its folders is hidden, a macOS resource folder or the recycle bin of Windows.
+    """Whether a file or one of its folders is hidden, or a folder of the system, such as the recycle bin.
 
     `name` is relative to the folder that is listed, with slashes.
     """
-    special = ("__MACOSX", "$RECYCLE.BIN")
-    return any(part.startswith(".") or part in special for part in name.split("/"))
+    return any(part.startswith(".") or part.lower() in _SYSTEM_FOLDERS for part in name.split("/"))
 
 
 @contextlib.contextmanager

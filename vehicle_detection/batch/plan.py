@@ -20,6 +20,7 @@ from vehicle_detection._common import (
     check_path,
     describe,
     hide_credentials,
+    is_hidden,
     is_url,
     local_path,
     stable_url,
@@ -62,7 +63,12 @@ def list_videos(sources: Iterable[str | os.PathLike[str]]) -> dict[str, Facts]:
         found.update(files)
     if not found:
         raise InvalidInputError("sources must name at least one video, got none; pass files or folders")
-    return dict(sorted(found.items()))
+    # Two paths of one file are one source, the first of them; a link to a file has a name of its own.
+    places: dict[str, str] = {}
+    for file in sorted(found):
+        folder, name = os.path.split(file)
+        places.setdefault(file if is_url(file) else os.path.join(os.path.realpath(folder), name), file)
+    return {file: found[file] for file in places.values()}
 
 
 def _list_local(path: Path) -> Iterator[tuple[str, Facts]]:
@@ -75,8 +81,7 @@ def _list_local(path: Path) -> Iterator[tuple[str, Facts]]:
         files = (each for each in files if is_video_file(each))
     else:
         raise InvalidInputError(f"sources {path} does not exist; check the path")
-    # The same file by another path of its folder is the same source. A link to a file keeps its own name.
-    return ((os.path.join(os.path.realpath(each.parent), each.name), {}) for each in files if each.is_file())
+    return ((os.path.abspath(each), {}) for each in files if each.is_file())
 
 
 def _list_remote(url: str) -> Iterator[tuple[str, Facts]]:
@@ -104,7 +109,8 @@ def _list_remote(url: str) -> Iterator[tuple[str, Facts]]:
         message = f"{url} cannot be listed ({error}); check the connection and permissions"
         raise TransientVideoError(hide_credentials(message)) from error
     for name, facts in found.items():
-        if is_video_file(name) and facts.get("type") != "directory":
+        inside = str(name).removeprefix(path)
+        if is_video_file(name) and not is_hidden(inside) and facts.get("type") != "directory":
             yield url_of(name), facts
 
 
@@ -118,7 +124,8 @@ def group_files(files: Sequence[str], group: str) -> list[Trip]:
     find_trips(named, duration=lambda file: needed.setdefault(file, 0.0))
     with ThreadPoolExecutor(available_cores(), thread_name_prefix="vehicle-probe") as pool:
         needed = dict(zip(needed, pool.map(_duration, needed), strict=True))
-    return find_trips(named, duration=needed.__getitem__)
+    # Others are needed if modification times have changed in the meantime.
+    return find_trips(named, duration=lambda file: needed[file] if file in needed else _duration(file))
 
 
 def _duration(file: Path | str) -> float:
@@ -151,10 +158,8 @@ def plan_trip(
     """
     files = [str(file) for file in trip.files]
     sources = [{"uri": _shown(file), **_identify(file, known.get(file, {}))} for file in files]
-    facts = [sources, dict(settings), fingerprint, __version__]
-    digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:_HASH_DIGITS]
     return {
-        "key": f"{trip_id(trip)}-{digest}",
+        "key": trip_key(sources, settings, fingerprint),
         "files": files,
         "sources": sources,
         "camera": trip.camera,
@@ -163,6 +168,13 @@ def plan_trip(
         "settings": dict(settings),
         "fingerprint": fingerprint,
     }
+
+
+def trip_key(sources: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], fingerprint: str) -> str:
+    """Key of the results of a trip: its identity, and a hash of everything that they depend on."""
+    facts = [sources, dict(settings), fingerprint, __version__]
+    digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:_HASH_DIGITS]
+    return f"{source_id(sources[0]['uri'])}-{digest}"
 
 
 def fingerprint_of(settings: Mapping[str, Any]) -> str:

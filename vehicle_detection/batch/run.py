@@ -11,13 +11,13 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vehicle_detection import __version__
 from vehicle_detection._common import (
     available_cores,
     check_choice,
@@ -38,6 +38,7 @@ from vehicle_detection.batch.plan import (
     shipped_model,
     source_id,
     trip_id,
+    trip_key,
 )
 from vehicle_detection.batch.records import (
     DONE,
@@ -53,7 +54,7 @@ from vehicle_detection.batch.trip import BUSY, RECORDED, remove_replaced, run_tr
 from vehicle_detection.batch.workers import WorkerPool
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.video import PRESETS, Trip
+from vehicle_detection.video import PRESETS, Trip, find_trips
 
 # Attempts at a trip whose worker is lost.
 _ATTEMPTS = 3
@@ -84,7 +85,7 @@ class BatchReport:
         Message of each failed trip and each error of this run, by its first source.
     planned
         With `dry_run`, the trips that would be processed: ``files``, ``camera``, ``start`` and ``replaces``,
-        the keys of earlier results that the new ones would replace.
+        the keys of earlier results that the new ones would replace; otherwise None.
 
     Examples
     --------
@@ -102,14 +103,15 @@ class BatchReport:
     frames: int
     seconds: float
     messages: Mapping[str, str]
-    planned: tuple[Mapping[str, Any], ...] = ()
+    planned: tuple[Mapping[str, Any], ...] | None = None
 
     def __str__(self) -> str:
-        if self.planned:
+        if self.planned is not None:
             replaced = sum(len(each["replaces"]) for each in self.planned)
+            earlier = f"{pluralize(replaced, 'earlier result')} to replace, " if replaced else ""
             return (
-                f"{pluralize(self.trips, 'trip')}: {len(self.planned):,} to do, which replace "
-                f"{pluralize(replaced, 'earlier result')}; {self.skipped:,} skipped"
+                f"{pluralize(self.trips, 'trip')}: {len(self.planned):,} to process, {earlier}"
+                f"{self.skipped:,} skipped"
             )
         rate = self.frames / self.seconds if self.seconds else 0.0
         return (
@@ -338,23 +340,19 @@ def _plan(
     earlier: dict[str, list[str]] = {}  # keys of records by the identity of their trip
     for key in record_keys(store):
         earlier.setdefault(key.partition("-")[0], []).append(key)
-    shortened = _shortened(trips, earlier, store)
     number, count = part
     tasks = []
     mine = [trip for trip in trips if int(trip_id(trip), 16) % count == number - 1]
     with ThreadPoolExecutor(_LOOKUPS, thread_name_prefix="vehicle-plan") as pool:
         plans = list(pool.map(lambda trip: plan_trip(trip, listed, settings, fingerprint), mine))
+    longer = _longer_records(plans, earlier, store)
     for trip, plan in zip(mine, plans, strict=True):
+        trip, plan = _without_recorded(trip, plan, longer.get(plan["sources"][0]["uri"]), listed)
         task = plan | {"out": store.name}
         # A trip replaces the earlier ones that began with one of its files.
         ids = (source_id(str(file)) for file in trip.files)
         keys = [key for each in ids for key in earlier.get(each, ())]
-        longer = shortened.get(str(trip.files[0]))
-        if longer is not None and _covers(longer, task, store):
-            task["key"] = longer["key"]
-        elif longer is not None:
-            keys.append(longer["key"])
-        task["recorded"] = task["key"] in keys or longer is not None
+        task["recorded"] = task["key"] in keys
         task["replaces"] = [key for key in keys if key != task["key"]]
         tasks.append(task)
     return tasks
@@ -368,27 +366,42 @@ def _is_result(file: str, store: Store) -> bool:
     return found[1] == store.name or os.path.isfile(f"{found[1]}/records/{found[2]}.json")
 
 
-def _shortened(
-    trips: Iterable[Trip], earlier: Mapping[str, Sequence[str]], store: Store
+def _longer_records(
+    plans: Iterable[Mapping[str, Any]], earlier: Mapping[str, Sequence[str]], store: Store
 ) -> dict[str, dict[str, Any]]:
-    """Find records of trips whose first segments are gone, as in loop recording, by the first one left."""
-    first = {str(trip.files[0]) for trip in trips}
-    known = {source_id(str(file)) for trip in trips for file in trip.files}
-    gone = [key for identity, keys in earlier.items() if identity not in known for key in keys]
-    if not gone or all(source_id(each) in earlier for each in first):
+    """Find complete records of trips whose first segments are gone, by each of their other segments.
+
+    A camera that records in a loop deletes its oldest files.
+    """
+    new = [plan for plan in plans if plan["key"].partition("-")[0] not in earlier]
+    if not new or not earlier:
         return {}
+    # Records are read only of the same days and cameras: there may be very many.
+    places = {f"tracks/date={plan['date']}/camera={plan['camera']}" for plan in new}
+    outputs = (path.rpartition("/") for path in store.list_files("tracks"))
+    keys = {name.partition(".")[0] for place, _, name in outputs if place in places}
     found: dict[str, dict[str, Any]] = {}
-    for record in read_records(store, gone).values():
-        found |= {source["uri"]: record for source in record["sources"][1:] if source["uri"] in first}
+    for record in read_records(store, sorted(keys)).values():
+        if record["status"] == DONE and is_complete(record, store.exists):
+            found |= {source["uri"]: record for source in record["sources"][1:]}
     return found
 
 
-def _covers(record: Mapping[str, Any], task: Mapping[str, Any], store: Store) -> bool:
-    """Whether a complete trip holds all files of another one, which would have the same parameters."""
-    same = all(record.get(name) == task[name] for name in ("settings", "fingerprint"))
-    current = record["status"] == DONE and record.get("version") == __version__
-    held = all(source in record["sources"] for source in task["sources"])
-    return same and current and held and is_complete(record, store.exists)
+def _without_recorded(
+    trip: Trip,
+    plan: dict[str, Any],
+    record: Mapping[str, Any] | None,
+    listed: Mapping[str, Mapping[str, Any]],
+) -> tuple[Trip, dict[str, Any]]:
+    """Leave out the first files of a trip that a longer record holds, if it has the same parameters."""
+    settings, fingerprint = plan["settings"], plan["fingerprint"]
+    if record is None or record["key"] != trip_key(record["sources"], settings, fingerprint):
+        return trip, plan
+    held = sum(1 for _ in takewhile(record["sources"].__contains__, plan["sources"]))
+    if held == len(trip.files):
+        return trip, plan | {"key": record["key"]}
+    rest = replace(trip, files=trip.files[held:], start=find_trips([trip.files[held]])[0].start)
+    return rest, plan_trip(rest, listed, settings, fingerprint)
 
 
 def _pending(

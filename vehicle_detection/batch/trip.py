@@ -39,7 +39,7 @@ from vehicle_detection.video import FrameSource, download, open_source, process_
 BUSY = "busy"
 """Status of a trip that another process is working on; it is not recorded."""
 
-RECORDED = ("key", "sources", "camera", "date", "start", "settings", "fingerprint")
+RECORDED = ("key", "sources", "camera", "date", "start", "settings")
 """What the record of a trip takes from its task."""
 
 _COLUMNS = {
@@ -71,7 +71,7 @@ def _detector(settings: Mapping[str, Any], fingerprint: str) -> VehicleDetector:
 
 
 def run_trip(task: Mapping[str, Any]) -> dict[str, Any]:
-    """Process a trip of `plan_trip` and return its record, with ``new`` telling whether it was done now.
+    """Process a trip of `plan_trip` and return its record, in which ``new`` is True if it was processed now.
 
     Only one process works on a trip at a time. Outputs are complete or absent, and the record is written
     last.

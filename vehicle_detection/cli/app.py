@@ -423,7 +423,8 @@ def evaluate(
     typer.echo("\n\n".join(each.summary() for each in scores.values()))
     for boxes, count, file in zip((found, true), unknown, (predictions, labels)):
         if 0 < count < (~boxes.ignore).sum():
-            print_error(f"note: the tracks are not scored, because {file} has {count} boxes without one")
+            noun = "box has" if count == 1 else "boxes have"
+            print_error(f"note: the tracks are not scored: {count} {noun} no track in {file}")
     if json is not None:
         with atomic_write(json) as part:
             plain = {name: each.to_dict() for name, each in scores.items()}

@@ -94,6 +94,8 @@ def batch(
         from vehicle_detection._common import check_suffix
 
         check_suffix(summary, "--summary", (".csv",))
+        if dry_run:
+            raise InvalidInputError("--dry-run has no results for --summary; omit one of them")
     if status:
         from vehicle_detection.batch import batch_status
 
@@ -137,7 +139,7 @@ def batch(
             progress=not quiet,
         )
     if dry_run:
-        for trip in done.planned:
+        for trip in done.planned or ():
             _print_trip(trip)
         typer.echo(str(done))
         return

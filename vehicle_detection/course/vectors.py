@@ -118,11 +118,10 @@ def single_img_features(
     features = options.compute([image])[0].astype(np.float64)
     if not vis:
         return features
-    if not options.hog_feat or options.hog_channel == "ALL":
-        raise InvalidInputError(
-            f"vis needs the HOG of one channel; got hog_feat={options.hog_feat} and "
-            f"hog_channel={options.hog_channel!r}, pass 0, 1 or 2"
-        )
+    if not options.hog_feat:
+        raise InvalidInputError("vis needs hog_feat=True, got False; omit vis")
+    if options.hog_channel == "ALL":
+        raise InvalidInputError("vis needs the HOG of one channel, got 'ALL'; pass hog_channel=0, 1 or 2")
     channel = convert_color(image, options.color_space)[..., int(options.hog_channel)]
     sizes = options.orient, options.pix_per_cell, options.cell_per_block
     _, picture = get_hog_features(channel, *sizes, vis=True, transform_sqrt=options.transform_sqrt)

@@ -42,6 +42,8 @@ Formula = Literal["old", "new"]
 ResizeOrder = Literal["after conversion", "before conversion"]
 
 _FORMULAS = ("old", "new")
+# Color spaces whose three channels have values 0-1 in a float image and up to 255 in a uint8 image.
+_UNIT_SPACES = ("RGB", "YUV", "YCrCb")
 # Number of windows whose features are in memory at a time.
 _CHUNK = 512
 
@@ -577,20 +579,29 @@ def _check_estimators(clf: Any, scaler: Any, options: FeatureOptions, image: Ima
             f"the {name} was fitted on {fitted} features, but these options give {options.length}; pass the "
             "options that the classifier was trained with"
         )
-    params = options.library_params(options.color_space)
-    means, scales = (getattr(scaler, name, None) for name in ("mean_", "scale_"))
-    if params is None or means is None or scales is None:
-        return
-    trained_on_255 = not has_unit_range(means, scales, params)
-    if trained_on_255 and not options.spatial_feat:  # a histogram or HOG does not show it
-        return
+    trained_on_unit = _was_fitted_on_unit_range(scaler, options)
     largest = 255.0 if image.dtype == np.uint8 else float(image.max())
     # An almost black image may have either range.
-    if largest > 0.1 and (largest > 2) != trained_on_255:
-        trained, given = ("0-255", "0-1") if trained_on_255 else ("0-1", "0-255")
+    if trained_on_unit is not None and largest > 0.1 and (largest <= 2) != trained_on_unit:
+        trained, given = ("0-1", "0-255") if trained_on_unit else ("0-255", "0-1")
         warnings.warn(
             f"the scaler was fitted on values {trained}, but the image has values {given}, which makes "
             "predictions useless. extract_features and mpimg.imread read a PNG as 0-1 and other files as "
             "0-255; find_cars divides by 255 unless divide_by=1 is passed.",
             stacklevel=4,
         )
+
+
+def _was_fitted_on_unit_range(scaler: Any, options: FeatureOptions) -> bool | None:
+    """Whether a scaler was fitted on features of images with values 0-1; None if it does not show it."""
+    means, scales = (getattr(scaler, name, None) for name in ("mean_", "scale_"))
+    if means is None:
+        return None
+    params = options.library_params(options.color_space)
+    if params is not None:
+        found = has_unit_range(means, np.ones_like(means) if scales is None else scales, params)
+        return True if found else False if options.spatial_feat else None
+    if not options.spatial_feat or options.color_space not in _UNIT_SPACES:
+        return None
+    width, height = options.spatial_size
+    return bool(np.max(means[: 3 * width * height]) <= 2)

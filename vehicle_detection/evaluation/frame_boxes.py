@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -45,7 +46,7 @@ _TABLE_COLUMNS: dict[str, tuple[str, type]] = {
 
 _FLAGS = {"false": False, "true": True}
 # Values of cells that are missing, as after a concatenation of tables.
-_USUAL = {"occluded": 0, "truncated": 0.0, "ignore": False, "track": NO_TRACK, "track_id": NO_TRACK}
+_USUAL = {"occluded": 0, "truncated": 0.0, "ignore": 0, "track": NO_TRACK, "track_id": NO_TRACK}
 
 _ROW_COLUMNS = ("tracks", "boxes", "occluded", "truncated", "ignore", "scores", "distance_m", "speed_mps")
 
@@ -90,30 +91,31 @@ def none_if_unknown(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
 def _table_frames(table: pandas.DataFrame) -> list[FrameKey]:
     """Frames of a table; whole numbers that a concatenation has made floats are numbers again."""
     frames: list[Any] = table["frame"].tolist()
-    if all(isinstance(frame, (int, float)) and frame % 1 == 0 for frame in frames):
+    if all(type(frame) in (int, float) and float(frame).is_integer() for frame in frames):
         return [int(frame) for frame in frames]
     return frames
 
 
 def _table_column(table: pandas.DataFrame, name: str, kind: type) -> NDArray[Any]:
     """Return a column of a table as numbers; a missing flag, occlusion or track is the usual one."""
-    given = table[name]
-    if kind is bool:
-        given = given.map(lambda value: _FLAGS.get(str(value).lower(), value))
-    if name in _USUAL:
-        given = given.fillna(_USUAL[name])
-    try:
-        values = np.asarray(given, np.float64)
-    except (TypeError, ValueError):
+    missing = table[name].isna().tolist()
+    values = [
+        _USUAL.get(name, math.nan) if gone else _FLAGS.get(str(value).lower(), value)
+        for value, gone in zip(table[name].tolist(), missing, strict=True)
+    ]
+    fractions = [value for value in values if isinstance(value, float) and not value.is_integer()]
+    if kind is not float and fractions:
         raise InvalidInputError(
-            f"table must hold numbers in the column {name}, got {describe(table[name].tolist())}"
-        ) from None
-    if kind is not float and (values % 1 != 0).any():  # NaN, too
-        wrong = values[values % 1 != 0][0]
-        raise InvalidInputError(f"table must hold whole numbers in the column {name}, got {wrong:g}")
-    if kind is bool and not np.isin(values, (0, 1)).all():
+            f"table must hold whole numbers in the column {name}, got {fractions[0]:g}; convert it to int"
+        )
+    if kind is bool and not set(values) <= {0, 1}:
         raise InvalidInputError(f"table must hold 0 or 1 in the column {name}; convert it to bool")
-    return np.asarray(values, kind)
+    try:
+        return np.array(values, np.float64 if kind is float else np.int64).astype(kind)
+    except (TypeError, ValueError, OverflowError):
+        raise InvalidInputError(
+            f"table must hold numbers in the column {name}, got {describe(values)}; convert it"
+        ) from None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -328,6 +330,9 @@ class FrameBoxes:
         given: object = table
         names = set(getattr(given, "columns", ()))
         missing = [name for name in ("frame", *_CORNERS) if name not in names]
+        twice = sorted({name for name in names if list(getattr(given, "columns", ())).count(name) > 1})
+        if twice:
+            raise InvalidInputError(f"table must have each column once; got {twice[0]} more than once")
         if missing or not hasattr(given, "to_dict"):
             raise InvalidInputError(
                 f"table must be a pandas.DataFrame with the columns frame, {', '.join(_CORNERS)}; "

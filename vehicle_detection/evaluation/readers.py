@@ -53,10 +53,14 @@ _HIDDEN, _MAX_TRUNCATED, _MIN_WIDTH = 2, 0.7, 40.0
 _MIN_CONFIDENCE = 1e-6
 
 
-# An item of a list or a mapping in YAML, without its comment.
+# YAML. Quotes open at the start of a value only, as in names: ['car [big]', driver's car]
+_YAML_QUOTED = r"""(?:(?<![^\s,\[{:-])(?:"[^"]*"|'[^']*'))"""
+_YAML_COMMENT = re.compile(rf"({_YAML_QUOTED})|(?:^|(?<=\s))#.*", re.MULTILINE)
+_YAML_FLOW = re.compile(rf"\s*[\[{{]((?:{_YAML_QUOTED}|[^\]}}])*)[\]}}]")
+_YAML_PART = re.compile(rf"(?:{_YAML_QUOTED}|[^,])+")
 _YAML_ITEM = re.compile(
     r"""\s*(?:-\s+|["']?(?P<number>\d+)["']?\s*:\s*)?"""
-    r"""(?:"(?P<double>[^"]*)"|'(?P<single>[^']*)'|(?P<plain>[^\s#].*?)?)\s*(?:(?:^|\s|(?<=["']))#.*)?"""
+    r"""(?:"(?P<double>[^"]*)"|'(?P<single>[^']*)'|(?P<plain>\S.*?)?)\s*"""
 )
 
 _READ_FORMATS = (*dict.fromkeys(FORMATS.values()), "coco_results", *FOLDER_FORMATS)
@@ -131,9 +135,8 @@ def _read_csv(source: Path) -> Rows:
     except csv.Error as error:
         raise DatasetError(f"{source} line {reader.line_num}: not CSV text ({error})") from None
     names = [" ".join(name.split()).lower() for name in lines[0][1]] if lines else []
-    predicted = _check_columns(source, names)
-    expected = BOX_COLUMNS if predicted else LABEL_COLUMNS
-    twice = sorted({name for name in expected if names.count(name) > 1})
+    known = (*BOX_COLUMNS, *LABEL_COLUMNS)
+    twice = sorted({name for name in known if names.count(name) > 1})
     if twice:
         raise DatasetError(f"{source} has the column {', '.join(twice)} more than once; keep one of each")
     records: list[tuple[str, dict[str, str]]] = []
@@ -144,6 +147,7 @@ def _read_csv(source: Path) -> Rows:
         if len(line) != len(names):
             raise DatasetError(f"{where}: expected {len(names)} columns, found {len(line)}")
         records.append((where, dict(zip(names, (cell.strip() for cell in line)))))
+    predicted = _check_columns(source, names, [record for _, record in records])
     counted = all(FRAME_NUMBER.fullmatch(record["frame"]) for _, record in records)
     return [_table_row(where, record, predicted, counted) for where, record in records], []
 
@@ -185,27 +189,29 @@ def _read_parquet(source: Path) -> Rows:
         raise DatasetError(f"{source} is not a Parquet file: {' '.join(str(error).split())}") from None
     rows = [(f"{source} row {number}", record) for number, record in enumerate(table.to_pylist())]
     if not rows:
-        _check_columns(source, table.column_names)
+        _check_columns(source, table.column_names, [])
     return _typed_rows(source, rows)
 
 
 def _typed_rows(source: Path, records: Sequence[tuple[str, Mapping[str, Any]]]) -> Rows:
     """Rows of a table with types: frames are numbers or names as they are stored there."""
-    predicted = _check_columns(source, list(records[0][1])) if records else False
-    frames = [record.get("frame") for _, record in records]
-    named = {isinstance(frame, str) for frame in frames}
-    if len(named) > 1:
-        raise DatasetError(f"{source}: frame must be a number in every row, or a name in every row")
     texts = [
         (where, {name: "" if value is None else str(value) for name, value in record.items()})
         for where, record in records
     ]
+    predicted = bool(texts) and _check_columns(source, list(texts[0][1]), [record for _, record in texts])
+    frames = [record.get("frame") for _, record in records]
+    named = {isinstance(frame, str) for frame in frames}
+    if len(named) > 1:
+        raise DatasetError(f"{source}: frame must be a number in every row, or a name in every row")
     return [_table_row(where, record, predicted, named == {False}) for where, record in texts], []
 
 
-def _check_columns(source: Path, names: Sequence[str]) -> bool:
-    """Check that all columns are there; return whether they are those of predictions."""
-    predicted = "score" in names
+def _check_columns(source: Path, names: Sequence[str], records: Sequence[Mapping[str, str]]) -> bool:
+    """Check that all columns are there; return whether the rows are predictions, which have scores."""
+    scored = any(record.get("score", "").lower() not in ("", "nan") for record in records)
+    tracked = not {"track", "track_id"}.isdisjoint(names)
+    predicted = "score" in names and (scored or not tracked)
     expected = BOX_COLUMNS if predicted else REQUIRED_LABEL_COLUMNS
     given = {*names} | ({"track", "track_id"} if {"track", "track_id"} & {*names} else set())
     missing = [name for name in expected if name not in given]
@@ -434,13 +440,15 @@ def _yolo_names(source: Path) -> dict[str, str]:
 
 def _yaml_names(text: str) -> dict[str, str]:
     """Value of ``names``, a list or a mapping from numbers, as a block or in brackets."""
-    key = re.search(r"""^[{ \t]*["']?names["']?[ \t]*:""", text, re.MULTILINE)
+    text = _YAML_COMMENT.sub(lambda found: found[1] or "", text)
+    before = r"[{,]" if text.lstrip().startswith("{") else "^"
+    key = re.search(rf"""{before}\s*["']?names["']?[ \t]*:""", text, re.MULTILINE)
     value = text[key.end() :] if key else ""
-    flow = re.match(r"\s*(?:\[(.*?)\]|\{(.*?)\})", value, re.DOTALL)
+    flow = _YAML_FLOW.match(value)
     if flow:
-        items = re.findall(r"""(?:[^,"']|"[^"]*"|'[^']*')+""", flow[1] or flow[2] or "")
+        items = [item for item in _YAML_PART.findall(flow[1]) if item.strip()]
     else:
-        items = list(takewhile(lambda line: not line.strip() or line[0] in " \t-#", value.splitlines()[1:]))
+        items = list(takewhile(_is_block_line, value.splitlines()[1:]))
     names: dict[str, str] = {}
     for item in items:
         entry = _YAML_ITEM.fullmatch(item)
@@ -448,6 +456,11 @@ def _yaml_names(text: str) -> dict[str, str]:
             number = entry["number"] or str(len(names))
             names[number] = (entry["double"] or entry["single"] or entry["plain"] or "").lower()
     return names
+
+
+def _is_block_line(line: str) -> bool:
+    """Whether a line may be that of an indented block, or of a list."""
+    return not line.strip() or (line[0] in " \t-" and not line.startswith("---"))
 
 
 class CocoFile(NamedTuple):

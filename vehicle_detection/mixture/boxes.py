@@ -24,7 +24,7 @@ _VOTE_MARGIN = -1.1
 MAX_PROPOSALS = 120
 """Greatest number of boxes that are proposed in a frame."""
 
-# Difference of the margins of two boxes on one vehicle from which on the lower one shows a part of it.
+# Minimum difference of the margins of two boxes on one vehicle of which the lower one shows a part of it.
 _PART_GAP = 1.0
 _MIN_VISIBLE_FRACTION = 0.35
 

@@ -56,7 +56,7 @@ def walk_files(folder: Path, name: str = "source") -> Iterator[Path]:
     visited = set[str]()
     for parent, folders, files in os.walk(folder, onerror=refuse, followlinks=True):
         place = os.path.realpath(parent)
-        folders[:] = [] if place in visited else [each for each in folders if not is_hidden(each)]
+        folders[:] = [] if place in visited else sorted(each for each in folders if not is_hidden(each))
         if place not in visited:
             yield from (Path(parent, each) for each in files if not is_hidden(each))
         visited.add(place)

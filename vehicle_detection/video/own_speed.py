@@ -213,7 +213,6 @@ class _TrackPoint:
 
     latitude: float
     longitude: float
-    segment: int
     time: float = math.nan
     speed: float = math.nan
 
@@ -223,7 +222,6 @@ class _GpxParser:
 
     def __init__(self) -> None:
         self.points: list[_TrackPoint] = []
-        self._segment = 0
         self._point: _TrackPoint | None = None
         self._text: list[str] | None = None
         self._parser = expat.ParserCreate()
@@ -240,11 +238,9 @@ class _GpxParser:
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
         name = tag.rpartition(":")[2]
-        if name == "trkseg":
-            self._segment += 1
-        elif name == "trkpt":
+        if name == "trkpt":
             position = _parse_float(attributes.get("lat"), 90), _parse_float(attributes.get("lon"), 180)
-            self._point = _TrackPoint(*position, self._segment)
+            self._point = _TrackPoint(*position)
         elif self._point is not None and name in ("time", "speed"):
             self._text = []
 
@@ -298,8 +294,8 @@ def _read_gpx(data: bytes, name: str) -> tuple[Floats, Floats]:
     except InvalidInputError as error:
         raise InvalidInputError(f"path {name} is refused: {error}") from None
     points = np.array(
-        [(each.time, each.speed, each.segment, each.latitude, each.longitude) for each in parser.points]
-    ).reshape(-1, 5)
+        [(each.time, each.speed, each.latitude, each.longitude) for each in parser.points]
+    ).reshape(-1, 4)
     points = points[np.argsort(points[:, 0], kind="stable")]
     points = points[np.diff(points[:, 0], prepend=-np.inf) > 0]
     if len(points) < 2:
@@ -309,8 +305,13 @@ def _read_gpx(data: bytes, name: str) -> tuple[Floats, Floats]:
         )
     times, speeds = points[:, 0] - points[0, 0], points[:, 1]
     if np.isfinite(speeds).mean() < 0.5:
-        breaks = np.flatnonzero((np.diff(times) > _MAX_GAP) | (np.diff(points[:, 2]) != 0)) + 1
-        parts = np.split(np.column_stack([times, np.deg2rad(points[:, 3:])]), breaks)
+        latitude, longitude = np.deg2rad(points[:, 2:]).T
+        known = np.isfinite(latitude) & np.isfinite(longitude)
+        times, latitude, longitude = times[known], latitude[known], longitude[known]
+        steps = np.diff(times)
+        jumps = _great_circle(latitude[:-1], longitude[:-1], latitude[1:], longitude[1:]) > _MAX_SPEED * steps
+        breaks = np.flatnonzero((steps > _MAX_GAP) | jumps) + 1
+        parts = np.split(np.column_stack([times, latitude, longitude]), breaks)
         speeds = np.concatenate([_speeds_of(*part.T) for part in parts])
     known = np.isfinite(speeds)
     if not known.any():
@@ -323,16 +324,22 @@ def _read_gpx(data: bytes, name: str) -> tuple[Floats, Floats]:
 
 def _speeds_of(times: Floats, latitude: Floats, longitude: Floats) -> Floats:
     """Speeds (m/s) from positions (radians): distance along the great circle between positions 3 s apart."""
-    known = np.isfinite(latitude) & np.isfinite(longitude)
-    if known.sum() < 2:
+    if len(times) < 2:
         return np.full(len(times), np.nan)
     first = np.clip(times - _SPAN / 2, times[0], max(times[-1] - _SPAN, times[0]))
     last = np.minimum(first + _SPAN, times[-1])
     # A track that crosses the date line has no jump in its unwrapped longitude.
-    columns = latitude[known], np.unwrap(longitude[known])
+    columns = latitude, np.unwrap(longitude)
     (lat_1, lat_2), (lon_1, lon_2) = (
-        [np.interp(each, times[known], column) for each in (first, last)] for column in columns
+        [np.interp(each, times, column) for each in (first, last)] for column in columns
     )
-    half = np.sin((lat_2 - lat_1) / 2) ** 2
-    half += np.cos(lat_1) * np.cos(lat_2) * np.sin((lon_2 - lon_1) / 2) ** 2
-    return np.asarray(2 * _EARTH_RADIUS * np.arcsin(np.sqrt(np.minimum(half, 1.0))) / (last - first))
+    return np.asarray(_great_circle(lat_1, lon_1, lat_2, lon_2) / (last - first))
+
+
+def _great_circle(
+    latitude: Floats, longitude: Floats, other_latitude: Floats, other_longitude: Floats
+) -> Floats:
+    """Distances (m) between positions (radians), by the haversine formula."""
+    half = np.sin((other_latitude - latitude) / 2) ** 2
+    half += np.cos(latitude) * np.cos(other_latitude) * np.sin((other_longitude - longitude) / 2) ** 2
+    return np.asarray(2 * _EARTH_RADIUS * np.arcsin(np.sqrt(np.minimum(half, 1.0))))

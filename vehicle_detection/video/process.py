@@ -1,7 +1,7 @@
 """Annotate a video with its vehicles.
 
-The result does not depend on the number of workers. In memory are a few frames, and those between two
-searched ones, which wait to be drawn.
+The result does not depend on the number of workers. Only a few frames are in memory: those being searched,
+and those between two searched frames, which wait to be drawn.
 """
 
 from __future__ import annotations

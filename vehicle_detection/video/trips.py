@@ -38,7 +38,7 @@ _TIME = re.compile(
 # Nextbase, whose years have two digits: 260131_081500_001_FH.MP4.
 _SHORT_TIME = re.compile(r"^(\d{2})(\d{2})(\d{2})_(\d{2})(\d{2})(\d{2})(?=_\d{3}_[A-Z]{2}$)", re.IGNORECASE)
 # A number that counts the files of a camera, perhaps with a letter or two for the kind of recording.
-_COUNTER = re.compile(r"(?<![A-Za-z0-9])\d{3,}(?=[A-Za-z]{0,2}(?![A-Za-z0-9]))")
+_COUNTER = re.compile(r"(?<!\d)\d{3,}(?=[A-Za-z]{0,2}(?![A-Za-z0-9]))")
 _GOPRO = re.compile(r"^G[HXLP](\d{2})(\d{4})$", re.IGNORECASE)
 _CAMERA_WORDS = {
     "front": "front", "rear": "rear", "back": "rear", "left": "left", "right": "right",
@@ -172,7 +172,7 @@ def _parse_name(name: PurePosixPath) -> _Segment:
     if gopro:  # the chapter comes before the number of the recording
         return _Segment(_folder_camera(name), None, f"gopro {gopro[2]}", int(gopro[1]))
     start, rest = None, stem
-    found = _TIME.search(stem) or _SHORT_TIME.search(stem)
+    found = _SHORT_TIME.search(stem) or _TIME.search(stem)
     if found:
         year, *others = (int(part) for part in found.groups())
         try:
