@@ -810,7 +810,7 @@ def test_a_shallow_copy_shares_the_search_and_has_its_own_tracks():
 def test_short_descriptions():
     detector = VehicleDetector()
     result = detector.process(np.full((180, 320, 3), 90, np.uint8), 0.0)
-    assert repr(detector.model) == "TemplateMixture(6 templates, threshold -0.98 (log-odds))"
+    assert repr(detector.model) == "TemplateMixture(6 templates, threshold at a probability of 0.27)"
     assert repr(detector) == f"VehicleDetector({detector.model!r}, 1 frame processed)"
     assert repr(result) == "FrameResult(0 at 0.00 s: 0 detections, 0 vehicles shown)"
     assert len(repr(load_model("highway"))) < 100

@@ -138,7 +138,8 @@ class VehicleDetector:
         A name (``"default"`` for any road, ``"highway"``), the path of a model file, or a model. For a
         detector of your own see `detector_from`.
     conf
-        Minimum confidence of a vehicle in a single image: its calibrated probability, 0 to 1. The search and
+        Minimum confidence of a vehicle in a single image: its calibrated probability, 0 to 1, of which values
+        outside 0.001 to 0.999 are limited to these. The search and
         the tracker follow: scores are those above this threshold. None: the model's own threshold.
     method
         ``"shared"``: the fast search, features shared by all windows. ``"windows"``: the reference, one patch

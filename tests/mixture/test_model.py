@@ -81,7 +81,7 @@ def test_the_summary_lists_the_templates():
     border = mixture_template(5, 6, border=True)
     model = dataclasses.replace(random_mixture(threshold=0.25), templates=(mixture_template(), border))
     title, facts = model.summary()
-    assert title == "2 templates, threshold 0.25 (log-odds)"
+    assert title == "2 templates, threshold at a probability of 0.56"
     assert facts == {
         "template 1": "box of 7x6 cells",
         "template 2": "box of 4x4 cells at the frame's border",

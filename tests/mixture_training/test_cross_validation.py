@@ -102,7 +102,7 @@ def test_extra_sources_are_never_evaluated(sources):
 def test_too_few_sources(sources):
     with pytest.raises(
         InvalidInputError,
-        match="sources must hold at least two data sets, so that one can be left out; got 1",
+        match="sources must hold at least 2 data sets, got 1; one at a time is left out",
     ):
         cross_validate_mixture(sources[:1], SMALL_MIXTURE)
     twin = dataclasses.replace(sources[1], name="one")

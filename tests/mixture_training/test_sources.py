@@ -1,11 +1,15 @@
 import dataclasses
 
 import imageio_ffmpeg
+import numpy as np
 import pytest
 
 from tests.helpers import drawn, write_frame_set
+from tests.video.clips import gray_frames, write_clip
 from vehicle_detection.errors import DatasetError, InvalidInputError
+from vehicle_detection.images import write_image
 from vehicle_detection.mixture_training import find_sources
+from vehicle_detection.mixture_training.sources import load_training_frames
 from vehicle_detection.synthetic import render_drive
 
 
@@ -74,3 +78,53 @@ def test_invalid_folders(tmp_path):
     (tmp_path / "frames" / "other").mkdir()
     with pytest.raises((DatasetError, InvalidInputError), match="other"):
         find_sources(tmp_path)
+
+
+def write_source(root, name, frames, rows):
+    """Images of a source, and its labels."""
+    (root / "labels").mkdir(exist_ok=True)
+    (root / "frames" / name).mkdir(parents=True)
+    for number in range(frames):
+        write_image(root / "frames" / name / f"{number}.png", np.zeros((90, 160, 3), np.uint8))
+    (root / "labels" / f"{name}.csv").write_text("frame,track,x1,y1,x2,y2\n" + "".join(rows))
+
+
+def test_a_source_without_vehicles(tmp_path):
+    write_source(tmp_path, "empty", 3, [])
+    (source,) = find_sources(tmp_path)
+    assert [len(frame.boxes) for frame in load_training_frames([source])] == [0, 0, 0]
+
+
+def test_labels_without_an_image_are_reported(tmp_path, caplog):
+    write_source(tmp_path, "road", 2, ["1.png,1,10,10,60,50\n", "none.png,1,10,10,60,50\n"])
+    (source,) = find_sources(tmp_path)
+    assert len(source.sets[0].labels) == 1
+    assert "1 of 2 labelled frames have no image in" in caplog.text
+    assert "such as 'none.png'; they are left out" in caplog.text
+
+
+def test_labels_of_another_resolution(tmp_path):
+    write_source(tmp_path, "road", 2, ["1.png,1,10,10,60,50\n", "1.png,2,500,10,560,50\n"])
+    with pytest.raises(
+        InvalidInputError, match=r"road, frame '1.png': the box \[500.0, .* outside the 160x90"
+    ):
+        load_training_frames(find_sources(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("labelled", "chosen"),
+    [
+        (range(24), [0, 8, 16]),  # all frames: three per second
+        (range(0, 24, 10), [0, 10, 20]),  # some: only these
+        (range(5), [0]),  # the beginning: only there
+        (range(6, 20, 2), [6, 14]),
+    ],
+)
+def test_frames_of_videos_that_are_labelled_in_part(tmp_path, labelled, chosen):
+    (tmp_path / "labels").mkdir()
+    (tmp_path / "videos").mkdir()
+    write_clip(tmp_path / "videos" / "own.MP4", gray_frames(24), fps=25)
+    rows = [f"{number},1,10,10,50,40\n" for number in labelled]
+    (tmp_path / "labels" / "own.CSV").write_text("frame,track,x1,y1,x2,y2\n" + "".join(rows))
+    (source,) = find_sources(tmp_path)
+    assert list(source.sets[0].keys) == chosen

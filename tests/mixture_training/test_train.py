@@ -97,7 +97,7 @@ def test_the_svm_solver_agrees_with_scikit_learn():
 
 def test_invalid_training_arguments(drawn_source):
     with pytest.raises(
-        InvalidInputError, match="sources must hold at least one data set; got 0: add labelled frames"
+        InvalidInputError, match="sources must hold at least 1 data set, got 0; add labelled frames"
     ):
         train_mixture([])
     with pytest.raises(InvalidInputError, match="sources must be a list of FrameDataset, got"):
@@ -110,13 +110,27 @@ def test_invalid_training_arguments(drawn_source):
         train_mixture([drawn_source], random_state=-1)
     with pytest.raises(InvalidInputError, match="params must be a MixtureParams"):
         train_mixture([drawn_source], PyramidParams())
-    odd = dataclasses.replace(SMALL_MIXTURE, shapes=((6, 5), (20, 3)), mirrored=(False, False))
-    with pytest.raises(
-        InvalidInputError, match="hold vehicles of every shape, got none like 20x3 that is at least 28"
-    ):
-        train_mixture([drawn_source], odd, n_jobs=1)
     empty = LabelledFrames(
         "empty", [np.zeros((90, 160, 3), np.uint8)], FrameBoxes([], None, [], frame_keys=[0])
     )
-    with pytest.raises(InvalidInputError, match="sources must hold vehicles of every shape"):
+    with pytest.raises(InvalidInputError, match="sources must hold labelled vehicles that are whole"):
         train_mixture([FrameDataset("empty", (empty,))], SMALL_MIXTURE, n_jobs=1)
+
+
+def test_shapes_that_no_vehicle_has_are_left_out(drawn_source):
+    shapes = {"shapes": ((6, 5), (3, 9)), "mirrored": (False, True), "border_shapes": ((2, 9),)}
+    params = dataclasses.replace(SMALL_MIXTURE, **shapes, aspect_tolerance=0.01)
+    # Each vehicle belongs to the shape that is closest.
+    steps: list[str] = []
+    model = train_mixture([drawn_source], params, on_step=steps.append, n_jobs=1)
+    assert (6.0, 5.0) in [template.box_cells for template in model.templates]
+    assert (3.0, 9.0) not in [template.box_cells for template in model.templates]
+    assert steps[0].startswith("no labelled vehicle has the proportions 3x9")
+
+
+def test_frames_without_a_vehicle_that_is_wide_enough(drawn_source):
+    params = dataclasses.replace(SMALL_MIXTURE, min_width=1000)
+    with pytest.raises(
+        InvalidInputError, match="must hold labelled vehicles that are whole and at least 1000"
+    ):
+        train_mixture([drawn_source], params, n_jobs=1)

@@ -146,7 +146,9 @@ def _parse(data: bytes, name: str, kind: str | None) -> ModelData:
             f"{FORMAT_VERSION}; train again or install the release that wrote it"
         )
     if header.get("sha256") != checksum(header, tensors):
-        raise ModelFileError(f"{name} was changed after it was written (checksum differs); download it again")
+        raise ModelFileError(
+            f"{name} was changed after it was written (checksum differs); restore it from a copy"
+        )
     if kind is not None and header.get("kind") != kind:
         raise ModelFileError(
             f"{name} contains a model of kind {header.get('kind')!r}, not {kind!r}; load it with load_model"

@@ -8,7 +8,8 @@ from __future__ import annotations
 import contextlib
 import errno
 import itertools
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
 
     from vehicle_detection.boxes import Detections
     from vehicle_detection.detector import VehicleDetector
+    from vehicle_detection.evaluation import FrameBoxes, FrameKey
 
 BAD_INPUT, INTERRUPTED = 2, 130  # exit codes
 _CHECKED_IMAGES = 20  # images that are searched again if no vehicle was found
@@ -241,7 +243,15 @@ def detect(
     ):
         announce_replaced([boxes])
         readable = _read_each(images, undecodable)
-        found = _detect_each(readable, detector, output, why, scores=labels == "score", line_width=line_width)
+        found = _detect_each(
+            readable,
+            detector,
+            output,
+            why,
+            scores=labels == "score",
+            line_width=line_width,
+            left_out=undecodable,
+        )
         found = _warn_if_empty(found, images, undecodable, detector, horizon)
         if boxes is None:
             for _ in found:
@@ -336,18 +346,31 @@ def _detect_each(
     output: Path | None,
     why: Path | None,
     *,
+    left_out: list[Path],
     scores: bool = True,
     line_width: int | None = None,
 ) -> Iterator[tuple[str, Detections]]:
-    """Detect the vehicles of each image, print them, and write the annotated image."""
+    """Detect the vehicles of each image, print them, and write the annotated image.
+
+    Images that are too small are left out, with a warning; it is an error if the first one is.
+    """
     import cv2
 
     from vehicle_detection._common import pluralize
     from vehicle_detection.drawing import blur_boxes, draw_detections, score_texts
     from vehicle_detection.images import write_image
 
+    searched = 0
     for path, image in images:
-        found = detector.detect(image)
+        try:
+            found = detector.detect(image)
+        except InvalidInputError as error:
+            if not searched:
+                raise InvalidInputError(f"{path}: {error}") from None
+            left_out.append(path)
+            print_error(f"warning: {path}: {error}; left out")
+            continue
+        searched += 1
         listed = "".join(
             f"  [{' '.join(f'{side:.0f}' for side in box)}] {text}"
             for box, text in zip(found.boxes.tolist(), score_texts(found))
@@ -400,6 +423,13 @@ def evaluate(
     ignored_as_regions: Annotated[
         bool, flag("--ignored-as-regions", help="Ignore boxes of which half lies in an ignored box.")
     ] = False,
+    frames: Annotated[
+        str | None,
+        Option(
+            metavar="A-B|FILE",
+            help="Score only these frames: numbers, such as 0-299, or a text file with a name in each line.",
+        ),
+    ] = None,
     json: Annotated[
         Path | None, Option(metavar="FILE", help="File for all scores, such as scores.json.")
     ] = None,
@@ -414,13 +444,28 @@ def evaluate(
         check_target(json, "--json")
         check_distinct_paths({"--json": json}, {"PREDICTIONS": predictions, "LABELS": labels})
     found, true = read_labels(predictions, truth=labels), read_labels(labels)
+    chosen = None
+    if frames is not None:
+        chosen = _parse_frames(frames, true.frame_keys)
+        found, true = (_boxes_in(each, chosen) for each in (found, true))
     scores: dict[str, Any] = {
-        "detections": evaluate_detections(found, true, iou=iou, ignored_as_regions=ignored_as_regions)
+        "detections": evaluate_detections(
+            found, true, iou=iou, ignored_as_regions=ignored_as_regions, frames=chosen
+        )
     }
     unknown = [int(((boxes.tracks == NO_TRACK) & ~boxes.ignore).sum()) for boxes in (found, true)]
     if not any(unknown):
-        scores["tracks"] = evaluate_tracks(found, true, iou=iou)
+        scores["tracks"] = evaluate_tracks(found, true, iou=iou, frames=chosen)
     typer.echo("\n\n".join(each.summary() for each in scores.values()))
+    labelled = set(true.frames if chosen is None else chosen)
+    unseen = len(labelled - set(found.frames))
+    if labelled and unseen > 0.5 * len(labelled):
+        print_error(
+            f"note: {unseen} of {len(labelled)} labelled frames have no box in {predictions}, so their "
+            "vehicles count as missed; pass --frames if not all of them were searched"
+        )
+    if ignored_as_regions and "tracks" in scores:
+        print_error("note: ignored boxes are regions in the scores of the boxes, not in those of the tracks")
     for boxes, count, file in zip((found, true), unknown, (predictions, labels)):
         if 0 < count < (~boxes.ignore).sum():
             noun = "box has" if count == 1 else "boxes have"
@@ -429,6 +474,32 @@ def evaluate(
         with atomic_write(json) as part:
             plain = {name: each.to_dict() for name, each in scores.items()}
             part.write_text(dumps(plain, indent=2) + "\n", encoding="utf-8")
+
+
+def _boxes_in(boxes: FrameBoxes, frames: Sequence[FrameKey]) -> FrameBoxes:
+    """Boxes in some frames."""
+    wanted = set(frames)
+    return boxes[[row for row, key in enumerate(boxes.frames) if key in wanted]]
+
+
+def _parse_frames(text: str, keys: Sequence[FrameKey]) -> list[FrameKey]:
+    """Frames of a range of numbers, or of a file with a frame in each line; some must be among the keys."""
+    span = re.fullmatch(r"(\d{1,9})-(\d{1,9})", text)
+    chosen: list[FrameKey]
+    if span:
+        chosen = list(range(int(span[1]), int(span[2]) + 1))
+    else:
+        from vehicle_detection._common import Limit, check_path, read_regular_file
+
+        file = check_path(text, "--frames", kind="a range such as 0-299, or a file")
+        data = read_regular_file(file, f"--frames {text}", Limit.TEXT_BYTES).decode("utf-8-sig", "replace")
+        names = [line.strip() for line in data.splitlines() if line.strip()]
+        numbered = bool(keys) and isinstance(keys[0], int)
+        chosen = [int(name) for name in names if name.isdecimal()] if numbered else [*names]
+    if not set(chosen) & set(keys):
+        example = f", such as {keys[0]}" if keys else ", which hold none"
+        raise InvalidInputError(f"--frames {text} names no frame of the labels{example}")
+    return list(dict.fromkeys(chosen))
 
 
 for _command in (batch, train, train_frames, tune, fetch, info):

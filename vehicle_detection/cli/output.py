@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import typer
 
-from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
+from vehicle_detection.errors import DatasetError, InvalidInputError, VehicleDetectionError
 
 UNKNOWN_LENS = (
     "warning: distances assume a lens of 58 degrees, and may be wrong by a factor of 2 or more; "
@@ -84,8 +84,8 @@ def option_names(**options: str) -> Iterator[None]:
     """Name the options of arguments in errors; for options named differently from the library's arguments."""
     try:
         yield
-    except InvalidInputError as error:
-        raise InvalidInputError(rename_argument(str(error), options)) from None
+    except (InvalidInputError, DatasetError) as error:
+        raise type(error)(rename_argument(str(error), options)) from None
 
 
 def print_table(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -226,7 +226,7 @@ def train_frames(
     seed: Annotated[int, Option(metavar="N", help="Random seed.")] = 0,
 ) -> None:
     """Train a model for any road on labelled frames, and evaluate it by cross-validation over the sources."""
-    from vehicle_detection._common import check_target
+    from vehicle_detection._common import check_suffix, check_target, pluralize
     from vehicle_detection.datasets import load_patches
     from vehicle_detection.mixture_training import (
         check_sources,
@@ -240,8 +240,14 @@ def train_frames(
     named = {"--output": output, "--curves": curves}
     targets = {name: check_target(path, name) for name, path in named.items() if path is not None}
     check_distinct_paths(targets, {"DATA": data})
+    check_suffix(output, "--output", (".safetensors",))
     sources = find_sources(data)
     check_sources(sources, min_count=2)
+    for source in sources:
+        for part in source.sets:
+            empty = sum(not len(part.labels.rows(key)) for key in part.keys)
+            boxes = pluralize(len(part.labels), "box", "es")
+            typer.echo(f"{source.name}: {pluralize(len(part), 'frame')}, {boxes}, {empty} frames without any")
     vehicles = [] if patches is None else list(load_patches(patches, label=1).patches)
     extra = [drawn_source(random_state=seed)] if drawn else []
     model, scores, folds = cross_validate_mixture(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -115,7 +116,7 @@ def tune(
 
     table = run_interruptible(work)
     final = table[table["stage"] == ("final" if halving else "compare")]
-    _show(final, table)
+    _show(final, table, values)
     if final["accuracy"].isna().all():
         if is_new:
             store.unlink(missing_ok=True)
@@ -129,6 +130,8 @@ def tune(
 
 def _read_frames(frames: Path | None, labels: Path | None, horizon: float | None) -> LabelledFrames | None:
     if frames is None and labels is None:
+        if horizon is not None:
+            raise InvalidInputError("--horizon needs --frames, which it concerns; omit it")
         return None
     if frames is None or labels is None:
         raise InvalidInputError("--frames and --labels belong together; give both")
@@ -138,17 +141,20 @@ def _read_frames(frames: Path | None, labels: Path | None, horizon: float | None
     return LabelledFrames(frames.name or "frames", load_frames(frames), read_labels(labels), horizon)
 
 
-def _show(final: DataFrame, table: DataFrame) -> None:
+def _show(final: DataFrame, table: DataFrame, grid: Mapping[str, Sequence[Any]]) -> None:
     """Print the best rows, with a star on the Pareto front, and the errors of failed configurations."""
     from vehicle_detection.tuning import pareto_front
 
     measured = final[final["accuracy"].notna()].sort_values("accuracy", ascending=False, kind="stable")
     front = set(pareto_front(final)["trial"])
-    heads = ["", "configuration", "C", "accuracy", "training", "search ms"]
+    # Options of which the grid has several values; the configuration is a name for the features.
+    swept = [name for name, each in grid.items() if name != "C" and len(each) > 1]
+    heads = ["", "configuration", *swept, "C", "accuracy", "training", "search ms"]
     scored = bool(measured["frame_f1"].notna().any())
     rows = []
     for row in measured.head(_MAX_ROWS).to_dict("records"):
-        cells = ["*" * (row["trial"] in front), row["configuration"], f"{row['C']:g}"]
+        cells = ["*" * (row["trial"] in front), row["configuration"], *(f"{row[name]}" for name in swept)]
+        cells += [f"{row['C']:g}"]
         cells += [_text(row[name], 4) for name in ("accuracy", "train_accuracy")]
         cells += [_text(row["search_ms"], 1)]
         rows.append(cells + ([_text(row["frame_f1"], 3), _text(row["frame_best_f1"], 3)] if scored else []))

@@ -344,7 +344,9 @@ def _download(address: str, part: Path, progress: bool) -> None:
             case requests.exceptions.ChunkedEncodingError():
                 problem = "was cut off during the download; call again to restart it"
             case requests.ConnectionError() | requests.Timeout():
-                remedy = "check the network and call again, or download the file in a browser"
+                remedy = (
+                    f"check the network and call again, or put the file from a browser into {part.parent}"
+                )
                 problem = f"cannot be reached ({type(error).__name__}); {remedy}"
             case requests.RequestException():
                 problem = f"cannot be downloaded ({type(error).__name__}); check url"

@@ -51,7 +51,7 @@ class LabelledFrames:
         Images by key (``{7: image}``), a list of images that are numbered from 0, or a `FrameSet`, which
         reads each image when it is used: ``(H, W, 3)`` uint8 RGB.
     labels
-        True boxes; those of other frames are dropped. A frame without any box counts as empty.
+        True boxes; those of other frames are dropped. A frame without any box shows no vehicle.
     horizon
         Row of the horizon as a fraction of the frame height; None keeps the default of the search.
 
@@ -76,10 +76,10 @@ class LabelledFrames:
         if not keys:
             raise InvalidInputError("frames must hold at least one image, got none")
         check_type(labels, "labels", FrameBoxes, "read a file with read_labels")
-        if not set(keys) & set(labels.frame_keys):
-            named = f"names {labels.frame_keys[0]!r}" if labels.frame_keys else "is empty"
+        if labels.frame_keys and not set(keys) & set(labels.frame_keys):
             raise InvalidInputError(
-                f"labels must name the frames, such as {keys[0]!r}; it {named}; use the same names in both"
+                f"labels must name the frames, such as {keys[0]!r}, got {labels.frame_keys[0]!r}; "
+                "use the same names in both"
             )
         if self.horizon is not None:
             check_number(self.horizon, "horizon", low=0, high=1)

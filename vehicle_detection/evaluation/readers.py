@@ -43,6 +43,7 @@ FRAME_NUMBER = re.compile(r"-?(0|[1-9][0-9]*)(\.0*)?")
 """Frame of a CSV file that is a number. One with leading zeros is a file name."""
 
 VEHICLE_CLASSES = ("car", "van", "truck", "bus", "vehicle")
+_CLASS_COLUMNS = ("class", "label", "category")  # of tables, all optional
 LOOKALIKE_CLASSES = ("tram", "train", "misc", "trailer", "caravan", "autorickshaw", "vehicle fallback")
 PERSON_CLASSES = ("pedestrian", "person_sitting", "cyclist")
 
@@ -126,7 +127,7 @@ def _integer(text: str, name: str, where: str, *, low: int) -> int:
     return int(value)
 
 
-def _read_csv(source: Path) -> Rows:
+def _read_csv(source: Path, classes: Collection[str] | None) -> Rows:
     text = _read_text(source)
     separator = max(",;\t", key=text.split("\n", 1)[0].count)
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
@@ -149,10 +150,10 @@ def _read_csv(source: Path) -> Rows:
         records.append((where, dict(zip(names, (cell.strip() for cell in line)))))
     predicted = _check_columns(source, names, [record for _, record in records])
     counted = all(FRAME_NUMBER.fullmatch(record["frame"]) for _, record in records)
-    return [_table_row(where, record, predicted, counted) for where, record in records], []
+    return _table_rows(source, records, classes, predicted=predicted, counted=counted)
 
 
-def _read_json_lines(source: Path) -> Rows:
+def _read_json_lines(source: Path, classes: Collection[str] | None) -> Rows:
     records: list[tuple[str, Any]] = []
     # Not splitlines, which also splits at other characters that a name may hold.
     for number, line in enumerate(_read_text(source).split("\n"), 1):
@@ -164,7 +165,7 @@ def _read_json_lines(source: Path) -> Rows:
                 raise DatasetError(f"{where}: not a JSON object ({_json_reason(error)})") from None
             if not isinstance(records[-1][1], dict):
                 raise DatasetError(f"{where}: expected a JSON object, found {line.strip()[:40]!r}")
-    return _typed_rows(source, records)
+    return _typed_rows(source, records, classes)
 
 
 def _json_reason(error: ValueError | RecursionError) -> str:
@@ -174,7 +175,7 @@ def _json_reason(error: ValueError | RecursionError) -> str:
     return error.msg if isinstance(error, json.JSONDecodeError) else "a number has too many digits"
 
 
-def _read_parquet(source: Path) -> Rows:
+def _read_parquet(source: Path, classes: Collection[str] | None) -> Rows:
     try:
         import pyarrow
         import pyarrow.parquet
@@ -190,10 +191,12 @@ def _read_parquet(source: Path) -> Rows:
     rows = [(f"{source} row {number}", record) for number, record in enumerate(table.to_pylist())]
     if not rows:
         _check_columns(source, table.column_names, [])
-    return _typed_rows(source, rows)
+    return _typed_rows(source, rows, classes)
 
 
-def _typed_rows(source: Path, records: Sequence[tuple[str, Mapping[str, Any]]]) -> Rows:
+def _typed_rows(
+    source: Path, records: Sequence[tuple[str, Mapping[str, Any]]], classes: Collection[str] | None
+) -> Rows:
     """Rows of a table with types: frames are numbers or names as they are stored there."""
     texts = [
         (where, {name: "" if value is None else str(value) for name, value in record.items()})
@@ -204,7 +207,34 @@ def _typed_rows(source: Path, records: Sequence[tuple[str, Mapping[str, Any]]]) 
     named = {isinstance(frame, str) for frame in frames}
     if len(named) > 1:
         raise DatasetError(f"{source}: frame must be a number in every row, or a name in every row")
-    return [_table_row(where, record, predicted, named == {False}) for where, record in texts], []
+    return _table_rows(source, texts, classes, predicted=predicted, counted=named == {False})
+
+
+def _table_rows(
+    source: Path,
+    records: Sequence[tuple[str, dict[str, str]]],
+    classes: Collection[str] | None,
+    *,
+    predicted: bool,
+    counted: bool,
+) -> Rows:
+    """Rows of vehicles of a table, and all its frames; without a column of classes all rows are vehicles."""
+    names = {record.get(column, "").lower() for _, record in records for column in _CLASS_COLUMNS} - {""}
+    # A column of numbers may hold anything.
+    named = bool(names) and not any(re.fullmatch(r"[-\d.]+", name) for name in names)
+    wanted = VEHICLE_CLASSES if classes is None else classes
+    if named:
+        _check_classes(source, names, wanted)
+    rows, keys = [], []
+    for where, record in records:
+        row = _table_row(where, record, predicted, counted)
+        name = next((record[column].lower() for column in _CLASS_COLUMNS if record.get(column)), "")
+        keys.append(row.frame)
+        if not named or name in wanted:
+            rows.append(row)
+        elif name in LOOKALIKE_CLASSES and not predicted:
+            rows.append(row._replace(ignore=True))
+    return rows, keys
 
 
 def _check_columns(source: Path, names: Sequence[str], records: Sequence[Mapping[str, str]]) -> bool:
@@ -570,7 +600,8 @@ def read_labels(
     path
         A CSV file (``frame,track,x1,y1,x2,y2[,occluded,truncated,ignore]``, where ``track_id`` may stand for
         ``track``, or, for predictions, ``frame,track_id,x1,y1,x2,y2,score[,distance_m,speed_mps]``; separated
-        by commas, semicolons or tabs),
+        by commas, semicolons or tabs; with a column ``class``, ``label`` or ``category`` of names, rows of
+        other classes than vehicles are left out),
         a JSON Lines or Parquet (needs pyarrow) file with these columns, a KITTI ``label_2`` folder, a
         MOTChallenge text file, the MOT archive of CVAT, a COCO JSON file, a list of COCO results, or a YOLO
         folder: ``labels/*.txt``, with class names in ``data.yaml`` or ``classes.txt``.
@@ -630,8 +661,9 @@ def read_labels(
     chosen = None
     if classes is not None:
         chosen = frozenset(str(name).lower() for name in check_sequence(classes, "classes", "names"))
-    if kind in ("csv", "jsonl", "parquet"):  # these files hold vehicles only
-        found = {"csv": _read_csv, "jsonl": _read_json_lines, "parquet": _read_parquet}[kind](source)
+    if kind in ("csv", "jsonl", "parquet"):
+        tables = {"csv": _read_csv, "jsonl": _read_json_lines, "parquet": _read_parquet}
+        found = tables[kind](source, chosen)
     elif kind in ("coco", "coco_results"):  # told apart by their content
         found = _read_coco(source, chosen, None if truth is None else check_path(truth, "truth"))
     elif kind == "yolo":

@@ -202,7 +202,8 @@ class TemplateMixture:
                 f"{len(self.rescorer.networks)} networks, {self.rescorer.n_weights:,} weights, blend weight "
                 f"{self.rescorer.blend_weight:g}"
             )
-        return f"{len(self.templates)} templates, threshold {self.threshold:.2f} (log-odds)", facts
+        probability = float(Platt(-1.0, 0.0).probability(self.threshold))
+        return f"{len(self.templates)} templates, threshold at a probability of {probability:.2g}", facts
 
     def scores(self, margins: Floats) -> Floats:
         """Convert SVM margins to log-odds above the threshold."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import glob
+import logging
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,11 +12,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_number, check_type, describe
+from vehicle_detection._common import check_number, check_type, describe, pluralize
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.evaluation import LabelledFrames, read_labels
+from vehicle_detection.evaluation import FrameBoxes, FrameKey, LabelledFrames, read_labels
 from vehicle_detection.params import entries
+from vehicle_detection.video import is_video_file, probe_video, read_frames
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +70,13 @@ def check_sources(sources: object, *, min_count: int = 1) -> tuple[FrameDataset,
         check_type(source, "sources", FrameDataset, "wrap the frames of each camera or country in one")
     names = [source.name for source in sources]
     if len(names) < min_count:
-        expected = "two data sets, so that one can be left out" if min_count > 1 else "one data set"
         raise InvalidInputError(
-            f"sources must hold at least {expected}; got {len(names)}: add labelled frames"
+            f"sources must hold at least {pluralize(min_count, 'data set')}, got {len(names)}; "
+            + (
+                "one at a time is left out for the evaluation: split the frames, such as a set for each drive"
+                if min_count > 1
+                else "add labelled frames"
+            )
         )
     twice = {name for name in names if names.count(name) > 1}
     if twice:
@@ -85,13 +94,15 @@ def find_sources(
 ) -> list[FrameDataset]:
     """Read a folder of labelled frames, as one data set for each file ``labels/NAME.csv``.
 
-    Its frames are in ``frames/NAME/``, ``NAME/`` or ``videos/NAME.mp4``, of which `clip_rate` frames per
-    second are taken. `min_labelled_widths` gives the ``min_labelled_width`` of data sets by name, else 0.
+    Its frames are in ``frames/NAME/``, ``NAME/`` or a video ``videos/NAME.mp4`` (or another suffix), of which
+    `clip_rate` frames per second are taken. If the labels name most frames of a video, the others show no
+    vehicle; if they name fewer, only these are taken.
+    `min_labelled_widths` gives the ``min_labelled_width`` of data sets by name, else 0.
     """
     root = Path(folder)
     if not root.is_dir():
         raise DatasetError(f"folder {root} does not exist; pass the folder of the labelled frames")
-    files = sorted(root.glob("labels/*.csv"))
+    files = sorted(path for path in root.glob("labels/*") if path.suffix.lower() == ".csv")
     if not files:
         raise DatasetError(f"folder {root} has no labels/NAME.csv; pass the folder of the labelled frames")
     widths = min_labelled_widths or {}
@@ -107,18 +118,46 @@ def find_sources(
 
 def _read_frames(root: Path, file: Path, clip_rate: float) -> LabelledFrames:
     """Frames of one file of labels, from a folder of images or a video."""
-    from vehicle_detection.video import probe_video
-
     name, labels = file.stem, read_labels(file)
-    video = root / "videos" / f"{name}.mp4"
     folders = root / "frames" / name, root / name
     for folder in folders:
         if folder.is_dir():
-            return LabelledFrames(name, load_frames(folder), labels)
-    if video.is_file():
-        every = max(1, round(float(probe_video(video).fps) / clip_rate))
-        return LabelledFrames.from_video(video, labels, every=every)
+            found = LabelledFrames(name, load_frames(folder), labels)
+            absent = sorted(set(labels.frame_keys) - set(found.keys), key=str)
+            if absent:
+                log.warning(
+                    "%s: %d of %d labelled frames have no image in %s, such as %r; they are left out",
+                    *(file, len(absent), len(labels.frame_keys), folder, absent[0]),
+                )
+            return found
+    videos = [path for path in (root / "videos").glob(f"{glob.escape(name)}.*") if is_video_file(path)]
+    if videos:
+        return _frames_of_video(min(videos), labels, clip_rate)
+    video = root / "videos" / f"{name}.mp4"
     raise DatasetError(f"{file} has no frames: add {folders[0]}, {folders[1]} or {video}")
+
+
+def _frames_of_video(video: Path, labels: FrameBoxes, clip_rate: float) -> LabelledFrames:
+    """Take some frames per second of a video: all of them if most are labelled, or else labelled ones.
+
+    Where most frames are labelled, the others show no vehicle.
+    """
+    info = probe_video(video)
+    every = max(1, round(float(info.fps) / clip_rate))
+    numbers = [key for key in labels.frame_keys if isinstance(key, int)]
+    if not numbers or len(numbers) > 0.5 * info.frames:
+        return LabelledFrames.from_video(video, labels, every=every)
+    chosen = numbers[:1]
+    for number in numbers:
+        if number >= chosen[-1] + every:
+            chosen.append(number)
+    with read_frames(video) as reader:
+        frames: dict[FrameKey, NDArray[np.uint8]] = {
+            index: frame for index, _, frame in reader if index in chosen
+        }
+    if not frames:
+        raise InvalidInputError(f"labels name no frame of {video}, but {numbers[0]}; count frames from 0")
+    return LabelledFrames(video.stem, frames, labels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +168,18 @@ class TrainingFrame:
     boxes: NDArray[np.float64]  # (N, 4) vehicles
     ignored: NDArray[np.float64]  # (M, 4) ignored boxes
     min_labelled_width: float  # width in pixels from which on every vehicle is labelled
+
+
+def _check_inside(boxes: NDArray[np.float64], shape: tuple[int, ...], where: str) -> None:
+    """Raise unless every box shows a part of the image."""
+    height, width = shape[:2]
+    outside = (boxes[:, :2] >= (width, height)).any(axis=1) | (boxes[:, 2:] <= 0).any(axis=1)
+    if outside.any():
+        box = boxes[int(np.argmax(outside))].tolist()
+        raise InvalidInputError(
+            f"{where}: the box {box} lies outside the {width}x{height} image; check that the labels were "
+            "drawn at this resolution"
+        )
 
 
 def load_training_frames(sources: Sequence[FrameDataset]) -> list[TrainingFrame]:
@@ -142,5 +193,6 @@ def load_training_frames(sources: Sequence[FrameDataset]) -> list[TrainingFrame]
             for key, image in part:
                 labels = part.labels.frame(key)
                 boxes, ignored = labels.boxes[~labels.ignore], labels.boxes[labels.ignore]
+                _check_inside(boxes, image.shape, f"{part.name}, frame {key!r}")
                 loaded.append(TrainingFrame(prepare(image), boxes, ignored, source.min_labelled_width))
     return loaded

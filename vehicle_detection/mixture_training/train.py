@@ -88,7 +88,8 @@ def train_mixture(
     Raises
     ------
     InvalidInputError
-        If there is no source, no vehicle for one of the templates, or a patch is not an image.
+        If there is no source, no labelled vehicle that is wide enough, a box lies outside its image, or a
+        patch is not an image.
     """
     sources = check_sources(sources)
     params = params if params is not None else MixtureParams()
@@ -115,10 +116,18 @@ class _Training:
 
     def run(self, patches: Sequence[Image]) -> TemplateMixture:
         """Train the templates, then the rescorer on what they find."""
-        params = self.params
+        params, rng = self.params, self.rng
         inner = [_blank(shape, params.padding) for shape in params.shapes]
         border = [_blank(shape, params.padding, border=True) for shape in params.border_shapes]
-        positives = self.positives(patches, inner, border)
+        whole = vehicle_features(whole_vehicles(self.frames, params, rng), inner, params)
+        truncated = vehicle_features(truncated_vehicles(self.frames, params, rng), border, params)
+        shown, shown_border = (np.flatnonzero([len(rows) for rows in each]) for each in (whole, truncated))
+        if len(shown) + len(shown_border) < len(whole) + len(truncated):
+            self.without_absent_shapes(shown.tolist(), shown_border.tolist())
+            return replace(self, params=_with_shapes(params, shown.tolist(), shown_border.tolist())).run(
+                patches
+            )
+        positives = self.with_patches(patches, inner, whole) + truncated
         self.report(f"vehicles per template: {', '.join(str(len(rows)) for rows in positives)}")
         mixture = TemplateMixture(
             tuple(self.train_templates([*inner, *border], positives)),
@@ -133,17 +142,25 @@ class _Training:
             mixture = replace(mixture, rescorer=rescorer)
         return mixture
 
-    def positives(self, patches: Sequence[Image], inner: Templates, border: Templates) -> list[Rows]:
-        """Features of the positive samples of each template."""
+    def without_absent_shapes(self, shown: list[int], shown_border: list[int]) -> None:
+        """Report the shapes that no labelled vehicle has, whose templates are left out."""
+        params = self.params
+        if not shown:
+            raise InvalidInputError(
+                f"sources must hold labelled vehicles that are whole and at least {params.min_width:g} "
+                "pixels wide, got none; label more"
+            )
+        absent = [f"{w:g}x{h:g}" for n, (w, h) in enumerate(params.shapes) if n not in shown]
+        absent += [
+            f"{w:g}x{h:g} at the border"
+            for n, (w, h) in enumerate(params.border_shapes)
+            if n not in shown_border
+        ]
+        self.report(f"no labelled vehicle has the proportions {', '.join(absent)}: left out these templates")
+
+    def with_patches(self, patches: Sequence[Image], inner: Templates, whole: list[Rows]) -> list[Rows]:
+        """Features of whole vehicles with those on patches; mirrored templates show one side only."""
         params, rng = self.params, self.rng
-        whole = vehicle_features(whole_vehicles(self.frames, params, rng), inner, params)
-        truncated = vehicle_features(truncated_vehicles(self.frames, params, rng), border, params)
-        for (width, height), rows in zip(params.shapes + params.border_shapes, whole + truncated):
-            if not len(rows):
-                raise InvalidInputError(
-                    f"sources must hold vehicles of every shape, got none like {width:g}x{height:g} that is "
-                    f"at least {params.min_width:g} pixels wide; label more, or leave out that shape"
-                )
         if len(patches):
             more = patch_features(
                 patches, fit_box_regressor(self.frames, params, rng, self.pool), inner, whole, params
@@ -151,7 +168,7 @@ class _Training:
             whole = [np.concatenate(both) for both in zip(whole, more)]
         for index in np.flatnonzero(params.mirrored).tolist():
             whole[index] = align_mirrored(whole[index], rng)
-        return whole + truncated
+        return whole
 
     def train_templates(self, templates: Templates, positives: Sequence[Rows]) -> Templates:
         """Train the templates, mining hard negatives in rounds; mirrored templates are added at the end."""
@@ -186,6 +203,16 @@ class _Training:
         templates, _ = solve(templates, vectors, _FINAL_ITERATIONS)
         biased = [replace(each, bias=each.bias + params.border_bias * each.border) for each in templates]
         return [view.template for view in with_mirrored(biased, mirrored)]
+
+
+def _with_shapes(params: MixtureParams, inner: list[int], border: list[int]) -> MixtureParams:
+    """Parameters with some of the shapes."""
+    return replace(
+        params,
+        shapes=tuple(params.shapes[index] for index in inner),
+        mirrored=tuple(params.mirrored[index] for index in inner),
+        border_shapes=tuple(params.border_shapes[index] for index in border),
+    )
 
 
 def _blank(shape: tuple[float, float], padding: float, *, border: bool = False) -> MixtureTemplate:

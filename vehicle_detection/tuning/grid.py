@@ -110,7 +110,9 @@ def expand_grid(grid: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
     for name, values in grid.items():
         if isinstance(values, (str, bytes)) or not isinstance(values, Iterable):
             raise InvalidInputError(f"grid[{name!r}] must be a list of values; got {describe(values)}")
-        lists[name] = [value.item() if isinstance(value, np.generic) else value for value in values]
+        plain = [value.item() if isinstance(value, np.generic) else value for value in values]
+        # Each value once; unlike in a set, True and 1 are two values.
+        lists[name] = list({(type(value), repr(value)): value for value in plain}.values())
         if not lists[name]:
             raise InvalidInputError(f"grid[{name!r}] must hold at least one value; got none")
     count = math.prod(map(len, lists.values()))

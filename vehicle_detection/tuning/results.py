@@ -26,6 +26,8 @@ _TEXT_COLUMNS = frozenset(
     {"status", "message", "stage", "configuration", "color_space", "split", "frame_f1_by_set", "trial"}
 )
 
+_NUMBER_COLUMNS = ("C", "accuracy", "train_accuracy", "search_ms", "fit_seconds", "seed", "train_size")
+
 _CONSTANTS: dict[str, Any] = {"": None, "True": True, "False": False}
 
 
@@ -245,6 +247,8 @@ def _parse(text: str, file: Path, suffix: str) -> tuple[list[str], list[dict[str
         if len(cells) != len(header):
             raise _damaged_line(file, number)
         rows.append({name: _parse_cell(name, cell) for name, cell in zip(header, cells)})
+        if any(isinstance(rows[-1].get(name), str) for name in _NUMBER_COLUMNS):
+            raise _damaged_line(file, number)
     return header, rows
 
 
