@@ -9,7 +9,7 @@ import math
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +22,9 @@ from vehicle_detection._common import (
     describe,
 )
 from vehicle_detection.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    import pandas
 
 Floats = NDArray[np.float64]
 
@@ -414,6 +417,19 @@ class Detections:
                 "omit class_ids"
             )
         return found[np.isin(classes, list(class_ids))]
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return a table with a row for each box: corners, score and, if known, confidence.
+
+        >>> Detections(np.array([[0.0, 0, 50, 40]]), np.array([1.5])).to_pandas().iloc[0].to_dict()
+        {'x1': 0.0, 'y1': 0.0, 'x2': 50.0, 'y2': 40.0, 'score': 1.5}
+        """
+        import pandas
+
+        columns = {**dict(zip(("x1", "y1", "x2", "y2"), self.boxes.T)), "score": self.scores}
+        if self.confidences is not None:
+            columns["confidence"] = self.confidences
+        return pandas.DataFrame(columns)
 
     def to_supervision(self, *, tracker_id: ArrayLike | None = None) -> Any:
         """Convert to ``supervision.Detections``, for the drawing, counting and tracking of that library.

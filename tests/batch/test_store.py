@@ -15,7 +15,7 @@ from vehicle_detection import batch_status
 from vehicle_detection.batch import plan
 from vehicle_detection.batch.plan import list_videos
 from vehicle_detection.batch.store import open_store
-from vehicle_detection.errors import OutputError, TransientVideoError
+from vehicle_detection.errors import InvalidInputError, OutputError, TransientVideoError
 
 fsspec = pytest.importorskip("fsspec")
 
@@ -172,3 +172,10 @@ def test_passwords_are_neither_stored_nor_printed(clip, model, tmp_path, bucket)
         batch_status(out)
     with pytest.raises(TransientVideoError, match=r"^loopback://\*\*\*@cam cannot be listed"):
         list_videos(["loopback://anna:pa@ss@cam"])
+
+
+def test_a_folder_that_cannot_be_written(tmp_path, monkeypatch):
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    with pytest.raises(InvalidInputError, match="cannot be written; change its permissions"):
+        open_store(tmp_path, create=True)
+    assert open_store(tmp_path).name == str(tmp_path)

@@ -71,7 +71,11 @@ def open_store(out: str | os.PathLike[str], *, create: bool = False, exists: boo
             raise InvalidInputError(
                 f"out must be a folder, {folder} cannot be created: {reason}; choose another"
             ) from error
-    elif (folder.exists() and not folder.is_dir()) or (exists and not folder.is_dir()):
+        if not os.access(folder, os.W_OK):
+            raise InvalidInputError(
+                f"out {folder} cannot be written; change its permissions, or choose another"
+            )
+    elif not folder.is_dir() and (exists or folder.exists()):
         raise InvalidInputError(f"out {text} is not a folder; pass the folder or URL of a batch")
     return LocalStore(folder)
 
