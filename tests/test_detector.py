@@ -14,7 +14,7 @@ from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.camera import Camera, write_camera
 from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.datasets import load_frames
-from vehicle_detection.detector import FrameResult, VehicleDetector
+from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drawing import draw_tracks
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, evaluate_detections, read_labels
@@ -30,7 +30,7 @@ from vehicle_detection.params import (
     TrackParams,
 )
 from vehicle_detection.synthetic import SceneVehicle, render_scene
-from vehicle_detection.tracking import Tracker
+from vehicle_detection.tracking import FrameResult, Tracker
 from vehicle_detection.video import OwnSpeed, process_video
 
 HEIGHT, WIDTH = 180, 320

@@ -19,7 +19,7 @@ from .datasets import (
     split_sequences,
     split_sources,
 )
-from .detector import FrameResult, VehicleDetector, detector_from
+from .detector import VehicleDetector, detector_from
 from .drawing import (
     blur_boxes,
     draw_boxes,
@@ -95,7 +95,7 @@ from .report import ReportWriter
 from .search import SearchResult, find_cars
 from .stream import TrackedFrame, track
 from .synthetic import render_drive, render_patches, render_scene
-from .tracking import Track, Tracker
+from .tracking import FrameResult, Track, Tracker
 from .training import train_and_evaluate
 from .tuning import (
     TrialOptions,

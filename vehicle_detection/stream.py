@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import check_flags
 from vehicle_detection.confidence import Model
-from vehicle_detection.detector import FrameResult, VehicleDetector
+from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.tracking import FrameResult
 from vehicle_detection.video import Source, VideoRun, open_viewer
 
 

@@ -8,9 +8,9 @@ from tests.plotting.helpers import new_axes, texts
 from vehicle_detection import plotting
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera
-from vehicle_detection.detector import FrameResult
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.plotting.style import COLORS
+from vehicle_detection.tracking import FrameResult
 
 CAMERA = Camera(focal_px=1000.0, horizon_px=400.0)
 

@@ -7,12 +7,11 @@ from matplotlib.colors import to_rgb
 from tests.plotting.helpers import legend, new_axes, texts
 from vehicle_detection import plotting
 from vehicle_detection.boxes import Detections
-from vehicle_detection.detector import FrameResult
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import FrameBoxes
 from vehicle_detection.plotting.style import COLORS
 from vehicle_detection.synthetic import render_drive
-from vehicle_detection.tracking import Track
+from vehicle_detection.tracking import FrameResult, Track
 from vehicle_detection.video import VideoReport
 
 

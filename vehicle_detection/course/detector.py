@@ -19,11 +19,12 @@ from vehicle_detection._common import (
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.course.heat import draw_boxes
 from vehicle_detection.course.windows import find_car_windows
-from vehicle_detection.detector import FrameResult, VehicleDetector
+from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.function_model import FunctionModel
 from vehicle_detection.heatmap import heat_threshold
 from vehicle_detection.params import PATCH_SIZE, REFERENCE_WIDTH, HeatParams, SearchBand, SearchParams
+from vehicle_detection.tracking import FrameResult
 
 _HORIZON = 400 / 720
 

@@ -12,7 +12,6 @@ from vehicle_detection._common import (
     check_type,
 )
 from vehicle_detection.camera import Camera, check_shape
-from vehicle_detection.detector import FrameResult
 from vehicle_detection.drawing import (
     LANE_WIDTH_M,
     MAX_SPEED_STD,
@@ -23,7 +22,7 @@ from vehicle_detection.drawing import (
 )
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.plotting import style
-from vehicle_detection.tracking import Track
+from vehicle_detection.tracking import FrameResult, Track
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import check_number, check_type, describe
-from vehicle_detection.detector import FrameResult
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import NO_TRACK, FrameBoxes
 from vehicle_detection.plotting import style
 from vehicle_detection.plotting.style import COLORS, LINESTYLES, YELLOW, FigureLike
 from vehicle_detection.synthetic import VehicleTruth
+from vehicle_detection.tracking import FrameResult
 from vehicle_detection.video import VideoReport
 
 if TYPE_CHECKING:
