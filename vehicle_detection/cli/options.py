@@ -24,7 +24,7 @@ Model = Annotated[
     str,
     Option(
         metavar="NAME|FILE",
-        help='"default" (any road), "highway" (fastest), or a model file, such as own.safetensors.',
+        help='"default" (any road), "highway" (the course\'s), or a model file, such as own.safetensors.',
         rich_help_panel=SEARCH,
     ),
 ]
