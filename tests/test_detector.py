@@ -826,3 +826,8 @@ def test_a_second_thread_is_refused():
                 pool.submit(call, frames[1]).result()
         assert len(pool.submit(detector.detect, frames[1]).result()) > 0
     assert detector.process(frames[1]).index == 1
+
+
+def test_every_frame_is_searched_where_vehicles_are_blurred():
+    assert VehicleDetector(blur="plates").search_interval(30) == 1
+    assert VehicleDetector(blur="plates", every=2).search_interval(30) == 2

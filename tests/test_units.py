@@ -21,6 +21,6 @@ def test_rough_distances_are_marked():
     assert metric.distance_text(20.0, 4.1, with_std=True) == "20 ± 4 m"
 
 
-def test_a_vehicle_at_the_same_speed_has_no_minus_sign():
-    assert UNITS["metric"].speed_text(-0.01, 0.2) == "+0 km/h"
+def test_a_vehicle_at_the_same_speed_has_no_sign():
+    assert UNITS["metric"].speed_text(-0.01, 0.2) == "0 km/h"
     assert UNITS["imperial"].speed_text(-5.0, 1.0, with_std=True) == "-11 ± 2 mph"

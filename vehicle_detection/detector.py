@@ -121,8 +121,8 @@ class VehicleDetector:
     every
         Search every n-th frame of a video, to save time. The tracks of the frames between are interpolated
         by `process_video`, which holds these frames in memory, and predicted by `process`. None:
-        `process_video` searches at least 12 frames per second, but every frame for heat maps, `diagnostics`
-        and functions; `process` searches every frame.
+        `process_video` searches at least 12 frames per second, but every frame for heat maps, `diagnostics`,
+        `blur` and functions; `process` searches every frame.
     own_speed
         Speed of the camera's own vehicle over the time of the video (`read_own_speed`). Where it is known,
         labels state speeds over ground, without a sign; otherwise speeds relative to the camera.
@@ -389,7 +389,7 @@ class VehicleDetector:
         """Interval of the frames that `process_video` searches at a frame rate: 1 for every frame."""
         if self.every is not None:
             return self.every
-        if self._heat_params or self.diagnostics or self.model.searches_every_frame:
+        if self._heat_params or self.diagnostics or self.blur or self.model.searches_every_frame:
             return 1
         fps = check_number(fps, "fps", above=0, high=1e6)
         return max(1, int(fps / _MIN_SEARCH_RATE + 0.01))  # 23.976 counts as 24
@@ -607,7 +607,7 @@ class VehicleDetector:
             frame = blur_boxes(frame, boxes, region=self.blur)
         if self.diagnostics:
             heat = frame_heat(frame.shape, result.windows, self._heat_params or HeatParams())
-            return draw_diagnostics(frame, result.windows, heat, result.tracks)
+            return draw_diagnostics(frame, result.windows, heat, result.tracks, params=self.draw_params)
         time = result.index / (self._fps or _USUAL_FPS) if result.time is None else result.time
         own_mps = math.nan if self.own_speed is None else float(self.own_speed.at(time))
         return self._drawer.draw(

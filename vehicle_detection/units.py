@@ -42,7 +42,7 @@ class Units:
         """
         value = round(self.speed * speed_mps) + 0.0  # + 0.0 turns -0.0 into 0.0
         error = f" ± {self.speed * std_mps:.0f}" if with_std and std_mps is not None else ""
-        return f"{value:{'+' if signed else ''}.0f}{error} {self.speed_symbol}"
+        return f"{value:{'+' if signed and value else ''}.0f}{error} {self.speed_symbol}"
 
 
 UNITS = {

@@ -805,7 +805,7 @@ def bad_videos(material, tmp):
         r"--report \S+ is also --output \S+;": [clip, "-o", target, "--report", target],
         r"--blur must be one of 'vehicles', 'plates'; got 'faces'": [clip, "-o", target, "--blur", "faces"],
         r"--events must end in .csv or .json, got 'e.txt'": [clip, "-o", target, "--events", tmp / "e.txt"],
-        r"--own-speed must be a number, at least 0": [clip, "-o", target, "--own-speed", -1],
+        r"--own-speed must be a speed of at most 500": [clip, "-o", target, "--own-speed", -1],
         r"--srt must end in .srt or .ass, got 's.txt'": [clip, "-o", target, "--srt", tmp / "s.txt"],
         r"--gpx must end in .gpx or .csv, got 'clip.mp4'": [clip, "-o", target, "--gpx", clip],
         r"--gpx \S+none.gpx does not exist": [clip, "-o", target, "--gpx", tmp / "none.gpx"],
@@ -1333,3 +1333,25 @@ def test_a_piped_video_whose_index_is_at_its_end_is_refused(tmp_path):
 )
 def test_a_wrong_call_is_an_error_of_one_line(words, message):
     assert re.fullmatch(f"error: {message}\n", refuse(*words))
+
+
+@pytest.mark.parametrize(("text", "mps"), [("100", 100 / 3.6), ("62mph", 62 * 0.44704), ("90 km/h", 25.0)])
+def test_own_speed_in_units(text, mps):
+    from vehicle_detection.cli.events import read_speed
+
+    assert read_speed(text, None, 0.0).at([1.0]) == pytest.approx(mps)
+
+
+@pytest.mark.parametrize("text", ["fast", "-5", "501", "10 m/s"])
+def test_own_speed_that_cannot_be_read(text):
+    from vehicle_detection.cli.events import read_speed
+
+    with pytest.raises(InvalidInputError, match="--own-speed must be a speed of at most 500, such as 100"):
+        read_speed(text, None, 0.0)
+
+
+def test_images_have_a_frame_rate(tmp_path):
+    for number in range(4):
+        write_image(tmp_path / f"{number}.png", np.zeros((360, 640, 3), np.uint8))
+    succeed("video", tmp_path, "-o", tmp_path / "out.mp4", "--fps", 2, "--model", "highway", "-q")
+    assert probe_video(tmp_path / "out.mp4").duration == pytest.approx(2.0)

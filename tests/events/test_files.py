@@ -58,7 +58,7 @@ def test_clips_show_the_frames_around_each_event(tmp_path):
     assert [first.name, second.name] == ["0000.8s_cut_in_2.mp4", "0002.0s_met_3.mp4"]
     assert probe_video(first).frames == 12 + 1 + 10
     assert probe_video(second).frames == 5 + 1 + 5
-    with pytest.raises(InvalidInputError, match="target needs an existing folder"):
+    with pytest.raises(InvalidInputError, match=r"folder .* does not exist; create it"):
         cut_clips(EVENTS, video, tmp_path / "none", fps=25)
     with pytest.raises(InvalidInputError, match="margin must be a number, at least 0"):
         cut_clips(EVENTS, video, tmp_path, fps=25, margin=-1)

@@ -160,7 +160,7 @@ def test_what_is_stated_is_known_and_in_order():
                 value, std = getattr(event, name), getattr(event, name.replace("_", "_std_"))
                 assert (value is None) == (std is None)
                 assert value is None or 0 < std <= 0.31 * value
-            assert f"vehicle {event.track_id} " in str(event)
+            assert f"vehicle {event.track_id}" in str(event)
 
 
 def test_the_camera_changing_lanes_is_no_cut_in():

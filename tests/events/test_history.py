@@ -81,3 +81,11 @@ def test_the_closest_approach_of_few_known_distances():
     assert history([5], [12.0]).closest_approach(25.0) == (5, 12.0, 1.0)
     assert history([5, 6], [math.nan, 12.0]).closest_approach(0.1).frame == 6
     assert history([5], [math.nan]).closest_approach(25.0) is None
+
+
+def test_frames_that_a_live_source_dropped():
+    log = TrackLog()
+    for frame in (0, 1, 5, 6):
+        log.add(frame, frame / 10, [track(1)] if frame < 6 else [])
+    assert list(log.counts) == [1, 1, 1, 1, 1, 1, 0]
+    assert log.histories()[0].frames.tolist() == [0, 1, 5]

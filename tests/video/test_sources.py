@@ -20,6 +20,7 @@ from tests.video.clips import (
     child_processes,
     damage_sizes,
     ffmpeg,
+    ffmpeg_log,
     frame_numbers,
     gray_frames,
     running_threads,
@@ -531,3 +532,37 @@ def test_times_may_be_numbers_of_numpy(tmp_path):
     with read_frames(clip, start=np.float32(0.2), end=np.int64(1)) as frames:
         assert [index for index, _, _ in frames] == [5, 6, 7, 8, 9]
     process_video(clip, None, StubDetector(), end=np.float32(0.2))
+
+
+def test_side_outputs_of_a_live_source_that_drops_frames(tmp_path):
+    """A search that is slower than the source: 4K noise at 60 Hz."""
+    noise = ["-f", "lavfi", "-i", "testsrc2=size=1920x1080:rate=60:duration=4", "-c:v", "libx264"]
+    encoder = [FFMPEG_BINARY, "-v", "quiet", "-re", *noise, "-preset", "ultrafast", "-f", "mpegts", "pipe:1"]
+    names = {
+        "--output": "a.mp4",
+        "--tracks": "a.csv",
+        "--srt": "a.srt",
+        "--report": "a.html",
+        "--events": "e.csv",
+    }
+    words = [word for name, file in names.items() for word in (name, str(tmp_path / file))]
+    command = [sys.executable, "-m", "vehicle_detection", "video", "-", "--live", *words, "--every", "1"]
+    with subprocess.Popen(encoder, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL) as camera:
+        done = subprocess.run(command, stdin=camera.stdout, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "dropped" in done.stdout
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names.values())
+
+
+def test_an_annotated_copy_has_no_chapters_and_no_place(tmp_path):
+    meta = tmp_path / "meta.txt"
+    meta.write_text(";FFMETADATA1\ntitle=private\n[CHAPTER]\nTIMEBASE=1/1\nSTART=0\nEND=9\ntitle=one\n")
+    clip = write_clip(tmp_path / "clip.mp4", gray_frames(20), sound=True)
+    full = tmp_path / "full.mp4"
+    ffmpeg("-i", clip, "-i", meta, "-map", 0, "-map_metadata", 1, "-map_chapters", 1, "-c", "copy", full)
+    assert "private" in ffmpeg_log(full)
+    for audio in (True, False):
+        process_video(full, tmp_path / "out.mp4", StubDetector(), audio=audio, end=0.4)
+        log = ffmpeg_log(tmp_path / "out.mp4")
+        assert "private" not in log
+        assert "Chapter" not in log

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,15 +17,15 @@ if TYPE_CHECKING:
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.events import Event, TrackLog
     from vehicle_detection.report import TrackPicture
-    from vehicle_detection.video import OwnSpeed, VideoReport
+    from vehicle_detection.video import FrameSource, OwnSpeed, VideoReport
 
 # Fraction of the frames without a known own speed from which on a warning is printed.
 _MAX_UNKNOWN = 0.05
+_MAX_OWN_SPEED = 500.0
 
 
-def read_speed(own_speed: float | None, gpx: Path | None, offset: float) -> OwnSpeed | None:
-    """Speed of the own vehicle: constant (km/h), from a file, or unknown."""
-    from vehicle_detection._common import check_number
+def read_speed(own_speed: str | None, gpx: Path | None, offset: float) -> OwnSpeed | None:
+    """Speed of the own vehicle: constant (km/h, or with its unit), from a file, or unknown."""
     from vehicle_detection.video import OwnSpeed, read_own_speed
 
     if gpx is not None:
@@ -36,7 +37,13 @@ def read_speed(own_speed: float | None, gpx: Path | None, offset: float) -> OwnS
         raise InvalidInputError("--gpx-offset needs --gpx; give the file, or omit the offset")
     if own_speed is None:
         return None
-    return OwnSpeed.constant(check_number(own_speed, "--own-speed", low=0, high=500) / 3.6)
+    found = re.fullmatch(r"(\d{1,3}(?:\.\d*)?) ?(km/h|kmh|mph)?", own_speed.strip().lower())
+    if found is None or float(found[1]) > _MAX_OWN_SPEED:
+        raise InvalidInputError(
+            f"--own-speed must be a speed of at most {_MAX_OWN_SPEED:g}, such as 100 (km/h) or 62mph; got "
+            f"{own_speed!r}"
+        )
+    return OwnSpeed.constant(float(found[1]) * (0.44704 if found[2] == "mph" else 1 / 3.6))
 
 
 @dataclass(frozen=True)
@@ -101,7 +108,7 @@ class SideOutputs:
                 )
 
 
-def explain_vehicles(detector: VehicleDetector, source: str, log: TrackLog) -> list[TrackPicture]:
+def explain_vehicles(detector: VehicleDetector, source: FrameSource, log: TrackLog) -> list[TrackPicture]:
     """Explain a box of each vehicle of a video, for its report."""
     from vehicle_detection.explanation import explain_tracks
     from vehicle_detection.report import TrackPicture

@@ -45,6 +45,7 @@ from vehicle_detection.errors import InvalidInputError
 if TYPE_CHECKING:
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.params import DrawParams
+    from vehicle_detection.report import TrackPicture
     from vehicle_detection.video import FrameSource
 
 DAMAGED = 3  # exit code
@@ -133,11 +134,15 @@ def video(
     end: Annotated[
         float | None, Option(metavar="S", help="End time in seconds, such as 30.", rich_help_panel=INPUT)
     ] = None,
+    fps: Annotated[
+        float,
+        Option(metavar="N", help="Frame rate of a source of images, such as 10.", rich_help_panel=INPUT),
+    ] = 25.0,
     own_speed: Annotated[
-        float | None,
+        str | None,
         Option(
-            metavar="KM/H",
-            help="Speed of the own vehicle, such as 100, for headways and speeds over ground.",
+            metavar="SPEED",
+            help="Own speed in km/h, such as 100, or 62mph, for headways and speeds over ground.",
             rich_help_panel=INPUT,
         ),
     ] = None,
@@ -254,6 +259,8 @@ def video(
     sources = {"SOURCE": Path(source)} | ({} if gpx is None else {"--gpx": gpx})
     check_distinct_paths(outputs, sources)
     _check_outputs(outputs, clips, show=show, why=why)
+    if diagnostics and panel != "none":
+        raise InvalidInputError("--panel has no place with --diagnostics; omit one of them")
     region = parse_blur(blur)
     if region is not None and output is None and not show:
         raise InvalidInputError("--output must name a video for --blur, which blurs its vehicles; add it")
@@ -268,7 +275,9 @@ def video(
                 check_format(tracks, None, FORMATS.values())
         fraction = None if horizon in (None, "auto") else parse_horizon(str(horizon))
         loaded = load_model(model)
-        opened = stack.enter_context(open_source(source, live=live or None, reconnect=not no_reconnect))
+        opened = stack.enter_context(
+            open_source(source, fps=fps, live=live or None, reconnect=not no_reconnect)
+        )
         if why and not opened.rereadable:
             raise InvalidInputError(
                 f"--why needs a source that can be read again, got {source}; use a file, or omit --why"
@@ -328,7 +337,11 @@ def video(
         if page is not None:
             # After the tracks, whose file is complete when its writer closes.
             stack.close()
-            page.finish(done, events=found, pictures=explain_vehicles(detector, source, log) if why else ())
+            pictures: list[TrackPicture] = []
+            if why:
+                with open_source(source, fps=fps) as again:
+                    pictures = explain_vehicles(detector, again, log)
+            page.finish(done, events=found, pictures=pictures)
     given = None if horizon in (None, "auto") else f"--horizon {horizon}"
     if horizon is None and detector.search_params_of(opened.info.shape) != detector.search_params:
         given = f"the horizon of --camera {camera}"

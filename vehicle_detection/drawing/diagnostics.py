@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_array, check_boxes, check_image, describe
+from vehicle_detection._common import check_array, check_boxes, check_image, check_type, describe
 from vehicle_detection.boxes import Detections
 from vehicle_detection.drawing.boxes import draw_boxes
 from vehicle_detection.drawing.primitives import (
@@ -22,8 +22,9 @@ from vehicle_detection.drawing.primitives import (
     text_scale,
     text_size,
 )
-from vehicle_detection.drawing.tracks import TRACK_COLORS, check_tracks, draw_tracks
+from vehicle_detection.drawing.tracks import TRACK_COLORS, TrackDrawer, check_tracks
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.params import DrawParams
 from vehicle_detection.tracking import Track
 
 # Colors of cells that speak for and against a vehicle, and opacity of the one with the largest share.
@@ -31,7 +32,12 @@ _FOR_COLOR, _AGAINST_COLOR, _MAX_ALPHA = TRACK_COLORS[5], TRACK_COLORS[4], 0.75
 
 
 def draw_diagnostics(
-    frame: Image, windows: Detections | ArrayLike, heat: NDArray[Any], tracks: Iterable[Track]
+    frame: Image,
+    windows: Detections | ArrayLike,
+    heat: NDArray[Any],
+    tracks: Iterable[Track],
+    *,
+    params: DrawParams | None = None,
 ) -> Image:
     """Draw a 2x2 mosaic: the frame, its positive windows, the heat map, the tracks.
 
@@ -43,6 +49,8 @@ def draw_diagnostics(
         Positive windows, as `Detections` or boxes in any form that `draw_boxes` accepts.
     heat
         ``(h, w)`` finite numbers, of the frame's size or smaller; drawn from black (0) to yellow (maximum).
+    params
+        Labels, units, lines and colors of the tracks; a bird's-eye view is not drawn.
 
     Returns
     -------
@@ -54,6 +62,8 @@ def draw_diagnostics(
     InvalidInputError
         If an argument is malformed, or the frame is smaller than 4x4 pixels.
     """
+    if params is not None:
+        check_type(params, "params", DrawParams, "omit it for the defaults")
     checked = check_image(frame, "frame")
     height, width = (side // 2 for side in checked.shape[:2])
     if min(height, width) < 2:
@@ -69,7 +79,10 @@ def draw_diagnostics(
         ("frame", small),
         ("windows", draw_boxes(small, boxes * scale, color=TRACK_COLORS[1], thickness=1)),
         ("heat", np.asarray(cv2.resize(heat_image(heat), (width, height)), np.uint8)),
-        ("tracks", draw_tracks(small, scaled, labels=("id", "distance"))),
+        (
+            "tracks",
+            TrackDrawer(dataclasses.replace(params or DrawParams(), panel="none")).draw(small, scaled),
+        ),
     ]
     mosaic = np.zeros_like(checked)
     for index, (title, panel) in enumerate(panels):
@@ -86,7 +99,7 @@ def draw_diagnostics(
 def draw_cell_shares(image: Image, window: ArrayLike, cells: NDArray[Any]) -> Image:
     """Draw the shares of a window's cells in its score on a copy of an image, as `Explanation` holds them.
 
-    Orange cells speak for a vehicle and blue ones against one, the stronger the more. `window` is
+    Orange cells raise the score and blue ones lower it, the stronger the more. `window` is
     ``[x1, y1, x2, y2]`` in pixels, and `cells` are ``(rows, columns)``.
     """
     result = check_image(image).copy()

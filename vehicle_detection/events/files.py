@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from vehicle_detection._common import atomic_write, check_number, check_suffix
+from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events.find import EVENT_COLUMNS, Event, check_events
 from vehicle_detection.video import cut_video
 
@@ -105,7 +106,10 @@ def cut_clips(
     rate = check_number(fps, "fps", above=0, high=1e6)
     check_number(margin, "margin", low=0, high=3600)
     paths = []
-    for event in check_events(events):
+    listed = check_events(events)
+    if listed and not Path(folder).is_dir():
+        raise InvalidInputError(f"folder {folder} does not exist; create it")
+    for event in listed:
         start = max(event.start_frame / rate - margin, event.time_s - _MAX_EXTENT, 0.0)
         end = min((event.end_frame + 1) / rate + margin, event.time_s + _MAX_EXTENT)
         path = Path(folder) / f"{event.time_s:06.1f}s_{event.kind}_{event.track_id}.mp4"

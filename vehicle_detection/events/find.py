@@ -143,9 +143,12 @@ class Event:
         Returns
         -------
         str
-            Such as ``"12.0 s: vehicle 4 following, headway 0.6 ± 0.1 s, distance 14.2 ± 1.2 m"``.
+            Such as ``"12.0 s: following vehicle 4, headway 0.6 ± 0.1 s, distance 14.2 ± 1.2 m"``.
         """
-        parts = [f"{self.time_s:.1f} s: " * with_time + f"vehicle {self.track_id} {KINDS[self.kind]}"]
+        vehicle, kind = f"vehicle {self.track_id}", KINDS[self.kind]
+        # The camera's vehicle follows; in all other events the other one acts, or is met.
+        what = f"{kind} {vehicle}" if self.kind == "headway" else f"{vehicle} {kind}"
+        parts = [f"{self.time_s:.1f} s: " * with_time + what]
         parts += [f"on the {self.side}"] if self.side else []
         listed = (
             ("time to collision", self.ttc_s, self.ttc_std_s, 1.0, "s"),
@@ -426,6 +429,9 @@ class _Finder:
         frame, own_speed = int(frames[row]), self.own_speed[frames[row]]
         values: dict[str, float | None] = dict.fromkeys(EVENT_COLUMNS[7:])
         distance, std = motion.distance[row], motion.distance_std[row]
+        stated = motion.track.columns["distance_m"][row], motion.track.columns["distance_std_m"][row]
+        if np.isfinite(stated).all():  # as labels and tables have it
+            distance, std = stated
         if std <= _MAX_STD * distance:
             values |= {"distance_m": distance, "distance_std_m": std}
             if kind == "headway" and own_speed > _MOVING:
@@ -441,7 +447,7 @@ class _Finder:
                 "ttc_s": motion.time_to_collision[row],
                 "ttc_std_s": motion.time_to_collision_std[row],
             }
-        stated = {name: None if value is None else round(float(value), 2) for name, value in values.items()}
+        rounded = {name: None if value is None else round(float(value), 2) for name, value in values.items()}
         return Event(
             kind=kind,
             track_id=motion.track.id,
@@ -450,7 +456,7 @@ class _Finder:
             end_frame=int(frames[stop - 1]),
             time_s=round(frame / self.fps, 3),
             side=side,
-            **stated,
+            **rounded,
         )
 
 

@@ -124,7 +124,7 @@ class TrackLog:
         Parameters
         ----------
         index
-            Number of the frame, counted from 0 without gaps.
+            Number of the frame, counted from 0; those that a live source dropped are left out.
         time
             Time of the frame in the source in seconds; None if unknown.
         tracks
@@ -133,12 +133,12 @@ class TrackLog:
         Raises
         ------
         InvalidInputError
-            If a frame is left out or repeated, two tracks have the same id, or an argument is malformed.
+            If a frame is repeated, two tracks have the same id, or an argument is malformed.
         """
         expected = len(self.counts)
-        if check_integer(index, "index", low=0) != expected:
+        if check_integer(index, "index", low=0) < expected:
             raise InvalidInputError(
-                f"index must be {expected}, as frames are added in order from 0; got {index}; "
+                f"index must be at least {expected}, as frames are added in order; got {index}; "
                 "use a new TrackLog for another video"
             )
         if time is not None:
@@ -146,9 +146,11 @@ class TrackLog:
         rows = list(_rows(tracks))
         if not expected:
             self.first_time = time
+        # Of frames that a live source dropped, a written video shows the last one before again.
+        self.counts.extend([self.counts[-1] if expected else 0] * (index - expected))
         self.counts.append(len(rows))
         for track_id, values in rows:
-            for column, value in zip(self._tracks[track_id], (expected, *values)):
+            for column, value in zip(self._tracks[track_id], (index, *values)):
                 column.append(value)
 
     def own_speeds(self, speed: OwnSpeed, fps: float) -> Floats:

@@ -124,6 +124,8 @@ def render_page(
 
     axis = TimeAxis(max(report.frames, len(log.counts), 1), float(report.fps))
     chosen = UNITS[units]
+    # Labels in the video state speeds over ground where the own speed is known.
+    relative = " relative" if getattr(detector, "own_speed", None) is not None else ""
     tracks = [_in_units(_without_imprecise_speeds(track), chosen) for track in log.histories()]
     css, script, template = map(_read, ("report.css", "report.js", "report.html.j2"))
     environment = Environment(
@@ -152,7 +154,8 @@ def render_page(
         settings=_settings(detector, report.shape),
         model=_model_summary(getattr(detector, "model", None)),
         version=vehicle_detection.__version__,
-        data=_script_data(tracks, axis) | {"units": [chosen.distance_symbol, chosen.speed_symbol]},
+        data=_script_data(tracks, axis)
+        | {"units": [chosen.distance_symbol, f"{chosen.speed_symbol}{relative}"]},
     )
 
 
@@ -178,7 +181,10 @@ def _counts(
 ) -> dict[str, str]:
     fps = float(report.fps)
     counts = {"Vehicles": f"{len(tracks):,}", "Frames": f"{report.frames:,}"}
-    counts |= {"Length": format_time(report.frames / fps), "Most at once": str(max(log.counts, default=0))}
+    counts |= {
+        "Length": format_time(max(report.frames, len(log.counts)) / fps),
+        "Most at once": str(max(log.counts, default=0)),
+    }
     if tracks:
         longest = max(tracks, key=lambda track: len(track.frames))
         counts["Longest track"] = f"#{longest.id}, {len(longest.frames) / fps:.1f} s"

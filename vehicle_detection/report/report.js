@@ -47,8 +47,8 @@ function showReadout(frame) {
     name.textContent = "#" + track.id;
     if (distance != null) name.textContent += (track.rough[index] ? " ~" : " ") + distance.toFixed(0) + " " + data.units[0];
     if (speed != null) {
-      const sign = speed > 0 ? "+" : speed < 0 ? "\u2212" : "";
-      name.textContent += " " + sign + Math.abs(speed).toFixed(0) + " " + data.units[1];
+      const rounded = Math.round(speed), sign = rounded > 0 ? "+" : rounded < 0 ? "\u2212" : "";
+      name.textContent += " " + sign + Math.abs(rounded) + " " + data.units[1];
     }
     return name;
   }));

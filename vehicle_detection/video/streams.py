@@ -295,7 +295,8 @@ class FrameWriter(_FfmpegStream):
         if info.pixel_aspect != 1:
             filters += f",setsar={info.pixel_aspect}"
         encoder = ["-vf", filters, "-c:v", "libx264", "-preset", preset, "-fps_mode", "passthrough"]
-        self._muxer = ["-f", container]
+        # Chapters and other metadata are those of the whole source, and its title and place may be private.
+        self._muxer = ["-map_chapters", "-1", "-map_metadata", "-1", "-f", container]
         if container != "matroska":  # the index at the front lets a browser play while it downloads
             self._muxer += ["-movflags", "+faststart"]
         options = ["-y", *video, "-i", "pipe:0", *sound, *mapped, *encoder, *self._muxer, f"file:{path}"]
