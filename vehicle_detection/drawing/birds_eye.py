@@ -128,7 +128,9 @@ class BirdsEyePanel:
         height, width = self.side_size(shape) if place == "side" else self.corner_size(shape)
         self._width = width
         self._scale = height / (_AHEAD_M + _BEHIND_M)  # pixels per meter
-        self._text_scale = max(0.3, min(0.4 * math.sqrt(height / 300), 4.0))
+        # Large frames are shown smaller than small ones.
+        enlarged = math.sqrt(max(shape[0] / 1080, 1.0))
+        self._text_scale = max(0.3, min(0.4 * math.sqrt(height / 300) * enlarged, 4.0))
         self._grid = self._draw_grid(height, width, units)
         self._dark = (self._grid * _BACKGROUND_ALPHA).astype(np.uint8)
         self._trails = Trails()

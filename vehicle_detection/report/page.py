@@ -260,7 +260,10 @@ def _curve_figure(
             f"{units.speed_name.capitalize()} relative to the camera, above 0 when moving away; standard "
             f"error at most {units.speed * MAX_SPEED_STD:.0f} {units.speed_symbol}"
         )
-    value_axis = ValueAxis.covering(min(low, 0.0), max(high, 0.0), 150)
+    # The band around a line belongs to it.
+    edges = [track.columns[name] + track.columns[std] for track in tracks] if std else []
+    top = max([high, *(float(np.nanmax(each)) for each in edges if np.isfinite(each).any())])
+    value_axis = ValueAxis.covering(min(low, 0.0), max(top, 0.0), 150)
     curves = "".join(curve(track, name, axis, value_axis, std=std) for track in tracks)
     ends = end_labels(tracks, name, axis, value_axis)
     label = f"Lines: {quantity} of each track, from {extent}"
