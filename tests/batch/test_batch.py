@@ -322,6 +322,8 @@ def test_a_trip_whose_first_segment_is_gone(clip, model, tmp_path, changed):
     assert counts(run(card, out, model, tracks_only=True)) == (1, 0, 0, 0)
     (card / "20260131_081500_F.mp4").unlink()
     options = {"every": 3} if changed else {}
+    planned = run(card, out, model, tracks_only=True, options=options, dry_run=True).planned
+    assert len(planned) == changed
     report = run(card, out, model, tracks_only=True, options=options)
     assert counts(report) == ((1, 0, 0, 0) if changed else (0, 0, 0, 1))
     # What was processed of a file that is gone stays.

@@ -352,7 +352,7 @@ def _plan(
         # A trip replaces the earlier ones that began with one of its files.
         ids = (source_id(str(file)) for file in trip.files)
         keys = [key for each in ids for key in earlier.get(each, ())]
-        task["recorded"] = task["key"] in keys
+        task["recorded"] = task["key"] in earlier.get(task["key"].partition("-")[0], ())
         task["replaces"] = [key for key in keys if key != task["key"]]
         tasks.append(task)
     return tasks
