@@ -490,9 +490,9 @@ class VehicleDetector:
         InvalidInputError
             If an argument is malformed, or the times do not lie between those of `before` and `after`.
         """
-        for name, result in (("before", before), ("after", after)):
-            if name == "before" or result is not None:
-                check_type(result, name, FrameResult, "pass what track returns")
+        check_type(before, "before", FrameResult, "pass what track returns")
+        if after is not None:
+            check_type(after, "after", FrameResult, "pass what track returns")
         times = [
             check_number(each, "times", low=-1e12, high=1e12)
             for each in check_sequence(times, "times", "numbers")

@@ -205,3 +205,11 @@ def test_a_bad_segment_of_a_server_is_named(signed, model, tmp_path):
     (message,) = report.messages.values()
     start = f"http://127.0.0.1:{signed.server_address[1]}/cam/20260131_081501_F.mp4 is not a video"
     assert message.startswith(start)
+
+
+def test_the_identity_of_a_url_does_not_depend_on_what_is_hidden_in_its_record():
+    url = "ftp://anna:secret@host/20260131_093000_F.mp4"
+    (found,) = plan.group_files([url], "trip")
+    task = plan.plan_trip(found, {url: {"size": 1}}, {"options": {}}, "")
+    assert task["key"].partition("-")[0] == plan.source_id(url) == plan.trip_id(found)
+    assert "secret" not in task["sources"][0]["uri"]

@@ -986,7 +986,7 @@ def test_images_that_are_too_small_are_left_out(tmp_path):
     small, image = tmp_path / "small.png", tmp_path / "image.png"
     write_image(small, np.zeros((20, 40, 3), np.uint8))
     write_image(image, np.zeros((360, 640, 3), np.uint8))
-    result = run("detect", image, small, "--model", "highway")
+    result = run("detect", small, image, "--model", "highway")
     assert result.exit_code == 3
     assert f"warning: {small}: image of 40x20 pixels holds no search window" in result.stderr
     assert str(small) in refuse("detect", small, "--model", "highway")

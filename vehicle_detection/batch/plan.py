@@ -159,7 +159,7 @@ def plan_trip(
     files = [str(file) for file in trip.files]
     sources = [{"uri": _shown(file), **_identify(file, known.get(file, {}))} for file in files]
     return {
-        "key": trip_key(sources, settings, fingerprint),
+        "key": f"{trip_id(trip)}-{trip_digest(sources, settings, fingerprint)}",
         "files": files,
         "sources": sources,
         "camera": trip.camera,
@@ -170,11 +170,10 @@ def plan_trip(
     }
 
 
-def trip_key(sources: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], fingerprint: str) -> str:
-    """Key of the results of a trip: its identity, and a hash of everything that they depend on."""
+def trip_digest(sources: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], fingerprint: str) -> str:
+    """Hash of everything that the results of a trip depend on: the second part of its key."""
     facts = [sources, dict(settings), fingerprint, __version__]
-    digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:_HASH_DIGITS]
-    return f"{source_id(sources[0]['uri'])}-{digest}"
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:_HASH_DIGITS]
 
 
 def fingerprint_of(settings: Mapping[str, Any]) -> str:

@@ -37,8 +37,8 @@ from vehicle_detection.batch.plan import (
     plan_trip,
     shipped_model,
     source_id,
+    trip_digest,
     trip_id,
-    trip_key,
 )
 from vehicle_detection.batch.records import (
     DONE,
@@ -395,7 +395,9 @@ def _without_recorded(
 ) -> tuple[Trip, dict[str, Any]]:
     """Leave out the first files of a trip that a longer record holds, if it has the same parameters."""
     settings, fingerprint = plan["settings"], plan["fingerprint"]
-    if record is None or record["key"] != trip_key(record["sources"], settings, fingerprint):
+    if record is None:
+        return trip, plan
+    if record["key"].partition("-")[2] != trip_digest(record["sources"], settings, fingerprint):
         return trip, plan
     held = sum(1 for _ in takewhile(record["sources"].__contains__, plan["sources"]))
     if held == len(trip.files):

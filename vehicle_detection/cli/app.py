@@ -352,7 +352,7 @@ def _detect_each(
 ) -> Iterator[tuple[str, Detections]]:
     """Detect the vehicles of each image, print them, and write the annotated image.
 
-    Images that are too small are left out, with a warning; it is an error if the first one is.
+    Images that are too small are left out, with a warning; it is an error if all of them are.
     """
     import cv2
 
@@ -360,17 +360,15 @@ def _detect_each(
     from vehicle_detection.drawing import blur_boxes, draw_detections, score_texts
     from vehicle_detection.images import write_image
 
-    searched = 0
+    searched, reasons = False, list[str]()
     for path, image in images:
         try:
             found = detector.detect(image)
         except InvalidInputError as error:
-            if not searched:
-                raise InvalidInputError(f"{path}: {error}") from None
             left_out.append(path)
-            print_error(f"warning: {path}: {error}; left out")
+            reasons.append(f"{path}: {error}")
             continue
-        searched += 1
+        searched = True
         listed = "".join(
             f"  [{' '.join(f'{side:.0f}' for side in box)}] {text}"
             for box, text in zip(found.boxes.tolist(), score_texts(found))
@@ -386,6 +384,10 @@ def _detect_each(
             drawn = draw_detections(shown, found, line_width=line_width, scores=scores)
             write_image(output / (path.stem + suffix), drawn)
         yield path.name, found
+    if reasons and not searched:
+        raise InvalidInputError(reasons[0])
+    for reason in reasons:
+        print_error(f"warning: {reason}; left out")
 
 
 def _write_explanations(

@@ -151,9 +151,10 @@ def _frames_of_video(video: Path, labels: FrameBoxes, clip_rate: float) -> Label
     for number in numbers:
         if number >= chosen[-1] + every:
             chosen.append(number)
+    wanted = set(chosen)
     with read_frames(video) as reader:
         frames: dict[FrameKey, NDArray[np.uint8]] = {
-            index: frame for index, _, frame in reader if index in chosen
+            index: frame for index, _, frame in reader if index in wanted
         }
     if not frames:
         raise InvalidInputError(f"labels name no frame of {video}, but {numbers[0]}; count frames from 0")
