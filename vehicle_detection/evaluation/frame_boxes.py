@@ -108,7 +108,7 @@ def _table_column(table: pandas.DataFrame, name: str, kind: type) -> NDArray[Any
         raise InvalidInputError(
             f"table must hold whole numbers in the column {name}, got {fractions[0]:g}; convert it to int"
         )
-    if kind is bool and not set(values) <= {0, 1}:
+    if kind is bool and not all(value in (0, 1) for value in values):
         raise InvalidInputError(f"table must hold 0 or 1 in the column {name}; convert it to bool")
     try:
         return np.array(values, np.float64 if kind is float else np.int64).astype(kind)

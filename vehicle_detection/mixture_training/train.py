@@ -123,7 +123,7 @@ class _Training:
         truncated = vehicle_features(truncated_vehicles(self.frames, params, rng), border, params)
         shown, shown_border = (np.flatnonzero([len(rows) for rows in each]) for each in (whole, truncated))
         if len(shown) + len(shown_border) < len(whole) + len(truncated):
-            self.without_absent_shapes(shown.tolist(), shown_border.tolist())
+            self.report_absent_shapes(shown.tolist(), shown_border.tolist())
             return replace(self, params=_with_shapes(params, shown.tolist(), shown_border.tolist())).run(
                 patches
             )
@@ -142,8 +142,8 @@ class _Training:
             mixture = replace(mixture, rescorer=rescorer)
         return mixture
 
-    def without_absent_shapes(self, shown: list[int], shown_border: list[int]) -> None:
-        """Report the shapes that no labelled vehicle has, whose templates are left out."""
+    def report_absent_shapes(self, shown: list[int], shown_border: list[int]) -> None:
+        """Report the shapes that no labelled vehicle has; it is an error if no shape of whole ones is left."""
         params = self.params
         if not shown:
             raise InvalidInputError(
