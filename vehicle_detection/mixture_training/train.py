@@ -143,7 +143,7 @@ class _Training:
         return mixture
 
     def report_absent_shapes(self, shown: list[int], shown_border: list[int]) -> None:
-        """Report the shapes that no labelled vehicle has; it is an error if no shape of whole ones is left."""
+        """Report the shapes that no labelled vehicle has; raise if no shape of whole vehicles is left."""
         params = self.params
         if not shown:
             raise InvalidInputError(
