@@ -457,7 +457,9 @@ def evaluate(
     }
     unknown = [int(((boxes.tracks == NO_TRACK) & ~boxes.ignore).sum()) for boxes in (found, true)]
     if not any(unknown):
-        scores["tracks"] = evaluate_tracks(found, true, iou=iou, frames=chosen)
+        scores["tracks"] = evaluate_tracks(
+            found, true, iou=iou, ignored_as_regions=ignored_as_regions, frames=chosen
+        )
     typer.echo("\n\n".join(each.summary() for each in scores.values()))
     labelled = set(true.frames if chosen is None else chosen)
     unseen = len(labelled - set(found.frames))
@@ -466,8 +468,6 @@ def evaluate(
             f"note: {unseen} of {len(labelled)} labelled frames have no box in {predictions}, so their "
             "vehicles count as missed; pass --frames if not all of them were searched"
         )
-    if ignored_as_regions and "tracks" in scores:
-        print_error("note: ignored boxes are regions in the scores of the boxes, not in those of the tracks")
     for boxes, count, file in zip((found, true), unknown, (predictions, labels)):
         if 0 < count < (~boxes.ignore).sum():
             noun = "box has" if count == 1 else "boxes have"

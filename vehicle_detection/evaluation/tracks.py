@@ -10,7 +10,7 @@ from itertools import accumulate, groupby, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_number
+from vehicle_detection._common import check_flags, check_number
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation.detections import Scores, format_number, format_summary, mean, rates, ratio
@@ -91,7 +91,12 @@ class TrackScores(Scores):
 
 
 def evaluate_tracks(
-    predictions: FrameBoxes, labels: FrameBoxes, *, iou: float = 0.5, frames: Sequence[FrameKey] | None = None
+    predictions: FrameBoxes,
+    labels: FrameBoxes,
+    *,
+    iou: float = 0.5,
+    frames: Sequence[FrameKey] | None = None,
+    ignored_as_regions: bool = False,
 ) -> TrackScores:
     """Score tracks against labels: HOTA, CLEAR MOT metrics, IDF1 and jitter.
 
@@ -103,7 +108,7 @@ def evaluate_tracks(
     ----------
     predictions, labels
         Tracked and true boxes, each with its track unless it is marked ``ignore``.
-    iou, frames
+    iou, frames, ignored_as_regions
         As in `evaluate_detections`; names of frames keep the given order.
 
     Returns
@@ -132,11 +137,12 @@ def evaluate_tracks(
     >>> scores.id_switches, round(scores.mota, 3), round(scores.hota, 3), scores.jitter
     (1, 0.667, 0.745, 0.25)
     """
+    check_flags(ignored_as_regions=ignored_as_regions)
     predictions, labels, keys = prepare_evaluation(predictions, labels, frames)
     min_iou = check_number(iou, "iou", above=0, high=1)
     _check_tracks(predictions, "predictions", keys)
     _check_tracks(labels, "labels", keys)
-    matched = _match_tracks(predictions, labels, keys, min_iou)
+    matched = _match_tracks(predictions, labels, keys, min_iou, ignored_as_regions)
 
     overlaps = [overlap for frame in matched for *_, overlap in frame.pairs]
     found_rows = [row for frame in matched for _, row, _ in frame.pairs]
@@ -204,7 +210,11 @@ def _check_tracks(side: FrameBoxes, name: str, keys: list[FrameKey]) -> None:
 
 
 def _match_tracks(
-    predictions: FrameBoxes, labels: FrameBoxes, keys: list[FrameKey], min_iou: float
+    predictions: FrameBoxes,
+    labels: FrameBoxes,
+    keys: list[FrameKey],
+    min_iou: float,
+    ignored_as_regions: bool,
 ) -> list[_MatchedFrame]:
     """Match the frames in order, each vehicle with its last track where possible."""
     track_of: dict[int, int] = {}
@@ -225,7 +235,7 @@ def _match_tracks(
         track_of.update((vehicles[i], tracks[j]) for i, j in pairs)
 
         rest = np.delete(here, [j for _, j in pairs])
-        ignored = find_ignored(predictions.boxes[rest], labels, rows, min_iou)
+        ignored = find_ignored(predictions.boxes[rest], labels, rows, min_iou, as_regions=ignored_as_regions)
         dropped = set(rest[ignored].tolist())
         close = np.argwhere(overlap >= min_iou)
         matched.append(
