@@ -420,7 +420,9 @@ def test_an_unknown_lens_has_one_warning(card, model, tmp_path):
     source = str(card / "20260131_093000_F.mp4")
     assert "distances assume a lens of 58 degrees" in CliRunner().invoke(app, [*words, source]).stderr
     known = CliRunner().invoke(app, [*words, "--fov", "90", source])
-    assert (known.exit_code, known.stderr) == (0, "")
+    assert (known.exit_code, known.stderr) == (0, f"done: {source}, 12 frames\n")
+    again = CliRunner().invoke(app, [*words, "--fov", "80", source, "-q"])
+    assert (again.exit_code, again.stderr) == (0, "")
 
 
 def test_a_damaged_record_does_not_stop_the_status(tmp_path):

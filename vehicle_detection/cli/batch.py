@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -137,6 +138,7 @@ def batch(
             retry_failed=retry_failed,
             dry_run=dry_run,
             progress=not quiet,
+            on_record=None if quiet or sys.stderr.isatty() else _print_record,
         )
     if dry_run:
         for trip in done.planned or ():
@@ -154,6 +156,14 @@ def batch(
         typer.echo(f"wrote {hide_credentials(output)}" + (f", {summary}" if summary else ""))
     if done.errors:  # the machine's fault: a job that is started again does the rest
         raise typer.Exit(1)
+
+
+def _print_record(record: Mapping[str, Any]) -> None:
+    """Print a finished trip, for logs, which show no progress bar."""
+    from vehicle_detection._common import encodable, hide_credentials
+
+    source = encodable(hide_credentials(record["sources"][0]["uri"]))
+    print_error(f"{record['status']}: {source}, {record.get('frames', 0):,} frames")
 
 
 def _print_trip(trip: Mapping[str, Any]) -> None:
