@@ -106,9 +106,9 @@ def test_clipping_keeps_the_dtype(dtype):
     assert clipped.tolist() == [[0, 0, 200, 100]]
 
 
-@pytest.mark.parametrize("shape", [(10,), (0, 10), (10, 0), ()])
+@pytest.mark.parametrize("shape", [(10,), (0, 10), (10, 0), (), (3.5, 4)])
 def test_clipping_rejects_invalid_shapes(shape):
-    with pytest.raises(InvalidInputError, match=r"shape must be \(height, width, ...\) of an image, got"):
+    with pytest.raises(InvalidInputError, match=r"shape(\[\d\])? must be "):
         clip_boxes([[0, 0, 1, 1]], shape)
 
 

@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import (
+    Floats,
     check_array,
     check_boxes,
     check_choice,
     check_number,
+    check_shape,
     describe,
 )
 from vehicle_detection.errors import InvalidInputError
@@ -26,7 +28,6 @@ from vehicle_detection.errors import InvalidInputError
 if TYPE_CHECKING:
     import pandas
 
-Floats = NDArray[np.float64]
 
 # Lower bound of a divisor. An empty box shares no area with any other, so its ratios become 0.
 _TINY = np.finfo(np.float64).tiny
@@ -130,14 +131,7 @@ def clip_boxes(boxes: Detections | ArrayLike, shape: tuple[int, ...]) -> NDArray
     array([[ 0, 10, 20, 50]])
     """
     array = check_boxes(boxes)
-    given: object = shape
-    sides = given[:2] if isinstance(given, (tuple, list)) else ()
-    numbers = (int, float, np.integer, np.floating)
-    if len(sides) < 2 or not all(isinstance(side, numbers) and 1 <= side <= 2**31 for side in sides):
-        raise InvalidInputError(
-            f"shape must be (height, width, ...) of an image, got {describe(shape)}; pass image.shape"
-        )
-    height, width = sides
+    height, width = check_shape(shape)
     limits = np.array([width, height, width, height])
     return np.asarray(np.clip(array, 0, limits), array.dtype)
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import (
+    Floats,
     Limit,
     atomic_write,
     check_array,
@@ -29,6 +30,7 @@ from vehicle_detection._common import (
     check_integer,
     check_number,
     check_path,
+    check_shape,
     check_type,
     describe,
     read_regular_file,
@@ -36,7 +38,6 @@ from vehicle_detection._common import (
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 
-Floats = NDArray[np.float64]
 FrameShape = tuple[int, int]
 """Height and width of a frame in pixels."""
 
@@ -75,15 +76,6 @@ Their errors are those of a guess; a calibrated camera (`read_camera`) is better
 
 LENS_STD, GIVEN_LENS_STD, UNKNOWN_LENS_STD = 0.08, 0.03, 0.25
 """Relative standard error of the focal length of a typical lens, of a given field of view, and of a guess."""
-
-
-def check_shape(shape: object) -> FrameShape:
-    """Return height and width of ``image.shape``, a tuple of two or more positive integers."""
-    if not isinstance(shape, tuple) or len(shape) < 2:
-        raise InvalidInputError(
-            f"shape must be (height, width, ...), got {describe(shape)}; pass image.shape"
-        )
-    return check_integer(shape[0], "shape[0]", low=1), check_integer(shape[1], "shape[1]", low=1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,23 +18,18 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import (
     check_choice,
+    check_flags,
     check_image,
     check_integer,
     check_number,
     check_sequence,
+    check_shape,
     check_type,
     describe,
     pluralize,
 )
 from vehicle_detection.boxes import Detections, ScoreScale
-from vehicle_detection.camera import (
-    GIVEN_LENS_STD,
-    LENSES,
-    UNKNOWN_LENS_STD,
-    Camera,
-    check_shape,
-    read_camera,
-)
+from vehicle_detection.camera import GIVEN_LENS_STD, LENSES, UNKNOWN_LENS_STD, Camera, read_camera
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.confidence import Model, with_confidence
 from vehicle_detection.drawing import (
@@ -184,6 +179,7 @@ class VehicleDetector:
         ):
             if value is not None:
                 check_type(value, name, kind, "omit it for the default")
+        check_flags(diagnostics=diagnostics)
         if conf is not None:
             self.model, region_params = with_confidence(self.model, region_params, conf)
         chosen = search_params or self.model.search_params_type.default()

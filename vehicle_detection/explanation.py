@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_boxes, check_image, check_type, describe
-from vehicle_detection.boxes import Floats, box_areas, iou_matrix
+from vehicle_detection._common import Floats, check_boxes, check_image, check_type, describe
+from vehicle_detection.boxes import box_areas, iou_matrix
 from vehicle_detection.camera import truncated_edges
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.detector import VehicleDetector

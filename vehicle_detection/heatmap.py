@@ -15,11 +15,11 @@ from vehicle_detection._common import (
     check_boxes,
     check_integer,
     check_number,
+    check_shape,
     check_type,
     describe,
 )
 from vehicle_detection.boxes import Detections, clip_boxes
-from vehicle_detection.camera import check_shape
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import HeatParams, SearchParams
 

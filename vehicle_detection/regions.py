@@ -14,16 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_type
-from vehicle_detection.boxes import (
-    Detections,
-    Floats,
-    box_areas,
-    clip_boxes,
-    intersection_matrix,
-    overlap_matrices,
-)
-from vehicle_detection.camera import Camera, check_shape
+from vehicle_detection._common import Floats, check_shape, check_type
+from vehicle_detection.boxes import Detections, box_areas, clip_boxes, intersection_matrix, overlap_matrices
+from vehicle_detection.camera import Camera
 from vehicle_detection.params import RegionParams
 
 

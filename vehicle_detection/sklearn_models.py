@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import describe
-from vehicle_detection.boxes import Floats
+from vehicle_detection._common import Floats, describe
 from vehicle_detection.classifier import Template
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import FeatureParams

@@ -6,7 +6,7 @@ import dataclasses
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -288,23 +288,24 @@ def _error_rates(predicted: NDArray[Any], labels: NDArray[np.int64]) -> tuple[fl
 
 def _report_metadata(report: TrainingReport) -> dict[str, Any]:
     """Part of the report that the model file keeps: nothing that differs between runs."""
-    splits = {
-        name: {
-            "accuracy": round(score.accuracy, 5),
-            "false_negative_rate": round(score.false_negative_rate, 5),
-            "false_positive_rate": round(score.false_positive_rate, 5),
-            "near_duplicates": round(score.leakage, 3),
-            "test": score.test,
-            "seeds": len(score.accuracies),
-        }
-        for name, score in report.splits.items()
-    }
+    splits = {name: _split_metadata(score) for name, score in report.splits.items()}
     metrics = {"accuracy": round(report.accuracy, 5), "split": report.split, "splits": splits}
     if report.calibration_error is not None:
         metrics["calibration_error"] = round(report.calibration_error, 5)
     balance = round(report.balance, 5)
     data = {"fingerprint": report.fingerprint, "sources": report.sources, "balance": balance}
     return {"metrics": metrics, "data": data}
+
+
+def _split_metadata(score: SplitScore) -> dict[str, Any]:
+    return {
+        "accuracy": round(score.accuracy, 5),
+        "false_negative_rate": round(score.false_negative_rate, 5),
+        "false_positive_rate": round(score.false_positive_rate, 5),
+        "near_duplicates": round(score.leakage, 3),
+        "test": score.test,
+        "seeds": len(score.accuracies),
+    }
 
 
 @contextmanager
@@ -409,26 +410,39 @@ def _card_data(report: TrainingReport) -> list[str]:
     ]
 
 
-SCORE_COLUMNS = (
-    "tested on", "trained", "tested", "accuracy", "false negatives", "false positives", "near duplicates",
-)  # fmt: skip
-"""Column titles of `score_rows`."""
+_SPLIT_COLUMNS = {
+    "train": ("trained", ","),
+    "test": ("tested", ","),
+    "accuracy": ("accuracy", ".4f"),
+    "false_negative_rate": ("false negatives", ".2%"),
+    "false_positive_rate": ("false positives", ".2%"),
+    "near_duplicates": ("near duplicates", ".1%"),
+}
 
 
-def score_rows(report: TrainingReport) -> list[tuple[str, ...]]:
-    """Scores of each split as text, for a table."""
-    return [
-        (
-            SPLITS[name],
-            f"{score.train:,}",
-            f"{score.test:,}",
-            f"{score.accuracy:.4f}",
-            f"{score.false_negative_rate:.2%}",
-            f"{score.false_positive_rate:.2%}",
-            f"{score.leakage:.1%}",
-        )
-        for name, score in report.splits.items()
-    ]
+def split_table(splits: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], list[list[str]]]:
+    """Column titles and rows of text for the scores of splits, as in a model's metadata.
+
+    A model file may hold anything: unknown splits, and columns without a number, are left out.
+    """
+
+    def number(split: str, column: str) -> float | None:
+        value = splits[split].get(column) if isinstance(splits[split], Mapping) else None
+        return value if isinstance(value, (int, float)) else None
+
+    shown = [split for split in SPLITS if split in splits]
+    columns = [name for name in _SPLIT_COLUMNS if any(number(split, name) is not None for split in shown)]
+    rows = []
+    for split in shown:
+        values = ((number(split, name), _SPLIT_COLUMNS[name][1]) for name in columns)
+        rows.append([SPLITS[split], *("" if value is None else f"{value:{form}}" for value, form in values)])
+    return ["tested on", *(_SPLIT_COLUMNS[name][0] for name in columns)], rows
+
+
+def report_table(report: TrainingReport) -> tuple[list[str], list[list[str]]]:
+    """Column titles and rows of text for the splits of a report."""
+    scores = report.splits.items()
+    return split_table({name: {"train": score.train, **_split_metadata(score)} for name, score in scores})
 
 
 def _card_accuracy(report: TrainingReport, others: Sequence[TrainingReport]) -> list[str]:
@@ -440,7 +454,7 @@ def _card_accuracy(report: TrainingReport, others: Sequence[TrainingReport]) -> 
     if "random" in report.splits:
         seeds = pluralize(len(report.splits["random"].accuracies), "seed")
         method += f" The random split is the mean of {seeds}."
-    text = ["## Accuracy", markdown_text(method), markdown_table(SCORE_COLUMNS, score_rows(report))]
+    text = ["## Accuracy", markdown_text(method), markdown_table(*report_table(report))]
     if report.calibration_error is not None:
         calibration = (
             f"The expected calibration error of the probabilities is {report.calibration_error:.4f} on "

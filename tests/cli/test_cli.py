@@ -403,6 +403,24 @@ def test_video_warns_of_a_wrong_horizon(clip, tmp_path, monkeypatch):
     assert f"warning: no vehicle was found with the horizon of --camera {camera}, but" in result.stderr
 
 
+def test_the_horizon_of_images_is_checked_at_their_frame_rate(tmp_path):
+    (tmp_path / "images").mkdir()
+    for number in range(4):
+        write_image(tmp_path / "images" / f"{number}.png", np.full((180, 320, 3), 90, np.uint8))
+    words = ["--fps", 1, "--start", 2, "--horizon", 0.95, "--tracks", tmp_path / "tracks.csv"]
+    result = run("video", tmp_path / "images", *words)
+    assert result.exit_code == 0
+    assert "a search of all rows found too few vehicles" in result.stderr
+
+
+def test_an_image_given_twice_is_searched_once(picture, tmp_path):
+    once = succeed("detect", picture, "--boxes", tmp_path / "once.csv")
+    assert once.count("vehicle") == succeed("detect", picture, picture, "--boxes", tmp_path / "b.csv").count(
+        "vehicle"
+    )
+    assert (tmp_path / "b.csv").read_text() == (tmp_path / "once.csv").read_text()
+
+
 def test_detect_accepts_every_kind_of_image(picture, tmp_path):
     image = cv2.imread(str(picture))
     gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
@@ -1156,6 +1174,9 @@ def test_info_of_the_shipped_models():
     assert out.startswith(f"highway: {model.params.length} features, 1 template\n")
     assert re.search(rf"color_space +{model.params.color_space}\s", out)
     assert re.search(r"numpy +\d", out)
+    split = model.metadata["metrics"]["splits"]["sequences"]
+    rates = f"{split['false_negative_rate']:.2%} +{split['false_positive_rate']:.2%}"
+    assert re.search(rf"last fifth of each folder +3,553 +{split['accuracy']:.4f} +{rates} +", out)
     out = succeed("info", "default")
     assert succeed("info") == out
     default = load_model()
@@ -1171,6 +1192,8 @@ def test_info_of_a_model_with_incomplete_scores(tmp_path):
     model, path = load_model(), tmp_path / "m.safetensors"
     model.with_metadata({"metrics": {"left_out": {"road": {"f1": 0.25}}}}).save(path)
     assert re.search(r"road\W+0\.250", succeed("info", path))
+    model.with_metadata({"metrics": {"splits": {"random": {"accuracy": 0.5, "test": "x"}}}}).save(path)
+    assert re.search(r"accuracy\s+─+\s+random fifth +0\.5000", succeed("info", path))
 
 
 def test_info_of_a_missing_model(material):

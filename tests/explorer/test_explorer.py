@@ -80,6 +80,19 @@ def test_windows_and_boxes_equal_those_of_the_detector(scenes, model, method, mi
         ):
             np.testing.assert_array_equal(actual.boxes, wanted.boxes)
             np.testing.assert_array_equal(actual.scores, wanted.scores)
+        if method == "groups":
+            np.testing.assert_array_equal(explorer.boxes().confidences, found.confidences)
+
+
+@pytest.mark.parametrize("model", ["default", "highway"])
+def test_a_camera_is_that_of_the_detector(scenes, model, tmp_path):
+    file = tmp_path / "camera.json"
+    file.write_text('{"field_of_view": 90, "horizon": 0.56}')
+    for camera in (file, "wide-90"):
+        explorer = Explorer(scenes, model, camera=camera)
+        with VehicleDetector(model, camera=camera, n_jobs=1) as detector:
+            assert explorer.search_params == detector.search_params_of(SHAPE)
+            np.testing.assert_array_equal(explorer.boxes().boxes, detector.detect(scenes[0]).boxes)
 
 
 def test_the_given_parameters_are_used(scenes):

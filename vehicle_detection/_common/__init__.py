@@ -2,6 +2,7 @@
 
 from vehicle_detection._common.augment import blur_patches, degrade_patches, mirror_patches, relight
 from vehicle_detection._common.checks import (
+    Floats,
     check_array,
     check_boxes,
     check_channel,
@@ -13,6 +14,7 @@ from vehicle_detection._common.checks import (
     check_patches,
     check_path,
     check_sequence,
+    check_shape,
     check_type,
     describe,
     finite_array,
@@ -51,6 +53,7 @@ __all__ = [
     "JOBS_VARIABLE",
     "NEW_ARRAYS",
     "SPARE",
+    "Floats",
     "Limit",
     "ModelData",
     "ParquetRows",
@@ -72,6 +75,7 @@ __all__ = [
     "check_path",
     "check_regular_file",
     "check_sequence",
+    "check_shape",
     "check_suffix",
     "check_target",
     "check_type",

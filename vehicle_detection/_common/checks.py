@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from vehicle_detection.errors import InvalidInputError
 
+Floats = NDArray[np.float64]
+
 _MAX_INTEGER = 2**53
 """Integers up to it are exact in every format; no count of anything is larger."""
 
@@ -149,6 +151,15 @@ def check_array(values: object, name: str) -> NDArray[Any]:
         raise InvalidInputError(
             f"{name} must be an array or a sequence of numbers of equal lengths, got {describe(values)}"
         ) from None
+
+
+def check_shape(shape: object) -> tuple[int, int]:
+    """Return height and width of ``image.shape``, two or more positive integers."""
+    if not isinstance(shape, (tuple, list)) or len(shape) < 2:
+        raise InvalidInputError(
+            f"shape must be (height, width, ...), got {describe(shape)}; pass image.shape"
+        )
+    return check_integer(shape[0], "shape[0]", low=1), check_integer(shape[1], "shape[1]", low=1)
 
 
 def check_flags(**flags: object) -> None:

@@ -8,9 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection._common import Floats
 from vehicle_detection._kernels.jit import jit
-
-Floats = NDArray[np.float64]
 
 # Rows per chunk when computing means and standard deviations.
 _CHUNK = 1024

@@ -229,6 +229,7 @@ def detect(
     check_choice(labels, "labels", ("score", "none"))
     if line_width is not None:
         check_integer(line_width, "line_width", low=1, high=1000)
+    images = list(dict.fromkeys(images))
     _check_images(images, output, boxes)
     region = parse_blur(blur)
     if region is not None and output is None and why is None:
@@ -308,12 +309,12 @@ def _warn_if_empty(
         yield name, vehicles
     if total or horizon is None:
         return
-    boxes, shape = [np.empty((0, 4))], (1, 1)
+    boxes, shape = [np.empty((0, 4))], tuple[int, ...]()
     with search_everywhere(detector.model, None) as everywhere:
         decodable = (path for path in images if path not in undecodable)
         for image in map(read_image, itertools.islice(decodable, _CHECKED_IMAGES)):
-            if image.shape[:2] == shape or shape == (1, 1):
-                shape = image.shape[:2]
+            shape = shape or image.shape[:2]
+            if image.shape[:2] == shape:
                 boxes.append(everywhere.detect(image).boxes)
     estimate = None
     with contextlib.suppress(InvalidInputError):  # too few boxes

@@ -123,13 +123,12 @@ def train(
 
 
 def _print_report(report: TrainingReport) -> None:
-    from vehicle_detection.training import SCORE_COLUMNS, SPLITS, score_rows
+    from vehicle_detection.training import SPLITS, report_table
 
     print_table(
         f"{report.features}: {report.vehicles:,} vehicles, {report.non_vehicles:,} others, accuracy "
         f"{report.accuracy:.4f} on the split {report.split!r}",
-        SCORE_COLUMNS,
-        score_rows(report),
+        *report_table(report),
     )
     if report.calibration_error is not None:
         typer.echo(f"calibration error on the split 'sequences': {report.calibration_error:.4f}")
@@ -171,19 +170,13 @@ def info(
 
 def _print_metrics(metrics: object) -> bool:
     """Print a model's metrics as a table; False if they are not those of `train` or `train-frames`."""
-    from vehicle_detection.training import SPLITS
+    from vehicle_detection.training import SPLITS, split_table
 
     splits, folds = (
         metrics.get(key) if isinstance(metrics, dict) else None for key in ("splits", "left_out")
     )
     if isinstance(splits, dict) and splits.keys() <= SPLITS.keys():
-        columns = ("accuracy", "false_negative_rate", "false_positive_rate", "near_duplicates", "test")
-        rows = [
-            (title, *(str(splits[name].get(column, "")) for column in columns))
-            for name, title in SPLITS.items()
-            if name in splits
-        ]
-        print_table("metrics", ("tested on", *(column.replace("_", " ") for column in columns)), rows)
+        print_table("metrics", *split_table(splits))
         return True
     if isinstance(folds, dict):
         print_fold_scores(folds)

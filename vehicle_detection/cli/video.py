@@ -346,8 +346,8 @@ def video(
     if horizon is None and detector.search_params_of(opened.info.shape) != detector.search_params:
         given = f"the horizon of --camera {camera}"
     if not quiet and not done.tracks and given is not None and opened.rereadable:
-        with search_everywhere(loaded, conf) as everywhere:
-            warn_of_horizon(given, estimate_video_horizon(source, everywhere, start=start, end=end))
+        with open_source(source, fps=fps) as again, search_everywhere(loaded, conf) as everywhere:
+            warn_of_horizon(given, estimate_video_horizon(again, everywhere, start=start, end=end))
     if not quiet and done.tracks:
         _warn_of_distances(detector, opened)
     if not quiet or profile:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection.boxes import Floats
+from vehicle_detection._common import Floats
 
 # Minimum IoU of a match; each score is the mean over these thresholds.
 _ALPHAS = np.arange(0.05, 0.99, 0.05)

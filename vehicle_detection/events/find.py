@@ -11,15 +11,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import (
+    Floats,
     check_array,
     check_number,
     check_sequence,
+    check_shape,
     check_type,
     describe,
 )
-from vehicle_detection.camera import Camera, check_shape
+from vehicle_detection.camera import Camera
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.events.history import Floats, TrackHistory, TrackLog, split_runs
+from vehicle_detection.events.history import TrackHistory, TrackLog, split_runs
 from vehicle_detection.events.motion import LANE_HALF_WIDTH_M, Bools, Motion, estimate_motion
 from vehicle_detection.units import UNITS, Units
 

@@ -13,12 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_integer, check_number, check_type, describe, pluralize
+from vehicle_detection._common import Floats, check_integer, check_number, check_type, describe, pluralize
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video import OwnSpeed
-
-Floats = NDArray[np.float64]
 
 BOX_COLUMNS = ("x1", "y1", "x2", "y2")
 COLUMNS = ("distance_m", "distance_std_m", "speed_mps", "speed_std_mps", "confidence", *BOX_COLUMNS)

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection._common import Floats
 from vehicle_detection.camera import Camera, truncated_edges
-from vehicle_detection.events.history import Floats, TrackHistory
+from vehicle_detection.events.history import TrackHistory
 
 Bools = NDArray[np.bool_]
 

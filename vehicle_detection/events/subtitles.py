@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from vehicle_detection._common import (
+    Floats,
     atomic_write,
     check_choice,
     check_number,
@@ -21,7 +22,7 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.drawing import MAX_SPEED_STD
 from vehicle_detection.events.find import Event, check_events
-from vehicle_detection.events.history import Floats, TrackHistory, TrackLog
+from vehicle_detection.events.history import TrackHistory, TrackLog
 from vehicle_detection.units import UNITS, Units
 from vehicle_detection.video import OwnSpeed
 

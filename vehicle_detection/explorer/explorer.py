@@ -128,7 +128,7 @@ class Explorer:
         *,
         search_params: SearchParams | PyramidParams | None = None,
         region_params: RegionParams | HeatParams | None = None,
-        camera: Camera | None = None,
+        camera: Camera | PathLike | None = None,
         horizon: float | None = None,
         width: int = 960,
     ) -> None:
@@ -147,7 +147,9 @@ class Explorer:
         self.frame = self.names[0]
         self.view: View = "windows"
         self.box = 0
-        self.search_params = detector.search_params
+        # A camera file may state a horizon.
+        shape = None if camera is None else self._read_frame(self.frame).shape
+        self.search_params = detector.search_params if shape is None else detector.search_params_of(shape)
         self.bands = tuple(range(len(self._all_bands)))
         given = detector.region_params
         self.method: Method = "heat" if isinstance(given, HeatParams) else "groups"
@@ -272,12 +274,16 @@ class Explorer:
         if self.method == "heat":
             return label_heat(self.heat_map(), self.heat_params)
         found = self._find()
-        if found.vehicles is not None:
-            return found.vehicles
-        shape = self._read_frame(self.frame).shape[:2]
-        params: Any = self.search_params
-        camera = self._camera or Camera.for_frame(shape, horizon=params.horizon)
-        return find_vehicles(self.windows(), camera, shape, self.group_params)
+        vehicles = found.vehicles
+        if vehicles is None:
+            shape = self._read_frame(self.frame).shape
+            with VehicleDetector(
+                self.model, search_params=self.search_params, camera=self._camera
+            ) as detector:
+                camera = detector.camera_of(shape)
+            vehicles = find_vehicles(self.windows(), camera, shape, self.group_params)
+        confidences = self.model.calibration.probability(vehicles.scores)
+        return Detections(vehicles.boxes, vehicles.scores, confidences)
 
     def explanation(self) -> Explanation | None:
         """Explain the selected box with `explain`; None if there is none."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection._common import Floats
 from vehicle_detection._kernels import group
 from vehicle_detection.boxes import box_areas, clip_boxes, on_one_vehicle
 
@@ -27,8 +28,6 @@ MAX_PROPOSALS = 120
 # Minimum difference of the margins of two boxes on one vehicle of which the lower one shows a part of it.
 _PART_GAP = 1.0
 _MIN_VISIBLE_FRACTION = 0.35
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

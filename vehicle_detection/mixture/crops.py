@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection._common import Floats
 from vehicle_detection._kernels import cell_means
 from vehicle_detection.mixture.features import N_CHANNELS, CellGrid, EdgePyramid
 
@@ -28,8 +29,6 @@ _BOX_CELLS = (8.0, 8.0)
 _LIGHTNESS_STD = 5
 # Range of edges to about 0 to 2, and of lightness, a and b to about -1 to 1.
 _EDGE_SCALE, _COLOR_UNITS = 5, (np.float32(2), np.float32(40), np.float32(40))
-
-Floats = NDArray[np.float64]
 
 
 def edge_features(pyramid: EdgePyramid, boxes: Floats) -> NDArray[np.float32]:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import (
+    Floats,
     check_choice,
     check_number,
     check_sequence,
@@ -47,7 +48,6 @@ from vehicle_detection.params import PyramidParams
 if TYPE_CHECKING:
     from vehicle_detection.mixture.search import MixtureSearch
 
-Floats = NDArray[np.float64]
 
 WINDOW_MARGIN = -0.38
 """Margin of a window whose score is 0; heat with the default thresholds is best with windows from there."""

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from vehicle_detection._common import Floats
 
 # Horizons, as fractions of the frame's height, and how likely they are before a vehicle is seen.
 _HORIZONS = np.linspace(0.15, 0.75, 41)

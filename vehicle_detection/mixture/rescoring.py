@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import NEW_ARRAYS, Workspace, check_number, finite_array
+from vehicle_detection._common import NEW_ARRAYS, Floats, Workspace, check_number, finite_array
 from vehicle_detection._kernels import Convolution, ConvolutionalNetwork
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture.crops import CROP_CELLS, N_INPUTS, rescoring_inputs
 from vehicle_detection.mixture.features import EdgePyramid
 
-Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 RESCORE_MIN, RESCORE_AGAIN_MIN = -1.05, -1.1

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_type, single_threaded_opencv
+from vehicle_detection._common import Floats, check_type, single_threaded_opencv
 from vehicle_detection._kernels import PackedFilters, PackedSearch
 from vehicle_detection.boxes import Detections
 from vehicle_detection.mixture.boxes import MIN_MARGIN, ScoredWindows, mostly_inside
@@ -33,7 +33,6 @@ _BEYOND, _CONTEXT = 4, 4
 _MAX_WINDOWS = 2000
 _MAX_PLANS = 8
 
-Floats = NDArray[np.float64]
 
 INNER, RIGHT, LEFT = range(3)
 """Where windows lie: anywhere, or at a border of the frame."""

@@ -9,12 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_number, describe, finite_array
+from vehicle_detection._common import Floats, check_number, describe, finite_array
 from vehicle_detection._kernels import Filter
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture.features import N_CHANNELS, CellGrid, FeatureMap, mirror_channels
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import vehicle_detection
-from vehicle_detection._common import atomic_write, check_integer, resolve_jobs
+from vehicle_detection._common import Floats, atomic_write, check_integer, resolve_jobs
 from vehicle_detection.evaluation import (
     DetectionMatches,
     FrameBoxes,
@@ -32,8 +32,6 @@ from vehicle_detection.mixture import TemplateMixture
 from vehicle_detection.mixture_training.sources import FrameDataset, check_sources
 from vehicle_detection.mixture_training.train import train_mixture
 from vehicle_detection.params import MixtureParams
-
-Floats = NDArray[np.float64]
 
 _MIN_MARGIN = -2.0  # of an evaluated box
 _THRESHOLDS = np.arange(-2.0, 1.5, 0.02)  # to choose from

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import single_threaded_opencv
+from vehicle_detection._common import Floats, single_threaded_opencv
 from vehicle_detection.boxes import box_areas, greedy_nms, intersection_matrix, iou_matrix
 from vehicle_detection.mixture import (
     EdgePyramid,
@@ -24,7 +24,6 @@ from vehicle_detection.mixture import (
 from vehicle_detection.mixture_training.sources import TrainingFrame
 from vehicle_detection.params import MixtureParams
 
-Floats = NDArray[np.float64]
 Choice = Callable[[NDArray[np.float32]], NDArray[np.intp]]
 """Chooses windows by their margins; returns indices."""
 Margins = Callable[[MixtureTemplate, NDArray[np.float32]], NDArray[np.float32]]

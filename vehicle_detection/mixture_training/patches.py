@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection._common import Floats
 from vehicle_detection.mixture import N_EDGE_FEATURES, EdgePyramid, MixtureTemplate, edge_features
 from vehicle_detection.mixture_training.positives import jitter_boxes, mirror_boxes, vehicle_features
 from vehicle_detection.mixture_training.sources import TrainingFrame
 from vehicle_detection.params import MixtureParams
 
 Image = NDArray[np.uint8]
-Floats = NDArray[np.float64]
 Rows = NDArray[np.float32]
 
 _BOX_ON_PATCH = np.array([0.05, 0.14, 0.95, 0.89])  # typical box of a vehicle, as fractions of the sides

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import relight
+from vehicle_detection._common import Floats, relight
 from vehicle_detection.mixture import (
     EdgePyramid,
     MixtureTemplate,
@@ -18,7 +18,6 @@ from vehicle_detection.mixture_training.sources import TrainingFrame
 from vehicle_detection.params import MixtureParams
 
 Image = NDArray[np.uint8]
-Floats = NDArray[np.float64]
 Rows = NDArray[np.float32]
 VehicleSamples = Iterator[tuple[Image, Sequence[Floats]]]
 """Images, each with boxes of vehicles."""

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import relight
+from vehicle_detection._common import Floats, relight
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.mixture import (
     EDGE_OFFSET,
@@ -35,7 +35,6 @@ from vehicle_detection.mixture_training.positives import jitter_boxes
 from vehicle_detection.mixture_training.sources import TrainingFrame
 from vehicle_detection.params import MixtureParams, PyramidParams
 
-Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 _NETWORKS = 2  # that are trained, and averaged

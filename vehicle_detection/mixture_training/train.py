@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from vehicle_detection._common import check_image, check_integer, check_type, resolve_jobs
+from vehicle_detection._common import Floats, check_image, check_integer, check_type, resolve_jobs
 from vehicle_detection._kernels import hinge_loss
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture import (
@@ -44,7 +44,6 @@ from vehicle_detection.mixture_training.sources import (
 from vehicle_detection.params import MixtureParams
 
 Image = NDArray[np.uint8]
-Floats = NDArray[np.float64]
 Rows = NDArray[np.float32]
 Templates = list[MixtureTemplate]
 log = logging.getLogger(__name__)

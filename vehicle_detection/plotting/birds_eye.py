@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 from vehicle_detection._common import (
     check_number,
     check_sequence,
+    check_shape,
     check_type,
 )
-from vehicle_detection.camera import Camera, check_shape
+from vehicle_detection.camera import Camera
 from vehicle_detection.drawing import (
     LANE_WIDTH_M,
     MAX_SPEED_STD,

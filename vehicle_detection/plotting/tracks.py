@@ -8,9 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vehicle_detection._common import check_number, check_type, describe
+from vehicle_detection._common import Floats, check_number, check_type, describe
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import NO_TRACK, FrameBoxes
 from vehicle_detection.plotting import style
@@ -22,7 +21,6 @@ from vehicle_detection.video import VideoReport
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Floats = NDArray[np.float64]
 
 _LABELS = (
     "center of the box, x (px)",

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection.boxes import Floats
+from vehicle_detection._common import Floats
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.events import KINDS, Event, TrackHistory, bin_means, split_runs
 from vehicle_detection.report.formatting import format_time, format_value, svg_element

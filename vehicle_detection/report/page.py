@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import vehicle_detection
-from vehicle_detection._common import pluralize
-from vehicle_detection.boxes import Floats
+from vehicle_detection._common import Floats, pluralize
 from vehicle_detection.drawing import MAX_SPEED_STD
 from vehicle_detection.events import (
     KINDS,
@@ -43,7 +42,7 @@ from vehicle_detection.report.charts import (
     gantt,
 )
 from vehicle_detection.report.formatting import format_time, format_value
-from vehicle_detection.training import SPLITS
+from vehicle_detection.training import split_table
 from vehicle_detection.units import ROUGH_DISTANCE, UNITS, Units
 from vehicle_detection.video import VideoReport
 
@@ -367,19 +366,10 @@ def _scores(metadata: Mapping[str, Any], name: str) -> dict[str, Mapping[str, An
 
 
 def _split_table(scores: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Accuracy of a classifier of patches on the splits of `SPLITS`."""
-    columns = ("accuracy", "false_negative_rate", "false_positive_rate", "near_duplicates", "test")
-
-    def cell(values: Mapping[str, Any], name: str) -> str:
-        value = values.get(name, "")
-        if isinstance(value, float):
-            return f"{value:.4f}" if name == "accuracy" else f"{value:.2%}"
-        return f"{value:,}" if isinstance(value, int) else str(value)
-
-    tested = {title: scores[split] for split, title in SPLITS.items() if split in scores}
-    rows = [[title, *(cell(values, name) for name in columns)] for title, values in tested.items()]
+    """Accuracy of a classifier of patches on each split."""
+    titles, rows = split_table(scores)
     note = "Accuracy on patches that were not used for training; vehicles in whole frames are another task."
-    return Table("Accuracy of the model", note, ("Tested on", *map(_heading, columns)), rows)
+    return Table("Accuracy of the model", note, tuple(map(_heading, titles)), rows)
 
 
 def _left_out_table(scores: Mapping[str, Mapping[str, Any]]) -> Table:

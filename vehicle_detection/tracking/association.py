@@ -8,14 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection.boxes import (
-    Floats,
-    box_areas,
-    clip_boxes,
-    intersection_matrix,
-    iter_nms,
-    overlap_matrices,
-)
+from vehicle_detection._common import Floats
+from vehicle_detection.boxes import box_areas, clip_boxes, intersection_matrix, iter_nms, overlap_matrices
 from vehicle_detection.camera import FrameShape
 from vehicle_detection.params import TrackParams
 from vehicle_detection.tracking.assignment import cheapest_pairs

@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection.boxes import Floats
+from vehicle_detection._common import Floats
 from vehicle_detection.camera import Camera, FrameShape, lateral_offsets
 
 # Times (s): correlation of the errors of a vehicle's boxes; decay of the sums; faster decay of the sums where

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_detection.boxes import Floats, clip_boxes
+from vehicle_detection._common import Floats
+from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.tracking.track import TIME_TOLERANCE, Track
 
 _INTERPOLATED = (

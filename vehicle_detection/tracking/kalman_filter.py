@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection.boxes import Floats
+from vehicle_detection._common import Floats
 from vehicle_detection.camera import Camera, FrameShape, lateral_offsets, truncated_edges
 from vehicle_detection.params import TrackParams
 from vehicle_detection.tracking.association import match_boxes

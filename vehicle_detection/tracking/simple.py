@@ -11,7 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vehicle_detection.boxes import Floats, iou_matrix
+from vehicle_detection._common import Floats
+from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.params import TrackParams
 from vehicle_detection.tracking.association import center_distances, match_boxes
 from vehicle_detection.tracking.kalman_filter import (

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from vehicle_detection.boxes import Floats
+from vehicle_detection._common import Floats
 from vehicle_detection.params import TrackParams
 
 TIME_TOLERANCE = 1e-6

@@ -16,15 +16,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_integer, check_number, check_type
-from vehicle_detection.boxes import Detections, Floats, Platt, box_areas, on_one_vehicle
-from vehicle_detection.camera import (
-    UNKNOWN_LENS_STD,
-    Camera,
-    FrameShape,
-    check_shape,
-    truncated_edges,
-)
+from vehicle_detection._common import Floats, check_integer, check_number, check_shape, check_type
+from vehicle_detection.boxes import Detections, Platt, box_areas, on_one_vehicle
+from vehicle_detection.camera import UNKNOWN_LENS_STD, Camera, FrameShape, truncated_edges
 from vehicle_detection.params import TrackParams
 from vehicle_detection.tracking.association import (
     covered_fractions,

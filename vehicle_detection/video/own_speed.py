@@ -15,9 +15,10 @@ from typing import Any
 from xml.parsers import expat
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from vehicle_detection._common import (
+    Floats,
     Limit,
     check_array,
     check_number,
@@ -26,8 +27,6 @@ from vehicle_detection._common import (
     read_regular_file,
 )
 from vehicle_detection.errors import InvalidInputError
-
-Floats = NDArray[np.float64]
 
 # Gap (s) between two values from which on the speed between them is unknown.
 _MAX_GAP = 5.0

@@ -198,6 +198,9 @@ class FrameReader(_FfmpegStream):
         incomplete = ""
         if not complete and end < self.info.frames - 1 and _TRUNCATED.search(log):
             incomplete = f"{name} is incomplete: {end} of about {self.info.frames} frames can be decoded"
+        if incomplete and not self.frames_read:
+            start = float(self._first / self.info.fps)
+            incomplete = f"{name} is incomplete: no frame after {start:g} s can be decoded"
         if incomplete and isinstance(self._path, str):  # the server or the network may be to blame
             raise video_error(f"{incomplete}; try again", self._path, code, log)
         if incomplete and self._whole:
