@@ -37,7 +37,7 @@ GUARDED = {
     ("_common.threads", "available_cores", "os.sched_getaffinity"): "hasattr; macOS does not have it, either",
     ("_common.threads", "", "os.register_at_fork"): "hasattr",
     ("tuning.trials", "_check_memory", "os.sysconf"): "AttributeError is caught",
-    ("batch.workers", "_private_folder", "os.getuid"): "hasattr",
+    ("batch.worker_pool", "_private_folder", "os.getuid"): "hasattr",
     ("batch.store", "_lock_file", "fcntl"): "ImportError is caught",
     ("video.ffmpeg", "", "os.register_at_fork"): "hasattr",
     ("video.ffmpeg", "_enlarge", "fcntl"): "on Linux only",

@@ -506,10 +506,9 @@ def estimate_horizon(boxes: Detections | ArrayLike, shape: tuple[int, ...]) -> H
         variance = edge_std**2 + np.square(_RELATIVE_STD * found[1] * size)
         residual = (bottom - found[0] - found[1] * size) / np.sqrt(variance)
         weight = np.square(np.maximum(1 - np.square(residual / _BIWEIGHT), 0)) / variance / _CORRELATED_BOXES
-        x, y = size, bottom
-        crossed = (weight * x).sum()
-        normal = information + np.array([[weight.sum(), crossed], [crossed, (weight * x * x).sum()]])
-        vector = np.array([(weight * y).sum(), (weight * x * y).sum()])
+        crossed = (weight * size).sum()
+        normal = information + np.array([[weight.sum(), crossed], [crossed, (weight * size * size).sum()]])
+        vector = np.array([(weight * bottom).sum(), (weight * size * bottom).sum()])
         found = np.linalg.solve(normal, vector + information @ mean)
     std = math.sqrt(np.linalg.inv(normal)[0, 0])
     # Boxes that do not lie on a line are no vehicles on a flat road.

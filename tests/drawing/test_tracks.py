@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.drawing.cases import blank, changed_box, track
-from vehicle_detection.drawing import TRACK_COLORS, TrackDrawer, draw_tracks, track_color, track_text
+from vehicle_detection.drawing import TRACK_COLORS, TrackDrawer, draw_tracks, track_color
 from vehicle_detection.drawing.primitives import draw_text, text_size
+from vehicle_detection.drawing.tracks import track_fields
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import LABEL_FIELDS, DrawParams
 
@@ -185,6 +186,10 @@ class TestTracks:
             draw_tracks(blank(), [[1, 2, 3, 4]])
         with pytest.raises(InvalidInputError, match="tracks must be Track objects"):
             draw_tracks(blank(), None)
+
+
+def track_text(*arguments, **options):
+    return "  ".join(track_fields(*arguments, **options))
 
 
 class TestText:

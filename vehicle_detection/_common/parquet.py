@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from vehicle_detection._common.files import atomic_write
 from vehicle_detection.errors import InvalidInputError
@@ -47,7 +47,7 @@ class ParquetRows:
         self._pyarrow = _import_pyarrow()
         self._schema = self._pyarrow.schema(list(types.items()))
 
-    def __enter__(self) -> ParquetRows:
+    def __enter__(self) -> Self:
         self._writer = self._pyarrow.parquet.ParquetWriter(self._path, self._schema)
         return self
 

@@ -8,7 +8,7 @@ from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from typing import Any
 
 from vehicle_detection._common import available_cores
-from vehicle_detection.batch.workers import worker_environment
+from vehicle_detection.batch.worker_pool import worker_environment
 from vehicle_detection.errors import InvalidInputError
 
 # Dask blames a lost worker on all its tasks; its default of 3 would fail innocent trips.

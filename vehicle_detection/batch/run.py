@@ -51,7 +51,7 @@ from vehicle_detection.batch.records import (
 )
 from vehicle_detection.batch.store import Store, open_store
 from vehicle_detection.batch.trip import BUSY, RECORDED, remove_replaced, run_trip, warm_up
-from vehicle_detection.batch.workers import WorkerPool
+from vehicle_detection.batch.worker_pool import WorkerPool
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video import PRESETS, Trip, find_trips
@@ -237,36 +237,25 @@ def run_batch(
         )
     for task, record in superseded:
         remove_replaced(store, task, record)
-    own = None
-    if executor is None and pending:
-        executor = own = WorkerPool(
-            min(workers, len(pending)), (warm_up, (settings, fingerprint_of(settings)))
-        )
     counts = {DONE: 0, FAILED: 0, ERROR: 0}
     frames = 0
     messages: dict[str, str] = {}
-    try:
-        with (
-            progress_bar(progress, len(pending), unit="trip", terminal_only=True) as bar,
-            contextlib.closing(_run(executor, pending, store)) as records,
-        ):
-            for made in records:
-                bar.update()
-                if not made["new"]:
-                    skipped += 1
-                    continue
-                counts[made["status"]] += 1
-                frames += made.get("frames", 0)
-                if made["status"] != DONE:
-                    messages[made["sources"][0]["uri"]] = made["message"]
-                if on_record is not None:
-                    on_record(made)
-    except BaseException:
-        if own is not None:
-            own.shutdown(cancel_futures=True)
-        raise
-    if own is not None:
-        own.shutdown()
+    with contextlib.ExitStack() as stack:
+        if executor is None and pending:
+            warm = warm_up, (settings, fingerprint_of(settings))
+            executor = stack.enter_context(WorkerPool(min(workers, len(pending)), warm))
+        bar = stack.enter_context(progress_bar(progress, len(pending), unit="trip", terminal_only=True))
+        for made in stack.enter_context(contextlib.closing(_run(executor, pending, store))):
+            bar.update()
+            if not made["new"]:
+                skipped += 1
+                continue
+            counts[made["status"]] += 1
+            frames += made.get("frames", 0)
+            if made["status"] != DONE:
+                messages[made["sources"][0]["uri"]] = made["message"]
+            if on_record is not None:
+                on_record(made)
     return BatchReport(
         trips=len(tasks),
         done=counts[DONE],
@@ -443,16 +432,14 @@ def _run(
 
     waiting = deque(pending)  # not submitted; what is left if the executor breaks has an error
     try:
-        while waiting:
-            submit(waiting[0])
-            waiting.popleft()
-        while running or busy:
+        while waiting or running or busy:
+            while waiting:
+                submit(waiting[0])
+                waiting.popleft()
             if not running:  # only trips that other runs are working on are left
                 time.sleep(_BUSY_INTERVAL)
                 waiting, busy = deque(busy), []
-                while waiting:
-                    submit(waiting[0])
-                    waiting.popleft()
+                continue
             future = finished.get()
             task = running.pop(future)
             waiting.append(task)

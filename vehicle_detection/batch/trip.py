@@ -221,29 +221,22 @@ def _check_access(file: str) -> None:
         ) from error
 
 
-class _TrackTable:
+class _TrackTable(ParquetRows):
     """Writer of the shown tracks of a trip as a Parquet file."""
 
     def __init__(self, path: Path, key: str) -> None:
         try:
-            self._table = ParquetRows(path, _COLUMNS)
+            super().__init__(path, _COLUMNS)
         except InvalidInputError as error:  # not the fault of the source
             raise OSError(f"this worker cannot write tracks: {error}") from None
         self._key = key
         self.rows = 0
 
-    def __enter__(self) -> _TrackTable:
-        self._table.__enter__()
-        return self
-
     def __call__(self, result: Any) -> None:
         """Add the shown tracks of a frame's result."""
         for row in track_rows(result):
-            self._table.write((self._key, row.frame, round(result.time, 4), *row[1 : len(TRACK_COLUMNS)]))
+            self.write((self._key, row.frame, round(result.time, 4), *row[1 : len(TRACK_COLUMNS)]))
             self.rows += 1
-
-    def __exit__(self, *error: Any) -> None:
-        self._table.__exit__(*error)
 
 
 def _scratch(store: Store, key: str) -> AbstractContextManager[Path]:

@@ -26,6 +26,7 @@ _MAX_OWN_SPEED = 500.0
 
 def read_speed(own_speed: str | None, gpx: Path | None, offset: float) -> OwnSpeed | None:
     """Speed of the own vehicle: constant (km/h, or with its unit), from a file, or unknown."""
+    from vehicle_detection.units import UNITS
     from vehicle_detection.video import OwnSpeed, read_own_speed
 
     if gpx is not None:
@@ -43,7 +44,7 @@ def read_speed(own_speed: str | None, gpx: Path | None, offset: float) -> OwnSpe
             f"--own-speed must be a speed of at most {_MAX_OWN_SPEED:g}, such as 100 (km/h) or 62mph; got "
             f"{own_speed!r}"
         )
-    return OwnSpeed.constant(float(found[1]) * (0.44704 if found[2] == "mph" else 1 / 3.6))
+    return OwnSpeed.constant(float(found[1]) / UNITS["imperial" if found[2] == "mph" else "metric"].speed)
 
 
 @dataclass(frozen=True)

@@ -47,12 +47,19 @@ def parse_horizon(text: str) -> float:
 
 
 def find_horizon(
-    source: FrameSource, detector: VehicleDetector, start: float | None, end: float | None, quiet: bool
+    source: FrameSource,
+    model: Any,
+    *,
+    conf: float | None,
+    start: float | None,
+    end: float | None,
+    quiet: bool,
 ) -> float | None:
     """Estimate the horizon of a video from its vehicles, and print the result."""
     from vehicle_detection.video import estimate_video_horizon
 
-    found = estimate_video_horizon(source, detector, start=start, end=end)
+    with search_everywhere(model, conf) as detector:
+        found = estimate_video_horizon(source, detector, start=start, end=end)
     if found is None:
         if not quiet:
             print_error(

@@ -299,8 +299,7 @@ def video(
             with VehicleDetector(loaded, **options) as unsure:
                 unsure.camera_of(opened.info.shape)
                 VideoRun(opened, unsure, target=output, audio=False, **settings).close()
-            with search_everywhere(loaded, conf) as everywhere:
-                fraction = find_horizon(opened, everywhere, start, end, quiet)
+            fraction = find_horizon(opened, loaded, conf=conf, start=start, end=end, quiet=quiet)
         detector = stack.enter_context(VehicleDetector(loaded, horizon=fraction, **options))
         page = None
         if report is not None and output is not None:
@@ -342,14 +341,15 @@ def video(
                 with open_source(source, fps=fps) as again:
                     pictures = explain_vehicles(detector, again, log)
             page.finish(done, events=found, pictures=pictures)
-    given = None if horizon in (None, "auto") else f"--horizon {horizon}"
-    if horizon is None and detector.search_params_of(opened.info.shape) != detector.search_params:
-        given = f"the horizon of --camera {camera}"
-    if not quiet and not done.tracks and given is not None and opened.rereadable:
-        with open_source(source, fps=fps) as again, search_everywhere(loaded, conf) as everywhere:
-            warn_of_horizon(given, estimate_video_horizon(again, everywhere, start=start, end=end))
     if not quiet and done.tracks:
         _warn_of_distances(detector, opened)
+    elif not quiet and opened.rereadable:
+        given = None if horizon in (None, "auto") else f"--horizon {horizon}"
+        if horizon is None and detector.search_params_of(opened.info.shape) != detector.search_params:
+            given = f"the horizon of --camera {camera}"
+        if given is not None:
+            with open_source(source, fps=fps) as again, search_everywhere(loaded, conf) as everywhere:
+                warn_of_horizon(given, estimate_video_horizon(again, everywhere, start=start, end=end))
     if not quiet or profile:
         lines = str(done).splitlines()
         typer.echo("\n".join(lines if profile else lines[:1]))

@@ -18,7 +18,6 @@ from vehicle_detection.drawing.tracks import (
     TrackDrawer,
     draw_tracks,
     track_color,
-    track_text,
 )
 
 __all__ = [
@@ -43,5 +42,4 @@ __all__ = [
     "road_position",
     "score_texts",
     "track_color",
-    "track_text",
 ]

@@ -205,13 +205,6 @@ def _distance_color(distance_m: float | None) -> Color:
     return _DISTANCE_COLORS[-1]
 
 
-def track_text(
-    track: Track, fields: Collection[str], units: str = "metric", own_mps: float | None = None
-) -> str:
-    """Text of a track's label, such as "#3  24 m  -6 km/h"; empty if no field is known."""
-    return "  ".join(track_fields(track, fields, units, own_mps))
-
-
 def track_fields(
     track: Track, fields: Collection[str], units: str = "metric", own_mps: float | None = None
 ) -> list[str]:

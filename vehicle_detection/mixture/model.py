@@ -377,10 +377,6 @@ def load_model(path: str | os.PathLike[str] = "default") -> TemplateMixture | Ve
     if data.kind != KIND:
         raise ModelFileError(f"{data.name} holds a model of the unknown kind {data.kind!r}; train one")
     params, tensors = data.params, data.tensors
-    if "box_regressor.weights" in tensors:
-        raise ModelFileError(
-            f"{data.name} is a mixture for features of an earlier version; train it again with train_mixture"
-        )
     try:
         rows = zip(params["biases"], params["paddings"], params["borders"], strict=True)
         templates = tuple(

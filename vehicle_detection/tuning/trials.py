@@ -131,7 +131,7 @@ class TrialEvaluator:
         if options.time_search or options.frame_sets:
             used["search"] = dataclasses.asdict(options.search_params)
         if options.frame_sets:
-            used["fit"] = dataclasses.asdict(options.region_params)
+            used["regions"] = dataclasses.asdict(options.region_params)
             used["frames"] = [_digest_frames(each) for each in options.frame_sets]
         self._options_digest = digest_of(used, options.time_search)
 

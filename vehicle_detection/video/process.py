@@ -43,7 +43,7 @@ from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.reading import check_span, frame_range
 from vehicle_detection.video.sources import Source, borrow_source, open_source
 from vehicle_detection.video.streams import CONTAINERS, AudioSource, FrameWriter
-from vehicle_detection.video.viewer import Viewer, open_viewer
+from vehicle_detection.video.viewer import open_viewer
 
 PRESETS = (
     "ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow", "placebo",
@@ -223,7 +223,7 @@ def process_video(
     ) as run:
         with (
             _stop_on_interrupt(run),
-            _viewer(show, run.source.name) as viewer,
+            contextlib.closing(open_viewer(run.source.name)) if show else contextlib.nullcontext() as viewer,
             contextlib.closing(run.results(progress=progress)) as results,
         ):
             for drawn, result in results:
@@ -234,16 +234,6 @@ def process_video(
                     if viewer.closed:
                         run.stop()
         return run.report()
-
-
-@contextlib.contextmanager
-def _viewer(show: bool, title: str) -> Iterator[Viewer | None]:
-    """Open a viewer for a block, if one is asked for."""
-    if not show:
-        yield None
-        return
-    with contextlib.closing(open_viewer(title)) as viewer:
-        yield viewer
 
 
 class VideoRun:
@@ -278,48 +268,33 @@ class VideoRun:
         output = None if target is None else _check_video_target(target)
         self._owned = not isinstance(source, FrameSource)
         self.source = open_source(source)
-        try:
+        with contextlib.ExitStack() as on_error:
+            on_error.callback(self.close)
             if output is not None:
                 _check_not_a_source(output, self.source.files)
-            self._set_up(output, detector, start, end, audio, preset, n_workers, frames, strict)
-        except BaseException:
-            self.close()
-            raise
-
-    def _set_up(
-        self,
-        output: Path | None,
-        detector: VideoDetector,
-        start: float | None,
-        end: float | None,
-        audio: bool,
-        preset: str,
-        workers: int,
-        frames: Frames,
-        strict: bool,
-    ) -> None:
-        info = self.info = self.source.info
-        first, count = frame_range(info, start, end)
-        sound = _sound(self.source, first, end) if audio and output is not None else None
-        drawn_shape = getattr(detector, "annotated_shape", lambda shape: shape)(info.shape)
-        drawn = dataclasses.replace(info, height=drawn_shape[0], width=drawn_shape[1])
-        self._total = count or max(info.frames - first, 0) or None
-        self._frames, self._seconds, self._track_ids = 0, 0.0, set[int]()
-        self._detector = detector
-        fps = float(info.fps)
-        delay = 0 if self.source.live else getattr(detector, "search_delay", lambda fps: 0)(fps)
-        interval = getattr(detector, "search_interval", lambda fps: 1)(fps)
-        self._pipeline = FramePipeline(
-            functools.partial(self.source.read, first, count, strict=strict),
-            None if output is None else functools.partial(_open_writer, output, drawn, preset, sound),
-            detector,
-            workers,
-            drawn_shape=drawn_shape,
-            interval=interval,
-            delay=delay,
-            lookahead=max(workers, min(workers * interval, _LOOKAHEAD_BYTES // math.prod(info.shape))) + 1,
-            frames=frames,
-        )
+            info = self.info = self.source.info
+            first, count = frame_range(info, start, end)
+            sound = _sound(self.source, first, end) if audio and output is not None else None
+            drawn_shape = getattr(detector, "annotated_shape", lambda shape: shape)(info.shape)
+            drawn = dataclasses.replace(info, height=drawn_shape[0], width=drawn_shape[1])
+            self._total = count or max(info.frames - first, 0) or None
+            self._frames, self._seconds, self._track_ids = 0, 0.0, set[int]()
+            self._detector = detector
+            fps = float(info.fps)
+            interval = getattr(detector, "search_interval", lambda fps: 1)(fps)
+            ahead = min(n_workers * interval, _LOOKAHEAD_BYTES // math.prod(info.shape))
+            self._pipeline = FramePipeline(
+                functools.partial(self.source.read, first, count, strict=strict),
+                None if output is None else functools.partial(_open_writer, output, drawn, preset, sound),
+                detector,
+                n_workers,
+                drawn_shape=drawn_shape,
+                interval=interval,
+                delay=0 if self.source.live else getattr(detector, "search_delay", lambda fps: 0)(fps),
+                lookahead=max(n_workers, ahead) + 1,
+                frames=frames,
+            )
+            on_error.pop_all()
 
     def results(self, *, progress: bool = False) -> Generator[tuple[NDArray[np.uint8] | None, Any]]:
         """Yield each frame, None unless `frames` asks for it, and its result; closing it stops everything."""

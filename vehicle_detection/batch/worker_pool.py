@@ -105,6 +105,10 @@ class WorkerPool(Executor):
             for thread in self._threads:
                 thread.join()
 
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Wait for all calls, or end them at once after an error."""
+        self.shutdown(cancel_futures=kind is not None)
+
     def _serve(self) -> None:
         """Pass calls to one process, which is started again after its death."""
         process: subprocess.Popen[str] | None = None
@@ -130,9 +134,8 @@ class WorkerPool(Executor):
             self._end(process)
 
     def _start(self) -> subprocess.Popen[str]:
-        group: dict[str, Any] = {
-            "process_group": 0
-        }  # Ctrl-C reaches this process only, which ends the workers
+        # Ctrl-C reaches this process only, which ends the workers.
+        group: dict[str, Any] = {"process_group": 0}
         if sys.platform == "win32":
             group = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
         with self._first_start:

@@ -13,8 +13,8 @@ import pytest
 from tests.helpers import ROOT
 from tests.video.clips import child_processes
 from vehicle_detection import open_dask
-from vehicle_detection.batch import workers
-from vehicle_detection.batch.workers import WorkerLost, WorkerPool
+from vehicle_detection.batch import worker_pool
+from vehicle_detection.batch.worker_pool import WorkerLost, WorkerPool
 
 
 def kill_this_process(*_):
@@ -79,11 +79,11 @@ def test_the_first_worker_compiles_the_kernels_before_the_others_start(tmp_path)
 
 def test_kernels_are_kept_on_a_local_disk(monkeypatch, tmp_path):
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    folder = Path(workers.worker_environment()["NUMBA_CACHE_DIR"])
+    folder = Path(worker_pool.worker_environment()["NUMBA_CACHE_DIR"])
     assert folder.parent == tmp_path / "scratch"
-    assert workers.worker_environment()["NUMBA_CACHE_DIR"] == str(folder)
+    assert worker_pool.worker_environment()["NUMBA_CACHE_DIR"] == str(folder)
     monkeypatch.setenv("NUMBA_CACHE_DIR", "/elsewhere")
-    assert workers.worker_environment()["NUMBA_CACHE_DIR"] == "/elsewhere"
+    assert worker_pool.worker_environment()["NUMBA_CACHE_DIR"] == "/elsewhere"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has a private folder for temporary files")
@@ -99,7 +99,7 @@ def test_kernels_of_another_user_are_not_loaded(monkeypatch, tmp_path, caplog, k
         folder.symlink_to(tmp_path)
     else:
         folder.write_text("")
-    assert "NUMBA_CACHE_DIR" not in workers.worker_environment()
+    assert "NUMBA_CACHE_DIR" not in worker_pool.worker_environment()
     assert "kernels are kept elsewhere" in caplog.text
 
 
