@@ -189,6 +189,13 @@ def test_duplicates_of_duplicates_are_one_group():
     assert len(find_near_duplicates(patches, threshold=0.9)) == 8
 
 
+def test_equal_patches_are_duplicates_at_the_largest_threshold():
+    patches = np.random.default_rng(0).integers(0, 256, (50, 16, 16, 3), np.uint8)
+    both = PatchSet(np.concatenate([patches, patches]), [1] * 100, [f"{row}.png" for row in range(100)])
+    assert len(find_near_duplicates(both, threshold=1)) == 100
+    assert split_leakage(both, Split(range(50), range(50, 100)), threshold=1) == 1
+
+
 def test_groups_are_found_across_chunks():
     seeds = [*range(1098), 3, 700]
     split = split_groups(copies_of(seeds), test_size=0.5)

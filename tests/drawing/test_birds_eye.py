@@ -1,5 +1,7 @@
 """Positions on the road, and the bird's-eye view in a video."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -33,6 +35,12 @@ class TestPosition:
         assert position.lateral_m == pytest.approx(0.150 * 8.5 + 0.9)
         mirrored = track((0, 380, 490, 600), distance_m=4.0, distance_std_m=0.5)
         assert road_position(mirrored, CAMERA, SHAPE).lateral_m == pytest.approx(-(0.150 * 8.5 + 0.9))
+
+    def test_a_whole_box_of_a_fisheye_lens_is_not_truncated(self):
+        camera = Camera.for_frame(SHAPE, lens="fisheye-120")
+        camera = dataclasses.replace(camera, vehicle_length_m=9.0)
+        known = track((761, 380, 1147, 600), distance_m=4.0, distance_std_m=0.5)
+        assert road_position(known, camera, SHAPE).lateral_m == pytest.approx(3.5, abs=0.1)
 
     def test_the_error_is_larger_along_the_ray(self):
         position = road_position(track((600, 400, 680, 460), distance_std_m=2.0), CAMERA, SHAPE)

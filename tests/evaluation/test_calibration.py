@@ -118,6 +118,8 @@ def test_calibration_error_by_hand():
     # Bin 0 holds 0.1 and 0.3 (mean 0.2, half of them vehicles), bin 1 holds 0.6 and 1.0 (0.8, all vehicles).
     assert calibration_error([0.1, 0.3, 0.6, 1.0], [0, 1, 1, 1], bins=2) == pytest.approx(0.25)
     assert calibration_error([0.0, 1.0], [False, True]) == 0
+    assert calibration_error(np.array([0, 1], np.uint8), [0, 1], bins=300) == 0
+    assert calibration_error(np.array([0, 1], np.float16), [0, 1], bins=100_000) == 0
 
 
 @given(

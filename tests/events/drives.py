@@ -24,11 +24,20 @@ def box_of(vehicle, time):
     )
 
 
-def simulate(scenario, seed, *, seconds=10.0, noise=0.03):
+def simulate(scenario, seed, **options):
     """Vehicles of a scenario, and the log of their tracks."""
+    log = TrackLog()
+    traffic = make_traffic(scenario, 10.0, np.random.default_rng(seed))[1]
+    for frame in log_frames(scenario, seed, **options):
+        log.add(*frame)
+    return traffic, log
+
+
+def log_frames(scenario, seed, *, seconds=10.0, noise=0.03):
+    """Yield the number, the time and the tracks of each frame of a scenario."""
     rng = np.random.default_rng(seed)
     _, traffic = make_traffic(scenario, seconds, rng)
-    tracker, log, errors = Tracker(fps=FPS), TrackLog(), {}
+    tracker, errors = Tracker(fps=FPS), {}
     for frame in range(round(seconds * FPS)):
         found = []
         nearest_first = sorted(traffic, key=lambda vehicle: vehicle.distance(frame / FPS))
@@ -51,8 +60,7 @@ def simulate(scenario, seed, *, seconds=10.0, noise=0.03):
             if visible > 0.4 and not hidden and rng.random() > 0.05:
                 found.append(np.clip(box + noise * error * sides, 0, [1280, 720, 1280, 720]))
         detections = Detections(np.array(found).reshape(-1, 4), np.full(len(found), 2.0))
-        log.add(frame, frame / FPS, tracker.update(detections, (*SHAPE, 3), time=frame / FPS))
-    return traffic, log
+        yield frame, frame / FPS, tracker.update(detections, (*SHAPE, 3), time=frame / FPS)
 
 
 def passing_times(traffic, seconds, *, first=2.0, oncoming=False):

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.events.drives import CAMERA, FPS, SHAPE, cut_in_times, passing_times, simulate
+from tests.events.drives import CAMERA, FPS, SHAPE, cut_in_times, log_frames, passing_times, simulate
 from vehicle_detection import Event, TrackLog, find_events
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events import TrackHistory, estimate_motion
@@ -98,6 +98,30 @@ def test_a_vehicle_that_closes_in_is_an_event():
         assert abs(first.time_s - times[np.argmin(true)]) < 1.0
         assert abs(first.ttc_s - min(true)) < max(0.25 * min(true), 2 * first.ttc_std_s)
         assert first.closing_mps > 3
+
+
+def test_frames_that_were_not_processed_do_not_change_the_speeds():
+    (_, log), dropped = simulated("closing", 0), TrackLog()
+    number = 0
+    for frame, time, tracks in log_frames("closing", 0):
+        if frame % 2 == 0:
+            dropped.add(number, time, tracks)
+            number += 1
+    whole, half = (find_events(each, fps=FPS, shape=SHAPE) for each in (log, dropped))
+    found, expected = (next(event for event in events if event.ttc_s is not None) for events in (half, whole))
+    assert found.kind == expected.kind
+    assert found.ttc_s == pytest.approx(expected.ttc_s, rel=0.15)
+    assert found.closing_mps == pytest.approx(expected.closing_mps, rel=0.1)
+
+
+def test_the_headway_is_at_the_smallest_stated_distance():
+    log = simulated("closing", 0)[1]
+    (history,) = (each for each in log.histories() if each.id == 1)
+    for event in find_events(log, fps=FPS, shape=SHAPE):
+        if event.kind == "headway" and event.track_id == 1:
+            rows = (history.frames >= event.start_frame) & (history.frames <= event.end_frame)
+            stated = history.columns["distance_m"][rows]
+            assert event.distance_m == pytest.approx(np.nanmin(stated), abs=0.01)
 
 
 def test_headway_in_seconds_needs_the_own_speed():

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.report.helpers import track
+from vehicle_detection import OwnSpeed
 from vehicle_detection.events.history import TrackHistory, TrackLog, bin_means
 
 PRESENCE = st.lists(st.sets(st.integers(1, 4)), max_size=40)
@@ -89,3 +90,25 @@ def test_frames_that_a_live_source_dropped():
         log.add(frame, frame / 10, [track(1)] if frame < 6 else [])
     assert list(log.counts) == [1, 1, 1, 1, 1, 1, 0]
     assert log.histories()[0].frames.tolist() == [0, 1, 5]
+
+
+def test_the_closest_approach_does_not_depend_on_the_unit():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        distances = rng.uniform(5, 9, 40).round(2)
+        meters, feet = (history(range(40), distances * unit).closest_approach(25) for unit in (1, 1 / 0.3048))
+        assert meters.frame == feet.frame
+
+
+def test_times_of_frames_that_are_not_evenly_spaced():
+    log = TrackLog()
+    for frame, time in enumerate((5.0, 5.1, None, 5.5)):
+        log.add(frame, time, [track(1)])
+    assert log.histories()[0].times.tolist() == pytest.approx([5.0, 5.1, 5.3, 5.5])
+    speed = OwnSpeed(np.array([5.0, 6.0]), np.array([10.0, 20.0]))
+    assert log.own_speeds(speed, 25).tolist() == pytest.approx([10, 11, 13, 15])
+    for times in ((1.0, 1.0), (1.0, 0.5), (None, 1.0), (None, None)):
+        other = TrackLog()
+        for frame, time in enumerate(times):
+            other.add(frame, time, [track(1)])
+        assert other.histories()[0].times is None

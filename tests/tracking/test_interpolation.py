@@ -46,6 +46,16 @@ def test_a_track_that_has_ended_moves_on():
     )
 
 
+def test_the_distance_of_a_track_that_has_ended_moves_on():
+    known = {"distance_m": 10.0, "distance_std_m": 0.3, "speed_mps": -5.0, "speed_std_mps": 1.0}
+    (found,) = interpolate_tracks([track(1, [100, 200, 150, 260], **known)], [], 0.4, 0.0, SHAPE)
+    assert (found.distance_m, found.distance_std_m) == (pytest.approx(8.0), pytest.approx(0.5))
+    np.testing.assert_allclose(found.box, [93.75, 192.5, 156.25, 267.5])
+    near = track(1, [100, 200, 150, 260], **known | {"distance_m": 1.5})
+    (found,) = interpolate_tracks([near], [], 0.4, 0.0, SHAPE)
+    assert found.distance_m == 1.0
+
+
 def test_a_track_is_shown_from_its_first_detection_on():
     tentative = track(0, [100, 200, 150, 260])
     confirmed = track(5, [104, 200, 154, 260], velocity=(50.0, 0.0), age=0.3)

@@ -5,6 +5,12 @@ import pytest
 
 from vehicle_detection.camera import Camera
 from vehicle_detection.params import TrackParams
+from vehicle_detection.tracking.distance_filter import (
+    estimate_distances,
+    initiate_states,
+    predict_distances,
+    update_distances,
+)
 from vehicle_detection.tracking.kalman_filter import (
     UNKNOWN,
     KalmanSmoother,
@@ -13,14 +19,10 @@ from vehicle_detection.tracking.kalman_filter import (
     boxes_from_states,
     centers_and_sizes,
     coasted_distance,
-    estimate_distances,
     exit_times,
     initiate,
-    initiate_states,
     predict,
-    predict_distances,
     update,
-    update_distances,
 )
 from vehicle_detection.tracking.track import TrackState
 

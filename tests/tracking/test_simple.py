@@ -92,6 +92,18 @@ def test_the_velocity_is_a_moving_average_of_the_displacements(kind):
     np.testing.assert_allclose(later.mean[0, 4:], expected)
 
 
+@pytest.mark.parametrize("kind", [HistorySmoother, NearestSmoother])
+def test_the_velocity_of_a_track_that_is_detected_now_and_then(kind):
+    smoother, dt = kind(PARAMS), 0.04
+    states, track = states_of(smoother, FIRST), TrackState(score=1.0)
+    track.last_gap = 2 * dt
+    for frame in range(3, 300, 3):
+        track.age += 3 * dt
+        box = Measurements.from_boxes(FIRST + 4.0 * frame, SHAPE)
+        states = smoother.correct(states, [track], box, dt)
+    np.testing.assert_allclose(states.mean[0, 4:6], 100, rtol=0.02)
+
+
 def test_the_nearest_pairs_are_matched_first():
     predicted = np.array([[0.0, 0, 40, 40], [30, 0, 70, 40]])
     measured = np.array([[25.0, 0, 65, 40], [55, 0, 95, 40]])

@@ -1150,3 +1150,16 @@ def test_a_vehicle_hidden_in_steps_keeps_its_size_place_and_id():
             (box,) = (track.box for track in tracks if track.id and track.box[3] < near[3] - 10)
             assert iou_matrix([box], [far])[0, 0] > 0.7
     assert [track.id for track in tracks] == [1, 2]
+
+
+@pytest.mark.parametrize("height_std", [0.02, 0.05, 0.1])
+def test_the_distance_of_a_near_vehicle_follows_its_bottom_edge(height_std):
+    # A car that the right border cuts, and that pulls away; its first box seems farther than the second one.
+    camera = Camera(focal_px=576, horizon_px=201.6, height_std_m=height_std, focal_std=0.01)
+    bottoms = [319, 347, 345, 331, 319, 310, 302, 295]
+    tracker = Tracker(fps=25, camera=camera)
+    for frame, bottom in enumerate(bottoms):
+        box = [450 + 60 * (bottom - 295) / 50, 2 * 201.6 - bottom + 15, 640, bottom]
+        (track,) = tracker.update(Detections([box], [4.0]), (360, 640), time=frame * 0.08)
+    true = 576 * camera.height_m / (bottoms[-1] - 201.6)
+    assert abs(track.distance_m - true) < track.distance_std_m < 0.3 * true

@@ -27,6 +27,7 @@ from vehicle_detection.params import PATCH_SIZE
 _PATCH_SET_REMEDY = "read one with load_training_patches"
 
 _CHUNK = 512  # Rows compared with all others at a time, to limit the memory of the correlation matrix.
+_ROUNDING = 1e-5  # relative error of a correlation
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -196,8 +197,7 @@ def split_groups(
     _, stratum, sizes = np.unique(strata, return_inverse=True, return_counts=True)
     # Test patches that each folder may still give, as in split_sequences; clipping to [1, 0] gives 0.
     remaining = np.clip(np.round(sizes * fraction).astype(np.intp), 1, sizes - 1)
-    # Slightly below the threshold, so that rounding errors separate no pair at the threshold.
-    groups = group_near_duplicates(make_thumbnails(patch_set), limit * (1 - 1e-5))
+    groups = group_near_duplicates(make_thumbnails(patch_set), limit * (1 - 2 * _ROUNDING))
     order = np.argsort(groups, kind="stable")
     members = np.split(order, np.flatnonzero(np.diff(groups[order])) + 1)
     tested = np.zeros(len(patch_set), np.bool_)
@@ -319,7 +319,7 @@ def find_near_duplicates(
     limit = check_number(threshold, "threshold", above=0, high=1)
     thumbnails = make_thumbnails(patches)
     nearest, correlation = find_nearest(thumbnails, thumbnails, same=True)
-    rows = np.flatnonzero(correlation >= limit)
+    rows = np.flatnonzero(correlation >= limit * (1 - _ROUNDING))
     return np.stack([rows, nearest[rows]], axis=1)
 
 
@@ -404,7 +404,7 @@ def split_leakage(patch_set: PatchSet, split: Split, *, threshold: float = 0.95)
         )
     thumbnails = make_thumbnails(patch_set)
     _, correlation = find_nearest(thumbnails[split.test], thumbnails[split.train], same=False)
-    return float((correlation >= limit).mean())
+    return float((correlation >= limit * (1 - _ROUNDING)).mean())
 
 
 def _check_test_size(test_size: object) -> float:

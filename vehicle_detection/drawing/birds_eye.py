@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection.camera import Camera
+from vehicle_detection.camera import Camera, truncated_edges
 from vehicle_detection.drawing.primitives import (
     Color,
     Image,
@@ -76,7 +76,7 @@ def road_position(track: Track, camera: Camera, shape: tuple[int, ...]) -> RoadP
     # Mirrored, if necessary, so that the vehicle is on the right.
     inner, outer = (left - middle, right - middle) if to_right else (middle - right, middle - left)
     width = outer - inner
-    if inner > 0 and outer >= middle - max(0.04 * width, 1.5):  # truncated
+    if inner > 0 and truncated_edges(track.box[None], (shape[0], shape[1]))[0, 2 if to_right else 0]:
         lateral = inner * (distance + camera.vehicle_length_m) / focal + camera.vehicle_width_m / 2
     else:
         side_px = min(camera.vehicle_length_m * max(inner, 0.0) / distance, 0.6 * width)

@@ -140,6 +140,7 @@ def calibration_error(probabilities: ArrayLike, labels: ArrayLike, *, bins: int 
         )
     _check_truth(truth, values, "probabilities")
     count = check_integer(bins, "bins", low=1, high=10**6)
+    values = values.astype(np.float64)
     chosen = np.minimum((values * count).astype(np.intp), count - 1)
     gaps = np.bincount(chosen, weights=truth.astype(np.float64) - values, minlength=count)
     return float(np.abs(gaps).sum() / len(values))

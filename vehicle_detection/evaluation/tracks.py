@@ -36,7 +36,8 @@ class TrackScores(Scores):
         Mean change of the four edge errors of a matched box from one frame to the next, in pixels.
     hota, deta, assa, loca
         Higher order tracking accuracy, with its parts for detection, association and localization: means
-        over the IoU thresholds 0.05, 0.1, ..., 0.95, whatever `iou` is. NaN without any box.
+        over the IoU thresholds 0.05, 0.1, ..., 0.95; `iou` only decides which boxes are ignored. NaN without
+        any box.
     mota
         ``1 - (fn + fp + id_switches) / (tp + fn)``; at most 1, and below 0 if errors outnumber vehicles.
     idf1

@@ -277,7 +277,9 @@ class _Finder:
         near = motion.in_path & (motion.distance_std <= _MAX_STD * motion.distance)
         for start, stop in self._runs(near, _MIN_FOLLOWING):
             rows = _rows(near, start, stop)
-            yield self._event("headway", int(rows[np.argmin(motion.distance[rows])]), start, stop)
+            stated = motion.track.columns["distance_m"]
+            distance = np.where(np.isfinite(stated), stated, motion.distance)
+            yield self._event("headway", int(rows[np.argmin(distance[rows])]), start, stop)
 
     def closest(self) -> Iterable[Event]:
         """Yield the closest approach, if it was near."""

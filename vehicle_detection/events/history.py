@@ -38,6 +38,7 @@ class TrackHistory:
     id: int
     frames: NDArray[np.int64]  # (N,) indices of the frames that show the track, ascending
     columns: dict[str, Floats]  # (N,) for each name of COLUMNS
+    times: Floats | None = None  # (N,) seconds; None: frames are evenly spaced
 
     @property
     def first(self) -> int:
@@ -79,6 +80,7 @@ class TrackHistory:
             return None
         # A median over a third of a second, so that a single outlier does not count.
         width = min(max(round(1 / 3 * fps), 1), known.size)
+        width -= 1 - width % 2  # so that the median is the distance of one frame
         medians = np.median(np.lib.stride_tricks.sliding_window_view(distances[known], width), axis=1)
         start = int(np.argmin(medians))
         window = known[start : start + width]
@@ -106,6 +108,7 @@ class TrackLog:
     def __init__(self) -> None:
         self.first_time: float | None = None  # of the first frame in the source, in seconds
         self.counts = array("q")  # shown tracks in each frame
+        self._times = array("d")  # of each frame; NaN if unknown
         # Frames and columns of each track.
         self._tracks: defaultdict[int, list[array[Any]]] = defaultdict(_empty_columns)
 
@@ -147,6 +150,8 @@ class TrackLog:
         # Of frames that a live source dropped, a written video shows the last one before again.
         self.counts.extend([self.counts[-1] if expected else 0] * (index - expected))
         self.counts.append(len(rows))
+        self._times.extend([math.nan] * (index - expected))
+        self._times.append(math.nan if time is None else float(time))
         for track_id, values in rows:
             for column, value in zip(self._tracks[track_id], (index, *values)):
                 column.append(value)
@@ -173,15 +178,30 @@ class TrackLog:
         """
         check_type(speed, "speed", OwnSpeed, "pass what read_own_speed returns")
         check_number(fps, "fps", above=0, high=1e6)
-        return speed.at((self.first_time or 0.0) + np.arange(len(self.counts)) / fps)
+        times = self._frame_times()
+        if times is None:
+            times = (self.first_time or 0.0) + np.arange(len(self.counts)) / fps
+        return speed.at(times)
 
     def histories(self) -> list[TrackHistory]:
         """Return the tracks in the order of their first frames."""
-        histories = [
-            TrackHistory(track_id, np.array(frames), dict(zip(COLUMNS, map(np.array, columns))))
-            for track_id, (frames, *columns) in self._tracks.items()
-        ]
+        times = self._frame_times()
+        histories = []
+        for track_id, (numbers, *columns) in self._tracks.items():
+            frames, values = np.array(numbers), dict(zip(COLUMNS, map(np.array, columns)))
+            histories.append(TrackHistory(track_id, frames, values, None if times is None else times[frames]))
         return sorted(histories, key=lambda track: (track.first, track.id))
+
+    def _frame_times(self) -> Floats | None:
+        """Return the time of each frame, interpolated where it is unknown.
+
+        None if most times are unknown, or if they do not ascend.
+        """
+        times = np.array(self._times)
+        known = np.flatnonzero(np.isfinite(times))
+        if 2 * known.size <= times.size or (np.diff(times[known]) <= 0).any() or known[0] > 0:
+            return None
+        return np.asarray(np.interp(np.arange(times.size), known, times[known]))
 
 
 def _empty_columns() -> list[array[Any]]:

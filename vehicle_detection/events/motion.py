@@ -66,7 +66,7 @@ class Motion:
 
 def estimate_motion(track: TrackHistory, *, fps: float, shape: tuple[int, int], camera: Camera) -> Motion:
     """Estimate the motion of a track in frames of this shape."""
-    boxes, seconds = track.boxes, track.frames / fps
+    boxes, seconds = track.boxes, track.frames / fps if track.times is None else track.times
     truncated = truncated_edges(boxes, shape)
     boxes = camera.rectify_boxes(boxes, shape)
     width, height = (np.maximum(boxes[:, axis + 2] - boxes[:, axis], 1.0) for axis in (0, 1))

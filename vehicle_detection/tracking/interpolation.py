@@ -24,6 +24,8 @@ _INTERPOLATED = (
     "speed_std_mps",
 )
 
+_MIN_DISTANCE = 1.0  # of a vehicle that moves on after its last detection (m)
+
 
 def interpolate_tracks(
     before: Sequence[Track], after: Sequence[Track], dt: float, dt_after: float, shape: tuple[int, ...]
@@ -89,9 +91,16 @@ def _mean(first: Track, second: Track, dt: float, dt_after: float) -> Track:
 
 
 def _move(track: Track, dt: float, shape: tuple[int, ...]) -> Track:
-    """Move a track by `dt` seconds at its velocity."""
-    box = clip_boxes((track.box + dt * np.tile(track.velocity, 2))[None], shape)[0]
-    return replace(track, box=_read_only(box), age=track.age + dt)
+    """Move a track by `dt` seconds at its velocity and, where it is known, its speed."""
+    box = track.box + dt * np.tile(track.velocity, 2)
+    values: dict[str, Any] = {"age": track.age + dt}
+    if track.distance_m is not None and track.speed_mps is not None:
+        distance = max(track.distance_m + dt * track.speed_mps, _MIN_DISTANCE)
+        center, half = (box[:2] + box[2:]) / 2, (box[2:] - box[:2]) / 2 * track.distance_m / distance
+        box = np.concatenate((center - half, center + half))
+        std = math.hypot(track.distance_std_m or 0.0, dt * (track.speed_std_mps or 0.0))
+        values |= {"distance_m": distance, "distance_std_m": std}
+    return replace(track, box=_read_only(clip_boxes(box[None], shape)[0]), **values)
 
 
 def _read_only(box: Floats) -> Floats:

@@ -1,20 +1,15 @@
-"""Kalman filters over many tracks at once: boxes in the image, and distances on the road.
+"""Kalman filter of the boxes of many tracks at once.
 
 The state of a box is ``[cx, cy, w, h]`` and its velocity in pixels per second. It is predicted at constant
 velocity and corrected by the measured edges (Bar-Shalom, Li and Kirubarajan, *Estimation with Applications
 to Tracking and Navigation*, chapter 6), because the frame's border may truncate one edge alone.
-
-The state of a distance is ``[distance in m, speed in m/s, log(width / camera.vehicle_width_m), length error
-in m]``. Width and length are part of the state: a truck seems near by its width until its bottom edge has
-corrected it, and from then on its growth in the image gives the speed. The length matters where the side of
-a vehicle is visible, and its error is relative to ``camera.vehicle_length_m``.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -284,153 +279,3 @@ def exit_times(mean: Floats, frame: FrameShape) -> Floats:
     moves_out = at_border[:, [0, 2]] & (outward > 0)
     seconds = np.where(moves_out, inside / np.where(moves_out, outward, 1.0), np.inf)
     return np.asarray(seconds.min(axis=1))
-
-
-_INITIAL_DISTANCE, _INITIAL_DISTANCE_STD, _INITIAL_RANGE_SPEED_STD = 30.0, 1e3, 40.0
-_MIN_DISTANCE, _MAX_DISTANCE = 1.0, 500.0
-_MIN_LOG_WIDTH, _MAX_LOG_WIDTH = -0.7, 0.9
-_MIN_LENGTH_ERROR, _MAX_LENGTH_ERROR = -3.0, 8.0
-# Process noise of the speed (m/s per square root of a second).
-_ACCELERATION = 1.5
-# Times (s) in which the width's prior variance is added to its process noise, and over which the pitch of the
-# camera is correlated.
-_WIDTH_TIME, _PITCH_TIME = 20.0, 2.0
-# Mean innovation of an edge above which a track's distance is uncertain, and its relative error per second.
-_UNSETTLED, _UNSETTLED_STD = 1.5, 0.5
-# Maximum relative error of a reported distance, age of its last measurement (s), and error of a speed (m/s).
-_MAX_RANGE_STD, _MAX_RANGE_AGE, _MAX_RANGE_SPEED_STD = 0.4, 0.5, 6.0
-# Fraction of a box that nearer vehicles cover, from which on it is no measurement, and relative error of the
-# width of a box that they cover less.
-_MAX_COVERED, _COVERED_STD = 0.3, 0.15
-# Vehicles in another lane that approach fast are mostly oncoming, and a barrier may hide their wheels:
-# minimum speed (m/s), length (m) of the side that their boxes lack, and relative error of the bottom edge.
-_ONCOMING_SPEED, _ONCOMING_CUT, _ONCOMING_BOTTOM_STD = 15.0, 1.0, 0.3
-# Aspect ratio above which a detector's boxes are narrower than the vehicle with its side.
-_MAX_ASPECT = 1.5
-
-
-def initiate_states(mean: Floats, cov: Floats, camera: Camera) -> KalmanStates:
-    """Return the states of new tracks, whose distance is unknown, from those of their boxes."""
-    count, width_std = len(mean), camera.vehicle_width_std_m / camera.vehicle_width_m
-    length_std = camera.vehicle_length_std_m
-    range_std = np.array([_INITIAL_DISTANCE_STD, _INITIAL_RANGE_SPEED_STD, width_std, length_std])
-    range_mean = np.tile([_INITIAL_DISTANCE, 0.0, 0.0, 0.0], (count, 1))
-    range_cov = np.tile(np.diag(np.square(range_std)), (count, 1, 1))
-    return KalmanStates(mean, cov, np.zeros((count, 4)), range_mean, range_cov)
-
-
-def predict_distances(states: KalmanStates, dt: float, camera: Camera) -> KalmanStates:
-    """Predict distances by `dt` seconds."""
-    transition = np.eye(4)
-    transition[0, 1] = dt
-    mean = states.range_mean @ transition.T
-    mean[:, 0] = np.clip(mean[:, 0], _MIN_DISTANCE, _MAX_DISTANCE)
-    noise = np.zeros((4, 4))
-    noise[:2, :2] = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]) * _ACCELERATION**2
-    noise[2, 2] = (camera.vehicle_width_std_m / camera.vehicle_width_m) ** 2 * dt / _WIDTH_TIME
-    return states._replace(range_mean=mean, range_cov=transition @ states.range_cov @ transition.T + noise)
-
-
-def update_distances(
-    states: KalmanStates, measured: Measurements, camera: Camera, dt: float, correlation_time: float
-) -> KalmanStates:
-    """Correct distances by the bottom edge and the width of boxes (extended Kalman filter).
-
-    The errors of a vehicle's boxes are correlated over `correlation_time` seconds.
-    """
-    mean, cov = states.range_mean.copy(), states.range_cov.copy()
-    # While the edges of a box have not settled, or are partly covered, its distance is uncertain.
-    unsettled = (np.abs(states.innovation_mean) > _UNSETTLED).any(axis=1)
-    unsettled |= measured.covered > 0
-    cov[:, 0, 0] += unsettled * np.square(_UNSETTLED_STD * mean[:, 0]) * dt
-    # A merged box shows neither the bottom nor the width of its vehicles.
-    visible = ~(measured.truncated | measured.merged[:, None])
-    visible &= (measured.covered < _MAX_COVERED)[:, None]
-    bottom_visible, width_visible = visible[:, 3], visible[:, 0] & visible[:, 2]
-    boxes, lateral_px = measured.road_boxes, measured.lateral_px
-    sides = np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0)
-    edge_std = np.hypot(camera.bottom_std_px * camera.pixel_scale, camera.box_std * sides)
-    horizon_std = camera.total_horizon_std_px
-    box_frames, pitch_frames = max(1.0, correlation_time / dt), max(1.0, _PITCH_TIME / dt)
-    below_horizon = boxes[:, 3] - camera.horizon_px
-
-    bottom_scale = camera.focal_px * camera.height_m
-    oncoming = (mean[:, 1] < -_ONCOMING_SPEED) & (lateral_px > 0)
-    width_scale = camera.width_times_distance(lateral_px) - oncoming * _ONCOMING_CUT * lateral_px
-    unknown = cov[:, 0, 0] > _INITIAL_DISTANCE_STD**2 / 2
-    if unknown.any():
-        # Linearize at the first measurement itself.
-        below = bottom_visible & (below_horizon > 2 * np.hypot(edge_std[:, 1], horizon_std))
-        by_bottom = bottom_scale / np.where(below, below_horizon, 1.0)
-        # The measurement with the smaller relative error.
-        bottom_error = np.hypot(edge_std[:, 1], horizon_std) / np.where(below, below_horizon, 1.0)
-        width_error = np.sqrt(cov[:, 2, 2] + np.square(lateral_px / width_scale) * cov[:, 3, 3])
-        is_better = below & ((bottom_error < width_error) | ~width_visible)
-        first = np.where(is_better, by_bottom, width_scale / sides[:, 0])
-        known = unknown & (below | width_visible)
-        mean[known, 0] = np.clip(first[known], _MIN_DISTANCE, _MAX_DISTANCE)
-        bottom_visible &= is_better | ~unknown
-
-    # Pixels below the horizon: bottom_scale / distance.
-    expected = bottom_scale / mean[:, 0]
-    bottom_std = np.hypot(camera.height_std_m / camera.height_m, oncoming * _ONCOMING_BOTTOM_STD)
-    systematic = horizon_std**2 + np.square(expected * bottom_std)
-    variance = np.square(edge_std[:, 1]) * box_frames + systematic * pitch_frames
-    jacobian = np.zeros_like(mean)
-    jacobian[:, 0] = -expected / mean[:, 0]
-    variance = np.where(bottom_visible, variance, np.inf)
-    mean, cov = _scalar_update(mean, cov, jacobian, below_horizon - expected, variance)
-    np.clip(mean[:, 0], _MIN_DISTANCE, _MAX_DISTANCE, out=mean[:, 0])
-
-    # Logarithm of the width in pixels: log(width_scale) + log(relative width) - log(distance), with the error
-    # of the length to first order.
-    side = lateral_px / width_scale
-    innovation = np.log(sides[:, 0] / width_scale) - mean[:, 2] - side * mean[:, 3] + np.log(mean[:, 0])
-    # Detectors cut the long sides of vehicles short, where the whole box would be wider than usual.
-    aspect = width_scale / (camera.focal_px * camera.vehicle_height_m)
-    cut_short = np.log(np.maximum(aspect / _MAX_ASPECT, 1.0))
-    covered_std = np.where(measured.covered > 0, _COVERED_STD, 0.0)
-    side_std = side * camera.vehicle_length_std_m
-    systematic = np.square(cut_short) + np.square(covered_std) + np.square(side_std)
-    variance = np.square(edge_std[:, 0] / sides[:, 0]) * 2 * box_frames + systematic * pitch_frames
-    jacobian[:, 0], jacobian[:, 2], jacobian[:, 3] = -1 / mean[:, 0], 1.0, side
-    variance = np.where(width_visible, variance, np.inf)
-    mean, cov = _scalar_update(mean, cov, jacobian, innovation, variance)
-    np.clip(mean[:, 0], _MIN_DISTANCE, _MAX_DISTANCE, out=mean[:, 0])
-    mean[:, 2] = np.clip(mean[:, 2], _MIN_LOG_WIDTH, _MAX_LOG_WIDTH)
-    mean[:, 3] = np.clip(mean[:, 3], _MIN_LENGTH_ERROR, _MAX_LENGTH_ERROR)
-    return states._replace(range_mean=mean, range_cov=cov)
-
-
-def _scalar_update(
-    mean: Floats, cov: Floats, jacobian: Floats, innovation: Floats, variance: Floats
-) -> tuple[Floats, Floats]:
-    """Correct each state by one scalar measurement; an infinite variance changes nothing."""
-    cross = (cov @ jacobian[:, :, None])[:, :, 0]
-    expected = (jacobian * cross).sum(axis=1)
-    penalty = np.maximum(np.square(innovation) / (expected + variance) / _OUTLIER**2, 1.0)
-    gain = cross / (expected + variance * penalty)[:, None]
-    return mean + gain * innovation[:, None], cov - gain[:, :, None] * cross[:, None, :]
-
-
-def estimate_distances(
-    states: KalmanStates, time_since_update: Floats, camera: Camera
-) -> list[dict[str, Any]]:
-    """Distance and speed of each track with standard errors, as fields of `Track`; None where unknown."""
-    distance, speed = states.range_mean[:, 0], states.range_mean[:, 1]
-    distance_std, speed_std = np.sqrt(np.maximum(states.range_cov[:, [0, 1], [0, 1]], 0)).T
-    known = (distance_std <= _MAX_RANGE_STD * distance) & (time_since_update <= _MAX_RANGE_AGE)
-    speed_known = known & (speed_std <= _MAX_RANGE_SPEED_STD)
-    # The focal length scales all measurements alike, so no filter averages its error out.
-    distance_std = np.hypot(distance_std, distance * camera.focal_std)
-    speed_std = np.hypot(speed_std, speed * camera.focal_std)
-    columns = {
-        "distance_m": (distance, known),
-        "distance_std_m": (distance_std, known),
-        "speed_mps": (speed, speed_known),
-        "speed_std_mps": (speed_std, speed_known),
-    }
-    return [
-        {name: float(values[row]) if mask[row] else None for name, (values, mask) in columns.items()}
-        for row in range(len(distance))
-    ]

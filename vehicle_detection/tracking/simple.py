@@ -6,7 +6,6 @@ average of its displacements.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -50,8 +49,9 @@ class HistorySmoother:
         before, velocity = states.mean[:, :4], states.mean[:, 4:]
         rows = zip(tracks, before, centers_and_sizes(measured.boxes))
         after = np.stack([self._smooth(track, old, new, dt) for track, old, new in rows])
-        decay = math.exp(-dt / self._params.score_time_constant)
-        velocity = decay * velocity + (1 - decay) * (after - before) / dt
+        seconds = np.array([[dt + track.last_gap] for track in tracks])  # since the boxes `before`
+        decay = np.exp(-seconds / self._params.score_time_constant)
+        velocity = decay * velocity + (1 - decay) * (after - before) / seconds
         return states._replace(mean=np.concatenate((after, velocity), axis=1))
 
     def _smooth(self, track: TrackState, before: Floats, measured: Floats, dt: float) -> Floats:

@@ -28,17 +28,19 @@ from vehicle_detection.tracking.association import (
     merged_detections,
     nearer_cover,
 )
+from vehicle_detection.tracking.distance_filter import (
+    estimate_distances,
+    initiate_states,
+    predict_distances,
+    update_distances,
+)
 from vehicle_detection.tracking.horizon_filter import HorizonFilter
 from vehicle_detection.tracking.kalman_filter import (
     OUTWARD,
     KalmanStates,
     Measurements,
     coasted_distance,
-    estimate_distances,
     exit_times,
-    initiate_states,
-    predict_distances,
-    update_distances,
 )
 from vehicle_detection.tracking.simple import make_smoother
 from vehicle_detection.tracking.track import TIME_TOLERANCE, Track, TrackState
