@@ -222,6 +222,53 @@ def test_cspace_selects_the_features_of_the_earlier_quizzes():
         lesson.extract_features(PATCHES[:2], cspace="LUV", color_space="LUV")
 
 
+@pytest.fixture
+def restored_defaults():
+    yield
+    lesson.set_lesson_defaults(transform_sqrt=False, formula="old")
+
+
+@pytest.mark.usefixtures("restored_defaults")
+def test_the_defaults_of_the_lesson_are_set_for_all_functions(models):
+    case, image, channel = models["hog", "uint8"], FRAMES["uint8"], PATCHES[0][..., 1]
+    positional, keywords = band_arguments(case)
+    band, keywords = (
+        (image, 60, 200, 0.7, *case.model, *positional),
+        {**keywords, "divide_by": 1, "cells_per_step": 1},
+    )
+
+    def results(**options):
+        return [
+            *lesson.extract_features(PATCHES[:2], "YCrCb", **options),
+            lesson.single_img_features(PATCHES[0], "YCrCb", **options),
+            lesson.get_hog_features(channel, 9, 8, 2, **options),
+            lesson.get_hog_features(channel, 9, 8, 2, vis=True, **options)[1],
+            lesson.search_windows(image, PAIRS, *case.model, **case.options, **options),
+            lesson.find_car_windows(*band, **keywords, **options),
+            lesson.find_cars(*band, **keywords, **options),
+        ]
+
+    def assert_equal(found, expected):
+        for one, other in zip(found, expected, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+    plain, root = results(transform_sqrt=False), results(transform_sqrt=True)
+    assert plain[6] != root[6]
+    assert_equal(results(), plain)
+    lesson.set_lesson_defaults(transform_sqrt=True)
+    assert_equal(results(), root)
+    assert_equal(results(transform_sqrt=False), plain)
+    assert lesson.slide_window(image) == lesson.slide_window(image, formula="old")
+    assert lesson.set_lesson_defaults(formula="new") is None
+    assert_equal(results(), root)
+    assert lesson.slide_window(image) == lesson.slide_window(image, formula="new")
+    with pytest.raises(InvalidInputError, match="formula must be one of 'old', 'new'; got 'newest'"):
+        lesson.set_lesson_defaults(transform_sqrt=False, formula="newest")
+    with pytest.raises(InvalidInputError, match="transform_sqrt must be True or False"):
+        lesson.set_lesson_defaults(transform_sqrt="yes")
+    assert_equal(results(), root)
+
+
 @given(
     st.integers(1, 90),
     st.integers(0, 50),
@@ -537,7 +584,7 @@ def test_the_signature_is_the_lessons(name):
 def test_a_star_import_brings_the_lesson_functions():
     names = {}
     exec("from vehicle_detection.course import *", names)
-    functions = set(SIGNATURES) | {"find_car_windows", "HeatmapDetector"}
+    functions = set(SIGNATURES) | {"find_car_windows", "HeatmapDetector", "set_lesson_defaults"}
     modules = {"np": "numpy", "cv2": "cv2", "mpimg": "matplotlib.image", "hog": "skimage.feature._hog"}
     assert functions | set(modules) == set(names) - {"__builtins__"}
     for name, module in modules.items():

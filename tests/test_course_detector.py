@@ -70,6 +70,21 @@ def test_it_takes_the_steps_of_the_lesson(estimators, patches):
     assert hits
 
 
+def test_it_keeps_the_defaults_of_its_construction(estimators):
+    frame = render_scene(shape=(360, 640), random_state=3).image
+    try:
+        lesson.set_lesson_defaults(transform_sqrt=True)
+        detector = HeatmapDetector(*estimators, threshold=1, **FEATURES)
+    finally:
+        lesson.set_lesson_defaults(transform_sqrt=False)
+    told, plain = (
+        HeatmapDetector(*estimators, threshold=1, **FEATURES, transform_sqrt=value) for value in (True, False)
+    )
+    found, expected, other = (each.process(frame).windows.boxes for each in (detector, told, plain))
+    np.testing.assert_array_equal(found, expected)
+    assert found.tolist() != other.tolist() or isinstance(estimators[0], GaussianNB)
+
+
 def test_calling_it_draws_in_the_style_of_the_course():
     scene = render_scene(shape=(540, 960), random_state=3)
     frame = cv2.resize(scene.image, (1280, 720))

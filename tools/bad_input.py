@@ -36,6 +36,7 @@ MAX_SECONDS = 60
 """Time limit of one call, which may have to compile kernels."""
 
 NOT_CALLED = {
+    "course.set_lesson_defaults": "changes later calls; tests/test_course.py",
     "open_dask": "starts a cluster",
     "fetch_patches": "downloads; its arguments are tested in tests/datasets/test_archives.py",
     "train_mixture": "trains for minutes; tests/mixture_training/test_train.py",

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
+from vehicle_detection.course.defaults import set_lesson_defaults
 from vehicle_detection.course.detector import HeatmapDetector
 from vehicle_detection.course.features import bin_spatial, color_hist, convert_color, get_hog_features
 from vehicle_detection.course.heat import add_heat, apply_threshold, draw_boxes, draw_labeled_bboxes
@@ -51,6 +52,7 @@ __all__ = [
     "mpimg",
     "np",
     "search_windows",
+    "set_lesson_defaults",
     "single_img_features",
     "slide_window",
 ]

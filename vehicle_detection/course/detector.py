@@ -17,6 +17,7 @@ from vehicle_detection._common import (
     describe,
 )
 from vehicle_detection.classifier import VehicleClassifier
+from vehicle_detection.course.defaults import or_default
 from vehicle_detection.course.heat import draw_boxes
 from vehicle_detection.course.windows import find_car_windows
 from vehicle_detection.detector import VehicleDetector
@@ -56,7 +57,7 @@ class HeatmapDetector(VehicleDetector):
     **options
         For a classifier with `scaler`, the features that it was trained on: arguments of `find_car_windows`
         such as ``orient`` (default 9), ``pix_per_cell`` (8), ``cell_per_block`` (2), ``spatial_size``
-        ((32, 32)), ``hist_bins`` (32), ``color_space`` and ``divide_by``.
+        ((32, 32)), ``hist_bins`` (32), ``color_space``, ``transform_sqrt`` and ``divide_by``.
 
     Raises
     ------
@@ -186,6 +187,8 @@ class _WindowSearch:
         defaults = {"orient": 9, "pix_per_cell": 8, "cell_per_block": 2, "spatial_size": (32, 32)}
         self._arguments = {"svc": clf, "X_scaler": scaler, "cells_per_step": cells_per_step}
         self._arguments |= defaults | {"hist_bins": 32} | options
+        # Later changes of the default must not change a detector.
+        self._arguments["transform_sqrt"] = or_default(options.get("transform_sqrt"), "transform_sqrt")
         # An image of one window checks the options and the estimators before the first frame.
         find_car_windows(np.zeros((PATCH_SIZE, PATCH_SIZE, 3), np.uint8), None, None, 1, **self._arguments)
 

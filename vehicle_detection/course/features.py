@@ -20,6 +20,7 @@ from vehicle_detection._kernels import degree_bounds, orientation_cotangents, sq
 from vehicle_detection._kernels import histogram as _histogram_kernels
 from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.course.checks import Image, check_lesson_image, check_range, check_size
+from vehicle_detection.course.defaults import or_default
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import COLOR_SPACES, SPATIAL_ORDERS
 
@@ -73,7 +74,7 @@ def get_hog_features(
     vis: bool = False,
     feature_vec: bool = True,
     *,
-    transform_sqrt: bool = False,
+    transform_sqrt: bool | None = None,
     visualise: bool = False,
     visualize: bool = False,
 ) -> Any:
@@ -92,8 +93,9 @@ def get_hog_features(
     feature_vec
         Return the features as a vector; False gives the array of blocks.
     transform_sqrt
-        Take the square root of the values first. An early quiz of the course does, its later code does not: a
-        model trained one way does not work the other way. Float channels must not be negative for it.
+        Take the square root of the values first. The course has published both: a model trained one way does
+        not work the other way. None is the default of `set_lesson_defaults`, initially False. Float channels
+        must not be negative for True.
 
     Returns
     -------
@@ -122,9 +124,10 @@ def get_hog_features(
             f"img must be one (H, W) channel of numbers, got {describe(img)}; pick one with image[..., 0]"
         )
     check_flags(vis=vis, visualise=visualise, visualize=visualize, feature_vec=feature_vec)
+    transform_sqrt = or_default(transform_sqrt, "transform_sqrt")
     check_flags(transform_sqrt=transform_sqrt)
     channel = img if img.dtype in (np.uint8, np.float32) else img.astype(np.float64)
-    blocks = hog_blocks(channel[..., None], orient, pix_per_cell, cell_per_block, transform_sqrt)[0]
+    blocks = hog_blocks(channel[..., None], orient, pix_per_cell, cell_per_block, bool(transform_sqrt))[0]
     blocks = np.ascontiguousarray(blocks, np.float32 if channel.dtype == np.float32 else np.float64)
     features = blocks.ravel() if feature_vec else blocks
     if not (vis or visualise or visualize):

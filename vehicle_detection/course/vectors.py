@@ -21,6 +21,7 @@ from vehicle_detection._common import (
     describe,
 )
 from vehicle_detection.course.checks import Image, check_lesson_image, check_range, check_size
+from vehicle_detection.course.defaults import or_default
 from vehicle_detection.course.features import (
     Size,
     SpatialOrder,
@@ -88,7 +89,7 @@ def single_img_features(
     vis: bool = False,
     *,
     hist_range: tuple[float, float] | None = (0, 256),
-    transform_sqrt: bool = False,
+    transform_sqrt: bool | None = None,
     spatial_order: SpatialOrder = "interleaved",
 ) -> Any:
     """Feature vector of one image; the options are those of `extract_features`.
@@ -143,7 +144,7 @@ def extract_features(
     hog_feat: bool = True,
     *,
     hist_range: tuple[float, float] | None = (0, 256),
-    transform_sqrt: bool = False,
+    transform_sqrt: bool | None = None,
     spatial_order: SpatialOrder = "interleaved",
     imread: Callable[[str], Image] | None = None,
 ) -> list[NDArray[Any]]:
@@ -233,10 +234,11 @@ class FeatureOptions:
     hist_feat: bool
     hog_feat: bool
     hist_range: tuple[float, float] | None
-    transform_sqrt: bool
+    transform_sqrt: bool  # None: the default of `set_lesson_defaults`
     spatial_order: SpatialOrder
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "transform_sqrt", or_default(self.transform_sqrt, "transform_sqrt"))
         for name in ("spatial_feat", "hist_feat", "hog_feat", "transform_sqrt"):
             check_flags(**{name: getattr(self, name)})
             object.__setattr__(self, name, bool(getattr(self, name)))

@@ -21,6 +21,7 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.course.checks import Image, box_rows, check_lesson_image, corner_array
+from vehicle_detection.course.defaults import FORMULAS, Formula, or_default
 from vehicle_detection.course.features import (
     Size,
     SpatialOrder,
@@ -38,10 +39,8 @@ from vehicle_detection.search import BandSearch
 from vehicle_detection.sklearn_models import fold_estimators, has_unit_range
 
 Box = tuple[tuple[int, int], tuple[int, int]]
-Formula = Literal["old", "new"]
 ResizeOrder = Literal["after conversion", "before conversion"]
 
-_FORMULAS = ("old", "new")
 # Color spaces whose three channels have values 0-1 in a float image and up to 255 in a uint8 image.
 _UNIT_SPACES = ("RGB", "YUV", "YCrCb")
 # Number of windows whose features are in memory at a time.
@@ -55,7 +54,7 @@ def slide_window(
     xy_window: Sequence[int] = (64, 64),
     xy_overlap: Sequence[float] = (0.5, 0.5),
     *,
-    formula: Formula = "old",
+    formula: Formula | None = None,
 ) -> list[Box]:
     """List the windows of one size over a region of an image, row by row.
 
@@ -72,7 +71,8 @@ def slide_window(
     formula
         Number of windows along an axis; the course has published both. ``"old"``: ``int(span / step) - 1``;
         with overlaps above 0.5 the last windows extend beyond the region, and below 0.5 some that fit are
-        left out. ``"new"``: ``int((span - int(window * overlap)) / step)``, the windows that fit.
+        left out. ``"new"``: ``int((span - int(window * overlap)) / step)``, the windows that fit. None is the
+        default of `set_lesson_defaults`, initially ``"old"``.
 
     Returns
     -------
@@ -93,7 +93,8 @@ def slide_window(
     """
     if not isinstance(img, np.ndarray) or img.ndim < 2:
         raise InvalidInputError(f"img must be an image array; got {describe(img)}")
-    check_choice(formula, "formula", _FORMULAS)
+    formula = or_default(formula, "formula")
+    check_choice(formula, "formula", FORMULAS)
     for name, pair in (("xy_window", xy_window), ("xy_overlap", xy_overlap)):
         if check_array(pair, name).shape != (2,):
             raise InvalidInputError(f"{name} must be a pair of numbers; got {describe(pair)}")
@@ -149,7 +150,7 @@ def search_windows(
     hist_feat: bool = True,
     hog_feat: bool = True,
     *,
-    transform_sqrt: bool = False,
+    transform_sqrt: bool | None = None,
     spatial_order: SpatialOrder = "interleaved",
 ) -> list[Any]:
     """Classify each window of an image, resized to 64x64 pixels.
@@ -283,7 +284,7 @@ def find_car_windows(
     hist_feat: bool = True,
     hog_feat: bool = True,
     hist_range: tuple[float, float] | None = (0, 256),
-    transform_sqrt: bool = False,
+    transform_sqrt: bool | None = None,
     spatial_order: SpatialOrder = "interleaved",
     cells_per_step: int = 2,
     divide_by: float = 255,
@@ -323,7 +324,8 @@ def find_car_windows(
     formula
         Number of steps along an axis; the course has published both. ``"old"``:
         ``(blocks - blocks per window) // cells_per_step``, which leaves out the last position; ``"new"`` adds
-        one.
+        one. `set_lesson_defaults` does not change this default: the two versions of `slide_window` are
+        independent of these.
 
     Returns
     -------
@@ -361,7 +363,7 @@ def find_car_windows(
     check_number(scale, "scale", above=0, high=1e6)
     check_integer(cells_per_step, "cells_per_step", low=1)
     check_choice(resize, "resize", ("after conversion", "before conversion"))
-    check_choice(formula, "formula", _FORMULAS)
+    check_choice(formula, "formula", FORMULAS)
     image = check_lesson_image(img)
     top, bottom = _check_rows(ystart, ystop, image.shape[0])
     image = _scale_values(image[top:bottom], check_number(divide_by, "divide_by", above=0))
