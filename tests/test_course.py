@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import label
+from sklearn.dummy import DummyClassifier
 from sklearn.linear_model import LogisticRegression, SGDClassifier
 from sklearn.model_selection import GridSearchCV
 from sklearn.naive_bayes import GaussianNB
@@ -487,6 +488,69 @@ def test_a_mismatch_of_the_range_of_values_warns(models):
         lesson.find_cars(
             FRAMES["uint8"], 60, 200, 1, *models["all", "0-1"].model, 9, 8, 2, (16, 16), 16, divide_by=1
         )
+
+
+UNIT_SPACES = ["RGB", "YUV", "YCrCb", "HSV", "HLS"]
+
+
+@pytest.mark.parametrize("spatial_feat", [False, True])
+@pytest.mark.parametrize("color_space", UNIT_SPACES)
+def test_histograms_of_another_range_warn(color_space, spatial_feat):
+    """With ``hist_range=(0, 256)``, a 0-1 image fills the first bins only."""
+    options = {"color_space": color_space, "spatial_size": (8, 8), "spatial_feat": spatial_feat}
+    for images, hist_range in (
+        (PATCHES / np.float32(255), None),  # of the HOG sub-sampling quiz
+        (PATCHES, (0, 256)),
+    ):
+        model = trained(np.array(lesson.extract_features(images, **options, hist_range=hist_range)))
+        with pytest.warns(UserWarning, match="scaler was fitted on") as caught:
+            lesson.search_windows(FRAMES["0-1"], PAIRS, *model, **options)
+        message = str(caught[0].message)
+        assert "divide_by=1" in message
+        assert 'needs hist_range=None and spatial_order="channels"' in message
+        many_bins = "histograms with values in many bins, but all values of a 0-1 image are in the first bin"
+        assert (many_bins in message) or (spatial_feat and hist_range is not None)
+
+
+@pytest.mark.parametrize("hist_bins", [1, 2, 16, 256])
+@pytest.mark.parametrize("color_space", [*UNIT_SPACES, "LUV", "LAB"])
+@pytest.mark.parametrize("spatial_feat", [False, True])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_images_like_those_of_the_training_do_not_warn(color_space, spatial_feat, hist_bins, dtype):
+    """Warnings are errors in the tests."""
+    images = {"uint8": PATCHES, "0-1": PATCHES / np.float32(255), "0-255": PATCHES.astype(np.float32)}[dtype]
+    if dtype == "0-255" and color_space in ("LUV", "LAB", "HLS", "HSV"):
+        return  # OpenCV defines them for 0-1
+    options = {"color_space": color_space, "spatial_size": (8, 8), "spatial_feat": spatial_feat}
+    options |= {"hist_bins": hist_bins, "hog_feat": hist_bins == 1}
+    for hist_range in ((0, 256), (0, 1), None):
+        options["hist_range"] = hist_range
+        model = trained(np.array(lesson.extract_features(images, **options)), clf=DummyClassifier())
+        lesson.search_windows(FRAMES[dtype], PAIRS, *model, **options)
+
+
+def test_the_warning_names_the_line_of_the_caller(models):
+    case, image = models["all", "uint8"], FRAMES["0-1"]
+    band = (image, 60, 200, 1, *case.model, 9, 8, 2, (16, 16), 16)
+    for search in (
+        lambda: lesson.search_windows(image, PAIRS, *case.model, **case.options),
+        lambda: lesson.find_car_windows(*band),
+        lambda: lesson.find_cars(*band),
+        lambda: lesson.HeatmapDetector(*case.model, spatial_size=(16, 16), hist_bins=16)(FRAMES["uint8"]),
+    ):
+        with pytest.warns(UserWarning, match="fitted on values 0-255") as caught:
+            search()
+        assert {warning.filename for warning in caught} == {__file__}
+
+
+def test_old_estimators_take_the_fast_search(models, monkeypatch):
+    """``n_features_in_`` was added in scikit-learn 0.24."""
+    svc, scaler = copy.deepcopy(models["all", "uint8"].model)
+    del svc.n_features_in_, scaler.n_features_in_
+    monkeypatch.setattr(windows_module, "_predicts_car", None)
+    lesson.find_car_windows(FRAMES["uint8"], 60, 200, 1.5, svc, scaler, 9, 8, 2, (16, 16), 16, divide_by=1)
+    with pytest.raises(InvalidInputError, match="fitted on 6108 features, but these options give 8460"):
+        lesson.find_cars(FRAMES["uint8"], 60, 200, 1, svc, scaler, 9, 8, 2, (32, 32), 32, divide_by=1)
 
 
 @given(

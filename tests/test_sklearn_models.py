@@ -209,6 +209,21 @@ def test_a_model_of_images_with_values_0_to_1_is_rejected(patches, labels, color
             assert VehicleClassifier.from_pipeline(model, params).score(patches, labels) > 0.9
 
 
+@pytest.mark.parametrize("scaler", [StandardScaler(), RobustScaler(), MinMaxScaler(), MaxAbsScaler()])
+def test_estimators_of_old_versions_lack_the_number_of_features(patches, labels, scaler):
+    """``n_features_in_`` was added in scikit-learn 0.24."""
+    rows = extract_features(patches, SMALL)
+    scaler = scaler.fit(rows)
+    svc = LinearSVC(C=0.01, random_state=0).fit(scaler.transform(rows), labels)
+    expected = VehicleClassifier.from_pipeline((svc, scaler), SMALL).decision_function(patches)
+    for estimator in (scaler, svc):
+        del estimator.n_features_in_
+    found = VehicleClassifier.from_pipeline((svc, scaler), SMALL).decision_function(patches)
+    np.testing.assert_array_equal(found, expected)
+    with pytest.raises(InvalidInputError, match=f"its {type(scaler).__name__} was fitted on"):
+        VehicleClassifier.from_pipeline((svc, scaler), dataclasses.replace(SMALL, orient=5))
+
+
 @pytest.mark.parametrize("scaler", [StandardScaler(with_mean=False), RobustScaler(with_centering=False)])
 @pytest.mark.parametrize("color_space", ["RGB", "HSV", "LUV", "LAB"])
 def test_a_model_of_uint8_images_needs_no_centering(patches, labels, color_space, scaler):

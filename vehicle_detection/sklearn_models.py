@@ -15,7 +15,7 @@ from vehicle_detection.params import FeatureParams
 
 _SCALERS = ("StandardScaler", "RobustScaler", "MinMaxScaler", "MaxAbsScaler")
 # Channels whose values are 0-1 in float images. Those of LUV and LAB have other ranges.
-_UNIT_CHANNELS = dict.fromkeys(("RGB", "YUV", "YCrCb"), (0, 1, 2)) | {"HSV": (1, 2), "HLS": (1, 2)}
+UNIT_CHANNELS = dict.fromkeys(("RGB", "YUV", "YCrCb"), (0, 1, 2)) | {"HSV": (1, 2), "HLS": (1, 2)}
 # Greatest sum of mean and scale of a spatial bin with values 0-1. For the last channel of LUV and LAB: the
 # greatest mean in float images, where gray is 0, and the least sum in uint8 images, where gray is over 127.
 _MAX_UNIT, _MAX_FLOAT_MEAN, _GRAY = 2.5, 64.0, 128.0
@@ -117,6 +117,18 @@ def fold_estimators(steps: Sequence[Any], length: int) -> Template:
     return Template(mean, scale, *_weights(classifier, length))
 
 
+def n_features(estimator: Any) -> int | None:
+    """Return the number of features that a scaler or linear classifier was fitted on; None if unknown.
+
+    Estimators that scikit-learn before 0.24 has pickled lack ``n_features_in_``.
+    """
+    found = getattr(estimator, "n_features_in_", None)
+    if found is not None:
+        return int(found)
+    arrays: list[Any] = [getattr(estimator, name, None) for name in ("scale_", "mean_", "center_", "coef_")]
+    return next((int(array.shape[-1]) for array in arrays if np.ndim(array)), None)
+
+
 def _scaling(scaler: Any, length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Offset and factor of a fitted scaler, which computes ``(x - offset) / factor``."""
     name = type(scaler).__name__
@@ -126,9 +138,10 @@ def _scaling(scaler: Any, length: int) -> tuple[NDArray[np.float64], NDArray[np.
             "not scale each feature by itself. Train with one of these, or search with "
             "vehicle_detection.course, which accepts any scikit-learn estimator"
         )
-    if getattr(scaler, "n_features_in_", None) is None:
+    fitted = n_features(scaler)
+    if fitted is None:
         raise InvalidInputError(f"pipeline must be fitted; its {name} is not: call fit first")
-    _check_length(int(scaler.n_features_in_), length, name)
+    _check_length(fitted, length, name)
     offset, factor = np.zeros(length), np.ones(length)
     if getattr(scaler, "clip", False):
         raise InvalidInputError(f"pipeline must not clip; train with {name}(clip=False)")
@@ -218,8 +231,8 @@ def _has_float_bins(mean: Floats, scale: Floats, params: FeatureParams) -> bool:
     if not params.spatial_feat:
         return False
     means, scales = (params.spatial_planes(values[: params.spatial_length]) for values in (mean, scale))
-    if params.spatial_space in _UNIT_CHANNELS:
-        channels = _UNIT_CHANNELS[params.spatial_space]
+    if params.spatial_space in UNIT_CHANNELS:
+        channels = UNIT_CHANNELS[params.spatial_space]
         return bool((np.abs(means) + scales)[list(channels)].max() < _MAX_UNIT)
     is_centered = bool(means.any())
     return is_centered and bool(means[2].max() < _MAX_FLOAT_MEAN and (means + scales)[2].min() < _GRAY)
@@ -228,7 +241,7 @@ def _has_float_bins(mean: Floats, scale: Floats, params: FeatureParams) -> bool:
 def _has_first_bins_only(mean: Floats, scale: Floats, params: FeatureParams) -> bool:
     """Whether all values of the channels with the range 0-1 are in the first bin of a histogram of 0-256."""
     bins = slice(params.spatial_length, params.spatial_length + params.hist_length)
-    channels = list(_UNIT_CHANNELS.get(params.hist_space, ()))
+    channels = list(UNIT_CHANNELS.get(params.hist_space, ()))
     if not params.hist_feat or params.hist_bins == 1 or not channels:
         return False
     means, scales = (values[bins].reshape(3, -1)[channels, 1:] for values in (mean, scale))

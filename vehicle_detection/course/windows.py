@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import sys
 import warnings
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -36,13 +37,15 @@ from vehicle_detection.course.vectors import FeatureOptions, accept_cspace, are_
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import PATCH_SIZE, FeatureParams
 from vehicle_detection.search import BandSearch
-from vehicle_detection.sklearn_models import fold_estimators, has_unit_range
+from vehicle_detection.sklearn_models import UNIT_CHANNELS, fold_estimators, has_unit_range, n_features
 
 Box = tuple[tuple[int, int], tuple[int, int]]
 ResizeOrder = Literal["after conversion", "before conversion"]
 
-# Color spaces whose three channels have values 0-1 in a float image and up to 255 in a uint8 image.
-_UNIT_SPACES = ("RGB", "YUV", "YCrCb")
+# Greatest value of a channel of a 0-1 image, with a margin: V of YUV reaches 1.12.
+_MAX_UNIT = 1.2
+# Least share of the values outside of the first bins that shows histograms of another range than 0-1.
+_MIN_SPREAD = 0.1
 # Number of windows whose features are in memory at a time.
 _CHUNK = 512
 
@@ -575,23 +578,53 @@ def _check_estimators(clf: Any, scaler: Any, options: FeatureOptions, image: Ima
             f"window of {PATCH_SIZE} pixels"
         )
     first, name = (clf, "classifier") if scaler is None else (scaler, "scaler")
-    fitted = getattr(first, "n_features_in_", options.length)
-    if fitted != options.length:
+    fitted = n_features(first)
+    if fitted not in (None, options.length):
         raise InvalidInputError(
             f"the {name} was fitted on {fitted} features, but these options give {options.length}; pass the "
             "options that the classifier was trained with"
         )
     trained_on_unit = _was_fitted_on_unit_range(scaler, options)
     largest = 255.0 if image.dtype == np.uint8 else float(image.max())
-    # An almost black image may have either range.
-    if trained_on_unit is not None and largest > 0.1 and (largest <= 2) != trained_on_unit:
+    if largest <= 0.1:
+        return  # an almost black image may have either range
+    if trained_on_unit is not None and (largest <= 2) != trained_on_unit:
         trained, given = ("0-1", "0-255") if trained_on_unit else ("0-255", "0-1")
-        warnings.warn(
-            f"the scaler was fitted on values {trained}, but the image has values {given}, which makes "
-            "predictions useless. extract_features and mpimg.imread read a PNG as 0-1 and other files as "
-            "0-255; find_cars divides by 255 unless divide_by=1 is passed.",
-            stacklevel=4,
+        problem = f"the scaler was fitted on values {trained}, but the image has values {given}"
+    elif largest <= 2 and _has_spread_histograms(scaler, options):
+        problem = (
+            "the scaler was fitted on histograms with values in many bins, but all values of a 0-1 image are "
+            f"in the first bin of hist_range={options.hist_range}"
         )
+    else:
+        return
+    warnings.warn(
+        f"{problem}, which makes predictions useless. extract_features and mpimg.imread read a PNG as 0-1 "
+        "and other files as 0-255; find_cars divides by 255 unless divide_by=1 is passed. A model trained "
+        'with the functions of the HOG sub-sampling quiz needs hist_range=None and spatial_order="channels".',
+        stacklevel=_caller_level(),
+    )
+
+
+def _caller_level() -> int:
+    """Return the ``stacklevel`` for a warning of the calling function that names the user's code."""
+    frame, level = sys._getframe(1), 1
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("vehicle_detection."):
+        frame, level = frame.f_back, level + 1
+    return level
+
+
+def _has_spread_histograms(scaler: Any, options: FeatureOptions) -> bool:
+    """Whether a scaler was fitted on histograms with values that channels of a 0-1 image cannot have."""
+    means = getattr(scaler, "mean_", None)
+    channels = list(UNIT_CHANNELS.get(options.color_space, ()))
+    if means is None or not (options.hist_feat and options.hist_range and channels):
+        return False
+    width, height = options.spatial_size
+    start = 3 * width * height if options.spatial_feat else 0
+    counts = means[start : start + 3 * options.hist_bins].reshape(3, -1)[channels]
+    lows = np.linspace(*options.hist_range, options.hist_bins, endpoint=False)
+    return bool(counts[:, lows > _MAX_UNIT].sum() > _MIN_SPREAD * counts.sum())
 
 
 def _was_fitted_on_unit_range(scaler: Any, options: FeatureOptions) -> bool | None:
@@ -603,7 +636,7 @@ def _was_fitted_on_unit_range(scaler: Any, options: FeatureOptions) -> bool | No
     if params is not None:
         found = has_unit_range(means, np.ones_like(means) if scales is None else scales, params)
         return True if found else False if options.spatial_feat else None
-    if not options.spatial_feat or options.color_space not in _UNIT_SPACES:
+    if not options.spatial_feat or len(UNIT_CHANNELS.get(options.color_space, ())) < 3:
         return None
     width, height = options.spatial_size
     return bool(np.max(means[: 3 * width * height]) <= 2)
