@@ -141,8 +141,17 @@ def test_color_conversion_is_that_of_opencv(conv, dtype):
     np.testing.assert_array_equal(found, expected)
 
 
+@pytest.mark.parametrize("space", ["HSV", "HLS", "LUV", "LAB", "YUV", "YCrCb"])
+def test_inverse_color_conversions(space):
+    image = FRAMES["0-1"]
+    back = lesson.convert_color(lesson.convert_color(image, f"BGR2{space}"), f"{space}2BGR")
+    np.testing.assert_allclose(back, image, atol=0.01)
+
+
 def test_color_conversion_by_the_name_of_the_space():
     image = FRAMES["uint8"]
+    for one, other in (("Lab", "LAB"), ("rgb2ycrcb", "RGB2YCrCb"), ("RGB2Gray", "RGB2GRAY")):
+        np.testing.assert_array_equal(lesson.convert_color(image, one), lesson.convert_color(image, other))
     np.testing.assert_array_equal(lesson.convert_color(image, "LAB"), cv2.cvtColor(image, cv2.COLOR_RGB2LAB))
     copy = lesson.convert_color(image, "RGB")
     assert copy is not image
@@ -178,6 +187,21 @@ def test_features_equal_the_definition(dtype, options):
     single = lesson.single_img_features(images[0], **options)
     assert single.dtype == np.float64
     np.testing.assert_allclose(single, expected[0], rtol=1e-6, atol=HOG_TOLERANCE)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "0-1"])
+def test_transparency_is_dropped_from_arrays(dtype):
+    patch = PATCHES[0] if dtype == "uint8" else PATCHES[0] / np.float32(255)
+    transparent = np.dstack([patch, patch[..., 0]])
+    for function in (
+        lambda image: lesson.extract_features([image, patch], "YCrCb", hog_channel="ALL"),
+        lambda image: lesson.extract_features(image[None], hist_range=None),
+        lambda image: lesson.single_img_features(image, "HLS", vis=True)[0],
+        lesson.bin_spatial,
+        lesson.color_hist,
+        lesson.convert_color,
+    ):
+        np.testing.assert_array_equal(function(transparent), function(patch))
 
 
 def test_features_of_images_that_are_not_64x64():
@@ -287,6 +311,8 @@ def test_windows_are_those_of_the_lesson(side, start, stop, overlap, formula):
     )
     assert found == expected
     assert arguments[:2] == ([start, stop], [None, None])
+    floats = ([float(start), np.float64(stop)], [None, 120.0], (float(side), np.float32(40)), (overlap, 0.5))
+    assert lesson.slide_window(image, *floats, formula=formula) == expected
 
 
 def test_the_first_system_has_130_windows():
@@ -819,14 +845,26 @@ def test_every_call_form_binds(call_data, form, is_right):
         ("color_hist(d.patch, 4, 256)", "bins_range must be .low, high."),
         ("color_hist(d.patch.astype(int))", "must be uint8 or float"),
         ("convert_color(d.patch, 'RGB2CMYK')", "conv must be"),
-        ("convert_color(d.patch, 'HSV2RGB')", "conv must be"),
+        ("convert_color(d.patch, 'HSV2LAB')", "conv must be"),
+        ("convert_color(d.patch, 'GRAY2RGB')", "conv must be"),
+        ("convert_color(d.patch, '')", "conv must be"),
         ("extract_features('car.png')", "list of file names"),
+        ("extract_features(d.patch)", r"list of images, .*pass \[image\], or use single_img_features"),
+        ("extract_features([d.patch, d.gray])", r"imgs\[1\] must be an .H, W, 3. RGB array"),
+        ("extract_features(iter([d.patch, d.patch.astype(int)]))", r"imgs\[1\] must be uint8 or float"),
+        (
+            "extract_features(d.patches, 'YCrCb', 9, 8, 2, 1)",
+            "HOG quiz .*: cspace='YCrCb', orient=9, pix_per_cell=8, cell_per_block=2, hog_channel=1",
+        ),
+        ("extract_features(d.patches, 'YUV', 11, 16, 2, 'ALL')", "by name: .* hog_channel='ALL'"),
         ("extract_features(['missing.png'])", "does not exist"),
         ("extract_features(d.files, 'YIQ')", "color_space must be one of"),
         ("extract_features(d.files, hog_channel=3)", "hog_channel must be one of"),
         ("extract_features(d.files, spatial_feat=0, hist_feat=0, hog_feat=0)", "all False"),
         ("slide_window((720, 1280))", "img must be an image"),
         ("slide_window(d.image, [0, 9.5])", "x_start_stop must be"),
+        ("slide_window(d.image, [0, np.nan])", "x_start_stop must be"),
+        ("slide_window(d.image, xy_window=(64.5, 64))", "xy_window must be an integer"),
         ("slide_window(d.image, [9, 5])", "0 <= start <= stop"),
         ("slide_window(d.image, xy_window=64)", "xy_window must be a pair"),
         ("slide_window(d.image, xy_overlap=(0.5, 1))", "xy_overlap must leave a step"),
@@ -859,6 +897,15 @@ def test_every_call_form_binds(call_data, form, is_right):
         ("add_heat(d.read_only, d.boxes)", "heatmap must be writable"),
         ("add_heat(d.heat, [((9, 9), (5, 5))])", "x1 <= x2"),
         ("add_heat(d.heat, [((9, np.nan), (5, 5))])", "corner pairs"),
+        *(
+            (
+                f"add_heat(d.heat, {boxes})",
+                "bbox_list must be .*find_cars returns a picture, find_car_windows",
+            )
+            for boxes in ("d.image", "list(d.image)", "[*d.boxes, *d.image]", "[d.image]", "iter(d.image)")
+        ),
+        ("draw_boxes(d.image, d.image)", "bboxes must be .*find_car_windows returns the boxes"),
+        ("draw_boxes(d.image[..., [0, 1, 2, 0]], [])", r"drop the alpha channel with img\[\.\.\., :3\]"),
         ("apply_threshold(d.heat, None)", "threshold must be a number"),
         ("draw_boxes(d.image, d.boxes, color='red')", "color must be"),
         ("draw_boxes(d.image, d.boxes, thick=1.5)", "thick must be an integer"),
@@ -874,6 +921,13 @@ def test_bad_input_raises_an_error_of_the_library(call_data, models, form, messa
     data.read_only.setflags(write=False)
     with pytest.raises(InvalidInputError, match=message):
         eval(form, {**vars(lesson), "np": np, "StandardScaler": StandardScaler, "d": data})
+
+
+def test_an_unknown_option_names_the_function_that_was_called(models):
+    with pytest.raises(TypeError, match=r"find_cars\(\) got an unexpected keyword argument 'draw'"):
+        lesson.find_cars(
+            FRAMES["uint8"], 0, 90, 1, *models["all", "uint8"].model, 9, 8, 2, 16, 16, draw=False
+        )
 
 
 def test_a_band_without_room_for_a_window(models):

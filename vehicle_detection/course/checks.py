@@ -19,8 +19,16 @@ from vehicle_detection.errors import InvalidInputError
 Image = NDArray[Any]
 
 
-def check_lesson_image(img: Any, name: str = "img") -> Image:
-    """Return an ``(H, W, 3)`` image as uint8 or float32."""
+def check_lesson_image(img: Any, name: str = "img", *, drop_alpha: bool = False) -> Image:
+    """Return an ``(H, W, 3)`` image as uint8 or float32; `drop_alpha` accepts a fourth channel."""
+    has_alpha = isinstance(img, np.ndarray) and img.ndim == 3 and img.shape[2] == 4
+    if has_alpha and drop_alpha:
+        img = np.ascontiguousarray(img[..., :3])
+    elif has_alpha:
+        raise InvalidInputError(
+            f"{name} must be an (H, W, 3) RGB array, got {describe(img)}; drop the alpha channel with "
+            f"{name}[..., :3]"
+        )
     if not isinstance(img, np.ndarray) or img.ndim != 3 or img.shape[2] != 3 or not img.size:
         raise InvalidInputError(f"{name} must be an (H, W, 3) RGB array; got {describe(img)}")
     if img.dtype in (np.uint8, np.float32):
@@ -56,6 +64,12 @@ def box_rows(boxes: Any) -> Any:
     return getattr(boxes, "xyxy", boxes)
 
 
+def _contains_image(rows: Any) -> bool:
+    """Whether boxes are an RGB image, or a list with images or rows of one, as by ``boxes.extend(image)``."""
+    items = rows if isinstance(rows, list) or (isinstance(rows, np.ndarray) and rows.ndim) else ()
+    return any(isinstance(item, np.ndarray) and item.ndim >= 2 and item.shape[-1] == 3 for item in items)
+
+
 def _first_corners(boxes: list[Any]) -> NDArray[Any]:
     """Return the first two items of each box, its corners; an array of no boxes if there are none."""
     try:
@@ -69,6 +83,11 @@ def corner_array(boxes: Any, name: str) -> NDArray[np.int64]:
     rows = box_rows(boxes)
     if isinstance(rows, Iterable) and not isinstance(rows, (str, np.ndarray)):
         rows = list(rows)
+    if _contains_image(rows):
+        raise InvalidInputError(
+            f"{name} must be a list of corner pairs ((x1, y1), (x2, y2)), got an image or rows of one; "
+            "find_cars returns a picture, find_car_windows returns the boxes"
+        )
     try:
         array = np.asarray(rows)
     except ValueError:  # rows of different lengths, such as boxes with scores

@@ -27,6 +27,9 @@ from vehicle_detection.params import COLOR_SPACES, SPATIAL_ORDERS
 Size = int | Sequence[int]
 SpatialOrder = Literal["interleaved", "channels"]
 
+# OpenCV's names of the color spaces by their name in upper case.
+_OPENCV_SPACES = {space.upper(): space for space in (*COLOR_SPACES, "BGR", "GRAY")}
+
 
 def convert_color(img: Image, conv: str = "RGB2YCrCb") -> Image:
     """Convert the color space of an image, by the name of OpenCV's conversion.
@@ -36,8 +39,9 @@ def convert_color(img: Image, conv: str = "RGB2YCrCb") -> Image:
     img
         ``(H, W, 3)`` uint8, or float as OpenCV defines it: 0-1, hue 0-360, LUV and LAB with negative values.
     conv
-        ``"RGB2YCrCb"``, ``"BGR2YCrCb"``, ``"RGB2LUV"``, ``"RGB2HLS"``, ``"RGB2GRAY"``, ...; a color space
-        alone, such as ``"LUV"``, means from RGB.
+        ``"RGB2YCrCb"``, ``"BGR2YCrCb"``, ``"RGB2LUV"``, ``"RGB2HLS"``, ``"RGB2GRAY"``, ..., or an inverse
+        such as ``"YCrCb2RGB"``, in upper or lower case; a color space alone, such as ``"LUV"``, means from
+        RGB.
 
     Returns
     -------
@@ -54,12 +58,13 @@ def convert_color(img: Image, conv: str = "RGB2YCrCb") -> Image:
     >>> convert_color(np.full((1, 1, 3), 200, np.uint8)).tolist()
     [[[200, 128, 128]]]
     """
-    image = check_lesson_image(img)
-    source, _, target = str(conv).rpartition("2")
-    source = source or "RGB"
-    if source not in ("RGB", "BGR") or target not in (*COLOR_SPACES, "BGR", "GRAY"):
+    image = check_lesson_image(img, drop_alpha=True)
+    names = str(conv).upper().rpartition("2")
+    source, target = (_OPENCV_SPACES.get(name) for name in (names[0] or "RGB", names[2]))
+    if source in (None, "GRAY") or target is None or {source, target}.isdisjoint({"RGB", "BGR"}):
         raise InvalidInputError(
-            f"conv must be RGB2 or BGR2 and one of {', '.join(COLOR_SPACES)}, BGR, GRAY; got {describe(conv)}"
+            f"conv must be RGB2 or BGR2 and one of {', '.join(_OPENCV_SPACES.values())}, or an inverse such "
+            f"as HSV2RGB; got {describe(conv)}"
         )
     if source == target:
         return image.copy()
@@ -176,7 +181,7 @@ def bin_spatial(
     ([1, 2, 3, 1, 2, 3], [1, 1, 2, 2, 3, 3])
     """
     one_channel = isinstance(img, np.ndarray) and img.ndim == 2
-    image = check_lesson_image(img[..., None].repeat(3, 2) if one_channel else img)
+    image = check_lesson_image(img[..., None].repeat(3, 2) if one_channel else img, drop_alpha=True)
     check_choice(order, "order", SPATIAL_ORDERS)
     check_type(color_space, "color_space", str, "pass a name such as 'YCrCb'")
     if isinstance(size, str) and len(last_size) <= 1:
@@ -218,7 +223,7 @@ def color_hist(
     >>> color_hist(np.zeros((2, 2, 3), np.uint8), 4).tolist()
     [4, 0, 0, 0, 4, 0, 0, 0, 4, 0, 0, 0]
     """
-    image = check_lesson_image(img)
+    image = check_lesson_image(img, drop_alpha=True)
     check_integer(nbins, "nbins", low=1)
     limits = check_range(bins_range, "bins_range")
     if limits is None:

@@ -55,11 +55,18 @@ def accept_cspace(function: Callable[Arguments, Result]) -> Callable[Arguments, 
 
     Each of those quizzes computes one group of features: one computes HOG, the other spatial bins and
     histograms. With ``cspace=`` and without ``spatial_feat=``, ``hist_feat=`` and ``hog_feat=``, the group
-    follows from the options that are passed.
+    follows from the options that are passed. The positional order of the HOG quiz raises an error.
     """
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Result:
+        if _is_in_hog_quiz_order(args):
+            names = ("cspace", "orient", "pix_per_cell", "cell_per_block", "hog_channel")
+            named = ", ".join(f"{name}={value!r}" for name, value in zip(names, args[1:]))
+            raise InvalidInputError(
+                "the arguments after color_space must be spatial_size, hist_bins, orient, pix_per_cell, ...; "
+                f"got those of the HOG quiz in its order. Pass them by name: {named}"
+            )
         if "cspace" in kwargs:
             if "color_space" in kwargs:
                 raise InvalidInputError("color_space and cspace are the same option; pass one of them")
@@ -71,6 +78,13 @@ def accept_cspace(function: Callable[Arguments, Result]) -> Callable[Arguments, 
         return function(*args, **kwargs)
 
     return call
+
+
+def _is_in_hog_quiz_order(args: tuple[Any, ...]) -> bool:
+    """Whether a number as `spatial_size` and a channel as `pix_per_cell` show another order of arguments."""
+    if len(args) < 6 or not isinstance(args[2], (int, np.integer)):
+        return False
+    return isinstance(args[5], str) or (isinstance(args[5], (int, np.integer)) and int(args[5]) <= 3)
 
 
 @accept_cspace
@@ -114,7 +128,7 @@ def single_img_features(
     >>> single_img_features(np.zeros((64, 64, 3), np.uint8), "YCrCb", hog_channel="ALL").shape
     (8460,)
     """
-    options, image = FeatureOptions.of(locals()), check_lesson_image(img)
+    options, image = FeatureOptions.of(locals()), check_lesson_image(img, drop_alpha=True)
     check_flags(vis=vis)
     features = options.compute([image])[0].astype(np.float64)
     if not vis:
@@ -153,11 +167,12 @@ def extract_features(
     Parameters
     ----------
     imgs
-        File names, or images ``(H, W, 3)`` RGB.
+        File names, or images ``(H, W, 3)`` RGB. A fourth channel, transparency, is dropped.
     color_space
         ``"RGB"``, ``"HSV"``, ``"LUV"``, ``"HLS"``, ``"YUV"``, ``"YCrCb"`` or ``"LAB"``. The keyword of two
         earlier quizzes, ``cspace=``, is accepted too: with HOG options only, it selects HOG alone, and with
-        color options only, spatial bins and histograms alone, as in those quizzes.
+        color options only, spatial bins and histograms alone, as in those quizzes. Their positional order is
+        not accepted.
     spatial_size, hist_bins, hist_range, spatial_order
         See `bin_spatial` and `color_hist`.
     orient, pix_per_cell, cell_per_block, transform_sqrt
@@ -195,6 +210,10 @@ def extract_features(
     scalar = isinstance(imgs, (str, os.PathLike)) or getattr(imgs, "ndim", 1) == 0
     if scalar or not isinstance(imgs, Iterable):
         raise InvalidInputError(f"imgs must be a list of file names or images; got {describe(imgs)}")
+    if isinstance(imgs, np.ndarray) and imgs.ndim in (2, 3) and imgs.dtype.kind in "uif":
+        raise InvalidInputError(
+            f"imgs must be a list of images, got {describe(imgs)}; pass [image], or use single_img_features"
+        )
     if imread is not None and not callable(imread):
         raise InvalidInputError(f"imread must be a function of a file name; got {describe(imread)}")
     read = _read_like_lesson if imread is None else imread
@@ -207,7 +226,12 @@ def extract_features(
             read(os.fspath(item)) if isinstance(item, (str, os.PathLike)) else item
             for item in items[start : start + _CHUNK]
         ]
-        vectors += options.compute([check_lesson_image(image, "imgs") for image in images])
+        vectors += options.compute(
+            [
+                check_lesson_image(image, f"imgs[{index}]", drop_alpha=True)
+                for index, image in enumerate(images, start)
+            ]
+        )
     return vectors
 
 

@@ -52,9 +52,9 @@ _CHUNK = 512
 
 def slide_window(
     img: Any,
-    x_start_stop: Sequence[int | None] = (None, None),
-    y_start_stop: Sequence[int | None] = (None, None),
-    xy_window: Sequence[int] = (64, 64),
+    x_start_stop: Sequence[float | None] = (None, None),
+    y_start_stop: Sequence[float | None] = (None, None),
+    xy_window: Sequence[float] = (64, 64),
     xy_overlap: Sequence[float] = (0.5, 0.5),
     *,
     formula: Formula | None = None,
@@ -66,9 +66,9 @@ def slide_window(
     img
         Only its height and width are used.
     x_start_stop, y_start_stop
-        Pixel range of the region; None means the image's border. Lists are not changed.
+        Pixel range of the region, whole numbers; None means the image's border. Lists are not changed.
     xy_window
-        Width and height of a window.
+        Width and height of a window, whole numbers.
     xy_overlap
         Horizontal and vertical overlap of neighboring windows as a fraction of their size.
     formula
@@ -101,7 +101,7 @@ def slide_window(
     for name, pair in (("xy_window", xy_window), ("xy_overlap", xy_overlap)):
         if check_array(pair, name).shape != (2,):
             raise InvalidInputError(f"{name} must be a pair of numbers; got {describe(pair)}")
-    width, height = (check_integer(side, "xy_window", low=1) for side in xy_window)
+    width, height = (check_integer(_as_whole(side), "xy_window", low=1) for side in xy_window)
     x1, x2 = _check_span(x_start_stop, img.shape[1], "x_start_stop")
     y1, y2 = _check_span(y_start_stop, img.shape[0], "y_start_stop")
     lefts = _window_starts(x1, x2, width, xy_overlap[0], formula)
@@ -109,13 +109,18 @@ def slide_window(
     return [((x, y), (x + width, y + height)) for y in tops for x in lefts]
 
 
+def _as_whole(value: Any) -> Any:
+    """Return a whole-number float as an int, other values as they are."""
+    return int(value) if isinstance(value, (float, np.floating)) and value.is_integer() else value
+
+
 def _check_span(limits: Any, size: int, name: str) -> tuple[int, int]:
     """Return the pixel range ``[start, stop]`` with None replaced by the image's border."""
-    whole = (int, np.integer, type(None))
-    if check_array(limits, name).shape != (2,) or not all(isinstance(limit, whole) for limit in limits):
+    pair = [_as_whole(limit) for limit in limits] if check_array(limits, name).shape == (2,) else []
+    if not pair or not all(isinstance(limit, (int, np.integer, type(None))) for limit in pair):
         raise InvalidInputError(f"{name} must be [start, stop], whole pixels or None; got {describe(limits)}")
-    start = 0 if limits[0] is None else int(limits[0])
-    stop = size if limits[1] is None else int(limits[1])
+    start = 0 if pair[0] is None else int(pair[0])
+    stop = size if pair[1] is None else int(pair[1])
     if not 0 <= start <= stop:
         raise InvalidInputError(f"{name} must satisfy 0 <= start <= stop; got {[start, stop]}")
     return start, stop
@@ -244,9 +249,21 @@ def find_cars(
     cell_per_block: int,
     spatial_size: Size,
     hist_bins: int,
-    **options: Any,
+    *,
+    color_space: str = "YCrCb",
+    hog_channel: int | str = "ALL",
+    spatial_feat: bool = True,
+    hist_feat: bool = True,
+    hog_feat: bool = True,
+    hist_range: tuple[float, float] | None = (0, 256),
+    transform_sqrt: bool | None = None,
+    spatial_order: SpatialOrder = "interleaved",
+    cells_per_step: int = 2,
+    divide_by: float = 255,
+    resize: ResizeOrder = "after conversion",
+    formula: Formula = "old",
 ) -> Image:
-    """Draw the windows of `find_car_windows` on a copy of the image; arguments and options are the same.
+    """Draw the windows of `find_car_windows` on a copy of the image; the arguments are the same.
 
     Returns
     -------
@@ -263,9 +280,7 @@ def find_cars(
     >>> drawn[0, 0].tolist(), drawn[40, 40].tolist()
     ([0, 0, 255], [0, 0, 0])
     """
-    positional = (orient, pix_per_cell, cell_per_block, spatial_size, hist_bins)
-    boxes = find_car_windows(img, ystart, ystop, scale, svc, X_scaler, *positional, **options)
-    return draw_boxes(img, boxes)
+    return draw_boxes(img, find_car_windows(**locals()))  # all arguments
 
 
 def find_car_windows(
