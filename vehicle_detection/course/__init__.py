@@ -4,6 +4,7 @@ The course is project 5 of Udacity's Self-Driving Car Engineer Nanodegree
 (https://github.com/udacity/CarND-Vehicle-Detection). After ``from vehicle_detection.course import *``, the
 functions of its ``lesson_functions.py`` and of its HOG sub-sampling quiz, ``find_cars``, are available with
 their argument order, defaults and return types. Options that the lesson does not have are keyword-only.
+`set_lesson_defaults` sets the defaults in which published versions of the lesson differ.
 
 Images are ``(H, W, 3)`` RGB, uint8 or float, as in the lesson; windows and boxes are lists of corner pairs
 ``((x1, y1), (x2, y2))``. HOG is computed by the library's kernels. For uint8 images, the library's
