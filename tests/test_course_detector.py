@@ -163,5 +163,10 @@ def test_invalid_arguments_are_rejected(arguments, message):
 def test_options_are_checked_before_the_first_frame(estimators):
     with pytest.raises(InvalidInputError, match="fitted on 6108 features, but these options give 8460"):
         HeatmapDetector(*estimators)
+    # Frames may be searched in other threads, whose warnings name no line of the caller.
+    options = {name: value for name, value in FEATURES.items() if name != "divide_by"}
+    with pytest.warns(UserWarning, match="divide_by=1") as caught:
+        HeatmapDetector(*estimators, **options)
+    assert caught[0].filename == __file__
     with pytest.raises(TypeError, match="spatial"):
         HeatmapDetector(*estimators, **FEATURES, spatial=True)

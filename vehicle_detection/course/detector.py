@@ -189,8 +189,9 @@ class _WindowSearch:
         self._arguments |= defaults | {"hist_bins": 32} | options
         # Later changes of the default must not change a detector.
         self._arguments["transform_sqrt"] = or_default(options.get("transform_sqrt"), "transform_sqrt")
-        # An image of one window checks the options and the estimators before the first frame.
-        find_car_windows(np.zeros((PATCH_SIZE, PATCH_SIZE, 3), np.uint8), None, None, 1, **self._arguments)
+        # An image of one window checks the options, the estimators and the range before the first frame.
+        white = np.full((PATCH_SIZE, PATCH_SIZE, 3), 255, np.uint8)
+        find_car_windows(white, None, None, 1, **self._arguments)
 
     def __call__(self, image: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[np.float64]]:
         factor = max(image.shape) / REFERENCE_WIDTH
