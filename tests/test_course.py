@@ -432,7 +432,7 @@ def test_the_fast_search_has_the_scores_of_the_lesson(models, monkeypatch):
     monkeypatch.setattr(windows_module, "_fast_scores", lambda *_: None)
     monkeypatch.setattr(
         windows_module,
-        "_predicts_car",
+        "predicts_car",
         lambda features, *_: seen.append(svc.decision_function(scaler.transform(features))) or seen[-1] > 0,
     )
     hits = windows_module._search_band(band, options, svc, scaler, 1, "new")
@@ -442,7 +442,7 @@ def test_the_fast_search_has_the_scores_of_the_lesson(models, monkeypatch):
 
 def test_the_fast_search_is_used_where_it_applies(models, monkeypatch):
     case = models["all", "uint8"]
-    monkeypatch.setattr(windows_module, "_predicts_car", None)
+    monkeypatch.setattr(windows_module, "predicts_car", None)
     lesson.find_car_windows(FRAMES["uint8"], 60, 200, 1.5, *case.model, 9, 8, 2, (16, 16), 16, divide_by=1)
     lesson.search_windows(FRAMES["uint8"], PAIRS, *case.model, **case.options)
 
@@ -458,7 +458,7 @@ def test_a_grid_search_uses_the_fast_search_too(models, monkeypatch):
         for clf in (grid, grid.best_estimator_)
     ]
     assert hits[0] == hits[1] != []
-    monkeypatch.setattr(windows_module, "_predicts_car", None)
+    monkeypatch.setattr(windows_module, "predicts_car", None)
     lesson.find_car_windows(FRAMES["uint8"], 60, 200, 1.5, grid, scaler, *arguments, divide_by=1)
     lesson.search_windows(FRAMES["uint8"], PAIRS, grid, scaler, **case.options)
 
@@ -573,7 +573,7 @@ def test_old_estimators_take_the_fast_search(models, monkeypatch):
     """``n_features_in_`` was added in scikit-learn 0.24."""
     svc, scaler = copy.deepcopy(models["all", "uint8"].model)
     del svc.n_features_in_, scaler.n_features_in_
-    monkeypatch.setattr(windows_module, "_predicts_car", None)
+    monkeypatch.setattr(windows_module, "predicts_car", None)
     lesson.find_car_windows(FRAMES["uint8"], 60, 200, 1.5, svc, scaler, 9, 8, 2, (16, 16), 16, divide_by=1)
     with pytest.raises(InvalidInputError, match="fitted on 6108 features, but these options give 8460"):
         lesson.find_cars(FRAMES["uint8"], 60, 200, 1, svc, scaler, 9, 8, 2, (32, 32), 32, divide_by=1)

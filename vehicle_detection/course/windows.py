@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import copy
 import functools
-import sys
-import warnings
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -23,6 +20,7 @@ from vehicle_detection._common import (
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.course.checks import Image, box_rows, check_lesson_image, corner_array
 from vehicle_detection.course.defaults import FORMULAS, Formula, or_default
+from vehicle_detection.course.estimators import check_estimators, library_classifier, predicts_car
 from vehicle_detection.course.features import (
     Size,
     SpatialOrder,
@@ -35,17 +33,12 @@ from vehicle_detection.course.features import (
 from vehicle_detection.course.heat import draw_boxes
 from vehicle_detection.course.vectors import FeatureOptions, accept_cspace, are_uint8_patches
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.params import PATCH_SIZE, FeatureParams
+from vehicle_detection.params import PATCH_SIZE
 from vehicle_detection.search import BandSearch
-from vehicle_detection.sklearn_models import UNIT_CHANNELS, fold_estimators, has_unit_range, n_features
 
 Box = tuple[tuple[int, int], tuple[int, int]]
 ResizeOrder = Literal["after conversion", "before conversion"]
 
-# Greatest value of a channel of a 0-1 image, with a margin: V of YUV reaches 1.12.
-_MAX_UNIT = 1.2
-# Least share of the values outside of the first bins that shows histograms of another range than 0-1.
-_MIN_SPREAD = 0.1
 # Number of windows whose features are in memory at a time.
 _CHUNK = 512
 
@@ -214,7 +207,7 @@ def search_windows(
     """
     options = FeatureOptions.of(locals())
     image = check_lesson_image(img)
-    _check_estimators(clf, scaler, options, image)
+    check_estimators(clf, scaler, options, image)
     corners = corner_array(windows, "windows")
     height, width = image.shape[:2]
     valid = (corners >= 0).all(axis=1) & (corners[:, 0] < width) & (corners[:, 1] < height)
@@ -385,7 +378,7 @@ def find_car_windows(
     image = check_lesson_image(img)
     top, bottom = _check_rows(ystart, ystop, image.shape[0])
     image = _scale_values(image[top:bottom], check_number(divide_by, "divide_by", above=0))
-    _check_estimators(svc, X_scaler, options, image)
+    check_estimators(svc, X_scaler, options, image)
     if resize == "after conversion":
         converted = _shrink(convert_color(image, color_space), scale)
     else:
@@ -457,7 +450,7 @@ def _search_band(
             if hog is not None:
                 parts.append(hog[row, column].ravel())
             np.concatenate(parts, out=vector)
-        hits.append(_predicts_car(features, clf, scaler))
+        hits.append(predicts_car(features, clf, scaler))
     return np.concatenate(hits).reshape(rows, columns)
 
 
@@ -489,7 +482,7 @@ def _fast_scores(
         return None
     if params.spatial_feat and (params.spatial_size % params.cells or PATCH_SIZE % params.spatial_size):
         return None
-    classifier = _library_classifier(clf, scaler, params)
+    classifier = library_classifier(clf, scaler, params)
     if classifier is None:
         return None
     search = _open_search(classifier)
@@ -520,138 +513,7 @@ def _classify_patches(
     """Whether the classifier predicts 1 for each of some 64x64 patches."""
     params = options.library_params(options.color_space) if options.has_library_range else None
     if params is not None and are_uint8_patches(patches):
-        classifier = _library_classifier(clf, scaler, params)
+        classifier = library_classifier(clf, scaler, params)
         if classifier is not None:
             return np.asarray(classifier.decision_function(np.stack(patches)) > 0)
-    return _predicts_car(np.array(options.compute(patches)), clf, scaler)
-
-
-# The attributes that a linear classifier and a scaler compute with.
-_MODEL_STATE = (
-    "classes_", "coef_", "intercept_", "mean_", "center_", "min_", "scale_", "with_mean", "with_std", "clip",
-)  # fmt: skip
-# The last model: a system calls `find_cars` for each scale and frame with the same one.
-_last_model: tuple[list[Any], FeatureParams, VehicleClassifier] | None = None
-
-
-def _library_classifier(clf: Any, scaler: Any, params: FeatureParams) -> VehicleClassifier | None:
-    """Return a linear classifier and its scaler as the library's classifier; None for other estimators."""
-    global _last_model
-    clf = getattr(clf, "best_estimator_", clf)  # of a GridSearchCV
-    steps = [clf] if scaler is None else [scaler, clf]
-    # Only classes of scikit-learn: others may predict in another way, as does a replaced method.
-    if not all(type(step).__module__.startswith("sklearn.") for step in steps) or "predict" in vars(clf):
-        return None
-    state: list[Any] = [type(clf), type(scaler)]
-    state += [getattr(each, name, None) for each in (clf, scaler) for name in _MODEL_STATE]
-    last = _last_model
-    if last is not None and last[1] == params and all(map(_equal, last[0], state)):
-        return last[2]
-    try:
-        classifier = VehicleClassifier(params, (fold_estimators(steps, params.length),))
-    except InvalidInputError:
-        return None
-    _last_model = (copy.deepcopy(state), params, classifier)
-    return classifier
-
-
-def _equal(first: Any, second: Any) -> bool:
-    return np.array_equal(first, second) if isinstance(first, np.ndarray) else bool(first == second)
-
-
-def _predicts_car(features: NDArray[np.float64], clf: Any, scaler: Any) -> NDArray[np.bool_]:
-    scaled = features if scaler is None else scaler.transform(features)
-    labels = np.asarray(clf.predict(scaled)).reshape(-1)
-    if len(labels) != len(features):
-        raise InvalidInputError(
-            f"the classifier must predict a label for each of {len(features)} windows; got {len(labels)} "
-            f"from {type(clf).__name__}.predict"
-        )
-    return np.asarray(labels == 1)
-
-
-def _check_estimators(clf: Any, scaler: Any, options: FeatureOptions, image: Image) -> None:
-    """Check that a classifier and its scaler fit the features, and the range of an image's values."""
-    from sklearn.exceptions import NotFittedError
-    from sklearn.utils.validation import check_is_fitted
-
-    for estimator, name, method in ((clf, "classifier", "predict"), (scaler, "scaler", "transform")):
-        if scaler is None and name == "scaler":
-            continue
-        if not hasattr(estimator, method):
-            raise InvalidInputError(f"the {name} must have a method {method}; got {describe(estimator)}")
-        if type(estimator).__module__.startswith("sklearn."):
-            try:
-                check_is_fitted(estimator)
-            except NotFittedError:
-                raise InvalidInputError(
-                    f"the {name} must be fitted; got an unfitted {type(estimator).__name__}: call fit first"
-                ) from None
-    if options.hog_feat and options.blocks < 1:
-        raise InvalidInputError(
-            f"a block of {options.cell_per_block} cells of {options.pix_per_cell} pixels must fit into a "
-            f"window of {PATCH_SIZE} pixels"
-        )
-    first, name = (clf, "classifier") if scaler is None else (scaler, "scaler")
-    fitted = n_features(first)
-    if fitted not in (None, options.length):
-        raise InvalidInputError(
-            f"the {name} was fitted on {fitted} features, but these options give {options.length}; pass the "
-            "options that the classifier was trained with"
-        )
-    trained_on_unit = _was_fitted_on_unit_range(scaler, options)
-    largest = 255.0 if image.dtype == np.uint8 else float(image.max())
-    if largest <= 0.1:
-        return  # an almost black image may have either range
-    if trained_on_unit is not None and (largest <= 2) != trained_on_unit:
-        trained, given = ("0-1", "0-255") if trained_on_unit else ("0-255", "0-1")
-        problem = f"the scaler was fitted on values {trained}, but the image has values {given}"
-    elif largest <= 2 and _has_spread_histograms(scaler, options):
-        problem = (
-            "the scaler was fitted on histograms with values in many bins, but all values of a 0-1 image are "
-            f"in the first bin of hist_range={options.hist_range}"
-        )
-    else:
-        return
-    warnings.warn(
-        f"{problem}, which makes predictions useless. extract_features and mpimg.imread read a PNG as 0-1 "
-        "and other files as 0-255; find_cars divides by 255 unless divide_by=1 is passed. A model trained "
-        'with the functions of the HOG sub-sampling quiz needs hist_range=None and spatial_order="channels".',
-        stacklevel=_caller_level(),
-    )
-
-
-def _caller_level() -> int:
-    """Return the ``stacklevel`` for a warning of the calling function that names the user's code."""
-    frame, level = sys._getframe(1), 1
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("vehicle_detection."):
-        frame, level = frame.f_back, level + 1
-    return level
-
-
-def _has_spread_histograms(scaler: Any, options: FeatureOptions) -> bool:
-    """Whether a scaler was fitted on histograms with values that channels of a 0-1 image cannot have."""
-    means = getattr(scaler, "mean_", None)
-    channels = list(UNIT_CHANNELS.get(options.color_space, ()))
-    if means is None or not (options.hist_feat and options.hist_range and channels):
-        return False
-    width, height = options.spatial_size
-    start = 3 * width * height if options.spatial_feat else 0
-    counts = means[start : start + 3 * options.hist_bins].reshape(3, -1)[channels]
-    lows = np.linspace(*options.hist_range, options.hist_bins, endpoint=False)
-    return bool(counts[:, lows > _MAX_UNIT].sum() > _MIN_SPREAD * counts.sum())
-
-
-def _was_fitted_on_unit_range(scaler: Any, options: FeatureOptions) -> bool | None:
-    """Whether a scaler was fitted on features of images with values 0-1; None if it does not show it."""
-    means, scales = (getattr(scaler, name, None) for name in ("mean_", "scale_"))
-    if means is None:
-        return None
-    params = options.library_params(options.color_space)
-    if params is not None:
-        found = has_unit_range(means, np.ones_like(means) if scales is None else scales, params)
-        return True if found else False if options.spatial_feat else None
-    if not options.spatial_feat or len(UNIT_CHANNELS.get(options.color_space, ())) < 3:
-        return None
-    width, height = options.spatial_size
-    return bool(np.max(means[: 3 * width * height]) <= 2)
+    return predicts_car(np.array(options.compute(patches)), clf, scaler)
