@@ -8,6 +8,18 @@ ROUGH_DISTANCE = 0.2
 """Relative standard error above which a distance is marked as rough, by a tilde."""
 
 
+def format_with_error(value: float, error: float | None, *, signed: bool = False) -> str:
+    """Format a value and its standard error, if any; both get a decimal if the error is below 1.
+
+    >>> format_with_error(17.3, 4.0), format_with_error(5.23, 0.36), format_with_error(-0.2, None)
+    ('17 ± 4', '5.2 ± 0.4', '0')
+    """
+    digits = int(error is not None and error < 0.95)
+    shown = round(value, digits) + 0.0  # + 0.0 turns -0.0 into 0.0
+    text = f"{shown:{'+' if signed and shown else ''}.{digits}f}"
+    return text if error is None else f"{text} ± {error:.{digits}f}"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Units:
     """A unit of distance and one of speed: factors from meters and meters per second, symbols and names."""
@@ -29,7 +41,7 @@ class Units:
         """
         value, symbol = self.distance * meters, self.distance_symbol
         if with_std and std_m is not None:
-            return f"{value:.0f} ± {self.distance * std_m:.0f} {symbol}"
+            return f"{format_with_error(value, self.distance * std_m)} {symbol}"
         rough = std_m is not None and std_m > ROUGH_DISTANCE * meters
         return f"{'~' * rough}{value:.0f} {symbol}"
 
@@ -40,9 +52,8 @@ class Units:
 
         Speeds over ground are not `signed`: "94 km/h".
         """
-        value = round(self.speed * speed_mps) + 0.0  # + 0.0 turns -0.0 into 0.0
-        error = f" ± {self.speed * std_mps:.0f}" if with_std and std_mps is not None else ""
-        return f"{value:{'+' if signed and value else ''}.0f}{error} {self.speed_symbol}"
+        error = None if std_mps is None or not with_std else self.speed * std_mps
+        return f"{format_with_error(self.speed * speed_mps, error, signed=signed)} {self.speed_symbol}"
 
 
 UNITS = {

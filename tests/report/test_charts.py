@@ -6,7 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from tests.events.test_history import PRESENCE, log_of
-from vehicle_detection.report.charts import Label, TimeAxis, ValueAxis, _assign_rows, _separate_labels
+from vehicle_detection.report.charts import Label, TimeAxis, ValueAxis, _assign_rows, _separate_labels, chart
 
 
 @given(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6), st.booleans())
@@ -49,7 +49,17 @@ def test_labels_do_not_overlap(places):
     for one, other in combinations(kept, 2):
         assert abs(one.x - other.x) >= 5 or abs(one.y - other.y) >= 13 - 1e-9
     assert all(0 < label.y <= 150 for label in kept)
+    for label in kept:
+        x, y = places[label.track]
+        assert label.x == x
+        assert abs(label.y - min(max(y, 13), 148)) <= 1.5 * 13
     assert len({label.track for label in kept}) == len(kept)
+
+
+def test_a_label_has_the_color_of_its_track():
+    labels = [Label(50.0, 40.0, 9)]
+    svg = chart("", TimeAxis(50, 25.0), ValueAxis.covering(0, 10, 150), label="Lines", track_labels=labels)
+    assert 'class="track-name c1"' in svg
 
 
 @given(PRESENCE)

@@ -7,6 +7,7 @@ import json
 import math
 import re
 import sys
+from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -146,6 +147,28 @@ class TestPage:
         assert "decode" in text
         assert "20.00" in text  # milliseconds per frame
         assert "75.0%" in text
+
+    def test_notices(self, tmp_path):
+        assert '<ul class="notices">' not in write_report(tmp_path, FRAMES)
+        writer = ReportWriter(tmp_path / "report.html", detector=SimpleNamespace(lens_is_known=False))
+        writer.write(0, 0.0, [track(1)])
+        writer.finish(video_report(1, damage="<a>.mp4 is damaged: 3 frames are missing", dropped=2))
+        text = (tmp_path / "report.html").read_text(encoding="utf-8")
+        (notices,) = re.findall(r'<ul class="notices">(.*?)</ul>', text, re.DOTALL)
+        assert re.findall(r"<li>(.*)</li>", notices) == [
+            "&lt;a&gt;.mp4 is damaged: 3 frames are missing.",
+            "2 frames of the live source were dropped.",
+            "The lens is unknown: distances and speeds may be wrong by a factor of 2 or more.",
+        ]
+
+    def test_an_unknown_lens_matters_for_distances_only(self, tmp_path):
+        detector = SimpleNamespace(lens_is_known=False)
+        text = write_report(tmp_path, [[track(1, distance=None, speed=None)]], detector=detector)
+        assert "The lens is unknown" not in text
+
+    def test_small_standard_errors_keep_a_decimal(self, tmp_path):
+        text = write_report(tmp_path, [[track(1, distance=5.23, distance_std=0.36)]] * 5)
+        assert "<dd>5.2 \N{PLUS-MINUS SIGN} 0.4 m, #1</dd>" in text
 
     def test_units(self, tmp_path):
         frames = [[track(1, distance=30.48, speed=10.0)] for _ in range(5)]
@@ -317,10 +340,24 @@ def color_schemes():
     return [dict(re.findall(r"--(\w+): (#\w+);", scheme)) for scheme in (light, dark)]
 
 
+def linear_rgb(color):
+    parts = np.array([int(color[start : start + 2], 16) / 255 for start in (1, 3, 5)])
+    return np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+
+
 def luminance(color):
-    parts = [int(color[start : start + 2], 16) / 255 for start in (1, 3, 5)]
-    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
-    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+    return float(linear_rgb(color) @ [0.2126, 0.7152, 0.0722])
+
+
+# Linear RGB as seen with full color blindness: Machado, Oliveira and Fernandes (2009).
+PROTANOPIA = [[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]]
+DEUTERANOPIA = [[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]]
+
+
+def lab_color(color, simulation):
+    seen = np.clip(np.array(simulation) @ linear_rgb(color), 0, 1).astype(np.float32)
+    srgb = np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055)
+    return cv2.cvtColor(srgb.astype(np.float32)[None, None], cv2.COLOR_RGB2LAB)[0, 0]
 
 
 def contrast(one, other):
@@ -337,6 +374,12 @@ class TestColors:
                 assert contrast(scheme[color], scheme[background]) >= 4.5, (color, background)
         for number in range(len(TRACK_COLORS)):
             assert contrast(scheme[f"c{number}"], scheme["background"]) >= 3.0, number
+
+    def test_track_colors_differ_for_color_blind_readers(self, scheme):
+        colors = [scheme[f"c{number}"] for number in range(len(TRACK_COLORS))]
+        for simulation in (PROTANOPIA, DEUTERANOPIA):
+            for one, other in combinations([lab_color(color, simulation) for color in colors], 2):
+                assert np.linalg.norm(one - other) >= 12  # CIE76
 
     def test_there_are_as_many_track_colors_as_in_the_video(self, scheme):
         names = [name for name in scheme if re.fullmatch(r"c\d", name)]

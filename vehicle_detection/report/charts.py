@@ -27,6 +27,7 @@ _CURVE_WIDTH = 1000  # units across the nested SVG of the curves
 _ROW_HEIGHT, _BAR_HEIGHT = 22, 14  # pixels
 _KIND_HEIGHT = 34  # pixels of a kind of event: its name, and its markers below
 _LABEL_WIDTH, _LABEL_HEIGHT = 5.0, 13.0  # percent of the chart's width, pixels
+_MAX_SHIFT = 1.5 * _LABEL_HEIGHT  # largest distance of a label from the end of its line
 _MIN_LABELED = 0.08  # fraction of the video that a track must last to be labeled inside a chart
 _TICK_STEPS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200)  # seconds
 
@@ -123,7 +124,9 @@ def chart(
     for each in _separate_labels(track_labels, height):
         place: dict[str, object] = {"dx": 4} if each.x < 90 else {"dx": -4, "text_anchor": "end"}
         place |= {"x": f"{_decimal(each.x)}%", "y": _decimal(each.y)}
-        names.append(svg_element("text", f"#{each.track}", class_="track-name", **place))
+        names.append(
+            svg_element("text", f"#{each.track}", class_=f"track-name {_color(each.track)}", **place)
+        )
     return _graph(values, [*grid, curves, *names], time_axis, height, role="img", label=label)
 
 
@@ -168,7 +171,7 @@ def event_markers(events: Sequence[Event], axis: TimeAxis, units: Units, *, labe
             if event.kind != kind:
                 continue
             text = event.text(units)
-            x, color = axis.percent(event.frame), f"c{(event.track_id - 1) % len(TRACK_COLORS)}"
+            x, color = axis.percent(event.frame), _color(event.track_id)
             parts = [
                 svg_element("title", text),
                 svg_element("circle", cx=x, cy=top + 24, r=5),
@@ -177,6 +180,11 @@ def event_markers(events: Sequence[Event], axis: TimeAxis, units: Units, *, labe
             seek = {"data_frame": event.frame, "data_track": event.track_id}
             markers.append(svg_element("g", *parts, class_=f"bar {color}", **button, **seek))
     return _graph([], [*names, *markers], axis, _KIND_HEIGHT * len(kinds), role="group", label=label)
+
+
+def _color(track_id: int) -> str:
+    """Class of a track's color, as `TrackHistory.color`."""
+    return f"c{(track_id - 1) % len(TRACK_COLORS)}"
 
 
 def _assign_rows(tracks: Sequence[TrackHistory], axis: TimeAxis) -> list[int]:
@@ -275,21 +283,20 @@ def fraction_bar(fraction: float) -> str:
 
 
 def _separate_labels(labels: Iterable[Label], height: int) -> list[Label]:
-    """Move labels down, or up where the chart ends, until none overlap; drop those without room."""
+    """Move labels up or down until none overlap; drop those that would be far from their lines."""
     placed: list[Label] = []
     for label in sorted(labels, key=lambda each: (each.y, each.x)):
-        near = sorted(other.y for other in placed if abs(other.x - label.x) < _LABEL_WIDTH)
-        y = max(label.y, _LABEL_HEIGHT)
-        for taken in near:
-            if abs(taken - y) < _LABEL_HEIGHT:
-                y = taken + _LABEL_HEIGHT
-        if y > height - 2:  # no room below: take the first free place above
-            y = height - 2.0
-            for taken in reversed(near):
-                if abs(taken - y) < _LABEL_HEIGHT:
-                    y = taken - _LABEL_HEIGHT
-        if y >= _LABEL_HEIGHT - 2:
-            placed.append(label._replace(y=y))
+        start = min(max(label.y, _LABEL_HEIGHT), height - 2.0)
+        near = [other.y for other in placed if abs(other.x - label.x) < _LABEL_WIDTH]
+        free = [
+            y
+            for y in (start, *(taken + step for taken in near for step in (_LABEL_HEIGHT, -_LABEL_HEIGHT)))
+            if abs(y - start) <= _MAX_SHIFT
+            and _LABEL_HEIGHT - 2 <= y <= height - 2
+            and all(abs(y - taken) >= _LABEL_HEIGHT - 1e-6 for taken in near)
+        ]
+        if free:
+            placed.append(label._replace(y=min(free, key=lambda y: abs(y - start))))
     return placed
 
 

@@ -43,7 +43,7 @@ from vehicle_detection.report.charts import (
 )
 from vehicle_detection.report.formatting import format_time, format_value
 from vehicle_detection.training import split_table
-from vehicle_detection.units import ROUGH_DISTANCE, UNITS, Units
+from vehicle_detection.units import ROUGH_DISTANCE, UNITS, Units, format_with_error
 from vehicle_detection.video import VideoReport
 
 _COUNT_SECONDS = (1, 2, 5, 10, 15, 30, 60, 120, 300)  # durations of a bar in the chart of counts
@@ -141,6 +141,7 @@ def render_page(
         fps=axis.fps,
         first_time=log.first_time,
         units=chosen,
+        notices=_notices(tracks, report, detector),
         counts=_counts(tracks, log, report, chosen),
         video=video,
         tracks=tracks,
@@ -175,6 +176,18 @@ def _in_units(track: TrackHistory, units: Units) -> TrackHistory:
     return dataclasses.replace(track, columns=columns)
 
 
+def _notices(tracks: Sequence[TrackHistory], report: VideoReport, detector: Any) -> list[str]:
+    """List what limits the results: damage of the source, dropped frames and an unknown lens."""
+    notices = [f"{report.damage}."] if report.damage else []
+    if report.dropped:
+        verb = "was" if report.dropped == 1 else "were"
+        notices.append(f"{pluralize(report.dropped, 'frame')} of the live source {verb} dropped.")
+    measured = any(np.isfinite(track.columns["distance_m"]).any() for track in tracks)
+    if measured and not getattr(detector, "lens_is_known", True):
+        notices.append("The lens is unknown: distances and speeds may be wrong by a factor of 2 or more.")
+    return notices
+
+
 def _counts(
     tracks: Sequence[TrackHistory], log: TrackLog, report: VideoReport, units: Units
 ) -> dict[str, str]:
@@ -190,8 +203,8 @@ def _counts(
     nearest = [(found, track.id) for track in tracks if (found := track.closest_approach(fps))]
     if nearest:
         found, track_id = min(nearest, key=lambda each: (each[0].distance_m, each[1]))
-        error = "" if found.std_m is None else f" \N{PLUS-MINUS SIGN} {found.std_m:.0f}"
-        counts["Nearest"] = f"{found.distance_m:.0f}{error} {units.distance_symbol}, #{track_id}"
+        distance = format_with_error(found.distance_m, found.std_m)
+        counts["Nearest"] = f"{distance} {units.distance_symbol}, #{track_id}"
     return counts
 
 
