@@ -1,6 +1,7 @@
 """Explanations of scores: shares of cells and other terms."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,9 +15,11 @@ from vehicle_detection import (
     VehicleDetector,
     explain,
     render_scene,
+    write_image,
 )
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.explanation import patch_cell_shares
+from vehicle_detection.events import TrackLog
+from vehicle_detection.explanation import explain_tracks, patch_cell_shares
 from vehicle_detection.features import part_slices
 from vehicle_detection.function_model import FunctionModel
 from vehicle_detection.mixture import MixtureSearch, denoise, prepare
@@ -157,6 +160,19 @@ def test_the_best_template_of_a_classifier_is_explained():
 def test_bad_boxes_are_refused(detector, box, message):
     with pytest.raises(InvalidInputError, match=message):
         explain(detector, SCENE.image, box)
+
+
+@pytest.mark.parametrize(("seconds", "frame"), [((0.0, 0.04), 0), ((0.04, 0.08), 1)])
+def test_a_detected_box_of_a_track_is_explained(detector, tmp_path, seconds, frame):
+    # Without any detected box, the largest predicted one.
+    log, box = TrackLog(), detector.detect(SCENE.image).boxes[0]
+    for index, time_since_update in enumerate(seconds):
+        write_image(tmp_path / f"{index}.png", SCENE.image)
+        larger = box + index * np.array([-1, -1, 1, 1])
+        log.add(index, index / 25, [SimpleNamespace(id=1, box=larger, time_since_update=time_since_update)])
+    explained = explain_tracks(detector, tmp_path, log)
+    assert explained[1].frame == frame
+    assert explained[1].explanation.found
 
 
 def test_bad_arguments_are_refused(detector):

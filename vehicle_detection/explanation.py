@@ -163,7 +163,7 @@ class ExplainedTrack(NamedTuple):
 
 
 def explain_tracks(detector: VehicleDetector, source: Source, log: TrackLog) -> dict[int, ExplainedTrack]:
-    """Explain a box of each of the twelve longest tracks of a video: its largest one inside the frame.
+    """Explain a box of each of the twelve longest tracks: the largest detected one inside the frame.
 
     Parameters
     ----------
@@ -187,10 +187,14 @@ def explain_tracks(detector: VehicleDetector, source: Source, log: TrackLog) -> 
     explained = {}
     with borrow_source(source) as opened:
         shape = opened.info.shape[:2]
-        offset = round((log.first_time or 0.0) * float(opened.info.fps))
+        fps = float(opened.info.fps)
+        offset, interval = round((log.first_time or 0.0) * fps), detector.search_interval(fps)
         for track in tracks:
             truncated = truncated_edges(track.boxes, shape).any(axis=1)
-            row = int(np.nanargmax(np.where(truncated, 0.01, 1.0) * box_areas(track.boxes)))
+            # Predicted boxes have no detection to explain; they are the last choice.
+            detected = (track.columns["time_since_update"] == 0) & (track.frames % interval == 0)
+            weights = np.where(truncated, 0.01, 1.0) * np.where(detected, 1.0, 1e-9)
+            row = int(np.nanargmax(weights * box_areas(track.boxes)))
             frame = int(track.frames[row])
             with opened.read(offset + frame, 1) as frames:
                 for _, _, image in frames:

@@ -19,7 +19,15 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video import OwnSpeed
 
 BOX_COLUMNS = ("x1", "y1", "x2", "y2")
-COLUMNS = ("distance_m", "distance_std_m", "speed_mps", "speed_std_mps", "confidence", *BOX_COLUMNS)
+COLUMNS = (
+    "distance_m",
+    "distance_std_m",
+    "speed_mps",
+    "speed_std_mps",
+    "confidence",
+    "time_since_update",
+    *BOX_COLUMNS,
+)
 """Values of a track that are kept for each frame; NaN if unknown."""
 
 
@@ -92,7 +100,7 @@ class TrackHistory:
 
 
 class TrackLog:
-    """Collect the shown tracks of a video while it is processed, 80 bytes for each track and frame.
+    """Collect the shown tracks of a video while it is processed, 88 bytes for each track and frame.
 
     Examples
     --------
