@@ -24,9 +24,11 @@ from tests.helpers import SMALL_MIXTURE, drawn, start_interruptible, write_frame
 from tests.video.clips import damage_sizes, write_clip
 from vehicle_detection import classifier, datasets, detector, mixture_training, training, video
 from vehicle_detection._common import files as _files
+from vehicle_detection._common import progress_bar
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import HorizonEstimate
 from vehicle_detection.classifier import VehicleClassifier, load_classifier
+from vehicle_detection.cli import output
 from vehicle_detection.cli.app import app
 from vehicle_detection.cli.demo import FILES, REPORT, SHEET, draw_clip, scored_truth
 from vehicle_detection.cli.output import output_folder, run_interruptible
@@ -162,7 +164,7 @@ def test_module_runs_as_a_program(picture, tmp_path):
     (found, missing, folder, version, usage) = (finish(process) for process in runs)
     assert found[0] == 0
     assert found[2] == ""
-    assert re.match(rf"{re.escape(str(picture))}: \d+ vehicles?( |$)", found[1])
+    assert re.match(rf"{re.escape(str(picture))}: \d+ vehicles?( |\n)", found[1])
     assert contents(tmp_path) == ["out", "out/road.png"]
     assert missing[:2] == (2, "")
     assert re.fullmatch(r"error: IMAGE \S+missing.png does not exist; check the path\n", missing[2])
@@ -297,6 +299,7 @@ def test_detect_writes_annotated_images_and_boxes(monkeypatch, picture, tmp_path
         f"{picture}: 2 vehicles  [10 20 60 70] 82%  [100 50 180 120] 56%",
         f"{other}: 0 vehicles",
         f"wrote 2 boxes to {boxes}",
+        f"wrote {folder}",
     ]
     assert boxes.read_text().splitlines() == [
         f"{HEADER},confidence",
@@ -434,7 +437,7 @@ def test_detect_accepts_every_kind_of_image(picture, tmp_path):
     for name, pixels in kinds.items():
         assert cv2.imwrite(str(tmp_path / name), pixels)
     out = succeed("detect", picture, *(tmp_path / name for name in kinds), "-o", tmp_path / "out")
-    found = {Path(line.partition(": ")[0]).name: line.partition(": ")[2] for line in out.splitlines()}
+    found = {Path(line.partition(": ")[0]).name: line.partition(": ")[2] for line in out.splitlines()[:-1]}
     assert list(found) == ["road.png", *kinds]
     assert found["rgba.png"] == found["deep.png"] == found["plain.bmp"] == found["road.png"]
     assert found["gray.png"] == found["gray_deep.png"]
@@ -617,6 +620,7 @@ def test_detect_explains_each_box(tmp_path):
     line = r"^  1: score \S+, template \d: margin \S+ = .* cells .* candidates .* perspective$"
     assert re.search(line, out, re.MULTILINE)
     assert contents(why) == ["road.png_1.png"]
+    assert out.splitlines()[-1] == f"wrote {why}"
     assert "--why must be a folder" in refuse("detect", image, "--why", image)
 
 
@@ -1283,6 +1287,40 @@ def test_info_of_a_model_with_other_metadata(tmp_path):
 
 
 # --- helpers ---
+
+
+def test_a_terminal_breaks_lines_at_spaces(monkeypatch, capsys):
+    monkeypatch.setattr(output, "_terminal_width", lambda stream: 24)
+    with progress_bar(True, 5, unit="frame"):
+        output.print_error("warning: /a/path/that/is/too/long/to/fit\nis used")
+    assert "warning:\n  /a/path/that/is/too/long/to/fit\n  is used\n" in capsys.readouterr().err
+    output.print_facts("data", {"sources": "GTI 3900, KITTI 5966", "n": 1})
+    assert capsys.readouterr().out == "data\n  sources  GTI 3900,\n           KITTI 5966\n  n        1\n"
+
+
+@pytest.mark.parametrize("width", [80, 50, 41])
+def test_a_table_breaks_no_word(monkeypatch, capsys, width):
+    monkeypatch.setattr(output, "_terminal_width", lambda stream: width)
+    words = ["project_clip", "false negatives", "near duplicates", "0.954", "KITTI and Extras"]
+    output.print_table("scores", ["tested on", *words[1:3]], [[words[0], "0.954", "1"], [words[4], "1", "2"]])
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= width
+    printed = " ".join(lines).split()
+    assert {word for text in words for word in text.split()} <= set(printed)
+    if width == 80:
+        assert any("false negatives" in line for line in lines)
+
+
+def test_a_table_that_is_too_wide_is_complete(monkeypatch, capsys):
+    monkeypatch.setattr(output, "_terminal_width", lambda stream: 12)
+    output.print_table("t", ["a", "b"], [["0123456789", "abcdefghij"]])
+    printed = "".join(capsys.readouterr().out.split())
+    assert set("0123456789abcdefghij") <= set(printed)
+
+
+def test_a_pipe_gets_one_line_for_each_message(capsys):
+    output.print_error("warning: " + "word " * 50)
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_run_interruptible_returns_results_and_raises_errors():

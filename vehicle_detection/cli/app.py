@@ -39,6 +39,7 @@ from vehicle_detection.cli.output import (
     output_folder,
     print_error,
     print_facts,
+    print_line,
     print_warnings,
     rename_argument,
     replace_unprintable,
@@ -174,7 +175,7 @@ def demo(
             "speed": f"{done.frames_per_second:.1f} frames/s",
         },
     )
-    typer.echo(f"wrote {', '.join((*FILES, REPORT) if report else FILES)} in {output}")
+    print_line(f"wrote {', '.join((*FILES, REPORT) if report else FILES)} in {output}")
 
 
 @app.command()
@@ -260,7 +261,10 @@ def detect(
         else:
             with option_names(path="--boxes"):
                 rows = write_boxes(found, boxes)
-            typer.echo(f"wrote {rows} boxes to {boxes}")
+            print_line(f"wrote {rows} boxes to {boxes}")
+    folders = [str(folder) for folder in (output, why) if folder is not None]
+    if folders:
+        print_line(f"wrote {', '.join(folders)}")
     if undecodable:
         raise typer.Exit(DAMAGED)
 
@@ -374,7 +378,7 @@ def _detect_each(
             f"  [{' '.join(f'{side:.0f}' for side in box)}] {text}"
             for box, text in zip(found.boxes.tolist(), score_texts(found))
         )
-        typer.echo(f"{path}: {pluralize(len(found), 'vehicle')}{listed}")
+        print_line(f"{path}: {pluralize(len(found), 'vehicle')}{listed}")
         shown = image
         if detector.blur is not None:
             shown = blur_boxes(image, found.boxes, region=detector.blur)
@@ -401,7 +405,7 @@ def _write_explanations(
 
     for number, box in enumerate(found.boxes, start=1):
         explanation = explain(detector, image, box)
-        typer.echo(f"  {number}: {explanation}")
+        print_line(f"  {number}: {explanation}")
         with atomic_write(folder / f"{name}_{number}.png", "--why") as part:
             picture: Any = plot_explanation(shown, explanation)
             picture.savefig(part)
@@ -461,7 +465,7 @@ def evaluate(
         scores["tracks"] = evaluate_tracks(
             found, true, iou=iou, ignored_as_regions=ignored_as_regions, frames=chosen
         )
-    typer.echo("\n\n".join(each.summary() for each in scores.values()))
+    print_line("\n\n".join(each.summary() for each in scores.values()))
     labelled = set(true.frames if chosen is None else chosen)
     unseen = len(labelled - set(found.frames))
     if labelled and unseen > 0.5 * len(labelled):

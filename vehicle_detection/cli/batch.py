@@ -24,7 +24,7 @@ from vehicle_detection.cli.options import (
     Preset,
     flag,
 )
-from vehicle_detection.cli.output import UNKNOWN_LENS, option_names, print_error
+from vehicle_detection.cli.output import UNKNOWN_LENS, option_names, print_error, print_line
 from vehicle_detection.errors import InvalidInputError
 
 
@@ -100,7 +100,7 @@ def batch(
     if status:
         from vehicle_detection.batch import batch_status
 
-        typer.echo(str(batch_status(output)))
+        print_line(str(batch_status(output)))
         _write_summary(output, summary)
         return
     if not sources:
@@ -122,7 +122,7 @@ def batch(
         if dask is not None and not dry_run:
             executor, dashboard = stack.enter_context(open_dask(dask, jobs))
             if not quiet:
-                typer.echo(f"dashboard {dashboard}")
+                print_line(f"dashboard {dashboard}")
         done = run_batch(
             sources,
             output,
@@ -143,7 +143,7 @@ def batch(
     if dry_run:
         for trip in done.planned or ():
             _print_trip(trip)
-        typer.echo(str(done))
+        print_line(str(done))
         return
     for source, message in done.messages.items():
         print_error(f"warning: {with_source(source, message)}")
@@ -152,8 +152,8 @@ def batch(
     if done.done and not lens_is_known and not quiet:
         print_error(UNKNOWN_LENS)
     if not quiet:
-        typer.echo(str(done))
-        typer.echo(f"wrote {hide_credentials(output)}" + (f", {summary}" if summary else ""))
+        print_line(str(done))
+        print_line(f"wrote {hide_credentials(output)}" + (f", {summary}" if summary else ""))
     if done.errors:  # the machine's fault: a job that is started again does the rest
         raise typer.Exit(1)
 
@@ -173,7 +173,7 @@ def _print_trip(trip: Mapping[str, Any]) -> None:
     start = (trip["start"] or "unknown start").replace("T", " ")
     replaced = f", replaces {pluralize(len(trip['replaces']), 'earlier result')}" if trip["replaces"] else ""
     first = encodable(hide_credentials(trip["files"][0]))
-    typer.echo(f"{start}  {trip['camera']}  {pluralize(len(trip['files']), 'file')} from {first}{replaced}")
+    print_line(f"{start}  {trip['camera']}  {pluralize(len(trip['files']), 'file')} from {first}{replaced}")
 
 
 def _write_summary(output: str, summary: Path | None) -> None:

@@ -8,9 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
-
-from vehicle_detection.cli.output import option_names, print_error
+from vehicle_detection.cli.output import option_names, print_error, print_line
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -126,7 +124,7 @@ def print_summary(log: TrackLog, events: tuple[Event, ...], report: VideoReport)
 
     if not len(log.counts):
         return
-    typer.echo(count_vehicles(events, log, fps=float(report.fps)).summary())
+    print_line(count_vehicles(events, log, fps=float(report.fps)).summary())
     kinds = Counter(event.kind for event in events if event.kind not in COUNTED)
     if kinds:
-        typer.echo("events: " + ", ".join(f"{kinds[kind]} {KINDS[kind]}" for kind in KINDS if kinds[kind]))
+        print_line("events: " + ", ".join(f"{kinds[kind]} {KINDS[kind]}" for kind in KINDS if kinds[kind]))

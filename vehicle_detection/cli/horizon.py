@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import typer
-
-from vehicle_detection.cli.output import print_error
+from vehicle_detection.cli.output import print_error, print_line
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -67,7 +65,7 @@ def find_horizon(
             )
         return None
     if not quiet:
-        typer.echo(
+        print_line(
             f"horizon {found.horizon:.3f} (standard error {found.horizon_std:.3f}, {found.n_boxes} boxes)"
         )
     return found.horizon

@@ -6,13 +6,15 @@ import contextlib
 import io
 import logging
 import os
+import shutil
 import sys
 import tempfile
+import textwrap
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import typer
 
@@ -36,9 +38,33 @@ def replace_unprintable() -> None:
         sys.stdout.reconfigure(errors="replace")
 
 
+def print_line(text: str, *, err: bool = False, indent: int = 2) -> None:
+    """Print a text; in a terminal, above progress bars, and wrapped at spaces with an indent."""
+    stream = sys.stderr if err else sys.stdout
+    if (width := _terminal_width(stream)) is None:
+        typer.echo(text, err=err)
+        return
+    options: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False}
+    options["subsequent_indent"] = " " * (indent if 2 * indent < width else 2)
+    lines = [
+        "\n".join(textwrap.wrap(line, width, **options)) if len(line) > width else line
+        for line in text.split("\n")
+    ]
+    tqdm = sys.modules.get("tqdm")  # unless it is imported, there is no bar
+    with tqdm.tqdm.external_write_mode(stream) if tqdm else contextlib.nullcontext():
+        typer.echo("\n".join(lines), err=err)
+
+
+def _terminal_width(stream: Any) -> int | None:
+    """Columns of a terminal; None for other streams."""
+    if stream is None or not stream.isatty():  # None: closed
+        return None
+    return shutil.get_terminal_size().columns
+
+
 def print_error(message: str) -> None:
     """Print one line to standard error, without the line breaks of the message."""
-    typer.echo(" ".join(message.split()), err=True)
+    print_line(" ".join(message.split()), err=True)
 
 
 class _LogPrinter(logging.Handler):
@@ -94,23 +120,44 @@ def print_table(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]])
     from rich.console import Console
     from rich.table import Table
 
+    terminal = _terminal_width(sys.stdout)
+    columns = [list(column) for column in zip(heads, *rows)]
+    padding, widths = _fit_columns(columns, terminal) if terminal else (1, [None] * len(columns))
     table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
-    for column, head in enumerate(heads):
-        numeric = all(row[column].replace(",", "").rstrip("%").replace(".", "").isdigit() for row in rows)
-        table.add_column(head, justify="right" if numeric and rows else "left", overflow="fold")
+    table.padding = (0, padding)
+    for (head, *cells), column_width in zip(columns, widths):
+        numeric = all(cell.replace(",", "").rstrip("%").replace(".", "").isdigit() for cell in cells)
+        justify: Literal["left", "right"] = "right" if numeric and rows else "left"
+        table.add_column(head, justify=justify, overflow="fold", width=column_width)
     for row in rows:
         table.add_row(*row)
-    Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH, highlight=False, markup=False).print(table)
+    Console(width=terminal or _PIPE_WIDTH, highlight=False, markup=False).print(table)
+
+
+def _fit_columns(columns: Sequence[Sequence[str]], width: int) -> tuple[int, list[int | None]]:
+    """Choose padding and widths that break a table's lines at spaces only; None if the words do not fit."""
+    full = [max(map(len, column)) for column in columns]
+    words = [max((len(word) for cell in column for word in cell.split()), default=0) for column in columns]
+    for padding in (1, 0):
+        spare = width - 1 - (2 * padding + 1) * len(columns) - sum(words)
+        if spare >= 0:
+            widths: list[int | None] = []
+            for most, least in zip(full, words):
+                extra = min(most - least, spare)
+                widths.append(least + extra)
+                spare -= extra
+            return padding, widths
+    return 0, [None] * len(columns)
 
 
 def print_facts(title: str, facts: Mapping[str, Any]) -> None:
     """Print a title, and below it names and values in two columns."""
-    typer.secho(title, bold=True)
+    print_line(typer.style(title, bold=True))
     width = max(map(len, facts), default=0)
     for name, value in facts.items():
         nested = isinstance(value, Mapping)
         text = ", ".join(f"{key} {entry}" for key, entry in value.items()) if nested else str(value)
-        typer.echo(f"  {name:<{width}}  {text}")
+        print_line(f"  {name:<{width}}  {text}", indent=width + 4)
 
 
 def check_distinct_paths(targets: Mapping[str, Path | None], sources: Mapping[str, Path]) -> None:

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
 from typer import Argument, Option
 
 from vehicle_detection.cli.options import PATCHES, flag
@@ -20,6 +19,7 @@ from vehicle_detection.cli.output import (
     option_names,
     output_folder,
     print_facts,
+    print_line,
     print_table,
     run_interruptible,
 )
@@ -119,7 +119,7 @@ def train(
             with atomic_write(card) as part:
                 text = model_card(classifier, evaluated, name=output.stem, others=others, command=command)
                 part.write_text(encodable(text), encoding="utf-8")
-    typer.echo(f"wrote {', '.join(map(str, targets.values()))}")
+    print_line(f"wrote {', '.join(map(str, targets.values()))}")
 
 
 def _print_report(report: TrainingReport) -> None:
@@ -131,10 +131,10 @@ def _print_report(report: TrainingReport) -> None:
         *report_table(report),
     )
     if report.calibration_error is not None:
-        typer.echo(f"calibration error on the split 'sequences': {report.calibration_error:.4f}")
+        print_line(f"calibration error on the split 'sequences': {report.calibration_error:.4f}")
     for name, reason in report.skipped.items():
-        typer.echo(f"left out {SPLITS[name]!r}: {reason}")
-    typer.echo(", ".join(f"{name} {seconds:.1f} s" for name, seconds in report.seconds.items()))
+        print_line(f"left out {SPLITS[name]!r}: {reason}")
+    print_line(", ".join(f"{name} {seconds:.1f} s" for name, seconds in report.seconds.items()))
 
 
 def fetch(
@@ -149,7 +149,7 @@ def fetch(
     with output_folder(output, "--output"):
         paths = fetch_patches(output, progress=sys.stderr.isatty())
     for path in paths:
-        typer.echo(str(path))
+        print_line(str(path))
 
 
 def info(
@@ -240,11 +240,11 @@ def train_frames(
         for part in source.sets:
             empty = sum(not len(part.labels.rows(key)) for key in part.keys)
             boxes = pluralize(len(part.labels), "box", "es")
-            typer.echo(f"{source.name}: {pluralize(len(part), 'frame')}, {boxes}, {empty} frames without any")
+            print_line(f"{source.name}: {pluralize(len(part), 'frame')}, {boxes}, {empty} frames without any")
     vehicles = [] if patches is None else list(load_patches(patches, label=1).patches)
     extra = [drawn_source(random_state=seed)] if drawn else []
     model, scores, folds = cross_validate_mixture(
-        sources, extra_sources=extra, patches=vehicles, random_state=seed, on_step=typer.echo
+        sources, extra_sources=extra, patches=vehicles, random_state=seed, on_step=print_line
     )
     metadata = training_metadata(scores, [*sources, *extra], seed, len(vehicles))
     with name_kept_files(targets.values()):
@@ -252,4 +252,4 @@ def train_frames(
         if curves is not None:
             write_curves(curves, folds)
     print_fold_scores({score.name: score.to_dict() for score in scores})
-    typer.echo(f"wrote {', '.join(map(str, targets.values()))}")
+    print_line(f"wrote {', '.join(map(str, targets.values()))}")

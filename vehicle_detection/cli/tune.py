@@ -8,13 +8,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
 from typer import Option
 
 from vehicle_detection.cli.options import PATCHES, flag
 from vehicle_detection.cli.output import (
     check_distinct_paths,
     option_names,
+    print_line,
     print_table,
     run_interruptible,
 )
@@ -125,7 +125,7 @@ def tune(
         write_results(table, output)
     if plot is not None:
         _draw(final, plot)
-    typer.echo(f"wrote {', '.join(map(str, targets.values()))}")
+    print_line(f"wrote {', '.join(map(str, targets.values()))}")
 
 
 def _read_frames(frames: Path | None, labels: Path | None, horizon: float | None) -> LabelledFrames | None:
@@ -163,7 +163,7 @@ def _show(final: DataFrame, table: DataFrame, grid: Mapping[str, Sequence[Any]])
     if rows:
         print_table(title, heads, rows)
     for row in table[table["message"].notna()].drop_duplicates("configuration").to_dict("records"):
-        typer.echo(f"{row['configuration']} {row['status']}: {row['message']}")
+        print_line(f"{row['configuration']} {row['status']}: {row['message']}")
 
 
 def _text(value: float, digits: int) -> str:

@@ -39,6 +39,7 @@ from vehicle_detection.cli.output import (
     option_names,
     output_folder,
     print_error,
+    print_line,
 )
 from vehicle_detection.errors import InvalidInputError
 
@@ -352,12 +353,12 @@ def video(
                 warn_of_horizon(given, estimate_video_horizon(again, everywhere, start=start, end=end))
     if not quiet or profile:
         lines = str(done).splitlines()
-        typer.echo("\n".join(lines if profile else lines[:1]))
+        print_line("\n".join(lines if profile else lines[:1]))
     if not quiet:
         print_summary(log, found, done)
         written = [path for path in (*outputs.values(), clips) if path is not None]
         if written:
-            typer.echo(f"wrote {', '.join(map(str, written))}")
+            print_line(f"wrote {', '.join(map(str, written))}")
     if done.damage:
         raise typer.Exit(DAMAGED)
 
