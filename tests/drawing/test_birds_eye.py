@@ -103,6 +103,32 @@ class TestPanel:
         color = (drawn[:300, left:] == TRACK_COLORS[0]).all(axis=2) & changed[:300, left:]
         assert color.sum() < 400  # the vehicle in the view, no label
 
+    def test_numbers_stay_in_the_view(self):
+        """At each border; a small view has no room for numbers."""
+        options = {"distance_std_m": 0.1, "speed_mps": None}
+        boxes = {79.0: (600, 400, 680, 470), 20.0: (1000, 400, 1080, 470), 21.0: (200, 400, 280, 470)}
+        for distance, box in boxes.items():
+            tracks = [track(box, id=8, distance_m=distance, **options)]
+            drawn = TrackDrawer(DrawParams(panel="side", labels=())).draw(blank(), tracks, camera=CAMERA)
+            empty = TrackDrawer(DrawParams(panel="side", labels=())).draw(blank(), [], camera=CAMERA)
+            white = ((drawn == 235).all(axis=2) & (empty != 235).any(axis=2))[:, 1280:]
+            rows, columns = np.nonzero(white)
+            assert np.ptp(rows) >= 8
+            assert np.ptp(columns) >= 4
+        image = blank(240, 320)
+        small = [
+            TrackDrawer(DrawParams(panel="corner", labels=())).draw(image, each) for each in (tracks, [])
+        ]
+        assert ((small[0] == 235).all(axis=2) & (small[1] != 235).any(axis=2)).sum() == 0
+
+    def test_lines_grow_with_the_frame(self):
+        widths = []
+        for height in (720, 2160):
+            image = blank(height, height)
+            drawn = TrackDrawer(DrawParams(panel="side", labels=())).draw(image, [], camera=CAMERA)
+            widths.append((drawn[height // 2, height:] == (72, 78, 86)).all(axis=1).sum())
+        assert widths[1] >= 3 * widths[0]
+
     def test_a_vehicle_is_at_its_place(self):
         """A vehicle in the own lane: in the middle, and the farther the higher."""
         rows = []

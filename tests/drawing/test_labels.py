@@ -2,11 +2,14 @@
 
 import itertools
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.drawing.labels import LabelPlacer, LabelRequest
+from vehicle_detection.drawing.primitives import BLACK, WHITE, ink_on
 
 SHAPE = (720, 1280, 3)
 FIELDS = ("#3", "24 m", "-1.2 m/s")
@@ -71,6 +74,40 @@ def test_a_row_of_vehicles_has_all_labels_outside_all_boxes():
     assert any(label.leader for label in labels)
 
 
+def test_labels_of_a_crowd_hide_nothing():
+    far = [request(key, 560 + 45 * key, 300, 40, 30) for key in range(4)]
+    near = [request(key + 4, 300 + 100 * key, 330 + 5 * (key % 3), 120, 90) for key in range(6)]
+    labels = LabelPlacer().place(far + near, SHAPE)
+    for label, box in itertools.product(labels, far + near):
+        assert overlap(label.rectangle, box.box) == 0
+    for first, second in itertools.combinations(labels, 2):
+        assert overlap(first.rectangle, second.rectangle) == 0
+    assert all("  ".join(label.lines) == "  ".join(FIELDS) for label in labels)
+
+
+def test_without_room_the_last_fields_are_left_out():
+    blocked = [(0, 0, 1280, 385), (0, 490, 1280, 720)]
+    boxes = [request(key, 100 + 250 * key, 400, fields=FIELDS) for key in range(4)]
+    walls = [(box.box[2], 380, box.box[0] + 220, 500) for box in boxes]
+    placer = LabelPlacer()
+    labels = placer.place(boxes, SHAPE, blocked + walls)
+    assert labels[0].lines == ("#3  24 m", "-1.2 m/s")  # free to the left
+    assert {label.lines for label in labels[1:]} == {("#3",)}
+    for label, other in itertools.product(labels, [*(box.box for box in boxes), *blocked, *walls]):
+        assert overlap(label.rectangle, other) == 0
+    assert placer.place(boxes, SHAPE, blocked + walls) == labels
+    assert placer.place(boxes, SHAPE)[1].lines == labels[0].lines
+
+
+def test_a_leader_line_may_run_down():
+    box = request(1, 600, 100)
+    around = [(0, 0, 1280, 100), (0, 100, 600, 300), (700, 100, 1280, 300), (0, 180, 1280, 182)]
+    (label,) = LabelPlacer().place([box], SHAPE, around)
+    (_, y), (end_x, end_y) = label.leader
+    assert (y, end_y) == (box.box[3] - 1, label.rectangle[1])
+    assert label.rectangle[0] <= end_x < label.rectangle[2]
+
+
 def test_a_leader_line_runs_from_the_box_to_its_label():
     row = [request(key, 500 + 45 * key, 400 + 2 * key, 70, 60) for key in range(6)]
     for box, label in zip(row, LabelPlacer().place(row, SHAPE), strict=True):
@@ -109,6 +146,24 @@ def test_a_label_does_not_switch_to_and_fro_while_a_vehicle_passes():
         tops.append(label.rectangle[1] - 400)
     changes = sum(first != second for first, second in itertools.pairwise(tops))
     assert 1 <= changes <= 2
+
+
+@pytest.mark.parametrize("color", TRACK_COLORS)
+def test_text_contrasts_with_its_label(color):
+    """Level AA of the Web Content Accessibility Guidelines 2.2: 4.5."""
+    assert contrast(ink_on(color), color) >= 4.5
+
+
+@given(st.tuples(*[st.integers(0, 255)] * 3))
+def test_text_is_black_or_white_whichever_contrasts_more(color):
+    assert contrast(ink_on(color), color) == max(contrast(ink, color) for ink in (BLACK, WHITE))
+
+
+def contrast(one, other):
+    values = np.array([one, other]) / 255
+    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    dark, light = sorted(linear @ [0.2126, 0.7152, 0.0722])
+    return (light + 0.05) / (dark + 0.05)
 
 
 def test_a_request_without_text_has_no_label():

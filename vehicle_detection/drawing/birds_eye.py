@@ -46,6 +46,8 @@ _BACKGROUND, _BACKGROUND_ALPHA, _ELLIPSE_ALPHA = (26, 29, 33), 0.78, 0.4
 _CORNER_HEIGHT, _SIDE_WIDTH, _ASPECT = 0.42, 0.3, 0.42
 # Lookup table of the frame's brightness behind the view.
 _DIMMED = np.rint(np.arange(256) * (1 - _BACKGROUND_ALPHA)).astype(np.uint8)
+_MIN_TEXT_HEIGHT = 140  # pixels of a view that has room for numbers
+_LINE_HEIGHT = 500  # pixels of a view for each pixel of the width of its lines
 _TRAIL_STEP = 0.08  # s
 _SHIFT = 4  # fractional bits of coordinates in OpenCV
 _FAR = 1e6  # limit of such coordinates
@@ -131,6 +133,8 @@ class BirdsEyePanel:
         # Large frames are shown smaller than small ones.
         enlarged = math.sqrt(max(shape[0] / 1080, 1.0))
         self._text_scale = max(0.3, min(0.4 * math.sqrt(height / 300) * enlarged, 4.0))
+        self._line = max(1, round(height / _LINE_HEIGHT))
+        self._has_text = height >= _MIN_TEXT_HEIGHT
         self._grid = self._draw_grid(height, width, units)
         self._dark = (self._grid * _BACKGROUND_ALPHA).astype(np.uint8)
         self._trails = Trails()
@@ -179,10 +183,11 @@ class BirdsEyePanel:
             self._draw_ellipse(view, position, color)
         for position, track, color in shown:
             trail = [*(point for _, point in trails[track.id]), points[track.id]]
-            cv2.polylines(view, [np.array(trail, np.int32)], False, color, 1, cv2.LINE_AA, _SHIFT)
+            cv2.polylines(view, [np.array(trail, np.int32)], False, color, self._line, cv2.LINE_AA, _SHIFT)
             self._draw_vehicle(view, track, position, color, camera)
-        for position, track, _ in shown:
-            self._write_number(view, track, position)
+        if self._has_text:
+            for position, track, _ in shown:
+                self._write_number(view, track, position)
         return left, 0, left + width, height
 
     def _draw_grid(self, height: int, width: int, units: str) -> Image:
@@ -191,14 +196,15 @@ class BirdsEyePanel:
         lanes = int(width / 2 / self._scale / LANE_WIDTH_M + 0.5)
         for number in range(-lanes, lanes):
             x = self._column((number + 0.5) * LANE_WIDTH_M)
-            cv2.line(grid, (x, 0), (x, height), _GRID_COLOR, 1)
+            cv2.line(grid, (x, 0), (x, height), _GRID_COLOR, self._line)
         chosen = UNITS[units]
         for distance in _RANGES[units]:
             y = self._row(distance / chosen.distance)
-            cv2.line(grid, (0, y), (width, y), _GRID_COLOR, 1)
+            cv2.line(grid, (0, y), (width, y), _GRID_COLOR, self._line)
             scale = self._text_scale
             text = f"{distance} {chosen.distance_symbol}"
-            draw_text(grid, [text], 0, y - cap_height(scale) - 6, scale, _TEXT_COLOR)
+            if self._has_text:
+                draw_text(grid, [text], 0, y - cap_height(scale) - 6, scale, _TEXT_COLOR)
         length, half = 4.2, 0.9
         corners = [(-half, -length), (half, -length), (half, -1.2), (0.0, 0.3), (-half, -1.2)]
         cv2.fillPoly(grid, [self._pixels(corners)], _OWN_COLOR, cv2.LINE_AA, _SHIFT)
@@ -225,7 +231,7 @@ class BirdsEyePanel:
         half, length = camera.vehicle_width_m / 2, camera.vehicle_length_m
         corners = self._pixels([(x - half, z), (x + half, z), (x + half, z + length), (x - half, z + length)])
         if track.state == "coasting":
-            cv2.polylines(panel, [corners], True, color, 1, cv2.LINE_AA, _SHIFT)
+            cv2.polylines(panel, [corners], True, color, self._line, cv2.LINE_AA, _SHIFT)
         else:
             cv2.fillPoly(panel, [corners], color, cv2.LINE_AA, _SHIFT)
         speed = track.speed_mps
@@ -233,14 +239,15 @@ class BirdsEyePanel:
             start = z + length if speed > 0 else z
             first, last = (self._column(x), self._row(start)), (self._column(x), self._row(start + speed))
             tip = min(0.4, max(3.0, self._scale) / max(abs(last[1] - first[1]), 1))
-            cv2.arrowedLine(panel, first, last, _OWN_COLOR, 1, cv2.LINE_AA, 0, tip)
+            cv2.arrowedLine(panel, first, last, _OWN_COLOR, self._line, cv2.LINE_AA, 0, tip)
 
     def _write_number(self, panel: Image, track: Track, position: RoadPosition) -> None:
         """Write the number of a track beside its vehicle."""
         text = [f"{track.id}"]
         width, height = text_size(text, self._text_scale)
-        x = min(self._column(position.lateral_m + 1.2), self._width - width)
-        draw_text(panel, text, x, self._row(position.distance_m) - height, self._text_scale, _OWN_COLOR)
+        x = min(max(self._column(position.lateral_m + 1.2), 0), self._width - width)
+        y = min(max(self._row(position.distance_m) - height, 0), len(panel) - height)
+        draw_text(panel, text, x, y, self._text_scale, _OWN_COLOR)
 
     def _column(self, lateral_m: float) -> int:
         return round(self._width / 2 + lateral_m * self._scale)

@@ -27,8 +27,8 @@ _FREE_WIDTH, _TOLERANCE = 180, 1.15
 _LAST_WEIGHT = 0.7
 # Fraction of a box that a label inside may cover.
 _MAX_INSIDE = 0.12
-# Rows of labels on leader lines above a box.
-_LEADER_ROWS = 6
+# Rows of labels on leader lines above and below a box.
+_ROWS_ABOVE, _ROWS_BELOW = 6, 3
 # Numbers of the place inside a box, and of that for a label without a place in the image.
 _INSIDE, _ELSEWHERE = 6, 99
 _DIGIT = re.compile(r"\d")
@@ -57,11 +57,13 @@ class LabelPlacer:
     """Places the labels of a frame; a label keeps its place at its box while that place is free.
 
     The places, in order of preference: above, below and beside the box, inside if that covers little of it,
-    then farther up on a leader line. If none is free, the label goes where it hides least.
+    then farther up or down on a leader line. If none is free, the last fields are left out; if even the first
+    one has no free place, it goes where it hides least.
     """
 
     def __init__(self) -> None:
-        self._last: dict[Hashable, tuple[int, int]] = {}  # lines and place of each label in the last frame
+        # Numbers of fields and lines, and place, of each label in the last frame.
+        self._last: dict[Hashable, tuple[int, int, int]] = {}
 
     def place(
         self, requests: list[LabelRequest], shape: tuple[int, ...], blocked: Sequence[Rectangle] = ()
@@ -72,30 +74,39 @@ class LabelPlacer:
         """
         scale = text_scale(shape)
         labels: list[Label | None] = []
-        last: dict[Hashable, tuple[int, int]] = {}
+        last: dict[Hashable, tuple[int, int, int]] = {}
         for number, request in enumerate(requests):
             if not request.fields:
                 labels.append(None)
                 continue
-            count, place = self._last.get(request.key, (None, None))
-            lines, size, fitted = _break_lines(request, shape[1], scale, count)
+            last_fields, last_lines, last_place = self._last.get(request.key, (None, None, None))
             obstacles = [other.box for other in requests[:number] + requests[number + 1 :]]
             obstacles += [label.rectangle for label in labels if label is not None]
             obstacles += blocked
-            place, rectangle = _choose(request.box, size, shape, obstacles, place, text_margin(scale))
+            for count in range(len(request.fields), 0, -1):
+                lines, size, fitted = _break_lines(
+                    request.fields[:count], request.box, shape[1], scale, last_lines
+                )
+                # Another number of fields is like another place.
+                before = last_place if last_fields in (None, count) else -1
+                place, rectangle, free = _choose(
+                    request.box, size, shape, obstacles, before, text_margin(scale)
+                )
+                if free:
+                    break
             labels.append(Label(lines, rectangle, fitted, _leader(request.box, rectangle)))
-            last[request.key] = len(lines), place
+            last[request.key] = count, len(lines), place
         self._last = last
         return labels
 
 
 def _break_lines(
-    request: LabelRequest, image_width: int, scale: float, last_count: int | None
+    fields: Sequence[str], box: Rectangle, image_width: int, scale: float, last_count: int | None
 ) -> tuple[tuple[str, ...], tuple[int, int], float]:
     """Lines of a label that is not much wider than its box, their size in pixels, and the font scale."""
-    wide = max(request.box[2] - request.box[0], _FREE_WIDTH * scale)
-    for count in range(1, len(request.fields) + 1):
-        lines = _split(request.fields, count)
+    wide = max(box[2] - box[0], _FREE_WIDTH * scale)
+    for count in range(1, len(fields) + 1):
+        lines = _split(fields, count)
         # All digits count as the widest one, so that the size does not change with every number.
         size = text_size([_DIGIT.sub("0", line) for line in lines], scale)
         if size[0] <= wide * (_TOLERANCE if count == last_count else 1.0):
@@ -124,14 +135,14 @@ def _choose(
     obstacles: Sequence[Rectangle],
     last: int | None,
     margin: int,
-) -> tuple[int, Rectangle]:
-    """Return number and rectangle of the best place for a label of this size."""
+) -> tuple[int, Rectangle, bool]:
+    """Return number and rectangle of the best place for a label of this size, and whether it is free."""
     places: dict[int, Rectangle] = {}
     for place, rectangle in _places(box, size, shape):
         # A better place than the last one needs some more space, so that a label does not switch to and fro.
         space = 0 if last is None or place == last else margin
         if not any(_intersect(rectangle, other, space) for other in obstacles):
-            return place, rectangle
+            return place, rectangle, True
         places[place] = rectangle
     # Nothing is free: the place that hides least, where the last one counts less.
     areas = {
@@ -139,7 +150,7 @@ def _choose(
         for place, rectangle in places.items()
     }
     best = min(areas, key=lambda place: (areas[place], place))
-    return best, places[best]
+    return best, places[best], False
 
 
 def _places(box: Rectangle, size: tuple[int, int], shape: tuple[int, ...]) -> Iterator[tuple[int, Rectangle]]:
@@ -166,9 +177,14 @@ def _corners(box: Rectangle, size: tuple[int, int]) -> Iterator[tuple[int, int]]
     yield from ((x1, y1 - height), (x2 - width, y1 - height), (x1, y2), (x2 - width, y2))
     yield from ((x2, y1), (x1 - width, y1), (x1, y1))
     gap = height // 2
-    for row in range(1, _LEADER_ROWS + 1):
+    columns = ((x1 + x2 - width) // 2, x2 + gap, x1 - width - gap)
+    farther = (x2 + 2 * gap + width, x1 - 2 * (width + gap))
+    for row in range(1, _ROWS_ABOVE + 1):
         y = y1 - (row + 1) * (height + gap // 2)
-        yield from (((x1 + x2 - width) // 2, y), (x2 + gap, y), (x1 - width - gap, y))
+        yield from ((x, y) for x in columns + farther)
+    for row in range(1, _ROWS_BELOW + 1):
+        y = y2 + row * (height + gap // 2)
+        yield from ((x, y) for x in columns)
 
 
 def _leader(box: Rectangle, label: Rectangle) -> tuple[tuple[int, int], tuple[int, int]] | None:
@@ -176,7 +192,8 @@ def _leader(box: Rectangle, label: Rectangle) -> tuple[tuple[int, int], tuple[in
     if _intersect(box, label, 1):
         return None
     x = min(max((box[0] + box[2]) // 2, label[0]), label[2] - 1)
-    return (min(max(x, box[0]), box[2] - 1), box[1]), (x, label[3] if label[3] <= box[1] else label[1])
+    start, end = (box[3] - 1, label[1]) if label[1] >= box[3] else (box[1], label[3])
+    return (min(max(x, box[0]), box[2] - 1), start), (x, end)
 
 
 def _hidden_area(label: Rectangle, obstacles: Sequence[Rectangle]) -> int:

@@ -69,9 +69,14 @@ def _fill_dashed(image: Image, line: Rectangle, color: Color) -> None:
             fill_rectangle(image, (x1, y1 + start, x2, y1 + start + dash), color)
 
 
+@functools.lru_cache(maxsize=4096)
 def ink_on(background: Color) -> Color:
-    """Black or white, whichever contrasts more with a background."""
-    return BLACK if np.dot(background, (0.299, 0.587, 0.114)) > 110 else WHITE
+    """Black or white, whichever contrasts more with a background (WCAG 2.2)."""
+    red, green, blue = (
+        value / 3294.6 if value <= 10 else ((value / 255 + 0.055) / 1.055) ** 2.4 for value in background
+    )
+    # The contrast is (lighter + 0.05) / (darker + 0.05), for relative luminances.
+    return BLACK if (0.2126 * red + 0.7152 * green + 0.0722 * blue + 0.05) ** 2 > 0.05 * 1.05 else WHITE
 
 
 def draw_text(image: Image, lines: list[str], x: int, y: int, scale: float, ink: Color) -> None:

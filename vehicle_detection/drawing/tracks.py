@@ -54,7 +54,8 @@ def draw_tracks(
     """Draw tracks on a copy of an image, each with a box and a label, sized to the image.
 
     Only tracks with ``track.shown`` are drawn; those without a detection in this frame have dashed boxes.
-    Labels are placed where they hide neither other labels nor other vehicles, if necessary on leader lines.
+    Labels are placed where they hide neither other labels nor other vehicles, if necessary on leader lines or
+    without their last fields.
 
     Parameters
     ----------
