@@ -57,9 +57,13 @@ html_theme_options = {
 }
 
 
-def _move_links(_app: Sphinx, docname: str, source: list[str]) -> None:
+def _edit_source(_app: Sphinx, docname: str, source: list[str]) -> None:
     path = f"docs/{docname}.md"
-    source[0] = move_links(source[0], path, path)
+    # Values and their errors stay in one line of a table's cell.
+    text = re.sub(
+        r"(?m)^\|.*", lambda row: row[0].replace(" ± ", "\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}"), source[0]
+    )
+    source[0] = move_links(text, path, path)
 
 
 # Readable forms of what type aliases and default factories evaluate to.
@@ -89,7 +93,7 @@ def _shorten_signature(
 
 
 def setup(app: Sphinx) -> None:
-    """Generate pages before, and change links while sources are read."""
+    """Generate pages before sources are read, and edit these."""
     write_pages(DOCS)
-    app.connect("source-read", _move_links)
+    app.connect("source-read", _edit_source)
     app.connect("autodoc-process-signature", _shorten_signature)
