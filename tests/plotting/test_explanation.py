@@ -33,6 +33,9 @@ def test_cells_and_terms_are_drawn():
         "bias",
         "second stage",
     ]
+    # The line of the margin is behind the numbers.
+    (line, *_), numbers = figure.axes[2].lines, figure.axes[2].texts
+    assert all(number.get_bbox_patch() and number.get_zorder() > line.get_zorder() for number in numbers)
     low, high = figure.axes[2].get_xlim()
     assert low < 0
     assert high > 0.75

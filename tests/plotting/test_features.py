@@ -12,6 +12,7 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import extract_features, hog_image, sum_blocks
 from vehicle_detection.params import FeatureParams
 from vehicle_detection.plotting.features import add_glyphs
+from vehicle_detection.plotting.style import OTHER, VEHICLE
 from vehicle_detection.synthetic import render_patches
 
 
@@ -142,6 +143,12 @@ def test_vectors_are_plotted_before_and_after_scaling(patch_set):
         np.testing.assert_array_equal(line.get_ydata(), values)
         np.testing.assert_allclose(scaled.get_ydata(), (values - template.mean) / template.scale)
     assert legend(above) == ["car", "road"]
+    classes = patch_set.labels[[3, 30]].tolist()
+    for rows in ([3, 30], [30, 3]):
+        lines = plotting.plot_features(patch_set, classifier, rows=rows).axes[0].lines
+        colors = [VEHICLE if patch_set.labels[row] else OTHER for row in rows]
+        assert [line.get_color() for line in lines] == colors
+    assert sorted(classes) == [False, True]
     parts = ["spatial bins (192)", "color histogram (24)", "HOG (648)"]
     assert texts(above.texts) == parts
     assert below.get_ylabel() == "value (standard deviations)"

@@ -176,7 +176,7 @@ def test_the_tradeoff_marks_the_pareto_front():
     assert given.lines[0].get_xydata().tolist() == [[4, 0.97], [9, 0.99]]
     assert given.collections[0].get_offsets().tolist() == [[4, 0.97], [5, 0.96], [9, 0.99]]
     assert texts(given.texts) == ["a", "c"]
-    assert (given.get_xlabel(), given.get_ylabel()) == ("search ms", "accuracy")
+    assert (given.get_xlabel(), given.get_ylabel()) == ("search time (ms per frame)", "accuracy on patches")
     other = plotting.plot_tradeoff(table, label=None)
     assert other.figure is not given.figure
     assert not other.texts
@@ -188,6 +188,27 @@ def test_the_tradeoff_marks_the_pareto_front():
         plotting.plot_tradeoff(table[3:])
 
 
+def test_names_of_the_tradeoff_stay_in_the_axes():
+    names = ["orient=9, color_space=YCrCb, C=1"] * 4
+    columns = {"accuracy": [0.97, 0.98, 0.99, 0.999], "search_ms": [4.0, 5.0, 8.0, 9.0]}
+    axes = plotting.plot_tradeoff(pd.DataFrame({"configuration": names} | columns))
+    assert max(axes.get_yticks()) == pytest.approx(1)
+    axes.figure.canvas.draw()
+    frame = axes.get_window_extent()
+    for text in axes.texts:
+        extent = text.get_window_extent()
+        assert frame.x0 <= extent.x0 < extent.x1 <= frame.x1
+        assert frame.y0 <= extent.y0 < extent.y1 <= frame.y1
+
+
+def test_names_of_sources_do_not_overlap():
+    frames, _ = labelled()
+    scores = evaluate_detections(frames.labels, frames.labels)
+    axes = plotting.plot_f1({f"source of frames number {number}": scores for number in range(8)})
+    axes.figure.canvas.draw()
+    assert {text.get_rotation() for text in axes.get_xticklabels()} == {30}
+
+
 def test_a_parameter_is_plotted_with_the_deviation_of_its_runs():
     table = pd.DataFrame({"C": [1e-4, 1e-4, 1.0, None], "split": ["x"] * 4, "accuracy": [0.9, 1.0, 0.8, 0.1]})
     axes = plotting.plot_parameter(table, "C", by="split", ax=new_axes())
@@ -197,7 +218,7 @@ def test_a_parameter_is_plotted_with_the_deviation_of_its_runs():
     several, single = bars[2][0].get_segments()
     assert np.ptp(several[:, 1]) / 2 == pytest.approx(np.std([0.9, 1.0], ddof=1))
     assert not len(single)  # a single run has no deviation
-    assert (axes.get_xscale(), axes.get_xlabel(), axes.get_ylabel()) == ("log", "C", "accuracy")
+    assert (axes.get_xscale(), axes.get_xlabel(), axes.get_ylabel()) == ("log", "C", "accuracy on patches")
     assert legend(axes) == ["x"]
 
 
@@ -209,7 +230,7 @@ def test_parameters_may_be_text_or_numbers():
     assert texts(words.get_xticklabels()) == ["LUV", "YCrCb"]
     np.testing.assert_allclose(words.lines[0].get_xydata(), [[0, 0.6], [1, 0.75]])
     assert words.get_legend() is None
-    assert words.get_ylabel() == "frame f1"
+    assert words.get_ylabel() == "F1 on frames"
     assert (
         plotting.plot_parameter(table, "orient", quality="frame_f1", ax=new_axes()).get_xscale() == "linear"
     )

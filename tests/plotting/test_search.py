@@ -93,6 +93,21 @@ def test_the_comparison_shows_all_scores_and_their_maximum_difference():
         plotting.plot_comparison([1.0], [np.inf])
 
 
+@pytest.mark.parametrize("fastest", [0.01, 29.9])
+def test_texts_of_speedups_stay_in_the_axes(fastest):
+    axes = plotting.plot_speedups(
+        {"the method of the course (scaler, SVM)": 30.0, "other": fastest, "b": 29.8}
+    )
+    axes.figure.canvas.draw()
+    right = axes.get_window_extent().x1
+    assert all(text.get_window_extent().x1 <= right for text in axes.texts)
+
+
+def test_a_heat_map_without_windows_has_a_readable_scale():
+    figure = plotting.plot_heatmap(gray_image(), Detections.empty())
+    assert figure.axes[1].images[0].get_clim() == (0, 1)
+
+
 def test_speedups_over_the_slowest_or_a_chosen_method():
     times = {"a": 2.0, "b": 0.5, "c": 0.002}
     axes = plotting.plot_speedups(times, ax=new_axes())

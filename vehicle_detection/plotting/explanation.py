@@ -78,7 +78,9 @@ def plot_explanation(
     sums.barh(rows, values, left=starts, color=[VERMILION if value > 0 else BLUE for value in values])
     for row, start, value in zip(rows.tolist(), starts.tolist(), values):
         end = max(start, start + value), row
-        sums.annotate(f"{value:+.2f}", end, (4, 0), textcoords="offset points", va="center", fontsize=9)
+        # White behind the text, which the line of the margin may cross.
+        options = {"bbox": {"facecolor": "white", "edgecolor": "none", "pad": 1}, "fontsize": 9}
+        sums.annotate(f"{value:+.2f}", end, (4, 0), textcoords="offset points", va="center", **options)
     sums.axvline(explanation.margin, color="black", linestyle="--", linewidth=1)
     sums.axvline(0, color="gray", linewidth=0.8)
     sums.set_yticks(rows, names)

@@ -295,19 +295,24 @@ def plot_features(
     figure, grid = style.new_panels(figure, (11, 5.5), 2, 1, sharex=True)
     above, below = grid.flat
     shades = (COLORS[1], COLORS[3], "0.6", COLORS[2])
+    colors = [VEHICLE, OTHER, *LINE_COLORS[2:]]
+    classes = patches.labels[chosen].tolist() if isinstance(patches, PatchSet) else []
+    if classes and len(set(classes)) == len(classes):  # at most one row of each class
+        colors = [VEHICLE if vehicle else OTHER for vehicle in classes]
     for panel, values in ((above, raw), (below, (raw - mean) / scale)):
-        for line, label, color in zip(values, labels, LINE_COLORS * len(chosen)):
+        for line, label, color in zip(values, labels, colors * len(chosen)):
             text = None if label is None else str(label)
             panel.plot(line, linewidth=0.6, color=color, label=text)
-        for shade, (name, part) in zip(shades, part_slices(params).items()):
+        for row, (shade, (name, part)) in enumerate(zip(shades, part_slices(params).items())):
             label, middle = f"{name} ({part.stop - part.start:,})", (part.start + part.stop) / 2
             top = panel.get_xaxis_transform()
             panel.axvspan(part.start, part.stop, color=shade, alpha=0.18, linewidth=0)
-            panel.annotate(label, (middle, 1.0), (0, 3), top, "offset points", ha="center", fontsize=8)
+            offset = 0, 3 + 10 * (row % 2)  # names of narrow parts are wider than these
+            panel.annotate(label, (middle, 1.0), offset, top, "offset points", ha="center", fontsize=8)
     above.set(ylabel="value", xlim=(0, params.length))
     below.set(ylabel="value (standard deviations)", xlabel="feature")
-    above.set_title("before scaling", loc="left", fontsize=10)
-    below.set_title("after scaling", loc="left", fontsize=10)
+    above.set_title("before scaling", loc="right", fontsize=10)
+    below.set_title("after scaling", loc="right", fontsize=10)
     if any(label is not None for label in labels):
         legend = above.legend(loc="upper right", fontsize=9)
         for handle in legend.get_lines():

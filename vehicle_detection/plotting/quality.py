@@ -232,7 +232,8 @@ def plot_f1(
         color = LINE_COLORS[number % len(LINE_COLORS)]
         bars = axes.bar(positions, values, width * 0.94, color=color, label=name)
         axes.bar_label(bars, ["" if np.isnan(v) else f"{v:.2f}" for v in values], padding=2, fontsize=8)
-    axes.set_xticks(range(len(sources)), [str(source) for source in sources])
+    # The figure grows with the number of sources.
+    _name_ticks(axes, [str(source) for source in sources], max_characters=14 * len(sources))
     axes.set(ylim=(0, 1.1), ylabel=_METRIC_NAMES.get(metric, metric))
     axes.spines[["top", "right"]].set_visible(False)
     if nested:
@@ -346,6 +347,18 @@ def _caption(side: FrameBoxes, row: int, predictions: FrameBoxes, kind: str) -> 
 _LOG_RATIO = 20
 # Number of characters of tick labels that fit under the x axis without rotation.
 _MAX_TICK_CHARACTERS = 60
+# Quantities of columns of results whose names do not say them.
+_QUANTITIES = {
+    "accuracy": "accuracy on patches",
+    "train_accuracy": "accuracy on training patches",
+    "search_ms": "search time (ms per frame)",
+    "fit_seconds": "training time (s)",
+    "frame_f1": "F1 on frames",
+    "frame_best_f1": "best F1 on frames",
+    "frame_average_precision": "average precision on frames",
+    "frame_iou": "mean IoU on frames",
+    "n_features": "number of features",
+}
 
 
 def plot_tradeoff(
@@ -382,7 +395,7 @@ def plot_tradeoff(
     >>> import pandas as pd
     >>> table = pd.DataFrame({"accuracy": [0.98, 0.99], "search_ms": [4.0, 9.0]})
     >>> plot_tradeoff(table, label=None).get_xlabel()
-    'search ms'
+    'search time (ms per frame)'
     """
     front = pareto_front(table, quality, cost)
     if not len(front):
@@ -394,13 +407,21 @@ def plot_tradeoff(
     shown = ~np.isnan(x) & ~np.isnan(y)
     axes.scatter(x[shown], y[shown], s=24, color="0.6", label="measured", zorder=2)
     axes.plot(front[cost], front[quality], "o-", color="C0", label="Pareto front", zorder=3)
-    if label is not None:
-        for x, y, text in zip(front[cost], front[quality], front[label]):
-            axes.annotate(str(text), (x, y), (4, 6), textcoords="offset points", fontsize=8)
-    axes.set(xlabel=cost.replace("_", " "), ylabel=quality.replace("_", " "))
+    axes.set(xlabel=_quantity(cost), ylabel=_quantity(quality))
     axes.grid(alpha=0.3)
     axes.margins(0.12)
-    axes.legend(loc="lower right")
+    low, high = axes.get_ylim()
+    if y[shown].max() <= 1 < high:  # a fraction: above 1 is room for text only
+        axes.set_ylim(low, min(high, 1 + 0.06 * (1 - low)))
+        axes.set_yticks([tick for tick in axes.get_yticks() if low <= tick <= 1])
+    if label is not None:
+        middle = sum(axes.get_xlim()) / 2
+        for x, y, text in zip(front[cost], front[quality], front[label]):
+            # Away from the nearer side of the axes, and off the rising front.
+            options: dict[str, Any] = {"ha": "left", "va": "top"} if x < middle else {"ha": "right"}
+            offset = (5, -3) if x < middle else (-5, 3)
+            axes.annotate(str(text), (x, y), offset, textcoords="offset points", fontsize=7, **options)
+    style.legend_above(axes, 2)
     return axes
 
 
@@ -467,14 +488,23 @@ def plot_parameter(
         )
         lines.set_label(None if by is None else str(name))
     if not numeric:
-        texts = [str(name) for name in names]
-        turned = max(map(len, texts)) * len(texts) > _MAX_TICK_CHARACTERS
-        align = "right" if turned else "center"
-        axes.set_xticks(range(len(texts)), texts, rotation=30 if turned else 0, horizontalalignment=align)
+        _name_ticks(axes, [str(name) for name in names])
     elif x.min() > 0 and x.max() > _LOG_RATIO * x.min():
         axes.set_xscale("log")
-    axes.set(xlabel=parameter.replace("_", " "), ylabel=quality.replace("_", " "))
+    axes.set(xlabel=_quantity(parameter), ylabel=_quantity(quality))
     axes.grid(alpha=0.3)
     if by is not None:
-        axes.legend(title=by.replace("_", " "), fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
+        axes.legend(title=_quantity(by), fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
     return axes
+
+
+def _quantity(column: str) -> str:
+    """Name of a column's quantity with its unit."""
+    return _QUANTITIES.get(column, column.replace("_", " "))
+
+
+def _name_ticks(axes: Axes, texts: list[str], max_characters: int = _MAX_TICK_CHARACTERS) -> None:
+    """Write a text at each position 0, 1, ... of the x axis, turned if they are long."""
+    turned = max(map(len, texts)) * len(texts) > max_characters
+    align = "right" if turned else "center"
+    axes.set_xticks(range(len(texts)), texts, rotation=30 if turned else 0, ha=align, rotation_mode="anchor")

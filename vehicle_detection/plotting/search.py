@@ -231,12 +231,17 @@ def plot_speedups(
     baseline: object = max(times, key=times.__getitem__) if reference is None else reference
     if not isinstance(baseline, str) or baseline not in times:
         raise InvalidInputError(f"reference must be one of {', '.join(times)}; got {describe(reference)}")
-    axes = style.new_axes(ax, 8, 0.8 + 0.45 * len(times))
+    # Long names take width from the bars.
+    width = 7.0 + 0.07 * max(map(len, times))
+    axes = style.new_axes(ax, width, 0.8 + 0.45 * len(times))
     values = [1000 * value for value in times.values()]
     bars = axes.barh(list(times), values, color=["0.6" if name == baseline else BLUE for name in times])
     texts = [_format_time(value, times[baseline] / value) for value in times.values()]
     axes.bar_label(bars, texts, padding=3, fontsize=9)
-    axes.set(xscale="log", xlim=(min(values) / 3, max(values) * 12), xlabel="time (ms)")
+    left = min(values) / 3
+    # Room for the text of the longest bar.
+    right = max(values) * max(12.0, (max(values) / left) ** 0.6)
+    axes.set(xscale="log", xlim=(left, right), xlabel="time (ms)")
     axes.invert_yaxis()
     axes.spines[["top", "right"]].set_visible(False)
     return axes
@@ -308,7 +313,7 @@ def plot_heatmap(
     style.add_boxes(first, windows.boxes, SKY, halo=False, linewidths=0.8)
     first.set_title(pluralize(len(windows), "window"), fontsize=10)
     peak = float(given.max())
-    style.add_image(second, given, cmap="inferno", vmin=0, vmax=max(peak, 1e-6))
+    style.add_image(second, given, cmap="inferno", vmin=0, vmax=peak if peak > 0 else 1.0)
     bar = second.figure.colorbar(second.images[0], ax=second, shrink=0.8, pad=0.02)
     bar.set_label("sum of scores" if params.weighting == "score" else "windows")
     if threshold <= peak:

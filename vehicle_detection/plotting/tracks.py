@@ -33,6 +33,9 @@ _MAX_GAP = 1.5
 # Replaces the yellow of the video, which is hard to see on white.
 _DARK_YELLOW = (0.80, 0.73, 0.1)
 
+# Rows of the legend of the tracks that fit beside the panels.
+_LEGEND_ROWS = 38
+
 _STAGES = ("decode", "search", "regions", "track", "draw", "encode")
 
 
@@ -111,7 +114,9 @@ def plot_tracks(
     grid[-1, 0].axhline(0, color="black", linewidth=0.6)
     grid[-1, 0].set_xlabel("time (s)")
     handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right upper", fontsize=9, title="track")
+    options: dict[str, Any] = {"fontsize": 9, "title": "track", "columnspacing": 1.0}
+    options["ncols"] = math.ceil(len(labels) / _LEGEND_ROWS)
+    figure.legend(handles, labels, loc="outside right upper", **options)
     return figure
 
 
