@@ -10,7 +10,13 @@ from vehicle_detection.drawing.birds_eye import (
     road_position,
 )
 from vehicle_detection.drawing.blur import BLUR_REGIONS, blur_boxes
-from vehicle_detection.drawing.boxes import draw_boxes, draw_detections, draw_labeled_bboxes, score_texts
+from vehicle_detection.drawing.boxes import (
+    draw_boxes,
+    draw_detections,
+    draw_labeled_bboxes,
+    draw_texts,
+    score_texts,
+)
 from vehicle_detection.drawing.diagnostics import draw_cell_shares, draw_diagnostics, heat_image
 from vehicle_detection.drawing.primitives import blend
 from vehicle_detection.drawing.tracks import (
@@ -37,6 +43,7 @@ __all__ = [
     "draw_detections",
     "draw_diagnostics",
     "draw_labeled_bboxes",
+    "draw_texts",
     "draw_tracks",
     "heat_image",
     "road_position",

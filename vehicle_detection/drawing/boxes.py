@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import (
+    Floats,
     check_array,
     check_boxes,
     check_flags,
@@ -164,10 +166,14 @@ def draw_detections(
     width = line_width or line_width_for(shape)
     result = draw_boxes(image, detections.boxes, color=color, thickness=width)
     if scores:
-        requests = [
-            LabelRequest(row, (text,), round_box(box))
-            for row, (box, text) in enumerate(zip(detections.boxes, score_texts(detections)))
-        ]
-        placed = LabelPlacer().place(requests, shape)
-        draw_labels(result, placed, [color] * len(placed), width)
+        draw_texts(result, detections.boxes, score_texts(detections), color, width)
     return result
+
+
+def draw_texts(image: Image, boxes: Floats, texts: Sequence[str], color: Color, width: int) -> None:
+    """Write a text at each box into an image, where they hide neither other boxes nor each other."""
+    requests = [
+        LabelRequest(row, (text,), round_box(box)) for row, (box, text) in enumerate(zip(boxes, texts))
+    ]
+    placed = LabelPlacer().place(requests, image.shape)
+    draw_labels(image, placed, [color] * len(placed), width)

@@ -30,14 +30,13 @@ from vehicle_detection.camera import Camera
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.drawing import TRACK_COLORS, blend, draw_boxes, draw_cell_shares, heat_image
-from vehicle_detection.drawing.primitives import (
-    draw_text,
-    fill_rectangle,
-    ink_on,
-    round_box,
-    text_scale,
-    text_size,
+from vehicle_detection.drawing import (
+    TRACK_COLORS,
+    blend,
+    draw_boxes,
+    draw_cell_shares,
+    draw_texts,
+    heat_image,
 )
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
 from vehicle_detection.explanation import Explanation, explain
@@ -372,7 +371,7 @@ class Explorer:
             image = draw_cell_shares(image, explanation.window * scale, explanation.cells)
         boxes = self.boxes().boxes[self._best_first()] * scale
         image = draw_boxes(image, boxes, color=_BOX_COLOR, thickness=3)
-        _draw_numbers(image, boxes)
+        draw_texts(image, boxes, [str(number + 1) for number in range(len(boxes))], _BOX_COLOR, 3)
         return image
 
     def summary(self) -> str:
@@ -471,19 +470,6 @@ def _draw_windows(image: Image, windows: Detections, scale: float) -> None:
     boxes = (windows.boxes[order] * scale).round().astype(int).tolist()
     for (x1, y1, x2, y2), color in zip(boxes, palette[levels].tolist()):
         cv2.rectangle(image, (x1, y1), (x2 - 1, y2 - 1), color, 1)
-
-
-def _draw_numbers(image: Image, boxes: NDArray[Any]) -> None:
-    """Write the number of each box, from 1, above its upper left corner, or inside at the image's edge."""
-    scale = text_scale(image.shape)
-    for number, box in enumerate(boxes, start=1):
-        text = [str(number)]
-        left, top = round_box(box)[:2]
-        width, height = text_size(text, scale)
-        left = min(max(left, 0), image.shape[1] - width)
-        top = top - height if top >= height else max(top, 0)
-        fill_rectangle(image, (left, top, left + width, top + height), _BOX_COLOR)
-        draw_text(image, text, left, top, scale, ink_on(_BOX_COLOR))
 
 
 def _frame_readers(frames: object) -> dict[str, Callable[[], Image]]:
