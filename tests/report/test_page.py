@@ -161,6 +161,12 @@ class TestPage:
             "The lens is unknown: distances and speeds may be wrong by a factor of 2 or more.",
         ]
 
+    def test_notices_leave_out_the_folder_of_the_source(self, tmp_path):
+        source = tmp_path / "road" / "drive.mp4"
+        writer = ReportWriter(tmp_path / "report.html", source=source)
+        writer.finish(video_report(0, damage=f"{source} is incomplete"))
+        assert "<li>drive.mp4 is incomplete.</li>" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
     def test_an_unknown_lens_matters_for_distances_only(self, tmp_path):
         detector = SimpleNamespace(lens_is_known=False)
         text = write_report(tmp_path, [[track(1, distance=None, speed=None)]], detector=detector)

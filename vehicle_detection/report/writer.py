@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import urllib.parse
 from collections.abc import Iterable, Sequence
@@ -86,6 +87,8 @@ class ReportWriter:
                 raise InvalidInputError(f"path {self._path} is also the {name}; choose another name")
         self._video = None if video is None else Path(video)
         self._source = None if source is None else Path(hide_credentials(os.fspath(source))).name
+        # Left out of texts about the damage of the source, as of the title.
+        self._folder = "" if source is None else os.path.join(os.path.dirname(os.fspath(source)), "")
         self._detector = detector
         self._embed_limit = check_integer(embed_limit, "embed_limit", low=0)
         self.log = TrackLog()
@@ -152,6 +155,8 @@ class ReportWriter:
             "units": self._units,
             "pictures": listed,
         }
+        if self._folder:
+            report = dataclasses.replace(report, damage=report.damage.replace(self._folder, ""))
         pieces = render_page(self.log, report, **options)
         with (
             atomic_write(self._path, "path") as part,
