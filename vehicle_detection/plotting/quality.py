@@ -233,7 +233,7 @@ def plot_f1(
         bars = axes.bar(positions, values, width * 0.94, color=color, label=name)
         axes.bar_label(bars, ["" if np.isnan(v) else f"{v:.2f}" for v in values], padding=2, fontsize=8)
     # The figure grows with the number of sources.
-    _name_ticks(axes, [str(source) for source in sources], max_characters=14 * len(sources))
+    _name_ticks(axes, [str(source) for source in sources])
     axes.set(ylim=(0, 1.1), ylabel=_METRIC_NAMES.get(metric, metric))
     axes.spines[["top", "right"]].set_visible(False)
     if nested:
@@ -345,8 +345,8 @@ def _caption(side: FrameBoxes, row: int, predictions: FrameBoxes, kind: str) -> 
 
 # Ratio of the largest to the smallest value above which the x axis is logarithmic.
 _LOG_RATIO = 20
-# Number of characters of tick labels that fit under the x axis without rotation.
-_MAX_TICK_CHARACTERS = 60
+# Width of a character of a tick label as a fraction of the font's size; axes grow when they are laid out.
+_CHARACTER_WIDTH = 0.5
 # Quantities of columns of results whose names do not say them.
 _QUANTITIES = {
     "accuracy": "accuracy on patches",
@@ -503,8 +503,10 @@ def _quantity(column: str) -> str:
     return _QUANTITIES.get(column, column.replace("_", " "))
 
 
-def _name_ticks(axes: Axes, texts: list[str], max_characters: int = _MAX_TICK_CHARACTERS) -> None:
+def _name_ticks(axes: Axes, texts: list[str]) -> None:
     """Write a text at each position 0, 1, ... of the x axis, turned if they are long."""
-    turned = max(map(len, texts)) * len(texts) > max_characters
-    align = "right" if turned else "center"
-    axes.set_xticks(range(len(texts)), texts, rotation=30 if turned else 0, ha=align, rotation_mode="anchor")
+    axes.set_xticks(range(len(texts)), texts)
+    points = axes.get_window_extent().width * 72 / axes.figure.dpi
+    character = _CHARACTER_WIDTH * float(axes.get_xticklabels()[0].get_fontsize())
+    if max(map(len, texts)) * len(texts) * character > points:
+        axes.set_xticks(range(len(texts)), texts, rotation=30, ha="right", rotation_mode="anchor")
