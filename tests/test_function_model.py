@@ -227,7 +227,7 @@ def test_a_function_has_the_interface_of_a_model():
         ({"score": (2, 1)}, r"score\[1\] must be a number, greater than 2"),
         ({"score": (0, 1), "threshold": 0.5}, "threshold must be omitted with"),
         ({"threshold": 0}, "threshold must be a number, greater than 0"),
-        ({"thread_safe": "yes"}, "thread_safe must be a bool"),
+        ({"thread_safe": "yes"}, "thread_safe must be True or False"),
         ({"search_params": HeatParams()}, "search_params must be a FunctionParams"),
     ],
 )

@@ -16,6 +16,7 @@ from vehicle_detection._common import (
     ModelData,
     blur_patches,
     check_array,
+    check_bool,
     check_choice,
     check_integer,
     check_number,
@@ -394,7 +395,7 @@ class TrainingOptions:
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         check_choice(self.solver, "solver", ("liblinear", "dual"))
-        check_type(self.mirror, "mirror", bool, "pass True or False")
+        object.__setattr__(self, "mirror", check_bool(self.mirror, "mirror"))
         if self.gamma and not self.mirror:
             raise InvalidInputError(
                 f"gamma must be 0 without mirrored patches, whose brightness it changes; got {self.gamma:g}"

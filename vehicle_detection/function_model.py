@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_type, describe
+from vehicle_detection._common import check_bool, check_type, describe
 from vehicle_detection.boxes import (
     Detections,
     Platt,
@@ -53,7 +53,7 @@ class FunctionModel:
                 f"function must be a function of an image, got {describe(self.function)}; it returns boxes "
                 "and scores"
             )
-        check_type(self.thread_safe, "thread_safe", bool, "pass True or False")
+        object.__setattr__(self, "thread_safe", check_bool(self.thread_safe, "thread_safe"))
         if self.name is not None:
             check_type(self.name, "name", str, "omit it for the function's name")
         name = self.name or getattr(self.function, "__name__", type(self.function).__name__)

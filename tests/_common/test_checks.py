@@ -1,11 +1,14 @@
 import math
 import re
+from decimal import Decimal
+from fractions import Fraction
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from vehicle_detection._common import (
+    check_bool,
     check_boxes,
     check_channel,
     check_choice,
@@ -187,6 +190,23 @@ def test_check_number_accepts_numbers_in_range(value):
     number = check_number(value, "fraction", low=0, high=1)
     assert type(number) is float
     assert number == value
+
+
+def test_check_number_accepts_fractions_but_no_decimals():
+    assert check_number(Fraction(30000, 1001), "fps") == 30000 / 1001
+    with pytest.raises(InvalidInputError, match="fps must be a number, finite; got Decimal"):
+        check_number(Decimal(30), "fps")
+
+
+@pytest.mark.parametrize("value", [True, np.bool_(True)])
+def test_check_bool_returns_a_bool(value):
+    assert check_bool(value, "mirror") is True
+
+
+@pytest.mark.parametrize("value", [1, "yes", None, np.int64(1)])
+def test_check_bool_refuses(value):
+    with pytest.raises(InvalidInputError, match="mirror must be True or False; got"):
+        check_bool(value, "mirror")
 
 
 def test_check_number_bounds():

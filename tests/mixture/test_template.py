@@ -135,7 +135,7 @@ def test_weights_are_copied_and_read_only():
         ({"padding": (0.0, 1.5)}, "padding must be less than half"),
         ({"padding": 1.0}, "padding must be two numbers of cells, got 1.0"),
         ({"padding": (np.nan, 0.0)}, "padding must be a number"),
-        ({"border": 1}, "border must be True or False, got 1"),
+        ({"border": 1}, "border must be True or False; got 1"),
     ],
 )
 def test_invalid_templates_are_rejected(changes, message):

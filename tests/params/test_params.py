@@ -97,6 +97,11 @@ def test_coarse_hog_is_the_last_part_of_hog():
     assert (FeatureParams().coarse_blocks, FeatureParams().coarse_length) == (0, 0)
 
 
+def test_switches_of_numpy_become_bools():
+    params = FeatureParams(coarse_hog=np.bool_(True))
+    assert params.coarse_hog is True
+
+
 def test_gains_apply_to_their_parts():
     params = FeatureParams(coarse_hog=True, hist_gain=3, coarse_gain=2)
     expected = np.repeat([1.0, 3.0, 1.0, 2.0], [768, 96, 5292, 972])

@@ -4,6 +4,7 @@ from vehicle_detection._common.augment import blur_patches, degrade_patches, mir
 from vehicle_detection._common.checks import (
     Floats,
     check_array,
+    check_bool,
     check_boxes,
     check_channel,
     check_choice,
@@ -64,6 +65,7 @@ __all__ = [
     "blur_patches",
     "call_in_thread",
     "check_array",
+    "check_bool",
     "check_boxes",
     "check_channel",
     "check_choice",

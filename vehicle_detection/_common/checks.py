@@ -6,6 +6,7 @@ import contextlib
 import math
 import os
 from collections.abc import Collection, Iterable
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -169,6 +170,13 @@ def check_flags(**flags: object) -> None:
             raise InvalidInputError(f"{name} must be True or False; got {describe(value)}")
 
 
+def check_bool(value: object, name: str) -> bool:
+    """Return `value` as a bool if it is one, of Python or of NumPy."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise InvalidInputError(f"{name} must be True or False; got {describe(value)}")
+    return bool(value)
+
+
 def check_sequence(values: object, name: str, of: str) -> tuple[Any, ...]:
     """Return the items of a sequence or another iterable, but not the characters of a text."""
     scalar = isinstance(values, (str, bytes)) or getattr(values, "ndim", 1) == 0
@@ -216,7 +224,7 @@ def check_number(
 ) -> float:
     """Return `value` as a finite float in ``[low, high]`` and, if given, greater than `above`."""
     number = math.nan
-    if isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool):
+    if isinstance(value, Real) and not isinstance(value, bool):
         with contextlib.suppress(OverflowError):  # an int of more than 308 digits
             number = float(value)
     if not (math.isfinite(number) and low <= number <= high and number > above):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import check_array, check_integer, check_type, describe
+from vehicle_detection._common import check_array, check_bool, check_integer, describe
 from vehicle_detection.boxes import Platt
 from vehicle_detection.errors import InvalidInputError
 
@@ -49,7 +49,7 @@ def calibrate_scores(
     >>> bool(platt.probability(1.5) > 0.5 > platt.probability(-1.5))
     True
     """
-    check_type(prior, "prior", bool, "pass True or False")
+    check_bool(prior, "prior")
     values, truth = check_array(scores, "scores"), check_array(labels, "labels")
     if values.ndim != 1 or not values.size or values.dtype.kind not in "iuf":
         raise InvalidInputError(f"scores must be a one-dimensional array of numbers; got {describe(values)}")

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import (
+    check_bool,
     check_channel,
     check_choice,
     check_image,
@@ -105,7 +106,7 @@ def hog_blocks(
     from skimage.feature import hog
 
     _check_hog(img, orient, pix_per_cell, cell_per_block)
-    check_type(transform_sqrt, "transform_sqrt", bool, "pass True or False")
+    transform_sqrt = check_bool(transform_sqrt, "transform_sqrt")
     cell, block = (pix_per_cell, pix_per_cell), (cell_per_block, cell_per_block)
     blocks = hog(img, orient, cell, block, "L2-Hys", transform_sqrt=transform_sqrt, feature_vector=False)
     return np.asarray(blocks, np.float64)
@@ -187,7 +188,7 @@ def hog_image(
     from skimage.feature import hog
 
     _check_hog(img, orient, pix_per_cell, 1)
-    check_type(transform_sqrt, "transform_sqrt", bool, "pass True or False")
+    transform_sqrt = check_bool(transform_sqrt, "transform_sqrt")
     cell = (pix_per_cell, pix_per_cell)
     _, picture = hog(img, orient, cell, (1, 1), transform_sqrt=transform_sqrt, visualize=True)
     return np.asarray(picture, np.float64)

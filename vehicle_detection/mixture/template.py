@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Floats, check_number, describe, finite_array
+from vehicle_detection._common import Floats, check_bool, check_number, describe, finite_array
 from vehicle_detection._kernels import Filter
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture.features import N_CHANNELS, CellGrid, FeatureMap, mirror_channels
@@ -41,9 +41,7 @@ class MixtureTemplate:
                     f"padding must be less than half of the window's {columns}x{rows} cells, "
                     f"got {describe(padding)}"
                 )
-        border: object = self.border
-        if not isinstance(border, bool):
-            raise InvalidInputError(f"border must be True or False, got {describe(border)}")
+        object.__setattr__(self, "border", check_bool(self.border, "border"))
         object.__setattr__(self, "weights", weights)
 
     @property

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_choice, check_integer, check_number, describe
+from vehicle_detection._common import check_bool, check_choice, check_integer, check_number
 from vehicle_detection.errors import InvalidInputError
 
 PATCH_SIZE = 64
@@ -108,8 +108,7 @@ class FeatureParams:
         check_choice(self.spatial_order, "spatial_order", SPATIAL_ORDERS)
         switches = ("spatial_feat", "hist_feat", "hog_feat", "transform_sqrt", "hist_sqrt", "coarse_hog")
         for name in switches:
-            if not isinstance(getattr(self, name), bool):
-                raise InvalidInputError(f"{name} must be True or False; got {describe(getattr(self, name))}")
+            object.__setattr__(self, name, check_bool(getattr(self, name), name))
         if not (self.spatial_feat or self.hist_feat or self.hog_feat):
             raise InvalidInputError("spatial_feat, hist_feat and hog_feat are all False; set one to True")
         size: Any = self.spatial_size
