@@ -1,3 +1,4 @@
+import dataclasses
 import math
 
 import cv2
@@ -201,6 +202,14 @@ def test_a_fisheye_sees_its_field_of_view():
         assert degrees == pytest.approx(min(angle, 160), abs=0.1)
 
 
+def test_boxes_of_small_integers_are_rectified():
+    camera = Camera.for_frame(SHAPE, lens="fisheye-120")
+    boxes = [[100, 100, 200, 200]]
+    expected = camera.rectify_boxes(np.array(boxes, np.float64), SHAPE)
+    np.testing.assert_array_equal(camera.rectify_boxes(np.array(boxes, np.uint8), SHAPE), expected)
+    np.testing.assert_array_equal(camera.rectify_boxes(boxes, SHAPE), expected)
+
+
 def test_a_pinhole_camera_keeps_boxes_and_horizon():
     boxes = np.array([[600.0, 300, 700, 420]])
     assert CAMERA.rectify_boxes(boxes, SHAPE) is boxes
@@ -222,6 +231,34 @@ def test_a_camera_file_holds_the_camera(tmp_path):
     half = read_camera(tmp_path / "camera.json", (360, 640))
     assert half.focal_px == pytest.approx(camera.focal_px / 2)
     assert half.horizon_px == pytest.approx(camera.horizon_px / 2)
+    assert half.shape == (360, 640)
+    write_camera(camera, tmp_path / "half.json", (360, 640))
+    assert read_camera(tmp_path / "half.json", SHAPE) == camera
+
+
+def test_numbers_of_numpy_become_floats(tmp_path):
+    camera = Camera(focal_px=np.float32(900), horizon_px=np.int64(360), fisheye=np.bool_(True))
+    write_camera(camera, tmp_path / "camera.json", SHAPE)
+    assert read_camera(tmp_path / "camera.json", SHAPE) == camera
+    assert type(camera.focal_px) is float
+
+
+def test_a_camera_is_scaled_to_frames_of_the_same_aspect_ratio():
+    half = CAMERA.for_shape((360, 640))
+    assert (half.focal_px, half.horizon_px) == (CAMERA.focal_px / 2, CAMERA.horizon_px / 2)
+    assert half.height_m == CAMERA.height_m
+    assert half.for_shape(SHAPE) == CAMERA
+    assert CAMERA.for_shape(SHAPE) is CAMERA
+    unknown = Camera(focal_px=900, horizon_px=360)
+    assert unknown.for_shape((480, 640)) is unknown
+    with pytest.raises(InvalidInputError, match=r"for frames of 640x480 pixels .* got one for 1280x720; use"):
+        CAMERA.for_shape((480, 640))
+
+
+def test_the_shape_of_a_camera_is_not_compared():
+    assert dataclasses.replace(CAMERA, shape=None) == CAMERA
+    with pytest.raises(InvalidInputError, match="shape must be"):
+        Camera(focal_px=900, horizon_px=360, shape=720)
 
 
 def test_a_camera_file_by_hand(tmp_path):
@@ -265,5 +302,5 @@ def test_invalid_camera_files(tmp_path, text, message):
 
 
 def test_a_missing_camera_file(tmp_path):
-    with pytest.raises(InvalidInputError, match=r"camera file \S+ does not exist; check the path"):
+    with pytest.raises(InvalidInputError, match=r"^camera file \S+ does not exist; check the path"):
         read_camera(tmp_path / "camera.json", SHAPE)

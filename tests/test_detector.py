@@ -795,6 +795,20 @@ def test_a_given_horizon_is_that_of_the_camera_too(tmp_path):
     assert VehicleDetector(camera=camera).camera_of(shape) is camera
 
 
+def test_a_camera_of_another_size_is_scaled_or_refused():
+    camera = Camera.for_frame((720, 1280), field_of_view=60)
+    detector = VehicleDetector(camera=camera)
+    assert detector.camera_of((360, 640)) == camera.for_shape((360, 640))
+    assert VehicleDetector(camera=camera, horizon=0.5).camera_of((360, 640)).horizon_px == 180
+    image = np.zeros((480, 640, 3), np.uint8)
+    with pytest.raises(InvalidInputError, match=r"frames of 640x480 pixels .* got one for 1280x720"):
+        detector.process(image)
+
+
+def test_times_become_floats():
+    assert type(make().process(frame_with(CAR), np.float32(1)).time) is float
+
+
 def test_a_shallow_copy_shares_the_search_and_has_its_own_tracks():
     detector, frames = make(), drive()
     for frame in frames[:6]:

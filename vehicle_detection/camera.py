@@ -13,7 +13,7 @@ import dataclasses
 import json
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from vehicle_detection._common import (
     Limit,
     atomic_write,
     check_array,
+    check_bool,
     check_boxes,
     check_choice,
     check_integer,
@@ -61,6 +62,8 @@ _CORRELATED_BOXES = 3.0
 _NORMAL_80 = 1.282
 # Largest angle from the optical axis (radians) at which boxes are converted to a pinhole camera.
 _MAX_ANGLE = math.radians(80)
+
+_PIXEL_FIELDS = ("focal_px", "horizon_px", "horizon_std_px")  # in pixels of the frame
 
 LENSES: dict[str, tuple[float, bool]] = {
     "standard-58": (58.0, False),
@@ -109,6 +112,9 @@ class Camera:
         Whether the lens is a fisheye, and its coefficients: a ray at the angle ``a`` to the optical axis,
         which is that of the frame's middle, meets the frame at
         ``focal_px * a * (1 + k1 * a**2 + k2 * a**4)`` pixels from the middle.
+    shape
+        Height and width of the frames that the pixels refer to, which `for_frame` and `read_camera` set; None
+        if unknown. For frames of another size, `for_shape` scales the pixels. It is not compared.
 
     Examples
     --------
@@ -134,17 +140,22 @@ class Camera:
     fisheye: bool = False
     k1: float = 0.0
     k2: float = 0.0
+    shape: FrameShape | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
-        check_type(self.fisheye, "fisheye", bool, "pass True or False")
-        for name in self.__dataclass_fields__.keys() - {"fisheye"}:
+        object.__setattr__(self, "fisheye", check_bool(self.fisheye, "fisheye"))
+        if self.shape is not None:
+            object.__setattr__(self, "shape", check_shape(self.shape))
+        for name in self.__dataclass_fields__.keys() - {"fisheye", "shape"}:
+            low, high, above = 0.0, 1e6, -math.inf
             if name in ("k1", "k2"):
-                check_number(getattr(self, name), name, low=-1, high=1)
+                low, high = -1, 1
             elif name in ("focal_px", "height_m", "vehicle_width_m", "vehicle_height_m"):
-                check_number(getattr(self, name), name, above=0, high=1e6)
-            else:
-                low = -1e6 if name == "horizon_px" else 0
-                check_number(getattr(self, name), name, low=low, high=1e6)
+                above = 0
+            elif name == "horizon_px":
+                low = -1e6
+            number = check_number(getattr(self, name), name, low=low, high=high, above=above)
+            object.__setattr__(self, name, number)
 
     @classmethod
     def for_frame(
@@ -207,7 +218,33 @@ class Camera:
                 f"k1 and k2 must keep the radius positive up to {angle / 2:g} degrees; got {k1:g} and {k2:g}"
             )
         focal = max(height, width) / (2 * radius)
-        return cls(focal_px=focal, horizon_px=horizon * height, height_m=height_m, **known)
+        size = height, width
+        return cls(focal_px=focal, horizon_px=horizon * height, height_m=height_m, shape=size, **known)
+
+    def for_shape(self, shape: tuple[int, ...]) -> Camera:
+        """Return the camera in pixels of frames of ``(height, width, ...)``, another size of the same video.
+
+        Raises
+        ------
+        InvalidInputError
+            If the aspect ratio is not that of the camera's own shape.
+
+        Examples
+        --------
+        >>> round(Camera.for_frame((720, 1280)).for_shape((360, 640)).horizon_px, 1)
+        201.6
+        """
+        size = check_shape(shape)
+        if self.shape is None or self.shape == size:
+            return self
+        scale = _scale_between(self.shape, size)
+        if scale is None:
+            raise InvalidInputError(
+                f"camera must be one for frames of {size[1]}x{size[0]} pixels or the same aspect ratio, got "
+                f"one for {self.shape[1]}x{self.shape[0]}; use Camera.for_frame(image.shape, ...)"
+            )
+        scaled = {name: scale * getattr(self, name) for name in _PIXEL_FIELDS}
+        return dataclasses.replace(self, shape=size, **scaled)
 
     @property
     def pixel_scale(self) -> float:
@@ -230,7 +267,7 @@ class Camera:
             raise InvalidInputError(f"lateral_px must be numbers of pixels; got {describe(lateral_px)}")
         return np.asarray(self.focal_px * self.vehicle_width_m + self.vehicle_length_m * lateral)
 
-    def rectify_boxes(self, boxes: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    def rectify_boxes(self, boxes: Detections | ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
         """Convert boxes to those of a pinhole camera with the same focal length.
 
         The middles of a box's edges are converted, and points farther than 80 degrees from the optical axis
@@ -239,7 +276,7 @@ class Camera:
         Parameters
         ----------
         boxes
-            ``(N, 4)`` boxes ``[x1, y1, x2, y2]`` in pixels of the frame.
+            ``(N, 4)`` boxes ``[x1, y1, x2, y2]`` in pixels of the frame; or `Detections`.
         shape
             ``(height, width, ...)`` of the frame.
 
@@ -254,8 +291,10 @@ class Camera:
         >>> camera.rectify_boxes(np.array([[900.0, 400, 1100, 520]]), (720, 1280)).round()
         array([[ 920.,  405., 1219.,  547.]])
         """
+        boxes = check_boxes(boxes)
         if not self.fisheye or not len(boxes):
             return boxes
+        boxes = boxes.astype(np.float64, copy=False)  # sums of small integers overflow
         middle = (boxes[:, :2] + boxes[:, 2:]) / 2
         columns = np.concatenate([boxes[:, 0], boxes[:, 2], middle[:, 0], middle[:, 0]])
         rows = np.concatenate([middle[:, 1], middle[:, 1], boxes[:, 1], boxes[:, 3]])
@@ -286,6 +325,12 @@ class Camera:
         return middle_x + factor * dx, middle_y + factor * dy
 
 
+def _scale_between(given: FrameShape, shape: FrameShape) -> float | None:
+    """Factor from pixels of one frame size to another; None if the aspect ratios differ by more than 1%."""
+    scale = shape[1] / given[1]
+    return scale if abs(scale * given[0] - shape[0]) <= 0.01 * shape[0] else None
+
+
 def _fisheye_radius(angle: Floats, k1: float, k2: float) -> Floats:
     """Distance from the middle of a fisheye frame in focal lengths, for rays at these angles (radians)."""
     return angle * (1 + k1 * angle**2 + k2 * angle**4)
@@ -299,7 +344,8 @@ def write_camera(camera: Camera, path: str | os.PathLike[str], shape: tuple[int,
     camera, path
         The camera, and the file to write, .json.
     shape
-        ``(height, width, ...)`` of the frames that its pixels refer to.
+        ``(height, width, ...)`` of the frames that its pixels refer to, or are to be scaled to if the camera
+        has a shape.
 
     Raises
     ------
@@ -316,7 +362,8 @@ def write_camera(camera: Camera, path: str | os.PathLike[str], shape: tuple[int,
     """
     check_type(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
     height, width = check_shape(shape)
-    values = {"image_size": [width, height], **dataclasses.asdict(camera)}
+    values = {"image_size": [width, height], **dataclasses.asdict(camera.for_shape((height, width)))}
+    del values["shape"]
     with atomic_write(path, "path") as part:
         part.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
 
@@ -362,13 +409,14 @@ def read_camera(path: str | os.PathLike[str], shape: tuple[int, ...]) -> Camera:
         if not isinstance(size, list) or len(size) != 2:
             raise InvalidInputError(f"{path}: image_size must be [width, height], got {describe(size)}")
         given = [check_integer(side, f"{path}: image_size", low=1) for side in size]
-        scale = width / given[0]
-        if abs(scale * given[1] - height) > 0.01 * height:
+        found = _scale_between((given[1], given[0]), (height, width))
+        if found is None:
             raise InvalidInputError(
                 f"{path}: image_size must have the aspect ratio of the frames, {width}x{height} pixels, got "
                 f"{given[0]}x{given[1]}; calibrate again, or give field_of_view and horizon"
             )
-    pixels = [name for name in ("focal_px", "horizon_px", "horizon_std_px") if name in values]
+        scale = found
+    pixels = [name for name in _PIXEL_FIELDS if name in values]
     if pixels and size is None:
         raise InvalidInputError(f"{path}: {pixels[0]} needs image_size, [width, height] in pixels; add it")
     for name in pixels:
@@ -381,11 +429,12 @@ def read_camera(path: str | os.PathLike[str], shape: tuple[int, ...]) -> Camera:
 
 def _read_json(path: Path) -> dict[str, Any]:
     """Read the object in a JSON file, and check its names."""
+    data = read_regular_file(path, f"camera file {path}", Limit.TEXT_BYTES)
     try:
-        values: Any = json.loads(read_regular_file(path, f"camera file {path}", Limit.TEXT_BYTES))
+        values: Any = json.loads(data)
     except ValueError as error:
         raise InvalidInputError(f"camera file {path} is not JSON: {error}; see read_camera") from None
-    known = {"image_size", "field_of_view", "lens", "horizon", *Camera.__dataclass_fields__}
+    known = {"image_size", "field_of_view", "lens", "horizon", *Camera.__dataclass_fields__} - {"shape"}
     if not isinstance(values, dict) or values.keys() - known:
         extra = sorted(values.keys() - known)[0] if isinstance(values, dict) else describe(values)
         raise InvalidInputError(
@@ -405,7 +454,7 @@ def _build_camera(values: dict[str, Any], shape: FrameShape) -> Camera:
             values["horizon_px"] = check_number(horizon, "horizon", low=-10, high=10) * shape[0]
         elif "horizon_px" not in values:
             values |= {"horizon_px": 0.56 * shape[0], "horizon_std_px": 0.05 * shape[0]}
-        return Camera(**values)
+        return Camera(**values, shape=shape)
     if "lens" not in values:
         accuracy = GIVEN_LENS_STD if "field_of_view" in values else UNKNOWN_LENS_STD
         values = {"focal_std": accuracy} | values

@@ -100,10 +100,10 @@ class VehicleDetector:
     draw_params
         What `annotate` and `process_video` draw: labels, lines, colors, a bird's-eye view.
     camera
-        The camera, for distances and boxes: a `Camera`, which fits frames of one size; a file of
-        `write_camera`; or the name of a lens, as in `Camera.for_frame`. By default a dash-cam with the
-        search's horizon, as an estimate that tracking refines. The horizon of a file is that of the search,
-        too.
+        The camera, for distances and boxes: a `Camera`; a file of `write_camera`; or the name of a lens, as
+        in `Camera.for_frame`. The pixels of a camera of known frame size are scaled to frames of the same
+        aspect ratio. By default a dash-cam with the search's horizon, as an estimate that tracking refines.
+        The horizon of a file is that of the search, too.
     field_of_view, camera_height_m
         Angle of view along the frame's longer side in degrees of a lens without distortion, and height of the
         lens above the road in meters, without a `Camera` or a file. If the lens is unknown, distances assume
@@ -351,12 +351,13 @@ class VehicleDetector:
     def camera_of(self, shape: tuple[int, ...]) -> Camera:
         """Return the camera for frames of ``(height, width, ...)``: as given, or what is assumed.
 
+        A camera whose frame size is known is scaled to frames of the same aspect ratio, and refused for
+        others with an `InvalidInputError`.
+
         >>> round(VehicleDetector(field_of_view=90).camera_of((720, 1280)).focal_px)
         640
         """
         shape = check_shape(shape)
-        if isinstance(self.camera, Camera) and not self._horizon_given:
-            return self.camera
         if shape not in self._cameras:
             self._cameras[shape] = self._open_camera(shape)
         return self._cameras[shape]
@@ -370,7 +371,8 @@ class VehicleDetector:
             known = {"horizon": params.horizon, "horizon_std_px": std * shape[0]}
         if self.camera is None or self.camera in LENSES:
             return Camera.for_frame(shape, **known, **self._lens)
-        camera = self.camera if isinstance(self.camera, Camera) else read_camera(self.camera, shape)
+        given = self.camera
+        camera = given.for_shape(shape) if isinstance(given, Camera) else read_camera(given, shape)
         if self._horizon_given:
             row = known["horizon"] * shape[0]
             camera = replace(camera, horizon_px=row, horizon_std_px=known["horizon_std_px"])
@@ -417,7 +419,7 @@ class VehicleDetector:
 
     def _process(self, frame: NDArray[np.uint8], time: float | None) -> FrameResult:
         start = clock.perf_counter()
-        _check_time(time)
+        time = _check_time(time)
         thumbnail = make_thumbnail(check_image(frame, "frame"))
         follows = frame.shape[:2] == self._shape and not self._is_cut(thumbnail)
         if time is not None and self._time is not None:
@@ -542,7 +544,7 @@ class VehicleDetector:
     def _track(self, found: SearchResult, time: float | None) -> FrameResult:
         start = clock.perf_counter()
         check_type(found, "found", SearchResult, "pass what search returns")
-        _check_time(time)
+        time = _check_time(time)
         self._shape, self._time = found.shape, time
         if self._tracker is None:
             fps = self._fps or _USUAL_FPS
@@ -749,9 +751,8 @@ class _ClipAnnotator:
         return self._picture.copy()
 
 
-def _check_time(time: object) -> None:
-    if time is not None:
-        check_number(time, "time", low=-1e12, high=1e12)
+def _check_time(time: object) -> float | None:
+    return None if time is None else check_number(time, "time", low=-1e12, high=1e12)
 
 
 def detector_from(

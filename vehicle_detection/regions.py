@@ -63,7 +63,8 @@ def find_vehicles(
     check_type(windows, "windows", Detections, "pass Detections(boxes, scores)")
     check_type(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
     check_type(params, "params", RegionParams, "omit it for the default")
-    return fit_boxes(group_windows(windows, params), camera, check_shape(shape), params)
+    frame = check_shape(shape)
+    return fit_boxes(group_windows(windows, params), camera.for_shape(frame), frame, params)
 
 
 def group_windows(windows: Detections, params: RegionParams) -> Detections:

@@ -716,6 +716,22 @@ class TestDistance:
         by_width_alone = 20 * 1.8 / 2.5
         assert abs(track.distance_m - 20) < abs(by_width_alone - 20) / 2
 
+    @pytest.mark.parametrize("lens", ["standard-58", "fisheye-120"])
+    def test_the_camera_is_scaled_to_the_frames(self, lens):
+        camera = Camera.for_frame(SHAPE, lens=lens)
+        distances = []
+        for scale in (1, 2):
+            shape = SHAPE[0] // scale, SHAPE[1] // scale
+            tracker = Tracker(camera=camera)
+            for _ in range(20):
+                (track,) = tracker.update(found([edge / scale for edge in CAR]), shape)
+            distances.append(track.distance_m)
+        assert distances[0] == pytest.approx(distances[1], rel=0.03)
+        with pytest.raises(InvalidInputError, match="frames of 640x480 pixels"):
+            tracker.update(found(CAR), (480, 640))
+        tracker.set_camera(Camera.for_frame((480, 640), lens=lens))
+        tracker.update(found(CAR), (480, 640))
+
     def test_distance_is_unknown_where_nothing_can_be_measured(self):
         tracker = Tracker(camera=CAMERA)
         for _ in range(20):

@@ -155,7 +155,7 @@ class TrackDrawer:
         if params.panel != "none":
             if self._panel is None or not self._panel.fits(shape):
                 self._panel = BirdsEyePanel(shape, params.panel, params.units)
-            view = camera or Camera.for_frame(shape)
+            view = Camera.for_frame(shape) if camera is None else camera.for_shape(shape)
             blocked.append(self._panel.draw(result, shown, colors, view, shape, self._time))
         frame = result[:, : shape[1]]
         width = params.line_width or line_width_for(shape)

@@ -117,7 +117,7 @@ class Tracker:
     def reset(self) -> None:
         """Restore the initial state: the next frame is the first, and the next vehicle gets the id 1."""
         self._shape: FrameShape | None = None
-        self._horizon = self._open_horizon((720, 1280))
+        self._open_horizon()
         self._time: float | None = None
         self._next_id = self._next_key = 1
         self.end_tracks()
@@ -127,17 +127,16 @@ class Tracker:
         check_type(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
         if camera != self._given_camera:
             self._given_camera = camera
-            self._horizon = self._open_horizon(self._shape or (720, 1280))
+            self._open_horizon()
 
-    def _open_horizon(self, frame: FrameShape) -> HorizonFilter:
-        """Start the estimate of the horizon for frames of this shape."""
-        return HorizonFilter((self._given_camera or _default_camera(frame)).to_pinhole(frame))
-
-    @property
-    def _lens(self) -> Camera | None:
-        """The camera, if boxes must be rectified."""
-        camera = self._given_camera
-        return camera if camera is not None and camera.fisheye else None
+    def _open_horizon(self, frame: FrameShape | None = None) -> None:
+        """Start the estimate of the horizon for frames of this shape; by default a likely one."""
+        given = self._given_camera
+        shape = frame or (given and given.shape) or self._shape or (720, 1280)
+        camera = _default_camera(shape) if given is None else given.for_shape(shape)
+        # The camera, if boxes must be rectified.
+        self._lens = camera if camera.fisheye else None
+        self._horizon, self._horizon_shape = HorizonFilter(camera.to_pinhole(shape)), shape
 
     @property
     def camera(self) -> Camera:
@@ -180,7 +179,7 @@ class Tracker:
         Raises
         ------
         InvalidInputError
-            If an argument is malformed.
+            If an argument is malformed, or the camera was made for frames of another aspect ratio.
         """
         if hasattr(detections, "xyxy"):
             detections = Detections.from_supervision(detections)
@@ -271,11 +270,11 @@ class Tracker:
         now = last + usual if time is None else check_number(time, "time", low=-1e12, high=1e12)
         dt = usual if self._time is None else now - last
         jump = dt < 0 or dt > max(self.params.max_gap, 1.5 * usual)
+        if self._horizon_shape != frame:
+            self._open_horizon(frame)
         if jump or frame != self._shape:
             self.end_tracks()
             dt = usual
-        if self._shape != frame:
-            self._horizon = self._open_horizon(frame)
         self._time, self._shape = now, frame
         return dt
 
