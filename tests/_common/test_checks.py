@@ -5,9 +5,11 @@ from fractions import Fraction
 from types import SimpleNamespace
 
 import numpy as np
+import pandas
 import pytest
 
 from vehicle_detection._common import (
+    check_array,
     check_bool,
     check_boxes,
     check_channel,
@@ -161,7 +163,9 @@ def test_check_patches_accepts_a_patch_set():
         ([[[0, 1, 2, 3]]], r"an \(N, 4\) number array"),
         ([["a", "b", "c", "d"]], r"an \(N, 4\) number array"),
         ([[True, True, True, True]], r"an \(N, 4\) number array"),
-        ([[0, 0, 1, 1], [0, 0, 1]], r"an \(N, 4\) number array"),
+        ([[0, 0, 1, 1], [0, 0, 1]], "numbers of equal lengths"),
+        ((SimpleNamespace(box=[0, 0, 1, 1]),), r"pass \[track.box for track in tracks\]"),
+        (pandas.DataFrame([[0, 0, 1, 1]], dtype="Int64"), r"convert .* with table.astype\(float\)"),
         (None, r"an \(N, 4\) number array"),
         ([[0, 0, math.nan, 1]], "must be finite"),
         ([[0, 0, math.inf, 1]], "must be finite"),
@@ -172,6 +176,17 @@ def test_check_patches_accepts_a_patch_set():
 def test_check_boxes_refuses(boxes, message):
     with pytest.raises(InvalidInputError, match=f"^windows .*{message}"):
         check_boxes(boxes, "windows")
+
+
+def test_the_reason_why_an_array_cannot_be_converted_is_kept():
+    class Tensor:
+        def __array__(self, *_, **__):
+            raise TypeError("Use Tensor.cpu() first.")
+
+    for check in (check_array, check_boxes):
+        with pytest.raises(InvalidInputError, match=r"^x must .*Tensor.*; Use Tensor.cpu\(\)") as caught:
+            check(Tensor(), "x")
+        assert isinstance(caught.value.__cause__, TypeError)
 
 
 def test_check_boxes_compares_unsigned_coordinates():

@@ -148,10 +148,13 @@ def check_array(values: object, name: str) -> NDArray[Any]:
     """Return `values` as an array, unless they are ragged or otherwise no array."""
     try:
         return np.asarray(values)
-    except (ValueError, TypeError, OverflowError):
+    except (ValueError, TypeError, OverflowError, RuntimeError) as error:
+        # Tensors say how to convert them; what NumPy says of ragged sequences is no help.
+        reason = "" if isinstance(error, ValueError) else f"; {error}"
         raise InvalidInputError(
             f"{name} must be an array or a sequence of numbers of equal lengths, got {describe(values)}"
-        ) from None
+            + reason
+        ) from error
 
 
 def check_shape(shape: object) -> tuple[int, int]:
@@ -194,18 +197,20 @@ def check_boxes(boxes: Any, name: str = "boxes") -> NDArray[Any]:
     attribute ``xyxy``, such as ``supervision.Detections``.
     """
     boxes = getattr(boxes, "boxes", boxes)  # of Detections
-    try:
-        array = np.asarray(getattr(boxes, "xyxy", boxes))
-    except ValueError:  # rows of different lengths
-        array = np.array(None)
+    array = check_array(getattr(boxes, "xyxy", boxes), name)
     if array.size == 0:
         return np.empty((0, 4), array.dtype if array.dtype.kind in "iuf" else np.float64)
     if array.shape[1:] == (2, 2) and array.dtype.kind in "iuf":
         array = np.concatenate((array.min(axis=1), array.max(axis=1)), axis=1)
     if array.ndim != 2 or array.shape[1] != 4 or array.dtype.kind not in "iuf":
+        remedy = "wrap a single box in a list"
+        if hasattr(array.flat[0], "box"):
+            remedy = "pass [track.box for track in tracks]"
+        elif hasattr(boxes, "astype") and array.dtype == object:
+            remedy = "convert columns that may hold NA with table.astype(float)"
         raise InvalidInputError(
             f"{name} must be an (N, 4) number array of [x1, y1, x2, y2] or corner pairs "
-            f"((x1, y1), (x2, y2)), got {describe(boxes)}; wrap a single box in a list"
+            f"((x1, y1), (x2, y2)), got {describe(boxes)}; {remedy}"
         )
     if not np.isfinite(array).all():
         raise InvalidInputError(f"{name} must be finite, got NaN or infinity; drop those rows")
