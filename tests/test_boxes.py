@@ -239,6 +239,9 @@ def test_confidences_are_probabilities():
     for confidences in ([-0.01, 0.5], [0.5, 1.01], [0.5]):
         with pytest.raises(InvalidInputError, match="confidences must be a probability, 0 to 1, for each of"):
             Detections(TWO, [1.0, 2.0], confidences)
+    assert Detections(TWO, [1.0, 2.0], [np.nan, np.nan]).confidences is None
+    with pytest.raises(InvalidInputError, match="confidences must be finite"):
+        Detections(TWO, [1.0, 2.0], [0.5, np.nan])
 
 
 @pytest.mark.parametrize(
@@ -271,7 +274,10 @@ def test_detections_are_joined():
     joined = first + second
     np.testing.assert_array_equal(joined.boxes, [*TWO, [1.5, 0, 3, 3]])
     assert joined.scores.tolist() == [1, 2, 3]
-    assert len(Detections.empty() + first) == 2
+    known = Detections(TWO, [1.0, 2.0], [0.5, 0.6])
+    assert (known + first).confidences is None
+    for joined in (Detections.empty() + known, known + Detections.empty()):
+        assert joined.confidences.tolist() == [0.5, 0.6]
     with pytest.raises(TypeError, match="unsupported operand"):
         first + 1
 
@@ -288,6 +294,13 @@ def test_detections_of_supervision_are_converted():
     assert Detections.from_supervision(given_, score=(0.1, 0.9)).scores.tolist() == pytest.approx([1.5, 3])
     assert Detections.from_supervision(StandIn(TWO)).scores.tolist() == [3, 3]
     assert len(Detections.from_supervision(StandIn(np.empty((0, 4)), np.empty(0)))) == 0
+
+
+def test_boxes_of_ultralytics_are_converted():
+    given_ = SimpleNamespace(xyxy=TWO, conf=[0.5, 0.9], cls=[2.0, 7.0])
+    found = Detections.from_supervision(given_, class_ids=[7])
+    assert found.boxes.tolist() == [TWO[1]]
+    assert found.scores.tolist() == pytest.approx([np.log(9)])
 
 
 def test_boxes_of_supervision_are_boxes():
@@ -311,8 +324,10 @@ def test_probabilities_of_0_and_1_are_finite():
         (
             StandIn(TWO, [0.5, 0.5]),
             {"class_ids": [1]},
-            "class_ids needs one class_id for each of the 2 boxes",
+            "class_ids needs an integer class for each of the 2 boxes",
         ),
+        (SimpleNamespace(xyxy=TWO), {}, "detections must have an attribute confidence or conf, got"),
+        (StandIn(TWO, [0.5, 0.5], [2, 7]), {"class_ids": 2}, "class_ids must be a sequence of integers"),
         (StandIn(TWO), {"score": "percent"}, "score must be one of 'probability', 'logit'"),
         (StandIn(TWO), {"score": (1, 1)}, r"score\[1\] must be a number, greater than 1"),
         (StandIn(TWO), {"score": (0, 1), "threshold": 0.5}, "threshold must be omitted"),

@@ -106,12 +106,41 @@ def test_the_documented_probabilities_confirm_and_continue_tracks():
 
 
 def test_other_results_are_accepted():
-    columns = SimpleNamespace(xyxy=[BOX, [0, 0, 9, 9]], confidence=[0.9, 0.8], class_id=[2, 0])
-    for result in (columns, Detections([BOX], [0.9]), ([BOX], [0.9]), [np.array([BOX]), np.array([0.9])]):
-        found = detector_from(returning(result), class_ids=[2]).detect(frame_with())
+    for result in (Detections([BOX], [0.9]), ([BOX], [0.9]), [np.array([BOX]), np.array([0.9])]):
+        found = detector_from(returning(result)).detect(frame_with())
         assert found.boxes.tolist() == [BOX]
         assert found.scores[0] == pytest.approx(np.log(9))
-    assert len(detector_from(returning(columns)).detect(frame_with())) == 2
+
+
+@pytest.mark.parametrize("class_ids", [[2], (2, 5), {2}, np.array([2, 7])])
+def test_boxes_of_other_classes_are_dropped(class_ids):
+    boxes = [BOX, [0, 0, 9, 9]]
+    supervision = SimpleNamespace(xyxy=boxes, confidence=[0.9, 0.8], class_id=[2, 0])
+    ultralytics = SimpleNamespace(xyxy=boxes, conf=[0.9, 0.8], cls=np.array([2.0, 0.0], np.float32))
+    for result in (supervision, ultralytics, (boxes, [0.9, 0.8], [2, 0])):
+        found = detector_from(returning(result), class_ids=class_ids).detect(frame_with())
+        assert found.boxes.tolist() == [BOX]
+        assert found.scores[0] == pytest.approx(np.log(9))
+        assert len(detector_from(returning(result)).detect(frame_with())) == 2
+    assert len(detector_from(returning([], []), class_ids=class_ids).detect(frame_with())) == 0
+
+
+@pytest.mark.parametrize(
+    "result", [([BOX], [0.9]), Detections([BOX], [0.9]), ([BOX], [0.9], ["car"]), ([BOX], [0.9], [2, 2])]
+)
+def test_unknown_classes_are_rejected(result):
+    with pytest.raises(DetectorError, match="class_ids needs an integer class for each of the 1 boxes"):
+        detector_from(returning(result), class_ids=[2]).detect(frame_with())
+
+
+def test_the_reason_why_an_array_cannot_be_converted_is_kept():
+    class Tensor:
+        def __array__(self, *_, **__):
+            raise RuntimeError("Use tensor.detach().numpy() instead.")
+
+    for result in ((Tensor(), [0.9]), ([BOX], Tensor())):
+        with pytest.raises(DetectorError, match=r"invalid result .* Use tensor\.detach"):
+            detector_from(returning(result)).detect(frame_with())
 
 
 def test_boxes_are_clipped_and_those_outside_dropped():
@@ -123,8 +152,11 @@ def test_boxes_are_clipped_and_those_outside_dropped():
 @pytest.mark.parametrize(
     ("result", "message"),
     [
-        (None, r"expected the pair \(boxes, scores\), got None; for an image without vehicles return"),
-        (np.zeros((3, 4)), r"expected the pair \(boxes, scores\), got an array of shape \(3, 4\)"),
+        (
+            None,
+            r"expected \(boxes, scores\) or \(boxes, scores, classes\), got None; for an image without",
+        ),
+        (np.zeros((3, 4)), r"expected \(boxes, scores\) or .*, got an array of shape \(3, 4\)"),
         (([BOX], [0.9, 0.8]), "scores must be one number for each of the 1 boxes"),
         (([BOX], [np.nan]), "scores must be finite"),
         (([[0, 0, np.nan, 4]], [0.5]), "boxes must be finite"),
@@ -227,6 +259,9 @@ def test_a_function_has_the_interface_of_a_model():
         ({"score": (2, 1)}, r"score\[1\] must be a number, greater than 2"),
         ({"score": (0, 1), "threshold": 0.5}, "threshold must be omitted with"),
         ({"threshold": 0}, "threshold must be a number, greater than 0"),
+        ({"class_ids": 2}, "class_ids must be a sequence of integers, such as .*, got 2; wrap it in a list"),
+        ({"class_ids": "car"}, "class_ids must be a sequence of integers"),
+        ({"class_ids": ["car"]}, "class_ids must be an integer"),
         ({"thread_safe": "yes"}, "thread_safe must be True or False"),
         ({"search_params": HeatParams()}, "search_params must be a FunctionParams"),
     ],

@@ -19,7 +19,9 @@ from vehicle_detection._common import (
     check_array,
     check_boxes,
     check_choice,
+    check_integer,
     check_number,
+    check_sequence,
     check_shape,
     describe,
 )
@@ -283,15 +285,40 @@ def check_score_scale(score: object, threshold: float | None) -> ScoreScale:
     return score  # type: ignore[return-value]
 
 
-def _score_column(scores: ArrayLike) -> Floats:
-    array = check_array(scores, "scores")
+def check_class_ids(class_ids: object) -> tuple[int, ...]:
+    """Return the numbers of the classes to keep."""
+    ids = check_sequence(class_ids, "class_ids", "integers, such as (2, 5, 7)")
+    return tuple(check_integer(each, "class_ids", low=-(2**53)) for each in ids)
+
+
+def select_classes(found: Detections, classes: Any, class_ids: Collection[int]) -> Detections:
+    """Keep the boxes of these classes; `classes` is ``(N,)``, or None if they are unknown."""
+    if not len(found):
+        return found
+    column = check_array(classes, "classes")
+    if column.shape != (len(found),) or column.dtype.kind not in "iuf":
+        raise InvalidInputError(
+            f"class_ids needs an integer class for each of the {len(found)} boxes, got {describe(classes)}; "
+            "omit class_ids"
+        )
+    return found[np.isin(column, list(class_ids))]
+
+
+def _score_column(scores: ArrayLike, name: str = "scores") -> Floats:
+    array = check_array(scores, name)
     if array.size == 0:
         return np.empty(0)
     if array.ndim != 1 or array.dtype.kind not in "iuf":
-        raise InvalidInputError(f"scores must be one number for each box, got {describe(scores)}")
+        raise InvalidInputError(f"{name} must be one number for each box, got {describe(scores)}")
     if not np.isfinite(array).all():
-        raise InvalidInputError("scores must be finite, got NaN or infinity; drop those rows")
+        raise InvalidInputError(f"{name} must be finite, got NaN or infinity; drop those rows")
     return array.astype(np.float64)
+
+
+def _is_unknown(column: object) -> bool:
+    """Whether a column holds NaN only."""
+    array = np.empty(0) if column is None else check_array(column, "confidences")
+    return array.size > 0 and array.dtype.kind == "f" and bool(np.isnan(array).all())
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,7 +330,8 @@ class Detections:
     boxes, scores
         ``(N, 4)`` boxes ``[x1, y1, x2, y2]``, and ``(N,)`` finite float64 scores.
     confidences
-        ``(N,)`` calibrated probabilities of a vehicle in [0, 1]; None if they are unknown.
+        ``(N,)`` calibrated probabilities of a vehicle in [0, 1]; None if they are unknown. A column of NaN,
+        as in a table, becomes None.
 
     Raises
     ------
@@ -338,8 +366,10 @@ class Detections:
             raise InvalidInputError("scores must be finite, got NaN or infinity; drop those rows")
         object.__setattr__(self, "boxes", boxes)
         object.__setattr__(self, "scores", scores.astype(np.float64, copy=False))
+        if _is_unknown(self.confidences):
+            object.__setattr__(self, "confidences", None)
         if self.confidences is not None:
-            confidences = _score_column(self.confidences)
+            confidences = _score_column(self.confidences, "confidences")
             if confidences.shape != scores.shape or not ((confidences >= 0) & (confidences <= 1)).all():
                 raise InvalidInputError(
                     f"confidences must be a probability, 0 to 1, for each of the {len(boxes)} boxes, got "
@@ -366,7 +396,9 @@ class Detections:
         Parameters
         ----------
         detections
-            An object with ``xyxy``, ``(N, 4)``, and, if known, ``confidence`` and ``class_id``, ``(N,)``.
+            An object with ``xyxy``, ``(N, 4)``, with ``confidence`` or ``conf``, ``(N,)`` or None if unknown,
+            and, if known, with ``class_id`` or ``cls``, ``(N,)``. The second names are those of the ``boxes``
+            of Ultralytics' results.
         score, threshold
             What the confidences are, as in `detector_from`.
         class_ids
@@ -375,12 +407,12 @@ class Detections:
         Returns
         -------
         Detections
-            Boxes with scores in log-odds above the threshold. Without confidences, the score is 3.
+            Boxes with scores in log-odds above the threshold. If confidences are unknown, the score is 3.
 
         Raises
         ------
         InvalidInputError
-            If the object has no ``xyxy``, its columns are malformed, or classes are asked for but unknown.
+            If an attribute is missing, a column is malformed, or classes are asked for but unknown.
 
         Examples
         --------
@@ -395,9 +427,13 @@ class Detections:
                 "supervision.Detections"
             )
         scale = check_score_scale(score, threshold)
-        boxes = check_boxes(detections.xyxy)
-        confidence: Any = getattr(detections, "confidence", None)
-        classes: Any = getattr(detections, "class_id", None)
+        name = next((each for each in ("confidence", "conf") if hasattr(detections, each)), None)
+        if name is None:
+            raise InvalidInputError(
+                f"detections must have an attribute confidence or conf, got {describe(detections)}; set it "
+                "to None if the confidences are unknown"
+            )
+        boxes, confidence = check_boxes(detections.xyxy), getattr(detections, name)
         if confidence is None:
             scores = np.full(len(boxes), CERTAIN_SCORE)
         else:
@@ -405,12 +441,8 @@ class Detections:
         found = cls(boxes, scores)
         if class_ids is None:
             return found
-        if np.shape(classes) != (len(found),):
-            raise InvalidInputError(
-                f"class_ids needs one class_id for each of the {len(found)} boxes, got {describe(classes)}; "
-                "omit class_ids"
-            )
-        return found[np.isin(classes, list(class_ids))]
+        classes = getattr(detections, "class_id", getattr(detections, "cls", None))
+        return select_classes(found, classes, check_class_ids(class_ids))
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return a table with a row for each box: corners, score and, if known, confidence.
@@ -467,6 +499,8 @@ class Detections:
         """Join two sets of boxes, such as the windows of two searches."""
         if not isinstance(other, Detections):
             return NotImplemented
+        if not len(self) or not len(other):  # without boxes, confidences are not unknown
+            return self if len(self) else other
         known = self.confidences is not None and other.confidences is not None
         names = ("boxes", "scores", "confidences") if known else ("boxes", "scores")
         return Detections(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))

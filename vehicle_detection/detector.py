@@ -770,9 +770,10 @@ def detector_from(
     Parameters
     ----------
     function
-        Called with an ``(H, W, 3)`` uint8 RGB image of its own. It returns the pair ``(boxes, scores)``,
-        ``(N, 4)`` ``[x1, y1, x2, y2]`` in pixels and ``(N,)``; or `Detections`, or an object with ``xyxy``
-        and ``confidence`` such as ``supervision.Detections``. Boxes are clipped to the image. It should
+        Called with an ``(H, W, 3)`` uint8 RGB image of its own. It returns ``(boxes, scores)``, ``(N, 4)``
+        ``[x1, y1, x2, y2]`` in pixels and ``(N,)``, or ``(boxes, scores, classes)``; or `Detections`, or an
+        object with ``xyxy``, such as ``supervision.Detections`` and the ``boxes`` of Ultralytics' results
+        (see `Detections.from_supervision`). Boxes are clipped to the image. It should
         return weak boxes as well: the tracker uses them, images show only those above the threshold.
     score
         What the scores are. They are converted to log-odds above the threshold, the unit of `TrackParams`:
@@ -782,7 +783,7 @@ def detector_from(
         Score from which a box is a vehicle in a single image: by default 0.5 for probabilities and 0 for
         log-odds. Pass 0.25 if that is the usual threshold of your detector.
     class_ids
-        Keep only boxes of these classes, where the function returns an object with ``class_id``.
+        Keep only boxes of these classes, integers as the function returns them.
     thread_safe
         Whether the function may be called from several threads. `process_video` searches several frames at
         once; with False the calls wait for each other. Sessions of ONNX Runtime and the ``predict`` of

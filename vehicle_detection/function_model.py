@@ -19,9 +19,11 @@ from vehicle_detection.boxes import (
     Platt,
     ScoreScale,
     box_areas,
+    check_class_ids,
     check_score_scale,
     clip_boxes,
     log_odds,
+    select_classes,
 )
 from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.params import FunctionParams
@@ -59,6 +61,8 @@ class FunctionModel:
         name = self.name or getattr(self.function, "__name__", type(self.function).__name__)
         object.__setattr__(self, "score", check_score_scale(self.score, self.threshold))
         object.__setattr__(self, "name", name)
+        if self.class_ids is not None:
+            object.__setattr__(self, "class_ids", check_class_ids(self.class_ids))
         if self.thread_safe:
             object.__setattr__(self, "_lock", contextlib.nullcontext())
         elif self._lock is None or isinstance(self._lock, contextlib.nullcontext):
@@ -133,12 +137,15 @@ class FunctionModel:
             )
         if isinstance(returned, Detections):
             returned = (returned.boxes, returned.scores)
-        if not isinstance(returned, (tuple, list)) or len(returned) != 2:
+        if not isinstance(returned, (tuple, list)) or len(returned) not in (2, 3):
             raise InvalidInputError(
-                f"expected the pair (boxes, scores), got {describe(returned)}; for an image without vehicles "
-                "return ([], [])"
+                f"expected (boxes, scores) or (boxes, scores, classes), got {describe(returned)}; for an "
+                "image without vehicles return ([], [])"
             )
-        return Detections(returned[0], log_odds(returned[1], self.score, self.threshold))
+        found = Detections(returned[0], log_odds(returned[1], self.score, self.threshold))
+        if self.class_ids is None:
+            return found
+        return select_classes(found, returned[2] if len(returned) == 3 else None, self.class_ids)
 
 
 class FunctionSearch(FrameSearch):
