@@ -186,6 +186,27 @@ def test_from_pandas_rejects_other_tables(table, message):
         FrameBoxes.from_pandas(table)
 
 
+def test_a_table_of_pyarrow_names_the_remedy():
+    pyarrow = pytest.importorskip("pyarrow")
+    with pytest.raises(InvalidInputError, match=r"got .*; convert it with table.to_pandas\(\)"):
+        FrameBoxes.from_pandas(pyarrow.table({"frame": [0], "x1": [0], "y1": [0], "x2": [5], "y2": [5]}))
+
+
+@pytest.mark.parametrize("name", ["class", "label", "category"])
+def test_rows_of_other_classes_are_dropped_as_in_files(tmp_path, name):
+    table = pd.DataFrame({"frame": [0, 0, 1, 2, 3], "track": range(5), "x1": 0, "y1": 0, "x2": 50, "y2": 40})
+    table[name] = ["Car", "person", "tram", "person", None]
+    table.to_csv(tmp_path / "labels.csv", index=False)
+    read, taken = read_labels(tmp_path / "labels.csv"), FrameBoxes.from_pandas(table)
+    pd.testing.assert_frame_equal(read.to_pandas(), taken.to_pandas())
+    assert read.frame_keys == taken.frame_keys == (0, 1, 2, 3)
+    assert taken.ignore.tolist() == [False, True]
+    assert FrameBoxes.from_pandas(table.assign(score=1.0)).frames == (0,)  # predictions
+    assert len(FrameBoxes.from_pandas(table.assign(**{name: [0, 1, 0, 2, 2]}))) == 5  # numbers are no names
+    with pytest.raises(InvalidInputError, match=r"must have a class among car, .* got person, tram; select"):
+        FrameBoxes.from_pandas(table[1:])
+
+
 def test_missing_cells_of_a_table_are_the_usual_values():
     """As after a concatenation of tables with different columns."""
     table = pd.DataFrame({"frame": [0.0, 1.0], "x1": [0, 5], "y1": [0, 0], "x2": [50, 55], "y2": [40, 40]})

@@ -44,6 +44,11 @@ _TABLE_COLUMNS: dict[str, tuple[str, type]] = {
     "speed_mps": ("speed_mps", float),
 }
 
+VEHICLE_CLASSES = ("car", "van", "truck", "bus", "vehicle")
+LOOKALIKE_CLASSES = ("tram", "train", "misc", "trailer", "caravan", "autorickshaw", "vehicle fallback")
+"""Classes whose boxes are vehicles by default, and classes whose labels are ignored."""
+_CLASS_COLUMNS = ("class", "label", "category")  # of tables, all optional
+
 _FLAGS = {"false": False, "true": True}
 # Values of cells that are missing, as after a concatenation of tables.
 _USUAL = {"occluded": 0, "truncated": 0.0, "ignore": 0, "track": NO_TRACK, "track_id": NO_TRACK}
@@ -83,6 +88,18 @@ def _column(values: ArrayLike | None, name: str, rows: int, kinds: str, default:
     return column.astype(filled.dtype)
 
 
+def class_name(record: Mapping[Any, Any]) -> str:
+    """Class of a row of a table in lower case; empty if the row has none."""
+    values = (record.get(column) for column in _CLASS_COLUMNS)
+    return next((str(value).lower() for value in values if value), "")
+
+
+def known_classes(names: Iterable[str]) -> set[str]:
+    """Classes in a table, given that of each row; none if they are numbers, which may mean anything."""
+    found = {*names} - {""}
+    return set() if any(re.fullmatch(r"[-\d.]+", name) for name in found) else found
+
+
 def none_if_unknown(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Return a column, or None if all values are NaN."""
     return None if np.isnan(values).all() else values
@@ -116,6 +133,25 @@ def _table_column(table: pandas.DataFrame, name: str, kind: type) -> NDArray[Any
         raise InvalidInputError(
             f"table must hold numbers in the column {name}, got {describe(values)}; convert it"
         ) from None
+
+
+def _vehicle_rows(table: pandas.DataFrame) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Mark the rows of a table to keep, and those among them to ignore, by the columns of classes."""
+    columns = [name for name in _CLASS_COLUMNS if name in table]
+    texts = table[columns].astype(object).where(table[columns].notna(), "")
+    names = [class_name(dict(zip(columns, row))) for row in texts.itertuples(index=False)]
+    found = known_classes(names)
+    if not found:
+        return np.ones(len(table), np.bool_), np.zeros(len(table), np.bool_)
+    if found.isdisjoint(VEHICLE_CLASSES):
+        raise InvalidInputError(
+            f"table must have a class among {', '.join(VEHICLE_CLASSES)}; got {', '.join(sorted(found))}; "
+            "select the rows of vehicles and drop the column"
+        )
+    vehicles, lookalike = np.isin(names, VEHICLE_CLASSES), np.isin(names, LOOKALIKE_CLASSES)
+    if "score" in table and table["score"].notna().any():  # predictions
+        lookalike[:] = False
+    return vehicles | lookalike, lookalike
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -315,39 +351,47 @@ class FrameBoxes:
         """Take the boxes of a table with the columns of `to_pandas`; only frame and corners are required.
 
         So ``pandas.read_csv`` of a file that `write_tracks` wrote is such a table. A missing track is -1, and
-        missing occlusion, truncation and `ignore` are 0.
+        missing occlusion, truncation and `ignore` are 0. As in `read_labels`, a column ``class``, ``label``
+        or ``category`` of names selects vehicles: car, van, truck, bus and vehicle.
 
         Returns
         -------
         FrameBoxes
-            One box for each row.
+            One box for each row of a vehicle, and all frames.
 
         Raises
         ------
         InvalidInputError
-            If a column is missing or holds something else.
+            If a column is missing or holds something else, or no class is that of vehicles.
         """
         given: object = table
-        names = set(getattr(given, "columns", ()))
+        expected = f"table must be a pandas.DataFrame with the columns frame, {', '.join(_CORNERS)}; "
+        if not hasattr(given, "iloc") or not hasattr(given, "columns"):
+            remedy = "; convert it with table.to_pandas()" if hasattr(given, "to_pandas") else ""
+            raise InvalidInputError(f"{expected}got {describe(given)}{remedy}")
+        names = list(table.columns)
         missing = [name for name in ("frame", *_CORNERS) if name not in names]
-        twice = sorted({name for name in names if list(getattr(given, "columns", ())).count(name) > 1})
-        if twice:
-            raise InvalidInputError(f"table must have each column once; got {twice[0]} more than once")
-        if missing or not hasattr(given, "to_dict"):
-            raise InvalidInputError(
-                f"table must be a pandas.DataFrame with the columns frame, {', '.join(_CORNERS)}; "
-                + (f"it lacks {', '.join(missing)}" if names else f"got {describe(given)}")
-            )
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise InvalidInputError(f"table must have each column once; got {twice} more than once")
+        if missing:
+            raise InvalidInputError(f"{expected}it lacks {', '.join(missing)}")
+        keys = _table_frames(table)
+        vehicles, lookalike = _vehicle_rows(table)
+        table = table[vehicles]
         columns: dict[str, Any] = {
             column: _table_column(table, name, kind)
             for name, (column, kind) in _TABLE_COLUMNS.items()
             if name in names
         }
+        if lookalike.any():
+            columns["ignore"] = columns.get("ignore", False) | lookalike[vehicles]
         track = next((name for name in ("track_id", "track") if name in names), None)
         return cls(
             _table_frames(table),
             None if track is None else _table_column(table, track, int),  # type: ignore[arg-type]
             np.stack([_table_column(table, name, float) for name in _CORNERS], axis=1),
+            frame_keys=keys,
             **columns,
         )
 

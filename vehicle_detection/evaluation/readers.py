@@ -28,10 +28,14 @@ from vehicle_detection._common import (
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation.frame_boxes import (
+    LOOKALIKE_CLASSES,
     NO_TRACK,
+    VEHICLE_CLASSES,
     FrameBoxes,
     FrameKey,
+    class_name,
     frame_order,
+    known_classes,
     none_if_unknown,
 )
 from vehicle_detection.export import BOX_COLUMNS, FOLDER_FORMATS, FORMATS
@@ -42,9 +46,6 @@ LABEL_COLUMNS = (*REQUIRED_LABEL_COLUMNS, "occluded", "truncated", "ignore")
 FRAME_NUMBER = re.compile(r"-?(0|[1-9][0-9]*)(\.0*)?")
 """Frame of a CSV file that is a number. One with leading zeros is a file name."""
 
-VEHICLE_CLASSES = ("car", "van", "truck", "bus", "vehicle")
-_CLASS_COLUMNS = ("class", "label", "category")  # of tables, all optional
-LOOKALIKE_CLASSES = ("tram", "train", "misc", "trailer", "caravan", "autorickshaw", "vehicle fallback")
 PERSON_CLASSES = ("pedestrian", "person_sitting", "cyclist")
 
 # The project's labels do not score vehicles that are largely hidden, truncated by more, or narrower (px).
@@ -219,18 +220,16 @@ def _table_rows(
     counted: bool,
 ) -> Rows:
     """Rows of vehicles of a table, and all its frames; without a column of classes all rows are vehicles."""
-    names = {record.get(column, "").lower() for _, record in records for column in _CLASS_COLUMNS} - {""}
-    # A column of numbers may hold anything.
-    named = bool(names) and not any(re.fullmatch(r"[-\d.]+", name) for name in names)
+    names = [class_name(record) for _, record in records]
     wanted = VEHICLE_CLASSES if classes is None else classes
-    if named:
-        _check_classes(source, names, wanted)
+    found = known_classes(names)
+    if found:
+        _check_classes(source, found, wanted)
     rows, keys = [], []
-    for where, record in records:
+    for (where, record), name in zip(records, names, strict=True):
         row = _table_row(where, record, predicted, counted)
-        name = next((record[column].lower() for column in _CLASS_COLUMNS if record.get(column)), "")
         keys.append(row.frame)
-        if not named or name in wanted:
+        if not found or name in wanted:
             rows.append(row)
         elif name in LOOKALIKE_CLASSES and not predicted:
             rows.append(row._replace(ignore=True))
