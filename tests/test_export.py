@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import read_labels
 from vehicle_detection.export import (
     BOX_COLUMNS,
     DIGITS,
@@ -62,7 +63,8 @@ rows = st.lists(
         st.none() | st.floats(0, 1e4),
     ),
     max_size=8,
-)
+    unique_by=lambda row: row[:2],
+).map(lambda rows: sorted(rows, key=lambda row: row[0]))
 
 
 def read_csv(path):
@@ -338,6 +340,24 @@ def test_rows_of_stills(tmp_path):
 
 
 # --- bad input ---
+
+
+@pytest.mark.parametrize("name", ["t.csv", "t.jsonl", "t.txt"])
+def test_a_track_comes_once_in_a_frame(tmp_path, name):
+    rows_ = [(0, 1, 2, 3, 4, 5, 6), (0, 2, 2, 3, 4, 5, 6), (1, 1, 2, 3, 4, 5, 6)]
+    for given_rows in (rows_ + rows_[1:2], rows_ + rows_[2:], rows_[::-1]):
+        with pytest.raises(
+            InvalidInputError, match=r"row \d: frame must be greater than \d, the last one of"
+        ):
+            write_tracks(given_rows, tmp_path / name)
+    assert os.listdir(tmp_path) == []
+    by_track = [rows_[0], rows_[2], rows_[1]]
+    assert write_tracks([*by_track, (0, -1, 2, 3, 4, 5, 6), (0, -1, 2, 3, 4, 5, 6)], tmp_path / name) == 5
+    assert len(read_labels(tmp_path / name)) == 5
+    writer = TrackWriter(tmp_path / name)
+    for _ in range(2):
+        with writer as write:
+            write(rows_[0])
 
 
 @pytest.mark.parametrize(

@@ -674,15 +674,17 @@ class VehicleDetector:
         clip
             A video clip of moviepy 2.
         on_result
-            Function that is called with the result of each processed frame.
+            Function that is called with the result of each processed frame. moviepy may read a frame more
+            than once: for a preview, a second rendering, or effects such as ``Loop``. A result with the index
+            0 says that the clip starts anew; drop the results before it.
 
         Returns
         -------
         moviepy.VideoClip
-            Reading frames in ascending order tracks the vehicles. A frame that is read again is not processed
-            again. Going back in time, as a second rendering does, forgets all frames and starts anew; its
-            result equals that of the first. Skipping more than ``track_params.max_gap`` seconds ends all
-            tracks.
+            Reading frames in ascending order tracks the vehicles. The frame that was read last is not
+            processed again. Going back in time, as a second rendering does, forgets all frames and starts
+            anew; its result equals that of the first. Skipping more than ``track_params.max_gap`` seconds
+            ends all tracks.
 
         Raises
         ------

@@ -13,6 +13,7 @@ from vehicle_detection.export.files import FORMATS, RowFile, check_format, open_
 from vehicle_detection.export.rows import (
     STILL_COLUMNS,
     TRACK_COLUMNS,
+    Row,
     check_items,
     check_row,
     is_result,
@@ -37,7 +38,8 @@ def write_tracks(
     results
         One :class:`FrameResult` for each frame, of which the shown tracks are written; or rows, each a
         mapping or a sequence of ``frame, track_id, x1, y1, x2, y2, score[, distance_m, speed_mps,
-        confidence, distance_std_m, speed_std_mps]``; or a pandas table of such rows.
+        confidence, distance_std_m, speed_std_mps]``; or a pandas table of such rows. The frames of each track
+        ascend.
     path, format
         File to write, and its format: ``"csv"``, ``"jsonl"`` (one JSON object per line), ``"parquet"`` (needs
         pyarrow), ``"mot"`` (MOTChallenge text), ``"mot_zip"`` (the archive that CVAT imports as tracks),
@@ -54,7 +56,8 @@ def write_tracks(
     Raises
     ------
     InvalidInputError
-        If a row is malformed, the format unknown, or the folder missing or read-only.
+        If a row is malformed, a track comes twice in a frame or its frames do not ascend, the format is
+        unknown, or the folder is missing or read-only.
 
     Notes
     -----
@@ -196,13 +199,14 @@ class TrackWriter:
         self._path, self._shape = path, shape
         self._stack = contextlib.ExitStack()
         self._file: RowFile | None = None
+        self._last_frames: dict[int, int] = {}  # by track
         self.rows = 0
 
     def __enter__(self) -> TrackWriter:
         self._file = self._stack.enter_context(
             open_row_file(self._path, self._kind, TRACK_COLUMNS, self._shape)
         )
-        self.rows = 0
+        self._last_frames, self.rows = {}, 0
         return self
 
     def __call__(self, result: Any) -> None:
@@ -214,8 +218,22 @@ class TrackWriter:
         if is_result(result):
             self._file.add_frame(int(result.index))
         for row in rows_of(result, self.rows):
+            self._check_order(row)
             self._file.write(row)
             self.rows += 1
+
+    def _check_order(self, row: Row) -> None:
+        """Refuse a box of a track in a frame that is not after its last one; tracks below 0 are none."""
+        frame, track = row.frame, row.track_id
+        assert isinstance(frame, int)
+        assert track is not None
+        last = self._last_frames.get(track, -1)
+        if track >= 0 and frame <= last:
+            raise InvalidInputError(
+                f"row {self.rows}: frame must be greater than {last}, the last one of track {track}, got "
+                f"{frame}; sort rows by frame, write each box once, and each video to a file of its own"
+            )
+        self._last_frames[track] = frame
 
     def __exit__(self, *error: Any) -> None:
         self._file = None
