@@ -115,6 +115,13 @@ class TestDetections:
         for x1, y1, x2, y2 in found.boxes:
             assert not changed[y1:y2, x1:x2].any()
 
+    @pytest.mark.parametrize("dtype", [np.uint8, np.int64])
+    def test_colors_may_be_arrays(self, dtype):
+        found = Detections([[600, 400, 700, 490]], [1.25])
+        expected = draw_detections(blank(), found, color=(255, 0, 0))
+        color = np.array([255, 0, 0], dtype)
+        np.testing.assert_array_equal(draw_detections(blank(), found, color=color), expected)
+
     def test_no_detections_draw_nothing(self):
         np.testing.assert_array_equal(draw_detections(blank(), Detections.empty()), blank())
 

@@ -29,6 +29,12 @@ class TestDiagnostics:
         assert panels[2][300, 500].sum() < 20
         assert (inside[3][-1, 25] == TRACK_COLORS[0]).all()
 
+    def test_frames_need_not_be_in_c_order(self):
+        image, heat = np.random.default_rng(0).integers(0, 256, (60, 90, 3), np.uint8), np.zeros((60, 90))
+        expected = draw_diagnostics(image, [[5, 5, 30, 30]], heat, [])
+        for frame in (np.asfortranarray(image), image[:, ::-1][:, ::-1]):
+            np.testing.assert_array_equal(draw_diagnostics(frame, [[5, 5, 30, 30]], heat, []), expected)
+
     def test_heat_may_be_smaller_empty_boolean_or_of_integers(self):
         for heat in (np.zeros((90, 160)), np.ones((90, 160), int), np.ones((9, 16), bool), -np.ones((9, 16))):
             assert draw_diagnostics(blank(), [], heat, []).shape == (720, 1280, 3)

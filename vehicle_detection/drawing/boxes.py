@@ -57,13 +57,19 @@ def draw_boxes(
     ([0, 0, 255], [0, 0, 255], 76)
     """
     result = check_image(image).copy()
+    rgb = _check_color(color)
+    width = check_integer(thickness, "thickness", low=1, high=10_000)
+    for box in check_boxes(boxes):
+        draw_outline(result, round_box(box), rgb, width)
+    return result
+
+
+def _check_color(color: Color) -> Color:
+    """Return a color as Python's integers, which OpenCV needs."""
     if np.shape(check_array(color, "color")) != (3,):
         raise InvalidInputError(f"color must be (red, green, blue), 0-255 each; got {describe(color)}")
     red, green, blue = (check_integer(value, "color", low=0, high=255) for value in color)
-    width = check_integer(thickness, "thickness", low=1, high=10_000)
-    for box in check_boxes(boxes):
-        draw_outline(result, round_box(box), (red, green, blue), width)
-    return result
+    return red, green, blue
 
 
 def score_texts(detections: Detections) -> list[str]:
@@ -166,7 +172,7 @@ def draw_detections(
     width = line_width or line_width_for(shape)
     result = draw_boxes(image, detections.boxes, color=color, thickness=width)
     if scores:
-        draw_texts(result, detections.boxes, score_texts(detections), color, width)
+        draw_texts(result, detections.boxes, score_texts(detections), _check_color(color), width)
     return result
 
 

@@ -84,7 +84,7 @@ def draw_diagnostics(
             TrackDrawer(dataclasses.replace(params or DrawParams(), panel="none")).draw(small, scaled),
         ),
     ]
-    mosaic = np.zeros_like(checked)
+    mosaic = np.zeros(checked.shape, np.uint8)  # not zeros_like: OpenCV needs rows in C order
     for index, (title, panel) in enumerate(panels):
         top, left = index // 2 * height, index % 2 * width
         view = mosaic[top : top + height, left : left + width]
