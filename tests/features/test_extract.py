@@ -283,6 +283,8 @@ def test_all_kinds_of_sources_give_the_same_features(tmp_path):
         "generator": (patch for patch in patches),
         "paths": paths,
         "strings": map(str, paths),
+        "array of paths": np.array(paths),
+        "array of strings": np.array([str(path) for path in paths]),
         "mixed": [paths[0], *patches[1:]],
         "strided": np.repeat(patches, 2, axis=0)[::2],
         "reversed": np.ascontiguousarray(patches[:, :, ::-1])[:, :, ::-1],

@@ -324,7 +324,8 @@ def extract_features(
     Parameters
     ----------
     source
-        ``(N, 64, 64, 3)`` uint8 RGB, a `PatchSet`, or a list of patches or of paths of image files.
+        ``(N, 64, 64, 3)`` uint8 RGB, a `PatchSet`, or a list of patches or a list or array of paths of image
+        files.
     params
         Features to compute; the default is ``FeatureParams()``.
     n_jobs
@@ -408,7 +409,7 @@ def read_patches(source: Any, name: str) -> NDArray[np.uint8]:
             f"{name} must be patches or a list of paths, got {describe(source)}; "
             "read a folder or zip with vehicle_detection.load_patches"
         )
-    if not isinstance(source, np.ndarray):
+    if not isinstance(source, np.ndarray) or (source.ndim == 1 and source.dtype.kind in "UO"):
         source = [read_image(item) if isinstance(item, (str, os.PathLike)) else item for item in source]
     return check_patches(source, PATCH_SIZE, name)
 
