@@ -36,6 +36,20 @@ def bgr(image):
     return np.ascontiguousarray(image[..., ::-1])
 
 
+def test_the_content_of_a_file_is_an_image(tmp_path, picture, monkeypatch):
+    write_image(tmp_path / "a.png", picture)
+    data = (tmp_path / "a.png").read_bytes()
+    np.testing.assert_array_equal(read_image(data), picture)
+    with pytest.raises(InvalidInputError, match="image of bytes must be a complete image file"):
+        read_image(data[:100])
+    for other in (io.BytesIO(data), bytearray(data)):
+        with pytest.raises(InvalidInputError, match=r"path must be a file name or bytes, got .*; pass bytes"):
+            read_image(other)
+    monkeypatch.setenv("VEHICLE_DETECTION_MAX_PIXELS", "100")
+    with pytest.raises(InvalidInputError, match="image of bytes has 60x40 pixels, more than 100"):
+        read_image(data)
+
+
 @pytest.mark.parametrize("suffix", LOSSLESS)
 def test_lossless_formats_keep_every_value(tmp_path, picture, suffix):
     write_image(tmp_path / f"a{suffix}", picture)

@@ -16,6 +16,7 @@ from vehicle_detection._common import (
     atomic_write,
     check_image,
     check_path,
+    describe,
     hide_credentials,
     image_size,
     is_url,
@@ -74,13 +75,14 @@ def _is_truncated(data: bytes) -> bool:
     return data.startswith(b"\x89PNG") and b"IEND" not in data
 
 
-def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
+def read_image(path: str | os.PathLike[str] | bytes) -> NDArray[np.uint8]:
     """Read an image file as ``(H, W, 3)`` uint8 RGB, whatever its format.
 
     Parameters
     ----------
     path
-        A PNG, JPEG, BMP, TIFF, WebP, GIF, PNM or JPEG 2000 file. Gray, RGBA and 16-bit files are converted.
+        A PNG, JPEG, BMP, TIFF, WebP, GIF, PNM or JPEG 2000 file, or the content of one as ``bytes``. Gray,
+        RGBA and 16-bit files are converted, and the EXIF rotation is applied.
 
     Returns
     -------
@@ -100,6 +102,12 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
     ...
     vehicle_detection.errors.InvalidInputError: image file missing.png does not exist; check the path
     """
+    if isinstance(path, bytes):
+        return decode_image(path, "image of bytes")
+    if isinstance(path, (bytearray, memoryview)) or hasattr(path, "getvalue"):
+        raise InvalidInputError(
+            f"path must be a file name or bytes, got {describe(path)}; pass bytes(...) or stream.getvalue()"
+        )
     file = check_path(path)
     if isinstance(path, str) and is_url(path):
         raise InvalidInputError(f"image file {hide_credentials(path)} is a URL; download it first")
