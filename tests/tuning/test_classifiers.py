@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from sklearn.naive_bayes import GaussianNB
@@ -77,6 +79,10 @@ def test_a_test_part_of_one_class_has_one_error_rate(patch_set):
         (
             {"classifiers": {"bayes": GaussianNB}},
             r"classifiers\['bayes'\] must be an estimator .*instance",
+        ),
+        (
+            {"classifiers": {"own": SimpleNamespace(fit=print, predict=print)}},
+            r"classifiers\['own'\] must be an estimator with fit, predict and get_params",
         ),
         ({"params": "luv-2384"}, r"params must be a FeatureParams"),
         ({"splits": "half"}, r"splits must be one of"),

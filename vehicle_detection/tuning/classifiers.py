@@ -131,10 +131,13 @@ def _check_classifiers(classifiers: Mapping[str, Any]) -> dict[str, Any]:
             f"{{'naive Bayes': GaussianNB()}}; got {describe(given)}"
         )
     for name, model in given.items():
-        if isinstance(model, type) or not (hasattr(model, "fit") and hasattr(model, "predict")):
+        # `sklearn.base.clone` needs get_params.
+        if isinstance(model, type) or not all(
+            hasattr(model, each) for each in ("fit", "predict", "get_params")
+        ):
             raise InvalidInputError(
-                f"classifiers[{name!r}] must be an estimator with fit and predict, got {describe(model)}; "
-                "pass an instance, such as GaussianNB()"
+                f"classifiers[{name!r}] must be an estimator with fit, predict and get_params, got "
+                f"{describe(model)}; pass an instance, such as GaussianNB()"
             )
     return {str(name): model for name, model in given.items()}
 
