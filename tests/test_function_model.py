@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from sklearn.pipeline import make_pipeline
 from sklearn.svm import LinearSVC
 
 from tests.video.clips import write_clip
@@ -280,6 +281,8 @@ def test_a_function_as_the_model_names_the_remedy():
 def test_an_estimator_as_the_model_names_the_remedy():
     with pytest.raises(InvalidInputError, match=r"not be an estimator of scikit-learn.*from_pipeline"):
         VehicleDetector(LinearSVC())
+    with pytest.raises(InvalidInputError, match=r"VehicleClassifier.from_pipeline\(pipeline, params\)"):
+        VehicleDetector(make_pipeline(LinearSVC()))
 
 
 def test_copies_share_the_function_and_other_processes_get_it():

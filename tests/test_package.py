@@ -57,6 +57,7 @@ WITHOUT_EXAMPLE = {
     "DetectionScores": "a result of evaluate_detections",
     "FrameSet": "a result of load_frames",
     "TrackScores": "a result of evaluate_tracks",
+    "TrainingReport": "a result of train_and_evaluate",
     "VehicleCounts": "a result of count_vehicles",
     "cross_validate_mixture": "trains several models",
     "hog_image": "a picture",
@@ -193,4 +194,5 @@ def test_every_exception_is_one_of_the_library():
 
 def test_version_and_type_marker():
     assert len(vehicle_detection.__version__.split(".")) == 3
+    assert "__version__" in dir(vehicle_detection)
     assert (FOLDER / "py.typed").exists()

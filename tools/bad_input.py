@@ -47,8 +47,8 @@ NOT_CALLED = {
 
 RESULTS = {
     "BatchReport", "BatchStatus", "DetectionScores", "Event", "Explanation", "FrameResult", "FrameSet",
-    "FrameSource", "HorizonEstimate", "SearchResult", "Track", "TrackScores", "TrackedFrame", "Trip",
-    "VehicleCounts", "VideoInfo", "VideoReport", "plotting.ImageDescription",
+    "FrameSource", "HorizonEstimate", "SearchResult", "Track", "TrackScores", "TrackedFrame",
+    "TrainingReport", "Trip", "VehicleCounts", "VideoInfo", "VideoReport", "plotting.ImageDescription",
 }  # fmt: skip
 """Classes whose instances the library makes, and whose constructors therefore check nothing."""
 
@@ -235,7 +235,8 @@ class _Valid:
             "FrameBoxes": predicted, "FunctionParams": vd.FunctionParams(), "HeatHistory": vd.HeatHistory(),
             "FrameSource": vd.open_source(clip), "HeatmapDetector": vd.HeatmapDetector(classifier),
             "OwnSpeed": own_speed, "PatchFeatures": vd.PatchFeatures(n_jobs=1), "PatchSet": patch_set,
-            "PyramidParams": vd.PyramidParams(), "ReportWriter": vd.ReportWriter(folder / "writer.html"),
+            "Platt": vd.Platt(-1.0, 0.0), "PyramidParams": vd.PyramidParams(),
+            "ReportWriter": vd.ReportWriter(folder / "writer.html"),
             "SearchParams": search, "TemplateMixture": vd.load_model("default"), "TrackLog": log,
             "Tracker": tracker, "VehicleClassifier": classifier, "VehicleDetector": detector,
         }  # fmt: skip
@@ -271,6 +272,8 @@ class _Valid:
             "FrameBoxes.from_pandas": {"table": predicted.to_pandas()},
             "Detections.from_supervision": {"detections": theirs},
             "FrameDataset": {"sets": (frames,)},
+            "Platt": {"a": -1.0, "b": 0.0},
+            "Platt.score": {"probability": 0.5},
             "OwnSpeed": {"seconds": [0.0, 2.0], "speeds_mps": [10.0, 14.0]},
             "OwnSpeed.at": {"seconds": [0.0, 1.0]},
             "PatchSet": {"names": names},

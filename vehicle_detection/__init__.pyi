@@ -1,6 +1,6 @@
 from . import course, plotting
 from .batch import BatchReport, BatchStatus, batch_status, batch_summary, open_dask, run_batch
-from .boxes import Detections, clip_boxes, iou_matrix, non_max_suppression
+from .boxes import Detections, Platt, clip_boxes, iou_matrix, non_max_suppression
 from .camera import Camera, HorizonEstimate, estimate_horizon, read_camera, write_camera
 from .classifier import VehicleClassifier, load_classifier, train_classifier
 from .course import HeatmapDetector
@@ -96,7 +96,7 @@ from .search import SearchResult, find_cars
 from .stream import TrackedFrame, track
 from .synthetic import render_drive, render_patches, render_scene
 from .tracking import FrameResult, Track, Tracker
-from .training import train_and_evaluate
+from .training import TrainingReport, train_and_evaluate
 from .tuning import (
     TrialOptions,
     compare_classifiers,
@@ -153,6 +153,7 @@ __all__ = [
     "OwnSpeed",
     "PatchFeatures",
     "PatchSet",
+    "Platt",
     "PyramidParams",
     "RegionParams",
     "ReportWriter",
@@ -168,6 +169,7 @@ __all__ = [
     "TrackWriter",
     "TrackedFrame",
     "Tracker",
+    "TrainingReport",
     "TransientVideoError",
     "TrialOptions",
     "Trip",

@@ -239,7 +239,24 @@ def log_odds(scores: ArrayLike, score: ScoreScale, threshold: float | None = Non
 
 @dataclass(frozen=True)
 class Platt:
-    """The sigmoid ``1 / (1 + exp(a * score + b))``; `a` is negative where higher scores are vehicles."""
+    """The sigmoid that turns scores into probabilities, as `calibrate_scores` fits it.
+
+    Attributes
+    ----------
+    a, b
+        Of ``1 / (1 + exp(a * score + b))``; `a` is negative where higher scores are vehicles.
+
+    Raises
+    ------
+    InvalidInputError
+        If a number is not finite.
+
+    Examples
+    --------
+    >>> platt = Platt(-1.0, 0.0)
+    >>> platt.probability([0.0, 2.0]).round(2), platt.score(0.5)
+    (array([0.5 , 0.88]), 0.0)
+    """
 
     a: float
     b: float
@@ -352,6 +369,12 @@ class Detections:
     boxes: NDArray[Any]
     scores: Floats
     confidences: Floats | None = None
+
+    if TYPE_CHECKING:  # what is converted
+
+        def __init__(
+            self, boxes: Detections | ArrayLike, scores: ArrayLike, confidences: ArrayLike | None = None
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         boxes = check_boxes(self.boxes)

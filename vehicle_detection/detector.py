@@ -11,7 +11,7 @@ import time as clock
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,6 +128,14 @@ class VehicleDetector:
         of every detection and track of the frame, also of tracks that are not detected or not shown. Vehicles
         that are not found are not blurred: check the result before you publish it.
 
+    Attributes
+    ----------
+    model, search_params, region_params, track_params, draw_params, camera
+        The arguments of these names, or their defaults.
+    every, own_speed, diagnostics, blur
+        The arguments of these names. Like the others, they are read-only: assigning to them has no effect, or
+        only a partial one. Make another detector instead.
+
     Raises
     ------
     ModelFileError
@@ -234,7 +242,7 @@ class VehicleDetector:
         self._lock = threading.RLock()
         self._search = self.model.open_search(*self._search_options)
 
-    def __copy__(self) -> VehicleDetector:
+    def __copy__(self) -> Self:
         """Return a detector with the same model and search threads, and a state of its own."""
         other = object.__new__(type(self))
         vars(other).update(vars(self))
@@ -719,7 +727,7 @@ class VehicleDetector:
         """Stop the search's threads; the detector starts them again when it is used."""
         self._search.close()
 
-    def __enter__(self) -> VehicleDetector:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: Any) -> None:
@@ -883,9 +891,10 @@ def _load(model: object) -> Model:
             f"model must not be a function, got {describe(model)}; pass it to detector_from"
         )
     if hasattr(model, "predict") and not isinstance(model, VehicleClassifier):
+        argument = "pipeline" if hasattr(model, "steps") else "(classifier, scaler)"
         raise InvalidInputError(
             f"model must not be an estimator of scikit-learn, got {describe(model)}; convert it with "
-            "VehicleClassifier.from_pipeline((classifier, scaler), params), or use HeatmapDetector"
+            f"VehicleClassifier.from_pipeline({argument}, params), or use HeatmapDetector"
         )
     if not isinstance(model, FunctionModel):
         kinds = VehicleClassifier, TemplateMixture

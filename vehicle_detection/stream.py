@@ -77,6 +77,19 @@ def track(
     progress: bool = ...,
     **options: Any,
 ) -> list[FrameResult]: ...
+@overload
+def track(
+    source: Source,
+    model: str | os.PathLike[str] | Model | VehicleDetector = ...,
+    *,
+    stream: bool,
+    start: float | None = ...,
+    end: float | None = ...,
+    workers: int | None = ...,
+    show: bool = ...,
+    progress: bool = ...,
+    **options: Any,
+) -> Generator[TrackedFrame] | list[FrameResult]: ...
 
 
 def track(

@@ -67,19 +67,39 @@ class SplitScore:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingReport:
-    """Options and results of `train_and_evaluate`."""
+    """Options and results of `train_and_evaluate`.
+
+    Attributes
+    ----------
+    params, options
+        The features, and the other options.
+    split
+        Split whose accuracy is reported as the model's.
+    sources
+        Number of patches of each source folder.
+    vehicles, non_vehicles
+        Number of patches of each class.
+    fingerprint
+        Fingerprint of the patches, see `PatchSet`.
+    splits, skipped
+        Scores on each split that the patches allow; and the other splits, with the reason.
+    calibration_error
+        On the split ``"sequences"``; None if it cannot be made twice.
+    seconds
+        Time of each step; times of concurrent fits add up.
+    """
 
     params: FeatureParams
     options: TrainingOptions
-    split: str  # Split whose accuracy is reported as the model's.
-    sources: dict[str, int]  # Number of patches of each source folder.
-    vehicles: int  # Number of patches.
+    split: str
+    sources: dict[str, int]
+    vehicles: int
     non_vehicles: int
-    fingerprint: str  # Fingerprint of the patches, see `PatchSet`.
-    splits: dict[str, SplitScore]  # Scores on each split of `SPLITS` that the patches allow.
-    calibration_error: float | None  # On the split "sequences"; None if it cannot be made twice.
-    skipped: dict[str, str]  # The other splits, with the reason.
-    seconds: dict[str, float]  # Time of each step; times of concurrent fits add up.
+    fingerprint: str
+    splits: dict[str, SplitScore]
+    calibration_error: float | None
+    skipped: dict[str, str]
+    seconds: dict[str, float]
 
     @property
     def accuracy(self) -> float:

@@ -6,10 +6,10 @@ import hashlib
 import math
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -61,6 +61,10 @@ class PatchSet:
     patches: NDArray[np.uint8]
     labels: NDArray[np.bool_]
     names: tuple[str, ...]
+
+    if TYPE_CHECKING:  # what is converted
+
+        def __init__(self, patches: ArrayLike, labels: ArrayLike, names: Iterable[str]) -> None: ...
 
     def __post_init__(self) -> None:
         given: object = self.patches

@@ -201,6 +201,23 @@ class FrameBoxes:
     frame_keys: Sequence[FrameKey] = ()
     _rows: dict[FrameKey, NDArray[np.intp]] = field(init=False)
 
+    if TYPE_CHECKING:  # what is converted
+
+        def __init__(
+            self,
+            frames: Iterable[FrameKey],
+            tracks: ArrayLike | None,
+            boxes: Detections | ArrayLike,
+            *,
+            occluded: ArrayLike | None = None,
+            truncated: ArrayLike | None = None,
+            ignore: ArrayLike | None = None,
+            scores: ArrayLike | None = None,
+            distance_m: ArrayLike | None = None,
+            speed_mps: ArrayLike | None = None,
+            frame_keys: Iterable[FrameKey] = (),
+        ) -> None: ...
+
     def __post_init__(self) -> None:
         frames = check_keys(self.frames, "frames")
         boxes = check_boxes(self.boxes).astype(np.float64)
@@ -260,7 +277,7 @@ class FrameBoxes:
         parts = [Detections.empty(), *detections.values()]
         return cls(
             [key for key, found in detections.items() for _ in range(len(found))],
-            None,  # type: ignore[arg-type]
+            None,
             np.concatenate([found.boxes for found in parts]),
             scores=np.concatenate([found.scores for found in parts]),
             frame_keys=tuple(detections),
@@ -389,7 +406,7 @@ class FrameBoxes:
         track = next((name for name in ("track_id", "track") if name in names), None)
         return cls(
             _table_frames(table),
-            None if track is None else _table_column(table, track, int),  # type: ignore[arg-type]
+            None if track is None else _table_column(table, track, int),
             np.stack([_table_column(table, name, float) for name in _CORNERS], axis=1),
             frame_keys=keys,
             **columns,

@@ -18,7 +18,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,9 @@ from vehicle_detection.video.reading import check_span, frame_range
 from vehicle_detection.video.sources import Source, borrow_source, open_source
 from vehicle_detection.video.streams import CONTAINERS, AudioSource, FrameWriter
 from vehicle_detection.video.viewer import open_viewer
+
+if TYPE_CHECKING:
+    from vehicle_detection.tracking import FrameResult
 
 PRESETS = (
     "ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow", "placebo",
@@ -143,7 +146,7 @@ def process_video(
     progress: bool = True,
     strict: bool = False,
     show: bool = False,
-    on_result: Callable[[Any], object] | None = None,
+    on_result: Callable[[FrameResult], object] | None = None,
 ) -> VideoReport:
     """Detect and track the vehicles of a video, and write a copy with their boxes.
 
