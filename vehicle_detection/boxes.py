@@ -24,6 +24,7 @@ from vehicle_detection._common import (
     check_sequence,
     check_shape,
     describe,
+    store_number,
 )
 from vehicle_detection.errors import InvalidInputError
 
@@ -262,8 +263,8 @@ class Platt:
     b: float
 
     def __post_init__(self) -> None:
-        check_number(self.a, "a")
-        check_number(self.b, "b")
+        store_number(self, "a")
+        store_number(self, "b")
 
     def probability(self, scores: ArrayLike) -> Floats:
         """Probability of a vehicle for each score, float64 in [0, 1], of the same shape."""

@@ -28,6 +28,7 @@ from vehicle_detection._common import (
     mirror_patches,
     pluralize,
     read_model,
+    store_number,
     write_model,
 )
 from vehicle_detection._kernels import fit_svm
@@ -77,7 +78,7 @@ class Template:
             object.__setattr__(self, name, column)
         if not (self.scale > 0).all():
             raise InvalidInputError("scale must be positive; a constant feature has scale 1")
-        check_number(self.intercept, "intercept")
+        store_number(self, "intercept")
         with np.errstate(over="ignore", invalid="ignore"):
             weights, bias = self.fold()
         if not (np.isfinite(weights).all() and math.isfinite(bias)):

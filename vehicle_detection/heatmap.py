@@ -178,7 +178,7 @@ def label_boxes(heatmap: NDArray[Any], *, threshold: float = 0.0, peak_fraction:
     ([[1, 1, 4, 2]], [[2, 1, 4, 2]])
     """
     heat = _check_heat(heatmap)
-    check_number(peak_fraction, "peak_fraction", low=0, high=0.99)
+    peak_fraction = check_number(peak_fraction, "peak_fraction", low=0, high=0.99)
     labels, stats = _connected_components(heat > check_number(threshold, "threshold", low=0))
     boxes, peaks = [], []
     # From top to bottom, because OpenCV labels components by blocks of two rows and columns.

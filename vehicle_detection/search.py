@@ -125,8 +125,8 @@ class FrameSearch(ABC):
         check_image(frame, "frame")
         params = self.params_type.default() if params is None else params
         check_type(params, "params", self.params_type, "omit it for the default")
-        check_number(min_vehicle_score, "min_vehicle_score")
-        windows, vehicles = self._search(frame, params, min_vehicle_score)
+        min_score = check_number(min_vehicle_score, "min_vehicle_score")
+        windows, vehicles = self._search(frame, params, min_score)
         thumbnail, shape = make_thumbnail(frame), (frame.shape[0], frame.shape[1])
         return SearchResult(windows, vehicles, shape, thumbnail, time.perf_counter() - start)
 

@@ -211,7 +211,7 @@ def search_windows(
             f"windows must be whole pixels; got {given[row].tolist()} in row {row}; round them first"
         )
     if min_score is not None:
-        check_number(min_score, "min_score")
+        min_score = check_number(min_score, "min_score")
     height, width = image.shape[:2]
     inside = (boxes[:, :2] >= 0).all(1) & (boxes[:, 2] <= width) & (boxes[:, 3] <= height)
     valid = inside & (boxes[:, 2:] > boxes[:, :2]).all(1)

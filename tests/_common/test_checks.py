@@ -20,6 +20,7 @@ from vehicle_detection._common import (
     check_patches,
     check_type,
     describe,
+    store_number,
 )
 from vehicle_detection.boxes import Detections
 from vehicle_detection.datasets import PatchSet
@@ -211,6 +212,15 @@ def test_check_number_accepts_fractions_but_no_decimals():
     assert check_number(Fraction(30000, 1001), "fps") == 30000 / 1001
     with pytest.raises(InvalidInputError, match="fps must be a number, finite; got Decimal"):
         check_number(Decimal(30), "fps")
+
+
+def test_stored_numbers_are_those_of_python():
+    values = SimpleNamespace(a=np.float32(0.5), b=Fraction(1, 2), c=1)
+    for name in "abc":
+        store_number(values, name, low=0, high=1)
+    assert [repr(value) for value in vars(values).values()] == ["0.5", "0.5", "1"]
+    with pytest.raises(InvalidInputError, match="c must be a number, at least 2; got 1"):
+        store_number(values, "c", low=2)
 
 
 @pytest.mark.parametrize("value", [True, np.bool_(True)])

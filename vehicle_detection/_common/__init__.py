@@ -19,6 +19,7 @@ from vehicle_detection._common.checks import (
     check_type,
     describe,
     finite_array,
+    store_number,
 )
 from vehicle_detection._common.environment import check_environment
 from vehicle_detection._common.files import (
@@ -100,6 +101,7 @@ __all__ = [
     "resolve_jobs",
     "single_threaded_opencv",
     "stable_url",
+    "store_number",
     "temporary_folder",
     "with_spare",
     "write_model",

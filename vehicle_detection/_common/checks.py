@@ -241,6 +241,14 @@ def check_number(
     return number
 
 
+def store_number(instance: object, name: str, **bounds: float) -> None:
+    """Check an attribute of a dataclass; a number of NumPy or a fraction becomes a float."""
+    value = getattr(instance, name)
+    number = check_number(value, name, **bounds)
+    if not isinstance(value, (int, float)):
+        object.__setattr__(instance, name, number)
+
+
 def check_integer(value: object, name: str, *, low: int, high: int | None = None) -> int:
     """Return `value` as an int in ``[low, high]``."""
     is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)

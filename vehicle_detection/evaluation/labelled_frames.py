@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from vehicle_detection._common import (
     check_image,
     check_integer,
-    check_number,
     check_type,
     describe,
     pluralize,
+    store_number,
 )
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
@@ -82,7 +82,7 @@ class LabelledFrames:
                 "use the same names in both"
             )
         if self.horizon is not None:
-            check_number(self.horizon, "horizon", low=0, high=1)
+            store_number(self, "horizon", low=0, high=1)
         object.__setattr__(self, "labels", labels[sorted(row for key in keys for row in labels.rows(key))])
 
     def __repr__(self) -> str:

@@ -326,8 +326,7 @@ class Explorer:
         InvalidInputError
             If a coordinate is not a finite number.
         """
-        check_number(x, "x")
-        check_number(y, "y")
+        x, y = check_number(x, "x"), check_number(y, "y")
         boxes = self.boxes().boxes
         left, top, right, bottom = boxes.T
         inside = (left <= x) & (x < right) & (top <= y) & (y < bottom)

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from vehicle_detection._common import (
     Floats,
     check_choice,
-    check_number,
     check_sequence,
     check_type,
     read_model,
+    store_number,
     write_model,
 )
 from vehicle_detection.boxes import Platt, box_areas, clip_boxes
@@ -142,13 +142,13 @@ class TemplateMixture:
             check_type(template, "templates", MixtureTemplate, "train_mixture creates them")
         if self.rescorer is not None:
             check_type(self.rescorer, "rescorer", Rescorer, "pass None, or train with train_mixture")
-        check_number(self.slope, "slope", above=0, high=1e9)
-        check_number(self.offset, "offset", low=-1e9, high=1e9)
-        check_number(self.threshold, "threshold", low=-1e9, high=1e9)
-        check_number(self.size_prior_weight, "size_prior_weight", low=0)
-        check_number(self.vote_weight, "vote_weight", low=0)
-        check_number(self.count_weight, "count_weight", low=0)
-        check_number(self.perspective_weight, "perspective_weight", low=0)
+        store_number(self, "slope", above=0, high=1e9)
+        store_number(self, "offset", low=-1e9, high=1e9)
+        store_number(self, "threshold", low=-1e9, high=1e9)
+        store_number(self, "size_prior_weight", low=0)
+        store_number(self, "vote_weight", low=0)
+        store_number(self, "count_weight", low=0)
+        store_number(self, "perspective_weight", low=0)
         object.__setattr__(self, "templates", templates)
 
     @property

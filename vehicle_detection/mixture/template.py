@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Floats, check_bool, check_number, describe, finite_array
+from vehicle_detection._common import Floats, check_bool, check_number, describe, finite_array, store_number
 from vehicle_detection._kernels import Filter
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.mixture.features import N_CHANNELS, CellGrid, FeatureMap, mirror_channels
@@ -30,7 +30,7 @@ class MixtureTemplate:
 
     def __post_init__(self) -> None:
         weights = finite_array(self.weights, "weights", (None, None, N_CHANNELS))
-        check_number(self.bias, "bias", low=-1e9, high=1e9)
+        store_number(self, "bias", low=-1e9, high=1e9)
         rows, columns = weights.shape[:2]
         padding: object = self.padding
         if not isinstance(padding, tuple) or len(padding) != 2:

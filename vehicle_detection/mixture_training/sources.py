@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_number, check_type, describe, pluralize
+from vehicle_detection._common import check_type, describe, pluralize, store_number
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation import FrameBoxes, FrameKey, LabelledFrames, read_labels
@@ -58,7 +58,7 @@ class FrameDataset:
         sets = entries(self.sets, "sets")
         for part in sets:
             check_type(part, "sets", LabelledFrames, "pass the frames with their labels as LabelledFrames")
-        check_number(self.min_labelled_width, "min_labelled_width", low=0)
+        store_number(self, "min_labelled_width", low=0)
         object.__setattr__(self, "sets", sets)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_detection._common import check_integer, check_number, check_type, describe
+from vehicle_detection._common import check_integer, check_number, check_type, describe, store_number
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params.search import PyramidParams
 
@@ -105,19 +105,19 @@ class MixtureParams:
         for name, fractions in ("simulated_borders", borders), ("mining_schedule", schedule):
             for fraction in fractions:
                 check_number(fraction, name, above=0, high=1)
-        check_number(self.padding, "padding", low=0, high=8)
-        check_number(self.border_bias, "border_bias")
+        store_number(self, "padding", low=0, high=8)
+        store_number(self, "border_bias")
         for name in "C", "border_C":
-            check_number(getattr(self, name), name, above=0, high=1e6)
-        check_number(self.positive_weight, "positive_weight", above=0, high=1e9)
+            store_number(self, name, above=0, high=1e6)
+        store_number(self, "positive_weight", above=0, high=1e9)
         for name in "size_prior_weight", "vote_weight", "count_weight", "perspective_weight":
-            check_number(getattr(self, name), name, low=0)
-        check_number(self.blend_weight, "blend_weight", low=0, high=1)
-        check_number(self.min_width, "min_width", low=8, high=10_000)
-        check_number(self.aspect_tolerance, "aspect_tolerance", low=0, high=10)
+            store_number(self, name, low=0)
+        store_number(self, "blend_weight", low=0, high=1)
+        store_number(self, "min_width", low=8, high=10_000)
+        store_number(self, "aspect_tolerance", low=0, high=10)
         for name in "copies", "border_copies":
             check_integer(getattr(self, name), name, low=1, high=100)
-        check_number(self.jitter_scale, "jitter_scale", low=0, high=0.25)
+        store_number(self, "jitter_scale", low=0, high=0.25)
         check_integer(self.relit_copies, "relit_copies", low=0, high=100)
         for name in "max_per_frame", "max_negatives":
             check_integer(getattr(self, name), name, low=1)

@@ -7,7 +7,7 @@ import warnings
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
-from vehicle_detection._common import check_choice, check_integer, check_number
+from vehicle_detection._common import check_choice, check_integer, store_number
 
 
 class HeatRange(NamedTuple):
@@ -52,8 +52,8 @@ class HeatParams:
         check_choice(self.weighting, "weighting", ("score", "count"))
         check_integer(self.frames, "frames", low=1, high=1000)
         if self.threshold is not None:
-            check_number(self.threshold, "threshold", low=0, high=1e9)
-        check_number(self.peak_fraction, "peak_fraction", low=0, high=0.99)
+            store_number(self, "threshold", low=0, high=1e9)
+        store_number(self, "peak_fraction", low=0, high=0.99)
 
     def for_search(self, search: HeatSearch) -> HeatParams:
         """Return the same parameters with a threshold for `search`; warn if the given one cannot fit it."""
@@ -114,11 +114,11 @@ class RegionParams:
 
     def __post_init__(self) -> None:
         for name in ("min_peak", "min_evidence"):
-            check_number(getattr(self, name), name, low=0, high=1e9)
+            store_number(self, name, low=0, high=1e9)
         for name in ("min_iou", "max_coverage", "flank_peak_ratio"):
-            check_number(getattr(self, name), name, low=0, high=1)
-        check_number(self.score_power, "score_power", low=0, high=20)
+            store_number(self, name, low=0, high=1)
+        store_number(self, "score_power", low=0, high=20)
         for name in ("suppression_radius", "face_width", "face_height", "flank_shift"):
-            check_number(getattr(self, name), name, above=0, high=2)
-        check_number(self.face_offset_y, "face_offset_y", low=-1, high=1)
-        check_number(self.flank_length_m, "flank_length_m", low=0, high=100)
+            store_number(self, name, above=0, high=2)
+        store_number(self, "face_offset_y", low=-1, high=1)
+        store_number(self, "flank_length_m", low=0, high=100)

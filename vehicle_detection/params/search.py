@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from vehicle_detection._common import check_choice, check_integer, check_number, describe
+from vehicle_detection._common import check_choice, check_integer, check_number, describe, store_number
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params.regions import HeatParams, HeatRange
 
@@ -151,9 +151,9 @@ class SearchParams:
                 f"bands must be a tuple of SearchBand, at least one; got {describe(bands)}"
             )
         object.__setattr__(self, "bands", tuple(bands))
-        check_number(self.horizon, "horizon", low=0, high=1)
-        check_number(self.min_score, "min_score", low=-1e6, high=1e6)
-        check_number(self.horizontal_padding, "horizontal_padding", low=0, high=0.9)
+        store_number(self, "horizon", low=0, high=1)
+        store_number(self, "min_score", low=-1e6, high=1e6)
+        store_number(self, "horizontal_padding", low=0, high=0.9)
 
     @classmethod
     def default(cls) -> SearchParams:
@@ -281,9 +281,9 @@ class FunctionParams:
 
     def __post_init__(self) -> None:
         if self.horizon is not None:
-            check_number(self.horizon, "horizon", low=0, high=1)
-        check_number(self.horizon_tolerance, "horizon_tolerance", low=0, high=1)
-        check_number(self.min_score, "min_score")
+            store_number(self, "horizon", low=0, high=1)
+        store_number(self, "horizon_tolerance", low=0, high=1)
+        store_number(self, "min_score")
 
     @classmethod
     def default(cls) -> FunctionParams:
@@ -343,11 +343,11 @@ class PyramidParams:
 
     def __post_init__(self) -> None:
         if self.min_width is not None:
-            check_number(self.min_width, "min_width", low=16, high=10_000)
-        check_number(self.max_height, "max_height", above=0, high=2)
+            store_number(self, "min_width", low=16, high=10_000)
+        store_number(self, "max_height", above=0, high=2)
         check_integer(self.per_octave, "per_octave", low=1, high=32)
         if self.horizon is not None:
-            check_number(self.horizon, "horizon", low=0, high=1)
+            store_number(self, "horizon", low=0, high=1)
         heights: object = self.camera_height_m
         if not isinstance(heights, (tuple, list)) or len(heights) != 2:
             raise InvalidInputError(
@@ -357,8 +357,8 @@ class PyramidParams:
         if low > high:
             raise InvalidInputError(f"camera_height_m must be in ascending order; got {describe(heights)}")
         object.__setattr__(self, "camera_height_m", (low, high))
-        check_number(self.horizon_tolerance, "horizon_tolerance", low=0, high=1)
-        check_number(self.min_score, "min_score")
+        store_number(self, "horizon_tolerance", low=0, high=1)
+        store_number(self, "min_score")
 
     @classmethod
     def default(cls) -> PyramidParams:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from vehicle_detection._common import check_choice, check_integer, check_number
+from vehicle_detection._common import check_choice, check_integer, store_number
 from vehicle_detection.errors import InvalidInputError
 
 
@@ -97,7 +97,7 @@ class TrackParams:
     def __post_init__(self) -> None:
         check_choice(self.smoother, "smoother", ("kalman", "history", "nearest"))
         for name in ("score_time_constant", "max_gap", "history_seconds"):
-            check_number(getattr(self, name), name, above=0, high=3600)
+            store_number(self, name, above=0, high=3600)
         times = (
             "confirm_seconds",
             "tentative_coast",
@@ -108,16 +108,16 @@ class TrackParams:
             "backfill",
         )
         for name in (*times, "measurement_correlation_time"):
-            check_number(getattr(self, name), name, low=0, high=3600)
+            store_number(self, name, low=0, high=3600)
         for name in ("high_threshold", "low_threshold", "confirm_score", "instant_confirm_score"):
-            check_number(getattr(self, name), name, low=-1e6, high=1e6)
+            store_number(self, name, low=-1e6, high=1e6)
         for name in ("max_distance", "process_noise_position", "process_noise_size"):
-            check_number(getattr(self, name), name, above=0, high=100)
+            store_number(self, name, above=0, high=100)
         for name in ("max_iou", "max_coverage"):
-            check_number(getattr(self, name), name, low=0, high=1)
+            store_number(self, name, low=0, high=1)
         check_integer(self.confirm_hits, "confirm_hits", low=1, high=10_000)
         for name in ("measurement_noise", "nearest_weight"):
-            check_number(getattr(self, name), name, above=0, high=1)
+            store_number(self, name, above=0, high=1)
         if self.show_coast > self.max_coast:
             raise InvalidInputError(
                 f"show_coast must be at most max_coast, because a track that ended is not shown; "

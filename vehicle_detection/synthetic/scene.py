@@ -11,7 +11,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_choice, check_integer, check_number, check_sequence, describe
+from vehicle_detection._common import (
+    check_choice,
+    check_integer,
+    check_number,
+    check_sequence,
+    describe,
+    store_number,
+)
 from vehicle_detection.camera import Camera
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.synthetic.camera_light import LIGHTS, SceneConfig, Sensor, make_light
@@ -36,14 +43,14 @@ class SceneVehicle:
     speed_mps: float = 0.0  # away from the camera; only for the ground truth
 
     def __post_init__(self) -> None:
-        check_number(self.distance_m, "distance_m", low=2.0, high=1000.0)
-        check_number(self.lateral_m, "lateral_m", low=-100.0, high=100.0)
+        store_number(self, "distance_m", low=2.0, high=1000.0)
+        store_number(self, "lateral_m", low=-100.0, high=100.0)
         if self.kind is not None:
             check_choice(self.kind, "kind", VEHICLE_SHAPES)
         if self.color is not None:
             check_choice(self.color, "color", COLORS)
         check_choice(self.view, "view", ("rear", "front"))
-        check_number(self.speed_mps, "speed_mps", low=-150.0, high=150.0)
+        store_number(self, "speed_mps", low=-150.0, high=150.0)
 
 
 @dataclass(frozen=True, eq=False)

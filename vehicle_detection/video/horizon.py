@@ -37,7 +37,7 @@ def estimate_video_horizon(
     or if the estimate is too uncertain.
     """
     boxes: list[NDArray[np.floating]] = []
-    check_span(start, end)
+    start, end = check_span(start, end)
     with borrow_source(source) as opened:
         if not opened.rereadable:
             raise InvalidInputError(

@@ -25,6 +25,7 @@ from vehicle_detection._common import (
     check_path,
     describe,
     read_regular_file,
+    store_number,
 )
 from vehicle_detection.errors import InvalidInputError
 
@@ -90,7 +91,7 @@ class OwnSpeed:
             raise InvalidInputError(
                 f"speeds_mps must be at least 0, got {self.speeds_mps.min():g}; pass speeds, not velocities"
             )
-        check_number(self.max_gap, "max_gap", above=0)
+        store_number(self, "max_gap", above=0)
 
     @classmethod
     def constant(cls, speed_mps: float) -> OwnSpeed:

@@ -259,7 +259,7 @@ class VideoRun:
         frames: Frames = "none",
         strict: bool = False,
     ) -> None:
-        check_span(start, end)
+        start, end = check_span(start, end)
         check_choice(preset, "preset", PRESETS)
         n_workers = min(available_cores(), 4) if workers is None else check_integer(workers, "workers", low=1)
         for method in ("search", "track", "annotate", "reset"):
@@ -386,7 +386,7 @@ def cut_video(
 
     The arguments are those of `process_video`, and so are the errors.
     """
-    check_span(start, end)
+    start, end = check_span(start, end)
     check_choice(preset, "preset", PRESETS)
     output = _check_video_target(target)
     with borrow_source(source) as opened:

@@ -85,21 +85,23 @@ def read_frames(
     vehicle_detection.errors.InvalidInputError: source missing.mp4 does not exist; check the path
     """
     path = check_file(source)
-    check_span(start, end)
+    start, end = check_span(start, end)
     info = probe(path)
     first, count = frame_range(info, start, end)
     return FrameReader(path, info, first=first, count=count, strict=strict)
 
 
-def check_span(start: float | None, end: float | None) -> None:
-    """Check a time range in seconds."""
-    for name, value in (("start", start), ("end", end)):
-        if value is not None:
-            check_number(value, name, low=0, high=1e7)
+def check_span(start: float | None, end: float | None) -> tuple[float | None, float | None]:
+    """Return a time range in seconds if it is valid."""
+    start, end = (
+        None if value is None else check_number(value, name, low=0, high=1e7)
+        for name, value in (("start", start), ("end", end))
+    )
     if end is not None and (start or 0) >= end:
         raise InvalidInputError(
             f"end must be later than the start; got {start or 0:g} s to {end:g} s, choose a later end"
         )
+    return start, end
 
 
 def frame_range(info: VideoInfo, start: float | None, end: float | None) -> tuple[int, int | None]:
