@@ -254,9 +254,9 @@ class Platt:
 
     Examples
     --------
-    >>> platt = Platt(-1.0, 0.0)
+    >>> platt = Platt(-2.0, 1.0)
     >>> platt.probability([0.0, 2.0]).round(2), platt.score(0.5)
-    (array([0.5 , 0.88]), 0.0)
+    (array([0.27, 0.95]), 0.5)
     """
 
     a: float
@@ -306,7 +306,7 @@ def check_score_scale(score: object, threshold: float | None) -> ScoreScale:
 def check_class_ids(class_ids: object) -> tuple[int, ...]:
     """Return the numbers of the classes to keep."""
     ids = check_sequence(class_ids, "class_ids", "integers, such as (2, 5, 7)")
-    return tuple(check_integer(each, "class_ids", low=-(2**53)) for each in ids)
+    return tuple(check_integer(each, "class_ids", low=0) for each in ids)
 
 
 def select_classes(found: Detections, classes: Any, class_ids: Collection[int]) -> Detections:

@@ -553,11 +553,12 @@ class VehicleDetector:
         start = clock.perf_counter()
         check_type(found, "found", SearchResult, "pass what search returns")
         time = _check_time(time)
+        camera = self.camera_of(found.shape)
         self._shape, self._time = found.shape, time
         if self._tracker is None:
             fps = self._fps or _USUAL_FPS
             self._tracker = Tracker(self.track_params, fps=fps, calibration=self._calibration)
-        self._tracker.set_camera(self.camera_of(found.shape))
+        self._tracker.set_camera(camera)
         if self._is_cut(found.thumbnail):
             self._heat_history.clear()
             self._tracker.end_tracks()

@@ -122,7 +122,7 @@ class MixtureParams:
         for name in "max_per_frame", "max_negatives":
             check_integer(getattr(self, name), name, low=1)
         check_type(self.search, "search", PyramidParams, "it sets the window sizes for negatives")
-        tuples = {"shapes": shapes, "border_shapes": border_shapes, "mirrored": mirrored}
+        tuples = {"shapes": shapes, "border_shapes": border_shapes, "mirrored": tuple(map(bool, mirrored))}
         for name, values in (tuples | {"simulated_borders": borders, "mining_schedule": schedule}).items():
             object.__setattr__(self, name, values)
 
