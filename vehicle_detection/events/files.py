@@ -104,7 +104,7 @@ def cut_clips(
     []
     """
     rate = check_number(fps, "fps", above=0, high=1e6)
-    check_number(margin, "margin", low=0, high=3600)
+    margin = check_number(margin, "margin", low=0, high=3600)
     paths = []
     listed = check_events(events)
     if listed and not Path(folder).is_dir():

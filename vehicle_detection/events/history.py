@@ -185,10 +185,10 @@ class TrackLog:
             If `speed` is something else, or the frame rate is not a positive number.
         """
         check_type(speed, "speed", OwnSpeed, "pass what read_own_speed returns")
-        check_number(fps, "fps", above=0, high=1e6)
+        rate = check_number(fps, "fps", above=0, high=1e6)
         times = self._frame_times()
         if times is None:
-            times = (self.first_time or 0.0) + np.arange(len(self.counts)) / fps
+            times = (self.first_time or 0.0) + np.arange(len(self.counts)) / rate
         return speed.at(times)
 
     def histories(self) -> list[TrackHistory]:

@@ -328,7 +328,7 @@ def _settings(detector: Any, shape: tuple[int, ...]) -> list[Group]:
     for title, params in groups.items():
         if dataclasses.is_dataclass(params):
             names = (each.name for each in dataclasses.fields(params))
-            values = {name: getattr(params, name) for name in names if name != "bands"}
+            values = {name: getattr(params, name) for name in names if name not in ("bands", "shape")}
             found.append(Group(title, values, _band_table(bands) if bands and params is search else None))
     return found
 
