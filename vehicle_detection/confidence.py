@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 from vehicle_detection._common import check_number
+from vehicle_detection.boxes import logit
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.function_model import FunctionModel
@@ -41,13 +41,12 @@ def with_confidence(
         # Weak groups of windows have less evidence in proportion.
         evidence = params.min_evidence * min(peak / max(params.min_peak, 1e-9), 1.0)
         return model, dataclasses.replace(params, min_peak=peak, min_evidence=evidence)
-    log_odds = math.log(limit / (1 - limit))
     if isinstance(model, TemplateMixture):
-        return dataclasses.replace(model, threshold=log_odds), regions
+        return dataclasses.replace(model, threshold=logit(limit)), regions
     if isinstance(model.score, tuple):
         raise InvalidInputError(
             f"conf must be None for scores on a scale of their own, got {conf:g}; change the lower end of "
             "score=(low, high), or return probabilities"
         )
-    threshold = limit if model.score == "probability" else log_odds
+    threshold = limit if model.score == "probability" else logit(limit)
     return dataclasses.replace(model, threshold=threshold), regions

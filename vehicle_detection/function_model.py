@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import math
 import threading
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, fields
@@ -23,6 +22,7 @@ from vehicle_detection.boxes import (
     check_score_scale,
     clip_boxes,
     log_odds,
+    logit,
     select_classes,
 )
 from vehicle_detection.errors import DetectorError, InvalidInputError
@@ -84,7 +84,7 @@ class FunctionModel:
         """Probability of the log-odds above the threshold."""
         limit = 0.0 if isinstance(self.score, tuple) or self.threshold is None else self.threshold
         if self.score == "probability" and self.threshold is not None:
-            limit = math.log(limit / (1 - limit))
+            limit = logit(limit)
         return Platt(-1.0, -limit)
 
     def open_search(

@@ -25,7 +25,7 @@ from vehicle_detection._common import (
     check_sequence,
     read_regular_file,
 )
-from vehicle_detection.boxes import clip_boxes
+from vehicle_detection.boxes import clip_boxes, logit
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation.frame_boxes import (
     LOOKALIKE_CLASSES,
@@ -445,7 +445,7 @@ def _yolo_row(where: str, frame: FrameKey, words: list[str], shape: tuple[int, .
     if len(words) > 5:
         confidence = _number(words[5], "confidence", where, low=0, high=1)
         confidence = min(max(confidence, _MIN_CONFIDENCE), 1 - _MIN_CONFIDENCE)
-        score = math.log(confidence / (1 - confidence))
+        score = logit(confidence)
     track = _integer(words[6], "track", where, low=NO_TRACK) if len(words) > 6 else NO_TRACK
     box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
     name = words[0].partition(".")[0] if FRAME_NUMBER.fullmatch(words[0]) else words[0]

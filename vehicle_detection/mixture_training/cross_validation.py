@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 import vehicle_detection
 from vehicle_detection._common import Floats, atomic_write, check_integer, resolve_jobs
+from vehicle_detection.boxes import Platt
 from vehicle_detection.evaluation import (
     DetectionMatches,
     FrameBoxes,
@@ -202,7 +203,7 @@ def score_fold(
     every_region = evaluate_detections(fold.predictions, labels, ignored_as_regions=True)
     strict = evaluate_detections(fold.predictions, labels, iou=0.7, ignored_as_regions=True)
     margins, hits = fold.hits
-    probabilities = 1 / (1 + np.exp(-(slope * margins + offset).clip(-500, 500)))
+    probabilities = Platt(-slope, -offset).probability(margins)
     # Boxes that are hardly ever vehicles are many, and would hide the errors of the others.
     likely = probabilities >= _MIN_PROBABILITY
     hits, probabilities = hits[likely], probabilities[likely]
