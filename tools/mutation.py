@@ -47,7 +47,7 @@ TARGETS = {
     "heatmap.py": ("tests/test_heatmap.py",),
     "regions.py": ("tests/test_regions.py",),
     "windows.py": ("tests/test_windows.py",),
-    "boxes.py": ("tests/test_boxes.py", "tests/evaluation/test_calibration.py"),
+    "boxes": ("tests/test_boxes.py", "tests/evaluation/test_calibration.py"),
     "tracking": ("tests/tracking",),
     "mixture": ("tests/mixture",),
 }
