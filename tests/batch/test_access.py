@@ -80,12 +80,16 @@ def fail(*_, **__):
     raise MemoryError
 
 
-def test_a_source_that_is_bad_now_replaces_its_results(one, model, tmp_path):
-    out = tmp_path / "out"
+def test_a_source_that_is_bad_now_keeps_its_results(one, model, tmp_path):
+    out, whole = tmp_path / "out", one.read_bytes()
     run(one, out, model)
-    one.write_bytes(one.read_bytes()[:3000])
-    assert counts(run(one, out, model)) == (0, 1, 0, 0)
-    check_whole(out, done=0, failed=1)
+    for size in (3000, 2000):
+        one.write_bytes(whole[:size])
+        assert counts(run(one, out, model)) == (0, 1, 0, 0)
+        check_whole(out, done=1, failed=1)
+    one.write_bytes(whole)
+    assert counts(run(one, out, model)) == (1, 0, 0, 0)
+    check_whole(out, done=1, failed=0)
 
 
 def test_videos_are_written_on_a_local_disk(one, model, tmp_path, monkeypatch):

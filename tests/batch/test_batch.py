@@ -190,14 +190,22 @@ def test_a_full_disk_is_an_error_that_the_next_run_repeats(card, model, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("number", "status"), [("KILL", "error"), ("XCPU", "error"), ("SEGV", "failed"), (None, "failed")]
+    ("end", "status"),
+    [
+        ("kill -KILL $$", "error"),
+        ("kill -XCPU $$", "error"),
+        ("kill -SEGV $$", "failed"),
+        ("echo '[h264 @ 0x1] pthread_create() failed: Resource temporarily unavailable'; exit 245", "error"),
+        ("echo 'x: Cannot allocate memory'; echo '  handler_name : SoundHandler'; exit 244", "error"),
+        ("exit 1", "failed"),
+    ],
 )
-def test_a_killed_ffmpeg_is_an_error_and_a_crashed_one_a_failure(
-    card, model, tmp_path, monkeypatch, number, status
+def test_an_ffmpeg_without_resources_is_an_error_and_a_crashed_one_a_failure(
+    card, model, tmp_path, monkeypatch, end, status
 ):
-    """A stand-in for ffmpeg ends by a signal, or with an error about the file."""
+    """A stand-in for ffmpeg ends by a signal, or with an error about the machine or the file."""
     program = tmp_path / "ffmpeg"
-    program.write_text(f"#!/bin/sh\n{f'kill -{number} $$' if number else 'exit 1'}\n")
+    program.write_text(f"#!/bin/sh\nexec >&2\n{end}\n")
     program.chmod(0o755)
     monkeypatch.setattr("vehicle_detection.video.ffmpeg.ffmpeg_binary", lambda: str(program))
     report = run(str(card / "*0930*"), tmp_path / "out", model)
@@ -379,7 +387,7 @@ def test_records_of_runs_with_other_parameters_at_the_same_time(card, model, tmp
     shutil.copy(next((out / "tracks").rglob("*.parquet")), place)
     task = {"key": next(other for other in records(out) if other != key), "replaces": []}
     record = records(out)[task["key"]]
-    trip_module._remove_earlier(store.open_store(out), {**record, **task}, record["outputs"])
+    trip_module._remove_earlier(store.open_store(out), {**record, **task}, record)
     check_whole(out, done=1, failed=0)
 
 

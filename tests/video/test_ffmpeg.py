@@ -1,5 +1,6 @@
 """Properties of video files."""
 
+import errno
 import os
 import shutil
 import signal
@@ -13,9 +14,9 @@ import pytest
 
 from tests.helpers import StubDetector, start_interruptible
 from tests.video.clips import NTSC, child_processes, ffmpeg, gray_frames, write_clip
-from vehicle_detection.errors import VideoError
+from vehicle_detection.errors import TransientVideoError, VideoError
 from vehicle_detection.video import probe_video, process_video, read_frames
-from vehicle_detection.video.ffmpeg import Process, exit_reason, ffmpeg_binary
+from vehicle_detection.video.ffmpeg import Process, check_resources, exit_reason, ffmpeg_binary
 from vehicle_detection.video.probe import frame_rate
 
 
@@ -103,6 +104,29 @@ def test_a_missing_ffmpeg(clip, monkeypatch):
 
 
 @pytest.mark.parametrize(
+    "error", [OSError(errno.EMFILE, "Too many open files"), RuntimeError("can't start new thread")]
+)
+def test_an_ffmpeg_that_cannot_be_started_for_now(clip, monkeypatch, error):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr("subprocess.Popen", fail)
+    with pytest.raises(TransientVideoError, match=r"ffmpeg cannot be started .*; close other programs, or"):
+        probe_video(clip)
+
+
+def test_a_platform_without_an_ffmpeg_of_imageio(clip, monkeypatch):
+    def fail():
+        raise RuntimeError("No ffmpeg exe could be found.")
+
+    monkeypatch.delitem(sys.modules, "moviepy.config", raising=False)
+    monkeypatch.delenv("FFMPEG_BINARY", raising=False)
+    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", fail)
+    with pytest.raises(VideoError, match="no ffmpeg program was found; install ffmpeg, or set FFMPEG_BINARY"):
+        probe_video(clip)
+
+
+@pytest.mark.parametrize(
     ("variable", "expected"),
     [
         (None, None),
@@ -182,6 +206,16 @@ def test_reasons_of_signals():
     )
     if hasattr(signal, "SIGXFSZ"):
         assert "the limit of the system for the size of a file" in exit_reason(-signal.SIGXFSZ, "")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limits of resources")
+def test_a_crash_under_a_limit_of_memory_may_be_repeated(monkeypatch):
+    import resource
+
+    check_resources("clip.mp4", -signal.SIGSEGV, "")
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (10**9, 10**9))
+    with pytest.raises(TransientVideoError, match=r"clip.mp4 cannot be read \(ffmpeg has crashed .*ulimit"):
+        check_resources("clip.mp4", -signal.SIGSEGV, "")
 
 
 def test_a_title_that_looks_like_a_part_of_the_log(tmp_path):

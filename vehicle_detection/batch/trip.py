@@ -115,18 +115,18 @@ def remove_replaced(store: Store, task: Mapping[str, Any], record: Mapping[str, 
     """Remove what a complete trip has replaced, which another run may have written in the meantime."""
     with store.lock(task["key"].partition("-")[0]) as locked:
         if locked:
-            _remove_earlier(store, task, record.get("outputs", {}))
+            _remove_earlier(store, task, record)
 
 
 def _replace(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
-    """Process a trip, then remove the results that it replaces; an error of the machine removes nothing."""
+    """Process a trip, then remove what it replaces; an error of the machine removes nothing."""
     try:
         facts = _process(store, task)
     except Exception as error:
         facts = _failure(error)
         if facts["status"] == ERROR:
             return facts
-    _remove_earlier(store, task, facts.get("outputs", {}))
+    _remove_earlier(store, task, facts)
     return facts
 
 
@@ -248,12 +248,20 @@ def _scratch(store: Store, key: str) -> AbstractContextManager[Path]:
     return temporary_folder(Path(tempfile.gettempdir()), f"vehicle-batch-{batch}-{key}")
 
 
-def _remove_earlier(store: Store, task: Mapping[str, Any], outputs: Mapping[str, str]) -> None:
-    """Remove results of this trip's files for other contents, parameters or trips; keep its `outputs`."""
+def _remove_earlier(store: Store, task: Mapping[str, Any], facts: Mapping[str, Any]) -> None:
+    """Remove results of this trip's files for other contents, parameters or trips.
+
+    `facts` are those of the trip's new record, whose outputs are kept. A failure replaces no results.
+    """
+    failed, outputs = facts["status"] != DONE, facts.get("outputs", {})
     for key, record in read_records(store, task.get("replaces", ())).items():
+        if failed and record["status"] == DONE:
+            continue
         for path in record.get("outputs", {}).values():
             store.remove(path)
         store.remove(record_path(key))
+    if failed:
+        return
     # Outputs of another run at the same time, or of a killed process that has not written their record.
     identity, place = task["key"].partition("-")[0], f"date={task['date']}/camera={task['camera']}"
     for kind in ("tracks", "videos"):

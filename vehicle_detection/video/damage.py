@@ -13,7 +13,14 @@ from fractions import Fraction
 from pathlib import Path
 
 from vehicle_detection._common import pluralize
-from vehicle_detection.video.ffmpeg import Process, input_options, last_line, seconds_of, source_name
+from vehicle_detection.video.ffmpeg import (
+    Process,
+    check_resources,
+    input_options,
+    last_line,
+    seconds_of,
+    source_name,
+)
 from vehicle_detection.video.probe import VideoInfo
 
 # Error of a frame rate that ffmpeg has derived from the file's times.
@@ -72,8 +79,8 @@ def stream_duration(path: Path | str, info: VideoInfo) -> float | None:
     """Duration of the video stream in seconds; None if the file does not state it."""
     options = ("-nostdin", *input_options(path), "-map", "0:V:0", "-c", "copy", "-frames:v", "1")
     with contextlib.closing(Process((*options, "-f", "null", "-"), level="trace")) as process:
-        process.wait()
-        log = process.log()
+        code, log = process.wait(), process.log()
+    check_resources(source_name(path), code, log)
     mapped = re.search(r"Stream #0:(\d+) -> #0:0", log)
     index = mapped[1] if mapped else "0"
     exact = re.search(rf"stream {index}: start_time: \S+ duration: ([\d.]+)", log)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import os
 import re
@@ -29,6 +30,13 @@ _NETWORK_FAULT = re.compile(
     r"Connection (refused|reset|timed out)|Operation timed out|Server returned (5|40[013]|429)"
     r"|Failed to resolve|Network is unreachable|No route to host|Input/output error|ends prematurely"
     r"|Broken pipe"
+)
+# Errors of the system that refuses memory, processes or open files.
+_LIMITS = {errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE}
+_RAISE_LIMITS = "close other programs, or raise the limits of this process (ulimit), and try again"
+# Messages of ffmpeg about memory, threads or open files that the system refuses.
+_SYSTEM_FAULT = re.compile(
+    r"^.*(Resource temporarily unavailable|Cannot allocate memory|Too many open files).*$", re.MULTILINE
 )
 NETWORK_TIMEOUT = 10.0
 """Seconds without data after which a server has failed."""
@@ -62,6 +70,23 @@ def check_frame_size(name: str, log: str) -> None:
         )
 
 
+def check_resources(name: str, code: int, log: str) -> None:
+    """Raise a TransientVideoError if ffmpeg has failed for lack of memory, threads or open files."""
+    fault = _SYSTEM_FAULT.search(log)
+    if code and (fault or (-code in _CRASHES and _is_memory_limited())):
+        reason = last_line(fault[0]) if fault else exit_reason(code, log)
+        raise TransientVideoError(f"{name} cannot be read ({reason}); {_RAISE_LIMITS}")
+
+
+def _is_memory_limited() -> bool:
+    """Whether the address space is limited; ffmpeg then crashes when it runs out of it."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return False
+    return resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
+
+
 def ffmpeg_binary() -> str:
     """Return the ffmpeg that moviepy uses, without importing moviepy, which takes half a second."""
     config = sys.modules.get("moviepy.config")
@@ -74,7 +99,12 @@ def ffmpeg_binary() -> str:
         return chosen
     from imageio_ffmpeg import get_ffmpeg_exe
 
-    return str(get_ffmpeg_exe())
+    try:
+        return str(get_ffmpeg_exe())
+    except RuntimeError as error:  # the wheel for this platform has no program
+        raise TransientVideoError(
+            "no ffmpeg program was found; install ffmpeg, or set FFMPEG_BINARY to its path"
+        ) from error
 
 
 @functools.cache
@@ -173,9 +203,11 @@ class Process:
                     bufsize=0,
                     **group,
                 )
-            except (OSError, ValueError) as error:
+            except (OSError, ValueError, RuntimeError) as error:  # a RuntimeError: no thread can be started
+                limited = isinstance(error, RuntimeError) or getattr(error, "errno", None) in _LIMITS
+                remedy = "reinstall imageio-ffmpeg or unset FFMPEG_BINARY"
                 raise TransientVideoError(
-                    f"ffmpeg cannot be started ({error}); reinstall imageio-ffmpeg or unset FFMPEG_BINARY"
+                    f"ffmpeg cannot be started ({error}); {_RAISE_LIMITS if limited else remedy}"
                 ) from error
             on_error.pop_all()
         # None unless requested.

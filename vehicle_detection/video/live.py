@@ -22,6 +22,7 @@ from vehicle_detection.video.ffmpeg import (
     NETWORK_TIMEOUT,
     Process,
     check_frame_size,
+    check_resources,
     last_line,
     pixel_limit,
     video_error,
@@ -74,6 +75,7 @@ class _LiveProcess:
                     f"{self.name} sends no video within {_OPEN_TIMEOUT:g} s; check the source"
                 )
             code = self.process.wait()
+            check_resources(self.name, code, self.process.log())
             check_frame_size(self.name, self.process.log())
             remedy = "check the source"
             if "received no packets" in self.reason() and self.name == "-":

@@ -20,6 +20,7 @@ from vehicle_detection.errors import VideoError
 from vehicle_detection.video.ffmpeg import (
     Process,
     check_frame_size,
+    check_resources,
     exit_reason,
     input_options,
     last_line,
@@ -196,6 +197,7 @@ def _read_log(path: Path | str) -> _Log:
     with contextlib.closing(Process((*source, *options), level="info")) as process:
         code = process.wait()
         log = process.log()
+    check_resources(name, code, log)
     if code < 0:
         raise video_error(f"{name} cannot be read: {exit_reason(code, log)}", path, code, log)
     check_frame_size(name, log)
@@ -272,7 +274,7 @@ def _frame_times(path: Path | str) -> list[float]:
     options += ("-f", "framecrc", "pipe:1")
     with contextlib.closing(Process(options, stdout=True)) as process:
         listing = process.stdout.read().decode()
-        process.wait()
+        check_resources(source_name(path), process.wait(), process.log())
     unit = re.search(r"^#tb 0: (\d+)/(\d+)", listing, re.MULTILINE)
     ticks = re.findall(r"^0, +-?\d+, +(-?\d+),", listing, re.MULTILINE)
     return sorted(int(tick) * int(unit[1]) / int(unit[2]) for tick in ticks) if unit else []

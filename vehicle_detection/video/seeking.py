@@ -7,7 +7,7 @@ import math
 import re
 from pathlib import Path
 
-from vehicle_detection.video.ffmpeg import Process, input_options
+from vehicle_detection.video.ffmpeg import Process, check_resources, input_options, source_name
 from vehicle_detection.video.probe import VideoInfo
 
 # Containers with an index of their key frames. It may hold the times of decoding, which are earlier than
@@ -49,6 +49,6 @@ def _first_time(path: Path | str, seek: float) -> float:
     options = ("-noaccurate_seek", "-ss", f"{seek:.6f}", *input_options(path), "-map", "0:V:0")
     options += ("-frames:v", "1", "-vf", "showinfo", "-f", "null", "-")
     with contextlib.closing(Process(("-nostdin", *options), level="info")) as process:
-        process.wait()
+        check_resources(source_name(path), process.wait(), process.log())
         found = re.search(r"n: *0 .*?pts_time:(-?[\d.]+).*? iskey:1 ", process.log())
     return float(found[1]) if found else math.inf

@@ -23,6 +23,7 @@ from vehicle_detection.errors import TransientVideoError, VideoError
 from vehicle_detection.video.damage import find_damage
 from vehicle_detection.video.ffmpeg import (
     Process,
+    check_resources,
     exit_reason,
     input_options,
     pixel_limit,
@@ -196,6 +197,8 @@ class FrameReader(_FfmpegStream):
         end, name = self._first + self.frames_read, source_name(self._path)
         complete = self._count is not None and self.frames_read >= self._count
         incomplete = ""
+        if not complete:
+            check_resources(name, code, log)
         if not complete and end < self.info.frames - 1 and _TRUNCATED.search(log):
             incomplete = f"{name} is incomplete: {end} of about {self.info.frames} frames can be decoded"
         if incomplete and not self.frames_read:
