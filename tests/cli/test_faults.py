@@ -24,7 +24,7 @@ from vehicle_detection.cli.app import app
 from vehicle_detection.cli.signals import raise_on_signals
 from vehicle_detection.errors import OutputError
 from vehicle_detection.images import write_image
-from vehicle_detection.synthetic import render_scene
+from vehicle_detection.synthetic import render_patches, render_scene
 from vehicle_detection.video import probe_video
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
@@ -158,6 +158,34 @@ def test_an_interrupt_after_a_command_changes_nothing():
     assert out.startswith("default: ")
 
 
+def test_an_interrupt_does_not_wait_for_threads_that_compute(tmp_path):
+    """Python joins the threads of an executor when it exits, also if their thread was abandoned."""
+    patches, labels = render_patches(4)
+    for name, label in (("vehicles", True), ("others", False)):
+        (tmp_path / name / "drawn").mkdir(parents=True)
+        for row in np.flatnonzero(labels == label):
+            write_image(tmp_path / name / "drawn" / f"{row}.png", patches[row])
+    code = """
+import sys, time
+from concurrent.futures import ThreadPoolExecutor
+from vehicle_detection import training
+def train(*_, **__):
+    with ThreadPoolExecutor(1) as executor:
+        print("now", flush=True)
+        executor.submit(time.sleep, 60).result()
+training.train_and_evaluate = train
+sys.argv = ["vehicle-detection", *sys.argv[1:]]
+from vehicle_detection.cli import main
+main()
+"""
+    words = ["train", "--vehicles", tmp_path / "vehicles", "--non-vehicles", tmp_path / "others"]
+    process = start_interruptible(sys.executable, "-c", code, *words, "-o", tmp_path / "x.safetensors")
+    assert process.stdout.readline() == "now\n", process.communicate()
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=20)
+    assert (process.returncode, errors) == (143, "interrupted\n")
+
+
 def test_an_ignored_signal_stays_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
     try:
@@ -242,6 +270,23 @@ def test_a_demo_folder_that_is_read_only(tmp_path, monkeypatch):
     assert "cannot be written (Read-only file system); check the folder, or choose another" in result.stderr
 
 
+def test_a_demo_without_ffmpeg(tmp_path):
+    code = """
+import sys, imageio_ffmpeg
+def fail():
+    raise RuntimeError("No ffmpeg exe could be found.")
+imageio_ffmpeg.get_ffmpeg_exe = fail
+sys.argv = ["vehicle-detection", *sys.argv[1:]]
+from vehicle_detection.cli import main
+main()
+"""
+    command = [sys.executable, "-c", code, "demo", "-o", str(tmp_path), "--frames", "3"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: no ffmpeg program was found; install ffmpeg, or set")
+    assert contents(tmp_path) == []
+
+
 def test_an_output_error_is_an_error_of_the_system():
     assert issubclass(OutputError, OSError)
 
@@ -314,6 +359,25 @@ def test_memory_that_runs_out(monkeypatch, clip, tmp_path):
     assert result.exit_code == 2
     assert result.stderr.startswith("error: memory ran out; close other programs")
     assert contents(tmp_path) == []
+
+
+def test_a_thread_that_cannot_be_started(monkeypatch, clip, tmp_path):
+    def fail(*_, **__):
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(detector.VehicleDetector, "search", fail)
+    result = run("video", clip, "-o", tmp_path / "out.mp4", "--model", "highway")
+    assert result.exit_code == 2
+    assert result.stderr.startswith("error: the system refuses to start another thread; close other")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full of Linux")
+@pytest.mark.parametrize("option", ["--version", "--help"])
+def test_a_standard_output_on_a_full_disk(option):
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "vehicle_detection", option]
+        done = subprocess.run(command, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (2, "error: No space left on device\n")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no ulimit")

@@ -117,6 +117,9 @@ def test_tune_refuses_bad_input(patches, material, tmp_path):
     table, grid = ("-o", tmp_path / "table.csv"), ("--grid", f"orient=3 {SMALL}")
     assert "--grid has the unknown option 'color'" in refuse(*patches, *table, "--grid", "color=LAB")
     assert "--grid must look like 'orient=8,9" in refuse(*patches, *table, "--grid", "orient")
+    assert "--finalists must be an integer at least 1; got 0" in refuse(
+        *patches, *table, *grid, "--halving", "--finalists", 0
+    )
     assert "--split must be one of 'sequences'" in refuse(*patches, *table, *grid, "--split", "half")
     assert "--output must end in .csv, .jsonl, .parquet" in refuse(
         *patches, *grid, "-o", tmp_path / "table.xls"

@@ -59,6 +59,19 @@ def test_a_file_cut_anywhere_keeps_its_complete_lines(tmp_path_factory, suffix, 
     pd.testing.assert_frame_equal(read_results(path), example_table(count + 1))
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".jsonl"])
+def test_a_trial_that_two_runs_measure_is_one_row(tmp_path, suffix):
+    path = tmp_path / f"rows{suffix}"
+    for store in (RowStore(path, COLUMNS), RowStore(path, COLUMNS)):
+        for number in range(2):
+            store.add(example_row(number))
+    assert path.read_text(encoding="utf-8").count("\n") == 2 + (suffix == ".csv")
+    # Both runs have written a row at once.
+    with path.open("a", encoding="utf-8") as file:
+        file.write(path.read_text(encoding="utf-8").splitlines()[-1] + "\n")
+    pd.testing.assert_frame_equal(read_results(path), example_table(2))
+
+
 def test_numpy_values_and_nan_are_converted(tmp_path):
     row = {**example_row(0), "accuracy": np.float64(0.5), "frame_f1": math.nan, "message": "two\nlines"}
     for suffix in (".csv", ".jsonl"):

@@ -35,6 +35,7 @@ from vehicle_detection.cli.output import (
     announce_replaced,
     capture_stderr,
     check_distinct_paths,
+    exit_if_abandoned,
     option_names,
     output_folder,
     print_error,
@@ -80,15 +81,43 @@ def _print_usage_error() -> Iterator[None]:
         raise typer.Exit(BAD_INPUT) from None
 
 
+@contextlib.contextmanager
+def _print_system_errors() -> Iterator[None]:
+    """Print an error of the system as one line, and exit."""
+    try:
+        yield
+    except OSError as error:  # such as a full disk
+        if error.errno == errno.EPIPE:
+            raise
+        reason = error.strerror or str(error)
+        print_error(f"error: {error.filename}: {reason}" if error.filename else f"error: {reason}")
+    except MemoryError:
+        print_error("error: memory ran out; close other programs, or use fewer --jobs and smaller files")
+    except RuntimeError as error:
+        if "can't start new thread" not in str(error):
+            raise
+        print_error(
+            "error: the system refuses to start another thread; close other programs, or raise the limit of "
+            "processes (ulimit -u)"
+        )
+    else:
+        return
+    raise typer.Exit(BAD_INPUT)
+
+
 class _Commands(TyperGroup):
     """Commands whose expected errors become one line on standard error."""
 
     def make_context(self, *args: Any, **options: Any) -> Any:
-        with _print_usage_error():
+        with _print_system_errors(), _print_usage_error():
             return super().make_context(*args, **options)
 
     def invoke(self, ctx: Any) -> Any:
         replace_unprintable()
+        with _print_system_errors():
+            return self._invoke(ctx)
+
+    def _invoke(self, ctx: Any) -> Any:
         try:
             with raise_on_signals(), print_warnings(), _print_usage_error():
                 return super().invoke(ctx)
@@ -98,18 +127,11 @@ class _Commands(TyperGroup):
         except VehicleDetectionError as error:
             print_error(f"error: {error}")
             raise typer.Exit(BAD_INPUT) from None
-        except OSError as error:  # such as a full disk
-            if error.errno == errno.EPIPE:
-                raise
-            reason = error.strerror or str(error)
-            print_error(f"error: {error.filename}: {reason}" if error.filename else f"error: {reason}")
-            raise typer.Exit(BAD_INPUT) from None
-        except MemoryError:
-            print_error("error: memory ran out; close other programs, or use fewer --jobs and smaller files")
-            raise typer.Exit(BAD_INPUT) from None
         except KeyboardInterrupt as error:
             print_error("interrupted")
-            raise typer.Exit(getattr(error, "code", INTERRUPTED)) from None
+            code = getattr(error, "code", INTERRUPTED)
+            exit_if_abandoned(code)
+            raise typer.Exit(code) from None
 
     def _option_names(self, ctx: Any) -> dict[str, str]:
         """Map the arguments of the command's function to the names that its user knows."""

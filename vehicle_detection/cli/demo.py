@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import progress_bar, temporary_folder
 from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.errors import OutputError
+from vehicle_detection.errors import OutputError, VideoError
 from vehicle_detection.evaluation import TrackScores, evaluate_tracks, read_labels
 from vehicle_detection.export import TrackWriter
 from vehicle_detection.images import write_image
@@ -60,11 +60,15 @@ def run_demo(
 
 def draw_clip(drive: Drive, clip: Path, labels: Path, *, progress: bool = False) -> None:
     """Write the frames of a drive as a video, and their ground truth as a table, with oncoming vehicles."""
-    # moviepy, because `process_video` needs a source.
-    from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
-
     height, width = drive.shape
     truth = []
+    try:
+        # moviepy, because `process_video` needs a source. It looks for ffmpeg when it is imported.
+        from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
+    except RuntimeError:
+        raise VideoError(
+            "no ffmpeg program was found; install ffmpeg, or set FFMPEG_BINARY to its path"
+        ) from None
     try:
         with (
             FFMPEG_VideoWriter(str(clip), (width, height), drive.fps, preset="veryfast") as writer,
@@ -77,7 +81,7 @@ def draw_clip(drive: Drive, clip: Path, labels: Path, *, progress: bool = False)
     except OSError as error:  # its text is ffmpeg's log
         full = "No space left" in str(error)
         reason = "the disk is full; free some space" if full else "ffmpeg failed; check the folder"
-        raise OutputError(f"{clip} cannot be written: {reason}") from error
+        raise OutputError(f"the drawn clip cannot be written: {reason}") from error
     write_labels(labels, enumerate(truth))
 
 

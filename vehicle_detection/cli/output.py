@@ -28,6 +28,9 @@ UNKNOWN_LENS = (
 
 Result = TypeVar("Result")
 
+# Name of the thread of `run_interruptible`.
+_ABANDONABLE = "interruptible"
+
 # Width of tables that are not printed to a terminal; fits a fingerprint in one line.
 _PIPE_WIDTH = 120
 
@@ -256,5 +259,17 @@ def run_interruptible(function: Callable[[], Result]) -> Result:
         except BaseException as error:
             outcome.set_exception(error)
 
-    threading.Thread(target=work, daemon=True).start()
+    threading.Thread(target=work, name=_ABANDONABLE, daemon=True).start()
     return outcome.result()
+
+
+def exit_if_abandoned(code: int) -> None:
+    """End Python at once if `run_interruptible` has abandoned its thread.
+
+    Otherwise Python would wait for the threads that it has started, or abort when it ends them.
+    """
+    if any(thread.name == _ABANDONABLE for thread in threading.enumerate()):
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(code)

@@ -78,7 +78,7 @@ def tune(
     ] = None,
 ) -> None:
     """Train and measure every combination of a grid of parameters, and show the best."""
-    from vehicle_detection._common import check_choice, check_target
+    from vehicle_detection._common import check_choice, check_integer, check_target
     from vehicle_detection.datasets import load_training_patches
     from vehicle_detection.tuning import (
         TrialOptions,
@@ -91,6 +91,7 @@ def tune(
 
     values = parse_grid(grid)
     check_choice(split, "--split", ("sequences", "groups", "random"))
+    check_integer(finalists, "--finalists", low=1)
     targets = {}
     for name, path, suffixes in (("--output", output, _TABLES), ("--plot", plot, _FIGURES)):
         if path is not None:

@@ -121,7 +121,8 @@ def read_results(path: str | os.PathLike[str]) -> DataFrame:
     Parameters
     ----------
     path
-        A ``.csv`` or ``.jsonl`` file. A last line that is incomplete is left out.
+        A ``.csv`` or ``.jsonl`` file. An incomplete last line is left out, and so is the second row of a
+        trial that two runs have measured at the same time.
 
     Returns
     -------
@@ -151,7 +152,11 @@ def read_results(path: str | os.PathLike[str]) -> DataFrame:
     if not file.is_file():
         raise DatasetError(f"results file {file} does not exist; check the path")
     columns, rows = _parse(_complete_lines(file), file, suffix)
-    return make_table(rows, columns)
+    seen: dict[Any, dict[str, Any]] = {}
+    for number, row in enumerate(rows):
+        trial = row.get("trial")
+        seen.setdefault((trial, row.get("stage"), row.get("configuration")) if trial else number, row)
+    return make_table(seen.values(), columns)
 
 
 class RowStore(dict[str, Mapping[str, Any]]):
@@ -183,7 +188,10 @@ class RowStore(dict[str, Mapping[str, Any]]):
         if self._path is None:
             return
         line = _format_row(row, self._columns, self._suffix)
-        with self._path.open("ab") as file:
+        with self._path.open("a+b") as file:
+            file.seek(0)
+            if str(row["trial"]).encode() in file.read():  # another run has measured it at the same time
+                return
             if file.tell() == 0 and self._suffix == ".csv":
                 line = _csv_line(self._columns) + line
             file.write(line.encode("utf-8"))
