@@ -295,6 +295,8 @@ def test_an_interrupt_at_any_time_leaves_no_temporary_files(tmp_path):
         while run_interrupted(function, number):
             assert names(tmp_path) in ([], ["out.csv"]), f"{function.__name__}, instruction {number}"
             number += 1
+        if number == 1:
+            pytest.skip("this Python reports no instructions to a trace function")  # 3.12.1
         assert number > 100
         assert (tmp_path / "out.csv").read_text() == "whole"
 
@@ -319,6 +321,16 @@ def test_a_new_folder_that_another_process_takes_for_abandoned(tmp_path, monkeyp
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no modes and links")
+def test_a_file_system_without_permissions(tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(Path, "chmod", refuse)
+    with atomic_write(tmp_path / "a.txt") as part:
+        part.write_text("whole")
+    assert (tmp_path / "a.txt").read_text() == "whole"
+
+
 def test_links_and_permissions_of_a_target_stay(tmp_path):
     real, link = tmp_path / "real.csv", tmp_path / "link.csv"
     real.write_text("old")

@@ -314,6 +314,16 @@ def test_code_for_another_processor_uses_no_special_instructions():
         assert byte_block() == Block(4, 3, 2)
 
 
+@pytest.mark.parametrize("features", [{"avx512f": True, "avx512vnni": True, "avx": True}, {"avx": True}])
+def test_numba_without_avx_uses_none(features):
+    with (
+        mock.patch.object(numba.config, "ENABLE_AVX", 0),
+        mock.patch("llvmlite.binding.get_host_cpu_features", return_value=features),
+    ):
+        assert float_block() == Block(4, 3, 4)
+        assert byte_block() == Block(4, 3, 2)
+
+
 @pytest.mark.parametrize("lanes", [2, 4, 8, 16])
 def test_squares_of_numbers_are_transposed(lanes):
     transpose = transposer(lanes)

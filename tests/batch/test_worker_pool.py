@@ -77,6 +77,16 @@ def test_the_first_worker_compiles_the_kernels_before_the_others_start(tmp_path)
     assert all(float(begin) >= first_end for begin, _ in times[1:])
 
 
+def test_files_in_the_current_folder_are_no_modules_of_a_worker(monkeypatch, tmp_path):
+    for name in ("queue", "json", "numpy", "vehicle_detection"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('foreign code')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONPATH")
+    with WorkerPool(1, (worker_pool.worker_environment, ())) as pool:
+        found = pool.submit(worker_pool.worker_environment).result(60)
+    assert found["OMP_NUM_THREADS"] == "1"
+
+
 def test_kernels_are_kept_on_a_local_disk(monkeypatch, tmp_path):
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     folder = Path(worker_pool.worker_environment()["NUMBA_CACHE_DIR"])

@@ -4,6 +4,7 @@ import contextlib
 import http.server
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -112,6 +113,14 @@ def test_segments_with_a_line_break_in_the_name(tmp_path):
     broken = clip.rename(tmp_path / "a\nb.mp4")
     with pytest.raises(InvalidInputError, match=r"a\\nb.mp4' has a line break in its name; rename"):
         open_source([broken, broken])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names are UTF-8")
+def test_segments_in_a_folder_whose_name_is_not_utf8(card, tmp_path):
+    folder = tmp_path / os.fsdecode(b"stra\xdfe")
+    shutil.copytree(card, folder)
+    process_video(str(folder / "*F.mp4"), tmp_path / "out.mp4", StubDetector())
+    assert sound_seconds(tmp_path / "out.mp4") == pytest.approx(2.5, abs=0.15)
 
 
 def test_segments_of_another_rate_and_size(tmp_path):

@@ -86,13 +86,16 @@ def atomic_write(target: str | os.PathLike[str], name: str = "target") -> Iterat
         with _output_errors(path, part):
             yield part
         with _output_errors(path, every=True):
-            part.chmod(_permissions(path))  # the temporary file is private
+            with contextlib.suppress(OSError):  # some file systems, such as exFAT, refuse it
+                part.chmod(_permissions(path))  # the temporary file is private
             part.replace(path)
             parts.clear()  # from now on, the name may be that of another process's file
 
 
 def _permissions(path: Path) -> int:
     """Permissions of an existing file, or else those of any new one."""
+    if sys.platform == "win32":  # where only a read-only file differs, which cannot be renamed
+        return 0o666
     with contextlib.suppress(OSError):  # it is missing, or a link that leads nowhere
         return stat.S_IMODE(path.stat().st_mode)
     umask = os.umask(0)

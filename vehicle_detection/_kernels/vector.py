@@ -89,7 +89,9 @@ def _host_features() -> Mapping[str, bool]:
     """Features of the processor that numba compiles for."""
     if numba.config.CPU_NAME or numba.config.CPU_FEATURES:
         return {}  # another processor than the host
-    return binding.get_host_cpu_features()  # type: ignore[no-any-return]
+    features = binding.get_host_cpu_features()
+    avx = bool(numba.config.ENABLE_AVX)
+    return {name: has and (avx or not name.startswith("avx")) for name, has in features.items()}
 
 
 def block_adder(floats: Block, packed: Block) -> Callable[..., None]:

@@ -104,7 +104,7 @@ def read_records(store: Store, keys: Iterable[str]) -> dict[str, dict[str, Any]]
 def _parse(data: bytes) -> dict[str, Any] | None:
     try:
         record = json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     whole = isinstance(record, dict) and "status" in record and bool(record.get("sources"))
     return record if whole else None

@@ -72,7 +72,3 @@ def _call(message: dict[str, Any]) -> dict[str, Any]:
         return {"result": function(*message["args"])}
     except Exception as error:
         return {"error": f"{type(error).__name__}: {error}"}
-
-
-if __name__ == "__main__":
-    main()

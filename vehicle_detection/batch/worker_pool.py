@@ -24,6 +24,16 @@ from vehicle_detection._common import JOBS_VARIABLE
 
 _LOGGER = logging.getLogger(__name__)
 
+# The program of a worker. Its argument is the folder that holds this package, which may not be installed.
+# With -P, Python does not search the current folder, where a file may have the name of a module.
+_PROGRAM = """\
+import sys
+if sys.argv[1] not in sys.path:
+    sys.path.insert(0, sys.argv[1])
+from vehicle_detection.batch.worker import main
+main()
+"""
+
 
 class WorkerLost(Exception):  # noqa: N818 - named after what happened, as BrokenExecutor is
     """The process of a call has ended before its result."""
@@ -143,7 +153,7 @@ class WorkerPool(Executor):
                 if self._stopped:
                     raise WorkerLost("the batch has been stopped")
                 process = subprocess.Popen(
-                    [sys.executable, "-m", "vehicle_detection.batch.worker"],
+                    [sys.executable, "-P", "-c", _PROGRAM, str(Path(__file__).resolve().parents[2])],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     text=True,

@@ -74,7 +74,10 @@ class VideoSegments(FrameSource):
             return None
         parent = Path(tempfile.gettempdir())
         folder = self._on_close.enter_context(temporary_folder(parent, "vehicle-segments"))
-        with (folder / "segments.txt").open("w", encoding="utf-8") as file:
+        # A path that is not UTF-8 keeps its bytes.
+        with (folder / "segments.txt").open(
+            "w", encoding="utf-8", errors="surrogateescape", newline="\n"
+        ) as file:
             for path, info in zip(self.files, self._infos, strict=True):
                 quoted = str(path.resolve()).replace("'", r"'\''")
                 seconds = float(info.frames / info.fps)
