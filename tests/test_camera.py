@@ -278,6 +278,7 @@ def test_a_camera_file_by_hand(tmp_path):
     ("text", "message"),
     [
         ("{", r"camera file \S+ is not JSON"),
+        pytest.param("[" * 100_000, r"camera file \S+ is not JSON: it is nested too deeply", id="deep"),
         ("[1]", r"camera file \S+ must be an object with the names .*; got \[1\]"),
         ('{"zoom": 1}', r"must be an object with the names .*; got zoom"),
         ('{"focal_px": 900}', r"camera.json: focal_px needs image_size"),

@@ -64,6 +64,8 @@ _NORMAL_80 = 1.282
 _MAX_ANGLE = math.radians(80)
 
 _PIXEL_FIELDS = ("focal_px", "horizon_px", "horizon_std_px")  # in pixels of the frame
+# Size of frames for which a file is checked that states none.
+_ANY_SHAPE = (720, 1280)
 
 LENSES: dict[str, tuple[float, bool]] = {
     "standard-58": (58.0, False),
@@ -400,15 +402,26 @@ def read_camera(path: str | os.PathLike[str], shape: tuple[int, ...]) -> Camera:
     >>> round(camera.focal_px), camera.height_m
     (598, 1.4)
     """
-    height, width = check_shape(shape)
-    path = check_path(path)
+    return _read_camera(check_path(path), check_shape(shape))
+
+
+def check_camera_file(path: str | os.PathLike[str]) -> None:
+    """Raise unless `read_camera` can read a file for frames of the size that it states, or of any size."""
+    _read_camera(check_path(path), None)
+
+
+def _read_camera(path: Path, shape: FrameShape | None) -> Camera:
+    """Camera of a file for frames of a shape; None for the size that the file states."""
     values = _read_json(path)
+    height, width = shape or _ANY_SHAPE
     size = values.pop("image_size", None)
     scale = 1.0
     if size is not None:
         if not isinstance(size, list) or len(size) != 2:
             raise InvalidInputError(f"{path}: image_size must be [width, height], got {describe(size)}")
         given = [check_integer(side, f"{path}: image_size", low=1) for side in size]
+        if shape is None:
+            width, height = given
         found = _scale_between((given[1], given[0]), (height, width))
         if found is None:
             raise InvalidInputError(
@@ -432,8 +445,9 @@ def _read_json(path: Path) -> dict[str, Any]:
     data = read_regular_file(path, f"camera file {path}", Limit.TEXT_BYTES)
     try:
         values: Any = json.loads(data)
-    except ValueError as error:
-        raise InvalidInputError(f"camera file {path} is not JSON: {error}; see read_camera") from None
+    except (ValueError, RecursionError) as error:
+        reason = "it is nested too deeply" if isinstance(error, RecursionError) else error
+        raise InvalidInputError(f"camera file {path} is not JSON: {reason}; see read_camera") from None
     known = {"image_size", "field_of_view", "lens", "horizon", *Camera.__dataclass_fields__} - {"shape"}
     if not isinstance(values, dict) or values.keys() - known:
         extra = sorted(values.keys() - known)[0] if isinstance(values, dict) else describe(values)

@@ -29,7 +29,14 @@ from vehicle_detection._common import (
     pluralize,
 )
 from vehicle_detection.boxes import Detections, ScoreScale
-from vehicle_detection.camera import GIVEN_LENS_STD, LENSES, UNKNOWN_LENS_STD, Camera, read_camera
+from vehicle_detection.camera import (
+    GIVEN_LENS_STD,
+    LENSES,
+    UNKNOWN_LENS_STD,
+    Camera,
+    check_camera_file,
+    read_camera,
+)
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.confidence import Model, with_confidence
 from vehicle_detection.drawing import (
@@ -858,10 +865,14 @@ def _check_lens(camera: object, field_of_view: float | None, camera_height_m: fl
             f"field_of_view must be omitted with a camera, which has one; got {field_of_view}"
         )
     named = camera is None or (isinstance(camera, str) and camera in LENSES)
-    if not named and not isinstance(camera, Camera) and not os.path.isfile(str(camera)):
-        raise InvalidInputError(
-            f"camera must be a Camera, a file or one of {', '.join(LENSES)}, got {describe(camera)}; omit it"
-        )
+    if not named and not isinstance(camera, Camera):
+        file = str(camera)
+        if not os.path.isfile(file):
+            raise InvalidInputError(
+                f"camera must be a Camera, a file or one of {', '.join(LENSES)}, got {describe(camera)}; "
+                "omit it"
+            )
+        check_camera_file(file)
     if camera_height_m is not None and not named:
         raise InvalidInputError(
             f"camera_height_m must be omitted with a Camera or a file, which have one; "

@@ -2,6 +2,7 @@ import math
 import re
 from decimal import Decimal
 from fractions import Fraction
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,6 +19,7 @@ from vehicle_detection._common import (
     check_integer,
     check_number,
     check_patches,
+    check_path,
     check_type,
     describe,
     store_number,
@@ -55,6 +57,21 @@ def test_describe(value, text):
 def test_describe_stays_short_and_on_one_line(value):
     assert len(describe(value)) < 100
     assert "\n" not in describe(value)
+
+
+def test_values_that_python_refuses_to_print():
+    nested = []
+    for _ in range(10**5):
+        nested = [nested]
+    assert describe(10**5000) == "a value too long to print (int)"
+    assert describe(nested) == "a value too long to print (list)"
+    with pytest.raises(InvalidInputError, match="must be an integer at least 1; got a value too long"):
+        check_integer(10**5000, "n", low=1)
+
+
+def test_a_long_name_is_shortened():
+    with pytest.raises(InvalidInputError, match=r"got 'a{76}\.\.\. with more than 255 bytes"):
+        check_path(Path("a" * 300))
 
 
 def test_check_image_returns_the_same_array():

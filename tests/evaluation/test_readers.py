@@ -110,6 +110,11 @@ def test_csv_frames_with_leading_zeros_are_names(tmp_path):
             "line 3: track 1 comes twice in frame 4, first at .* line 2",
         ),
         (f"{HEADER}\n0,1,0,0,9,9,0,0,2\n", "line 2: ignore must be 0 or 1, got '2'"),
+        pytest.param(
+            f"{HEADER}\n0,1,0,0,{'9' * 130_000},9,0,0,2\n",
+            r"line 2: x2 must be a finite number, got '9{76}\.\.\.$",
+            id="long",
+        ),
         (f"{HEADER}\n0,1.5,0,0,9,9,0,0,0\n", "line 2: track must be a whole number, got '1.5'"),
         (f"{HEADER}\n0,-2,0,0,9,9,0,0,0\n", "line 2: track must be at least -1"),
         (f"{HEADER}\n0,1e99,0,0,9,9,0,0,0\n", "line 2: track must be at most"),

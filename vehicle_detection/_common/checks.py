@@ -28,7 +28,10 @@ def describe(value: object) -> str:
     """Describe a value in a message: the shape and dtype of an array, otherwise the value itself."""
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape} and dtype {value.dtype}"
-    text = " ".join(repr(value).split())
+    try:
+        text = " ".join(repr(value).split())
+    except (ValueError, RecursionError):  # an integer of thousands of digits, or deeply nested lists
+        return f"a value too long to print ({type(value).__name__})"
     text = text if len(text) <= 80 else text[:77] + "..."
     obvious = value is None or type(value) in (str, int, float, bool)
     return text if obvious else f"{text} ({type(value).__name__})"
@@ -58,7 +61,7 @@ def check_path(path: object, name: str = "path", *, kind: str = "a file name") -
     too_long |= any(len(os.fsencode(part)) > _MAX_NAME for part in Path(text).parts)
     if too_long or "\0" in text:
         problem = f"more than {_MAX_NAME} bytes" if too_long else "a null character"
-        raise InvalidInputError(f"{name} must be {kind}, got {describe(path)} with {problem}")
+        raise InvalidInputError(f"{name} must be {kind}, got {describe(text)} with {problem}")
     return Path(text)
 
 

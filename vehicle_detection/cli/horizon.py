@@ -39,8 +39,10 @@ def parse_horizon(text: str) -> float:
     try:
         return float(text)
     except ValueError:
+        from vehicle_detection._common import describe
+
         raise InvalidInputError(
-            f"--horizon must be a fraction of the frame's height, such as 0.55, or auto; got {text!r}"
+            f"--horizon must be a fraction of the frame's height, such as 0.55, or auto; got {describe(text)}"
         ) from None
 
 

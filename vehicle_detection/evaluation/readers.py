@@ -23,6 +23,7 @@ from vehicle_detection._common import (
     check_path,
     check_regular_file,
     check_sequence,
+    describe,
     read_regular_file,
 )
 from vehicle_detection.boxes import clip_boxes, logit
@@ -114,17 +115,17 @@ def _number(text: str, name: str, where: str, *, low: float = -math.inf, high: f
         value = math.nan
     if not math.isfinite(value):
         hint = "; use a decimal point" if re.fullmatch(r"\s*-?\d+,\d+\s*", text) else ""
-        raise DatasetError(f"{where}: {name} must be a finite number, got {text!r}{hint}")
+        raise DatasetError(f"{where}: {name} must be a finite number, got {describe(text)}{hint}")
     if not low <= value <= high:
         bound = f"at least {low:g}" if value < low else f"at most {high:g}"
-        raise DatasetError(f"{where}: {name} must be {bound}, got {text!r}")
+        raise DatasetError(f"{where}: {name} must be {bound}, got {describe(text)}")
     return value
 
 
 def _integer(text: str, name: str, where: str, *, low: int) -> int:
     value = _number(text, name, where, low=low, high=2.0**53)
     if value != int(value):
-        raise DatasetError(f"{where}: {name} must be a whole number, got {text!r}")
+        raise DatasetError(f"{where}: {name} must be a whole number, got {describe(text)}")
     return int(value)
 
 
@@ -271,7 +272,7 @@ def _table_row(where: str, record: dict[str, str], predicted: bool, counted: boo
     ignored = text("ignore", "0")
     flag = {"0": False, "1": True, "false": False, "true": True}.get(ignored.lower())
     if flag is None:
-        raise DatasetError(f"{where}: ignore must be 0 or 1, got {ignored!r}")
+        raise DatasetError(f"{where}: ignore must be 0 or 1, got {describe(ignored)}")
     optional: dict[str, Any] = {
         name: _number(text(name), name, where)
         for name in ("distance_m", "speed_mps")
@@ -688,7 +689,8 @@ def _assemble(rows: list[Row], keys: list[FrameKey], shape: tuple[int, ...] | No
             before = first.setdefault((row.frame, row.track), row.where)
             if before != row.where:
                 raise DatasetError(
-                    f"{row.where}: track {row.track} comes twice in frame {row.frame!r}, first at {before}"
+                    f"{row.where}: track {row.track} comes twice in frame {describe(row.frame)}, "
+                    f"first at {before}"
                 )
         if has_score != scored[0]:
             raise DatasetError(f"{row.where}: some boxes have a score and some have none; give all or none")

@@ -244,7 +244,7 @@ def _parse(text: str, file: Path, suffix: str) -> tuple[list[str], list[dict[str
         for number, line in enumerate(text.splitlines(), start=1):
             try:
                 row = json.loads(line)
-            except ValueError:
+            except (ValueError, RecursionError):
                 row = None
             if not isinstance(row, dict):
                 raise _damaged_line(file, number)

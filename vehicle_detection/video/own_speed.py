@@ -181,7 +181,7 @@ def _read_csv(data: bytes, name: str) -> tuple[Floats, Floats]:
     if "time_s" not in header or unit is None:
         raise InvalidInputError(
             f"path {name} must have the columns time_s and one of {', '.join(_SPEED_COLUMNS)}; "
-            f"got {', '.join(header) or 'no header'}"
+            f"got {describe(', '.join(header)) if header else 'no header'}"
         )
     columns = header.index("time_s"), header.index(unit)
     rows = []
@@ -198,7 +198,7 @@ def _read_csv(data: bytes, name: str) -> tuple[Floats, Floats]:
         if not math.isfinite(time) or not 0 <= speed <= _MAX_SPEED:
             raise InvalidInputError(
                 f"path {name}, line {number}: the speed must be from 0 to {_MAX_SPEED:g} m/s at a finite "
-                f"time; got {','.join(row)}"
+                f"time; got {describe(','.join(row))}"
             )
         rows.append((time, speed))
     if not rows:
