@@ -3,10 +3,11 @@
 import ast
 import subprocess
 import sys
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import vehicle_detection
 from tests.helpers import ROOT
+from vehicle_detection.video import trips
 
 FOLDER = Path(vehicle_detection.__file__).parent
 
@@ -94,7 +95,7 @@ def refuse(name, *args, **kwargs):
     return real_import(name, *args, **kwargs)
 
 builtins.__import__ = refuse
-sys.platform = "win32"
+sys.platform, signal.SIGBREAK = "win32", 10
 subprocess.CREATE_NEW_PROCESS_GROUP = 0
 used = ("getuid", "geteuid", "SIGCHLD", "WNOHANG", "O_NONBLOCK")  # by the standard library here
 for module, missing in {POSIX_ONLY!r}.items():
@@ -113,7 +114,8 @@ with atomic_write(folder / "a.csv") as part, temporary_folder(folder, "b") as in
     part.write_text("whole")
     (inner / "c").touch()
 with LocalStore(folder).lock("a") as free, raise_on_signals():
-    print(free, available_cores() > 0, sorted(path.name for path in folder.iterdir()))
+    handled = callable(signal.getsignal(signal.SIGBREAK))
+    print(free, handled, available_cores() > 0, sorted(path.name for path in folder.iterdir()))
 """
 
 
@@ -124,4 +126,19 @@ def test_all_modules_work_without_what_only_posix_has():
     assert done.returncode == 0, done.stderr[-2000:]
     count, rest = done.stdout.splitlines()
     assert int(count) > 100
-    assert rest == "True True ['a.csv']"
+    assert rest == "True True True ['a.csv']"
+
+
+def test_text_files_have_the_same_line_breaks_everywhere():
+    for path in FOLDER.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+                named = {keyword.arg for keyword in node.keywords}
+                assert node.func.attr != "write_text" or "newline" in named, f"{path.name} {node.lineno}"
+
+
+def test_paths_of_windows_are_grouped_by_their_folders(monkeypatch):
+    monkeypatch.setattr(trips, "PurePath", PureWindowsPath)
+    names = [rf"C:\{folder}\GX{chapter}0042.MP4" for folder in ("A", "B") for chapter in ("02", "01")]
+    found = trips.find_trips(names)
+    assert [trip.files for trip in found] == [(names[1], names[0]), (names[3], names[2])]

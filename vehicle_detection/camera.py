@@ -367,7 +367,7 @@ def write_camera(camera: Camera, path: str | os.PathLike[str], shape: tuple[int,
     values = {"image_size": [width, height], **dataclasses.asdict(camera.for_shape((height, width)))}
     del values["shape"]
     with atomic_write(path, "path") as part:
-        part.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+        part.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8", newline="\n")
 
 
 def read_camera(path: str | os.PathLike[str], shape: tuple[int, ...]) -> Camera:

@@ -47,5 +47,6 @@ def test_parameters_that_may_name_a_file_are_kept():
 
 def test_paths_of_file_urls():
     assert local_path("file:///a%20b/c.mp4") == local_path("FILE:///a%20b/c.mp4") == "/a b/c.mp4"
+    assert local_path("file://localhost/a%20b/c.mp4") == "/a b/c.mp4"
     assert local_path("http://host/a%20b") == "http://host/a%20b"
     assert local_path("a%20b.mp4") == "a%20b.mp4"

@@ -31,7 +31,7 @@ from vehicle_detection.classifier import VehicleClassifier, load_classifier
 from vehicle_detection.cli import output
 from vehicle_detection.cli.app import app
 from vehicle_detection.cli.demo import FILES, REPORT, SHEET, draw_clip, scored_truth
-from vehicle_detection.cli.output import output_folder, run_interruptible
+from vehicle_detection.cli.output import check_distinct_paths, output_folder, run_interruptible
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.mixture import load_model
@@ -422,6 +422,22 @@ def test_an_image_given_twice_is_searched_once(picture, tmp_path):
         "vehicle"
     )
     assert (tmp_path / "b.csv").read_text() == (tmp_path / "once.csv").read_text()
+
+
+def test_patterns_of_images_are_expanded(picture, tmp_path):
+    for name in ("a.png", "b.png", "c[1].png"):
+        shutil.copy(picture, tmp_path / name)
+    out = succeed("detect", tmp_path / "[ab].png", tmp_path / "c[1].png", "--model", "highway")
+    assert [line.partition(":")[0] for line in out.splitlines()] == [
+        str(tmp_path / name) for name in ("a.png", "b.png", "c[1].png")
+    ]
+
+
+def test_two_names_of_a_file_are_one_file(tmp_path):
+    (tmp_path / "a.csv").touch()
+    os.link(tmp_path / "a.csv", tmp_path / "A2.csv")  # as A.csv on a disk that ignores case
+    with pytest.raises(InvalidInputError, match=r"--json \S+A2.csv is also LABELS \S+a.csv; choose another"):
+        check_distinct_paths({"--json": tmp_path / "A2.csv"}, {"LABELS": tmp_path / "a.csv"})
 
 
 def test_detect_accepts_every_kind_of_image(picture, tmp_path):

@@ -511,6 +511,7 @@ def test_copies_of_killed_processes_are_removed(clip, tmp_path, monkeypatch):
         ("http://nas/a%20b.mp4?X-Amz-Credential=AK/2026/us&sig=" + "a" * 900, "a b.mp4"),
         ("http://nas/" + "é" * 300 + ".mp4", "é" * 56 + ".mp4"),
         ("http://nas/..%2F..%2Fx.mp4", ".._.._x.mp4"),
+        ("http://nas/08%3A15%3F.mp4", "08_15_.mp4"),  # Windows allows neither
         ("http://nas/", "nas"),
     ],
 )

@@ -25,7 +25,8 @@ def main() -> None:
     exit_on_signals()
     from vehicle_detection.cli.app import app
 
-    app(prog_name="vehicle-detection")
+    # On Windows, typer would also take names with brackets for patterns.
+    app(prog_name="vehicle-detection", windows_expand_args=False)
 
 
 def _open_closed_streams() -> None:

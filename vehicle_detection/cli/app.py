@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import glob
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -252,7 +253,7 @@ def detect(
     check_choice(labels, "labels", ("score", "none"))
     if line_width is not None:
         check_integer(line_width, "line_width", low=1, high=1000)
-    images = list(dict.fromkeys(images))
+    images = list(dict.fromkeys(itertools.chain.from_iterable(map(_expand, images))))
     _check_images(images, output, boxes)
     region = parse_blur(blur)
     if region is not None and output is None and why is None:
@@ -289,6 +290,11 @@ def detect(
         print_line(f"wrote {', '.join(folders)}")
     if undecodable:
         raise typer.Exit(DAMAGED)
+
+
+def _expand(image: Path) -> list[Path]:
+    """List the files of a pattern, which the shell of Windows passes on as it is."""
+    return [image] if image.exists() else [Path(name) for name in sorted(glob.glob(str(image)))] or [image]
 
 
 def _check_images(images: list[Path], output: Path | None, boxes: Path | None) -> None:
@@ -502,7 +508,7 @@ def evaluate(
     if json is not None:
         with atomic_write(json) as part:
             plain = {name: each.to_dict() for name, each in scores.items()}
-            part.write_text(dumps(plain, indent=2) + "\n", encoding="utf-8")
+            part.write_text(dumps(plain, indent=2) + "\n", encoding="utf-8", newline="\n")
 
 
 def _boxes_in(boxes: FrameBoxes, frames: Sequence[FrameKey]) -> FrameBoxes:

@@ -165,14 +165,23 @@ def print_facts(title: str, facts: Mapping[str, Any]) -> None:
 
 def check_distinct_paths(targets: Mapping[str, Path | None], sources: Mapping[str, Path]) -> None:
     """Refuse a target that is also a source or another target."""
-    # Not Path.resolve, which raises RuntimeError for a loop of links.
-    seen = {os.path.realpath(path): f"{name} {path}" for name, path in sources.items()}
+    seen = {_file_key(path): f"{name} {path}" for name, path in sources.items()}
     for name, path in targets.items():
         if path is None:
             continue
-        other = seen.setdefault(os.path.realpath(path), f"{name} {path}")
+        other = seen.setdefault(_file_key(path), f"{name} {path}")
         if other != f"{name} {path}":
             raise InvalidInputError(f"{name} {path} is also {other}; choose another name")
+
+
+def _file_key(path: Path) -> tuple[int, int] | str:
+    """Return a key that all names of a file have, such as ``A.csv`` and ``a.csv`` on some disks."""
+    with contextlib.suppress(OSError):  # it is missing, or a loop of links
+        status = path.stat()
+        if status.st_ino:
+            return status.st_dev, status.st_ino
+    # Not Path.resolve, which raises RuntimeError for a loop of links.
+    return os.path.normcase(os.path.realpath(path))
 
 
 def announce_replaced(targets: Iterable[Path | None]) -> None:

@@ -13,8 +13,9 @@ from typing import NoReturn
 
 from vehicle_detection._signals import postpone
 
-# SIGHUP: the terminal was closed.
-_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+# SIGHUP: the terminal was closed. SIGBREAK: Ctrl-Break on Windows, and the end of its terminal.
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+_SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
 # Seconds after a signal in which others are ignored, so that a second Ctrl-C does not interrupt the cleanup.
 _CLEANUP_SECONDS = 1.0
 

@@ -107,7 +107,7 @@ def train(
         if report is not None:
             plain = evaluated.to_dict() | {"others": [other.to_dict() for other in others]}
             with atomic_write(report) as part:
-                part.write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
+                part.write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8", newline="\n")
         if card is not None:
             words = ["--vehicles", vehicles.name, "--non-vehicles", non_vehicles.name, "--features", features]
             words += ["--split", split, "--C", f"{C:g}", "--seed", str(seed)] + ["--no-mirror"] * no_mirror
@@ -118,7 +118,7 @@ def train(
             command = shlex.join(["vehicle-detection", "train", *words])
             with atomic_write(card) as part:
                 text = model_card(classifier, evaluated, name=output.stem, others=others, command=command)
-                part.write_text(encodable(text), encoding="utf-8")
+                part.write_text(encodable(text), encoding="utf-8", newline="\n")
     print_line(f"wrote {', '.join(map(str, targets.values()))}")
 
 

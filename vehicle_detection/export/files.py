@@ -199,7 +199,10 @@ class _CvatFile:
 @contextlib.contextmanager
 def _open_mot_zip(part: Path) -> Iterator[_CvatFile]:
     with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
-        with archive.open("gt/gt.txt", "w") as binary, io.TextIOWrapper(binary, "utf-8") as text:
+        with (
+            archive.open("gt/gt.txt", "w") as binary,
+            io.TextIOWrapper(binary, "utf-8", newline="\n") as text,
+        ):
             yield _CvatFile(text)
         # Without the time of day, as the other member: the same tracks give the same archive.
         archive.writestr(zipfile.ZipInfo("gt/labels.txt"), "vehicle\n")
@@ -248,7 +251,7 @@ def _open_yolo(path: Path, shape: tuple[int, ...] | None) -> Iterator[_YoloFolde
         raise InvalidInputError("shape must be (height, width) of the frames for YOLO, got None; pass it")
     with new_folder(path, "YOLO") as part:
         (part / "labels").mkdir()
-        (part / "data.yaml").write_text("names:\n  0: vehicle\n", encoding="utf-8")
+        (part / "data.yaml").write_text("names:\n  0: vehicle\n", encoding="utf-8", newline="\n")
         yield _YoloFolder(part / "labels", shape)
 
 

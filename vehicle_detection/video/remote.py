@@ -50,10 +50,10 @@ def download(url: str, folder: Path) -> Path:
 
 
 def file_name(url: str) -> str:
-    """Name of a local copy: the end of the URL's path."""
+    """Name of a local copy: the end of the URL's path, without what Windows does not allow in names."""
     path = re.split("[?#]", url)[0] if url.startswith(("http://", "https://")) else url
     name = unquote(path.rstrip("/").rpartition("/")[2])
-    return re.sub(r"[\x00-\x1f/\\]", "_", name)[-_MAX_NAME:] or "video"
+    return re.sub(r'[\x00-\x1f/\\:?*"<>|]', "_", name)[-_MAX_NAME:] or "video"
 
 
 def _download_http(url: str, path: Path) -> None:

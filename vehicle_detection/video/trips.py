@@ -14,10 +14,10 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 from typing import TypeVar
 
-from vehicle_detection._common import check_sequence, describe, pluralize
+from vehicle_detection._common import check_sequence, describe, is_url, pluralize
 from vehicle_detection.errors import InvalidInputError
 
 File = TypeVar("File", Path, str)
@@ -162,7 +162,9 @@ def find_trips(
 def _posix(file: Path | str) -> PurePosixPath:
     """Path of a file, or of a URL without its query, which may hold another time."""
     text = os.fspath(file)
-    return PurePosixPath(re.split("[?#]", text)[0] if text.startswith(("http://", "https://")) else text)
+    if is_url(text):
+        return PurePosixPath(re.split("[?#]", text)[0] if text.startswith(("http://", "https://")) else text)
+    return PurePosixPath(PurePath(text).as_posix())
 
 
 def _parse_name(name: PurePosixPath) -> _Segment:
