@@ -20,6 +20,7 @@ from tests.video.clips import gray_frames, write_clip
 from vehicle_detection import detector, export, report
 from vehicle_detection._common import files
 from vehicle_detection._kernels.jit import jit
+from vehicle_detection.cli import demo
 from vehicle_detection.cli.app import app
 from vehicle_detection.cli.signals import raise_on_signals
 from vehicle_detection.errors import OutputError
@@ -285,6 +286,57 @@ main()
     assert done.returncode == 2
     assert done.stderr.startswith("error: no ffmpeg program was found; install ffmpeg, or set")
     assert contents(tmp_path) == []
+
+
+def test_a_demo_names_its_folder_in_errors(tmp_path, monkeypatch):
+    def fail(clip, annotated, *_, **__):
+        raise OutputError(f"{annotated} cannot be written")
+
+    monkeypatch.setattr(demo, "process_video", fail)
+    result = run("demo", "-o", tmp_path, "--frames", 3)
+    assert (result.exit_code, result.stderr) == (
+        2,
+        f"error: {tmp_path / 'annotated.mp4'} cannot be written\n",
+    )
+
+
+def test_a_folder_for_images_that_is_read_only(tmp_path, monkeypatch):
+    write_image(tmp_path / "a.png", np.zeros((64, 64, 3), np.uint8))
+    monkeypatch.setattr(os, "access", lambda _, mode: not mode & os.W_OK)
+    result = run("detect", tmp_path / "a.png", "-o", tmp_path / "out")
+    message = f"error: --output must be a writable folder, {tmp_path / 'out'} is not; choose another\n"
+    assert (result.exit_code, result.stdout, result.stderr) == (2, "", message)
+    assert contents(tmp_path) == ["a.png"]
+
+
+def test_an_interrupted_batch_leaves_no_empty_folder(clip, tmp_path):
+    code = """
+import sys, time
+from vehicle_detection import batch
+batch.run_batch = lambda *_, **__: (print("now", flush=True), time.sleep(60))
+sys.argv = ["vehicle-detection", *sys.argv[1:]]
+from vehicle_detection.cli import main
+main()
+"""
+    process = start_interruptible(sys.executable, "-c", code, "batch", clip, "-o", tmp_path / "new" / "out")
+    assert process.stdout.readline() == "now\n", process.communicate()
+    assert contents(tmp_path / "new") == ["out"]
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=20)[1] == "interrupted\n"
+    assert contents(tmp_path) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps the current folder")
+def test_a_current_folder_that_has_been_removed(clip, tmp_path):
+    (tmp_path / "gone").mkdir()
+    script = f'cd {tmp_path / "gone"} && rmdir {tmp_path / "gone"} && exec "$@"'
+    command = [sys.executable, "-m", "vehicle_detection", "video", str(clip), "-o", "out.mp4"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        ["sh", "-c", script, "sh", *command], env=environment, capture_output=True, text=True
+    )
+    message = "error: the current folder has been removed; change to another one\n"
+    assert (done.returncode, done.stderr) == (2, message)
 
 
 def test_an_output_error_is_an_error_of_the_system():

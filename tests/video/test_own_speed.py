@@ -143,7 +143,7 @@ class TestTable:
         ("text", "message"),
         [
             ("", "must have the columns time_s and one of speed_mps, speed_kmh, speed_mph; got no header"),
-            ("time,speed\n", "must have the columns .*; got 'time, speed'"),
+            ("time,speed\n", "must have the columns .*; got time, speed"),
             ("time_s,speed_mps\n", "has no rows below its header"),
             ("time_s,speed_mps\n0,fast\n", "line 2: time_s and speed_mps must be numbers"),
             ("time_s,speed_mps\n0\n", "line 2: time_s and speed_mps must be numbers"),

@@ -108,7 +108,7 @@ def test_a_killed_encoder_is_an_error(clip, tmp_path, monkeypatch):
             time.sleep(0.05)
 
     with pytest.raises(
-        VideoError, match="cannot be written: another process ended ffmpeg by the signal SIGKILL"
+        VideoError, match=r"out.mp4 cannot be written: another process ended ffmpeg by the signal SIGKILL"
     ):
         process_video(clip, tmp_path / "out.mp4", StubDetector(), on_result=kill)
     assert os.listdir(tmp_path) == []
@@ -116,7 +116,7 @@ def test_a_killed_encoder_is_an_error(clip, tmp_path, monkeypatch):
 
 def test_an_encoder_that_does_not_start_is_an_error(clip, tmp_path, monkeypatch):
     monkeypatch.setattr(process, "PRESETS", ("no such speed",))
-    with pytest.raises(VideoError, match="cannot be written: ffmpeg reports"):
+    with pytest.raises(VideoError, match=r"out.mp4 cannot be written: ffmpeg reports"):
         process_video(clip, tmp_path / "out.mp4", StubDetector(), preset="no such speed")
     assert os.listdir(tmp_path) == []
 
@@ -344,7 +344,7 @@ def test_frames_that_are_not_searched_are_kept_only_to_be_drawn(clip, tmp_path, 
             pass
 
         def interpolate(self, before, after, times):
-            frames = [each for each in gc.get_objects() if isinstance(each, _QueuedFrame)]
+            frames = [each for each in gc.get_objects() if type(each) is _QueuedFrame]
             self.alive = sum(each.frame is not None for each in frames)
             return [Result(before.index + 1 + number, 0.0, time) for number, time in enumerate(times)]
 

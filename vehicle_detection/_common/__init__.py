@@ -19,6 +19,7 @@ from vehicle_detection._common.checks import (
     check_type,
     describe,
     finite_array,
+    shorten,
     store_number,
 )
 from vehicle_detection._common.environment import check_environment
@@ -99,6 +100,7 @@ __all__ = [
     "read_regular_file",
     "relight",
     "resolve_jobs",
+    "shorten",
     "single_threaded_opencv",
     "stable_url",
     "store_number",

@@ -32,9 +32,14 @@ def describe(value: object) -> str:
         text = " ".join(repr(value).split())
     except (ValueError, RecursionError):  # an integer of thousands of digits, or deeply nested lists
         return f"a value too long to print ({type(value).__name__})"
-    text = text if len(text) <= 80 else text[:77] + "..."
+    text = shorten(text)
     obvious = value is None or type(value) in (str, int, float, bool)
     return text if obvious else f"{text} ({type(value).__name__})"
+
+
+def shorten(text: str, length: int = 80) -> str:
+    """Cut off a text that is too long for a message."""
+    return text if len(text) <= length else text[: length - 3] + "..."
 
 
 def check_type(value: object, name: str, kind: type | tuple[type, ...], remedy: str) -> None:

@@ -150,7 +150,8 @@ def _process(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
                     on_result=write,
                 )
         except VideoError as error:
-            raise type(error)(_with_urls(str(error), task, folder)) from error
+            message = str(error).replace(str(folder / "video.mp4"), f"the video in {folder.parent}")
+            raise type(error)(_with_urls(message, task, folder)) from error
         damage = _with_urls(report.damage, task, folder)
         outputs = {"tracks": f"tracks/{place}.parquet"}
         if video is not None:  # the larger file first, for which there may be no space

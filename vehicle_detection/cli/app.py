@@ -91,6 +91,8 @@ def _print_system_errors() -> Iterator[None]:
         if error.errno == errno.EPIPE:
             raise
         reason = error.strerror or str(error)
+        if error.errno == errno.ENOENT and error.filename is None:  # of os.getcwd
+            reason = "the current folder has been removed; change to another one"
         print_error(f"error: {error.filename}: {reason}" if error.filename else f"error: {reason}")
     except MemoryError:
         print_error("error: memory ran out; close other programs, or use fewer --jobs and smaller files")

@@ -24,7 +24,13 @@ from vehicle_detection.cli.options import (
     Preset,
     flag,
 )
-from vehicle_detection.cli.output import UNKNOWN_LENS, option_names, print_error, print_line
+from vehicle_detection.cli.output import (
+    UNKNOWN_LENS,
+    option_names,
+    output_folder,
+    print_error,
+    print_line,
+)
 from vehicle_detection.errors import InvalidInputError
 
 
@@ -105,7 +111,7 @@ def batch(
         return
     if not sources:
         raise InvalidInputError("SOURCES... must name at least one video, folder, pattern or URL")
-    from vehicle_detection._common import hide_credentials
+    from vehicle_detection._common import hide_credentials, is_url, local_path
     from vehicle_detection.batch import open_dask, run_batch, with_source
 
     options: dict[str, Any] = {
@@ -123,6 +129,9 @@ def batch(
             executor, dashboard = stack.enter_context(open_dask(dask, jobs))
             if not quiet:
                 print_line(f"dashboard {dashboard}")
+        folder = local_path(output)
+        if folder and not dry_run and not is_url(folder):
+            stack.enter_context(output_folder(Path(folder), "--output"))
         done = run_batch(
             sources,
             output,

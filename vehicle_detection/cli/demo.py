@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import progress_bar, temporary_folder
 from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.errors import OutputError, VideoError
+from vehicle_detection.errors import OutputError, VehicleDetectionError, VideoError
 from vehicle_detection.evaluation import TrackScores, evaluate_tracks, read_labels
 from vehicle_detection.export import TrackWriter
 from vehicle_detection.images import write_image
@@ -38,7 +39,7 @@ def run_demo(
 ) -> tuple[VideoReport, TrackScores]:
     """Draw a drive, annotate and score it, oncoming vehicles too; an error leaves no file in the folder."""
     drive = render_drive(frames=frames, random_state=random_state)
-    with temporary_folder(folder, "demo") as temporary:
+    with temporary_folder(folder, "demo") as temporary, _named_in(folder, temporary):
         clip, annotated, tracks, labels, sheet = (temporary / name for name in FILES)
         page = ReportWriter(temporary / REPORT, video=annotated, source=clip, detector=detector)
         draw_clip(drive, clip, labels, progress=True)
@@ -56,6 +57,15 @@ def run_demo(
         for name in (*FILES, REPORT) if report else FILES:
             (temporary / name).replace(folder / name)
     return done, scores
+
+
+@contextlib.contextmanager
+def _named_in(folder: Path, temporary: Path) -> Iterator[None]:
+    """Replace a temporary folder in errors by the one for which its files are made."""
+    try:
+        yield
+    except VehicleDetectionError as error:
+        raise type(error)(str(error).replace(str(temporary), str(folder))) from error
 
 
 def draw_clip(drive: Drive, clip: Path, labels: Path, *, progress: bool = False) -> None:
@@ -81,7 +91,7 @@ def draw_clip(drive: Drive, clip: Path, labels: Path, *, progress: bool = False)
     except OSError as error:  # its text is ffmpeg's log
         full = "No space left" in str(error)
         reason = "the disk is full; free some space" if full else "ffmpeg failed; check the folder"
-        raise OutputError(f"the drawn clip cannot be written: {reason}") from error
+        raise OutputError(f"{clip} cannot be written: {reason}") from error
     write_labels(labels, enumerate(truth))
 
 

@@ -24,6 +24,7 @@ _MAX_OWN_SPEED = 500.0
 
 def read_speed(own_speed: str | None, gpx: Path | None, offset: float) -> OwnSpeed | None:
     """Speed of the own vehicle: constant (km/h, or with its unit), from a file, or unknown."""
+    from vehicle_detection._common import describe
     from vehicle_detection.units import UNITS
     from vehicle_detection.video import OwnSpeed, read_own_speed
 
@@ -40,7 +41,7 @@ def read_speed(own_speed: str | None, gpx: Path | None, offset: float) -> OwnSpe
     if found is None or float(found[1]) > _MAX_OWN_SPEED:
         raise InvalidInputError(
             f"--own-speed must be a speed of at most {_MAX_OWN_SPEED:g}, such as 100 (km/h) or 62mph; got "
-            f"{own_speed!r}"
+            f"{describe(own_speed)}"
         )
     return OwnSpeed.constant(float(found[1]) / UNITS["imperial" if found[2] == "mph" else "metric"].speed)
 

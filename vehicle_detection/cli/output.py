@@ -239,6 +239,9 @@ def output_folder(folder: Path | None, option: str) -> Iterator[None]:
     if folder is None:
         yield
         return
+    from vehicle_detection._common import check_path
+
+    check_path(folder, option, kind="a folder")
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -247,6 +250,8 @@ def output_folder(folder: Path | None, option: str) -> Iterator[None]:
             f"{option} must be a folder, {folder} cannot be created: {error.strerror}; choose another"
         ) from error
     try:
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise InvalidInputError(f"{option} must be a writable folder, {folder} is not; choose another")
         yield
     except BaseException:
         for path in created:

@@ -25,6 +25,7 @@ from vehicle_detection._common import (
     check_sequence,
     describe,
     read_regular_file,
+    shorten,
 )
 from vehicle_detection.boxes import clip_boxes, logit
 from vehicle_detection.errors import DatasetError, InvalidInputError
@@ -246,9 +247,10 @@ def _check_columns(source: Path, names: Sequence[str], records: Sequence[Mapping
     given = {*names} | ({"track", "track_id"} if {"track", "track_id"} & {*names} else set())
     missing = [name for name in expected if name not in given]
     if missing:
+        found = shorten(", ".join(names), 300) or "an empty file"
         raise DatasetError(
-            f"{source} lacks the columns {', '.join(missing)}; found {', '.join(names) or 'an empty file'}; "
-            f"labels have {','.join(REQUIRED_LABEL_COLUMNS)} and, optionally, "
+            f"{source} lacks the columns {', '.join(missing)}; found {found}; labels have "
+            f"{','.join(REQUIRED_LABEL_COLUMNS)} and, optionally, "
             f"{','.join(LABEL_COLUMNS[len(REQUIRED_LABEL_COLUMNS) :])}; predictions {','.join(BOX_COLUMNS)}"
         )
     return predicted
@@ -333,7 +335,7 @@ def _check_classes(
 ) -> None:
     """Refuse a file in which no class is that of vehicles: it would have no box."""
     if not any(name in wanted for name in found):
-        listed = ", ".join(map(repr, sorted(found))) or "none"
+        listed = shorten(", ".join(map(repr, sorted(found))), 300) or "none"
         raise DatasetError(
             f"{source} has no {kind} among {', '.join(sorted(wanted))}; found {listed}; "
             "name those of vehicles with classes="

@@ -25,6 +25,7 @@ from vehicle_detection._common import (
     check_path,
     describe,
     read_regular_file,
+    shorten,
     store_number,
 )
 from vehicle_detection.errors import InvalidInputError
@@ -181,7 +182,7 @@ def _read_csv(data: bytes, name: str) -> tuple[Floats, Floats]:
     if "time_s" not in header or unit is None:
         raise InvalidInputError(
             f"path {name} must have the columns time_s and one of {', '.join(_SPEED_COLUMNS)}; "
-            f"got {describe(', '.join(header)) if header else 'no header'}"
+            f"got {shorten(', '.join(header), 300) or 'no header'}"
         )
     columns = header.index("time_s"), header.index(unit)
     rows = []
@@ -198,7 +199,7 @@ def _read_csv(data: bytes, name: str) -> tuple[Floats, Floats]:
         if not math.isfinite(time) or not 0 <= speed <= _MAX_SPEED:
             raise InvalidInputError(
                 f"path {name}, line {number}: the speed must be from 0 to {_MAX_SPEED:g} m/s at a finite "
-                f"time; got {describe(','.join(row))}"
+                f"time; got {shorten(','.join(row))}"
             )
         rows.append((time, speed))
     if not rows:

@@ -409,7 +409,10 @@ def _open_writer(
     target: Path, info: VideoInfo, preset: str, audio: AudioSource | None
 ) -> Iterator[FrameWriter]:
     """Open a video file that is written atomically."""
-    with atomic_write(target) as part, FrameWriter(part, info, preset=preset, audio=audio) as writer:
+    with (
+        atomic_write(target) as part,
+        FrameWriter(part, info, name=str(target), preset=preset, audio=audio) as writer,
+    ):
         yield writer
 
 

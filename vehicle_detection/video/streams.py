@@ -273,10 +273,19 @@ class FrameWriter(_FfmpegStream):
     the last column or row.
     """
 
-    def __init__(self, path: Path, info: VideoInfo, *, preset: str, audio: AudioSource | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        info: VideoInfo,
+        *,
+        name: str,
+        preset: str,
+        audio: AudioSource | None = None,
+    ) -> None:
+        """Start ffmpeg, which writes to `path`; `name` names the video in errors."""
         container = CONTAINERS[path.suffix.lower()]
         self.frames_written = 0
-        self._path, self._has_sound = path, audio is not None
+        self._path, self._name, self._has_sound = path, name, audio is not None
         self._fps = info.fps
         width, height = info.width + info.width % 2, info.height + info.height % 2
         self._planes = np.empty((height * 3 // 2, width), np.uint8)
@@ -353,4 +362,4 @@ class FrameWriter(_FfmpegStream):
 
     def _error(self) -> TransientVideoError:
         reason = exit_reason(self._process.wait(), self._process.log())
-        return TransientVideoError(f"the video cannot be written: {reason}; nothing of it was kept")
+        return TransientVideoError(f"{self._name} cannot be written: {reason}; nothing of it was kept")
