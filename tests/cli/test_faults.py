@@ -304,7 +304,7 @@ def test_a_folder_for_images_that_is_read_only(tmp_path, monkeypatch):
     write_image(tmp_path / "a.png", np.zeros((64, 64, 3), np.uint8))
     monkeypatch.setattr(os, "access", lambda _, mode: not mode & os.W_OK)
     result = run("detect", tmp_path / "a.png", "-o", tmp_path / "out")
-    message = f"error: --output must be a writable folder, {tmp_path / 'out'} is not; choose another\n"
+    message = f"error: --output needs a writable folder, {tmp_path / 'out'} is read-only; choose another\n"
     assert (result.exit_code, result.stdout, result.stderr) == (2, "", message)
     assert contents(tmp_path) == ["a.png"]
 

@@ -214,7 +214,7 @@ def test_a_crash_under_a_limit_of_memory_may_be_repeated(monkeypatch):
 
     check_resources("clip.mp4", -signal.SIGSEGV, "")
     monkeypatch.setattr(resource, "getrlimit", lambda _: (10**9, 10**9))
-    with pytest.raises(TransientVideoError, match=r"clip.mp4 cannot be read \(ffmpeg has crashed .*ulimit"):
+    with pytest.raises(TransientVideoError, match=r"clip.mp4 cannot be read: ffmpeg has crashed .*ulimit"):
         check_resources("clip.mp4", -signal.SIGSEGV, "")
 
 

@@ -28,8 +28,8 @@ UNKNOWN_LENS = (
 
 Result = TypeVar("Result")
 
-# Name of the thread of `run_interruptible`.
-_ABANDONABLE = "interruptible"
+# Name of a thread that `run_interruptible` has abandoned.
+_ABANDONED = "abandoned"
 
 # Width of tables that are not printed to a terminal; fits a fingerprint in one line.
 _PIPE_WIDTH = 120
@@ -251,7 +251,9 @@ def output_folder(folder: Path | None, option: str) -> Iterator[None]:
         ) from error
     try:
         if not os.access(folder, os.W_OK | os.X_OK):
-            raise InvalidInputError(f"{option} must be a writable folder, {folder} is not; choose another")
+            raise InvalidInputError(
+                f"{option} needs a writable folder, {folder} is read-only; choose another"
+            )
         yield
     except BaseException:
         for path in created:
@@ -273,8 +275,14 @@ def run_interruptible(function: Callable[[], Result]) -> Result:
         except BaseException as error:
             outcome.set_exception(error)
 
-    threading.Thread(target=work, name=_ABANDONABLE, daemon=True).start()
-    return outcome.result()
+    thread = threading.Thread(target=work, daemon=True)
+    try:
+        thread.start()
+        return outcome.result()
+    except BaseException:
+        if not outcome.done():
+            thread.name = _ABANDONED
+        raise
 
 
 def exit_if_abandoned(code: int) -> None:
@@ -282,7 +290,7 @@ def exit_if_abandoned(code: int) -> None:
 
     Otherwise Python would wait for the threads that it has started, or abort when it ends them.
     """
-    if any(thread.name == _ABANDONABLE for thread in threading.enumerate()):
+    if any(thread.name == _ABANDONED for thread in threading.enumerate()):
         for stream in (sys.stdout, sys.stderr):
             with contextlib.suppress(OSError, ValueError):
                 stream.flush()

@@ -74,8 +74,7 @@ def check_resources(name: str, code: int, log: str) -> None:
     """Raise a TransientVideoError if ffmpeg has failed for lack of memory, threads or open files."""
     fault = _SYSTEM_FAULT.search(log)
     if code and (fault or (-code in _CRASHES and _is_memory_limited())):
-        reason = last_line(fault[0]) if fault else exit_reason(code, log)
-        raise TransientVideoError(f"{name} cannot be read ({reason}); {_RAISE_LIMITS}")
+        raise TransientVideoError(f"{name} cannot be read: {exit_reason(code, log)}; {_RAISE_LIMITS}")
 
 
 def _is_memory_limited() -> bool:
@@ -280,7 +279,8 @@ def exit_reason(code: int, log: str) -> str:
         hint = ", perhaps because memory ran out" if name == "SIGKILL" else ""
         return f"another process ended ffmpeg by the signal {name}{hint}"
     hint = "; free some disk space" if "No space left" in log else ""
-    return f"ffmpeg reports {last_line(log)!r}{hint}"
+    fault = _SYSTEM_FAULT.search(log)  # other messages may follow
+    return f"ffmpeg reports {last_line(fault[0] if fault else log)!r}{hint}"
 
 
 def video_error(message: str, source: Path | str, code: int, log: str) -> VideoError:
