@@ -324,7 +324,7 @@ def test_probabilities_of_0_and_1_are_finite():
         (
             StandIn(TWO, [0.5, 0.5]),
             {"class_ids": [1]},
-            "class_ids needs an integer class for each of the 2 boxes",
+            "class_ids needs an integer class for each of 2 boxes",
         ),
         (SimpleNamespace(xyxy=TWO), {}, "detections must have an attribute confidence or conf, got"),
         (StandIn(TWO, [0.5, 0.5], [2, 7]), {"class_ids": 2}, "class_ids must be a sequence of integers"),

@@ -305,3 +305,11 @@ def test_invalid_camera_files(tmp_path, text, message):
 def test_a_missing_camera_file(tmp_path):
     with pytest.raises(InvalidInputError, match=r"^camera file \S+ does not exist; check the path"):
         read_camera(tmp_path / "camera.json", SHAPE)
+
+
+@pytest.mark.parametrize("lens", ["standard-58", "fisheye-120"])
+def test_a_camera_of_another_size_rectifies_as_one_of_this_size(lens):
+    large, small = (Camera.for_frame(shape, lens=lens) for shape in ((720, 1280), (360, 640)))
+    boxes = np.array([[450.0, 200, 550, 260]])
+    np.testing.assert_allclose(large.rectify_boxes(boxes, (360, 640)), small.rectify_boxes(boxes, (360, 640)))
+    assert large.to_pinhole((360, 640)).horizon_px == pytest.approx(small.to_pinhole((360, 640)).horizon_px)

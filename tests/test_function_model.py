@@ -130,7 +130,7 @@ def test_boxes_of_other_classes_are_dropped(class_ids):
     "result", [([BOX], [0.9]), Detections([BOX], [0.9]), ([BOX], [0.9], ["car"]), ([BOX], [0.9], [2, 2])]
 )
 def test_unknown_classes_are_rejected(result):
-    with pytest.raises(DetectorError, match="class_ids needs an integer class for each of the 1 boxes"):
+    with pytest.raises(DetectorError, match="class_ids needs an integer class for each of 1 box"):
         detector_from(returning(result), class_ids=[2]).detect(frame_with())
 
 

@@ -116,7 +116,8 @@ class Camera:
         ``focal_px * a * (1 + k1 * a**2 + k2 * a**4)`` pixels from the middle.
     shape
         Height and width of the frames that the pixels refer to, which `for_frame` and `read_camera` set; None
-        if unknown. For frames of another size, `for_shape` scales the pixels. It is not compared.
+        if unknown. For frames of another size, `for_shape` scales the pixels; a copy with other pixels by
+        ``dataclasses.replace`` needs another `shape`, too. It is not compared.
 
     Examples
     --------
@@ -153,7 +154,7 @@ class Camera:
             if name in ("k1", "k2"):
                 low, high = -1, 1
             elif name in ("focal_px", "height_m", "vehicle_width_m", "vehicle_height_m"):
-                above = 0
+                low, above = -math.inf, 0
             elif name == "horizon_px":
                 low = -1e6
             number = check_number(getattr(self, name), name, low=low, high=high, above=above)
@@ -285,7 +286,12 @@ class Camera:
         Returns
         -------
         numpy.ndarray
-            ``(N, 4)`` boxes around the same middle of the frame; `boxes` itself for a pinhole camera.
+            ``(N, 4)`` boxes around the same middle of the frame; for a pinhole camera `boxes` as they are.
+
+        Raises
+        ------
+        InvalidInputError
+            If the boxes are malformed, or the camera was made for frames of another aspect ratio.
 
         Examples
         --------
@@ -296,21 +302,23 @@ class Camera:
         boxes = check_boxes(boxes)
         if not self.fisheye or not len(boxes):
             return boxes
+        camera = self.for_shape(shape)
         boxes = boxes.astype(np.float64, copy=False)  # sums of small integers overflow
         middle = (boxes[:, :2] + boxes[:, 2:]) / 2
         columns = np.concatenate([boxes[:, 0], boxes[:, 2], middle[:, 0], middle[:, 0]])
         rows = np.concatenate([middle[:, 1], middle[:, 1], boxes[:, 1], boxes[:, 3]])
-        x, y = self._rectify_points(columns, rows, shape)
+        x, y = camera._rectify_points(columns, rows, shape)
         left, right, _, _ = np.split(x, 4)
         _, _, top, bottom = np.split(y, 4)
         return np.stack([left, top, right, bottom], axis=1)
 
     def to_pinhole(self, shape: tuple[int, ...]) -> Camera:
         """Return the pinhole camera of the boxes that `rectify_boxes` returns."""
-        if not self.fisheye:
-            return self
-        _, row = self._rectify_points(np.array([shape[1] / 2]), np.array([self.horizon_px]), shape)
-        return dataclasses.replace(self, horizon_px=float(row[0]), fisheye=False, k1=0.0, k2=0.0)
+        camera = self.for_shape(shape)
+        if not camera.fisheye:
+            return camera
+        _, row = camera._rectify_points(np.array([shape[1] / 2]), np.array([camera.horizon_px]), shape)
+        return dataclasses.replace(camera, horizon_px=float(row[0]), fisheye=False, k1=0.0, k2=0.0)
 
     def _rectify_points(self, x: Floats, y: Floats, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
         """Convert points of a fisheye frame to a pinhole camera with the same focal length and middle."""

@@ -353,7 +353,7 @@ class VehicleDetector:
         0.5
         """
         shape = check_shape(shape)
-        # A `Camera` may be one for frames of another size.
+        # The horizon of a `Camera` that was passed may be a default, unlike that of a file.
         if not self._default_horizon or isinstance(self.camera, Camera | None) or self.camera in LENSES:
             return self.search_params
         camera = self.camera_of(shape)
@@ -692,7 +692,7 @@ class VehicleDetector:
         on_result
             Function that is called with the result of each processed frame. moviepy may read a frame more
             than once: for a preview, a second rendering, or effects such as ``Loop``. A result with the index
-            0 says that the clip starts anew; drop the results before it.
+            0 is the first one of another pass; drop the results before it.
 
         Returns
         -------

@@ -125,6 +125,8 @@ def n_features(estimator: Any) -> int | None:
     found = getattr(estimator, "n_features_in_", None)
     if found is not None:
         return int(found)
+    if not type(estimator).__module__.startswith("sklearn."):
+        return None
     arrays: list[Any] = [getattr(estimator, name, None) for name in ("scale_", "mean_", "center_", "coef_")]
     return next((int(array.shape[-1]) for array in arrays if np.ndim(array)), None)
 

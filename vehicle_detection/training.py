@@ -448,7 +448,9 @@ def split_table(splits: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], lis
 
     def number(split: str, column: str) -> float | None:
         value = splits[split].get(column) if isinstance(splits[split], Mapping) else None
-        return value if isinstance(value, (int, float)) else None
+        if not isinstance(value, (int, float)) or isinstance(value, bool):
+            return None
+        return value if abs(value) < 1e15 else None  # a longer one may not be convertible to float
 
     shown = [split for split in SPLITS if split in splits]
     columns = [name for name in _SPLIT_COLUMNS if any(number(split, name) is not None for split in shown)]

@@ -9,7 +9,7 @@ ROUGH_DISTANCE = 0.2
 
 
 def format_with_error(value: float, error: float | None, *, signed: bool = False) -> str:
-    """Format a value and its standard error, if any; both get a decimal if the error is below 1.
+    """Format a value and its standard error, if any; both have a decimal if the error is below 0.95.
 
     >>> format_with_error(17.3, 4.0), format_with_error(5.23, 0.36), format_with_error(-0.2, None)
     ('17 ± 4', '5.2 ± 0.4', '0')
@@ -17,7 +17,7 @@ def format_with_error(value: float, error: float | None, *, signed: bool = False
     digits = int(error is not None and error < 0.95)
     shown = round(value, digits) + 0.0  # + 0.0 turns -0.0 into 0.0
     text = f"{shown:{'+' if signed and shown else ''}.{digits}f}"
-    return text if error is None else f"{text} ± {error:.{digits}f}"
+    return text if error is None else f"{text} ± {max(error, 0.1):.{digits}f}"
 
 
 @dataclass(frozen=True, kw_only=True)

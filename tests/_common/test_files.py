@@ -340,7 +340,6 @@ def test_a_new_folder_that_another_process_takes_for_abandoned(tmp_path, monkeyp
     assert names(tmp_path) == []
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no modes and links")
 def test_a_file_system_without_permissions(tmp_path, monkeypatch):
     def refuse(*_, **__):
         raise PermissionError(errno.EPERM, "Operation not permitted")
@@ -351,6 +350,7 @@ def test_a_file_system_without_permissions(tmp_path, monkeypatch):
     assert (tmp_path / "a.txt").read_text() == "whole"
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no modes and links")
 def test_links_and_permissions_of_a_target_stay(tmp_path):
     real, link = tmp_path / "real.csv", tmp_path / "link.csv"
     real.write_text("old")

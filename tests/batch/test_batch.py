@@ -3,6 +3,8 @@
 import json
 import os
 import shutil
+import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -197,7 +199,7 @@ def test_a_full_disk_is_an_error_that_the_next_run_repeats(card, model, tmp_path
         ("kill -XCPU $$", "error"),
         ("kill -SEGV $$", "failed"),
         ("echo '[h264 @ 0x1] pthread_create() failed: Resource temporarily unavailable'; exit 245", "error"),
-        ("echo 'x: Cannot allocate memory'; echo '  handler_name : SoundHandler'; exit 244", "error"),
+        ("echo 'x: Cannot allocate memory'; echo '  handler_name : SoundHandler'; exit 244", "failed"),
         ("exit 1", "failed"),
     ],
 )
@@ -433,6 +435,36 @@ def test_an_unknown_lens_has_one_warning(card, model, tmp_path):
     assert (known.exit_code, known.stderr) == (0, f"done: {source}, 12 frames\n")
     again = CliRunner().invoke(app, [*words, "--fov", "80", source, "-q"])
     assert (again.exit_code, again.stderr) == (0, "")
+
+
+def test_an_ffmpeg_without_memory_is_an_error_only_where_memory_is_limited(
+    card, model, tmp_path, monkeypatch
+):
+    """A damaged table asks for any amount of memory, too."""
+    program = tmp_path / "ffmpeg"
+    program.write_text("#!/bin/sh\necho 'x: Cannot allocate memory' >&2\nexit 244\n")
+    program.chmod(0o755)
+    monkeypatch.setattr("vehicle_detection.video.ffmpeg.ffmpeg_binary", lambda: str(program))
+    monkeypatch.setattr("vehicle_detection.video.ffmpeg._is_memory_limited", lambda: True)
+    assert counts(run(str(card / "*0930*"), tmp_path / "out", model)) == (0, 0, 1, 0)
+
+
+def test_a_file_with_a_damaged_table_is_a_failure(card, model, tmp_path):
+    data = (card / "20260131_093000_F.mp4").read_bytes()
+    place = data.index(b"stts") + 8  # the number of entries
+    (tmp_path / "20260131_093000_F.mp4").write_bytes(data[:place] + b"\x7f\xff\xff\xff" + data[place + 4 :])
+    report = run(str(tmp_path / "*.mp4"), tmp_path / "out", model)
+    assert (report.done, report.errors) in ((0, 0), (1, 0))  # newer versions of ffmpeg read it
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+def test_a_log_that_cannot_be_written_does_not_end_a_batch(card, model, tmp_path):
+    words = [sys.executable, "-m", "vehicle_detection", "batch", "-o", tmp_path / "out", "--tracks-only"]
+    with open("/dev/full", "w") as full:
+        subprocess.run(
+            [*words, "--model", model, "--group", "file", card], stderr=full, stdout=full, timeout=120
+        )
+    assert len(records(tmp_path / "out")) == len(list(card.glob("*.mp4")))
 
 
 def test_a_damaged_record_does_not_stop_the_status(tmp_path):

@@ -1,6 +1,7 @@
 import csv
 import errno
 import functools
+import io
 import json
 import os
 import re
@@ -31,7 +32,13 @@ from vehicle_detection.classifier import VehicleClassifier, load_classifier
 from vehicle_detection.cli import output
 from vehicle_detection.cli.app import app
 from vehicle_detection.cli.demo import FILES, REPORT, SHEET, draw_clip, scored_truth
-from vehicle_detection.cli.output import check_distinct_paths, output_folder, run_interruptible
+from vehicle_detection.cli.output import (
+    check_distinct_paths,
+    output_folder,
+    print_error,
+    print_table,
+    run_interruptible,
+)
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.mixture import load_model
@@ -427,10 +434,13 @@ def test_an_image_given_twice_is_searched_once(picture, tmp_path):
 def test_patterns_of_images_are_expanded(picture, tmp_path):
     for name in ("a.png", "b.png", "c[1].png"):
         shutil.copy(picture, tmp_path / name)
-    out = succeed("detect", tmp_path / "[ab].png", tmp_path / "c[1].png", "--model", "highway")
+    (tmp_path / "d.png").mkdir()
+    out = succeed("detect", tmp_path / "?.png", tmp_path / "c[1].png", "--model", "highway")
     assert [line.partition(":")[0] for line in out.splitlines()] == [
         str(tmp_path / name) for name in ("a.png", "b.png", "c[1].png")
     ]
+    # A name with brackets is no pattern, so that a wrong one is refused.
+    assert "[a].png does not exist; check the path" in refuse("detect", tmp_path / "[a].png")
 
 
 def test_two_names_of_a_file_are_one_file(tmp_path):
@@ -1214,6 +1224,8 @@ def test_info_of_a_model_with_incomplete_scores(tmp_path):
     assert re.search(r"road\W+0\.250", succeed("info", path))
     model.with_metadata({"metrics": {"splits": {"random": {"accuracy": 0.5, "test": "x"}}}}).save(path)
     assert re.search(r"accuracy\s+─+\s+random fifth +0\.5000", succeed("info", path))
+    model.with_metadata({"metrics": {"splits": {"random": {"accuracy": 10**400}}}}).save(path)
+    assert "random fifth" in succeed("info", path)
 
 
 def test_info_of_a_missing_model(material):
@@ -1432,3 +1444,28 @@ def test_images_have_a_frame_rate(tmp_path):
         write_image(tmp_path / f"{number}.png", np.zeros((360, 640, 3), np.uint8))
     succeed("video", tmp_path, "-o", tmp_path / "out.mp4", "--fps", 2, "--model", "highway", "-q")
     assert probe_video(tmp_path / "out.mp4").duration == pytest.approx(2.0)
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_lines_are_wrapped_at_spaces_in_a_terminal_only(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    for stream, lines in ((Terminal(), 3), (io.StringIO(), 1)):
+        monkeypatch.setattr(sys, "stderr", stream)
+        print_error("warning: " + "word " * 20)
+        printed = stream.getvalue().splitlines()
+        assert len(printed) == lines
+        assert all(len(line) <= 40 and line.split()[-1] == "word" for line in printed) or lines == 1
+
+
+def test_a_table_in_a_terminal_breaks_no_words(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "44")
+    stream = Terminal()
+    monkeypatch.setattr(sys, "stdout", stream)
+    name = "\u8eca\u4e21\u30c7\u30fc\u30bf.mp4"  # each of these five characters takes two columns
+    print_table("title", ["name", "precision", "average recall"], [[name, "0.5", "0.75"]])
+    words = re.sub(r"\x1b\[[\d;]*m", "", stream.getvalue()).split()
+    assert {name, "precision", "average", "recall"} <= {*words}

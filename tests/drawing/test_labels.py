@@ -185,3 +185,19 @@ def test_all_labels_stay_in_the_image_and_are_repeatable(boxes, height, width):
         assert 0 <= label.rectangle[1] < label.rectangle[3] <= height
     assert LabelPlacer().place(requests, (height, width)) == labels
     assert placer.place(requests, (height, width)) == labels
+
+
+def test_the_fields_of_a_crowd_do_not_come_and_go():
+    rng = np.random.default_rng(0)
+    corners = rng.uniform([300, 300], [900, 450], (30, 2))
+    sizes = rng.integers(40, 160, 30)
+    placer, counts = LabelPlacer(), []
+    for _ in range(50):
+        moved = corners + rng.normal(0, 0.5, corners.shape)
+        requests = [
+            request(key, round(x), round(y), int(size), int(0.8 * size))
+            for key, ((x, y), size) in enumerate(zip(moved, sizes))
+        ]
+        counts.append(["  ".join(label.lines).count("  ") for label in placer.place(requests, SHAPE)])
+    changes = (np.diff(counts, axis=0) != 0).mean() * 25
+    assert changes < 0.3  # for each label and second

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.events.drives import CAMERA, FPS, SHAPE, cut_in_times, log_frames, passing_times, simulate
-from vehicle_detection import Event, TrackLog, find_events
+from vehicle_detection import Camera, Event, TrackLog, find_events
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events import TrackHistory, estimate_motion
 from vehicle_detection.units import UNITS
@@ -218,6 +218,15 @@ def test_any_track_gives_consistent_events(seed, known, speed):
         assert event.ttc_s is None or event.ttc_s > 0
         assert event.distance_m is None or event.distance_m > 0
         assert all(math.isfinite(value) for value in vars(event).values() if isinstance(value, float))
+
+
+def test_a_camera_of_another_size_is_scaled_or_refused():
+    log = simulated("cut_in", 0)[1]
+    large = Camera.for_frame((2 * SHAPE[0], 2 * SHAPE[1]))
+    same = find_events(log, fps=FPS, shape=SHAPE, camera=Camera.for_frame(SHAPE))
+    assert find_events(log, fps=FPS, shape=SHAPE, camera=large) == same
+    with pytest.raises(InvalidInputError, match="camera must be one for frames of"):
+        find_events(log, fps=FPS, shape=(500, 500), camera=large)
 
 
 def test_no_tracks_give_no_events():

@@ -107,6 +107,10 @@ def test_times_of_frames_that_are_not_evenly_spaced():
     assert log.histories()[0].times.tolist() == pytest.approx([5.0, 5.1, 5.3, 5.5])
     speed = OwnSpeed(np.array([5.0, 6.0]), np.array([10.0, 20.0]))
     assert log.own_speeds(speed, 25).tolist() == pytest.approx([10, 11, 13, 15])
+    repeated = TrackLog()
+    for frame, time in enumerate((1.0, 1.1, 1.1, 1.3)):
+        repeated.add(frame, time, [track(1)])
+    assert repeated.histories()[0].times.tolist() == pytest.approx([1.0, 1.1, 1.2, 1.3])
     for times in ((1.0, 1.0), (1.0, 0.5), (None, 1.0), (None, None)):
         other = TrackLog()
         for frame, time in enumerate(times):

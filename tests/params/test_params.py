@@ -1,4 +1,5 @@
 import dataclasses
+import json
 import math
 from itertools import pairwise
 
@@ -447,3 +448,10 @@ def test_everywhere_searches_all_rows(params):
         assert everywhere.rows(100, 80, (720, 1280)) == (0, 720)
     elif isinstance(params, SearchParams):
         assert {(band.y1, band.y2) for band in everywhere.place((720, 1280))} == {(0, 720)}
+
+
+def test_numbers_of_numpy_become_those_of_python():
+    params = [PyramidParams(per_octave=np.int64(4)), HeatParams(frames=np.int64(3), threshold=np.float64(2))]
+    for each in (*params, TrackParams(confirm_hits=np.int64(3)), RegionParams(min_peak=np.float32(0.5))):
+        assert {type(value) for value in dataclasses.asdict(each).values()} & {np.int64, np.float64} == set()
+        json.dumps(dataclasses.asdict(each))

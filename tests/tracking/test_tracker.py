@@ -1168,6 +1168,14 @@ def test_a_vehicle_hidden_in_steps_keeps_its_size_place_and_id():
     assert [track.id for track in tracks] == [1, 2]
 
 
+def test_an_equal_camera_for_another_size_is_another_camera():
+    unknown = Camera(focal_px=600, horizon_px=400)
+    tracker = Tracker(camera=unknown)
+    tracker.set_camera(dataclasses.replace(unknown, shape=(720, 1280)))
+    tracker.update(Detections.empty(), (360, 640, 3))
+    assert tracker.camera.focal_px == 300
+
+
 @pytest.mark.parametrize("height_std", [0.02, 0.05, 0.1])
 def test_the_distance_of_a_near_vehicle_follows_its_bottom_edge(height_std):
     # A car that the right border cuts, and that pulls away; its first box seems farther than the second one.

@@ -20,6 +20,7 @@ from vehicle_detection._common.checks import (
     describe,
     finite_array,
     shorten,
+    store_integer,
     store_number,
 )
 from vehicle_detection._common.environment import check_environment
@@ -103,6 +104,7 @@ __all__ = [
     "shorten",
     "single_threaded_opencv",
     "stable_url",
+    "store_integer",
     "store_number",
     "temporary_folder",
     "with_spare",

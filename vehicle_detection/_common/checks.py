@@ -157,7 +157,7 @@ def check_array(values: object, name: str) -> NDArray[Any]:
     try:
         return np.asarray(values)
     except (ValueError, TypeError, OverflowError, RuntimeError) as error:
-        # Tensors say how to convert them; what NumPy says of ragged sequences is no help.
+        # Errors of tensors state how to convert them, those of NumPy do not help.
         reason = "" if isinstance(error, ValueError) else f"; {error}"
         raise InvalidInputError(
             f"{name} must be an array or a sequence of numbers of equal lengths, got {describe(values)}"
@@ -204,7 +204,7 @@ def check_boxes(boxes: Any, name: str = "boxes") -> NDArray[Any]:
     `boxes` may also be `Detections`, pairs ``((x1, y1), (x2, y2))`` of opposite corners, or an object with an
     attribute ``xyxy``, such as ``supervision.Detections``.
     """
-    boxes = getattr(boxes, "boxes", boxes)  # of Detections
+    boxes = getattr(boxes, "boxes", boxes)  # Detections have this attribute.
     array = check_array(getattr(boxes, "xyxy", boxes), name)
     if array.size == 0:
         return np.empty((0, 4), array.dtype if array.dtype.kind in "iuf" else np.float64)
@@ -253,8 +253,13 @@ def store_number(instance: object, name: str, **bounds: float) -> None:
     """Check an attribute of a dataclass; a number of NumPy or a fraction becomes a float."""
     value = getattr(instance, name)
     number = check_number(value, name, **bounds)
-    if not isinstance(value, (int, float)):
+    if type(value) not in (int, float):
         object.__setattr__(instance, name, number)
+
+
+def store_integer(instance: object, name: str, *, low: int, high: int | None = None) -> None:
+    """Check an attribute of a dataclass; an integer of NumPy becomes an int."""
+    object.__setattr__(instance, name, check_integer(getattr(instance, name), name, low=low, high=high))
 
 
 def check_integer(value: object, name: str, *, low: int, high: int | None = None) -> int:

@@ -144,7 +144,8 @@ def run_batch(
     `out` gets, for each trip, ``tracks/date=D/camera=C/KEY.parquet``, the annotated video
     ``videos/date=D/camera=C/KEY.mp4``, and ``records/KEY.json``, which is written last. KEY depends on the
     trip's files (path or URL, size, modification time or entity tag), the model, the parameters and the
-    version of the library. If one of them changes, the new results replace the old ones.
+    version of the library. If one of them changes, the new results replace the old ones, unless the changed
+    source cannot be processed.
 
     Parameters
     ----------

@@ -16,6 +16,7 @@ from vehicle_detection._common import (
     check_integer,
     check_sequence,
     describe,
+    pluralize,
 )
 from vehicle_detection.boxes.scores import (
     CERTAIN_SCORE,
@@ -63,7 +64,7 @@ class Detections:
     scores: Floats
     confidences: Floats | None = None
 
-    if TYPE_CHECKING:  # what is converted
+    if TYPE_CHECKING:  # The constructor converts its arguments.
 
         def __init__(
             self, boxes: Detections | ArrayLike, scores: ArrayLike, confidences: ArrayLike | None = None
@@ -143,13 +144,12 @@ class Detections:
                 "supervision.Detections"
             )
         scale = check_score_scale(score, threshold)
-        name = next((each for each in ("confidence", "conf") if hasattr(detections, each)), None)
-        if name is None:
+        if not hasattr(detections, "confidence") and not hasattr(detections, "conf"):
             raise InvalidInputError(
                 f"detections must have an attribute confidence or conf, got {describe(detections)}; set it "
                 "to None if the confidences are unknown"
             )
-        boxes, confidence = check_boxes(detections.xyxy), getattr(detections, name)
+        boxes, confidence = check_boxes(detections.xyxy), _first_known(detections, "confidence", "conf")
         if confidence is None:
             scores = np.full(len(boxes), CERTAIN_SCORE)
         else:
@@ -157,8 +157,7 @@ class Detections:
         found = cls(boxes, scores)
         if class_ids is None:
             return found
-        classes = getattr(detections, "class_id", getattr(detections, "cls", None))
-        return select_classes(found, classes, check_class_ids(class_ids))
+        return select_classes(found, _first_known(detections, "class_id", "cls"), check_class_ids(class_ids))
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return a table with a row for each box: corners, score and, if known, confidence.
@@ -241,6 +240,12 @@ class Detections:
         return zip(self.boxes, self.scores.tolist())
 
 
+def _first_known(detections: Any, *names: str) -> Any:
+    """Return the first of these attributes that is not None; None if there is none."""
+    values = (getattr(detections, name, None) for name in names)
+    return next((value for value in values if value is not None), None)
+
+
 def check_class_ids(class_ids: object) -> tuple[int, ...]:
     """Return the numbers of the classes to keep."""
     ids = check_sequence(class_ids, "class_ids", "integers, such as (2, 5, 7)")
@@ -254,8 +259,8 @@ def select_classes(found: Detections, classes: Any, class_ids: Collection[int]) 
     column = check_array(classes, "classes")
     if column.shape != (len(found),) or column.dtype.kind not in "iuf":
         raise InvalidInputError(
-            f"class_ids needs an integer class for each of the {len(found)} boxes, got {describe(classes)}; "
-            "omit class_ids"
+            f"class_ids needs an integer class for each of {pluralize(len(found), 'box', 'es')}, got "
+            f"{describe(classes)}; omit it, or return (boxes, scores, classes)"
         )
     return found[np.isin(column, list(class_ids))]
 

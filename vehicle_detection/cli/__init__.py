@@ -25,8 +25,10 @@ def main() -> None:
     exit_on_signals()
     from vehicle_detection.cli.app import app
 
-    # On Windows, typer would also take names with brackets for patterns.
-    app(prog_name="vehicle-detection", windows_expand_args=False)
+    words = sys.argv[1:]
+    if os.name == "nt":  # where shells leave this to programs; patterns are expanded by the commands
+        words = [os.path.expandvars(os.path.expanduser(word)) for word in words]
+    app(words, prog_name="vehicle-detection", windows_expand_args=False)
 
 
 def _open_closed_streams() -> None:

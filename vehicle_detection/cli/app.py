@@ -9,6 +9,7 @@ import contextlib
 import errno
 import glob
 import itertools
+import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -82,6 +83,14 @@ def _print_usage_error() -> Iterator[None]:
         raise typer.Exit(BAD_INPUT) from None
 
 
+def _is_folder_gone() -> bool:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return True
+    return False
+
+
 @contextlib.contextmanager
 def _print_system_errors() -> Iterator[None]:
     """Print an error of the system as one line, and exit."""
@@ -91,7 +100,7 @@ def _print_system_errors() -> Iterator[None]:
         if error.errno == errno.EPIPE:
             raise
         reason = error.strerror or str(error)
-        if error.errno == errno.ENOENT and error.filename is None:  # of os.getcwd
+        if error.errno == errno.ENOENT and error.filename is None and _is_folder_gone():
             reason = "the current folder has been removed; change to another one"
         print_error(f"error: {error.filename}: {reason}" if error.filename else f"error: {reason}")
     except MemoryError:
@@ -295,8 +304,11 @@ def detect(
 
 
 def _expand(image: Path) -> list[Path]:
-    """List the files of a pattern, which the shell of Windows passes on as it is."""
-    return [image] if image.exists() else [Path(name) for name in sorted(glob.glob(str(image)))] or [image]
+    """List the files of a pattern with ``*`` or ``?``, which the shell of Windows passes on as it is."""
+    if image.exists():
+        return [image]
+    found = map(Path, sorted(glob.glob(str(image).replace("[", "[[]"))))
+    return [path for path in found if not path.is_dir()] or [image]
 
 
 def _check_images(images: list[Path], output: Path | None, boxes: Path | None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -112,7 +113,7 @@ def batch(
     if not sources:
         raise InvalidInputError("SOURCES... must name at least one video, folder, pattern or URL")
     from vehicle_detection._common import hide_credentials, is_url, local_path
-    from vehicle_detection.batch import open_dask, run_batch, with_source
+    from vehicle_detection.batch import open_dask, run_batch
 
     options: dict[str, Any] = {
         "conf": conf,
@@ -147,15 +148,13 @@ def batch(
             retry_failed=retry_failed,
             dry_run=dry_run,
             progress=not quiet,
-            on_record=None if quiet or sys.stderr.isatty() else _print_record,
+            on_record=functools.partial(_print_record, done=not quiet and not sys.stderr.isatty()),
         )
     if dry_run:
         for trip in done.planned or ():
             _print_trip(trip)
         print_line(str(done))
         return
-    for source, message in done.messages.items():
-        print_error(f"warning: {with_source(source, message)}")
     _write_summary(output, summary)
     lens_is_known = any(option is not None for option in (camera, fov))
     if done.done and not lens_is_known and not quiet:
@@ -167,12 +166,19 @@ def batch(
         raise typer.Exit(1)
 
 
-def _print_record(record: Mapping[str, Any]) -> None:
-    """Print a finished trip, for logs, which show no progress bar."""
-    from vehicle_detection._common import encodable, hide_credentials
+def _print_record(record: Mapping[str, Any], *, done: bool) -> None:
+    """Warn of a trip without results; with `done` also print others, for logs, which show no progress bar."""
+    from vehicle_detection._common import encodable, hide_credentials, pluralize
+    from vehicle_detection.batch import with_source
 
-    source = encodable(hide_credentials(record["sources"][0]["uri"]))
-    print_error(f"{record['status']}: {source}, {record.get('frames', 0):,} frames")
+    source = record["sources"][0]["uri"]
+    # A log that cannot be written does not end the batch.
+    with contextlib.suppress(OSError, ValueError):
+        if record["status"] != "done":
+            print_error(f"warning: {with_source(source, record['message'])}")
+        elif done:
+            name = encodable(hide_credentials(source))
+            print_error(f"done: {name}, {pluralize(record['frames'], 'frame')}")
 
 
 def _print_trip(trip: Mapping[str, Any]) -> None:

@@ -6,7 +6,6 @@ import contextlib
 import io
 import logging
 import os
-import shutil
 import sys
 import tempfile
 import textwrap
@@ -32,6 +31,7 @@ Result = TypeVar("Result")
 _ABANDONED = "abandoned"
 
 # Width of tables that are not printed to a terminal; fits a fingerprint in one line.
+_USUAL_WIDTH = 80  # of a terminal that does not state its own
 _PIPE_WIDTH = 120
 
 
@@ -50,7 +50,7 @@ def print_line(text: str, *, err: bool = False, indent: int = 2) -> None:
     options: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False}
     options["subsequent_indent"] = " " * (indent if 2 * indent < width else 2)
     lines = [
-        "\n".join(textwrap.wrap(line, width, **options)) if len(line) > width else line
+        "\n".join(textwrap.wrap(line, width, **options)) if _cells(line) > width else line
         for line in text.split("\n")
     ]
     tqdm = sys.modules.get("tqdm")  # unless it is imported, there is no bar
@@ -58,11 +58,25 @@ def print_line(text: str, *, err: bool = False, indent: int = 2) -> None:
         typer.echo("\n".join(lines), err=err)
 
 
+def _cells(text: str) -> int:
+    """Columns of a terminal that a text takes; some characters take two, escape codes none."""
+    if text.isascii() and "\x1b" not in text:
+        return len(text)
+    from rich.text import Text
+
+    return Text.from_ansi(text).cell_len
+
+
 def _terminal_width(stream: Any) -> int | None:
     """Columns of a terminal; None for other streams."""
     if stream is None or not stream.isatty():  # None: closed
         return None
-    return shutil.get_terminal_size().columns
+    columns = os.environ.get("COLUMNS", "")
+    if columns.isdecimal() and int(columns):
+        return int(columns)
+    with contextlib.suppress(OSError, ValueError):  # a stream without a descriptor
+        return os.get_terminal_size(stream.fileno()).columns or _USUAL_WIDTH
+    return _USUAL_WIDTH
 
 
 def print_error(message: str) -> None:
@@ -139,8 +153,8 @@ def print_table(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]])
 
 def _fit_columns(columns: Sequence[Sequence[str]], width: int) -> tuple[int, list[int | None]]:
     """Choose padding and widths that break a table's lines at spaces only; None if the words do not fit."""
-    full = [max(map(len, column)) for column in columns]
-    words = [max((len(word) for cell in column for word in cell.split()), default=0) for column in columns]
+    full = [max(map(_cells, column)) for column in columns]
+    words = [max((_cells(word) for cell in column for word in cell.split()), default=0) for column in columns]
     for padding in (1, 0):
         spare = width - 1 - (2 * padding + 1) * len(columns) - sum(words)
         if spare >= 0:

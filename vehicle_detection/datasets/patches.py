@@ -62,7 +62,7 @@ class PatchSet:
     labels: NDArray[np.bool_]
     names: tuple[str, ...]
 
-    if TYPE_CHECKING:  # what is converted
+    if TYPE_CHECKING:  # The constructor converts its arguments.
 
         def __init__(self, patches: ArrayLike, labels: ArrayLike, names: Iterable[str]) -> None: ...
 

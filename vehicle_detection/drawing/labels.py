@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -20,9 +20,14 @@ from vehicle_detection.drawing.primitives import (
     text_size,
 )
 
+Place = tuple[int, Rectangle]
+"""A place for a label: its number, the same for all labels, and the rectangle there."""
+
 # Width in pixels up to which a label may be wider than its box, at font scale 1; to get another line, a label
 # must be this much too wide.
 _FREE_WIDTH, _TOLERANCE = 180, 1.15
+# Factor of the margin around a place for a label with more fields than in the last frame.
+_GROWTH = 4
 # Weight of the hidden area at a label's last place.
 _LAST_WEIGHT = 0.7
 # Fraction of a box that a label inside may cover.
@@ -87,13 +92,17 @@ class LabelPlacer:
                 lines, size, fitted = _break_lines(
                     request.fields[:count], request.box, shape[1], scale, last_lines
                 )
-                # Another number of fields is like another place.
+                # Another number of fields is like another place. More fields than before need more space, so
+                # that they do not come and go.
                 before = last_place if last_fields in (None, count) else -1
-                place, rectangle, free = _choose(
-                    request.box, size, shape, obstacles, before, text_margin(scale)
-                )
-                if free:
+                grows = last_fields is not None and count > last_fields
+                margin = text_margin(scale) * (_GROWTH if grows else 1)
+                found = _free_place(_places(request.box, size, shape), obstacles, before, margin)
+                if found is not None:
                     break
+            else:
+                found = _least_hiding(_places(request.box, size, shape), obstacles, before)
+            place, rectangle = found
             labels.append(Label(lines, rectangle, fitted, _leader(request.box, rectangle)))
             last[request.key] = count, len(lines), place
         self._last = last
@@ -128,32 +137,29 @@ def _split(fields: Sequence[str], count: int) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def _choose(
-    box: Rectangle,
-    size: tuple[int, int],
-    shape: tuple[int, ...],
-    obstacles: Sequence[Rectangle],
-    last: int | None,
-    margin: int,
-) -> tuple[int, Rectangle, bool]:
-    """Return number and rectangle of the best place for a label of this size, and whether it is free."""
-    places: dict[int, Rectangle] = {}
-    for place, rectangle in _places(box, size, shape):
+def _free_place(
+    places: Iterable[Place], obstacles: Sequence[Rectangle], last: int | None, margin: int
+) -> Place | None:
+    """Return the best place without obstacles; None if there is none."""
+    for place, rectangle in places:
         # A better place than the last one needs some more space, so that a label does not switch to and fro.
         space = 0 if last is None or place == last else margin
         if not any(_intersect(rectangle, other, space) for other in obstacles):
-            return place, rectangle, True
-        places[place] = rectangle
-    # Nothing is free: the place that hides least, where the last one counts less.
-    areas = {
-        place: _hidden_area(rectangle, obstacles) * (_LAST_WEIGHT if place == last else 1.0)
-        for place, rectangle in places.items()
-    }
-    best = min(areas, key=lambda place: (areas[place], place))
-    return best, places[best], False
+            return place, rectangle
+    return None
 
 
-def _places(box: Rectangle, size: tuple[int, int], shape: tuple[int, ...]) -> Iterator[tuple[int, Rectangle]]:
+def _least_hiding(places: Iterable[Place], obstacles: Sequence[Rectangle], last: int | None) -> Place:
+    """Return the place that hides least, where the last one counts less."""
+
+    def cost(place: Place) -> tuple[float, int]:
+        number, rectangle = place
+        return _hidden_area(rectangle, obstacles) * (_LAST_WEIGHT if number == last else 1.0), number
+
+    return min(places, key=cost)
+
+
+def _places(box: Rectangle, size: tuple[int, int], shape: tuple[int, ...]) -> Iterator[Place]:
     """Yield numbered places for a label inside the image, best first."""
     (width, height), (rows, columns) = size, shape[:2]
     found = False

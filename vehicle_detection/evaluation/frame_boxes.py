@@ -95,9 +95,9 @@ def class_name(record: Mapping[Any, Any]) -> str:
 
 
 def known_classes(names: Iterable[str]) -> set[str]:
-    """Classes in a table, given that of each row; none if they are numbers, which may mean anything."""
+    """Classes in a table, given that of each row; none if they are numbers or flags."""
     found = {*names} - {""}
-    return set() if any(re.fullmatch(r"[-\d.]+", name) for name in found) else found
+    return set() if any(re.fullmatch(r"[-\d.]+|true|false", name) for name in found) else found
 
 
 def none_if_unknown(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -201,7 +201,7 @@ class FrameBoxes:
     frame_keys: Sequence[FrameKey] = ()
     _rows: dict[FrameKey, NDArray[np.intp]] = field(init=False)
 
-    if TYPE_CHECKING:  # what is converted
+    if TYPE_CHECKING:  # The constructor converts its arguments.
 
         def __init__(
             self,

@@ -231,6 +231,7 @@ def find_events(
     if camera is None:
         camera = Camera.for_frame(frame_shape)
     check_type(camera, "camera", Camera, "omit it for a typical dash-cam")
+    camera = camera.for_shape(frame_shape)
     histories = log.histories() if isinstance(log, TrackLog) else check_sequence(log, "log", "TrackHistory")
     for each in histories:
         check_type(each, "log", TrackHistory, "pass a TrackLog, or what its histories() returns")

@@ -172,7 +172,7 @@ class TrackLog:
         speed
             Speed over the time of the source, as `read_own_speed` returns it.
         fps
-            Frame rate.
+            Frame rate, for frames that were added without a time.
 
         Returns
         -------
@@ -201,15 +201,18 @@ class TrackLog:
         return sorted(histories, key=lambda track: (track.first, track.id))
 
     def _frame_times(self) -> Floats | None:
-        """Return the time of each frame, interpolated where it is unknown.
+        """Return the time of each frame, interpolated where it is unknown or does not ascend.
 
-        None if most times are unknown, or if they do not ascend.
+        None if that is so for most frames, for the first one or for the last one.
         """
         times = np.array(self._times)
-        known = np.flatnonzero(np.isfinite(times))
-        if 2 * known.size <= times.size or (np.diff(times[known]) <= 0).any() or known[0] > 0:
+        known = np.isfinite(times)
+        latest = np.maximum.accumulate(np.where(known, times, -np.inf))
+        known[1:] &= times[1:] > latest[:-1]
+        rows = np.flatnonzero(known)
+        if 2 * rows.size <= times.size or not known[0] or not known[-1]:
             return None
-        return np.asarray(np.interp(np.arange(times.size), known, times[known]))
+        return np.asarray(np.interp(np.arange(times.size), rows, times[rows]))
 
 
 def _empty_columns() -> list[array[Any]]:

@@ -144,8 +144,9 @@ def _second_texts(
     counts = np.array(log.counts, np.int64)
     seconds = math.ceil(len(counts) / fps - 1e-9)
     nearest = _nearest_tracks(log.histories(), fps)
-    start = log.first_time or 0.0
-    own = np.full(seconds, np.nan) if own_speed is None else own_speed.at(start + 0.5 + np.arange(seconds))
+    # In the middle of each second.
+    frames = np.minimum((np.arange(seconds) + 0.5) * fps, len(counts) - 1).astype(np.intp)
+    own = np.full(seconds, np.nan) if own_speed is None else log.own_speeds(own_speed, fps)[frames]
     shown: defaultdict[int, list[Event]] = defaultdict(list)
     for event in events:
         for second in range(int(event.time_s), int(event.time_s) + _EVENT_SECONDS):

@@ -217,13 +217,15 @@ class TrackWriter:
             )
         if is_result(result):
             self._file.add_frame(int(result.index))
-        for row in rows_of(result, self.rows):
+        rows = list(rows_of(result, self.rows))
+        for row in rows:
             self._check_order(row)
+        for row in rows:
             self._file.write(row)
-            self.rows += 1
+        self.rows += len(rows)
 
     def _check_order(self, row: Row) -> None:
-        """Refuse a box of a track in a frame that is not after its last one; tracks below 0 are none."""
+        """Refuse a box of a track, if it has one (not -1), in a frame that is not after its last one."""
         frame, track = row.frame, row.track_id
         assert isinstance(frame, int)
         assert track is not None
@@ -231,7 +233,8 @@ class TrackWriter:
         if track >= 0 and frame <= last:
             raise InvalidInputError(
                 f"row {self.rows}: frame must be greater than {last}, the last one of track {track}, got "
-                f"{frame}; sort rows by frame, write each box once, and each video to a file of its own"
+                f"{frame}; sort rows by frame, write each box once, and each video to a file of its own; "
+                "boxes without a track have -1"
             )
         self._last_frames[track] = frame
 

@@ -6,7 +6,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Literal
 
-from vehicle_detection._common import check_choice, check_integer, describe
+from vehicle_detection._common import check_choice, describe, store_integer
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.units import UNITS
 
@@ -64,7 +64,7 @@ class DrawParams:
             check_choice(field, "labels", LABEL_FIELDS)
         object.__setattr__(self, "labels", fields)
         if self.line_width is not None:
-            check_integer(self.line_width, "line_width", low=1, high=1000)
+            store_integer(self, "line_width", low=1, high=1000)
         check_choice(self.color_by, "color_by", COLORINGS)
         check_choice(self.panel, "panel", PANELS)
         check_choice(self.units, "units", UNITS)

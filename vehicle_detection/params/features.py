@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_bool, check_choice, check_integer, check_number
+from vehicle_detection._common import check_bool, check_choice, check_number, store_integer
 from vehicle_detection.errors import InvalidInputError
 
 PATCH_SIZE = 64
@@ -114,14 +114,14 @@ class FeatureParams:
         size: Any = self.spatial_size
         if isinstance(size, (tuple, list)) and len(size) == 2 and size[0] == size[1]:
             object.__setattr__(self, "spatial_size", size[0])
-        self._check_integer("spatial_size", 1, PATCH_SIZE)
-        self._check_integer("hist_bins", 1, 256)
-        self._check_integer("orient", 1, 180)
-        self._check_integer("pix_per_cell", 2, PATCH_SIZE)
-        self._check_integer("cell_per_block", 1, PATCH_SIZE // self.pix_per_cell)
+        store_integer(self, "spatial_size", low=1, high=PATCH_SIZE)
+        store_integer(self, "hist_bins", low=1, high=256)
+        store_integer(self, "orient", low=1, high=180)
+        store_integer(self, "pix_per_cell", low=2, high=PATCH_SIZE)
+        store_integer(self, "cell_per_block", low=1, high=PATCH_SIZE // self.pix_per_cell)
         check_choice(self.hog_channel, "hog_channel", HOG_CHANNELS)
         if not isinstance(self.hog_channel, str):
-            self._check_integer("hog_channel", 0, 2)
+            store_integer(self, "hog_channel", low=0, high=2)
         if self.coarse_hog and self.cells // 2 < self.cell_per_block:
             raise InvalidInputError(
                 f"coarse_hog must be False, because a block of {self.cell_per_block} cells of "
@@ -129,10 +129,6 @@ class FeatureParams:
             )
         for name in ("hist_gain", "coarse_gain"):
             object.__setattr__(self, name, check_number(getattr(self, name), name, low=0.01, high=100))
-
-    def _check_integer(self, name: str, low: int, high: int) -> None:
-        # Convert numpy integers, which JSON does not support.
-        object.__setattr__(self, name, check_integer(getattr(self, name), name, low=low, high=high))
 
     @classmethod
     def preset(cls, name: str) -> FeatureParams:

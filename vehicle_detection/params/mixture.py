@@ -7,7 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_detection._common import check_integer, check_number, check_type, describe, store_number
+from vehicle_detection._common import (
+    check_number,
+    check_type,
+    describe,
+    store_integer,
+    store_number,
+)
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params.search import PyramidParams
 
@@ -116,11 +122,11 @@ class MixtureParams:
         store_number(self, "min_width", low=8, high=10_000)
         store_number(self, "aspect_tolerance", low=0, high=10)
         for name in "copies", "border_copies":
-            check_integer(getattr(self, name), name, low=1, high=100)
+            store_integer(self, name, low=1, high=100)
         store_number(self, "jitter_scale", low=0, high=0.25)
-        check_integer(self.relit_copies, "relit_copies", low=0, high=100)
+        store_integer(self, "relit_copies", low=0, high=100)
         for name in "max_per_frame", "max_negatives":
-            check_integer(getattr(self, name), name, low=1)
+            store_integer(self, name, low=1)
         check_type(self.search, "search", PyramidParams, "it sets the window sizes for negatives")
         tuples = {"shapes": shapes, "border_shapes": border_shapes, "mirrored": tuple(map(bool, mirrored))}
         for name, values in (tuples | {"simulated_borders": borders, "mining_schedule": schedule}).items():

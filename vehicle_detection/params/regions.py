@@ -7,7 +7,7 @@ import warnings
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
-from vehicle_detection._common import check_choice, check_integer, store_number
+from vehicle_detection._common import check_choice, store_integer, store_number
 
 
 class HeatRange(NamedTuple):
@@ -50,7 +50,7 @@ class HeatParams:
 
     def __post_init__(self) -> None:
         check_choice(self.weighting, "weighting", ("score", "count"))
-        check_integer(self.frames, "frames", low=1, high=1000)
+        store_integer(self, "frames", low=1, high=1000)
         if self.threshold is not None:
             store_number(self, "threshold", low=0, high=1e9)
         store_number(self, "peak_fraction", low=0, high=0.99)

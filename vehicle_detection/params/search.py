@@ -7,7 +7,13 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from vehicle_detection._common import check_choice, check_integer, check_number, describe, store_number
+from vehicle_detection._common import (
+    check_choice,
+    check_number,
+    describe,
+    store_integer,
+    store_number,
+)
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params.regions import HeatParams, HeatRange
 
@@ -345,7 +351,7 @@ class PyramidParams:
         if self.min_width is not None:
             store_number(self, "min_width", low=16, high=10_000)
         store_number(self, "max_height", above=0, high=2)
-        check_integer(self.per_octave, "per_octave", low=1, high=32)
+        store_integer(self, "per_octave", low=1, high=32)
         if self.horizon is not None:
             store_number(self, "horizon", low=0, high=1)
         heights: object = self.camera_height_m

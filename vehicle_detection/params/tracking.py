@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from vehicle_detection._common import check_choice, check_integer, store_number
+from vehicle_detection._common import check_choice, store_integer, store_number
 from vehicle_detection.errors import InvalidInputError
 
 
@@ -115,7 +115,7 @@ class TrackParams:
             store_number(self, name, above=0, high=100)
         for name in ("max_iou", "max_coverage"):
             store_number(self, name, low=0, high=1)
-        check_integer(self.confirm_hits, "confirm_hits", low=1, high=10_000)
+        store_integer(self, "confirm_hits", low=1, high=10_000)
         for name in ("measurement_noise", "nearest_weight"):
             store_number(self, name, above=0, high=1)
         if self.show_coast > self.max_coast:

@@ -91,6 +91,7 @@ def plot_birds_eye(
     if camera is None:
         camera = Camera.for_frame(frame)
     check_type(camera, "camera", Camera, "pass a Camera, or None for a typical dash-cam")
+    camera = camera.for_shape(frame)
 
     axes = style.new_axes(ax, 4.5, 7.0)
     last = listed[-1]

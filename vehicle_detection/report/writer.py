@@ -87,8 +87,7 @@ class ReportWriter:
                 raise InvalidInputError(f"path {self._path} is also the {name}; choose another name")
         self._video = None if video is None else Path(video)
         self._source = None if source is None else Path(hide_credentials(os.fspath(source))).name
-        # Left out of texts about the damage of the source, as of the title.
-        self._folder = "" if source is None else os.path.join(os.path.dirname(os.fspath(source)), "")
+        self._source_path = None if source is None else str(Path(os.fspath(source)))
         self._detector = detector
         self._embed_limit = check_integer(embed_limit, "embed_limit", low=0)
         self.log = TrackLog()
@@ -155,8 +154,9 @@ class ReportWriter:
             "units": self._units,
             "pictures": listed,
         }
-        if self._folder:
-            report = dataclasses.replace(report, damage=report.damage.replace(self._folder, ""))
+        if self._source_path and self._source:  # without its folder, as in the title
+            damage = report.damage.replace(self._source_path, self._source)
+            report = dataclasses.replace(report, damage=damage)
         pieces = render_page(self.log, report, **options)
         with (
             atomic_write(self._path, "path") as part,

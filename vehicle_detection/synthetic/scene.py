@@ -87,7 +87,12 @@ def make_config(
     if jpeg_quality is not None:
         jpeg_quality = check_integer(jpeg_quality, "jpeg_quality", low=1, high=100)
     camera = Camera(
-        focal_px=focal_px, horizon_px=horizon_px, height_m=height_m, focal_std=0.0, height_std_m=0.0
+        focal_px=focal_px,
+        horizon_px=horizon_px,
+        height_m=height_m,
+        focal_std=0.0,
+        height_std_m=0.0,
+        shape=(height, width),
     )
     seed = int(rng.integers(2**62))
     lighting = make_light(light, rain, np.random.default_rng([seed, 4]))

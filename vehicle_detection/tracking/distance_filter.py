@@ -122,7 +122,7 @@ def update_distances(
         variance = np.square(edge_std[:, 1] / scale) * box_frames + systematic * pitch_frames
         return _scalar_update(mean, cov, jacobian, innovation, np.where(bottom_visible, variance, np.inf))
 
-    # Far away, noise dominates the correction, so that the predicted distance is the better place.
+    # Far away, noise dominates the correction, so that the predicted distance is more exact.
     corrected = np.maximum(correct_by_bottom(mean[:, 0])[0][:, 0], _MIN_DISTANCE)
     mean, cov = correct_by_bottom(np.where(corrected < _RELINEARIZED, corrected, mean[:, 0]))
     np.clip(mean[:, 0], _MIN_DISTANCE, _MAX_DISTANCE, out=mean[:, 0])

@@ -34,8 +34,8 @@ def interpolate_tracks(
 
     The frame is `dt` seconds after the tracks `before` and `dt_after` seconds before the tracks `after`;
     `shape` is its ``(height, width, ...)``. A track that has ended in `after`, or that was not confirmed yet
-    in `before`, moves at its velocity, unless it is outside the frame. Tentative tracks are included, so that
-    their vehicles can be blurred.
+    in `before`, moves at its velocity and speed, unless it is outside the frame. Tentative tracks are
+    included, so that their vehicles can be blurred.
     """
     confirmed = {track.key for track in after if track.id}
     following = {_identity(track): track for track in after}

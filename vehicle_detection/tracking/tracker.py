@@ -125,7 +125,8 @@ class Tracker:
     def set_camera(self, camera: Camera) -> None:
         """Use another camera from the next frame on, for example if the size of the frames changes."""
         check_type(camera, "camera", Camera, "pass Camera.for_frame(image.shape)")
-        if camera != self._given_camera:
+        given = self._given_camera
+        if given is None or (camera, camera.shape) != (given, given.shape):
             self._given_camera = camera
             self._open_horizon()
 

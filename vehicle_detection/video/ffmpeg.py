@@ -34,10 +34,9 @@ _NETWORK_FAULT = re.compile(
 # Errors of the system that refuses memory, processes or open files.
 _LIMITS = {errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE}
 _RAISE_LIMITS = "close other programs, or raise the limits of this process (ulimit), and try again"
-# Messages of ffmpeg about memory, threads or open files that the system refuses.
-_SYSTEM_FAULT = re.compile(
-    r"^.*(Resource temporarily unavailable|Cannot allocate memory|Too many open files).*$", re.MULTILINE
-)
+# Messages of ffmpeg about threads or open files that the system refuses.
+_SYSTEM_FAULT = re.compile(r"^.*(Resource temporarily unavailable|Too many open files).*$", re.MULTILINE)
+_NO_MEMORY = "Cannot allocate memory"
 NETWORK_TIMEOUT = 10.0
 """Seconds without data after which a server has failed."""
 
@@ -72,8 +71,10 @@ def check_frame_size(name: str, log: str) -> None:
 
 def check_resources(name: str, code: int, log: str) -> None:
     """Raise a TransientVideoError if ffmpeg has failed for lack of memory, threads or open files."""
-    fault = _SYSTEM_FAULT.search(log)
-    if code and (fault or (-code in _CRASHES and _is_memory_limited())):
+    refused = bool(_SYSTEM_FAULT.search(log))
+    # Damaged tables of a file ask for any amount of memory, too.
+    short = _is_memory_limited() and (-code in _CRASHES or _NO_MEMORY in log)
+    if code and (refused or short):
         raise TransientVideoError(f"{name} cannot be read: {exit_reason(code, log)}; {_RAISE_LIMITS}")
 
 
