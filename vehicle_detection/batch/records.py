@@ -184,6 +184,8 @@ def batch_status(out: str | os.PathLike[str]) -> BatchStatus:
 def batch_summary(out: str | os.PathLike[str]) -> pandas.DataFrame:
     """Summarize each trip of a batch in a row of a table, also while it runs.
 
+    A trip whose changed source cannot be processed has a second row with its earlier results.
+
     Parameters
     ----------
     out

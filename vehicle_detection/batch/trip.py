@@ -119,7 +119,10 @@ def remove_replaced(store: Store, task: Mapping[str, Any], record: Mapping[str, 
 
 
 def _replace(store: Store, task: Mapping[str, Any]) -> dict[str, Any]:
-    """Process a trip, then remove what it replaces; an error of the machine removes nothing."""
+    """Process a trip, then remove what it replaces; an error of the machine removes nothing.
+
+    A source that cannot be processed replaces no results.
+    """
     try:
         facts = _process(store, task)
     except Exception as error:

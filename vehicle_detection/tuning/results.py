@@ -190,7 +190,8 @@ class RowStore(dict[str, Mapping[str, Any]]):
         line = _format_row(row, self._columns, self._suffix)
         with self._path.open("a+b") as file:
             file.seek(0)
-            if str(row["trial"]).encode() in file.read():  # another run has measured it at the same time
+            # Another run may have measured it at the same time; `read_results` drops what it still writes.
+            if str(row["trial"]).encode() in file.read():
                 return
             if file.tell() == 0 and self._suffix == ".csv":
                 line = _csv_line(self._columns) + line
