@@ -37,8 +37,8 @@ def convert_color(img: Image, conv: str = "RGB2YCrCb") -> Image:
     Parameters
     ----------
     img
-        ``(H, W, 3)`` uint8, or float as OpenCV defines it: 0-1, hue 0-360, LUV and LAB with negative values. A
-        fourth channel is left out.
+        ``(H, W, 3)`` uint8, or float as OpenCV defines it: 0-1, hue 0-360, LUV and LAB with negative values.
+        A fourth channel is left out.
     conv
         ``"RGB2YCrCb"``, ``"BGR2YCrCb"``, ``"RGB2LUV"``, ``"RGB2HLS"``, ``"RGB2GRAY"``, ..., or an inverse
         such as ``"YCrCb2RGB"``, in upper or lower case; a color space alone, such as ``"LUV"``, means from
