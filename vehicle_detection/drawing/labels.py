@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -92,16 +93,18 @@ class LabelPlacer:
                 lines, size, fitted = _break_lines(
                     request.fields[:count], request.box, shape[1], scale, last_lines
                 )
-                # Another number of fields is like another place. More fields than before need more space, so
-                # that they do not come and go.
+                # Another number of fields is like another place.
                 before = last_place if last_fields in (None, count) else -1
+                margin, places = text_margin(scale), functools.partial(_places, request.box, size, shape)
                 grows = last_fields is not None and count > last_fields
-                margin = text_margin(scale) * (_GROWTH if grows else 1)
-                found = _free_place(_places(request.box, size, shape), obstacles, before, margin)
+                # More fields than before need more space, so that they do not come and go.
+                if grows and _free_place(places(), obstacles, -1, _GROWTH * margin) is None:
+                    continue
+                found = _free_place(places(), obstacles, before, margin)
                 if found is not None:
                     break
             else:
-                found = _least_hiding(_places(request.box, size, shape), obstacles, before)
+                found = _least_hiding(places(), obstacles, before)
             place, rectangle = found
             labels.append(Label(lines, rectangle, fitted, _leader(request.box, rectangle)))
             last[request.key] = count, len(lines), place
