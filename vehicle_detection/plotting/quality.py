@@ -232,7 +232,6 @@ def plot_f1(
         color = LINE_COLORS[number % len(LINE_COLORS)]
         bars = axes.bar(positions, values, width * 0.94, color=color, label=name)
         axes.bar_label(bars, ["" if np.isnan(v) else f"{v:.2f}" for v in values], padding=2, fontsize=8)
-    # The figure grows with the number of sources.
     _name_ticks(axes, [str(source) for source in sources])
     axes.set(ylim=(0, 1.1), ylabel=_METRIC_NAMES.get(metric, metric))
     axes.spines[["top", "right"]].set_visible(False)
