@@ -729,21 +729,6 @@ def test_existing_files_are_replaced_with_a_note(clip, picture, tmp_path):
         assert refuse(*words, *refused).startswith("error: --")
 
 
-def test_pixels_that_are_not_square_give_a_warning(tmp_path):
-    drive = render_drive(frames=20, random_state=1)
-    frames = [drive[index].image for index in range(20)]
-    warning = (
-        "warning: the pixels of this video are not square (width to height 4/3), so distances are wrong;"
-    )
-    for name, aspect in (("square", "1"), ("wide", "4/3")):
-        clip = write_clip(tmp_path / f"{name}.mp4", frames, options=["-vf", f"setsar={aspect}"])
-        words = ("video", clip, "--tracks", tmp_path / "t.csv", "--fov", 60)
-        result = run(*words)
-        assert result.exit_code == 0
-        assert (warning in result.stderr) == (name == "wide")
-        assert "warning" not in run(*words, "--quiet").stderr
-
-
 def test_a_damaged_video_has_an_exit_code_of_its_own(clip, tmp_path):
     lost, target = damage_sizes(clip, tmp_path / "lost.mp4", entry=3, byte=0, flip=64), tmp_path / "out.mp4"
     result = run("video", lost, "-o", target, "-q")

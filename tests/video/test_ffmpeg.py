@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.helpers import StubDetector, start_interruptible
-from tests.video.clips import NTSC, child_processes, ffmpeg, gray_frames, write_clip
+from tests.video.clips import NTSC, child_processes, ffmpeg, ffmpeg_log, gray_frames, write_clip
 from vehicle_detection.errors import TransientVideoError, VideoError
 from vehicle_detection.video import probe_video, process_video, read_frames
 from vehicle_detection.video.ffmpeg import Process, check_resources, exit_reason, ffmpeg_binary
@@ -36,11 +36,24 @@ def test_probe_reads_the_sound(clip, folder):
     assert not probe_video(write_clip(folder / "silent.mp4", gray_frames(3))).has_audio
 
 
-def test_anamorphic_pixels_are_kept(folder):
-    path = write_clip(folder / "wide_pixels.mp4", gray_frames(4), options=["-vf", "setsar=4/3"])
-    assert probe_video(path).pixel_aspect == Fraction(4, 3)
+@pytest.mark.parametrize(
+    ("aspect", "width"),
+    [("4/3", 86), ("8/9", 56), ("3/1", 192), ("1/1", 64), ("4095/4096", 64), ("4/1", 64), ("0/1", 64)],
+)
+def test_frames_of_anamorphic_video_have_square_pixels(folder, aspect, width):
+    path = write_clip(folder / "wide_pixels.mp4", gray_frames(4), options=["-vf", f"setsar={aspect}"])
+    assert probe_video(path).shape == (48, width, 3)
     process_video(path, folder / "out.mp4", StubDetector())
-    assert probe_video(folder / "out.mp4").pixel_aspect == Fraction(4, 3)
+    assert probe_video(folder / "out.mp4").shape == (48, width, 3)
+    assert "SAR" not in ffmpeg_log(folder / "out.mp4").replace("SAR 1:1", "")
+
+
+def test_anamorphic_video_is_turned_before_it_is_stretched(folder):
+    flat = write_clip(folder / "flat.mp4", gray_frames(4), options=["-vf", "setsar=4/3"])
+    ffmpeg("-display_rotation", 90, "-i", flat, "-c", "copy", folder / "turned.mp4")
+    assert probe_video(folder / "turned.mp4").shape == (64, 36, 3)
+    with read_frames(folder / "turned.mp4") as frames:
+        assert {frame.shape for _, _, frame in frames} == {(64, 36, 3)}
 
 
 @pytest.mark.parametrize(

@@ -237,6 +237,13 @@ def test_standard_input_waits_for_the_search(clip, tmp_path):
     assert frame_numbers(tmp_path / "out.mp4") == list(range(20))
 
 
+def test_anamorphic_frames_from_standard_input_have_square_pixels(tmp_path):
+    stream = write_clip(tmp_path / "wide.ts", gray_frames(4), options=["-vf", "setsar=4/3"]).read_bytes()
+    command = [sys.executable, "-c", FROM_STDIN, tmp_path / "out.mp4"]
+    subprocess.run(command, input=stream, capture_output=True, check=True)
+    assert probe_video(tmp_path / "out.mp4").shape == (48, 86, 3)
+
+
 @contextlib.contextmanager
 def endless_pipe(path):
     """A named pipe that a camera of 50 frames per second writes to, until its reader ends."""

@@ -44,16 +44,10 @@ from vehicle_detection.cli.output import (
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.params import DrawParams
     from vehicle_detection.report import TrackPicture
-    from vehicle_detection.video import FrameSource
 
 DAMAGED = 3  # exit code
-_NOT_SQUARE = (
-    "warning: the pixels of this video are not square (width to height {}), so distances are wrong; "
-    'convert it first: ffmpeg -i IN -vf "scale=trunc(iw*sar/2)*2:ih,setsar=1" OUT'
-)
 
 
 @option_names(target="--output", workers="--jobs", field_of_view="--fov", camera_height_m="--camera-height")
@@ -343,7 +337,8 @@ def video(
                     pictures = explain_vehicles(detector, again, log)
             page.finish(done, events=found, pictures=pictures)
     if not quiet and done.tracks:
-        _warn_of_distances(detector, opened)
+        if not detector.lens_is_known:
+            print_error(UNKNOWN_LENS)
     elif not quiet and opened.rereadable:
         given = None if horizon in (None, "auto") else f"--horizon {horizon}"
         if horizon is None and detector.search_params_of(opened.info.shape) != detector.search_params:
@@ -361,14 +356,6 @@ def video(
             print_line(f"wrote {', '.join(map(str, written))}")
     if done.damage:
         raise typer.Exit(DAMAGED)
-
-
-def _warn_of_distances(detector: VehicleDetector, source: FrameSource) -> None:
-    """Warn if the distances are rough because of the camera, or wrong because of the file."""
-    if not detector.lens_is_known:
-        print_error(UNKNOWN_LENS)
-    if source.info.pixel_aspect != 1:
-        print_error(_NOT_SQUARE.format(source.info.pixel_aspect))
 
 
 def _check_outputs(outputs: Mapping[str, Path | None], clips: Path | None, *, show: bool, why: bool) -> None:

@@ -54,6 +54,13 @@ def source_name(path: Path | str) -> str:
     return str(path) if isinstance(path, Path) else hide_credentials(path)
 
 
+SQUARE_PIXELS = "scale=w='if(gt(abs(sar-1),0.02)*between(sar,1/3,3),round(iw*sar/2)*2,iw)':h=ih"
+"""ffmpeg's filter that stretches anamorphic frames to square pixels, with an even width as H.264 requires.
+
+Ratios near 1, such as 4095:4096, count as square, and so do wild ones, which come from damaged headers.
+"""
+
+
 def pixel_limit() -> tuple[str, str]:
     """Options that limit the size of decoded frames."""
     return "-max_pixels", str(min(Limit.PIXELS.current(), 2**31 - 1))

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from vehicle_detection.errors import TransientVideoError, VideoError
 from vehicle_detection.video.ffmpeg import (
     NETWORK_TIMEOUT,
+    SQUARE_PIXELS,
     Process,
     check_frame_size,
     check_resources,
@@ -54,7 +55,9 @@ class _LiveProcess:
     ) -> None:
         self.name, self._timed = name, timed
         self._stalled = False
-        filters = "crop=trunc(iw/2)*2:trunc(ih/2)*2,scale=out_color_matrix=bt601:out_range=tv"
+        filters = (
+            f"{SQUARE_PIXELS},crop=trunc(iw/2)*2:trunc(ih/2)*2,scale=out_color_matrix=bt601:out_range=tv"
+        )
         rate: tuple[str, ...] = ()
         if like is not None:
             filters = f"scale={like.width}:{like.height}:out_color_matrix=bt601:out_range=tv"

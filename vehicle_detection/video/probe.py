@@ -18,6 +18,7 @@ from pathlib import Path
 from vehicle_detection._common import call_in_thread
 from vehicle_detection.errors import VideoError
 from vehicle_detection.video.ffmpeg import (
+    SQUARE_PIXELS,
     Process,
     check_frame_size,
     check_resources,
@@ -49,7 +50,8 @@ class VideoInfo:
     Attributes
     ----------
     width, height
-        Size of a frame in pixels, after the rotation stored in the file.
+        Size of a frame in pixels, after the rotation stored in the file. The width of anamorphic video, whose
+        stored pixels are not square, is that of frames with square pixels.
     fps
         Exact frame rate, such as 30000/1001; ``float(info.fps)`` is 29.97. If the file's rate varies, the
         constant rate to which its frames are converted.
@@ -63,8 +65,6 @@ class VideoInfo:
         Whether the file's frame rate is constant.
     start_time
         Time of the first frame in seconds after the file's start, if the sound starts earlier; otherwise 0.0.
-    pixel_aspect
-        Width over height of a pixel; other than 1 for anamorphic video.
     pixel_format
         ffmpeg's name of the pixel format, such as ``"yuv420p"``; empty if unknown.
     color_encoding
@@ -96,7 +96,6 @@ class VideoInfo:
     rotation: int = 0
     constant_rate: bool = True
     start_time: float = 0.0
-    pixel_aspect: Fraction = Fraction(1)
     pixel_format: str = ""
     color_encoding: ColorEncoding = field(default_factory=ColorEncoding)
     container: str = ""
@@ -157,7 +156,6 @@ def _probe(path: Path | str) -> VideoInfo:
         rotation=round(-float(_find(r"rotation of (-?[\d.]+) degrees", stream, "0"))) % 360,
         constant_rate=constant,
         start_time=start_time,
-        pixel_aspect=log.pixel_aspect,
         pixel_format=_find(r"n: *0 .*? fmt:(\w+)", log.decoded, ""),
         color_encoding=ColorEncoding(colors[2], colors[1] == "pc") if colors else ColorEncoding(),
         container=log.container,
@@ -174,7 +172,7 @@ def _probe(path: Path | str) -> VideoInfo:
 
 @dataclass(frozen=True, kw_only=True)
 class _Log:
-    """ffmpeg's log of the first frame.
+    """ffmpeg's log of the first frame, with square pixels.
 
     `header` describes the file, `decoded` the filter graph and the frame. `size` is the frame's width and
     height, `frame_time` its time in seconds.
@@ -184,14 +182,13 @@ class _Log:
     decoded: str
     container: str
     size: tuple[int, int]
-    pixel_aspect: Fraction
     frame_time: float
 
 
 def _read_log(path: Path | str) -> _Log:
     """Decode the first frame of a video; raise a VideoError if there is none."""
     # "V" excludes cover pictures. Only the showinfo filter prints the exact frame rate.
-    options = ("-map", "0:V:0", "-frames:v", "1", "-vf", "showinfo", "-f", "null", "-")
+    options = ("-map", "0:V:0", "-frames:v", "1", "-vf", f"{SQUARE_PIXELS},showinfo", "-f", "null", "-")
     source = ("-nostdin", *pixel_limit(), *input_options(path))
     name = source_name(path)
     with contextlib.closing(Process((*source, *options), level="info")) as process:
@@ -212,18 +209,16 @@ def _read_log(path: Path | str) -> _Log:
         raise video_error(message, path, code, log)
     if not mapped:
         raise VideoError(f"{name} has no video track; choose a file with one")
-    frame = re.search(r"n: *0 .*?pts_time:(\S+).*? sar:(\d+)/(\d+) s:(\d+)x(\d+)", decoded)
+    frame = re.search(r"n: *0 .*?pts_time:(\S+).*? s:(\d+)x(\d+)", decoded)
     if frame is None:
         message = f"{name} has no frame that can be decoded ({last_line(log)}); copy it again"
         raise video_error(message, path, code, log)
-    moment, *numbers = frame.groups()
-    numerator, denominator, width, height = map(int, numbers)
+    moment, width, height = frame.groups()
     return _Log(
         header=header,
         decoded=decoded,
         container=container,
-        size=(width, height),
-        pixel_aspect=Fraction(numerator, denominator) if numerator and denominator else Fraction(1),
+        size=(int(width), int(height)),
         frame_time=float(moment) if moment[-1].isdigit() else 0.0,
     )
 

@@ -136,7 +136,7 @@ class FrameReader(_FfmpegStream):
         self._strict, self._whole = strict, whole
         self._killed = False
         self._path, self._first, self._count = path, first, count
-        # A stream may change its frame size; all frames get the size of the first one.
+        # All frames get the probed size: a stream may change its size, and pixels may not be square.
         filters = [f"scale={info.width}:{info.height}:flags=bicubic"]
         early = _EARLY
         if not info.constant_rate:  # some seconds, to decode the frame that is still shown at the start
@@ -307,8 +307,6 @@ class FrameWriter(_FfmpegStream):
             encoded = ["-c:a", "aac", "-b:a", "192k", "-af", _SYNCHRONIZED + end]
             mapped += ["-c:a", "copy"] if copied else encoded
         filters = "setparams=colorspace=smpte170m:color_primaries=bt709:color_trc=bt709:range=tv"
-        if info.pixel_aspect != 1:
-            filters += f",setsar={info.pixel_aspect}"
         encoder = ["-vf", filters, "-c:v", "libx264", "-preset", preset, "-fps_mode", "passthrough"]
         # Chapters and other metadata are those of the whole source, and its title and place may be private.
         self._muxer = ["-map_chapters", "-1", "-map_metadata", "-1", "-f", container]
