@@ -922,7 +922,7 @@ def test_read_only_folders_are_refused(monkeypatch, material, clip, picture, tmp
 
 def test_demo_draws_annotates_and_scores(tmp_path):
     out = succeed("demo", "-o", tmp_path / "shown", "--frames", 5, "--seed", 4)
-    assert out.startswith("5 drawn frames of 1280x720")
+    assert out.startswith("5 rendered frames of 1280x720")
     for name in ("F1", "mean IoU", "MOTA", "identity switches"):
         assert re.search(rf"^  {name} +(-?\d\S*|nan)\s*$", out, re.MULTILINE), out
     assert re.search(r"speed +\d+\.\d frames/s", out)

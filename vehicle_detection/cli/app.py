@@ -195,11 +195,11 @@ def demo(
     from vehicle_detection.cli.demo import FILES, REPORT, run_demo
     from vehicle_detection.detector import VehicleDetector
 
-    # The field of view of the drawn camera.
+    # The field of view of the rendering camera.
     with output_folder(output, "--output"), VehicleDetector(field_of_view=58) as detector:
         done, scores = run_demo(output, detector, frames=frames, random_state=seed, report=report)
     print_facts(
-        f"{scores.frames} drawn frames of 1280x720, {scores.vehicles} vehicles, {scores.tracks} tracks",
+        f"{scores.frames} rendered frames of 1280x720, {scores.vehicles} vehicles, {scores.tracks} tracks",
         {
             "F1": f"{scores.f1:.3f}",
             "mean IoU": f"{scores.mean_iou:.3f}",

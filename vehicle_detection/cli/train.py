@@ -215,7 +215,7 @@ def train_frames(
         Path | None,
         Option(metavar="FILE.csv", help="Precision and recall on each source left out of training."),
     ] = None,
-    drawn: Annotated[bool, Option("--drawn/--no-drawn", help="Also train on drawn frames.")] = True,
+    drawn: Annotated[bool, Option("--drawn/--no-drawn", help="Also train on rendered frames.")] = True,
     seed: Annotated[int, Option(metavar="N", help="Random seed.")] = 0,
 ) -> None:
     """Train a model for any road on labelled frames, and evaluate it by cross-validation over the sources."""
