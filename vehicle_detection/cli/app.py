@@ -31,6 +31,7 @@ from vehicle_detection.cli.options import (
     LineWidth,
     Model,
     flag,
+    option,
     parse_blur,
 )
 from vehicle_detection.cli.output import (
@@ -182,9 +183,9 @@ def _global_options(
 @app.command()
 @option_names(random_state="--seed")
 def demo(
-    output: Annotated[Path, Option("-o", "--output", metavar="DIR", help="Folder to write.")] = Path("demo"),
-    frames: Annotated[int, Option(metavar="N", help="Number of frames.")] = 120,
-    seed: Annotated[int, Option(metavar="N", help="Random seed of the scene.")] = 0,
+    output: Annotated[Path, option("DIR", "Folder to write.", "-o", "--output")] = Path("demo"),
+    frames: Annotated[int, option("N", "Number of frames.")] = 120,
+    seed: Annotated[int, option("N", "Random seed of the scene.")] = 0,
     report: Annotated[bool, flag("--report", help="Write a page with the video and its tracks.")] = False,
 ) -> None:
     """Draw a drive, annotate it with the default model and score it against the ground truth.
@@ -217,38 +218,25 @@ def detect(
     images: Annotated[list[Path], Argument(metavar="IMAGE...", help="Image files, such as frames/*.jpg.")],
     output: Annotated[
         Path | None,
-        Option(
-            "-o",
-            "--output",
-            metavar="DIR",
-            help="Folder for annotated images, such as found.",
-            rich_help_panel=OUTPUT,
-        ),
+        option("DIR", "Folder for annotated images, such as found.", "-o", "--output", panel=OUTPUT),
     ] = None,
     boxes: Annotated[
         Path | None,
-        Option(
-            metavar="FILE",
-            help="Boxes by file name: .csv, .jsonl, .parquet or .json (COCO).",
-            rich_help_panel=OUTPUT,
-        ),
+        option("FILE", "Boxes by file name: .csv, .jsonl, .parquet or .json (COCO).", panel=OUTPUT),
     ] = None,
     why: Annotated[
         Path | None,
-        Option(
-            metavar="DIR",
-            help="Folder, such as why, for pictures that explain each box: the share of each cell.",
-            rich_help_panel=OUTPUT,
+        option(
+            "DIR",
+            "Folder, such as why, for pictures that explain each box: the share of each cell.",
+            panel=OUTPUT,
         ),
     ] = None,
     model: Model = "default",
     conf: Confidence = None,
     horizon: Horizon = None,
     labels: Annotated[
-        str,
-        Option(
-            metavar="score|none", help="Labels of the boxes in annotated images.", rich_help_panel=DRAWING
-        ),
+        str, option("score|none", "Labels of the boxes in annotated images.", panel=DRAWING)
     ] = "score",
     line_width: LineWidth = None,
     blur: Blur = None,
@@ -468,20 +456,18 @@ def evaluate(
     labels: Annotated[
         Path, Argument(metavar="LABELS.csv", help="True boxes, in one of these formats or KITTI's folder.")
     ],
-    iou: Annotated[float, Option(metavar="F", help="Minimum IoU of a correct box.")] = 0.5,
+    iou: Annotated[float, option("F", "Minimum IoU of a correct box.")] = 0.5,
     ignored_as_regions: Annotated[
         bool, flag("--ignored-as-regions", help="Ignore boxes of which half lies in an ignored box.")
     ] = False,
     frames: Annotated[
         str | None,
-        Option(
-            metavar="A-B|FILE",
-            help="Score only these frames: numbers, such as 0-299, or a text file with a name in each line.",
+        option(
+            "A-B|FILE",
+            "Score only these frames: numbers, such as 0-299, or a text file with a name in each line.",
         ),
     ] = None,
-    json: Annotated[
-        Path | None, Option(metavar="FILE", help="File for all scores, such as scores.json.")
-    ] = None,
+    json: Annotated[Path | None, option("FILE", "File for all scores, such as scores.json.")] = None,
 ) -> None:
     """Score boxes, and tracks if there are any, against labels."""
     from json import dumps

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer import Argument, Option
+from typer import Argument
 
 from vehicle_detection.cli.options import (
     Blur,
@@ -24,6 +24,7 @@ from vehicle_detection.cli.options import (
     NoAudio,
     Preset,
     flag,
+    option,
 )
 from vehicle_detection.cli.output import (
     UNKNOWN_LENS,
@@ -45,11 +46,11 @@ from vehicle_detection.errors import InvalidInputError
 def batch(
     output: Annotated[
         str,
-        Option(
+        option(
+            "DIR|URL",
+            "Folder or URL of the results, such as results or s3://fleet/results.",
             "-o",
             "--output",
-            metavar="DIR|URL",
-            help="Folder or URL of the results, such as results or s3://fleet/results.",
         ),
     ],
     sources: Annotated[
@@ -62,22 +63,16 @@ def batch(
     model: Model = "default",
     conf: Confidence = None,
     jobs: Annotated[
-        int | None,
-        Option(metavar="N", help="Worker processes of one thread, such as 4; default: one per core."),
+        int | None, option("N", "Worker processes of one thread, such as 4; default: one per core.")
     ] = None,
     shard: Annotated[
-        str | None, Option(metavar="I/N", help="Process the I-th of N parts, such as 2/8, for job arrays.")
+        str | None, option("I/N", "Process the I-th of N parts, such as 2/8, for job arrays.")
     ] = None,
     dask: Annotated[
         str | None,
-        Option(
-            metavar="ADDRESS|local",
-            help="Use a Dask cluster, such as tcp://10.0.0.5:8786, or start one here.",
-        ),
+        option("ADDRESS|local", "Use a Dask cluster, such as tcp://10.0.0.5:8786, or start one here."),
     ] = None,
-    group: Annotated[
-        str, Option(metavar="trip|file", help="Make consecutive segments one trip, or each file.")
-    ] = "trip",
+    group: Annotated[str, option("trip|file", "Make consecutive segments one trip, or each file.")] = "trip",
     tracks_only: Annotated[bool, flag("--tracks-only", help="Write no videos.")] = False,
     horizon: Horizon = None,
     camera: CameraName = None,
@@ -93,7 +88,7 @@ def batch(
     dry_run: Annotated[bool, flag("--dry-run", help="Only list the trips that would be processed.")] = False,
     status: Annotated[bool, flag("--status", help="Only show what has been done.")] = False,
     summary: Annotated[
-        Path | None, Option(metavar="FILE.csv", help="Table with a row for each trip that has been done.")
+        Path | None, option("FILE.csv", "Table with a row for each trip that has been done.")
     ] = None,
     quiet: Annotated[bool, flag("-q", "--quiet", help="Print errors only.")] = False,
 ) -> None:

@@ -15,85 +15,88 @@ PATCHES = "--vehicles and --non-vehicles"
 HORIZON_HELP = "Row of the horizon as a fraction of the frame's height, 0 at the top, such as 0.55."
 
 
-def flag(*names: str, panel: str | None = None, help: str) -> Any:  # noqa: A002 - typer's name
+def option(metavar: str, help: str, *names: str, panel: str | None = None) -> Any:  # noqa: A002 - as typer
+    """Option with a value; without `names`, the parameter names it."""
+    return Option(*names, metavar=metavar, help=help, rich_help_panel=panel)
+
+
+def flag(*names: str, panel: str | None = None, help: str) -> Any:  # noqa: A002 - as typer
     """Option without a value; the help shows no type for it."""
-    return Option(*names, metavar="", help=help, rich_help_panel=panel)
+    return option("", help, *names, panel=panel)
 
 
 Model = Annotated[
     str,
-    Option(
-        metavar="NAME|FILE",
-        help='"default" (any road), "highway" (the course\'s), or a model file, such as own.safetensors.',
-        rich_help_panel=SEARCH,
+    option(
+        "NAME|FILE",
+        '"default" (any road), "highway" (the course\'s), or a model file, such as own.safetensors.',
+        panel=SEARCH,
     ),
 ]
 Confidence = Annotated[
     float | None,
-    Option(
-        metavar="P",
-        help="Minimum confidence, a probability from 0 to 1, such as 0.5; default: the model's threshold.",
-        rich_help_panel=SEARCH,
+    option(
+        "P",
+        "Minimum confidence, a probability from 0 to 1, such as 0.5; default: the model's threshold.",
+        panel=SEARCH,
     ),
 ]
 Every = Annotated[
     int | None,
-    Option(
-        metavar="N",
-        help="Search every N-th frame, and interpolate between; 1: every frame; default: 12 a second.",
-        rich_help_panel=SEARCH,
+    option(
+        "N",
+        "Search every N-th frame, and interpolate between; 1: every frame; default: 12 a second.",
+        panel=SEARCH,
     ),
 ]
-Horizon = Annotated[float | None, Option(metavar="F", help=HORIZON_HELP, rich_help_panel=CAMERA)]
+Horizon = Annotated[float | None, option("F", HORIZON_HELP, panel=CAMERA)]
 CameraName = Annotated[
     str | None,
-    Option(
-        metavar="NAME|FILE",
-        help="Lens: standard-58, wide-90, fisheye-120, fisheye-140 or fisheye-170; or a JSON file.",
-        rich_help_panel=CAMERA,
+    option(
+        "NAME|FILE",
+        "Lens: standard-58, wide-90, fisheye-120, fisheye-140 or fisheye-170; or a JSON file.",
+        panel=CAMERA,
     ),
 ]
 FieldOfView = Annotated[
     float | None,
-    Option(
+    option(
+        "DEG",
+        "Field of view along the longer side in degrees, such as 90; default: 58, with a warning.",
         "--fov",
-        metavar="DEG",
-        help="Field of view along the longer side in degrees, such as 90; default: 58, with a warning.",
-        rich_help_panel=CAMERA,
+        panel=CAMERA,
     ),
 ]
 CameraHeight = Annotated[
     float | None,
-    Option(
+    option(
+        "M",
+        "Height of the lens above the road in meters, such as 1.5; default: 1.3.",
         "--camera-height",
-        metavar="M",
-        help="Height of the lens above the road in meters, such as 1.5; default: 1.3.",
-        rich_help_panel=CAMERA,
+        panel=CAMERA,
     ),
 ]
 LineWidth = Annotated[
     int | None,
-    Option(
+    option(
+        "N",
+        "Width of the boxes' lines in pixels, such as 3; default: by size of the frame.",
         "--line-width",
-        metavar="N",
-        help="Width of the boxes' lines in pixels, such as 3; default: by size of the frame.",
-        rich_help_panel=DRAWING,
+        panel=DRAWING,
     ),
 ]
 Blur = Annotated[
     str | None,
-    Option(
-        metavar="vehicles|plates",
-        help="Blur the vehicles, or the region of their plates, in what is written.",
-        rich_help_panel=DRAWING,
+    option(
+        "vehicles|plates",
+        "Blur the vehicles, or the region of their plates, in what is written.",
+        panel=DRAWING,
     ),
 ]
 Preset = Annotated[
     str,
-    Option(
-        metavar="NAME",
-        help="Speed of the encoder, from ultrafast (large files) to placebo (small ones).",
-        rich_help_panel=OUTPUT,
+    option(
+        "NAME", "Speed of the encoder, from ultrafast (large files) to placebo (small ones).", panel=OUTPUT
     ),
 ]
 NoAudio = Annotated[bool, flag("--no-audio", panel=OUTPUT, help="Write no sound.")]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Option
 
-from vehicle_detection.cli.options import PATCHES, flag
+from vehicle_detection.cli.options import PATCHES, flag, option
 from vehicle_detection.cli.output import (
     capture_stderr,
     check_distinct_paths,
@@ -33,45 +33,34 @@ _HIDDEN_FOLD_COLUMNS = "best_f1", "strict_average_precision", "calibration_error
 
 @option_names(random_state="--seed", patches_or_labels=PATCHES, patch_set=PATCHES)
 def train(
-    vehicles: Annotated[
-        Path, Option(metavar="PATH", help="Folder or zip of patches of vehicles, such as vehicles.zip.")
-    ],
+    vehicles: Annotated[Path, option("PATH", "Folder or zip of patches of vehicles, such as vehicles.zip.")],
     non_vehicles: Annotated[
-        Path, Option(metavar="PATH", help="Folder or zip of other patches, such as non-vehicles.zip.")
+        Path, option("PATH", "Folder or zip of other patches, such as non-vehicles.zip.")
     ],
     output: Annotated[
-        Path, Option("-o", "--output", metavar="FILE", help="Model file to write, such as own.safetensors.")
+        Path, option("FILE", "Model file to write, such as own.safetensors.", "-o", "--output")
     ],
     features: Annotated[
-        str, Option(metavar="PRESET", help="lab-9432, lab-8460, ycrcb-8460, ycrcb-6156 or luv-2384.")
+        str, option("PRESET", "lab-9432, lab-8460, ycrcb-8460, ycrcb-6156 or luv-2384.")
     ] = "lab-9432",
     split: Annotated[
-        str, Option(metavar="random|sequences", help="Split whose accuracy is reported as the model's.")
+        str, option("random|sequences", "Split whose accuracy is reported as the model's.")
     ] = "random",
-    C: Annotated[float, Option("--C", metavar="F", help="Inverse regularization strength.")] = 1e-4,
-    seed: Annotated[int, Option(metavar="N", help="Random seed of solver and first split.")] = 0,
+    C: Annotated[float, option("F", "Inverse regularization strength.", "--C")] = 1e-4,
+    seed: Annotated[int, option("N", "Random seed of solver and first split.")] = 0,
     no_mirror: Annotated[bool, flag("--no-mirror", help="Train without mirrored copies.")] = False,
     gamma: Annotated[
         float | None,
-        Option(
-            metavar="F",
-            help="Brightness range of mirrored copies, such as 0.3; default: 0.4, without mirroring 0.",
-        ),
+        option("F", "Brightness range of mirrored copies, such as 0.3; default: 0.4, without mirroring 0."),
     ] = None,
     degraded: Annotated[
-        float, Option(metavar="W", help="Weight of blurred, pale and compressed copies of each patch, 0-1.")
+        float, option("W", "Weight of blurred, pale and compressed copies of each patch, 0-1.")
     ] = 0.05,
-    solver: Annotated[
-        str,
-        Option(metavar="dual|liblinear", help="liblinear is LinearSVC: same model, slower."),
-    ] = "dual",
-    report: Annotated[
-        Path | None, Option(metavar="FILE.json", help="Scores on every split, timings.")
-    ] = None,
-    card: Annotated[Path | None, Option(metavar="FILE.md", help="Model card to write.")] = None,
+    solver: Annotated[str, option("dual|liblinear", "liblinear is LinearSVC: same model, slower.")] = "dual",
+    report: Annotated[Path | None, option("FILE.json", "Scores on every split, timings.")] = None,
+    card: Annotated[Path | None, option("FILE.md", "Model card to write.")] = None,
     compare: Annotated[
-        list[str] | None,
-        Option(metavar="PRESET", help="Other features to evaluate, such as luv-2384; repeatable."),
+        list[str] | None, option("PRESET", "Other features to evaluate, such as luv-2384; repeatable.")
     ] = None,
 ) -> None:
     """Train a model on patches, and evaluate it on held-out patches; by default like the model "highway"."""
@@ -139,8 +128,7 @@ def _print_report(report: TrainingReport) -> None:
 
 def fetch(
     output: Annotated[
-        Path | None,
-        Option("-o", "--output", metavar="DIR", help="Folder, such as data; default: the user's cache."),
+        Path | None, option("DIR", "Folder, such as data; default: the user's cache.", "-o", "--output")
     ] = None,
 ) -> None:
     """Download the course's training patches (110 MB) once."""
@@ -205,18 +193,16 @@ def train_frames(
         Argument(metavar="DATA", help="Folder with labels/NAME.csv and frames/NAME/ or videos/NAME.mp4."),
     ],
     output: Annotated[
-        Path, Option("-o", "--output", metavar="FILE", help="Model file to write, such as own.safetensors.")
+        Path, option("FILE", "Model file to write, such as own.safetensors.", "-o", "--output")
     ],
     patches: Annotated[
-        Path | None,
-        Option(metavar="PATH", help="Folder or zip of patches with more vehicles, such as vehicles.zip."),
+        Path | None, option("PATH", "Folder or zip of patches with more vehicles, such as vehicles.zip.")
     ] = None,
     curves: Annotated[
-        Path | None,
-        Option(metavar="FILE.csv", help="Precision and recall on each source left out of training."),
+        Path | None, option("FILE.csv", "Precision and recall on each source left out of training.")
     ] = None,
     drawn: Annotated[bool, Option("--drawn/--no-drawn", help="Also train on rendered frames.")] = True,
-    seed: Annotated[int, Option(metavar="N", help="Random seed.")] = 0,
+    seed: Annotated[int, option("N", "Random seed.")] = 0,
 ) -> None:
     """Train a model for any road on labelled frames, and evaluate it by cross-validation over the sources."""
     from vehicle_detection._common import check_suffix, check_target, pluralize

@@ -8,9 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from typer import Option
-
-from vehicle_detection.cli.options import PATCHES, flag
+from vehicle_detection.cli.options import PATCHES, flag, option
 from vehicle_detection.cli.output import (
     check_distinct_paths,
     option_names,
@@ -38,44 +36,34 @@ _MAX_ROWS = 15
     patch_set=PATCHES,
 )
 def tune(
-    vehicles: Annotated[
-        Path, Option(metavar="PATH", help="Folder or zip of patches of vehicles, such as vehicles.zip.")
-    ],
+    vehicles: Annotated[Path, option("PATH", "Folder or zip of patches of vehicles, such as vehicles.zip.")],
     non_vehicles: Annotated[
-        Path, Option(metavar="PATH", help="Folder or zip of other patches, such as non-vehicles.zip.")
+        Path, option("PATH", "Folder or zip of other patches, such as non-vehicles.zip.")
     ],
-    grid: Annotated[
-        str, Option(metavar="GRID", help="Values to try: 'orient=8,9 color_space=YCrCb,LAB C=1e-4,1'.")
-    ],
+    grid: Annotated[str, option("GRID", "Values to try: 'orient=8,9 color_space=YCrCb,LAB C=1e-4,1'.")],
     output: Annotated[
         Path,
-        Option(
+        option(
+            "FILE.csv",
+            "Table to write: .csv, .jsonl or .parquet. Results are saved one by one; the same command "
+            "resumes an interrupted run.",
             "-o",
             "--output",
-            metavar="FILE.csv",
-            help="Table to write: .csv, .jsonl or .parquet. Results are saved one by one; the same command "
-            "resumes an interrupted run.",
         ),
     ],
-    plot: Annotated[Path | None, Option(metavar="FILE.png", help="Accuracy against search time.")] = None,
-    split: Annotated[str, Option(metavar="sequences|groups|random", help="Held-out patches.")] = "sequences",
+    plot: Annotated[Path | None, option("FILE.png", "Accuracy against search time.")] = None,
+    split: Annotated[str, option("sequences|groups|random", "Held-out patches.")] = "sequences",
     halving: Annotated[
         bool, flag("--halving", help="Eliminate poor configurations on few patches (successive halving).")
     ] = False,
-    finalists: Annotated[
-        int, Option(metavar="N", help="Configurations to measure fully after --halving.")
-    ] = 3,
+    finalists: Annotated[int, option("N", "Configurations to measure fully after --halving.")] = 3,
     frames: Annotated[
-        Path | None, Option(metavar="DIR", help="Labelled frames to score models on, such as test_images.")
+        Path | None, option("DIR", "Labelled frames to score models on, such as test_images.")
     ] = None,
-    labels: Annotated[Path | None, Option(metavar="FILE.csv", help="True boxes of --frames.")] = None,
-    horizon: Annotated[
-        float | None, Option(metavar="F", help="Horizon of --frames, 0 (top) to 1, such as 0.55.")
-    ] = None,
-    seed: Annotated[int, Option(metavar="N", help="Random seed of splits and training.")] = 0,
-    cache: Annotated[
-        Path | None, Option(metavar="DIR", help="Folder to keep features in, such as cache.")
-    ] = None,
+    labels: Annotated[Path | None, option("FILE.csv", "True boxes of --frames.")] = None,
+    horizon: Annotated[float | None, option("F", "Horizon of --frames, 0 (top) to 1, such as 0.55.")] = None,
+    seed: Annotated[int, option("N", "Random seed of splits and training.")] = 0,
+    cache: Annotated[Path | None, option("DIR", "Folder to keep features in, such as cache.")] = None,
 ) -> None:
     """Train and measure every combination of a grid of parameters, and show the best."""
     from vehicle_detection._common import check_choice, check_integer, check_target

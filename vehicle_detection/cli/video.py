@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer import Argument, Option
+from typer import Argument
 
 from vehicle_detection.cli.horizon import find_horizon, parse_horizon, search_everywhere, warn_of_horizon
 from vehicle_detection.cli.options import (
@@ -29,6 +29,7 @@ from vehicle_detection.cli.options import (
     NoAudio,
     Preset,
     flag,
+    option,
     parse_blur,
 )
 from vehicle_detection.cli.output import (
@@ -62,29 +63,19 @@ def video(
     ],
     output: Annotated[
         Path | None,
-        Option(
-            "-o",
-            "--output",
-            metavar="TARGET",
-            help="Video to write: .mp4, .m4v, .mov or .mkv.",
-            rich_help_panel=OUTPUT,
-        ),
+        option("TARGET", "Video to write: .mp4, .m4v, .mov or .mkv.", "-o", "--output", panel=OUTPUT),
     ] = None,
     show: Annotated[
-        bool,
-        flag("--show", panel=OUTPUT, help="Show the annotated frames in a window; Escape ends the run."),
+        bool, flag("--show", panel=OUTPUT, help="Show the annotated frames in a window; Escape ends the run.")
     ] = False,
     tracks: Annotated[
         Path | None,
-        Option(
-            metavar="FILE",
-            help="Tracks: .csv, .jsonl, .parquet, .txt (MOT), .zip (CVAT) or .json (COCO).",
-            rich_help_panel=OUTPUT,
+        option(
+            "FILE", "Tracks: .csv, .jsonl, .parquet, .txt (MOT), .zip (CVAT) or .json (COCO).", panel=OUTPUT
         ),
     ] = None,
     report: Annotated[
-        Path | None,
-        Option(metavar="FILE.html", help="Page with the video and its tracks.", rich_help_panel=OUTPUT),
+        Path | None, option("FILE.html", "Page with the video and its tracks.", panel=OUTPUT)
     ] = None,
     why: Annotated[
         bool,
@@ -93,27 +84,18 @@ def video(
         ),
     ] = False,
     events: Annotated[
-        Path | None,
-        Option(
-            metavar="FILE",
-            help="Events, such as cut-ins and overtaking: .csv or .json.",
-            rich_help_panel=OUTPUT,
-        ),
+        Path | None, option("FILE", "Events, such as cut-ins and overtaking: .csv or .json.", panel=OUTPUT)
     ] = None,
     clips: Annotated[
         Path | None,
-        Option(
-            metavar="DIR",
-            help="Folder for a short annotated clip of each event, such as clips.",
-            rich_help_panel=OUTPUT,
-        ),
+        option("DIR", "Folder for a short annotated clip of each event, such as clips.", panel=OUTPUT),
     ] = None,
     srt: Annotated[
         Path | None,
-        Option(
-            metavar="FILE",
-            help="Subtitles with vehicles, nearest distance and events, second by second: .srt or .ass.",
-            rich_help_panel=OUTPUT,
+        option(
+            "FILE",
+            "Subtitles with vehicles, nearest distance and events, second by second: .srt or .ass.",
+            panel=OUTPUT,
         ),
     ] = None,
     preset: Preset = "veryfast",
@@ -122,40 +104,32 @@ def video(
         bool, flag("-q", "--quiet", panel=OUTPUT, help="Print errors and warnings of damage only.")
     ] = False,
     profile: Annotated[bool, flag("--profile", panel=OUTPUT, help="Print the time of each stage.")] = False,
-    start: Annotated[
-        float | None,
-        Option(metavar="S", help="Start time in seconds, such as 12.5.", rich_help_panel=INPUT),
-    ] = None,
-    end: Annotated[
-        float | None, Option(metavar="S", help="End time in seconds, such as 30.", rich_help_panel=INPUT)
-    ] = None,
-    fps: Annotated[
-        float,
-        Option(metavar="N", help="Frame rate of a source of images, such as 10.", rich_help_panel=INPUT),
-    ] = 25.0,
+    start: Annotated[float | None, option("S", "Start time in seconds, such as 12.5.", panel=INPUT)] = None,
+    end: Annotated[float | None, option("S", "End time in seconds, such as 30.", panel=INPUT)] = None,
+    fps: Annotated[float, option("N", "Frame rate of a source of images, such as 10.", panel=INPUT)] = 25.0,
     own_speed: Annotated[
         str | None,
-        Option(
-            metavar="SPEED",
-            help="Own speed in km/h, such as 100, or 62mph, for headways and speeds over ground.",
-            rich_help_panel=INPUT,
+        option(
+            "SPEED",
+            "Own speed in km/h, such as 100, or 62mph, for headways and speeds over ground.",
+            panel=INPUT,
         ),
     ] = None,
     gpx: Annotated[
         Path | None,
-        Option(
-            metavar="FILE",
-            help="Own speed over time: a GPX track, or a .csv table with the columns time_s and speed_kmh.",
-            rich_help_panel=INPUT,
+        option(
+            "FILE",
+            "Own speed over time: a GPX track, or a .csv table with the columns time_s and speed_kmh.",
+            panel=INPUT,
         ),
     ] = None,
     gpx_offset: Annotated[
         float,
-        Option(
-            metavar="S",
-            help="Time of the video's start in --gpx: seconds after the first point of a track, or the "
+        option(
+            "S",
+            "Time of the video's start in --gpx: seconds after the first point of a track, or the "
             "time_s of a table, such as 12.5 or -3.",
-            rich_help_panel=INPUT,
+            panel=INPUT,
         ),
     ] = 0.0,
     live: Annotated[
@@ -177,10 +151,8 @@ def video(
     camera_height: CameraHeight = None,
     horizon: Annotated[
         str | None,
-        Option(
-            metavar="F|auto",
-            help=f'{HORIZON_HELP} "auto": estimated from vehicles in a sample of frames.',
-            rich_help_panel=CAMERA,
+        option(
+            "F|auto", f'{HORIZON_HELP} "auto": estimated from vehicles in a sample of frames.', panel=CAMERA
         ),
     ] = None,
     model: Model = "default",
@@ -188,41 +160,29 @@ def video(
     every: Every = None,
     jobs: Annotated[
         int | None,
-        Option(
-            metavar="N",
-            help="Frames searched in parallel, such as 2; default: one per core, at most 4.",
-            rich_help_panel=SEARCH,
+        option(
+            "N", "Frames searched in parallel, such as 2; default: one per core, at most 4.", panel=SEARCH
         ),
     ] = None,
     labels: Annotated[
         str,
-        Option(
-            metavar="LIST",
-            help="Fields of the labels: some of id,distance,speed,score,std, such as id,distance; or none.",
-            rich_help_panel=DRAWING,
+        option(
+            "LIST",
+            "Fields of the labels: some of id,distance,speed,score,std, such as id,distance; or none.",
+            panel=DRAWING,
         ),
     ] = "id,distance,speed",
     line_width: LineWidth = None,
     color_by: Annotated[
-        str,
-        Option(
-            metavar="id|distance", help="What the colors of the boxes stand for.", rich_help_panel=DRAWING
-        ),
+        str, option("id|distance", "What the colors of the boxes stand for.", panel=DRAWING)
     ] = "id",
     panel: Annotated[
-        str,
-        Option(
-            metavar="corner|side|none",
-            help="Bird's-eye view in the frame's corner, or beside it.",
-            rich_help_panel=DRAWING,
-        ),
+        str, option("corner|side|none", "Bird's-eye view in the frame's corner, or beside it.", panel=DRAWING)
     ] = "none",
     units: Annotated[
         str,
-        Option(
-            metavar="metric|imperial",
-            help="Labels, subtitles and report in m and km/h, or ft and mph.",
-            rich_help_panel=DRAWING,
+        option(
+            "metric|imperial", "Labels, subtitles and report in m and km/h, or ft and mph.", panel=DRAWING
         ),
     ] = "metric",
     blur: Blur = None,
