@@ -1,4 +1,4 @@
-"""Signals that arrive where Python prints an exception and goes on, so that an interrupt would be lost."""
+"""Signals that end a program, also where Python would print their exception and go on."""
 
 from __future__ import annotations
 
@@ -6,6 +6,10 @@ import _thread
 import signal
 import time
 from types import FrameType
+
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+ENDING_SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
+"""SIGHUP: the terminal was closed. SIGBREAK: Ctrl-Break on Windows, and the end of its terminal."""
 
 # Modules whose functions are called from C, by the compiler of the kernels and for weak references, and the
 # method that finalizes an object.

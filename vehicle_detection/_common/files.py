@@ -17,14 +17,13 @@ from types import FrameType
 from typing import Any
 
 from vehicle_detection._common.checks import check_path
+from vehicle_detection._signals import ENDING_SIGNALS
 from vehicle_detection.errors import InvalidInputError, OutputError, VehicleDetectionError
 
 _FULL = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
 _DISK_ERRORS = (*_FULL, errno.EROFS, errno.EIO)
 # Processes that write one target at the same time, above which their leftovers are not removed.
 _MAX_PARTS = 100
-_SIGNAL_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
-_SIGNALS = tuple(getattr(signal, name) for name in _SIGNAL_NAMES if hasattr(signal, name))
 
 _SYSTEM_FOLDERS = ("__macosx", "$recycle.bin", "system volume information", "lost+found")
 
@@ -123,7 +122,7 @@ def _uninterrupted() -> Iterator[None]:
             handlers[number](number, frame)
 
     try:
-        for number in _SIGNALS:
+        for number in ENDING_SIGNALS:
             handler = signal.getsignal(number)
             if callable(handler):  # neither ignored nor the default of the system
                 handlers[number] = handler

@@ -11,11 +11,8 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import NoReturn
 
-from vehicle_detection._signals import postpone
+from vehicle_detection._signals import ENDING_SIGNALS, postpone
 
-# SIGHUP: the terminal was closed. SIGBREAK: Ctrl-Break on Windows, and the end of its terminal.
-_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
-_SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
 # Seconds after a signal in which others are ignored, so that a second Ctrl-C does not interrupt the cleanup.
 _CLEANUP_SECONDS = 1.0
 
@@ -60,7 +57,7 @@ def raise_on_signals() -> Iterator[None]:
 def _set_handlers(handler: signal._HANDLER) -> dict[int, signal._HANDLER]:
     """Set the handler of all signals that are not ignored, as by nohup; return the earlier ones."""
     before: dict[int, signal._HANDLER] = {}
-    for number in _SIGNALS:
+    for number in ENDING_SIGNALS:
         if signal.getsignal(number) not in (signal.SIG_IGN, None):
             before[number] = signal.signal(number, handler)
     return before
