@@ -16,7 +16,6 @@ from vehicle_detection.boxes.geometry import (
     overlap_matrices,
 )
 from vehicle_detection.boxes.scores import (
-    CERTAIN_SCORE,
     Platt,
     ScoreScale,
     check_score_scale,
@@ -25,7 +24,6 @@ from vehicle_detection.boxes.scores import (
 )
 
 __all__ = [
-    "CERTAIN_SCORE",
     "Detections",
     "Platt",
     "ScoreScale",

@@ -30,8 +30,8 @@ Result = TypeVar("Result")
 # Name of a thread that `run_interruptible` has abandoned.
 _ABANDONED = "abandoned"
 
-# Width of tables that are not printed to a terminal; fits a fingerprint in one line.
 _USUAL_WIDTH = 80  # of a terminal that does not state its own
+# Width of tables that are not printed to a terminal; fits a fingerprint in one line.
 _PIPE_WIDTH = 120
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vehicle_detection.params.drawing import COLORINGS, LABEL_FIELDS, PANELS, DrawParams
+from vehicle_detection.params.drawing import LABEL_FIELDS, DrawParams
 from vehicle_detection.params.features import (
     COLOR_SPACES,
     HOG_CHANNELS,
@@ -23,11 +23,9 @@ from vehicle_detection.params.search import (
 from vehicle_detection.params.tracking import TrackParams
 
 __all__ = [
-    "COLORINGS",
     "COLOR_SPACES",
     "HOG_CHANNELS",
     "LABEL_FIELDS",
-    "PANELS",
     "PATCH_SIZE",
     "REFERENCE_WIDTH",
     "SPATIAL_ORDERS",

@@ -10,12 +10,11 @@ from vehicle_detection.video.process import PRESETS, VideoReport, VideoRun, cut_
 from vehicle_detection.video.reading import probe_video, read_frames
 from vehicle_detection.video.remote import download, open_filesystem, with_retries
 from vehicle_detection.video.sources import Source, borrow_source, open_source
-from vehicle_detection.video.trips import UNKNOWN_CAMERA, Trip, find_trips, is_video_file
+from vehicle_detection.video.trips import Trip, find_trips, is_video_file
 from vehicle_detection.video.viewer import Viewer, open_viewer
 
 __all__ = [
     "PRESETS",
-    "UNKNOWN_CAMERA",
     "FrameSource",
     "OwnSpeed",
     "Source",
