@@ -15,7 +15,7 @@ from typing import Any, Literal
 from rich.console import Console
 from rich.table import Table
 
-from vehicle_detection._common import JOBS_VARIABLE, atomic_write, available_cores
+from vehicle_detection._common import JOBS_VARIABLE, available_cores, write_text
 
 LIBRARIES = (
     "imageio-ffmpeg",
@@ -163,5 +163,4 @@ def write_json(results: Results, path: Path) -> None:
             kept = dict(earlier["benchmarks"])
     kept |= {name: [row.to_dict() for row in rows] for name, rows in results.items()}
     text = json.dumps({"machine": facts, "benchmarks": kept}, indent=2, ensure_ascii=False)
-    with atomic_write(path) as part:
-        part.write_text(text + "\n", encoding="utf-8")
+    write_text(path, text + "\n")

@@ -20,7 +20,7 @@ import pandas as pd
 
 from benchmarks._course_runs import COURSE_C, PLANS, SPLITS, Runs, summarize
 from benchmarks._report import machine_facts
-from vehicle_detection._common import atomic_write
+from vehicle_detection._common import atomic_write, write_text
 from vehicle_detection.classifier import load_classifier
 from vehicle_detection.datasets import load_training_patches
 from vehicle_detection.tuning import write_results
@@ -58,8 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         load_training_patches(Path(folder) / "vehicles.zip", Path(folder) / "non-vehicles.zip"), results
     )
     parts = [_HEAD, *(section(runs, results) for section in _SECTIONS), _machine()]
-    with atomic_write(Path(options.out) / "results.md") as part:
-        part.write_text("\n".join(parts), encoding="utf-8")
+    write_text(Path(options.out) / "results.md", "\n".join(parts))
 
 
 def _svm_section(name: str) -> Callable[[Runs, Path], str]:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tools.recall_tables import VISIBILITY, WIDTHS, recall_tables
-from vehicle_detection._common import atomic_write
+from vehicle_detection._common import write_text
 from vehicle_detection.mixture import TemplateMixture
 from vehicle_detection.mixture_training import (
     FOLD_COLUMNS,
@@ -92,8 +92,7 @@ def write_card(
         "## Limits",
         "\n".join(markdown_text(line, "- ") for line in _LIMITS),
     ]
-    with atomic_write(path, "path") as part:
-        part.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+    write_text(path, "\n\n".join(parts) + "\n", "path")
 
 
 def _details(folds: Sequence[FoldDetections], scores: Sequence[FoldScore]) -> list[str]:

@@ -22,7 +22,7 @@ from PIL import Image as PillowImage
 
 import vehicle_detection
 from vehicle_detection import DetectorError, FrameResult, VehicleDetectionError, VehicleDetector, iou_matrix
-from vehicle_detection._common import atomic_write, progress_bar
+from vehicle_detection._common import atomic_write, progress_bar, write_text
 from vehicle_detection.camera import Camera
 from vehicle_detection.drawing import TrackDrawer
 from vehicle_detection.images import write_image
@@ -73,8 +73,7 @@ def make_pictures(folder: Path, detector: VehicleDetector, scene: Mapping[str, A
         "files": {name: file_hash(folder / name) for name in FILES},
         "boxes": boxes,
     }
-    with atomic_write(folder / RECORD) as part:
-        part.write_text(json.dumps(record) + "\n", encoding="utf-8")
+    write_text(folder / RECORD, json.dumps(record) + "\n")
 
 
 def find_errors(

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from tools.browser import Browser
 from tools.pictures import MODEL, file_hash, find_errors
 from vehicle_detection import DetectorError, Explorer, VehicleDetectionError, VehicleDetector
-from vehicle_detection._common import atomic_write
+from vehicle_detection._common import atomic_write, write_text
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.events import find_events
 from vehicle_detection.report import ReportWriter
@@ -64,8 +64,7 @@ def make_screenshots(folder: Path, detector: VehicleDetector) -> None:
         with atomic_write(folder / name) as part:
             part.write_bytes(data.tobytes())
     record = {"model": file_hash(MODEL), "files": {name: file_hash(folder / name) for name in FILES}}
-    with atomic_write(folder / RECORD) as part:
-        part.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    write_text(folder / RECORD, json.dumps(record, indent=2) + "\n")
 
 
 def _write_explorer_page(folder: Path) -> Path:

@@ -23,7 +23,6 @@ from numpy.typing import ArrayLike, NDArray
 from vehicle_detection._common import (
     Floats,
     Limit,
-    atomic_write,
     check_array,
     check_bool,
     check_boxes,
@@ -35,6 +34,7 @@ from vehicle_detection._common import (
     check_type,
     describe,
     read_regular_file,
+    write_text,
 )
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
@@ -374,8 +374,7 @@ def write_camera(camera: Camera, path: str | os.PathLike[str], shape: tuple[int,
     height, width = check_shape(shape)
     values = {"image_size": [width, height], **dataclasses.asdict(camera.for_shape((height, width)))}
     del values["shape"]
-    with atomic_write(path, "path") as part:
-        part.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8", newline="\n")
+    write_text(path, json.dumps(values, indent=2) + "\n", "path")
 
 
 def read_camera(path: str | os.PathLike[str], shape: tuple[int, ...]) -> Camera:

@@ -30,6 +30,7 @@ from vehicle_detection._common.files import (
     check_target,
     is_hidden,
     temporary_folder,
+    write_text,
 )
 from vehicle_detection._common.image_size import image_size
 from vehicle_detection._common.limits import Limit, check_regular_file, read_regular_file
@@ -110,4 +111,5 @@ __all__ = [
     "with_spare",
     "write_model",
     "write_parquet",
+    "write_text",
 ]

@@ -51,6 +51,12 @@ def check_suffix(target: str | os.PathLike[str], name: str, suffixes: Sequence[s
     return path
 
 
+def write_text(target: str | os.PathLike[str], text: str, name: str = "target") -> None:
+    """Write a text as UTF-8 with Unix line ends, as a whole or not at all."""
+    with atomic_write(target, name) as part:
+        part.write_text(text, encoding="utf-8", newline="\n")
+
+
 def is_hidden(name: str) -> bool:
     """Whether a file or one of its folders is hidden, or a folder of the system, such as the recycle bin.
 

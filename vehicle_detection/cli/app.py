@@ -472,7 +472,7 @@ def evaluate(
     """Score boxes, and tracks if there are any, against labels."""
     from json import dumps
 
-    from vehicle_detection._common import atomic_write, check_target
+    from vehicle_detection._common import check_target, write_text
     from vehicle_detection.evaluation import NO_TRACK, evaluate_detections, evaluate_tracks, read_labels
 
     if json is not None:
@@ -506,9 +506,7 @@ def evaluate(
             noun = "box has" if count == 1 else "boxes have"
             print_error(f"note: the tracks are not scored: {count} {noun} no track in {file}")
     if json is not None:
-        with atomic_write(json) as part:
-            plain = {name: each.to_dict() for name, each in scores.items()}
-            part.write_text(dumps(plain, indent=2) + "\n", encoding="utf-8", newline="\n")
+        write_text(json, dumps({name: each.to_dict() for name, each in scores.items()}, indent=2) + "\n")
 
 
 def _boxes_in(boxes: FrameBoxes, frames: Sequence[FrameKey]) -> FrameBoxes:

@@ -64,7 +64,7 @@ def train(
     ] = None,
 ) -> None:
     """Train a model on patches, and evaluate it on held-out patches; by default like the model "highway"."""
-    from vehicle_detection._common import atomic_write, check_target, encodable
+    from vehicle_detection._common import check_target, encodable, write_text
     from vehicle_detection.datasets import load_training_patches
     from vehicle_detection.params import FeatureParams
     from vehicle_detection.training import model_card, train_and_evaluate
@@ -95,8 +95,7 @@ def train(
         classifier.save(output)
         if report is not None:
             plain = evaluated.to_dict() | {"others": [other.to_dict() for other in others]}
-            with atomic_write(report) as part:
-                part.write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8", newline="\n")
+            write_text(report, json.dumps(plain, indent=2) + "\n")
         if card is not None:
             words = ["--vehicles", vehicles.name, "--non-vehicles", non_vehicles.name, "--features", features]
             words += ["--split", split, "--C", f"{C:g}", "--seed", str(seed)] + ["--no-mirror"] * no_mirror
@@ -105,9 +104,8 @@ def train(
             words += [word for name in compare or () for word in ("--compare", name)]
             words += ["-o", output.name, "--card", card.name]
             command = shlex.join(["vehicle-detection", "train", *words])
-            with atomic_write(card) as part:
-                text = model_card(classifier, evaluated, name=output.stem, others=others, command=command)
-                part.write_text(encodable(text), encoding="utf-8", newline="\n")
+            text = model_card(classifier, evaluated, name=output.stem, others=others, command=command)
+            write_text(card, encodable(text))
     print_line(f"wrote {', '.join(map(str, targets.values()))}")
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import atomic_write, check_path, check_target, describe, write_parquet
+from vehicle_detection._common import check_path, check_target, describe, write_parquet, write_text
 from vehicle_detection.errors import DatasetError, InvalidInputError
 
 if TYPE_CHECKING:
@@ -111,8 +111,7 @@ def write_results(table: DataFrame, path: str | os.PathLike[str]) -> None:
         return
     lines = [_csv_line(table.columns)] if suffix == ".csv" else []
     lines += [_format_row(row, table.columns, suffix) for row in table.to_dict("records")]
-    with atomic_write(path, "path") as part:
-        part.write_text("".join(lines), encoding="utf-8", newline="")
+    write_text(path, "".join(lines), "path")
 
 
 def read_results(path: str | os.PathLike[str]) -> DataFrame:
