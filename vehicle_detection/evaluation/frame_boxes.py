@@ -19,6 +19,7 @@ from vehicle_detection._common import (
     check_sequence,
     check_type,
     describe,
+    natural_key,
     pluralize,
 )
 from vehicle_detection.boxes import Detections
@@ -67,12 +68,9 @@ def check_keys(values: object, name: str) -> tuple[FrameKey, ...]:
     return keys
 
 
-def frame_order(key: FrameKey) -> tuple[tuple[int, str], ...]:
+def frame_order(key: FrameKey) -> tuple[list[object], str]:
     """Natural sort key: frame 2 comes before frame 10, also in file names."""
-    if isinstance(key, int):
-        return ((key, ""),)
-    parts = re.split(r"([0-9]+)", key)
-    return tuple((int(part), "") if index % 2 else (-1, part) for index, part in enumerate(parts))
+    return ([key], "") if isinstance(key, int) else natural_key(key)
 
 
 def _column(values: ArrayLike | None, name: str, rows: int, kinds: str, default: Any) -> NDArray[Any]:

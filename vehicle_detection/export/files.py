@@ -11,7 +11,7 @@ import os
 import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import IO, Any
 
 from vehicle_detection._common import (
     ParquetRows,
@@ -60,14 +60,15 @@ def check_format(path: object, name: str | None, allowed: Iterable[str]) -> str:
     return str(kind)
 
 
-class RowFile(Protocol):
+class RowFile:
     """An open file of rows."""
 
     def add_frame(self, frame: int | str) -> None:
-        """Note a frame, which may have no row."""
+        """Note a frame, which may have no row; a table does not list frames."""
 
     def write(self, row: Row) -> None:
         """Write a row."""
+        raise NotImplementedError
 
 
 @contextlib.contextmanager
@@ -94,7 +95,7 @@ def open_row_file(
                 yield _TextFile(file, kind, columns)
 
 
-class _TextFile:
+class _TextFile(RowFile):
     """CSV, JSON Lines or MOTChallenge text."""
 
     def __init__(self, file: IO[str], kind: str, columns: Sequence[str]) -> None:
@@ -102,9 +103,6 @@ class _TextFile:
         self._table = csv.writer(file, lineterminator="\n")
         if kind == "csv":
             self._table.writerow(columns)
-
-    def add_frame(self, frame: int | str) -> None:
-        """Do nothing: a table has no frames without rows."""
 
     def write(self, row: Row) -> None:
         """Write a row."""
@@ -137,19 +135,16 @@ def mot_line(row: Row) -> str:
     return f"{int(row.frame) + 1},{-1 if row.track_id is None else row.track_id},{box},{end}"
 
 
-class _ParquetFile:
+class _ParquetFile(RowFile):
     def __init__(self, table: ParquetRows, columns: Sequence[str]) -> None:
         self._table, self._columns = table, columns
-
-    def add_frame(self, frame: int | str) -> None:
-        """Do nothing: a table has no frames without rows."""
 
     def write(self, row: Row) -> None:
         """Write a row."""
         self._table.write([getattr(row, name) for name in self._columns])
 
 
-class _CocoFile:
+class _CocoFile(RowFile):
     """A COCO data set. Its images come last, when all are known."""
 
     def __init__(self, file: IO[str]) -> None:
@@ -180,14 +175,11 @@ def _open_coco(file: IO[str], shape: tuple[int, ...] | None) -> Iterator[_CocoFi
     file.write(f"], {rest[1:]}")
 
 
-class _CvatFile:
+class _CvatFile(RowFile):
     """MOT ground truth as CVAT writes it: frames count from 1, pixels from 0; class 1 is the first label."""
 
     def __init__(self, file: IO[str]) -> None:
         self._file = file
-
-    def add_frame(self, frame: int | str) -> None:
-        """Do nothing: the file has no frames without rows."""
 
     def write(self, row: Row) -> None:
         """Write a row; without a track, it becomes a shape of its frame."""
@@ -208,7 +200,7 @@ def _open_mot_zip(part: Path) -> Iterator[_CvatFile]:
         archive.writestr(zipfile.ZipInfo("gt/labels.txt"), "vehicle\n")
 
 
-class _YoloFolder:
+class _YoloFolder(RowFile):
     """A text file for each frame: class, center and size as fractions of the frame, confidence, track."""
 
     def __init__(self, folder: Path, shape: tuple[int, ...]) -> None:
