@@ -8,7 +8,7 @@ import os
 from collections.abc import Collection, Iterable
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -188,10 +188,15 @@ def check_bool(value: object, name: str) -> bool:
     return bool(value)
 
 
+def is_listing(values: object) -> TypeGuard[Iterable[Any]]:
+    """Whether `values` is a sequence or another iterable, but neither a text nor an array of one number."""
+    scalar = isinstance(values, (str, bytes)) or getattr(values, "ndim", 1) == 0
+    return isinstance(values, Iterable) and not scalar
+
+
 def check_sequence(values: object, name: str, of: str) -> tuple[Any, ...]:
     """Return the items of a sequence or another iterable, but not the characters of a text."""
-    scalar = isinstance(values, (str, bytes)) or getattr(values, "ndim", 1) == 0
-    if scalar or not isinstance(values, Iterable):
+    if not is_listing(values):
         raise InvalidInputError(
             f"{name} must be a sequence of {of}, got {describe(values)}; wrap it in a list"
         )

@@ -19,6 +19,7 @@ from vehicle_detection._common import (
     check_flags,
     check_integer,
     describe,
+    is_listing,
 )
 from vehicle_detection.course.checks import Image, check_lesson_image, check_range, check_size
 from vehicle_detection.course.defaults import or_default
@@ -207,8 +208,7 @@ def extract_features(
     [1764, 1764]
     """
     options = FeatureOptions.of(locals())
-    scalar = isinstance(imgs, (str, os.PathLike)) or getattr(imgs, "ndim", 1) == 0
-    if scalar or not isinstance(imgs, Iterable):
+    if not is_listing(imgs):
         raise InvalidInputError(f"imgs must be a list of file names or images; got {describe(imgs)}")
     if isinstance(imgs, np.ndarray) and imgs.ndim in (2, 3) and imgs.dtype.kind in "uif":
         raise InvalidInputError(

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vehicle_detection._common import check_image, describe
+from vehicle_detection._common import check_image, describe, is_listing
 from vehicle_detection.camera import Camera
 from vehicle_detection.drawing.birds_eye import MAX_SPEED_STD, BirdsEyePanel
 from vehicle_detection.drawing.labels import LabelPlacer, LabelRequest, draw_labels
@@ -228,10 +228,8 @@ def track_fields(
 
 def check_tracks(tracks: object) -> list[Track]:
     """Return tracks as a list."""
-    listed: list[Any] | None = None
-    if isinstance(tracks, Iterable) and getattr(tracks, "ndim", 1) > 0:
-        listed = list(tracks)
-    if listed is None or not all(isinstance(track, Track) for track in listed):
+    listed: list[Any] = list(tracks) if is_listing(tracks) else [None]
+    if not all(isinstance(track, Track) for track in listed):
         raise InvalidInputError(
             f"tracks must be Track objects, got {describe(tracks)}; pass what update returns"
         )

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from vehicle_detection._common import check_number, describe
+from vehicle_detection._common import check_number, describe, is_listing
 from vehicle_detection.errors import InvalidInputError
 
 BOX_COLUMNS = ("frame", "track_id", "x1", "y1", "x2", "y2", "score")
@@ -44,8 +44,7 @@ def check_items(items: object) -> Iterator[Any]:
     """Iterate over results or rows; a pandas table gives its rows as mappings."""
     if hasattr(items, "to_dict") and hasattr(items, "columns"):
         return iter(items.to_dict("records"))
-    scalar = isinstance(items, (str, bytes, Mapping)) or getattr(items, "ndim", 1) == 0
-    if scalar or not isinstance(items, Iterable):
+    if isinstance(items, Mapping) or not is_listing(items):
         raise InvalidInputError(
             f"results must be a list of results or rows, got {describe(items)}; wrap it in a list"
         )

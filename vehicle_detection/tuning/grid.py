@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_detection._common import describe
+from vehicle_detection._common import describe, is_listing
 from vehicle_detection.classifier import TrainingOptions
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.params import FeatureParams
@@ -61,9 +61,7 @@ def read_configurations(
     if isinstance(given, Mapping):
         pairs: list[tuple[str | None, Any]] = list(given.items())
     else:
-        scalar = isinstance(given, (str, bytes)) or getattr(given, "ndim", 1) == 0
-        listed = isinstance(given, Iterable) and not scalar
-        pairs = [(None, each) for each in configurations] if listed else []
+        pairs = [(None, each) for each in given] if is_listing(given) else []
     if not pairs:
         raise InvalidInputError(
             "configurations must be a mapping from names to FeatureParams or a list of them, with at least "
@@ -108,7 +106,7 @@ def expand_grid(grid: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
     _check_names(grid, "grid")
     lists = {}
     for name, values in grid.items():
-        if isinstance(values, (str, bytes)) or not isinstance(values, Iterable):
+        if not is_listing(values):
             raise InvalidInputError(f"grid[{name!r}] must be a list of values; got {describe(values)}")
         plain = [value.item() if isinstance(value, np.generic) else value for value in values]
         # Each value once; unlike in a set, True and 1 are two values.

@@ -23,6 +23,7 @@ from vehicle_detection._common import (
     check_sequence,
     check_type,
     describe,
+    is_listing,
     progress_bar,
 )
 from vehicle_detection.classifier import DEFAULT_C
@@ -375,8 +376,7 @@ def make_splits(
 
 def check_seeds(seeds: object) -> tuple[int, ...]:
     """Return the seeds if they are different integers."""
-    scalar = isinstance(seeds, (str, bytes)) or getattr(seeds, "ndim", 1) == 0
-    listed = tuple(seeds) if isinstance(seeds, Iterable) and not scalar else ()
+    listed = seeds if is_listing(seeds) else ()
     checked = tuple(check_integer(seed, "seeds", low=0, high=2**32 - 1) for seed in listed)
     if not checked or len(set(checked)) < len(checked):
         raise InvalidInputError(
