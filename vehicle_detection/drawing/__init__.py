@@ -22,6 +22,7 @@ from vehicle_detection.drawing.primitives import blend
 from vehicle_detection.drawing.tracks import (
     TRACK_COLORS,
     TrackDrawer,
+    color_index,
     draw_tracks,
     track_color,
 )
@@ -38,6 +39,7 @@ __all__ = [
     "Trails",
     "blend",
     "blur_boxes",
+    "color_index",
     "draw_boxes",
     "draw_cell_shares",
     "draw_detections",

@@ -184,11 +184,16 @@ class TrackDrawer:
         return canvas
 
 
+def color_index(track_id: int) -> int:
+    """Index of the color of a track with an id in `TRACK_COLORS`."""
+    return (track_id - 1) % len(TRACK_COLORS)
+
+
 def track_color(track: Track, color_by: Literal["id", "distance"] = "id") -> Color:
     """RGB color of a track, chosen by its id or its distance; gray for a tentative track."""
     if color_by == "distance":
         return _distance_color(track.distance_m)
-    return TRACK_COLORS[(track.id - 1) % len(TRACK_COLORS)] if track.id > 0 else _UNKNOWN_COLOR
+    return TRACK_COLORS[color_index(track.id)] if track.id > 0 else _UNKNOWN_COLOR
 
 
 def _distance_color(distance_m: float | None) -> Color:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import Floats, check_integer, check_number, check_type, describe, pluralize
-from vehicle_detection.drawing import TRACK_COLORS
+from vehicle_detection.drawing import color_index
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video import OwnSpeed
 
@@ -61,7 +61,7 @@ class TrackHistory:
     @property
     def color(self) -> int:
         """Index of the track's color in `TRACK_COLORS`, as in the video."""
-        return (self.id - 1) % len(TRACK_COLORS)
+        return color_index(self.id)
 
     @property
     def boxes(self) -> Floats:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import Floats
-from vehicle_detection.drawing import TRACK_COLORS
+from vehicle_detection.drawing import color_index
 from vehicle_detection.events import KINDS, Event, TrackHistory, bin_means, split_runs
 from vehicle_detection.report.formatting import format_time, format_value, svg_element
 from vehicle_detection.units import Units
@@ -125,7 +125,7 @@ def chart(
         place: dict[str, object] = {"dx": 4} if each.x < 90 else {"dx": -4, "text_anchor": "end"}
         place |= {"x": f"{_decimal(each.x)}%", "y": _decimal(each.y)}
         names.append(
-            svg_element("text", f"#{each.track}", class_=f"track-name {_color(each.track)}", **place)
+            svg_element("text", f"#{each.track}", class_=f"track-name c{color_index(each.track)}", **place)
         )
     return _graph(values, [*grid, curves, *names], time_axis, height, role="img", label=label)
 
@@ -171,20 +171,15 @@ def event_markers(events: Sequence[Event], axis: TimeAxis, units: Units, *, labe
             if event.kind != kind:
                 continue
             text = event.text(units)
-            x, color = axis.percent(event.frame), _color(event.track_id)
+            x, color = axis.percent(event.frame), color_index(event.track_id)
             parts = [
                 svg_element("title", text),
                 svg_element("circle", cx=x, cy=top + 24, r=5),
             ]
             button = {"role": "button", "tabindex": 0, "aria_label": f"{text}: show in the video"}
             seek = {"data_frame": event.frame, "data_track": event.track_id}
-            markers.append(svg_element("g", *parts, class_=f"bar {color}", **button, **seek))
+            markers.append(svg_element("g", *parts, class_=f"bar c{color}", **button, **seek))
     return _graph([], [*names, *markers], axis, _KIND_HEIGHT * len(kinds), role="group", label=label)
-
-
-def _color(track_id: int) -> str:
-    """Class of a track's color, as `TrackHistory.color`."""
-    return f"c{(track_id - 1) % len(TRACK_COLORS)}"
 
 
 def _assign_rows(tracks: Sequence[TrackHistory], axis: TimeAxis) -> list[int]:

@@ -38,6 +38,7 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.video.frame_source import FrameSource
+from vehicle_detection.export import shown_tracks
 from vehicle_detection.video.pipeline import FramePipeline, Frames, VideoDetector
 from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.reading import check_span, frame_range
@@ -312,9 +313,7 @@ class VideoRun:
             ):
                 for frame, result in results:
                     self._frames += 1
-                    self._track_ids.update(
-                        track.id for track in result.tracks if getattr(track, "shown", True)
-                    )
+                    self._track_ids.update(track.id for track in shown_tracks(result))
                     yield frame, result
                     del frame, result
                     bar.update()
