@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import (
+    Closing,
     check_choice,
     check_flags,
     check_image,
@@ -80,7 +81,7 @@ _USUAL_FPS = 25.0
 _FRAME_TOLERANCE = 1e-5
 
 
-class VehicleDetector:
+class VehicleDetector(Closing):
     """Detect the vehicles of images, and track those of a video.
 
     Parameters
@@ -734,12 +735,6 @@ class VehicleDetector:
     def close(self) -> None:
         """Stop the search's threads; the detector starts them again when it is used."""
         self._search.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self.close()
 
 
 class _ClipAnnotator:

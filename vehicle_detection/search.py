@@ -20,7 +20,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import (
     NEW_ARRAYS,
+    Closing,
     ThreadTeam,
     Workspace,
     check_image,
@@ -89,7 +90,7 @@ class SearchResult:
         return f"SearchResult(windows={self.windows}, vehicles={self.vehicles}, shape={self.shape})"
 
 
-class FrameSearch(ABC):
+class FrameSearch(Closing, ABC):
     """What ``model.open_search()`` returns for every kind of model: threads and memory kept between frames.
 
     Searches are thread-safe context managers.
@@ -139,12 +140,6 @@ class FrameSearch(ABC):
     def close(self) -> None:
         """Stop the threads; they start again on the next search."""
         self._team.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def find_cars(

@@ -24,6 +24,7 @@ from vehicle_detection._common.checks import (
     store_integer,
     store_number,
 )
+from vehicle_detection._common.closing import Closing
 from vehicle_detection._common.environment import check_environment
 from vehicle_detection._common.files import (
     atomic_write,
@@ -59,6 +60,7 @@ __all__ = [
     "JOBS_VARIABLE",
     "NEW_ARRAYS",
     "SPARE",
+    "Closing",
     "Floats",
     "Limit",
     "ModelData",

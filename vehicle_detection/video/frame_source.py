@@ -5,16 +5,16 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection._common import Closing
 from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.streams import AudioSource, Reader
 
 
-class FrameSource:
+class FrameSource(Closing):
     """Frames of a file, of several files or of a stream, as `open_source` returns it.
 
     A context manager, and an iterable of ``(index, time, frame)``: the frame's number from 0, its time in
@@ -97,9 +97,3 @@ class FrameSource:
     def close(self) -> None:
         """End its processes and remove its temporary files."""
         self._on_close.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self.close()

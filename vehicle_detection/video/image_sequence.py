@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,19 +36,13 @@ class ImageSequence(FrameSource):
         return _ImageReader(self.info, self.files, first, count)
 
 
-class _ImageReader:
+class _ImageReader(Reader):
     """Reader of image files."""
-
-    cpu_seconds = 0.0
-    damage = ""
 
     def __init__(self, info: VideoInfo, paths: Sequence[Path], first: int, count: int | None) -> None:
         self.info = info
         self._paths = paths[: None if count is None else first + count]
         self._index, self._killed = first, False
-
-    def __iter__(self) -> Self:
-        return self
 
     def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
         if self._killed or self._index >= len(self._paths):
@@ -66,12 +59,3 @@ class _ImageReader:
 
     def kill(self) -> None:
         self._killed = True
-
-    def close(self) -> None:
-        self.kill()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self.close()

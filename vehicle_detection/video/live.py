@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Sequence
 from fractions import Fraction
-from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +28,7 @@ from vehicle_detection.video.ffmpeg import (
     video_error,
 )
 from vehicle_detection.video.probe import VideoInfo
+from vehicle_detection.video.streams import Reader
 from vehicle_detection.video.yuv import ColorEncoding, rgb_from_planes
 
 _LOGGER = logging.getLogger(__name__)
@@ -249,14 +249,12 @@ class LiveStream:
             self._end_process()
 
 
-class LiveReader:
+class LiveReader(Reader):
     """Frames of a `LiveStream`, in order: an iterator of ``(index, time, frame)`` and a context manager.
 
     With `drop`, a thread reads all frames, and the iterator returns the first one, then the newest ones: a
     slow consumer sees gaps in the indices. Without, ffmpeg and the sender wait for the consumer.
     """
-
-    damage = ""
 
     def __init__(self, stream: LiveStream, *, drop: bool, first: int = 0, count: int | None = None) -> None:
         self.info = stream.info
@@ -279,9 +277,6 @@ class LiveReader:
     def cpu_seconds(self) -> float:
         """Processor time of ffmpeg, known after it has ended."""
         return self._stream.cpu_seconds
-
-    def __iter__(self) -> Self:
-        return self
 
     def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
         number, planes = self._next_planes()
@@ -353,9 +348,3 @@ class LiveReader:
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
         self._stream.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self.close()

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import (
+    Closing,
     atomic_write,
     available_cores,
     check_choice,
@@ -37,8 +38,8 @@ from vehicle_detection._common import (
     single_threaded_opencv,
 )
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.video.frame_source import FrameSource
 from vehicle_detection.export import shown_tracks
+from vehicle_detection.video.frame_source import FrameSource
 from vehicle_detection.video.pipeline import FramePipeline, Frames, VideoDetector
 from vehicle_detection.video.probe import VideoInfo
 from vehicle_detection.video.reading import check_span, frame_range
@@ -240,7 +241,7 @@ def process_video(
         return run.report()
 
 
-class VideoRun:
+class VideoRun(Closing):
     """One pass of a detector over a source, which `process_video` and `track` have in common.
 
     The arguments are those of `process_video`; `results` does the work, then `report` sums it up.
@@ -341,12 +342,6 @@ class VideoRun:
         """Close the source, unless the caller opened it."""
         if self._owned:
             self.source.close()
-
-    def __enter__(self) -> VideoRun:
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self.close()
 
 
 @contextlib.contextmanager

@@ -9,7 +9,6 @@ import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,7 +88,7 @@ class VideoSegments(FrameSource):
         return AudioSource(input=options, start=float(first / self.info.fps), length=length)
 
 
-class _SegmentReader:
+class _SegmentReader(Reader):
     """Reader of the frames of several files, one after the other."""
 
     def __init__(
@@ -102,9 +101,8 @@ class _SegmentReader:
         strict: bool,
     ) -> None:
         self.info = info
-        self.damage = ""
         self._strict = strict
-        self.cpu_seconds = 0.0
+        self._cpu_seconds = 0.0
         self._segments = list(segments)
         self._index = first
         self._end = math.inf if count is None else first + count
@@ -116,8 +114,10 @@ class _SegmentReader:
             first -= self._segments.pop(0)[1].frames
         self._first = first
 
-    def __iter__(self) -> Self:
-        return self
+    @property
+    def cpu_seconds(self) -> float:
+        """Processor time of ffmpeg for the segments that have been read."""
+        return self._cpu_seconds
 
     def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
         while self._index < self._end:
@@ -144,7 +144,7 @@ class _SegmentReader:
         with self._lock:
             if self._reader is not None:
                 self._reader.close()
-                self.cpu_seconds += self._reader.cpu_seconds
+                self._cpu_seconds += self._reader.cpu_seconds
                 self.damage = "; ".join(filter(None, (self.damage, self._reader.damage)))
                 self._reader = None
 
@@ -157,9 +157,3 @@ class _SegmentReader:
     def close(self) -> None:
         self.kill()
         self._close_reader()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self.close()

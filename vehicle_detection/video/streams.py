@@ -9,16 +9,15 @@ import logging
 import math
 import re
 import shutil
-from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import temporary_folder
+from vehicle_detection._common import Closing, temporary_folder
 from vehicle_detection.errors import TransientVideoError, VideoError
 from vehicle_detection.video.damage import find_damage
 from vehicle_detection.video.ffmpeg import (
@@ -53,31 +52,34 @@ _DECODER_THREADS = "2"
 _TRUNCATED = re.compile(r"partial file|ended prematurely")
 
 
-class Reader(Protocol):
+class Reader(Closing):
     """Frames of a source, in order: an iterator of ``(index, time, frame)`` and a context manager."""
 
     info: VideoInfo
-    damage: str
+    damage: str = ""
     """What is damaged in the source; known after the last frame, and empty if nothing is."""
 
     @property
     def cpu_seconds(self) -> float:
         """Processor time of ffmpeg, known after it has ended."""
+        return 0.0
 
-    def __iter__(self) -> Iterator[tuple[int, float, NDArray[np.uint8]]]: ...
+    def __iter__(self) -> Self:
+        return self
 
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *_: Any) -> None: ...
+    def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
+        raise NotImplementedError
 
     def kill(self) -> None:
         """End at once, from any thread; a thread that reads sees the end."""
+        raise NotImplementedError
 
     def close(self) -> None:
         """End and release everything."""
+        self.kill()
 
 
-class _FfmpegStream:
+class _FfmpegStream(Closing):
     """A pipe to or from an ffmpeg process, which ends with the ``with`` block."""
 
     _process: Process
@@ -95,14 +97,8 @@ class _FfmpegStream:
         """End ffmpeg if it is still running."""
         self._process.close()
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(self, *_: Any) -> None:
-        self.close()
-
-
-class FrameReader(_FfmpegStream):
+class FrameReader(_FfmpegStream, Reader):
     """Frames of a video, in order: an iterator of ``(index, time, frame)`` and a context manager.
 
     ``index`` is the frame's number in the file from 0, ``time`` its time in seconds, ``frame`` a new
@@ -132,7 +128,6 @@ class FrameReader(_FfmpegStream):
     ) -> None:
         self.info = info
         self.frames_read = 0
-        self.damage = ""
         self._strict, self._whole = strict, whole
         self._killed = False
         self._path, self._first, self._count = path, first, count
@@ -164,9 +159,6 @@ class FrameReader(_FfmpegStream):
         self._channels = np.empty((3, height, width), np.uint8)
         options += ["-pix_fmt", pixel_format, "-f", "rawvideo", "pipe:1"]
         self._process = Process(("-nostdin", *options), stdout=True)
-
-    def __iter__(self) -> FrameReader:
-        return self
 
     def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
         if self._process.stdout.closed:
