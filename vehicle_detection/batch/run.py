@@ -223,19 +223,11 @@ def run_batch(
     tasks = _plan(listed, store, settings, group, part)
     pending, superseded = _pending(tasks, store, retry_failed)
     skipped = len(tasks) - len(pending)
+    planned = None
     if dry_run:
         names = ("files", "camera", "start", "replaces")
-        return BatchReport(
-            trips=len(tasks),
-            done=0,
-            failed=0,
-            errors=0,
-            skipped=skipped,
-            frames=0,
-            seconds=time.perf_counter() - started,
-            messages={},
-            planned=tuple({name: task[name] for name in names} for task in pending),
-        )
+        planned = tuple({name: task[name] for name in names} for task in pending)
+        pending, superseded, progress = [], [], False
     for task, record in superseded:
         remove_replaced(store, task, record)
     counts = {DONE: 0, FAILED: 0, ERROR: 0}
@@ -266,6 +258,7 @@ def run_batch(
         frames=frames,
         seconds=time.perf_counter() - started,
         messages=messages,
+        planned=planned,
     )
 
 
