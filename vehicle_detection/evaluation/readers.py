@@ -244,7 +244,7 @@ def _check_columns(source: Path, names: Sequence[str], records: Sequence[Mapping
     tracked = not {"track", "track_id"}.isdisjoint(names)
     predicted = "score" in names and (scored or not tracked)
     expected = BOX_COLUMNS if predicted else REQUIRED_LABEL_COLUMNS
-    given = {*names} | ({"track", "track_id"} if {"track", "track_id"} & {*names} else set())
+    given = {*names, "track", "track_id"} if tracked else {*names}
     missing = [name for name in expected if name not in given]
     if missing:
         found = shorten(", ".join(names), 300) or "an empty file"

@@ -109,13 +109,10 @@ class _TextFile(RowFile):
         if self._kind == "csv":
             self._table.writerow(_csv_cells(row, self._columns))
         elif self._kind == "jsonl":
-            self._file.write(json.dumps(_values(row, self._columns), ensure_ascii=False) + "\n")
+            values = {name: getattr(row, name) for name in self._columns}
+            self._file.write(json.dumps(values, ensure_ascii=False) + "\n")
         else:
             self._file.write(mot_line(row) + "\n")
-
-
-def _values(row: Row, columns: Sequence[str]) -> dict[str, Any]:
-    return {name: getattr(row, name) for name in columns}
 
 
 def _csv_cells(row: Row, columns: Sequence[str]) -> list[Any]:

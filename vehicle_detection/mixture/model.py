@@ -143,12 +143,10 @@ class TemplateMixture:
         if self.rescorer is not None:
             check_type(self.rescorer, "rescorer", Rescorer, "pass None, or train with train_mixture")
         store_number(self, "slope", above=0, high=1e9)
-        store_number(self, "offset", low=-1e9, high=1e9)
-        store_number(self, "threshold", low=-1e9, high=1e9)
-        store_number(self, "size_prior_weight", low=0)
-        store_number(self, "vote_weight", low=0)
-        store_number(self, "count_weight", low=0)
-        store_number(self, "perspective_weight", low=0)
+        for name in "offset", "threshold":
+            store_number(self, name, low=-1e9, high=1e9)
+        for name in "size_prior_weight", "vote_weight", "count_weight", "perspective_weight":
+            store_number(self, name, low=0)
         object.__setattr__(self, "templates", templates)
 
     @property

@@ -152,16 +152,12 @@ class MixtureSearch(FrameSearch):
         with single_threaded_opencv():
             pyramid = EdgePyramid(image, plan.row_ranges, self.workspace, self._team)
             found = self._team.map(
-                lambda level: self._search_level(pyramid, level),
+                lambda level: level.search.find(pyramid.packed_channels(level.grid), self.workspace),
                 plan.levels,
                 cost=lambda level: level.grid.rows * level.grid.columns,
             )
         windows = self._to_windows(plan, found, pyramid.shape)
         return pyramid, windows.best(_MAX_WINDOWS)
-
-    def _search_level(self, pyramid: EdgePyramid, level: _Level) -> NDArray[np.int32]:
-        """Windows of all searches on the cells of one size, see `PackedSearch.find`."""
-        return level.search.find(pyramid.packed_channels(level.grid), self.workspace)
 
     def _to_windows(
         self, plan: _Plan, found: list[NDArray[np.int32]], shape: tuple[int, int]
