@@ -1,0 +1,183 @@
+import math
+
+import numpy as np
+import pytest
+
+from vehicle_detection.camera import Camera
+from vehicle_detection.tracking.distance_filter import (
+    estimate_distances,
+    initiate_states,
+    predict_distances,
+    update_distances,
+)
+from vehicle_detection.tracking.kalman_filter import Measurements, initiate
+
+SHAPE = (720, 1280)
+CAMERA = Camera.for_frame(SHAPE, horizon_std_px=0.0)
+BOXES = np.array([[600.0, 400, 700, 490], [100, 300, 180, 420]])
+
+
+def first_range(box, *, camera=CAMERA):
+    """Distance, and its standard error, after the first measurement of a vehicle."""
+    boxes = np.array([box])
+    states = initiate_states(*initiate(boxes, np.ones((1, 4))), camera)
+    states = update_distances(states, Measurements.from_boxes(boxes, SHAPE), camera, 0.04, 0.04)
+    return states.range_mean[0, 0], np.sqrt(states.range_cov[0, 0, 0])
+
+
+def box_at(distance, *, width=1.8, camera=CAMERA):
+    """Box of a vehicle straight ahead."""
+    pixel = camera.focal_px / distance
+    bottom = camera.horizon_px + pixel * camera.height_m
+    return [640 - pixel * width / 2, bottom - pixel * 1.5, 640 + pixel * width / 2, bottom]
+
+
+@pytest.mark.parametrize("distance", [8.0, 20.0, 40.0])
+def test_first_distance_of_a_vehicle_is_that_of_the_pinhole_camera(distance):
+    estimate, std = first_range(box_at(distance))
+    assert estimate == pytest.approx(distance)
+    assert 0 < std < 0.4 * distance
+
+
+def test_truncated_edges_do_not_contribute_to_the_distance():
+    by_bottom, by_width = (
+        CAMERA.focal_px * CAMERA.height_m / (520 - CAMERA.horizon_px),
+        CAMERA.focal_px * CAMERA.vehicle_width_m / 160,
+    )
+    assert first_range([1100.0, 420, 1280, 520])[0] == pytest.approx(by_bottom)
+    assert first_range([560.0, 420, 720, 720])[0] == pytest.approx(by_width)
+    assert first_range([1100.0, 420, 1280, 720])[1] > 500
+
+
+def test_the_first_distance_is_that_of_the_better_measurement():
+    # 8 m away by its bottom edge, 10 m by its width.
+    near, far = box_at(8.0), box_at(10.0)
+    box = [far[0], near[1], far[2], near[3]]
+    camera = Camera.for_frame(SHAPE, horizon_std_px=40.0)
+    assert first_range(box, camera=camera)[0] == pytest.approx(10.0)
+    assert first_range(box)[0] < 9.8  # the horizon is known, and the width corrects the distance
+    # Without a visible width, the bottom edge must do.
+    box = [0.0, near[1], near[2] - near[0], near[3]]
+    assert first_range(box, camera=camera)[0] == pytest.approx(8.0)
+
+
+def test_an_uncertain_horizon_gives_more_weight_to_the_width():
+    box = box_at(30.0)
+    fixed, uncertain = (
+        Camera.for_frame(SHAPE, horizon=0.5, horizon_std_px=std, height_std_m=0.0) for std in (0.0, 40.0)
+    )
+    assert first_range(box, camera=fixed)[0] < 26
+    assert first_range(box, camera=uncertain)[0] == pytest.approx(30.0, rel=0.15)
+
+
+def test_inputs_are_not_modified():
+    states = initiate_states(*initiate(BOXES, np.ones((2, 4))), CAMERA)
+    before = [column.copy() for column in states]
+    predict_distances(states, 0.2, CAMERA)
+    update_distances(states, Measurements.from_boxes(BOXES, SHAPE), CAMERA, 0.04, 0.04)
+    for column, copy in zip(states, before, strict=True):
+        np.testing.assert_array_equal(column, copy)
+
+
+def ranges(mean, cov):
+    """States of a track with this distance, speed and width."""
+    states = initiate_states(*initiate(BOXES[:1], np.ones((1, 4))), CAMERA)
+    return states._replace(range_mean=np.array([mean], float), range_cov=np.array([cov], float))
+
+
+def test_distances_are_predicted_at_constant_speed():
+    cov = np.array([[4.0, 0.5, 0.1, 0], [0.5, 9.0, 0.2, 0], [0.1, 0.2, 0.04, 0], [0, 0, 0, 0.5]])
+    found = predict_distances(ranges([30.0, -5.0, 0.1, 0.3], cov), 0.2, CAMERA)
+    np.testing.assert_allclose(found.range_mean, [[29.0, -5.0, 0.1, 0.3]])
+    transition = np.array([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    expected = transition @ cov @ transition.T
+    expected[:2, :2] += 1.5**2 * np.array([[0.2**3 / 3, 0.2**2 / 2], [0.2**2 / 2, 0.2]])
+    expected[2, 2] += (CAMERA.vehicle_width_std_m / CAMERA.vehicle_width_m) ** 2 * 0.2 / 20
+    np.testing.assert_allclose(found.range_cov[0], expected)
+    for start, speed, end in ((2.0, -50.0, 1.0), (499.0, 50.0, 500.0)):
+        assert predict_distances(ranges([start, speed, 0, 0], cov), 0.2, CAMERA).range_mean[0, 0] == end
+
+
+@pytest.mark.parametrize("speed", [-2.0, -20.0])
+@pytest.mark.parametrize("right", [700.0, 560.0])
+def test_the_width_corrects_distance_width_and_length(right, speed):
+    cov = np.array([[9.0, 1.0, 0.2, 0.1], [1.0, 4.0, 0, 0], [0.2, 0, 0.02, 0], [0.1, 0, 0, 0.6]])
+    states = ranges([20.0, speed, 0.05, 0.3], cov)
+    box = np.array([[right - 100.0, 640, right, 720]])  # its bottom edge is truncated
+    found = update_distances(states, Measurements.from_boxes(box, SHAPE), CAMERA, 0.04, 0.04)
+    lateral = max(640 - right, 0)
+    # The boxes of an oncoming vehicle, in another lane, show less of its side.
+    length = CAMERA.vehicle_length_m - (1.0 if speed == -20 else 0.0)
+    scale = CAMERA.focal_px * CAMERA.vehicle_width_m + length * lateral
+    side = lateral / scale
+    # The logarithm of the width in pixels, whose error is that of two edges and of the hidden length.
+    innovation = np.log(100 / scale) - 0.05 - side * 0.3 + np.log(20)
+    jacobian = np.array([-1 / 20, 0, 1, side])
+    edge_std = math.hypot(CAMERA.bottom_std_px * CAMERA.pixel_scale, CAMERA.box_std * 100)
+    variance = 2 * (edge_std / 100) ** 2 + 50 * (side * CAMERA.vehicle_length_std_m) ** 2
+    gain = cov @ jacobian / (jacobian @ cov @ jacobian + variance)
+    np.testing.assert_allclose(found.range_mean[0], [20.0, speed, 0.05, 0.3] + gain * innovation)
+    np.testing.assert_allclose(found.range_cov[0], cov - np.outer(gain, jacobian @ cov), atol=1e-9)
+
+
+def test_the_bottom_edge_of_an_oncoming_vehicle_has_less_weight():
+    """A barrier may hide its wheels."""
+    box = np.array([[100.0, CAMERA.horizon_px, 200, CAMERA.horizon_px + 40]])
+    changes = []
+    for speed, middle in ((-2.0, False), (-20.0, False), (-20.0, True)):
+        # The left edge is truncated, so that the width is no measurement.
+        boxes = np.where([True, False, middle, False], [0, 0, 700, 0], box)
+        states = ranges([20.0, speed, 0.0, 0.0], np.diag([9.0, 4.0, 0.02, 0.6]))
+        found = update_distances(states, Measurements.from_boxes(boxes, SHAPE), CAMERA, 0.04, 0.04)
+        changes.append(found.range_mean[0, 0] - 20.0)
+    near, oncoming, in_this_lane = changes
+    assert near == in_this_lane > 0
+    assert 0 < oncoming < near / 2
+
+
+@pytest.mark.parametrize(
+    ("mean", "limited"),
+    [([0.5, 1, -2, -9], [1, 1, -0.7, -3]), ([900, 1, 2, 20], [500, 1, 0.9, 8]), ([9, 1, 0, 0], [9, 1, 0, 0])],
+)
+def test_distance_width_and_length_are_limited(mean, limited):
+    measured = Measurements.from_boxes(BOXES[:1], SHAPE, merged=True)  # it shows neither edge
+    found = update_distances(ranges(mean, np.eye(4)), measured, CAMERA, 0.04, 0.04)
+    np.testing.assert_allclose(found.range_mean, [limited])
+
+
+@pytest.mark.parametrize(
+    ("distance_std", "speed_std", "age", "known"),
+    [
+        (8.0, 6.0, 0.5, (True, True)),
+        (8.1, 6.0, 0.5, (False, False)),
+        (8.0, 6.1, 0.5, (True, False)),
+        (8.0, 6.0, 0.51, (False, False)),
+    ],
+)
+def test_distances_and_speeds_are_stated_where_they_are_known(distance_std, speed_std, age, known):
+    camera = Camera.for_frame(SHAPE, focal_std=0.1)
+    states = ranges([20.0, -3.0, 0.0], np.diag([distance_std**2, speed_std**2, 0.1]))
+    (found,) = estimate_distances(states, np.array([age]), camera)
+    distance = (20.0, math.hypot(distance_std, 2.0)) if known[0] else (None, None)
+    speed = (-3.0, math.hypot(speed_std, 0.3)) if known[1] else (None, None)
+    names = ["distance_m", "distance_std_m", "speed_mps", "speed_std_mps"]
+    assert list(found) == names
+    for name, value in zip(names, (*distance, *speed)):
+        assert found[name] == (value if value is None else pytest.approx(value))
+
+
+def test_a_box_that_a_nearer_vehicle_covers_is_a_weaker_measurement():
+    width = np.array([[600.0, 380.0, 660.0, 430.0]])  # narrower than before: part of it is hidden
+
+    def distance(covered):
+        boxes = np.array([[600.0, 380.0, 680.0, 446.0]])
+        states = initiate_states(*initiate(boxes, np.ones((1, 4))), CAMERA)
+        for box, fraction in ((boxes, 0.0), (boxes, 0.0), (width, covered)):
+            measured = Measurements.from_boxes(box, SHAPE, covered=fraction)
+            states = update_distances(states, measured, CAMERA, 0.08, 0.04)
+        return states.range_mean[0, 0], states.range_cov[0, 0, 0]
+
+    visible, partial, hidden = distance(0.0), distance(0.1), distance(0.5)
+    # The narrower a box, the farther the vehicle seems.
+    assert hidden[0] < partial[0] < visible[0]
+    assert visible[1] < partial[1] < hidden[1]
