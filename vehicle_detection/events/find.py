@@ -54,7 +54,7 @@ KINDS: dict[Kind, str] = {
 _MIN_TRACK, _MIN_FOLLOWING, _MIN_IN_LANE = 0.5, 2.0, 0.5
 # Largest relative error of a distance, a headway and a time to collision that is stated.
 _MAX_STD = 0.3
-# Largest relative error of the time to collision that leaves no doubt about its sign.
+# Largest relative error of a vehicle's growth that leaves no doubt about its sign.
 _MAX_PASSING_STD = 0.5
 # Largest standard error (m/s) of a closing speed that is stated.
 _MAX_SPEED_STD = 5.0
@@ -359,9 +359,9 @@ class _Finder:
 
     def _left_behind(self, first: int, last: int) -> Iterable[Event]:
         motion = self.motion
-        time, std = motion.time_to_collision[last], motion.time_to_collision_std[last]
+        time, error = motion.time_to_collision[last], motion.slope_error[last]
         ends_at_side = motion.at_side[-max(int(0.3 * self.fps), 1) :].any()
-        if not 0 < time <= _PASSING_TIME or std > _MAX_PASSING_STD * time or not self._beside(last):
+        if not 0 < time <= _PASSING_TIME or error > _MAX_PASSING_STD or not self._beside(last):
             return
         grown = np.nanmax(motion.distance[first : last + 1]) / motion.distance[last]
         if grown < _PASSING_RATIO or not (ends_at_side or motion.distance[last] <= _PASSING_M):
@@ -377,7 +377,7 @@ class _Finder:
         time = motion.time_to_collision
         at_side = motion.at_side[: max(int(0.3 * self.fps), 1)].any()
         # Where its motion away is certain for the first time, at most a few seconds after its first frame.
-        sure = np.flatnonzero((time < 0) & (motion.time_to_collision_std < _MAX_PASSING_STD * -time))
+        sure = np.flatnonzero((time < 0) & (motion.slope_error < _MAX_PASSING_STD))
         near = first + int(np.nanargmin(motion.distance[first : first + max(round(self.fps), 1)]))
         if not sure.size or not self._beside(first) or motion.distance[near] > _PASSING_M:
             return

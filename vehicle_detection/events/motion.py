@@ -47,6 +47,7 @@ class Motion:
     lateral_rate: Floats  # m/s
     time_to_collision: Floats  # s; negative when moving away: time since the vehicle was beside the camera
     time_to_collision_std: Floats
+    slope_error: Floats  # relative standard error of the rate at which the vehicle grows or shrinks
     at_side: NDArray[np.int64]  # -1 and 1 where the left and the right border of the frame truncates the box
 
     @property
@@ -81,12 +82,16 @@ def estimate_motion(track: TrackHistory, *, fps: float, shape: tuple[int, int], 
     # Both inverse sizes have the unit of the reciprocal height, so that a track may change between them.
     ratio = np.nanmedian(inverse * size) if np.isfinite(inverse * size).any() else 1.0
     inverse = np.where(np.isfinite(inverse), inverse / ratio, 1 / size)
-    value, slope, span = local_lines(seconds, inverse)
+    value, slope, span, mean = local_lines(seconds, inverse)
     with np.errstate(divide="ignore", invalid="ignore"):
         time = -value / slope
         count = np.maximum(span / _SIZE_TIME, 2.0)
-        slope_std = _SIZE_STD * value * np.sqrt(12 / count) / span
-        time_std = np.abs(time) * np.hypot(slope_std / slope, _SIZE_STD / np.sqrt(count))
+        # The mean of the values and the slope have independent errors, unlike the value at an end of the
+        # track, so that the error of the zero is relative to its distance from the mean time (Draper and
+        # Smith, *Applied Regression Analysis*, chapter 3, inverse regression).
+        mean_std = _SIZE_STD * mean / np.sqrt(count)
+        slope_std = mean_std * np.sqrt(12) / span
+        time_std = np.hypot(mean_std, slope_std * mean / slope) / np.abs(slope)
     closing = -scale * slope
     return Motion(
         track=track,
@@ -100,6 +105,7 @@ def estimate_motion(track: TrackHistory, *, fps: float, shape: tuple[int, int], 
         lateral_rate=local_lines(seconds, lateral)[1],
         time_to_collision=time,
         time_to_collision_std=time_std,
+        slope_error=slope_std / np.abs(slope),
         at_side=truncated[:, 2].astype(np.int64) - truncated[:, 0],
     )
 
@@ -130,8 +136,8 @@ def _lateral(
     return lateral, std
 
 
-def local_lines(seconds: Floats, values: Floats) -> tuple[Floats, Floats, Floats]:
-    """Value, slope and span (s) of a straight line through the values around each time; NaN if unknown."""
+def local_lines(seconds: Floats, values: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Straight lines through the values around each time: value, slope, span (s) and mean; NaN if unknown."""
     known = np.isfinite(values)
     t, y = np.where(known, seconds - seconds[0], 0.0), np.where(known, values, 0.0)
     sums = [np.concatenate(([0.0], np.cumsum(each))) for each in (known, t, y, t * t, t * y)]
@@ -141,7 +147,8 @@ def local_lines(seconds: Floats, values: Floats) -> tuple[Floats, Floats, Floats
     with np.errstate(divide="ignore", invalid="ignore"):
         variance = stt - st * st / count
         slope = (sty - st * sy / count) / variance
-        value = sy / count + slope * (seconds - seconds[0] - st / count)
+        mean = sy / count
+        value = mean + slope * (seconds - seconds[0] - st / count)
         span = np.sqrt(12 * variance / count)  # of as many values, evenly spread
     slope = np.where((span >= _MIN_SPAN) & (count >= 3), slope, np.nan)
-    return np.where(count > 0, value, np.nan), slope, span
+    return np.where(count > 0, value, np.nan), slope, span, mean
