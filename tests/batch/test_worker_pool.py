@@ -1,8 +1,10 @@
 """The worker processes of a batch, and the executor of a Dask cluster."""
 
 import contextlib
+import gc
 import os
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -56,12 +58,13 @@ def open_files():
     [(kill_this_process, WorkerLost, "signal 9"), (fail, RuntimeError, "ValueError: no model")],
 )
 def test_a_worker_that_dies_at_its_start_leaves_nothing(initializer, error, message):
+    gc.collect()  # files that earlier tests have left open
     before = open_files(), child_processes()
     pool = WorkerPool(1, (initializer, ()))
     calls = [pool.submit(process_id) for _ in range(3)]
     for call in calls:
         with pytest.raises(error, match=message):
-            call.result(60)
+            call.result(300)
     pool.shutdown()
     assert (open_files(), child_processes()) == before
 
@@ -69,12 +72,40 @@ def test_a_worker_that_dies_at_its_start_leaves_nothing(initializer, error, mess
 def test_the_first_worker_compiles_the_kernels_before_the_others_start(tmp_path):
     pool = WorkerPool(3, (note_start, (str(tmp_path / "starts"),)))
     calls = [pool.submit(process_id, number) for number in range(6)]
-    assert len({call.result(60) for call in calls}) > 1
+    assert len({call.result(300) for call in calls}) > 1
     pool.shutdown()
     times = [line.split() for line in (tmp_path / "starts").read_text().splitlines()]
     assert len(times) > 1
     first_end = float(times[0][1])
     assert all(float(begin) >= first_end for begin, _ in times[1:])
+
+
+SLOW_TO_BE_IDLE = """
+import threading, time
+set_event = threading.Event.set
+def set_late(event):
+    time.sleep(0.5)
+    set_event(event)
+threading.Event.set = set_late
+from vehicle_detection.batch.worker import main
+main()
+"""
+
+
+def test_a_call_right_after_an_answer_ends_with_the_parent_process():
+    command = [sys.executable, "-c", SLOW_TO_BE_IDLE]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as worker:
+        worker.stdin.write('{"call": "builtins:abs", "args": [-1]}\n')
+        worker.stdin.flush()
+        assert worker.stdout.readline() == '{"result": 1}\n'
+        worker.stdin.write('{"call": "time:sleep", "args": [600]}\n')
+        worker.stdin.flush()
+        time.sleep(1.0)  # until the call has begun
+        worker.stdin.close()
+        try:
+            assert worker.wait(60) == 1
+        finally:
+            worker.kill()
 
 
 def test_files_in_the_current_folder_are_no_modules_of_a_worker(monkeypatch, tmp_path):
@@ -83,7 +114,7 @@ def test_files_in_the_current_folder_are_no_modules_of_a_worker(monkeypatch, tmp
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("PYTHONPATH")
     with WorkerPool(1, (worker_pool.worker_environment, ())) as pool:
-        found = pool.submit(worker_pool.worker_environment).result(60)
+        found = pool.submit(worker_pool.worker_environment).result(300)
     assert found["OMP_NUM_THREADS"] == "1"
 
 

@@ -32,10 +32,10 @@ def main() -> None:
     with contextlib.suppress(KeyboardInterrupt, BrokenPipeError):  # the parent process is gone
         threading.Thread(target=_receive, args=(calls, idle), daemon=True).start()
         while (line := calls.get()) is not None:
-            answers.write(json.dumps(_call(json.loads(line))) + "\n")
+            answer = json.dumps(_call(json.loads(line)))
+            idle.set()  # before the answer, after which the next call may arrive at any time
+            answers.write(answer + "\n")
             answers.flush()
-            if calls.empty():
-                idle.set()
         # An interrupt that is meant for the last call may come after it.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         return
