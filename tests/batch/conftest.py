@@ -78,7 +78,7 @@ def start(tmp_path):
             process.send_signal(signal.SIGTERM)
         if not process.stdout.closed:
             try:
-                process.communicate(timeout=20)
+                process.communicate(timeout=60)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.communicate()

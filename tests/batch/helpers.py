@@ -1,11 +1,14 @@
 """Runs of batches, and checks of what they have written."""
 
+import contextlib
 import json
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 from vehicle_detection import run_batch
+from vehicle_detection.batch.plan import source_id
+from vehicle_detection.batch.store import LocalStore
 from vehicle_detection.video import probe_video
 
 parquet = pytest.importorskip("pyarrow.parquet")
@@ -14,6 +17,15 @@ parquet = pytest.importorskip("pyarrow.parquet")
 def run(sources, out, model, **options):
     with ThreadPoolExecutor(1) as executor:
         return run_batch(sources, out, executor, model=model, progress=False, **options)
+
+
+@contextlib.contextmanager
+def unfinished(out, source):
+    """Lock a trip, as another run does that works on it: a batch with this trip outlasts the block."""
+    pytest.importorskip("fcntl")
+    with LocalStore(out).lock(source_id(str(source))) as locked:
+        assert locked
+        yield
 
 
 def counts(report):

@@ -50,7 +50,10 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
 
     def handle_request(self):
-        body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        length = int(self.headers.get("Content-Length", 0))
+        body = self.rfile.read(length)
+        if len(body) < length:  # the client has ended: an object is stored whole or not at all
+            return None
         key, objects = unquote(self.path[1:]), self.server.objects
         if self.server.fails(self.headers["From"], (self.command, self.path)):
             return self.answer(503)
@@ -95,7 +98,7 @@ class LoopbackFileSystem(AbstractFileSystem):
         return super()._strip_protocol(path).rpartition("@")[2]
 
     def _ask(self, command, path, data=None):
-        connection = http.client.HTTPConnection("127.0.0.1", int(os.environ[PORT]), timeout=10)
+        connection = http.client.HTTPConnection("127.0.0.1", int(os.environ[PORT]), timeout=60)
         with contextlib.closing(connection):
             client = {"From": f"{os.getpid()} {threading.get_ident()}"}
             connection.request(command, "/" + quote(path), data, client)
