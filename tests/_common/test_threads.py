@@ -84,12 +84,12 @@ def test_opencv_has_one_thread_until_the_last_thread_leaves():
     def other():
         with single_threaded_opencv():
             inside.set()
-            leave.wait(10)
+            leave.wait(60)
 
     thread = threading.Thread(target=other)
     with single_threaded_opencv():
         thread.start()
-        assert inside.wait(10)
+        assert inside.wait(60)
     # The first thread has left the context; the other one has not.
     inside_count = cv2.getNumThreads()
     leave.set()
@@ -140,7 +140,7 @@ def test_a_team_processes_expensive_items_first():
 def test_a_team_uses_all_threads():
     together = threading.Barrier(3)
     team = ThreadTeam(3, name="team")
-    names = team.map(lambda _: (together.wait(10), threading.current_thread().name)[1], range(3), cost=float)
+    names = team.map(lambda _: (together.wait(60), threading.current_thread().name)[1], range(3), cost=float)
     team.close()
     assert len(set(names)) == 3
     assert threading.current_thread().name in names
@@ -169,7 +169,7 @@ def test_the_second_of_two_callers_has_no_helpers():
     def call(caller):
         def work(item):
             if item == 0:
-                inside.wait(10)  # until both callers are here
+                inside.wait(60)  # until both callers are here
             return threading.current_thread().name
 
         # The first item is the most expensive one, so each caller processes its own.
@@ -241,12 +241,12 @@ def test_an_interrupted_call_in_another_thread_ends_first():
     ended = []
 
     def wait():
+        signal.setitimer(signal.ITIMER_REAL, 0.05)  # when the main thread waits
         time.sleep(0.2)
         ended.append(True)
 
     before = signal.signal(signal.SIGALRM, interrupt)
     try:
-        signal.setitimer(signal.ITIMER_REAL, 0.05)
         with pytest.raises(KeyboardInterrupt):
             call_in_thread(wait)
     finally:

@@ -57,7 +57,7 @@ emit = pipeline.FramePipeline._emit
 def pause(self, *args, **kwargs):
     emit(self, *args, **kwargs)
     print("now", flush=True)
-    time.sleep(0.2)
+    time.sleep(1)
 pipeline.FramePipeline._emit = pause
 sys.argv = ["vehicle-detection", *sys.argv[1:]]
 from vehicle_detection.cli import main
@@ -80,7 +80,7 @@ def test_a_signal_ends_a_video_and_leaves_nothing(clip, tmp_path, name):
     process = start_video(clip, tmp_path)
     process.send_signal(number)
     process.send_signal(number)  # does not interrupt the cleanup
-    out, errors = process.communicate(timeout=30)
+    out, errors = process.communicate(timeout=60)
     note = f"note: {tmp_path / 'out.mp4'} will be replaced when the new file is complete\n"
     assert (process.returncode, errors) == (128 + number, f"{note}interrupted\n")
     assert set(out.split()) <= {"now"}
@@ -94,7 +94,7 @@ def test_a_killed_run_leaves_no_process_and_the_next_one_removes_its_files(clip,
     process.communicate()
     parts = contents(tmp_path)
     assert parts == [".out.0.part.csv", ".out.0.part.mp4"]
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 60
     while processes_with(tmp_path) and time.monotonic() < deadline:
         time.sleep(0.02)
     assert not processes_with(tmp_path)
@@ -114,18 +114,25 @@ def processes_with(folder):
     return found
 
 
-@pytest.mark.parametrize("delay", [0.1, 0.3])
+@pytest.mark.parametrize("delay", [0.0, 0.1, 0.3])
 def test_an_early_interrupt_has_no_traceback(delay):
     code = (
-        "import sys\n"
-        "print('now', flush=True)\n"  # Python has started; what it prints before is not ours
+        "import signal, sys\n"
+        "original = signal.signal\n"
+        "def note(number, handler):\n"
+        "    before = original(number, handler)\n"
+        "    if number == signal.SIGINT:\n"
+        "        signal.signal = original\n"
+        "        print('now', flush=True)\n"  # what Python prints at an earlier interrupt is not ours
+        "    return before\n"
+        "signal.signal = note\n"
         "sys.argv = ['vehicle-detection', 'info']\n"
         "from vehicle_detection.cli import main\n"
         "main()"
     )
     process = start_interruptible(sys.executable, "-c", code)
-    process.stdout.readline()
-    time.sleep(0.02 + delay)  # until the handlers are set
+    assert process.stdout.readline() == "now\n", process.communicate()
+    time.sleep(delay)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert (process.returncode, errors) in ((130, "interrupted\n"), (0, ""))
@@ -173,7 +180,7 @@ from vehicle_detection import training
 def train(*_, **__):
     with ThreadPoolExecutor(1) as executor:
         print("now", flush=True)
-        executor.submit(time.sleep, 60).result()
+        executor.submit(time.sleep, 600).result()
 training.train_and_evaluate = train
 sys.argv = ["vehicle-detection", *sys.argv[1:]]
 from vehicle_detection.cli import main
@@ -183,7 +190,7 @@ main()
     process = start_interruptible(sys.executable, "-c", code, *words, "-o", tmp_path / "x.safetensors")
     assert process.stdout.readline() == "now\n", process.communicate()
     process.send_signal(signal.SIGTERM)
-    _, errors = process.communicate(timeout=20)
+    _, errors = process.communicate(timeout=60)
     assert (process.returncode, errors) == (143, "interrupted\n")
 
 
@@ -313,7 +320,7 @@ def test_an_interrupted_batch_leaves_no_empty_folder(clip, tmp_path):
     code = """
 import sys, time
 from vehicle_detection import batch
-batch.run_batch = lambda *_, **__: (print("now", flush=True), time.sleep(60))
+batch.run_batch = lambda *_, **__: (print("now", flush=True), time.sleep(600))
 sys.argv = ["vehicle-detection", *sys.argv[1:]]
 from vehicle_detection.cli import main
 main()
@@ -322,7 +329,7 @@ main()
     assert process.stdout.readline() == "now\n", process.communicate()
     assert contents(tmp_path / "new") == ["out"]
     process.send_signal(signal.SIGINT)
-    assert process.communicate(timeout=20)[1] == "interrupted\n"
+    assert process.communicate(timeout=60)[1] == "interrupted\n"
     assert contents(tmp_path) == []
 
 
