@@ -214,13 +214,17 @@ def test_the_function_gets_an_image_of_its_own():
 @pytest.mark.parametrize("thread_safe", [False, True])
 def test_calls_wait_for_each_other_unless_the_function_is_thread_safe(thread_safe):
     running, most, lock = 0, 0, threading.Lock()
+    together = threading.Barrier(4)
 
     def slow(image):
         nonlocal running, most
         with lock:
             running += 1
             most = max(most, running)
-        time.sleep(0.05)
+        if thread_safe:
+            together.wait(60)
+        else:
+            time.sleep(0.05)
         with lock:
             running -= 1
         return [], []
@@ -231,7 +235,7 @@ def test_calls_wait_for_each_other_unless_the_function_is_thread_safe(thread_saf
         thread.start()
     for thread in threads:
         thread.join()
-    assert most > 1 if thread_safe else most == 1
+    assert most == (4 if thread_safe else 1)
 
 
 def test_a_function_has_the_interface_of_a_model():

@@ -306,7 +306,7 @@ def test_many_threads_can_use_one_search(monkeypatch):
         together = threading.Barrier(8)
 
         def find(image):
-            together.wait(10)
+            together.wait(60)
             return bands.find_windows(image, search)
 
         for found, expected in zip(callers.map(find, images), fresh):
