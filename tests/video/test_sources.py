@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from moviepy.config import FFMPEG_BINARY
 
-from tests.helpers import StubDetector, start_interruptible
+from tests.helpers import ROOT, StubDetector, start_interruptible
 from tests.video.clips import (
     beeps,
     child_processes,
@@ -258,10 +258,22 @@ def endless_pipe(path):
         camera.wait()
 
 
-def test_a_live_source_drops_frames_rather_than_lag(tmp_path):
+def test_a_live_source_drops_frames_rather_than_lag(tmp_path, monkeypatch):
+    arrived, read = [], live.LiveStream.read
+
+    def count(stream, planes):
+        number = read(stream, planes)
+        arrived.append(number)
+        return number
+
+    monkeypatch.setattr(live.LiveStream, "read", count)
+
     class Slow(StubDetector):
         def search(self, frame):
-            time.sleep(0.1)
+            enough = min(len(arrived) + 5, 75)  # as many frames arrive in the meantime, of all 75
+            deadline = time.monotonic() + 60
+            while len(arrived) < enough and time.monotonic() < deadline:
+                time.sleep(0.005)
             return super().search(frame)
 
         def search_interval(self, fps):
@@ -272,16 +284,13 @@ def test_a_live_source_drops_frames_rather_than_lag(tmp_path):
 
     results = []
     with endless_pipe(tmp_path / "pipe"), open_source(tmp_path / "pipe", live=True) as source:
-        started = time.monotonic()
         report = process_video(
             source, tmp_path / "out.mp4", Slow(), workers=1, end=1.5, on_result=results.append
         )
-        seconds = time.monotonic() - started
         with pytest.raises(InvalidInputError, match="can be read only once"):
             source.read()
-    assert seconds < 4  # every frame would take 7.5 s
-    assert 3 < report.frames < 40
-    assert report.dropped > 20
+    assert 2 <= report.frames < 25  # on a busy machine, perhaps only the first one and the last one
+    assert report.dropped > 50
     assert f"{report.dropped} frames dropped" in str(report)
     # Times are those of the source, and the video repeats frames in place of those that were dropped.
     times = [result.time - results[0].time for result in results]
@@ -295,7 +304,7 @@ def test_closing_a_live_source_leaves_no_process(tmp_path):
             for index, _, _ in source:
                 if index > 3:
                     break
-        camera.wait(5)  # its reader is gone
+        camera.wait(60)  # its reader is gone
 
 
 LIVE = """
@@ -315,7 +324,7 @@ def test_an_interrupt_completes_the_video_of_a_live_source(tmp_path):
         for _ in range(5):
             assert process.stdout.readline()
         os.kill(process.pid, signal.SIGINT)
-        out, errors = process.communicate(timeout=20)
+        out, errors = process.communicate(timeout=60)
     assert (process.returncode, errors) == (0, "")
     assert int(out.split()[-1]) >= 5
     assert probe_video(tmp_path / "out.mp4").frames >= 5
@@ -421,7 +430,8 @@ def quick_reconnects(monkeypatch):
 def test_a_network_stream_that_breaks_off_is_opened_again(
     clip, tmp_path, monkeypatch, caplog, quick_reconnects, fault
 ):
-    monkeypatch.setattr(live, "NETWORK_TIMEOUT", 1.0)
+    if fault == "stalls":
+        monkeypatch.setattr(live, "NETWORK_TIMEOUT", 2.0)
     # ffmpeg reads seconds of a stream before it yields a frame.
     frames = 20 if fault == "ends" else 240
     loop = ("-stream_loop", frames // 20 - 1)
@@ -452,7 +462,7 @@ def test_a_network_stream_that_breaks_off_is_opened_again(
 
 
 def test_closing_a_stream_ends_its_attempts_to_reconnect(clip, monkeypatch):
-    monkeypatch.setattr(live, "_RECONNECT_DELAYS", (60.0,))
+    monkeypatch.setattr(live, "_RECONNECT_DELAYS", (600.0,))
     data = ffmpeg("-i", clip, "-c", "copy", "-an", "-f", "mpegts", "-")
     before = child_processes()
     with server(stream_of(data)) as address, open_source(f"{address}/live.ts", live=True) as source:
@@ -460,7 +470,7 @@ def test_closing_a_stream_ends_its_attempts_to_reconnect(clip, monkeypatch):
             assert next(reader)[0] >= 0
             time.sleep(0.3)
         started = time.monotonic()
-    assert time.monotonic() - started < 10
+    assert time.monotonic() - started < 60
     assert child_processes() == before
     assert not running_threads()
 
@@ -540,7 +550,7 @@ def test_hidden_folders_are_left_out(tmp_path):
 
 @pytest.mark.parametrize(("fps", "rate"), [(np.float32(10), 10), (0.0004, 0.0004), (0.5, 0.5)])
 def test_frame_rates_of_images(fps, rate):
-    with open_source("test_images/*.jpg", fps=fps) as source:
+    with open_source(f"{ROOT}/test_images/*.jpg", fps=fps) as source:
         assert float(source.info.fps) == pytest.approx(rate)
 
 
