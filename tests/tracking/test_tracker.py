@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vehicle_detection.boxes import Detections, iou_matrix
+from vehicle_detection.boxes import Detections, Platt, iou_matrix
 from vehicle_detection.camera import Camera
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import FrameBoxes, evaluate_tracks
@@ -421,12 +421,32 @@ class TestLifeCycle:
         (track,) = tracker.update(found(CAR, score=0.4), SHAPE)
         assert track.score == pytest.approx(0.8 * weight * (1 - weight) + 0.4 * weight)
 
-    def test_the_confidence_is_the_probability_of_the_score_as_log_odds(self):
-        (track,) = Tracker().update(found(CAR, score=9.0), SHAPE)
-        assert track.score > 0.5
-        assert track.confidence == pytest.approx(1 / (1 + math.exp(-track.score)))
+    def test_the_confidence_is_the_probability_of_the_mean_score_as_log_odds(self):
+        tracker, decay = Tracker(fps=10), math.exp(-0.1 / TrackParams().score_time_constant)
+        (track,) = tracker.update(found(CAR, score=3.0), SHAPE)
+        assert track.confidence == pytest.approx(1 / (1 + math.exp(-3.0)))
+        (track,) = tracker.update(found(), SHAPE)
+        assert track.confidence == pytest.approx(1 / (1 + math.exp(-3.0)))
+        (track,) = tracker.update(found(CAR, score=1.0), SHAPE)
+        mean = (3.0 * decay**2 + 1.0) / (decay**2 + 1)
+        assert track.confidence == pytest.approx(1 / (1 + math.exp(-mean)))
         (track,) = Tracker(calibration=None).update(found(CAR), SHAPE)
         assert track.confidence is None
+
+    @given(time_constant=st.floats(1e-9, 3600), threshold=st.floats(-2, 2))
+    def test_a_shifted_threshold_leaves_the_confidence(self, time_constant, threshold):
+        """The scores and their calibration shift alike if `conf` chooses another threshold."""
+        seen = []
+        for shift in (0.0, threshold):
+            params = TrackParams(score_time_constant=time_constant)
+            tracker = Tracker(params=params, fps=10, calibration=Platt(-1.0, -shift))
+            seen.append(
+                [
+                    tracker.update(found(CAR, score=score - shift), SHAPE)[0].confidence
+                    for score in (3.0, 2.5, 4.0)
+                ]
+            )
+        np.testing.assert_allclose(*seen)
 
 
 class TestOcclusion:

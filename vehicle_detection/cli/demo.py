@@ -23,7 +23,7 @@ from vehicle_detection.synthetic import Drive, VehicleTruth, render_drive, write
 from vehicle_detection.video import VideoReport, process_video, read_frames
 
 FILES = ("clip.mp4", "annotated.mp4", "tracks.csv", "labels.csv", "contact_sheet.png")
-"""Files that the demo writes: rendered clip, annotated clip, tracks, ground truth, and some annotated frames."""
+"""Files that the demo writes: rendered clip, annotated clip, tracks, ground truth, some annotated frames."""
 
 REPORT = "report.html"
 """File that the demo writes too if a report is asked for."""

@@ -26,7 +26,8 @@ class Track:
     score
         Exponential moving average of the detections' scores; a frame without a detection counts as 0.
     confidence
-        Calibrated probability of the score, in [0, 1]: that the track shows a vehicle.
+        Calibrated probability that the track shows a vehicle, in [0, 1]: that of the mean of its detections'
+        scores, in which older ones weigh less. It stays while there are no detections.
     state, shown
         ``"tentative"`` (not confirmed yet), ``"confirmed"`` (detected in this frame) or ``"coasting"``
         (confirmed, but not detected in this frame: the box is a prediction); whether to draw the track.
@@ -57,11 +58,18 @@ class Track:
     speed_std_mps: float | None = None
 
 
+def weight_of(dt: float, params: TrackParams) -> float:
+    """Weight of a frame in the exponential moving average of scores, `dt` seconds after the frame before."""
+    return -math.expm1(-dt / params.score_time_constant)
+
+
 @dataclass(eq=False, slots=True)
 class TrackState:
     """Life cycle of a track; its Kalman states are a row of `KalmanStates`. Times are in seconds."""
 
     score: float
+    weight: float = 1.0  # sum of the weights that the detections have in the score
+    mean_score: float = field(init=False)  # mean of the detections' scores with these weights
     confirm_at_birth: bool = False  # whether its first detection suffices to confirm it
     key: int = 0
     id: int = 0
@@ -79,6 +87,9 @@ class TrackState:
     covered: float = 0.0  # fraction of its box that nearer vehicles cover
     lost: bool = False  # whether its predicted position is only a guess
     past_boxes: list[tuple[float, Floats]] = field(default_factory=list)  # for the smoother "history"
+
+    def __post_init__(self) -> None:
+        self.mean_score = self.score / self.weight
 
     @property
     def state(self) -> Literal["tentative", "confirmed", "coasting"]:
@@ -101,8 +112,9 @@ class TrackState:
 
     def update_score(self, score: float | None, dt: float, params: TrackParams) -> None:
         """Advance by a frame, with the score of the assigned detection, or None without one."""
-        decay = math.exp(-dt / params.score_time_constant)
-        self.score = decay * self.score + (1 - decay) * (score or 0.0)
+        new = weight_of(dt, params)
+        self.score = (1 - new) * self.score + new * (score or 0.0)
+        self.weight = (1 - new) * self.weight + new * (score is not None)
         self.age += dt
         self.hidden = self.lost = False
         if score is None:
@@ -110,6 +122,7 @@ class TrackState:
             self.all_misses += 1
             self.time_since_update += dt
         else:
+            self.mean_score = self.score / self.weight
             self.hits += 1
             self.last_gap = self.time_since_update
             self.misses, self.time_since_update = 0, 0.0

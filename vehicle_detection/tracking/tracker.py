@@ -43,7 +43,7 @@ from vehicle_detection.tracking.kalman_filter import (
     exit_times,
 )
 from vehicle_detection.tracking.simple import make_smoother
-from vehicle_detection.tracking.track import TIME_TOLERANCE, Track, TrackState
+from vehicle_detection.tracking.track import TIME_TOLERANCE, Track, TrackState, weight_of
 
 # Visible fraction of a box below which its vehicle leaves the frame if it moves outwards, and below which it
 # has left; covered fractions above which a vehicle is hidden, and above which nothing of it is visible.
@@ -411,10 +411,11 @@ class Tracker:
         measured = Measurements.from_boxes(boxes[rows], frame, camera=self._lens)
         states = initiate_states(*self._smoother.initiate(measured), self.camera)
         self._states = self._states.join(self._update_distances(states, measured, dt))
-        weight = 1 - math.exp(-dt / self.params.score_time_constant)
+        weight = weight_of(dt, self.params)
         for score in scores[rows].tolist():
             confirm_at_birth = self._at_start and score >= self.params.instant_confirm_score
-            self._live.append(TrackState(score * weight, confirm_at_birth, key=self._next_key))
+            track = TrackState(score * weight, weight, confirm_at_birth=confirm_at_birth, key=self._next_key)
+            self._live.append(track)
             self._next_key += 1
 
     def _confirm(self, frame: FrameShape) -> None:
@@ -449,7 +450,7 @@ class Tracker:
         gap = np.array([track.time_since_update + dt for track in self._live[: len(boxes)]])
         ranges = estimate_distances(states, gap, self.camera)
         velocities = states.mean[:, 4:6].tolist()
-        scores = np.array([track.score for track in self._live[: len(boxes)]])
+        scores = np.array([track.mean_score for track in self._live[: len(boxes)]])
         confidences = [None] * len(scores)
         if self._calibration is not None:
             confidences = self._calibration.probability(scores).tolist()
