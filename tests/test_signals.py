@@ -11,6 +11,14 @@ from vehicle_detection.batch import worker
 from vehicle_detection.cli.signals import raise_on_signals
 
 
+@pytest.fixture(autouse=True)
+def interruptible():
+    """Interrupts are not ignored, as they are if pytest is a background job."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @contextlib.contextmanager
 def worker_signals():
     before = signal.signal(signal.SIGINT, worker._interrupt)

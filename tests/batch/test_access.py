@@ -117,7 +117,7 @@ def test_folders_that_cannot_be_read_are_errors(one, model, tmp_path, monkeypatc
         raise PermissionError(13, "Permission denied", path)
 
     monkeypatch.setattr(os, "scandir", refuse)
-    with pytest.raises(InvalidInputError, match=r"sources \S+card cannot be listed \(Permission denied\)"):
+    with pytest.raises(InvalidInputError, match=r"sources .+card cannot be listed \(Permission denied\)"):
         list_videos([one.parent])
     with pytest.raises(OutputError, match=r"records cannot be read \(Permission denied\)"):
         run(one, out, model, tracks_only=True)

@@ -174,9 +174,9 @@ def test_module_runs_as_a_program(picture, tmp_path):
     assert re.match(rf"{re.escape(str(picture))}: \d+ vehicles?( |\n)", found[1])
     assert contents(tmp_path) == ["out", "out/road.png"]
     assert missing[:2] == (2, "")
-    assert re.fullmatch(r"error: IMAGE \S+missing.png does not exist; check the path\n", missing[2])
+    assert re.fullmatch(r"error: IMAGE .+missing.png does not exist; check the path\n", missing[2])
     assert folder[0] == 2
-    assert re.fullmatch(r"error: IMAGE \S+ is a folder; choose files in it, such as \S+\n", folder[2])
+    assert re.fullmatch(r"error: IMAGE .+ is a folder; choose files in it, such as .+\n", folder[2])
     assert version == (0, f"{vehicle_detection.__version__}\n", "")
     assert usage[0] == 2
     assert "--nonsense" in usage[2]
@@ -278,10 +278,10 @@ def test_batch_refuses_bad_input_in_one_line(material, tmp_path):
     for message, words in {
         r"SOURCES\.\.\. must name at least one video": [],
         r"SOURCES\.\.\. nothing does not exist; check the path": ["nothing"],
-        r"SOURCES\.\.\. \S+empty holds no videos": [material / "empty"],
+        r"SOURCES\.\.\. .+empty holds no videos": [material / "empty"],
         r"--shard must be a number and a count, such as 3/200 .* got '9/3'": ["x", "--shard", "9/3"],
         r"--group must be one of 'trip', 'file'": ["x", "--group", "day"],
-        r"--output \S+nothing is not a folder": ["--status", "-o", tmp_path / "nothing"],
+        r"--output .+nothing is not a folder": ["--status", "-o", tmp_path / "nothing"],
         r"model file nothing does not exist": ["x", "--model", "nothing"],
         r"--preset must be one of": ["x", "--preset", "quick"],
         r"--every must be an integer": ["x", "--every", "0"],
@@ -446,7 +446,7 @@ def test_patterns_of_images_are_expanded(picture, tmp_path):
 def test_two_names_of_a_file_are_one_file(tmp_path):
     (tmp_path / "a.csv").touch()
     os.link(tmp_path / "a.csv", tmp_path / "A2.csv")  # as A.csv on a disk that ignores case
-    with pytest.raises(InvalidInputError, match=r"--json \S+A2.csv is also LABELS \S+a.csv; choose another"):
+    with pytest.raises(InvalidInputError, match=r"--json .+A2.csv is also LABELS .+a.csv; choose another"):
         check_distinct_paths({"--json": tmp_path / "A2.csv"}, {"LABELS": tmp_path / "a.csv"})
 
 
@@ -483,7 +483,7 @@ def test_a_damaged_but_readable_image_gives_a_warning(picture, tmp_path):
     (tmp_path / "road.jpg").write_bytes(data)
     result = run("detect", tmp_path / "road.jpg")
     assert result.exit_code == 0
-    assert re.fullmatch(r"(warning: \S+road.jpg: Corrupt JPEG data[^\n]*\n)+", result.stderr)
+    assert re.fullmatch(r"(warning: .+road.jpg: Corrupt JPEG data[^\n]*\n)+", result.stderr)
 
 
 def bad_images(material, tmp):
@@ -496,8 +496,8 @@ def bad_images(material, tmp):
     shutil.copy(material / "road.png", tmp / "twin")
     road = material / "road.png"
     return {
-        r"IMAGE \S+missing.png does not exist; check the path": [tmp / "missing.png"],
-        r"IMAGE \S+empty is a folder; choose files in it": [material / "empty"],
+        r"IMAGE .+missing.png does not exist; check the path": [tmp / "missing.png"],
+        r"IMAGE .+empty is a folder; choose files in it": [material / "empty"],
         r"text.png must be a complete image file": [material / "text.png"],
         r"cut_road.png must be a complete image file": [material / "cut_road.png"],
         r"nothing.png must be a complete image file": [tmp / "nothing.png"],
@@ -507,26 +507,26 @@ def bad_images(material, tmp):
         r"--horizon must be a number, at least 0 and at most 1; got 2": [road, "--horizon", 2],
         r"--conf must be a number, at least 0 and at most 1; got 7": [road, "--conf", 7],
         r"--horizon must be a number, .* got nan": [road, "--horizon", "nan"],
-        r"--output \S+ is the folder of road.png, which would be overwritten": [road, "-o", material],
-        r"--output must be a folder, \S+ cannot be created: File exists": [road, "-o", road],
+        r"--output .+ is the folder of road.png, which would be overwritten": [road, "-o", material],
+        r"--output must be a folder, .+ cannot be created: File exists": [road, "-o", road],
         r"have the same file name, which identifies the results": [
             road,
             tmp / "twin" / "road.png",
             "-o",
             tmp / "out",
         ],
-        r"--boxes \S+road.png is one of the images": [road, "--boxes", road],
+        r"--boxes .+road.png is one of the images": [road, "--boxes", road],
         r"--labels must be one of 'score', 'none'; got 'id'": [road, "--labels", "id"],
         r"--line-width must be an integer from 1 to 1000; got 0": [road, "--line-width", 0],
         r"--boxes must end in .csv, .* got 'boxes.doc'": [road, "--boxes", tmp / "boxes.doc"],
-        r"--boxes needs an existing folder, \S+none is not one": [
+        r"--boxes needs an existing folder, .+none is not one": [
             road,
             "--boxes",
             tmp / "none" / "boxes.csv",
         ],
-        r"model file \S+none.safetensors does not exist": [road, "--model", tmp / "none.safetensors"],
+        r"model file .+none.safetensors does not exist": [road, "--model", tmp / "none.safetensors"],
         r"model file motorway does not exist; .* a shipped model: default, h": [road, "--model", "motorway"],
-        r"model file \S+empty is a folder": [road, "--model", material / "empty"],
+        r"model file .+empty is a folder": [road, "--model", material / "empty"],
         r"text.safetensors is not a complete safetensors": [road, "--model", material / "text.safetensors"],
     }
 
@@ -798,14 +798,14 @@ def bad_videos(material, tmp):
             writer.write(np.zeros((*size, 3), np.uint8))
         writer.release()
     return {
-        r"SOURCE \S+missing.mp4 does not exist": [tmp / "missing.mp4", "-o", target],
-        r"SOURCE \S+empty holds no videos and no images": [material / "empty", "-o", target],
+        r"SOURCE .+missing.mp4 does not exist": [tmp / "missing.mp4", "-o", target],
+        r"SOURCE .+empty holds no videos and no images": [material / "empty", "-o", target],
         r"text.mp4 is a text file, not a video": [material / "text.mp4", "-o", target],
         r"cut_clip.mp4 is not a video .*its index is missing": [material / "cut_clip.mp4", "-o", target],
         r"none.mp4 (has no|is not a video)": [tmp / "none.mp4", "-o", target],
         r"image of 32x32 pixels holds no search window": [tiny, "-o", target, "--model", "highway"],
-        r"--output \S+clip.mp4 is also SOURCE": [clip, "-o", clip],
-        r"--output needs an existing folder, \S+none is not one": [clip, "-o", tmp / "none" / "out.mp4"],
+        r"--output .+clip.mp4 is also SOURCE": [clip, "-o", clip],
+        r"--output needs an existing folder, .+none is not one": [clip, "-o", tmp / "none" / "out.mp4"],
         r"--output must end in .mp4, .* got 'out.gif'": [clip, "-o", tmp / "out.gif"],
         r"--output must be a file, got the folder": [clip, "-o", tmp],
         r"--end must be later than the start; got 3 s to 2 s": [clip, "-o", target, "--start", 3, "--end", 2],
@@ -835,18 +835,18 @@ def bad_videos(material, tmp):
             "--report",
             tmp / "page.pdf",
         ],
-        r"--report \S+ is also --output \S+;": [clip, "-o", target, "--report", target],
+        r"--report .+ is also --output .+;": [clip, "-o", target, "--report", target],
         r"--blur must be one of 'vehicles', 'plates'; got 'faces'": [clip, "-o", target, "--blur", "faces"],
         r"--events must end in .csv or .json, got 'e.txt'": [clip, "-o", target, "--events", tmp / "e.txt"],
         r"--own-speed must be a speed of at most 500": [clip, "-o", target, "--own-speed", -1],
         r"--srt must end in .srt or .ass, got 's.txt'": [clip, "-o", target, "--srt", tmp / "s.txt"],
         r"--gpx must end in .gpx or .csv, got 'clip.mp4'": [clip, "-o", target, "--gpx", clip],
-        r"--gpx \S+none.gpx does not exist": [clip, "-o", target, "--gpx", tmp / "none.gpx"],
+        r"--gpx .+none.gpx does not exist": [clip, "-o", target, "--gpx", tmp / "none.gpx"],
         r"--own-speed and --gpx both state": [clip, "-o", target, "--own-speed", 9, "--gpx", tmp / "a.gpx"],
         r"--gpx-offset needs --gpx": [clip, "-o", target, "--gpx-offset", 9],
         r"--why needs --report, which shows": [clip, "-o", target, "--why"],
         r"--clips must be a folder": [clip, "-o", target, "--clips", clip],
-        r"--tracks \S+ is also SOURCE \S+;": [tmp / "a.csv", "-o", target, "--tracks", tmp / "a.csv"],
+        r"--tracks .+ is also SOURCE .+;": [tmp / "a.csv", "-o", target, "--tracks", tmp / "a.csv"],
     }
 
 
@@ -903,7 +903,7 @@ def test_video_refuses_bad_input_before_it_estimates_the_horizon(material, tmp_p
 def test_read_only_folders_are_refused(monkeypatch, material, clip, picture, tmp_path):
     # The tests may run as root, to whom the system grants any access.
     monkeypatch.setattr(_files.os, "access", lambda path, mode: not (mode & os.W_OK))
-    read_only = r"needs a writable folder, \S+ is read-only; choose another"
+    read_only = r"needs a writable folder, .+ is read-only; choose another"
     for words in (
         ["video", clip, "-o", tmp_path / "out.mp4"],
         ["video", clip, "-o", tmp_path / "out.mp4", "--tracks", tmp_path / "tracks.csv"],
@@ -1044,7 +1044,7 @@ def test_evaluate_refuses_bad_input(material, tmp_path):
         r"other.csv lacks the columns": [tmp_path / "other.csv", labels],
         r"--iou must be a number, greater than 0 and at most 1": [labels, labels, "--iou", 0],
         r"--json needs an existing folder": [labels, labels, "--json", tmp_path / "none" / "s.json"],
-        r"--json \S+ is also LABELS \S+;": [tmp_path / "other.csv", labels, "--json", labels],
+        r"--json .+ is also LABELS .+;": [tmp_path / "other.csv", labels, "--json", labels],
     }
     original = labels.read_bytes()
     for message, words in cases.items():
@@ -1104,24 +1104,24 @@ def bad_training(material, tmp):
     good, vehicles, others = patches_of(material), material / "vehicles", material / "non-vehicles"
     model = ["-o", tmp / "m.safetensors"]
     return {
-        r"--vehicles \S+none does not exist; check the path": [
+        r"--vehicles .+none does not exist; check the path": [
             "--vehicles", tmp / "none", "--non-vehicles", others, *model],
-        r"--non-vehicles \S+empty holds no PNG or JPEG patches": [
+        r"--non-vehicles .+empty holds no PNG or JPEG patches": [
             "--vehicles", vehicles, "--non-vehicles", material / "empty", *model],
-        r"1.png of \S+small is 32x32 pixels, expected 64x64": [
+        r"1.png of .+small is 32x32 pixels, expected 64x64": [
             "--vehicles", tmp / "small", "--non-vehicles", others, *model],
-        r"cut_road.png of \S+ must be a complete image file": [
+        r"cut_road.png of .+ must be a complete image file": [
             "--vehicles", tmp / "cut", "--non-vehicles", others, *model],
         r"small.zip is not a zip": ["--vehicles", tmp / "small.zip", "--non-vehicles", others, *model],
-        r"--non-vehicles \S+ is also --vehicles \S+;": [
+        r"--non-vehicles .+ is also --vehicles .+;": [
             "--vehicles", vehicles, "--non-vehicles", vehicles, *model],
         r"1 vehicles and 20 non-vehicles are too few": [
             "--vehicles", tmp / "one", "--non-vehicles", others, *model],
         r"--output needs an existing folder": [*good, "-o", tmp / "none" / "m.safetensors"],
         r"--output must be a file, got the folder": [*good, "-o", tmp],
-        r"--output \S+small.zip is also --vehicles \S+;": [
+        r"--output .+small.zip is also --vehicles .+;": [
             "--vehicles", tmp / "small.zip", "--non-vehicles", others, "-o", tmp / "small.zip"],
-        r"--report \S+ is also --output \S+;": [*good, *model, "--report", tmp / "m.safetensors"],
+        r"--report .+ is also --output .+;": [*good, *model, "--report", tmp / "m.safetensors"],
         r"--card needs an existing folder": [*good, *model, "--card", tmp / "none" / "card.md"],
         r"--features must be one of 'luv-2384'": [*good, *model, "--features", "hog"],
         r"--compare must be one of 'luv-2384', .* got 'sift'": [*good, *model, "--compare", "sift"],
@@ -1164,7 +1164,7 @@ def test_fetch_prints_the_paths_of_the_patches(monkeypatch, tmp_path):
         "fetch_patches",
         lambda output, progress: (output / "vehicles.zip", output / "non-vehicles.zip"),
     )
-    assert succeed("fetch", "-o", tmp_path).split() == [
+    assert succeed("fetch", "-o", tmp_path).splitlines() == [
         str(tmp_path / "vehicles.zip"),
         str(tmp_path / "non-vehicles.zip"),
     ]
@@ -1279,12 +1279,12 @@ def test_train_frames_refuses_bad_input_before_it_trains(drawn_roads, tmp_path, 
     model = tmp_path / "m.safetensors"
     (tmp_path / "empty").mkdir()
     cases = {
-        r"folder \S+none does not exist; pass the folder of the labelled": [tmp_path / "none", "-o", model],
-        r"folder \S+empty has no labels/NAME.csv": [tmp_path / "empty", "-o", model],
+        r"folder .+none does not exist; pass the folder of the labelled": [tmp_path / "none", "-o", model],
+        r"folder .+empty has no labels/NAME.csv": [tmp_path / "empty", "-o", model],
         r"DATA must hold at least 2 data sets, got 1; one at a time is left out": [one, "-o", model],
         r"--output needs an existing folder": [drawn_roads, "-o", tmp_path / "none" / "m.safetensors"],
         r"--output must be a file, got the folder": [drawn_roads, "-o", tmp_path],
-        r"--curves \S+ is also --output \S+;": [drawn_roads, "-o", model, "--curves", model],
+        r"--curves .+ is also --output .+;": [drawn_roads, "-o", model, "--curves", model],
         r"none does not exist": [drawn_roads, "-o", model, "--patches", tmp_path / "none"],
         r"--seed must be an integer from 0": [drawn_roads, "-o", model, "--seed", -1],
     }

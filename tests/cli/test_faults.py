@@ -4,6 +4,7 @@ import errno
 import itertools
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -336,7 +337,8 @@ main()
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps the current folder")
 def test_a_current_folder_that_has_been_removed(clip, tmp_path):
     (tmp_path / "gone").mkdir()
-    script = f'cd {tmp_path / "gone"} && rmdir {tmp_path / "gone"} && exec "$@"'
+    gone = shlex.quote(str(tmp_path / "gone"))
+    script = f'cd {gone} && rmdir {gone} && exec "$@"'
     command = [sys.executable, "-m", "vehicle_detection", "video", str(clip), "-o", "out.mp4"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
@@ -402,8 +404,8 @@ def test_a_name_that_cannot_be_printed(tmp_path):
 @pytest.mark.parametrize("closed", [">&-", "2>&-"])
 def test_closed_outputs(tmp_path, closed):
     write_image(tmp_path / "road.png", render_scene(shape=(180, 320), vehicles=0, random_state=0).image)
-    for words in ("info", f"detect {tmp_path / 'road.png'} --model highway"):
-        command = f"{sys.executable} -m vehicle_detection {words} {closed}"
+    for words in (["info"], ["detect", str(tmp_path / "road.png"), "--model", "highway"]):
+        command = f"{shlex.join([sys.executable, '-m', 'vehicle_detection', *words])} {closed}"
         done = subprocess.run(["sh", "-c", command], cwd=ROOT, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         assert "Traceback" not in done.stderr
