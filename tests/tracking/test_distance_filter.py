@@ -17,11 +17,12 @@ CAMERA = Camera.for_frame(SHAPE, horizon_std_px=0.0)
 BOXES = np.array([[600.0, 400, 700, 490], [100, 300, 180, 420]])
 
 
-def first_range(box, *, camera=CAMERA):
+def first_range(box, *, camera=CAMERA, hidden=False):
     """Distance, and its standard error, after the first measurement of a vehicle."""
     boxes = np.array([box])
     states = initiate_states(*initiate(boxes, np.ones((1, 4))), camera)
-    states = update_distances(states, Measurements.from_boxes(boxes, SHAPE), camera, 0.04, 0.04)
+    measured = Measurements.from_boxes(boxes, SHAPE, hidden=hidden)
+    states = update_distances(states, measured, camera, 0.04, 0.04)
     return states.range_mean[0, 0], np.sqrt(states.range_cov[0, 0, 0])
 
 
@@ -181,3 +182,31 @@ def test_a_box_that_a_nearer_vehicle_covers_is_a_weaker_measurement():
     # The narrower a box, the farther the vehicle seems.
     assert hidden[0] < partial[0] < visible[0]
     assert visible[1] < partial[1] < hidden[1]
+
+
+@pytest.mark.parametrize("edge", [0, 2])
+def test_the_width_of_a_vehicle_behind_another_one_is_a_lower_bound(edge):
+    hidden = np.arange(4) == edge
+    states = ranges([20.0, 0.0, 0.0, 0.0], np.diag([9.0, 4.0, 0.02, 0.6]))
+
+    def distance(width, **options):
+        box = np.array([box_at(20.0, width=width)])
+        box[:, 3] = 720  # its bottom edge is truncated
+        measured = Measurements.from_boxes(box, SHAPE, **options)
+        return update_distances(states, measured, CAMERA, 0.04, 0.04).range_mean[0, 0]
+
+    assert distance(1.2) > 20.5
+    assert distance(1.2, hidden=hidden) == 20
+    # A part that is wider than expected shows that the vehicle is nearer, or wider.
+    assert distance(2.2, hidden=hidden) == distance(2.2) < 19.5
+    # Above and below a vehicle, nothing is hidden.
+    assert distance(1.2, hidden=np.array([False, True, False, True])) == distance(1.2)
+
+
+def test_the_first_distance_of_a_vehicle_behind_another_one_is_not_that_of_its_width():
+    half, camera = box_at(30.0, width=0.9), Camera.for_frame(SHAPE, horizon_std_px=20.0)
+    hidden = [False, False, True, False]
+    assert first_range(half, camera=camera)[0] > 50
+    assert first_range(half, camera=camera, hidden=hidden)[0] == pytest.approx(30)
+    # Without a visible bottom edge, its distance is unknown.
+    assert first_range([*half[:3], 720.0], hidden=hidden)[1] > 500

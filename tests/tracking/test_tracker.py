@@ -1188,6 +1188,22 @@ def test_a_vehicle_hidden_in_steps_keeps_its_size_place_and_id():
     assert [track.id for track in tracks] == [1, 2]
 
 
+def test_the_distance_of_a_vehicle_that_emerges_from_behind_another_one_is_right():
+    """It seems far away if its visible part is taken for its width, and fast as that part grows."""
+    tracker, near, estimates = Tracker(fps=25, camera=CAMERA), on_road(12), []
+    for step in range(90):
+        visible = on_road(30, x=1 + step / 25, length=4.5)
+        whole = visible[2] - visible[0]
+        visible[0] = max(visible[0], near[2])
+        is_detected = visible[2] - visible[0] > 0.5 * whole
+        tracks = tracker.update(found(near, *([visible] if is_detected else [])), SHAPE)
+        estimates += [track for track in tracks if track.id == 2]
+    errors = [track.distance_m / 30 - 1 for track in estimates]
+    assert len(errors) > 20
+    assert np.abs(errors).max() < 0.12
+    assert abs(estimates[-1].speed_mps or 0.0) < 2
+
+
 def test_an_equal_camera_for_another_size_is_another_camera():
     unknown = Camera(focal_px=600, horizon_px=400)
     tracker = Tracker(camera=unknown)

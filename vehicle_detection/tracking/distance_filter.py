@@ -83,6 +83,10 @@ def update_distances(
     visible = ~(measured.truncated | measured.merged[:, None])
     visible &= (measured.covered < _MAX_COVERED)[:, None]
     bottom_visible, width_visible = visible[:, 3], visible[:, 0] & visible[:, 2]
+    # Behind a nearer vehicle a box ends where its visible part does, and grows as its vehicle emerges: its
+    # width is only a lower bound, as in a Kalman filter of censored measurements (Allik et al., *IEEE
+    # Transactions on Control Systems Technology*, 2016).
+    is_bound = measured.hidden[:, [0, 2]].any(axis=1)
     boxes, lateral_px = measured.road_boxes, measured.lateral_px
     sides = np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0)
     edge_std = np.hypot(camera.bottom_std_px * camera.pixel_scale, camera.box_std * sides)
@@ -95,15 +99,16 @@ def update_distances(
     width_scale = camera.width_times_distance(lateral_px) - oncoming * _ONCOMING_CUT * lateral_px
     unknown = cov[:, 0, 0] > _INITIAL_DISTANCE_STD**2 / 2
     if unknown.any():
+        whole = width_visible & ~is_bound
         # Linearize at the first measurement itself.
         below = bottom_visible & (below_horizon > 2 * np.hypot(edge_std[:, 1], horizon_std))
         by_bottom = bottom_scale / np.where(below, below_horizon, 1.0)
         # The measurement with the smaller relative error.
         bottom_error = np.hypot(edge_std[:, 1], horizon_std) / np.where(below, below_horizon, 1.0)
         width_error = np.sqrt(cov[:, 2, 2] + np.square(lateral_px / width_scale) * cov[:, 3, 3])
-        is_better = below & ((bottom_error < width_error) | ~width_visible)
+        is_better = below & ((bottom_error < width_error) | ~whole)
         first = np.where(is_better, by_bottom, width_scale / sides[:, 0])
-        known = unknown & (below | width_visible)
+        known = unknown & (below | whole)
         mean[known, 0] = np.clip(first[known], _MIN_DISTANCE, _MAX_DISTANCE)
         bottom_visible &= is_better | ~unknown
 
@@ -139,7 +144,7 @@ def update_distances(
     systematic = np.square(cut_short) + np.square(covered_std) + np.square(side_std)
     variance = np.square(edge_std[:, 0] / sides[:, 0]) * 2 * box_frames + systematic * pitch_frames
     jacobian[:, 0], jacobian[:, 2], jacobian[:, 3] = -1 / mean[:, 0], 1.0, side
-    variance = np.where(width_visible, variance, np.inf)
+    variance = np.where(width_visible & ~(is_bound & (innovation < 0)), variance, np.inf)
     mean, cov = _scalar_update(mean, cov, jacobian, innovation, variance)
     np.clip(mean[:, 0], _MIN_DISTANCE, _MAX_DISTANCE, out=mean[:, 0])
     mean[:, 2] = np.clip(mean[:, 2], _MIN_LOG_WIDTH, _MAX_LOG_WIDTH)

@@ -408,7 +408,10 @@ class Tracker:
         rows = distinct_vehicles(boxes, range(high), known, self.params) if high else []
         if not rows:
             return
-        measured = Measurements.from_boxes(boxes[rows], frame, camera=self._lens)
+        in_front = np.array([track.id > 0 and track.misses == 0 for track in self._live], np.bool_)
+        tracked = _clip(self._states.boxes(), frame)
+        hidden = hidden_edges(boxes[rows], tracked, [-1] * len(rows), in_front)
+        measured = Measurements.from_boxes(boxes[rows], frame, camera=self._lens, hidden=hidden)
         states = initiate_states(*self._smoother.initiate(measured), self.camera)
         self._states = self._states.join(self._update_distances(states, measured, dt))
         weight = weight_of(dt, self.params)
