@@ -28,6 +28,9 @@ _WIDTH_TIME, _PITCH_TIME = 20.0, 2.0
 # Mean innovation of an edge above which a track's distance is uncertain, and its relative error per second.
 _UNSETTLED, _UNSETTLED_STD = 1.5, 0.5
 # Maximum relative error of a reported distance, age of its last measurement (s), and error of a speed (m/s).
+# Distance, speed and error of a vehicle have a common factor, so that fast vehicles that seem too near, and
+# thus too slow, are below the last limit first: speeds that are stated at -40 m/s lean towards 0 by about a
+# standard error. Over vehicles with speeds of the filter's prior they do not lean towards 0.
 _MAX_RANGE_STD, _MAX_RANGE_AGE, _MAX_RANGE_SPEED_STD = 0.4, 0.5, 6.0
 # Fraction of a box that nearer vehicles cover, from which on it is no measurement, and relative error of the
 # width of a box that they cover less.
