@@ -303,7 +303,9 @@ class _Finder:
         for start, stop in self._runs(short, _MIN_CLOSING):
             rows = _rows(short, start, stop)
             row = int(rows[np.argmin(time[rows])])
-            deceleration = float((motion.closing[rows] ** 2 / (2 * motion.distance[rows])).max())
+            # The largest of many estimates is too large, so each is lowered by its standard error.
+            closing = motion.closing[rows] * (1 - std[rows] / time[rows])
+            deceleration = float((closing**2 / (2 * motion.distance[rows])).max())
             hard = time[row] <= _HARD_TIME or deceleration >= _HARD_DECELERATION
             yield self._event("hard_closing" if hard else "closing", row, start, stop)
 
