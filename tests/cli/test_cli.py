@@ -1013,6 +1013,39 @@ def test_evaluate_scores_some_frames(tmp_path):
     out = succeed("evaluate", found, labels, "--frames", "0-1")
     assert "2 found, 0 missed, 0 false" in out
     assert "1 tracks of 1 vehicles in 2 frames" in out
+    for listed, frames in {"0,1": 2, "0, 3-5": 4, "0-9:3": 4}.items():
+        assert f"Detections in {frames} frames" in succeed("evaluate", found, labels, "--frames", listed)
+    for listed in ("0,x", "5-9:0", "none.txt"):
+        message = refuse("evaluate", found, labels, "--frames", listed)
+        assert "--frames must be numbers such as 0,6,12 or 0-299" in message
+        assert f"or a file with a frame in each line, got '{listed}'" in message
+
+
+def test_evaluate_notes_boxes_in_frames_without_labels(tmp_path):
+    labels, found = tmp_path / "labels.csv", tmp_path / "found.csv"
+    labels.write_text("frame,track,x1,y1,x2,y2\n0,1,10,10,60,50\n6,1,10,10,60,50\n")
+    found.write_text(f"{HEADER}\n" + "".join(f"{n},1,10,10,60,50,1.{n}\n" for n in range(10)))
+    result = run("evaluate", found, labels)
+    assert result.stderr == (
+        f"note: 8 of 10 frames with boxes have no row in {labels}, so their boxes count as false; pass "
+        "--frames if not all of them are labelled\n"
+    )
+    assert run("evaluate", found, labels, "--frames", "0-9:6").stderr == ""
+    message = refuse("evaluate", labels, found)
+    assert f"{found} has scores and {labels} has none, so they seem to be swapped" in message
+    found.write_text(f"{HEADER}\n" + "".join(f"{n},1,10,10,60,50,1\n" for n in (0, 6)))
+    assert "2 found, 0 missed, 0 false" in succeed("evaluate", labels, found)  # a constant may be a flag
+
+
+def test_evaluate_names_the_files_whose_frames_differ(tmp_path):
+    labels, found = tmp_path / "labels.csv", tmp_path / "found.csv"
+    labels.write_text("frame,track,x1,y1,x2,y2\na,1,10,10,60,50\n")
+    found.write_text(f"{HEADER}\nin/a.jpg,1,10,10,60,50,1\n")
+    for words in ((), ("--frames", tmp_path / "part.txt")):
+        (tmp_path / "part.txt").write_text("a\n")
+        assert "1 found, 0 missed, 0 false" in succeed("evaluate", found, labels, *words)
+    found.write_text(f"{HEADER}\nin/a.jpg,1,10,10,60,50,1\nout/a.jpg,1,10,10,60,50,1\n")
+    assert f"frame names of {found} and {labels} differ: 'out/a.jpg'" in refuse("evaluate", found, labels)
 
 
 def test_images_that_are_too_small_are_left_out(tmp_path):

@@ -463,8 +463,9 @@ def evaluate(
     frames: Annotated[
         str | None,
         option(
-            "A-B|FILE",
-            "Score only these frames: numbers, such as 0-299, or a text file with a name in each line.",
+            "LIST|FILE",
+            "Score only these frames: numbers, such as 0,6,12, 0-299 or 0-299:6 (every 6th), or a text file "
+            "with the number or name of a frame in each line.",
         ),
     ] = None,
     json: Annotated[Path | None, option("FILE", "File for all scores, such as scores.json.")] = None,
@@ -473,12 +474,25 @@ def evaluate(
     from json import dumps
 
     from vehicle_detection._common import check_target, write_text
-    from vehicle_detection.evaluation import NO_TRACK, evaluate_detections, evaluate_tracks, read_labels
+    from vehicle_detection.evaluation import (
+        NO_TRACK,
+        evaluate_detections,
+        evaluate_tracks,
+        match_names,
+        read_labels,
+    )
 
     if json is not None:
         check_target(json, "--json")
         check_distinct_paths({"--json": json}, {"PREDICTIONS": predictions, "LABELS": labels})
     found, true = read_labels(predictions, truth=labels), read_labels(labels)
+    # Equal scores may be flags of labels, as in MOTChallenge's ground truth.
+    if len(found) and found.scores is None and true.scores is not None and len(set(true.scores)) > 1:
+        raise InvalidInputError(
+            f"{labels} has scores and {predictions} has none, so they seem to be swapped; pass the "
+            "predictions first, then the labels; if these are labels with scores, remove the scores"
+        )
+    found = match_names(found, true.frame_keys, (str(predictions), str(labels)))
     chosen = None
     if frames is not None:
         chosen = _parse_frames(frames, true.frame_keys)
@@ -501,6 +515,13 @@ def evaluate(
             f"note: {unseen} of {len(labelled)} labelled frames have no box in {predictions}, so their "
             "vehicles count as missed; pass --frames if not all of them were searched"
         )
+    searched = set(found[~found.ignore].frames)
+    unlabelled = len(searched - set(true.frame_keys if chosen is None else chosen))
+    if unlabelled > 0.1 * len(searched):
+        print_error(
+            f"note: {unlabelled} of {len(searched)} frames with boxes have no row in {labels}, so their "
+            "boxes count as false; pass --frames if not all of them are labelled"
+        )
     for boxes, count, file in zip((found, true), unknown, (predictions, labels)):
         if 0 < count < (~boxes.ignore).sum():
             noun = "box has" if count == 1 else "boxes have"
@@ -516,15 +537,20 @@ def _boxes_in(boxes: FrameBoxes, frames: Sequence[FrameKey]) -> FrameBoxes:
 
 
 def _parse_frames(text: str, keys: Sequence[FrameKey]) -> list[FrameKey]:
-    """Frames of a range of numbers, or of a file with a frame in each line; some must be among the keys."""
-    span = re.fullmatch(r"(\d{1,9})-(\d{1,9})", text)
-    chosen: list[FrameKey]
-    if span:
-        chosen = list(range(int(span[1]), int(span[2]) + 1))
+    """Frames of numbers and ranges, or of a file with a frame in each line; some must be among the keys."""
+    span = r"\s*(\d{1,9})(?:-(\d{1,9})(?::([1-9]\d{0,8}))?)?\s*"
+    spans = [re.fullmatch(span, part) for part in text.split(",")]
+    chosen: list[FrameKey] = []
+    if all(spans):
+        for first, last, step in (found.groups() for found in spans if found):
+            chosen += range(int(first), int(last or first) + 1, int(step or 1))
     else:
         from vehicle_detection._common import Limit, check_path, read_regular_file
 
-        file = check_path(text, "--frames", kind="a range such as 0-299, or a file")
+        kind = "numbers such as 0,6,12 or 0-299 (0-299:6 for every 6th), or a file with a frame in each line"
+        file = check_path(text, "--frames", kind=kind)
+        if not file.exists():
+            raise InvalidInputError(f"--frames must be {kind}, got {text!r}")
         data = read_regular_file(file, f"--frames {text}", Limit.TEXT_BYTES).decode("utf-8-sig", "replace")
         names = [line.strip() for line in data.splitlines() if line.strip()]
         numbered = bool(keys) and isinstance(keys[0], int)

@@ -178,7 +178,7 @@ def evaluate_detections(
     ------
     InvalidInputError
         If an argument is not `FrameBoxes`, `iou` is out of range, a prediction is in none of the `frames`, or
-        predictions and labels name their frames differently.
+        the names of the same frames are not unique without their folders and suffixes.
 
     Examples
     --------

@@ -8,6 +8,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
+from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from vehicle_detection._common import (
     pluralize,
 )
 from vehicle_detection.boxes import Detections
+from vehicle_detection.datasets.archives import is_image
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.export import check_items, is_result, shown_tracks
 
@@ -71,6 +73,39 @@ def check_keys(values: object, name: str) -> tuple[FrameKey, ...]:
 def frame_order(key: FrameKey) -> tuple[list[object], str]:
     """Natural sort key: frame 2 comes before frame 10, also in file names."""
     return ([key], "") if isinstance(key, int) else natural_key(key)
+
+
+def without_suffix(name: str) -> str:
+    """Return the name of a frame without the suffix of an image."""
+    path = PurePosixPath(name)
+    return name[: -len(path.suffix)] if is_image(path.name) else name
+
+
+def match_names(boxes: FrameBoxes, keys: Sequence[FrameKey], sides: tuple[str, str]) -> FrameBoxes:
+    """Rename frames to `keys` where the names differ by a folder or the suffix of an image only.
+
+    Nothing is renamed if a frame is among `keys`. Names that are not unique then are an error, which names
+    `boxes` and `keys` by `sides`.
+    """
+    if set(boxes.frame_keys) & set(keys):
+        return boxes
+    ours, theirs = (
+        {PurePosixPath(without_suffix(key)).name: key for key in side if isinstance(key, str)}
+        for side in (boxes.frame_keys, keys)
+    )
+    shared = ours.keys() & theirs.keys()
+    if not shared:
+        return boxes
+    paths = [[f"/{without_suffix(side[name])}" for side in (ours, theirs)] for name in sorted(shared)]
+    different = [pair for pair in paths if not (pair[0].endswith(pair[1]) or pair[1].endswith(pair[0]))]
+    if different or len(ours) < len(boxes.frame_keys) or len(theirs) < len(keys):
+        name = min(shared)
+        raise InvalidInputError(
+            f"frame names of {sides[0]} and {sides[1]} differ: {ours[name]!r} and {theirs[name]!r}; use the "
+            "same names on both sides, for example with FrameBoxes.renamed"
+        )
+    names = {ours[name]: theirs[name] for name in shared}
+    return boxes.renamed(lambda key: names.get(key, key))
 
 
 def _column(values: ArrayLike | None, name: str, rows: int, kinds: str, default: Any) -> NDArray[Any]:

@@ -20,7 +20,7 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation.frame_boxes import FrameBoxes, FrameKey
+from vehicle_detection.evaluation.frame_boxes import FrameBoxes, FrameKey, match_names
 
 Frames = Mapping[FrameKey, NDArray[np.uint8]] | FrameSet | Sequence[NDArray[np.uint8]]
 """Images by key, a `FrameSet`, or a list of images that are numbered from 0."""
@@ -76,6 +76,7 @@ class LabelledFrames:
         if not keys:
             raise InvalidInputError("frames must hold at least one image, got none")
         check_type(labels, "labels", FrameBoxes, "read a file with read_labels")
+        labels = match_names(labels, keys, ("labels", "frames"))
         if labels.frame_keys and not set(keys) & set(labels.frame_keys):
             raise InvalidInputError(
                 f"labels must name the frames, such as {keys[0]!r}, got {labels.frame_keys[0]!r}; "

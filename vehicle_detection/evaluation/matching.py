@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,14 @@ from numpy.typing import NDArray
 from vehicle_detection._common import describe
 from vehicle_detection.boxes import box_areas, intersection_matrix, iou_matrix
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation.frame_boxes import NO_TRACK, FrameBoxes, FrameKey, check_keys, frame_order
+from vehicle_detection.evaluation.frame_boxes import (
+    NO_TRACK,
+    FrameBoxes,
+    FrameKey,
+    check_keys,
+    frame_order,
+    match_names,
+)
 
 
 def prepare_evaluation(
@@ -27,6 +33,7 @@ def prepare_evaluation(
                 "the Detections of each frame with FrameBoxes.from_detections"
             )
     predictions = predictions[~predictions.ignore]
+    predictions = match_names(predictions, labels.frame_keys, ("predictions", "labels"))
     given = None if frames is None else check_keys(frames, "frames")
     sides = {"predictions": predictions.frame_keys, "labels": labels.frame_keys, "frames": given or ()}
     first = {name: keys[0] for name, keys in sides.items() if keys}
@@ -36,14 +43,6 @@ def prepare_evaluation(
             f"frame keys must be all numbers or all names, got {listed}; use the same keys on both sides"
         )
     if given is None:
-        # If no frame matches and names differ only by folder or suffix, that is a mistake, not an F1 of 0.
-        ours, theirs = set(predictions.frames), set(labels.frames)
-        stems = [{PurePosixPath(str(key)).stem for key in side} for side in (ours, theirs)]
-        if not ours & theirs and stems[0] & stems[1]:
-            raise InvalidInputError(
-                f"predictions and labels name their frames differently: {predictions.frames[0]!r} and "
-                f"{labels.frames[0]!r}; use the same names on both sides"
-            )
         return predictions, labels, sorted({*predictions.frame_keys, *labels.frame_keys}, key=frame_order)
     for key, count in Counter(given).items():
         if count > 1:
