@@ -277,6 +277,14 @@ def test_invalid_arguments_are_rejected(options, message):
         detector_from(options.pop("function"), **options)
 
 
+def test_boxes_as_fractions_of_the_frame_are_rejected():
+    detector = detector_from(returning([[0.1, 0.2, 0.4, 0.5], [0.5, 0.5, 1, 1]], [0.9, 0.8]))
+    with pytest.raises(DetectorError, match=r"boxes must be in pixels, got 0\.1 to 1, .* multiply x by"):
+        detector.detect(frame_with(BOX))
+    for boxes in ([[0, 0, 0, 0]], [[0.1, 0.2, 0.4, 9]]):
+        detector_from(returning(boxes, [0.9])).detect(frame_with(BOX))
+
+
 def test_a_function_as_the_model_names_the_remedy():
     with pytest.raises(InvalidInputError, match=r"model must not be a function, .*; pass it"):
         VehicleDetector(find_red)

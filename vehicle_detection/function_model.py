@@ -121,6 +121,7 @@ class FunctionModel:
             ) from error
         try:
             found = self._convert(returned)
+            _check_pixels(found.boxes)
         except InvalidInputError as error:
             raise DetectorError(
                 f"the function {self.name} returned an invalid result for a frame of {width}x{height} "
@@ -146,6 +147,15 @@ class FunctionModel:
         if self.class_ids is None:
             return found
         return select_classes(found, returned[2] if len(returned) == 3 else None, self.class_ids)
+
+
+def _check_pixels(boxes: NDArray[Any]) -> None:
+    """Raise if all boxes lie within one pixel: fractions of the frame."""
+    if boxes.size and boxes.min() >= 0 and boxes.max() <= 1 and (box_areas(boxes) > 0).any():
+        raise InvalidInputError(
+            f"boxes must be in pixels, got {boxes.min():g} to {boxes.max():g}, as fractions of the frame "
+            "are; multiply x by its width and y by its height"
+        )
 
 
 class FunctionSearch(FrameSearch):

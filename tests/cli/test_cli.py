@@ -1037,6 +1037,17 @@ def test_evaluate_notes_boxes_in_frames_without_labels(tmp_path):
     assert "2 found, 0 missed, 0 false" in succeed("evaluate", labels, found)  # a constant may be a flag
 
 
+def test_evaluate_reads_yolo_folders_with_the_sizes_of_images(tmp_path):
+    found, labels, images = tmp_path / "found.csv", tmp_path / "labels", tmp_path / "images"
+    for folder in (labels, images):
+        folder.mkdir()
+    write_image(images / "000001.png", np.zeros((100, 200, 3), np.uint8))
+    (labels / "000001.txt").write_text("0 0.5 0.5 0.2 0.4\n")
+    found.write_text(f"{HEADER}\n000001.png,,80,30,120,70,1\n")
+    assert "1 found, 0 missed, 0 false" in succeed("evaluate", found, labels, "--images", images)
+    assert "the folder of the images as images= or --images" in refuse("evaluate", found, labels)
+
+
 def test_evaluate_names_the_files_whose_frames_differ(tmp_path):
     labels, found = tmp_path / "labels.csv", tmp_path / "found.csv"
     labels.write_text("frame,track,x1,y1,x2,y2\na,1,10,10,60,50\n")

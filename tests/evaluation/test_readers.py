@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation import FrameBoxes, evaluate_detections, evaluate_tracks, read_labels
+from vehicle_detection.images import write_image
 
 HEADER = "frame,track,x1,y1,x2,y2,occluded,truncated,ignore"
 
@@ -215,7 +217,7 @@ def test_coco_file(tmp_path):
     ("name", "text", "message"),
     [
         ("a.json", "{", "line 1: not JSON text"),
-        ("a.json", "[]", "is a list of COCO results, .* name that file with truth="),
+        ("a.json", "[]", "is a list of COCO results, .* read it with truth=, and use the ground truth"),
         ("a.json", "[1]", "is not a COCO file: it lacks the lists images, annotations, categories"),
         ("a.json", coco(images=[{"file_name": "x"}]), "every image and category needs an id"),
         ("a.json", coco(images=[{"id": 5}, {"id": 6, "file_name": "a"}]), "give every image a file_name"),
@@ -411,6 +413,37 @@ def test_a_yolo_folder(tmp_path, name, text):
     assert len(read_labels(tmp_path, shape=(100, 200), classes=["person", "car"])) == 2
 
 
+def test_a_yolo_folder_of_images_of_several_sizes(tmp_path):
+    for folder in ("labels/train", "images/train"):
+        (tmp_path / folder).mkdir(parents=True)
+    labels, images = tmp_path / "labels" / "train", tmp_path / "images" / "train"
+    for name, shape in {"000001.png": (40, 80, 3), "000002.jpg": (100, 200, 3)}.items():
+        write_image(images / name, np.zeros(shape, np.uint8))
+        written(labels, "0 0.5 0.5 0.2 0.4\n", f"{Path(name).stem}.txt")
+    rotated = Image.new("RGB", (60, 30))
+    exif = rotated.getexif()
+    exif[274] = 6  # turned by a quarter
+    rotated.save(images / "c.jpg", exif=exif)
+    written(labels, "0 0.5 0.5 1.001 1\n", "c.txt")
+    found = read_labels(labels, images=images)
+    assert found.frames == ("000001.png", "000002.jpg", "c.jpg")
+    np.testing.assert_allclose(found.boxes, [[32, 12, 48, 28], [80, 30, 120, 70], [0, 0, 30, 60]])
+    with pytest.raises(DatasetError, match=r"labels holds no \.txt file; .* name .*labels.train"):
+        read_labels(tmp_path, images=images)
+    with pytest.raises(DatasetError, match=r"labels holds no \.txt file; .* name .*labels.train"):
+        read_labels(tmp_path / "labels")
+    (images / "c.jpg").unlink()
+    with pytest.raises(DatasetError, match=r"c\.txt has no image in .*train; pass the folder of its image"):
+        read_labels(labels, images=images)
+
+
+@pytest.mark.parametrize("line", ["0 0.5 0.5 0.2 0.4", "0 0.5 0.5 0.2 0.4 0.9", "0 0.5 0.5 0.2 0.4 0.9 7"])
+def test_a_folder_of_text_files_is_yolo_by_the_number_of_values(tmp_path, line):
+    written(tmp_path, "", "a.txt")
+    written(tmp_path, f"{line}\n", "b.txt")
+    assert len(read_labels(tmp_path, shape=(100, 200))) == 1
+
+
 def test_a_yolo_folder_without_names(tmp_path):
     (tmp_path / "a.txt").write_text("1 0.5 0.5 0.2 0.4\n0 0.5 0.5 0.1 0.1\n")
     options = {"format": "yolo", "shape": (100, 200)}
@@ -445,13 +478,14 @@ def test_files_without_a_class_of_vehicles_are_refused(tmp_path):
         ("1 0.5 0.5", r"a\.txt line 1: expected class, center and size, .*, found 3 values"),
         ("1 0.5 0.5 x 0.1", "side of the box must be a finite number, got 'x'"),
         ("1 0.5 0.5 0.1 0.1 1.5", "confidence must be at most 1"),
+        ("1 90 40 9 9", "the box 90 40 9 9 lies outside the image; center and size are fractions"),
     ],
 )
 def test_invalid_yolo_files(tmp_path, line, message):
     (tmp_path / "a.txt").write_text(line)
     with pytest.raises(DatasetError, match=message):
         read_labels(tmp_path, format="yolo", shape=(100, 200))
-    with pytest.raises(InvalidInputError, match=r"shape must be \(height, width\) of the frames for YOLO"):
+    with pytest.raises(InvalidInputError, match=r"shape must be \(height, width\) of the frames .* images="):
         read_labels(tmp_path, format="yolo")
     (tmp_path / "a.txt").unlink()
     with pytest.raises(DatasetError, match=r"holds no \.txt file; name a folder of YOLO labels"):

@@ -337,14 +337,26 @@ def test_results_take_the_ids_of_a_foreign_ground_truth(tmp_path):
         (
             boxes_of((0, 1, CAR), ignore=[True]),
             "t",
-            {"format": "yolo", "shape": (9, 9)},
+            {"format": "yolo", "shape": (99, 199)},
             "labels hold boxes marked ignore, which YOLO cannot mark",
         ),
         (
             boxes_of(("a.jpg", 1, CAR), ("a.png", 1, CAR)),
             "t",
-            {"format": "yolo", "shape": (9, 9)},
+            {"format": "yolo", "shape": (99, 199)},
             "the frames 'a.jpg' and 'a.png', which are one file in YOLO; rename them",
+        ),
+        (
+            boxes_of(("a.jpg", 1, CAR), ("a.png", 1, CAR)),
+            "t",
+            {"format": "kitti"},
+            "the frames 'a.jpg' and 'a.png', which are one file in KITTI; rename them",
+        ),
+        (
+            boxes_of((0, 1, CAR), (4, 1, [0, 0, 301, 60])),
+            "t",
+            {"format": "yolo", "shape": (99, 200)},
+            r"box \[0.0, 0.0, 301.0, 60.0\] in frame 4, beyond the 200x99 pixels of shape; .* clip_boxes",
         ),
         (boxes_of((0, 1, CAR)), "t.csv", {"truth": "x.json"}, "truth must be None for the format 'csv'"),
     ],
@@ -365,6 +377,11 @@ def test_frames_that_the_truth_does_not_have(tmp_path, kind):
         )
     with pytest.raises(DatasetError, match=r"none.json does not exist; check the path"):
         write_labels(boxes_of((0, 1, CAR, 0.5)), tmp_path / "t.json", truth=tmp_path / "none.json")
+
+
+def test_kitti_files_have_the_names_of_their_images(tmp_path):
+    write_labels(boxes_of(("a.jpg", 1, CAR), ("b.5", 1, CAR)), tmp_path / "kitti", format="kitti")
+    assert {path.name for path in (tmp_path / "kitti").iterdir()} == {"a.txt", "b.5.txt"}
 
 
 def test_kitti_never_mixes_with_older_files(tmp_path):

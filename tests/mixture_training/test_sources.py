@@ -7,6 +7,7 @@ import pytest
 from tests.helpers import drawn, write_frame_set
 from tests.video.clips import gray_frames, write_clip
 from vehicle_detection.errors import DatasetError, InvalidInputError
+from vehicle_detection.evaluation import read_labels, write_labels
 from vehicle_detection.images import write_image
 from vehicle_detection.mixture_training import find_sources
 from vehicle_detection.mixture_training.sources import load_training_frames
@@ -40,6 +41,18 @@ def test_find_sources(tmp_path):
     assert len(found[2].sets[0].labels) == len(drawn(range(3)).labels)
 
 
+def test_labels_of_coco(tmp_path, caplog):
+    frames = drawn(range(3))
+    write_frame_set(tmp_path, "town", frames)
+    table = tmp_path / "labels" / "town.csv"
+    labels = read_labels(table)
+    table.unlink()
+    write_labels(labels.renamed(lambda name: f"town/{name}"), tmp_path / "labels" / "town.json")
+    (source,) = find_sources(tmp_path)
+    assert len(source.sets[0].labels) == len(frames.labels)
+    assert caplog.text == ""
+
+
 def test_frames_of_a_video_are_sampled_at_the_clip_rate(tmp_path):
     for name in ("labels", "videos"):
         (tmp_path / name).mkdir()
@@ -61,7 +74,7 @@ def test_frames_of_a_video_are_sampled_at_the_clip_rate(tmp_path):
 def test_invalid_folders(tmp_path):
     with pytest.raises(DatasetError, match="does not exist; pass the folder of the labelled frames"):
         find_sources(tmp_path / "none")
-    with pytest.raises(DatasetError, match=r"has no labels/NAME\.csv; pass the folder"):
+    with pytest.raises(DatasetError, match=r"has no labels/NAME\.csv \(or \.json, .*convert other labels"):
         find_sources(tmp_path)
     write_frame_set(tmp_path, "town", drawn(range(2)))
     labels = tmp_path / "labels" / "town.csv"

@@ -454,7 +454,10 @@ def evaluate(
         ),
     ],
     labels: Annotated[
-        Path, Argument(metavar="LABELS.csv", help="True boxes, in one of these formats or KITTI's folder.")
+        Path,
+        Argument(
+            metavar="LABELS.csv", help="True boxes, in one of these formats, or a folder of KITTI or YOLO."
+        ),
     ],
     iou: Annotated[float, option("F", "Minimum IoU of a correct box.")] = 0.5,
     ignored_as_regions: Annotated[
@@ -467,6 +470,9 @@ def evaluate(
             "Score only these frames: numbers, such as 0,6,12, 0-299 or 0-299:6 (every 6th), or a text file "
             "with the number or name of a frame in each line.",
         ),
+    ] = None,
+    images: Annotated[
+        Path | None, option("DIR", "Folder of the images, whose sizes YOLO folders need, such as images/val.")
     ] = None,
     json: Annotated[Path | None, option("FILE", "File for all scores, such as scores.json.")] = None,
 ) -> None:
@@ -485,7 +491,7 @@ def evaluate(
     if json is not None:
         check_target(json, "--json")
         check_distinct_paths({"--json": json}, {"PREDICTIONS": predictions, "LABELS": labels})
-    found, true = read_labels(predictions, truth=labels), read_labels(labels)
+    found, true = read_labels(predictions, truth=labels, images=images), read_labels(labels, images=images)
     # Equal scores may be flags of labels, as in MOTChallenge's ground truth.
     if len(found) and found.scores is None and true.scores is not None and len(set(true.scores)) > 1:
         raise InvalidInputError(

@@ -1,6 +1,6 @@
 """Training patches and frames: reading, download, splits and near duplicates."""
 
-from vehicle_detection.datasets.archives import fetch_patches
+from vehicle_detection.datasets.archives import fetch_patches, is_image
 from vehicle_detection.datasets.frames import FrameSet, load_frames
 from vehicle_detection.datasets.patches import PatchSet, load_patches, load_training_patches
 from vehicle_detection.datasets.splits import (
@@ -25,6 +25,7 @@ __all__ = [
     "Split",
     "fetch_patches",
     "find_near_duplicates",
+    "is_image",
     "load_frames",
     "load_patches",
     "load_training_patches",

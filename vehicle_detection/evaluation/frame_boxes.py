@@ -24,7 +24,7 @@ from vehicle_detection._common import (
     pluralize,
 )
 from vehicle_detection.boxes import Detections
-from vehicle_detection.datasets.archives import is_image
+from vehicle_detection.datasets import is_image
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.export import check_items, is_result, shown_tracks
 

@@ -23,11 +23,14 @@ from vehicle_detection._common import (
     check_path,
     check_regular_file,
     check_sequence,
+    check_shape,
     describe,
+    image_size,
     read_regular_file,
     shorten,
 )
 from vehicle_detection.boxes import clip_boxes, logit
+from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation.frame_boxes import (
     LOOKALIKE_CLASSES,
@@ -39,8 +42,10 @@ from vehicle_detection.evaluation.frame_boxes import (
     frame_order,
     known_classes,
     none_if_unknown,
+    without_suffix,
 )
 from vehicle_detection.export import BOX_COLUMNS, FOLDER_FORMATS, FORMATS
+from vehicle_detection.images import read_image
 
 REQUIRED_LABEL_COLUMNS = ("frame", "track", "x1", "y1", "x2", "y2")
 LABEL_COLUMNS = (*REQUIRED_LABEL_COLUMNS, "occluded", "truncated", "ignore")
@@ -288,13 +293,20 @@ def _table_row(where: str, record: dict[str, str], predicted: bool, counted: boo
 def _read_kitti(source: Path, classes: Collection[str] | None) -> Rows:
     files = list(source.glob("*.txt")) if source.is_dir() else [source]
     if not files:
-        raise DatasetError(f"{source} holds no .txt file; name a KITTI label_2 folder or a label file")
+        raise _no_text_files(source, "a KITTI label_2 folder or a label file")
     rows: list[Row] = []
     for file in sorted(files, key=lambda file: frame_order(file.name)):
         for where, line in _read_lines(file):
             row = _kitti_row(where, file.stem, len(rows), line.split(), classes)
             rows += [row] if row else []
     return rows, [file.stem for file in files]
+
+
+def _no_text_files(folder: Path, expected: str) -> DatasetError:
+    """Error of a folder without text files, which names a subfolder that has some, such as labels/train."""
+    inside = min((file.parent for file in folder.glob("*/*.txt")), default=None)
+    remedy = f"name {expected}" if inside is None else f"its subfolders are read one at a time: name {inside}"
+    return DatasetError(f"{folder} holds no .txt file; {remedy}")
 
 
 def _kitti_row(
@@ -405,34 +417,65 @@ def _read_members(source: Path, *names: str) -> list[str | None]:
     return texts
 
 
-def _read_yolo(source: Path, classes: Collection[str] | None, shape: tuple[int, ...] | None) -> Rows:
+def _read_yolo(
+    source: Path,
+    classes: Collection[str] | None,
+    shape: tuple[int, ...] | None,
+    images: str | os.PathLike[str] | None,
+) -> Rows:
     """Read a text file for each frame; the names of the classes are beside their folder, or unknown."""
-    if shape is None:
-        raise InvalidInputError("shape must be (height, width) of the frames for YOLO, got None; pass it")
+    if shape is None and images is None:
+        raise InvalidInputError(
+            "shape must be (height, width) of the frames for YOLO, got None; pass it, or the folder of "
+            "the images as images= or --images"
+        )
     folder = source / "labels" if (source / "labels").is_dir() else source
     files = [file for file in folder.glob("*.txt") if file.name != "classes.txt"]
     without_frames = folder != source and not any(folder.iterdir())
     if not files and not without_frames:
-        raise DatasetError(f"{folder} holds no .txt file; name a folder of YOLO labels")
+        raise _no_text_files(folder, "a folder of YOLO labels")
     names = _yolo_names(source)
     wanted = VEHICLE_CLASSES if classes is None else classes
     if names:
         _check_classes(source, names.values(), wanted)
-    numbered = all(file.stem.isdecimal() and file.stem == f"{int(file.stem):06d}" for file in files)
-    keys: list[FrameKey] = []
+    files.sort(key=lambda file: frame_order(file.name))
+    frames = _yolo_frames(files, shape) if images is None else _yolo_images(files, images)
     rows: list[Row] = []
     numbers: set[str] = set()
-    for file in sorted(files, key=lambda file: frame_order(file.name)):
-        keys.append(int(file.stem) if numbered else file.stem)
+    for file, (key, size) in zip(files, frames, strict=True):
         for where, line in _read_lines(file):
-            name, row = _yolo_row(where, keys[-1], line.split(), shape)
+            name, row = _yolo_row(where, key, line.split(), size)
             # Without names, classes are numbers, and by default all of them are vehicles.
             numbers.add(name)
             if (not names and classes is None) or names.get(name, name) in wanted:
                 rows.append(row)
     if not names and classes is not None and numbers:
         _check_classes(source, numbers, wanted)
-    return rows, keys
+    return rows, [key for key, _ in frames]
+
+
+def _yolo_frames(files: Sequence[Path], shape: Any) -> list[tuple[FrameKey, tuple[int, ...]]]:
+    """Frame and shape of each file, all of one shape: numbers if all names have six digits."""
+    shape = check_shape(shape)
+    numbered = all(file.stem.isdecimal() and file.stem == f"{int(file.stem):06d}" for file in files)
+    return [(int(file.stem) if numbered else file.stem, shape) for file in files]
+
+
+def _yolo_images(
+    files: Sequence[Path], images: str | os.PathLike[str]
+) -> list[tuple[FrameKey, tuple[int, ...]]]:
+    """Name and shape of the image of each file; the header has the shape, unless EXIF data may rotate it."""
+    folder = load_frames(images)
+    names = {without_suffix(name): name for name in folder.names}
+    frames: list[tuple[FrameKey, tuple[int, ...]]] = []
+    for file in files:
+        if file.stem not in names:
+            raise DatasetError(f"{file} has no image in {folder.folder}; pass the folder of its image")
+        image = folder.folder / names[file.stem]
+        data = read_regular_file(image, f"image file {image}", Limit.IMAGE_BYTES, error=DatasetError)
+        size = None if b"exif" in data.lower() else image_size(data)
+        frames.append((image.name, read_image(image).shape[:2] if size is None else size[::-1]))
+    return frames
 
 
 def _yolo_row(where: str, frame: FrameKey, words: list[str], shape: tuple[int, ...]) -> tuple[str, Row]:
@@ -443,6 +486,11 @@ def _yolo_row(where: str, frame: FrameKey, words: list[str], shape: tuple[int, .
             "values"
         )
     x, y, width, height = (_number(word, "side of the box", where) for word in words[1:5])
+    if len(words) == 5 and not (abs(x - 0.5) < (1 + width) / 2 and abs(y - 0.5) < (1 + height) / 2):
+        raise DatasetError(
+            f"{where}: the box {' '.join(words[1:5])} lies outside the image; center and size are fractions "
+            "of the image in YOLO"
+        )
     x, width, y, height = x * shape[1], width * shape[1], y * shape[0], height * shape[0]
     score = math.nan
     if len(words) > 5:
@@ -450,9 +498,10 @@ def _yolo_row(where: str, frame: FrameKey, words: list[str], shape: tuple[int, .
         confidence = min(max(confidence, _MIN_CONFIDENCE), 1 - _MIN_CONFIDENCE)
         score = logit(confidence)
     track = _integer(words[6], "track", where, low=NO_TRACK) if len(words) > 6 else NO_TRACK
-    box = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
+    corners = np.array([[x - width / 2, y - height / 2, x + width / 2, y + height / 2]])
+    x1, y1, x2, y2 = clip_boxes(corners, shape)[0].tolist()
     name = words[0].partition(".")[0] if FRAME_NUMBER.fullmatch(words[0]) else words[0]
-    return name, Row(where, frame, track, box, score=score)
+    return name, Row(where, frame, track, (x1, y1, x2, y2), score=score)
 
 
 def _yolo_names(source: Path) -> dict[str, str]:
@@ -514,8 +563,8 @@ def read_coco_file(source: Path, truth: Path | None = None) -> CocoFile:
     if isinstance(data, list) and all(isinstance(entry, dict) and "image_id" in entry for entry in data):
         if truth is None:
             raise DatasetError(
-                f"{source} is a list of COCO results, which names images by their ids in the ground truth; "
-                "name that file with truth="
+                f"{source} is a list of COCO results, predictions of images that the ground truth lists; "
+                "read it with truth=, and use the ground truth, a COCO data set, as labels"
             )
         return read_coco_file(truth)._replace(annotations=data)
     parts = data if isinstance(data, dict) else {}
@@ -594,6 +643,7 @@ def read_labels(
     classes: Collection[str] | None = None,
     shape: tuple[int, ...] | None = None,
     truth: str | os.PathLike[str] | None = None,
+    images: str | os.PathLike[str] | None = None,
 ) -> FrameBoxes:
     """Read labelled or predicted boxes from a file or folder; `write_labels` writes them.
 
@@ -616,9 +666,12 @@ def read_labels(
         and vehicle, and every row of files with numbers.
     shape
         ``(height, width, ...)`` of the frames, to which boxes are clipped. None does not clip them. YOLO
-        needs it.
+        needs it, or `images`.
     truth
         The COCO data set whose image and category ids a list of COCO results has; not read otherwise.
+    images
+        The folder of the images of a YOLO folder, which may differ in size, instead of `shape`; not read
+        otherwise.
 
     Returns
     -------
@@ -626,7 +679,7 @@ def read_labels(
         CSV frames are int if all of them are whole numbers, else str. KITTI frames are the files' names
         without ``.txt``, COCO frames the images' ``file_name``. Frames and pixels of MOT files count from 1
         and are returned from 0. YOLO frames are the files' names without ``.txt``, or numbers if all have six
-        digits; a confidence becomes its log-odds.
+        digits, or with `images` the images' file names; a confidence becomes its log-odds.
 
     Raises
     ------
@@ -669,7 +722,7 @@ def read_labels(
     elif kind in ("coco", "coco_results"):  # told apart by their content
         found = _read_coco(source, chosen, None if truth is None else check_path(truth, "truth"))
     elif kind == "yolo":
-        found = _read_yolo(source, chosen, shape)
+        found, shape = _read_yolo(source, chosen, shape, images), None  # its boxes are clipped
     else:
         found = {"kitti": _read_kitti, "mot": _read_mot, "mot_zip": _read_mot_zip}[kind](source, chosen)
     return _assemble(*found, shape)
@@ -723,7 +776,10 @@ def _guess_format(source: Path) -> str:
     """Choose the format by the suffix or else by the first line."""
     if source.is_dir():
         named = ("labels", "data.yaml", "classes.txt")
-        return "yolo" if any((source / name).exists() for name in named) else "kitti"
+        if any((source / name).exists() for name in named):
+            return "yolo"
+        lines = (line for file in source.glob("*.txt") for _, line in _read_lines(file))
+        return "yolo" if 5 <= len(next(lines, "").split()) <= 7 else "kitti"
     suffix = source.suffix.lower()
     if suffix == ".tsv" or (suffix in FORMATS and suffix != ".txt"):
         return FORMATS.get(suffix, "csv")

@@ -9,9 +9,12 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
+
 from vehicle_detection._common import atomic_write, check_type, write_parquet
+from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation.frame_boxes import NO_TRACK, FrameBoxes, FrameKey
+from vehicle_detection.evaluation.frame_boxes import NO_TRACK, FrameBoxes, FrameKey, without_suffix
 from vehicle_detection.evaluation.readers import FRAME_NUMBER, read_coco_file, vehicle_categories
 from vehicle_detection.export import (
     FOLDER_FORMATS,
@@ -27,6 +30,8 @@ from vehicle_detection.export import (
     new_folder,
     open_row_file,
 )
+
+_ROUNDING = 1.0  # px by which a box may extend beyond its image
 
 
 def write_labels(
@@ -56,7 +61,8 @@ def write_labels(
 
         None chooses by the suffix: .csv, .jsonl, .ndjson, .parquet, .txt or .zip (MOT), or .json (data set).
     shape
-        ``(height, width, ...)`` of the images, which YOLO and some viewers of COCO data sets need.
+        ``(height, width, ...)`` of the images, which YOLO and some viewers of COCO data sets need. All images
+        have this shape: write those of each size separately.
     truth
         A COCO data set whose image ids are used; required for results. Frames are found by file name, or by
         number in data sets written here. A data set has its images, too.
@@ -85,9 +91,10 @@ def write_labels(
     - COCO: occlusion and truncation. Ignored boxes are crowds, which pycocotools ignores as
       `evaluate_detections` does with ``ignored_as_regions=True``.
     - COCO results: the same, and predictions marked ``ignore`` (an error).
-    - YOLO: ignored boxes (an error), suffixes of file names, distance and speed. Scores become confidences.
-    - KITTI: numbered frames (an error), tracks, distance and speed. Ignored boxes become regions, and
-      `read_labels` ignores labels that are narrow, hidden or truncated.
+    - YOLO: ignored boxes (an error), boxes that extend beyond `shape` by over 1 px (an error), suffixes of
+      file names, distance and speed. Scores become confidences.
+    - KITTI: numbered frames (an error), suffixes of images' names, tracks, distance and speed. Ignored
+      boxes become regions, and `read_labels` ignores labels that are narrow, hidden or truncated.
 
     Without `truth`, the id of a COCO image is its frame number plus 1 or a hash of its file name: it does not
     depend on the other frames, so that labels and predictions written separately agree.
@@ -112,7 +119,7 @@ def write_labels(
         return len(labels)
     if truth is not None and not kind.startswith("coco"):
         raise InvalidInputError(f"truth must be None for the format {kind!r}; only COCO files have image ids")
-    _check_holds(labels, kind)
+    _check_holds(labels, kind, shape)
     if kind == "parquet":
         _write_parquet(labels, path)
         return len(labels)
@@ -138,7 +145,7 @@ def write_labels(
     return len(labels)
 
 
-def _check_holds(labels: FrameBoxes, kind: str) -> None:
+def _check_holds(labels: FrameBoxes, kind: str, shape: tuple[int, ...] | None) -> None:
     """Raise if a format would change or lose what decides about the scores."""
     names = [key for key in labels.frames if isinstance(key, str)]
     if kind == "csv" and names:
@@ -156,6 +163,15 @@ def _check_holds(labels: FrameBoxes, kind: str) -> None:
         raise InvalidInputError(
             f"labels must have numbered frames for MOT, got {names[0]!r}; number them with labels.renamed"
         )
+    if kind == "yolo" and shape is not None and len(labels):
+        beyond = np.abs(labels.boxes - clip_boxes(labels.boxes, shape)).max(axis=1)
+        row = int(beyond.argmax())
+        if beyond[row] > _ROUNDING:
+            raise InvalidInputError(
+                f"labels hold the box {labels.boxes[row].tolist()} in frame {labels.frames[row]!r}, beyond "
+                f"the {shape[1]}x{shape[0]} pixels of shape; write images of each size into a folder of "
+                "their own, and clip boxes that leave their image with clip_boxes"
+            )
     if kind == "yolo" and labels.ignore.any():
         raise InvalidInputError(
             "labels hold boxes marked ignore, which YOLO cannot mark; drop them with labels[~labels.ignore]"
@@ -243,9 +259,16 @@ def _write_kitti(labels: FrameBoxes, folder: Path) -> None:
                 f"labels must have frames that are file names for KITTI, got {key!r}; "
                 "name them with labels.renamed(lambda frame: f'{frame:06d}')"
             )
+    names: dict[str, FrameKey] = {}
+    for key in labels.frame_keys:
+        other = names.setdefault(without_suffix(str(key)), key)
+        if other != key:
+            raise InvalidInputError(
+                f"path cannot hold the frames {other!r} and {key!r}, which are one file in KITTI; rename them"
+            )
     with new_folder(folder, "KITTI") as part:
-        for key in labels.frame_keys:
-            with (part / f"{key}.txt").open("w", encoding="utf-8", newline="") as file:
+        for name, key in names.items():
+            with (part / f"{name}.txt").open("w", encoding="utf-8", newline="") as file:
                 _write_kitti_file(labels.frame(key), file)
 
 

@@ -19,6 +19,8 @@ from vehicle_detection.evaluation import FrameBoxes, FrameKey, LabelledFrames, r
 from vehicle_detection.params import entries
 from vehicle_detection.video import is_video_file, probe_video, read_frames
 
+_LABEL_SUFFIXES = (".csv", ".json", ".jsonl", ".parquet")
+
 log = logging.getLogger(__name__)
 
 
@@ -94,6 +96,7 @@ def find_sources(
 ) -> list[FrameDataset]:
     """Read a folder of labelled frames, as one data set for each file ``labels/NAME.csv``.
 
+    The labels may also be .json (a COCO data set), .jsonl or .parquet.
     Its frames are in ``frames/NAME/``, ``NAME/`` or a video ``videos/NAME.mp4`` (or another suffix), of which
     `clip_rate` frames per second are taken. If the labels name most frames of a video, the others show no
     vehicle; if they name fewer, only these are taken.
@@ -102,9 +105,13 @@ def find_sources(
     root = Path(folder)
     if not root.is_dir():
         raise DatasetError(f"folder {root} does not exist; pass the folder of the labelled frames")
-    files = sorted(path for path in root.glob("labels/*") if path.suffix.lower() == ".csv")
+    files = sorted(path for path in root.glob("labels/*") if path.suffix.lower() in _LABEL_SUFFIXES)
     if not files:
-        raise DatasetError(f"folder {root} has no labels/NAME.csv; pass the folder of the labelled frames")
+        raise DatasetError(
+            f"folder {root} has no labels/NAME.csv (or {', '.join(_LABEL_SUFFIXES[1:])}); pass the folder of "
+            "the labelled frames; convert other labels with write_labels(read_labels(...), "
+            "'labels/NAME.csv')"
+        )
     widths = min_labelled_widths or {}
     sources = []
     for file in files:
@@ -123,11 +130,12 @@ def _read_frames(root: Path, file: Path, clip_rate: float) -> LabelledFrames:
     for folder in folders:
         if folder.is_dir():
             found = LabelledFrames(name, load_frames(folder), labels)
-            absent = sorted(set(labels.frame_keys) - set(found.keys), key=str)
+            named = found.labels.frame_keys  # those of the labels, by the names of the images
+            absent = sorted(set(named) - set(found.keys), key=str)
             if absent:
                 log.warning(
                     "%s: %d of %d labelled frames have no image in %s, such as %r; they are left out",
-                    *(file, len(absent), len(labels.frame_keys), folder, absent[0]),
+                    *(file, len(absent), len(named), folder, absent[0]),
                 )
             return found
     videos = [path for path in (root / "videos").glob(f"{glob.escape(name)}.*") if is_video_file(path)]
