@@ -30,7 +30,7 @@ from vehicle_detection._common import (
     shorten,
 )
 from vehicle_detection.boxes import clip_boxes, logit
-from vehicle_detection.datasets import load_frames
+from vehicle_detection.datasets import FrameSet, load_frames
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation.frame_boxes import (
     LOOKALIKE_CLASSES,
@@ -421,7 +421,7 @@ def _read_yolo(
     source: Path,
     classes: Collection[str] | None,
     shape: tuple[int, ...] | None,
-    images: str | os.PathLike[str] | None,
+    images: FrameSet | None,
 ) -> Rows:
     """Read a text file for each frame; the names of the classes are beside their folder, or unknown."""
     if shape is None and images is None:
@@ -461,17 +461,14 @@ def _yolo_frames(files: Sequence[Path], shape: Any) -> list[tuple[FrameKey, tupl
     return [(int(file.stem) if numbered else file.stem, shape) for file in files]
 
 
-def _yolo_images(
-    files: Sequence[Path], images: str | os.PathLike[str]
-) -> list[tuple[FrameKey, tuple[int, ...]]]:
+def _yolo_images(files: Sequence[Path], images: FrameSet) -> list[tuple[FrameKey, tuple[int, ...]]]:
     """Name and shape of the image of each file; the header has the shape, unless EXIF data may rotate it."""
-    folder = load_frames(images)
-    names = {without_suffix(name): name for name in folder.names}
+    names = {without_suffix(name): name for name in images.names}
     frames: list[tuple[FrameKey, tuple[int, ...]]] = []
     for file in files:
         if file.stem not in names:
-            raise DatasetError(f"{file} has no image in {folder.folder}; pass the folder of its image")
-        image = folder.folder / names[file.stem]
+            raise DatasetError(f"{file} has no image in {images.folder}; pass the folder of its image")
+        image = images.folder / names[file.stem]
         data = read_regular_file(image, f"image file {image}", Limit.IMAGE_BYTES, error=DatasetError)
         size = None if b"exif" in data.lower() else image_size(data)
         frames.append((image.name, read_image(image).shape[:2] if size is None else size[::-1]))
@@ -670,7 +667,7 @@ def read_labels(
     truth
         The COCO data set whose image and category ids a list of COCO results has; not read otherwise.
     images
-        The folder of the images of a YOLO folder, which may differ in size, instead of `shape`; not read
+        The folder of the images of a YOLO folder, which may differ in size, instead of `shape`; not used
         otherwise.
 
     Returns
@@ -704,6 +701,9 @@ def read_labels(
     vehicle_detection.errors.DatasetError: labels/missing.csv does not exist; check the path
     """
     source = check_path(path, "path", kind="a file or folder")
+    pictures = None
+    if images is not None:
+        pictures = load_frames(check_path(images, "images", kind="the folder of the images"))
     if format is not None:
         check_choice(format, "format", _READ_FORMATS)
     if not source.exists():
@@ -722,7 +722,7 @@ def read_labels(
     elif kind in ("coco", "coco_results"):  # told apart by their content
         found = _read_coco(source, chosen, None if truth is None else check_path(truth, "truth"))
     elif kind == "yolo":
-        found, shape = _read_yolo(source, chosen, shape, images), None  # its boxes are clipped
+        found, shape = _read_yolo(source, chosen, shape, pictures), None  # its boxes are clipped
     else:
         found = {"kitti": _read_kitti, "mot": _read_mot, "mot_zip": _read_mot_zip}[kind](source, chosen)
     return _assemble(*found, shape)
