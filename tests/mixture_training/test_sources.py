@@ -51,6 +51,9 @@ def test_labels_of_coco(tmp_path, caplog):
     (source,) = find_sources(tmp_path)
     assert len(source.sets[0].labels) == len(frames.labels)
     assert caplog.text == ""
+    write_labels(labels, table)
+    with pytest.raises(DatasetError, match=r"town\.csv and \S.*town\.json label the same frames"):
+        find_sources(tmp_path)
 
 
 def test_frames_of_a_video_are_sampled_at_the_clip_rate(tmp_path):

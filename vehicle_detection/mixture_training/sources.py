@@ -112,6 +112,11 @@ def find_sources(
             "the labelled frames; convert other labels with write_labels(read_labels(...), "
             "'labels/NAME.csv')"
         )
+    by_name: dict[str, Path] = {}
+    for file in files:
+        other = by_name.setdefault(file.stem, file)
+        if other != file:
+            raise DatasetError(f"{other} and {file} label the same frames; leave one in the folder")
     widths = min_labelled_widths or {}
     sources = []
     for file in files:
