@@ -846,6 +846,16 @@ def bad_videos(material, tmp):
         r"--gpx-offset needs --gpx": [clip, "-o", target, "--gpx-offset", 9],
         r"--why needs --report, which shows": [clip, "-o", target, "--why"],
         r"--clips must be a folder": [clip, "-o", target, "--clips", clip],
+        r"--clips-of needs --clips": [clip, "-o", target, "--clips-of", "met"],
+        r"--clips-of must be one of 'headway', .*; got 'cutin'": [
+            clip,
+            "-o",
+            target,
+            "--clips",
+            tmp / "clips",
+            "--clips-of",
+            "met,cutin",
+        ],
         r"--tracks .+ is also SOURCE .+;": [tmp / "a.csv", "-o", target, "--tracks", tmp / "a.csv"],
     }
 

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from tests.helpers import ROOT, start_interruptible
 from tests.video.clips import gray_frames, write_clip
-from vehicle_detection import detector, export, report
+from vehicle_detection import detector, events, export, report
 from vehicle_detection._common import files
 from vehicle_detection._kernels.jit import jit
 from vehicle_detection.cli import demo
@@ -232,12 +232,39 @@ def test_a_full_disk_names_the_output_and_what_was_kept(clip, tmp_path, monkeypa
     words = [word for option, name in outputs.items() for word in (option, tmp_path / name)]
     result = run("video", clip, *words, "--model", "highway", "-q")
     assert result.exit_code == 2
-    names = " and ".join(str(tmp_path / name) for name in kept)
+    names = " and ".join(str(tmp_path / name) for name in kept)  # two at most
     end = f"; {names} {'is' if len(kept) == 1 else 'are'} complete and kept" if kept else ""
     assert result.stderr == (
         f"error: {tmp_path / failed} cannot be written (No space left on device); free some space{end}\n"
     )
     assert contents(tmp_path) == sorted(kept)
+
+
+def test_an_interrupt_while_clips_are_cut_keeps_all_other_files(clip, tmp_path, monkeypatch):
+    kinds = ("met", "cut_in", "closing", "cut_in")
+    found = tuple(
+        events.Event(kind=kind, track_id=number, frame=5, start_frame=4, end_frame=6, time_s=0.2)
+        for number, kind in enumerate(kinds)
+    )
+    monkeypatch.setattr(events, "find_events", lambda *_, **__: found)
+    cut = events.files.cut_video
+
+    def interrupt(source, target, **options):
+        if "closing" in target.name:
+            raise KeyboardInterrupt
+        return cut(source, target, **options)
+
+    monkeypatch.setattr(events.files, "cut_video", interrupt)
+    outputs = {"-o": "o.mp4", "--tracks": "o.csv", "--report": "o.html", "--events": "o.json"}
+    outputs["--srt"] = "o.srt"
+    words = [word for option, name in outputs.items() for word in (option, tmp_path / name)]
+    words += ["--clips", tmp_path / "clips", "--clips-of", "cut_in, closing"]
+    result = run("video", clip, *words, "--model", "highway", "-q")
+    *others, last = (str(tmp_path / name) for name in outputs.values())
+    message = f"interrupted; {', '.join(others)} and {last} are complete and kept\n"
+    assert (result.exit_code, result.stderr) == (130, message)
+    assert contents(tmp_path) == sorted(["clips", *outputs.values()])
+    assert contents(tmp_path / "clips") == ["0000.2s_cut_in_1.mp4"]
 
 
 def test_a_disk_that_is_full_while_tracks_are_written(clip, tmp_path, monkeypatch):

@@ -50,11 +50,13 @@ def test_bad_files_are_refused(events, name, message, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_clips_show_the_frames_around_each_event(tmp_path):
+def test_clips_show_the_frames_around_each_event(tmp_path, monkeypatch, capsys):
     video = tmp_path / "found.mp4"
     write_clip(video, [np.full((64, 96, 3), frame * 4, np.uint8) for frame in range(50)])
     (tmp_path / "clips").mkdir()
-    first, second = cut_clips(EVENTS, video, tmp_path / "clips", fps=25, margin=0.2)
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    first, second = cut_clips(EVENTS, video, tmp_path / "clips", fps=25, margin=0.2, progress=True)
+    assert "2/2" in capsys.readouterr().err
     assert [first.name, second.name] == ["0000.8s_cut_in_2.mp4", "0002.0s_met_3.mp4"]
     assert probe_video(first).frames == 12 + 1 + 10
     assert probe_video(second).frames == 5 + 1 + 5

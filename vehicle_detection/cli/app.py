@@ -141,7 +141,7 @@ class _Commands(TyperGroup):
             print_error(f"error: {error}")
             raise typer.Exit(BAD_INPUT) from None
         except KeyboardInterrupt as error:
-            print_error("interrupted")
+            print_error(f"interrupted{error}")
             code = getattr(error, "code", INTERRUPTED)
             exit_if_abandoned(code)
             raise typer.Exit(code) from None

@@ -52,16 +52,25 @@ class SideOutputs:
 
     events: Path | None
     clips: Path | None  # existing folder for clips of the events
+    clips_of: str | None  # kinds of events that get a clip, separated by commas; None: all
     subtitles: Path | None
 
     def __post_init__(self) -> None:
-        from vehicle_detection._common import check_suffix
-        from vehicle_detection.events import EVENT_SUFFIXES, SUBTITLE_SUFFIXES
+        from vehicle_detection._common import check_choice, check_suffix
+        from vehicle_detection.events import EVENT_SUFFIXES, KINDS, SUBTITLE_SUFFIXES
 
         if self.events is not None:
             check_suffix(self.events, "--events", EVENT_SUFFIXES)
         if self.subtitles is not None:
             check_suffix(self.subtitles, "--srt", SUBTITLE_SUFFIXES)
+        if self.clips_of is not None and self.clips is None:
+            raise InvalidInputError("--clips-of needs --clips, the folder of the clips; add it")
+        for kind in self._kinds():
+            check_choice(kind, "--clips-of", KINDS)
+
+    def _kinds(self) -> list[str]:
+        """Kinds of events that `clips_of` lists."""
+        return [] if self.clips_of is None else [kind.strip() for kind in self.clips_of.split(",")]
 
     def find_events(
         self, log: TrackLog, report: VideoReport, detector: VehicleDetector, *, quiet: bool = False
@@ -87,25 +96,30 @@ class SideOutputs:
         self,
         log: TrackLog,
         events: tuple[Event, ...],
-        video: Path | None,
         report: VideoReport,
         detector: VehicleDetector,
     ) -> None:
-        """Write the file of events, their clips, and the subtitles."""
-        from vehicle_detection.events import cut_clips, write_events, write_subtitles
+        """Write the file of events and the subtitles."""
+        from vehicle_detection.events import write_events, write_subtitles
 
         fps = float(report.fps)
         if self.events is not None:
             with option_names(path="--events"):
                 write_events(events, self.events)
-        if self.clips is not None and video is not None:
-            cut_clips(events, video, self.clips, fps=fps)
         if self.subtitles is not None:
             units = detector.draw_params.units
             with option_names(path="--srt"):
                 write_subtitles(
                     log, self.subtitles, fps=fps, events=events, own_speed=detector.own_speed, units=units
                 )
+
+    def cut_clips(self, events: tuple[Event, ...], video: Path, *, fps: float, progress: bool) -> None:
+        """Cut the clips of the events out of the annotated video."""
+        from vehicle_detection.events import cut_clips
+
+        if self.clips is not None:
+            chosen = [event for event in events if self.clips_of is None or event.kind in self._kinds()]
+            cut_clips(chosen, video, self.clips, fps=fps, progress=progress)
 
 
 def explain_vehicles(detector: VehicleDetector, source: FrameSource, log: TrackLog) -> list[TrackPicture]:

@@ -207,16 +207,21 @@ def announce_replaced(targets: Iterable[Path | None]) -> None:
 
 @contextlib.contextmanager
 def name_kept_files(outputs: Iterable[Path | None]) -> Iterator[None]:
-    """Add to an error in the block which of the output files the block has completed."""
+    """Add to an error or interrupt in the block which of the output files the block has completed."""
     before = {path: _identity(path) for path in outputs if path is not None}
     try:
         yield
-    except VehicleDetectionError as error:
+    except (VehicleDetectionError, KeyboardInterrupt) as error:
         kept = [str(path) for path, identity in before.items() if _identity(path) not in (None, identity)]
         if not kept:
             raise
-        verb = "is" if len(kept) == 1 else "are"
-        raise type(error)(f"{error}; {' and '.join(kept)} {verb} complete and kept") from error
+        *others, last = kept
+        note = f"{', '.join(others)} and {last} are" if others else f"{last} is"
+        message = f"{error}; {note} complete and kept"
+        if isinstance(error, KeyboardInterrupt):
+            error.args = (message,)  # it has an exit code, which a new one would lack
+            raise
+        raise type(error)(message) from error
 
 
 def _identity(path: Path) -> tuple[int, int] | None:

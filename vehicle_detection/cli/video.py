@@ -90,6 +90,15 @@ def video(
         Path | None,
         option("DIR", "Folder for a short annotated clip of each event, such as clips.", panel=OUTPUT),
     ] = None,
+    clips_of: Annotated[
+        str | None,
+        option(
+            "KINDS",
+            "Kinds of events for --clips, such as cut_in,closing; default: all.",
+            "--clips-of",
+            panel=OUTPUT,
+        ),
+    ] = None,
     srt: Annotated[
         Path | None,
         option(
@@ -221,9 +230,12 @@ def video(
         raise InvalidInputError("--output must name a video for --blur, which blurs its vehicles; add it")
     draw_params = _draw_params(labels, line_width=line_width, color_by=color_by, panel=panel, units=units)
     speed = read_speed(own_speed, gpx, gpx_offset)
-    side_outputs = SideOutputs(events, clips, srt)
-    with name_kept_files(outputs.values()), contextlib.ExitStack() as stack:
-        stack.enter_context(output_folder(clips, "--clips"))
+    side_outputs = SideOutputs(events, clips, clips_of, srt)
+    with (
+        name_kept_files(outputs.values()),
+        output_folder(clips, "--clips"),
+        contextlib.ExitStack() as stack,
+    ):
         writers: list[Callable[[Any], object]] = []
         if tracks is not None:
             with option_names(path="--tracks"):
@@ -286,16 +298,18 @@ def video(
             on_result=lambda result: [write(result) for write in writers],
             **settings,
         )
+        stack.close()  # the file of tracks is complete when its writer closes
         found = side_outputs.find_events(log, done, detector, quiet=quiet)
-        side_outputs.write(log, found, output, done, detector)
+        side_outputs.write(log, found, done, detector)
         if page is not None:
-            # After the tracks, whose file is complete when its writer closes.
-            stack.close()
             pictures: list[TrackPicture] = []
             if why:
                 with open_source(source, fps=fps) as again:
                     pictures = explain_vehicles(detector, again, log)
             page.finish(done, events=found, pictures=pictures)
+        if output is not None:
+            # Last, because there may be thousands of clips.
+            side_outputs.cut_clips(found, output, fps=float(done.fps), progress=not quiet)
     if not quiet and done.tracks:
         if not detector.lens_is_known:
             print_error(UNKNOWN_LENS)

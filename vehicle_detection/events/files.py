@@ -9,10 +9,10 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from vehicle_detection._common import atomic_write, check_number, check_suffix
+from vehicle_detection._common import atomic_write, check_number, check_suffix, progress_bar
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events.find import EVENT_COLUMNS, Event, check_events
-from vehicle_detection.video import cut_video
+from vehicle_detection.video import cut_video, open_source
 
 EVENT_SUFFIXES = (".csv", ".json")
 """Suffixes of files of events."""
@@ -72,6 +72,7 @@ def cut_clips(
     *,
     fps: float,
     margin: float = 2.0,
+    progress: bool = False,
 ) -> list[Path]:
     """Cut a short clip of each event out of an annotated video.
 
@@ -85,6 +86,8 @@ def cut_clips(
         Existing folder; the clips are called ``0012.4s_cut_in_7.mp4`` after time, kind and track.
     margin
         Seconds before and after the frames of an event, of which at most 5 s are shown on either side.
+    progress
+        Show a progress bar if standard error is a terminal.
 
     Returns
     -------
@@ -107,12 +110,19 @@ def cut_clips(
     margin = check_number(margin, "margin", low=0, high=3600)
     paths = []
     listed = check_events(events)
-    if listed and not Path(folder).is_dir():
+    if not listed:
+        return []
+    if not Path(folder).is_dir():
         raise InvalidInputError(f"folder {folder} does not exist; create it")
-    for event in listed:
-        start = max(event.start_frame / rate - margin, event.time_s - _MAX_EXTENT, 0.0)
-        end = min((event.end_frame + 1) / rate + margin, event.time_s + _MAX_EXTENT)
-        path = Path(folder) / f"{event.time_s:06.1f}s_{event.kind}_{event.track_id}.mp4"
-        cut_video(video, path, start=start, end=end)
-        paths.append(path)
+    with (
+        open_source(video) as source,
+        progress_bar(progress, len(listed), unit="clip", terminal_only=True) as bar,
+    ):
+        for event in listed:
+            start = max(event.start_frame / rate - margin, event.time_s - _MAX_EXTENT, 0.0)
+            end = min((event.end_frame + 1) / rate + margin, event.time_s + _MAX_EXTENT)
+            path = Path(folder) / f"{event.time_s:06.1f}s_{event.kind}_{event.track_id}.mp4"
+            cut_video(source, path, start=start, end=end)
+            paths.append(path)
+            bar.update()
     return paths
