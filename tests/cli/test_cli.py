@@ -32,6 +32,7 @@ from vehicle_detection.classifier import VehicleClassifier, load_classifier
 from vehicle_detection.cli import output
 from vehicle_detection.cli.app import app
 from vehicle_detection.cli.demo import FILES, REPORT, SHEET, draw_clip, scored_truth
+from vehicle_detection.cli.options import parse_time
 from vehicle_detection.cli.output import (
     check_distinct_paths,
     output_folder,
@@ -811,6 +812,14 @@ def bad_videos(material, tmp):
         r"--end must be later than the start; got 3 s to 2 s": [clip, "-o", target, "--start", 3, "--end", 2],
         r"--start must be less than the video's length of 0.4 s; got 3 s": [clip, "-o", target, "--start", 3],
         r"--start must be a number, at least 0": [clip, "-o", target, "--start", -1],
+        r"--start must be less .* 0.4 s; got 3606.5 s": [clip, "-o", target, "--start", "1:00:06.5"],
+        r"--end must be a time in seconds or as \[H:\]M:S, .*; got '1:2:'": [
+            clip,
+            "-o",
+            target,
+            "--end",
+            "1:2:",
+        ],
         r"--end must be a number, .* got nan": [clip, "-o", target, "--end", "nan"],
         r"--preset must be one of 'ultrafast'": [clip, "-o", target, "--preset", "hasty"],
         r"--labels must be one of 'id', .*; got 'name'": [clip, "-o", target, "--labels", "id,name"],
@@ -1461,6 +1470,20 @@ def test_a_piped_video_whose_index_is_at_its_end_is_refused(tmp_path):
 )
 def test_a_wrong_call_is_an_error_of_one_line(words, message):
     assert re.fullmatch(f"error: {message}\n", refuse(*words))
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("12", 12), ("0.5", 0.5), ("-1", -1), ("12:00", 720), ("00:12:00", 720), (" 1:02:06.5", 3726.5)],
+)
+def test_times_in_seconds_or_as_players_show_them(text, seconds):
+    assert parse_time(text, "--start") == seconds
+
+
+@pytest.mark.parametrize("text", ["", "noon", "1:2:3:4", "-1:00", "1:200", "12.5:00", "5s"])
+def test_times_that_cannot_be_read(text):
+    with pytest.raises(InvalidInputError, match=r"^--end must be a time in seconds or as \[H:\]M:S"):
+        parse_time(text, "--end")
 
 
 @pytest.mark.parametrize(("text", "mps"), [("100", 100 / 3.6), ("62mph", 62 * 0.44704), ("90 km/h", 25.0)])

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Any
 
 from typer import Option
+
+from vehicle_detection.errors import InvalidInputError
 
 INPUT, CAMERA, SEARCH, DRAWING, OUTPUT = "Input", "Camera", "Search", "Drawing", "Output"
 """Panels of the options in ``--help``."""
@@ -100,6 +103,24 @@ Preset = Annotated[
     ),
 ]
 NoAudio = Annotated[bool, flag("--no-audio", panel=OUTPUT, help="Write no sound.")]
+
+
+def parse_time(text: str | None, name: str) -> float | None:
+    """Read a time in seconds, or as players show it: ``12:30`` or ``1:02:06.5``."""
+    from vehicle_detection._common import describe
+
+    if text is None:
+        return None
+    clock = re.fullmatch(r"(?:(\d+):)?(\d+):(\d{1,2}(?:\.\d*)?)", text.strip())
+    if clock is not None:
+        hours, minutes, seconds = (float(part or 0) for part in clock.groups())
+        return 3600 * hours + 60 * minutes + seconds
+    try:
+        return float(text)
+    except ValueError:
+        raise InvalidInputError(
+            f"{name} must be a time in seconds or as [H:]M:S, such as 750 or 12:30; got {describe(text)}"
+        ) from None
 
 
 def parse_blur(text: str | None) -> Any:

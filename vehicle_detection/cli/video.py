@@ -31,6 +31,7 @@ from vehicle_detection.cli.options import (
     flag,
     option,
     parse_blur,
+    parse_time,
 )
 from vehicle_detection.cli.output import (
     UNKNOWN_LENS,
@@ -113,8 +114,12 @@ def video(
         bool, flag("-q", "--quiet", panel=OUTPUT, help="Print errors and warnings of damage only.")
     ] = False,
     profile: Annotated[bool, flag("--profile", panel=OUTPUT, help="Print the time of each stage.")] = False,
-    start: Annotated[float | None, option("S", "Start time in seconds, such as 12.5.", panel=INPUT)] = None,
-    end: Annotated[float | None, option("S", "End time in seconds, such as 30.", panel=INPUT)] = None,
+    start: Annotated[
+        str | None, option("TIME", "Start time, such as 12.5 (seconds) or 12:30.", panel=INPUT)
+    ] = None,
+    end: Annotated[
+        str | None, option("TIME", "End time, such as 30 (seconds) or 1:02:06.", panel=INPUT)
+    ] = None,
     fps: Annotated[float, option("N", "Frame rate of a source of images, such as 10.", panel=INPUT)] = 25.0,
     own_speed: Annotated[
         str | None,
@@ -230,6 +235,7 @@ def video(
         raise InvalidInputError("--output must name a video for --blur, which blurs its vehicles; add it")
     draw_params = _draw_params(labels, line_width=line_width, color_by=color_by, panel=panel, units=units)
     speed = read_speed(own_speed, gpx, gpx_offset)
+    span = {"start": parse_time(start, "--start"), "end": parse_time(end, "--end")}
     side_outputs = SideOutputs(events, clips, clips_of, srt)
     with (
         name_kept_files(outputs.values()),
@@ -260,13 +266,13 @@ def video(
             "draw_params": draw_params,
             "blur": region,
         }
-        settings: dict[str, Any] = {"start": start, "end": end, "preset": preset, "workers": jobs}
+        settings: dict[str, Any] = span | {"preset": preset, "workers": jobs}
         if horizon == "auto":
             # The estimate takes seconds: refuse invalid options before it.
             with VehicleDetector(loaded, **options) as unsure:
                 unsure.camera_of(opened.info.shape)
                 VideoRun(opened, unsure, target=output, audio=False, **settings).close()
-            fraction = find_horizon(opened, loaded, conf=conf, start=start, end=end, quiet=quiet)
+            fraction = find_horizon(opened, loaded, conf=conf, quiet=quiet, **span)
         detector = stack.enter_context(VehicleDetector(loaded, horizon=fraction, **options))
         page = None
         if report is not None and output is not None:
@@ -319,7 +325,7 @@ def video(
             given = f"the horizon of --camera {camera}"
         if given is not None:
             with open_source(source, fps=fps) as again, search_everywhere(loaded, conf) as everywhere:
-                warn_of_horizon(given, estimate_video_horizon(again, everywhere, start=start, end=end))
+                warn_of_horizon(given, estimate_video_horizon(again, everywhere, **span))
     if not quiet or profile:
         lines = str(done).splitlines()
         print_line("\n".join(lines if profile else lines[:1]))
