@@ -98,10 +98,10 @@ def test_tables_hold_the_rows(tmp_path_factory, given_rows):
         assert len(found) == len(given_rows)
         for row, wanted in zip(found, given_rows):
             assert row[:2] == wanted[:2]
-            for value, want, digits in zip(row[2:], wanted[2:], DIGITS.values(), strict=True):
+            for name, value, want in zip(TRACK_COLUMNS[2:], row[2:], wanted[2:], strict=True):
                 assert (value is None) == (want is None)
                 if want is not None:
-                    assert value == pytest.approx(want, abs=0.50001 * 10**-digits)
+                    assert value == pytest.approx(want, abs=0.50001 * 10 ** -DIGITS[name])
         # Written again, what was read is the same file: nothing creeps.
         again = folder / f"again{suffix}"
         write_tracks([(int(row[0]), int(row[1]), *row[2:]) for row in found], again)
@@ -116,6 +116,26 @@ def test_csv_to_the_letter(tmp_path):
         "0,2,100.00,20.00,150.00,60.00,-0.1250,,,,,\n"
         "2,1,12.00,21.00,52.00,61.00,1.0625,31.00,0.00,0.8000,2.25,0.50\n"
     )
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".jsonl", ".parquet"])
+def test_a_frame_rate_adds_the_time(tmp_path, suffix):
+    path = tmp_path / f"tracks{suffix}"
+    write_tracks(RESULTS, path, fps=30000 / 1001)
+    without = tmp_path / f"without{suffix}"
+    write_tracks(RESULTS, without)
+    assert [row[-1] for row in read_table(path)] == [0.0, 0.0, 0.067]
+    assert [row[:-1] for row in read_table(path)] == read_table(without)
+    assert read_labels(path).to_pandas().equals(read_labels(without).to_pandas())
+
+
+def test_other_formats_have_no_time(tmp_path):
+    for name in ("t.txt", "t.json"):
+        write_tracks(RESULTS, tmp_path / name, fps=25)
+        write_tracks(RESULTS, tmp_path / f"without_{name}")
+        assert (tmp_path / name).read_bytes() == (tmp_path / f"without_{name}").read_bytes()
+    with pytest.raises(InvalidInputError, match="fps must be a number, greater than 0"):
+        write_tracks(RESULTS, tmp_path / "t.csv", fps=0)
 
 
 def test_pandas_reads_the_tables(tmp_path):

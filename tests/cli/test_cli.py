@@ -618,7 +618,7 @@ def test_video_writes_an_annotated_copy_and_tracks(clip, tmp_path):
     ]  # fmt: skip
     assert lines[-1] == f"wrote {target}, {tracks}"
     assert tracks.read_text().splitlines()[0] == (
-        f"{HEADER},distance_m,speed_mps,confidence,distance_std_m,speed_std_mps"
+        f"{HEADER},distance_m,speed_mps,confidence,distance_std_m,speed_std_mps,time_s"
     )
     written, source = probe_video(target), probe_video(clip)
     assert (written.shape, written.fps, written.frames) == (source.shape, source.fps, source.frames)

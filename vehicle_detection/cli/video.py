@@ -288,7 +288,8 @@ def video(
             writers.append(page or log)
         if tracks is not None:
             with option_names(path="--tracks"):
-                writers.append(stack.enter_context(TrackWriter(tracks, shape=opened.info.shape)))
+                table = TrackWriter(tracks, shape=opened.info.shape, fps=float(opened.info.fps))
+                writers.append(stack.enter_context(table))
         if not quiet:
             # After the other checks: what is refused replaces nothing.
             VideoRun(opened, detector, target=output, audio=not no_audio, **settings).close()

@@ -1,7 +1,8 @@
 """Write results to files: CSV, JSON Lines, Parquet, MOTChallenge text and archives, COCO JSON, YOLO folders.
 
 Every table has the columns ``frame,track_id,x1,y1,x2,y2,score``. Tables of tracks go on with
-``distance_m,speed_mps,confidence,distance_std_m,speed_std_mps``, tables of boxes with ``confidence``.
+``distance_m,speed_mps,confidence,distance_std_m,speed_std_mps`` and, with a frame rate, ``time_s``; tables of
+boxes with ``confidence``.
 """
 
 from vehicle_detection.export.coco import CocoImages, coco_document, coco_images, coco_result

@@ -17,7 +17,10 @@ BOX_COLUMNS = ("frame", "track_id", "x1", "y1", "x2", "y2", "score")
 STILL_COLUMNS = (*BOX_COLUMNS, "confidence")
 TRACK_COLUMNS = (*BOX_COLUMNS, "distance_m", "speed_mps", "confidence", "distance_std_m", "speed_std_mps")
 
-DIGITS = dict(zip(TRACK_COLUMNS[2:], (2, 2, 2, 2, 4, 2, 2, 4, 2, 2)))
+TIME_COLUMN = "time_s"
+"""Last column of a table of tracks whose frame rate is known."""
+
+DIGITS = dict(zip((*TRACK_COLUMNS[2:], TIME_COLUMN), (2, 2, 2, 2, 4, 2, 2, 4, 2, 2, 3)))
 """Decimals of each column."""
 
 
@@ -38,6 +41,7 @@ class Row(NamedTuple):
     speed_std_mps: float | None = None
     ignore: bool = False
     visible: float = 1.0
+    time_s: float | None = None
 
 
 def check_items(items: object) -> Iterator[Any]:

@@ -7,11 +7,13 @@ import os
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from vehicle_detection._common import encodable
+from vehicle_detection._common import check_number, encodable
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.export.files import FORMATS, RowFile, check_format, open_row_file
 from vehicle_detection.export.rows import (
+    DIGITS,
     STILL_COLUMNS,
+    TIME_COLUMN,
     TRACK_COLUMNS,
     Row,
     check_items,
@@ -30,6 +32,7 @@ def write_tracks(
     *,
     format: str | None = None,  # noqa: A002 - the name that pandas and Pillow use
     shape: tuple[int, ...] | None = None,
+    fps: float | None = None,
 ) -> int:
     """Write the tracks of a video to a file; the file appears only when it is complete.
 
@@ -47,6 +50,9 @@ def write_tracks(
         .parquet, .txt, .zip or .json.
     shape
         ``(height, width, ...)`` of a frame, which YOLO and viewers of COCO data sets need.
+    fps
+        Frame rate, with which tables (CSV, JSON Lines, Parquet) get a last column ``time_s``: the frame's
+        number divided by it, as in `write_events`.
 
     Returns
     -------
@@ -57,7 +63,7 @@ def write_tracks(
     ------
     InvalidInputError
         If a row is malformed, a track comes twice in a frame or its frames do not ascend, the format is
-        unknown, or the folder is missing or read-only.
+        unknown, the frame rate is not a positive number, or the folder is missing or read-only.
 
     Notes
     -----
@@ -85,7 +91,7 @@ def write_tracks(
     0,1,10.00,20.00,50.13,60.00,1.5000,,,,,
     1,1,12.00,20.00,52.00,60.00,1.2500,31.40,-0.50,,,
     """
-    with TrackWriter(path, format=format, shape=shape) as write:
+    with TrackWriter(path, format=format, shape=shape, fps=fps) as write:
         for item in check_items(results):
             write(item)
     return write.rows
@@ -163,7 +169,7 @@ class TrackWriter:
 
     Parameters
     ----------
-    path, format, shape
+    path, format, shape, fps
         As in `write_tracks`.
 
     Attributes
@@ -174,7 +180,8 @@ class TrackWriter:
     Raises
     ------
     InvalidInputError
-        If the format is another one, or the folder is missing or read-only.
+        If the format is another one, the frame rate is not a positive number, or the folder is missing or
+        read-only.
 
     Examples
     --------
@@ -194,8 +201,10 @@ class TrackWriter:
         *,
         format: str | None = None,  # noqa: A002
         shape: tuple[int, ...] | None = None,
+        fps: float | None = None,
     ) -> None:
         self._kind = check_format(path, format, _TRACK_FORMATS)
+        self._fps = None if fps is None else check_number(fps, "fps", above=0, high=1e6)
         self._path, self._shape = path, shape
         self._stack = contextlib.ExitStack()
         self._file: RowFile | None = None
@@ -203,9 +212,8 @@ class TrackWriter:
         self.rows = 0
 
     def __enter__(self) -> TrackWriter:
-        self._file = self._stack.enter_context(
-            open_row_file(self._path, self._kind, TRACK_COLUMNS, self._shape)
-        )
+        columns = TRACK_COLUMNS if self._fps is None else (*TRACK_COLUMNS, TIME_COLUMN)
+        self._file = self._stack.enter_context(open_row_file(self._path, self._kind, columns, self._shape))
         self._last_frames, self.rows = {}, 0
         return self
 
@@ -221,7 +229,8 @@ class TrackWriter:
         for row in rows:
             self._check_order(row)
         for row in rows:
-            self._file.write(row)
+            time = None if self._fps is None else round(int(row.frame) / self._fps, DIGITS[TIME_COLUMN])
+            self._file.write(row._replace(time_s=time))
         self.rows += len(rows)
 
     def _check_order(self, row: Row) -> None:
