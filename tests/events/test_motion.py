@@ -53,3 +53,15 @@ def test_errors_of_the_time_to_collision_fit_at_the_end_of_a_track_too(seconds):
     middle, *ends = np.std(np.array(normalized)[:, [round(seconds * FPS) // 2, -5, -1]], axis=0)
     assert 0.6 < middle < 1
     assert all(0.6 < end < 1 for end in ends)
+
+
+def test_a_vehicle_of_constant_size_has_no_time_to_collision():
+    columns = {name: np.full(100, np.nan) for name in COLUMNS}
+    columns |= {
+        name: np.full(100, side) for name, side in zip(("x1", "y1", "x2", "y2"), (600.0, 400, 680, 464))
+    }
+    columns |= {"distance_m": np.full(100, 20.0), "distance_std_m": np.full(100, 2.0)}
+    motion = estimate_motion(TrackHistory(1, np.arange(100), columns), fps=FPS, shape=SHAPE, camera=CAMERA)
+    # Slopes of 0, or of the rounding error.
+    assert (np.abs(motion.time_to_collision) > 1e9).all()
+    assert (motion.slope_error > 1e9).all()

@@ -91,6 +91,7 @@ def estimate_motion(track: TrackHistory, *, fps: float, shape: tuple[int, int], 
         # Smith, *Applied Regression Analysis*, chapter 3, inverse regression).
         mean_std = _SIZE_STD * mean / np.sqrt(count)
         slope_std = mean_std * np.sqrt(12) / span
+        slope_error = slope_std / np.abs(slope)
         time_std = np.hypot(mean_std, slope_std * mean / slope) / np.abs(slope)
     closing = -scale * slope
     return Motion(
@@ -105,7 +106,7 @@ def estimate_motion(track: TrackHistory, *, fps: float, shape: tuple[int, int], 
         lateral_rate=local_lines(seconds, lateral)[1],
         time_to_collision=time,
         time_to_collision_std=time_std,
-        slope_error=slope_std / np.abs(slope),
+        slope_error=slope_error,
         at_side=truncated[:, 2].astype(np.int64) - truncated[:, 0],
     )
 
