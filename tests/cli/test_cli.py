@@ -675,7 +675,9 @@ def test_video_writes_events_and_a_summary(clip, tmp_path):
     target, events, clips = tmp_path / "out.mp4", tmp_path / "events.json", tmp_path / "clips"
     words = ["--events", events, "--clips", clips, "--own-speed", 100, "--preset", "ultrafast"]
     lines = succeed("video", clip, "-o", target, *words).splitlines()
-    assert re.search(r"\d+ met, \d+ overtaken, \d+ overtaking.*vehicles in view on average", lines[1])
+    assert re.search(
+        r"overtook \d+ vehicles?, was overtaken by \d+, met \d+ oncoming.* in view on average", lines[1]
+    )
     assert lines[-1] == f"wrote {target}, {events}, {clips}"
     found = json.loads(events.read_text())
     assert [path.suffix for path in clips.iterdir()] == [".mp4"] * len(found)

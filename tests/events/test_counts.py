@@ -29,7 +29,9 @@ def test_counts_are_the_sums_of_their_minutes():
     for name in ("met", "overtaken", "overtaking", "passed", "seconds"):
         assert sum(getattr(minute, name) for minute in counts.minutes) == getattr(counts.total, name)
     assert (counts.vehicles, counts.total.max_in_view) == (2, 2)
-    assert counts.summary().startswith("2 met, 1 overtaken, 1 overtaking, 1 passed; 1.6 vehicles in view")
+    assert counts.summary().startswith(
+        "overtook 1 vehicle, was overtaken by 1, met 2 oncoming, passed 1 other; 1.6 vehicles in view"
+    )
 
 
 def test_an_empty_drive_has_no_minutes():

@@ -141,7 +141,7 @@ class TestPage:
         assert counts["Nearest"] == "21 \N{PLUS-MINUS SIGN} 2 m, #1"
         rows = re.findall(r"<tr>(<th scope=\"row\">.*?)</tr>", text, re.DOTALL)
         cells = [re.findall(r"<t[hd].*?>(.*?)</t[hd]>", row) for row in rows]
-        assert [re.sub("<.*?>", "", cell) for cell in cells[1]] == [
+        assert [re.sub("<.*?>", "", cell) for cell in cells[2]] == [
             "#2", "0:00.4", "0:00.8", "10", "\N{EN DASH}", "\N{EN DASH}", "100 %",
         ]  # fmt: skip
         assert "decode" in text
@@ -409,7 +409,7 @@ def test_events_and_counts_are_listed_with_buttons_that_seek(tmp_path):
     buttons = [each for each in parser.all("button") if "vehicle" in each.get("aria-label", "")]
     assert [button["data-frame"] for button in buttons] == ["12", "40"]
     assert "<td>12.5 ± 1.5 m</td>" in page
-    row = re.search(r'<th scope="row">0:00</th>(.*?)</tr>', page)[1]
+    row = re.search(r">0:00</button></th>(.*?)</tr>", page)[1]
     assert re.findall("<td>(.*?)</td>", row) == ["0", "1", "0", "0", "1.2", "2"]
 
 
@@ -443,5 +443,19 @@ def test_pictures_are_part_of_the_page(tmp_path):
 
 
 def test_a_page_without_certain_events_says_so(tmp_path):
-    assert "No event is certain." in write_report(tmp_path, FRAMES)
-    assert "No event is certain." not in write_report(tmp_path, [[]])
+    assert "No event was found." in write_report(tmp_path, FRAMES)
+    assert "No event was found." not in write_report(tmp_path, [[]])
+
+
+def test_minutes_are_buttons_that_seek_and_come_before_the_tracks(tmp_path):
+    writer = ReportWriter(tmp_path / "report.html")
+    for index in range(2 * 60 * FPS + 1):
+        writer.write(index, index / FPS, FRAMES[0])
+    writer.finish(video_report(2 * 60 * FPS + 1), events=[])
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    buttons = [
+        each for each in StrictParser(page).all("button") if re.match(r"\d:\d\d: show", each["aria-label"])
+    ]
+    assert [int(button["data-frame"]) for button in buttons] == [0, 60 * FPS, 120 * FPS]
+    assert '<th scope="row">Total</th>' in page
+    assert page.index("<h2>Events</h2>") < page.index(">2:00</button>") < page.index("<h2>Tracks</h2>")

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_detection._common import check_number, check_type
+from vehicle_detection._common import check_number, check_type, pluralize
 from vehicle_detection.events.find import Event, Kind, check_events
 from vehicle_detection.events.history import TrackLog
 
@@ -60,10 +60,11 @@ class VehicleCounts:
     minutes: tuple[MinuteCounts, ...]
 
     def summary(self) -> str:
-        """Describe the counts in one line."""
+        """Describe the counts in one line, whose subject is the own vehicle."""
         total = self.total
-        counts = f"{total.met} met, {total.overtaken} overtaken, {total.overtaking} overtaking"
-        counts += f", {total.passed} passed" if total.passed else ""
+        counts = f"overtook {pluralize(total.overtaken, 'vehicle')}, was overtaken by {total.overtaking}"
+        counts += f", met {total.met} oncoming"
+        counts += f", passed {pluralize(total.passed, 'other')}" if total.passed else ""
         return f"{counts}; {total.mean_in_view:.1f} vehicles in view on average, {total.max_in_view} at most"
 
 
@@ -95,8 +96,10 @@ def count_vehicles(events: Iterable[Event], log: TrackLog, *, fps: float) -> Veh
     ...     log.add(frame, None, [])
     >>> event = Event(kind="met", track_id=1, frame=1600, start_frame=1580, end_frame=1600, time_s=64.0)
     >>> counts = count_vehicles([event], log, fps=25)
-    >>> [minute.met for minute in counts.minutes], counts.summary()
-    ([0, 1], '1 met, 0 overtaken, 0 overtaking; 0.0 vehicles in view on average, 0 at most')
+    >>> [minute.met for minute in counts.minutes]
+    [0, 1]
+    >>> print(counts.summary())
+    overtook 0 vehicles, was overtaken by 0, met 1 oncoming; 0.0 vehicles in view on average, 0 at most
     """
     rate = check_number(fps, "fps", above=0, high=1e6)
     check_type(log, "log", TrackLog, "pass the TrackLog of the video")

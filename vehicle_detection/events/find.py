@@ -43,10 +43,10 @@ KINDS: dict[Kind, str] = {
     "closing": "closing in",
     "hard_closing": "closing in hard",
     "cut_in": "cut-in",
-    "overtaken": "overtaken",
-    "overtaking": "overtaking",
+    "overtaken": "overtaken by us",
+    "overtaking": "overtook us",
     "met": "met (oncoming)",
-    "passed": "passed",
+    "passed": "passed by us",
 }
 """Name of each kind of event for readers."""
 

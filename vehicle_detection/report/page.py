@@ -91,12 +91,13 @@ class Figure(NamedTuple):
 
 
 class Table(NamedTuple):
-    """A table of text cells; the first cell of a row is its header."""
+    """A table of text cells; the first cell of a row is its header, which may go to a frame."""
 
     label: str
     note: str
     header: Sequence[str]
     rows: list[list[str]]
+    frames: Sequence[int] = ()  # of the first rows
 
 
 class Group(NamedTuple):
@@ -149,7 +150,7 @@ def render_page(
         events=events,
         event_kinds=KINDS,
         pictures=pictures,
-        minutes=_minute_table(count_vehicles(events, log, fps=axis.fps)) if tracks else None,
+        minutes=_minute_table(count_vehicles(events, log, fps=axis.fps), axis.fps) if tracks else None,
         fraction_bar=fraction_bar,
         settings=_settings(detector, report.shape),
         model=_model_summary(getattr(detector, "model", None)),
@@ -208,7 +209,7 @@ def _counts(
     return counts
 
 
-def _minute_table(counts: VehicleCounts) -> Table:
+def _minute_table(counts: VehicleCounts, fps: float) -> Table:
     """List the counts of each minute, and of the whole video."""
     rows = []
     for minute in counts.minutes + ((counts.total,) if len(counts.minutes) > 1 else ()):
@@ -217,11 +218,14 @@ def _minute_table(counts: VehicleCounts) -> Table:
         numbers = minute.met, minute.overtaken, minute.overtaking, minute.passed
         rows.append([name, *map(str, numbers), f"{minute.mean_in_view:.1f}", str(minute.max_in_view)])
     note = (
-        "Vehicles that came towards the camera, that it overtook, that overtook it, and that it passed "
-        "although their direction is uncertain; and vehicles in view."
+        "Vehicles that were oncoming, that we overtook, that overtook us, and that we passed although they "
+        "stood or their direction is uncertain; and vehicles in view."
     )
-    header = ("From", "Met", "Overtaken", "Overtaking", "Passed", "Mean in view", "Most in view")
-    return Table("Counts by minute", note, header, rows)
+    header = (
+        "From", "Oncoming", "Overtaken by us", "Overtook us", "Passed by us", "Mean in view", "Most in view"
+    )  # fmt: skip
+    frames = [round(minute.start_s * fps) for minute in counts.minutes]
+    return Table("Counts by minute", note, header, rows, frames)
 
 
 def _figures(
