@@ -395,7 +395,7 @@ def test_video_takes_the_camera(tmp_path):
         (("--fov", 200), "--fov must be a number, at least 1 and at most 170"),
         (("--units", "nautical"), "--units must be one of 'metric', 'imperial'; got 'nautical'"),
         (("--camera-height", 0), "--camera-height must be a number"),
-        (("--camera", "missing.json"), "--camera must be a Camera, a file or one of standard-58, "),
+        (("--camera", "missing.json"), "--camera must be one of standard-58, "),
         (("--camera", "wide-90", "--fov", 90), "--fov must be omitted with a camera"),
     ):
         result = run("video", clip, "-o", tmp_path / "out.mp4", *words)
@@ -499,6 +499,7 @@ def bad_images(material, tmp):
     return {
         r"IMAGE .+missing.png does not exist; check the path": [tmp / "missing.png"],
         r"IMAGE .+empty is a folder; choose files in it": [material / "empty"],
+        r"clip.mp4 is a video; use vehicle-detection video": [material / "clip.mp4"],
         r"text.png must be a complete image file": [material / "text.png"],
         r"cut_road.png must be a complete image file": [material / "cut_road.png"],
         r"nothing.png must be a complete image file": [tmp / "nothing.png"],
@@ -519,7 +520,7 @@ def bad_images(material, tmp):
         r"--boxes .+road.png is one of the images": [road, "--boxes", road],
         r"--labels must be one of 'score', 'none'; got 'id'": [road, "--labels", "id"],
         r"--line-width must be an integer from 1 to 1000; got 0": [road, "--line-width", 0],
-        r"--boxes must end in .csv, .* got 'boxes.doc'": [road, "--boxes", tmp / "boxes.doc"],
+        r"--boxes must end in .csv or .*, got 'boxes.doc'": [road, "--boxes", tmp / "boxes.doc"],
         r"--boxes needs an existing folder, .+none is not one": [
             road,
             "--boxes",
@@ -831,7 +832,7 @@ def bad_videos(material, tmp):
         r"--panel must be one of 'none', 'corner', 'side'": [clip, "-o", target, "--panel", "left"],
         r"--horizon must be a number": [clip, "-o", target, "--horizon", -0.5],
         r"--horizon must be a fraction .* or auto; got 'high'": [clip, "-o", target, "--horizon", "high"],
-        r"--tracks must end in .csv, .*got 'tracks.doc'": [
+        r"--tracks must end in .csv or .*, got 'tracks.doc'; write 'tracks.csv'\n": [
             clip,
             "-o",
             target,
@@ -909,6 +910,13 @@ def test_video_refuses_bad_input_before_it_estimates_the_horizon(material, tmp_p
     lens.write_text('{"image_size": [640, 480], "focal_px": 600}')
     cases = bad_videos(material, tmp_path) | {
         r"--fov must be omitted with a camera": [clip, "-o", target, "--camera", "wide-90", "--fov", 90],
+        r"--camera must be one of standard-58, .* or an existing JSON file; got 'gopro'; or state": [
+            clip,
+            "-o",
+            target,
+            "--camera",
+            "gopro",
+        ],
         r"--fov must be a number": [clip, "-o", target, "--fov", 500],
         r"lens.json: image_size must have the aspect ratio": [clip, "-o", target, "--camera", lens],
         r"--conf must be a number": [clip, "-o", target, "--conf", 2],
@@ -1466,6 +1474,11 @@ def test_a_piped_video_whose_index_is_at_its_end_is_refused(tmp_path):
         (
             ["video", "a.mp4", "--jobs", "many"],
             r"Invalid value for '--jobs': .*(should be|is not) a valid integer; .*",
+        ),
+        (
+            ["video", *(f"CARD/{number}.MP4" for number in range(1000))],
+            r"Got unexpected .* \(CARD/1.MP4 [^;]{10,120} \.\.\.\); SOURCE is one argument: for several "
+            r"files, pass their folder or a quoted pattern, such as 'CARD/\*.MP4'; see \S+ video --help",
         ),
         (["video", "a.mp4", "--labels"], r"Option '--labels' requires an argument; see \S+ --help"),
     ],

@@ -11,6 +11,7 @@ import glob
 import itertools
 import os
 import re
+import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -63,6 +64,7 @@ if TYPE_CHECKING:
     from vehicle_detection.evaluation import FrameBoxes, FrameKey
 
 BAD_INPUT, INTERRUPTED = 2, 130  # exit codes
+_MAX_LISTED = 120  # characters of a message that lists surplus arguments
 _CHECKED_IMAGES = 20  # images that are searched again if no vehicle was found
 
 
@@ -80,6 +82,13 @@ def _print_usage_error() -> Iterator[None]:
             raise
         message = " ".join(error.format_message().split()).rstrip(".")
         command = "vehicle-detection" if error.ctx is None else error.ctx.command_path
+        if "unexpected extra argument" in message and command.endswith(" video"):
+            # Such as the files of a pattern that the shell has expanded, of which there may be thousands.
+            message = textwrap.shorten(message, _MAX_LISTED, placeholder=" ...)")
+            message += (
+                "; SOURCE is one argument: for several files, pass their folder or a quoted pattern, such as "
+                "'CARD/*.MP4'"
+            )
         print_error(f"error: {message.partition(', unable to parse')[0]}; see {command} --help")
         raise typer.Exit(BAD_INPUT) from None
 
@@ -245,7 +254,7 @@ def detect(
 
     Exit code 3: some images cannot be decoded, and are left out.
     """
-    from vehicle_detection._common import check_choice, check_integer
+    from vehicle_detection._common import check_choice, check_integer, check_suffix
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.export import write_boxes
 
@@ -254,6 +263,8 @@ def detect(
         check_integer(line_width, "line_width", low=1, high=1000)
     images = list(dict.fromkeys(itertools.chain.from_iterable(map(_expand, images))))
     _check_images(images, output, boxes)
+    if boxes is not None:
+        check_suffix(boxes, "--boxes", (".csv", ".jsonl", ".ndjson", ".parquet", ".json"))
     region = parse_blur(blur)
     if region is not None and output is None and why is None:
         raise InvalidInputError(
@@ -359,9 +370,12 @@ def _warn_if_empty(
 def _read_each(images: list[Path], undecodable: list[Path]) -> Iterator[tuple[Path, NDArray[np.uint8]]]:
     """Yield the images that can be decoded, warn of others and list them; it is an error if all are such."""
     from vehicle_detection.images import read_image
+    from vehicle_detection.video.trips import VIDEO_SUFFIXES
 
     for path in images:
         try:
+            if path.suffix.lower() in VIDEO_SUFFIXES:
+                raise InvalidInputError(f"image file {path} is a video; use vehicle-detection video {path}")
             with capture_stderr() as messages:
                 image = read_image(path)
         except InvalidInputError as error:

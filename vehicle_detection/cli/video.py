@@ -215,10 +215,11 @@ def video(
 
     Exit code 3: the source is damaged, and the copy lacks what cannot be decoded.
     """
+    from vehicle_detection.camera import LENSES
     from vehicle_detection.cli.events import SideOutputs, explain_vehicles, print_summary, read_speed
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.events import TrackLog
-    from vehicle_detection.export import FORMATS, TrackWriter, check_format
+    from vehicle_detection.export import TrackWriter
     from vehicle_detection.mixture import load_model
     from vehicle_detection.video import VideoRun, estimate_video_horizon, open_source, process_video
 
@@ -228,6 +229,11 @@ def video(
     sources = {"SOURCE": Path(source)} | ({} if gpx is None else {"--gpx": gpx})
     check_distinct_paths(outputs, sources)
     _check_outputs(outputs, clips, show=show, why=why)
+    if camera is not None and camera not in LENSES and not Path(camera).is_file():
+        raise InvalidInputError(
+            f"--camera must be one of {', '.join(LENSES)} or an existing JSON file; got {camera!r}; "
+            "or state the lens with --fov"
+        )
     if diagnostics and panel != "none":
         raise InvalidInputError("--panel has no place with --diagnostics; omit one of them")
     region = parse_blur(blur)
@@ -243,9 +249,6 @@ def video(
         contextlib.ExitStack() as stack,
     ):
         writers: list[Callable[[Any], object]] = []
-        if tracks is not None:
-            with option_names(path="--tracks"):
-                check_format(tracks, None, FORMATS.values())
         fraction = None if horizon in (None, "auto") else parse_horizon(str(horizon))
         loaded = load_model(model)
         opened = stack.enter_context(
@@ -342,7 +345,10 @@ def video(
 def _check_outputs(outputs: Mapping[str, Path | None], clips: Path | None, *, show: bool, why: bool) -> None:
     """Refuse outputs of ``video`` that need another one, and a run without any output."""
     from vehicle_detection._common import check_suffix
+    from vehicle_detection.export import FORMATS
 
+    if outputs["--tracks"] is not None:
+        check_suffix(outputs["--tracks"], "--tracks", tuple(FORMATS))
     if outputs["--report"] is not None:
         check_suffix(outputs["--report"], "--report", (".html", ".htm"))
     if outputs["--output"] is None:

@@ -50,13 +50,14 @@ class WindowViewer:
             import tkinter
         except ImportError:
             raise InvalidInputError(
-                "show needs tkinter, which this Python lacks; install it (such as python3-tk), or omit show"
+                "show needs tkinter, which this Python lacks; install it (such as python3-tk), or write a "
+                "video"
             ) from None
         try:
             self._root = tkinter.Tk()
         except tkinter.TclError as error:
             raise InvalidInputError(
-                f"show needs a display ({error}); run it on a desktop or in a notebook, or omit show"
+                f"show needs a display ({error}); run it on a desktop or in a notebook, or write a video"
             ) from None
         self._tkinter: Any = tkinter
         self._root.title(title)
