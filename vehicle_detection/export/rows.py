@@ -39,9 +39,9 @@ class Row(NamedTuple):
     confidence: float | None = None
     distance_std_m: float | None = None
     speed_std_mps: float | None = None
+    time_s: float | None = None
     ignore: bool = False
     visible: float = 1.0
-    time_s: float | None = None
 
 
 def check_items(items: object) -> Iterator[Any]:
