@@ -370,11 +370,11 @@ def _warn_if_empty(
 def _read_each(images: list[Path], undecodable: list[Path]) -> Iterator[tuple[Path, NDArray[np.uint8]]]:
     """Yield the images that can be decoded, warn of others and list them; it is an error if all are such."""
     from vehicle_detection.images import read_image
-    from vehicle_detection.video.trips import VIDEO_SUFFIXES
+    from vehicle_detection.video import is_video_file
 
     for path in images:
         try:
-            if path.suffix.lower() in VIDEO_SUFFIXES:
+            if is_video_file(path.name):
                 raise InvalidInputError(f"image file {path} is a video; use vehicle-detection video {path}")
             with capture_stderr() as messages:
                 image = read_image(path)
