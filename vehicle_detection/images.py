@@ -54,8 +54,8 @@ def decode_image(data: bytes, name: str) -> NDArray[np.uint8]:
     size, image = image_size(data), None
     if size is not None and size[0] * size[1] > Limit.PIXELS.current():
         raise InvalidInputError(
-            f"{name} has {size[0]}x{size[1]} pixels, more than {Limit.PIXELS.current():,}; if it is meant to "
-            f"be so large, set {Limit.PIXELS.variable}"
+            f"{name} must have at most {Limit.PIXELS.current():,} pixels, got {size[0]}x{size[1]}; if the "
+            f"image is meant to be so large, set {Limit.PIXELS.variable}"
         )
     # OpenCV's decoders of other formats are not used: nothing limits the memory that a file claims.
     with contextlib.suppress(cv2.error, MemoryError):
@@ -103,7 +103,7 @@ def read_image(path: str | os.PathLike[str] | bytes) -> NDArray[np.uint8]:
     vehicle_detection.errors.InvalidInputError: image file missing.png does not exist; check the path
     """
     if isinstance(path, bytes):
-        return decode_image(path, "image of bytes")
+        return decode_image(path, "the bytes")
     if isinstance(path, (bytearray, memoryview)) or hasattr(path, "getvalue"):
         raise InvalidInputError(
             f"path must be a file name or bytes, got {describe(path)}; pass bytes(...) or stream.getvalue()"

@@ -80,6 +80,8 @@ def check_image(image: object, name: str = "image") -> NDArray[np.uint8]:
             remedy = "convert it with numpy.asarray(image)"
         elif isinstance(image, (list, tuple)):
             remedy = "pass one image after the other"
+        elif isinstance(image, bytes):
+            remedy = "decode it with vehicle_detection.read_image(data)"
         raise InvalidInputError(
             f"{name} must be an (H, W, 3) uint8 RGB array, got {describe(image)}; {remedy}"
         )
