@@ -3,6 +3,7 @@ import dataclasses
 import pickle
 import random
 import sys
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
@@ -32,6 +33,9 @@ from vehicle_detection.params import (
 from vehicle_detection.synthetic import SceneVehicle, render_scene
 from vehicle_detection.tracking import FrameResult, Tracker
 from vehicle_detection.video import OwnSpeed, process_video
+
+# Most of these frames come without times.
+pytestmark = pytest.mark.filterwarnings("ignore:the speeds assume:UserWarning")
 
 HEIGHT, WIDTH = 180, 320
 SIDES = (160, 200, 250)  # of windows in a 1280 wide frame: 40, 50 and 62 pixels in these
@@ -556,6 +560,7 @@ GOOD = frame_with(CAR)
         (GOOD[:0], "the image is empty"),
         (GOOD[None], "pass one image"),
         (None, "read files with vehicle_detection.read_image"),
+        (b"\xff\xd8\xff", r"decode it with vehicle_detection.read_image\(data\)"),
     ],
 )
 @pytest.mark.parametrize("method", ["shared", "windows"])
@@ -564,9 +569,32 @@ def test_bad_frames_are_refused_and_change_nothing(frame, message, method):
     detector.process(GOOD)
     plain.process(GOOD)
     for take in (detector.detect, detector.process, detector.search, detector):
-        with pytest.raises(InvalidInputError, match=f"^frame must be an .*{message}"):
+        name = "image" if take == detector.detect else "frame"
+        with pytest.raises(InvalidInputError, match=f"^{name} must be an .*{message}"):
             take(frame)
     assert_same(detector.process(GOOD), plain.process(GOOD))
+
+
+@pytest.mark.parametrize("method", ["process", "track"])
+def test_frames_without_times_and_frame_rate_warn_once_of_their_speeds(method):
+    def follow(detector, times):
+        for frame, time in zip(drive(), times, strict=True):
+            if method == "process":
+                detector.process(frame, time)
+            else:
+                detector.track(detector.search(frame), time=time)
+
+    unknown, known, timed = make(), make(), make()
+    with pytest.warns(UserWarning, match="speeds assume 25 frames per second.*reset") as caught:
+        follow(unknown, [None] * 12)
+    assert [warning.filename for warning in caught] == [__file__]
+    known.reset(fps=10)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        follow(known, [None] * 12)
+        follow(timed, [index / 10 for index in range(12)])
+        unknown.reset()
+        follow(unknown, [None] * 12)
 
 
 def test_only_single_images_are_read_from_files():

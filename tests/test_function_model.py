@@ -102,7 +102,7 @@ def test_the_documented_probabilities_confirm_and_continue_tracks():
     )] == [0.43, 0.55, 0.18]  # fmt: skip
     for probability, shown in ((0.53, 0), (0.6, 1)):
         detector = detector_from(returning([BOX], [probability]))
-        results = [detector.process(frame_with()) for _ in range(40)]
+        results = [detector.process(frame_with(), step / 25) for step in range(40)]
         assert len(results[-1].shown) == shown
 
 

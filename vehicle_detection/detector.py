@@ -317,7 +317,7 @@ class VehicleDetector(Closing):
         InvalidInputError
             If the image is malformed, unreadable or too small for a window.
         """
-        frame = read_image(image) if isinstance(image, (str, os.PathLike)) else image
+        frame = read_image(image) if isinstance(image, (str, os.PathLike)) else check_image(image)
         found = self.search(frame)
         if self._heat_params is not None:
             return label_heat(frame_heat(found.shape, found.windows, self._heat_params), self._heat_params)
@@ -416,7 +416,8 @@ class VehicleDetector(Closing):
         frame
             ``(H, W, 3)`` uint8 RGB.
         time
-            Time of the frame in seconds; None: one frame after the last one.
+            Time of the frame in seconds; None: one frame after the last one, at the frame rate that `reset`
+            was given (25 per second if none).
 
         Returns
         -------
@@ -429,9 +430,28 @@ class VehicleDetector(Closing):
             If the frame is not an ``(H, W, 3)`` uint8 RGB image, or is too small for a window.
         DetectorError
             If the detector is a function that fails; the message names the frame.
+
+        Warns
+        -----
+        UserWarning
+            Once, if speeds are estimated although neither times nor a frame rate are known.
         """
         with self._one_thread():
-            return self._process(frame, time)
+            result = self._process(frame, time)
+        self._warn_of_frame_rate(result)
+        return result
+
+    def _warn_of_frame_rate(self, result: FrameResult) -> None:
+        """Warn the caller of a public method, once, that speeds depend on an assumed frame rate."""
+        has_speed = any(track.speed_mps is not None for track in result.shown)
+        if has_speed and result.time is None and self._fps is None and self._speed_warning:
+            self._speed_warning = False
+            warnings.warn(
+                f"the speeds assume {_USUAL_FPS:g} frames per second, because the frames came without times; "
+                "pass their times in seconds to process, or call detector.reset(fps=...) first; in moviepy "
+                "use detector.annotate_clip(clip)",
+                stacklevel=3,
+            )
 
     def _process(self, frame: NDArray[np.uint8], time: float | None) -> FrameResult:
         start = clock.perf_counter()
@@ -448,7 +468,7 @@ class VehicleDetector(Closing):
             found = self.search(frame)
         except DetectorError as error:
             raise DetectorError(f"frame {self._index}: {error}") from error
-        return self.track(found, time=time)
+        return self._track(found, time)
 
     def skip(self, thumbnail: NDArray[np.float32]) -> None:
         """Count the next frame, which is not searched, given its `make_thumbnail`."""
@@ -538,7 +558,7 @@ class VehicleDetector(Closing):
         found
             Result of `search` for this frame.
         time
-            Time of the frame in seconds; None: one frame after the last one.
+            Time of the frame in seconds; None: as in `process`.
 
         Returns
         -------
@@ -550,12 +570,19 @@ class VehicleDetector(Closing):
         InvalidInputError
             If an argument is malformed, or another thread is processing a frame.
 
+        Warns
+        -----
+        UserWarning
+            As in `process`.
+
         Notes
         -----
         A cut to another scene, a frame of another size and a time that goes backwards end all tracks.
         """
         with self._one_thread():
-            return self._track(found, time)
+            result = self._track(found, time)
+        self._warn_of_frame_rate(result)
+        return result
 
     def _track(self, found: SearchResult, time: float | None) -> FrameResult:
         start = clock.perf_counter()
@@ -649,7 +676,7 @@ class VehicleDetector(Closing):
         Warns
         -----
         UserWarning
-            Once, if speeds are shown although the frame rate is unknown.
+            As in `process`.
 
         Notes
         -----
@@ -665,17 +692,11 @@ class VehicleDetector(Closing):
             return draw_boxes(image, boxes)
         if self._first is not None and self._index == 1 and np.array_equal(frame, self._first[0]):
             return self.annotate(frame, self._first[1])
-        result = self.process(frame)
+        with self._one_thread():
+            result = self._process(frame, None)
         if result.index == 0:
             self._first = frame.copy(), result
-        has_speed = any(track.speed_mps is not None for track in result.shown)
-        if has_speed and self._fps is None and self._speed_warning:
-            self._speed_warning = False
-            warnings.warn(
-                f"the speeds assume {_USUAL_FPS:g} frames per second, because the frames came without times; "
-                "use detector.annotate_clip(clip) in moviepy, or call detector.reset(fps=...) first",
-                stacklevel=2,
-            )
+        self._warn_of_frame_rate(result)
         return self.annotate(frame, result)
 
     def annotate_clip(self, clip: Clip, *, on_result: Callable[[FrameResult], object] | None = None) -> Clip:
