@@ -290,6 +290,17 @@ def test_bad_arguments(card, model, tmp_path, monkeypatch, options, message):
         batch_status("nowhere")
 
 
+def test_a_missing_pyarrow_is_reported_before_the_first_trip(card, model, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    arguments = ["batch", str(card), "-o", str(tmp_path / "out"), "--model", str(model)]
+    planned = CliRunner().invoke(app, [*arguments, "--dry-run"])
+    assert planned.exit_code == 0, planned.output
+    refused = CliRunner().invoke(app, arguments)
+    assert refused.exit_code == 2
+    assert refused.stderr == "error: .parquet files need pyarrow; pip install pyarrow\n"
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_status_sums_up_the_records(tmp_path):
     folder = tmp_path / "records"
     folder.mkdir()

@@ -37,7 +37,7 @@ from vehicle_detection._common.files import (
 from vehicle_detection._common.image_size import image_size
 from vehicle_detection._common.limits import Limit, check_regular_file, read_regular_file
 from vehicle_detection._common.model_file import FORMAT_VERSION, ModelData, read_model, write_model
-from vehicle_detection._common.parquet import ParquetRows, write_parquet
+from vehicle_detection._common.parquet import ParquetRows, import_pyarrow, write_parquet
 from vehicle_detection._common.progress import progress_bar
 from vehicle_detection._common.text import encodable, natural_key, pluralize
 from vehicle_detection._common.threads import (
@@ -94,6 +94,7 @@ __all__ = [
     "finite_array",
     "hide_credentials",
     "image_size",
+    "import_pyarrow",
     "is_hidden",
     "is_listing",
     "is_url",

@@ -14,14 +14,13 @@ from vehicle_detection.errors import InvalidInputError
 _ROWS_PER_GROUP = 50_000
 
 
-def _import_pyarrow() -> Any:
+def import_pyarrow() -> Any:
+    """Return the package pyarrow; raise an error with the remedy if it is missing."""
     try:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
-        raise InvalidInputError(
-            "a .parquet file needs pyarrow; pip install 'vehicle-detection[parquet]', or write .csv"
-        ) from None
+        raise InvalidInputError(".parquet files need pyarrow; pip install pyarrow") from None
     return pyarrow
 
 
@@ -32,7 +31,7 @@ def write_parquet(
 
     `types` names the Arrow type of each column, such as ``"int64"``; None infers them from the values.
     """
-    pyarrow = _import_pyarrow()
+    pyarrow = import_pyarrow()
     schema = None if types is None else pyarrow.schema(list(types.items()))
     with atomic_write(path, "path") as part:
         pyarrow.parquet.write_table(pyarrow.table(table, schema=schema), part)
@@ -44,7 +43,7 @@ class ParquetRows:
     def __init__(self, path: Path, types: Mapping[str, str]) -> None:
         self._path = path
         self._waiting: dict[str, list[Any]] = {name: [] for name in types}
-        self._pyarrow = _import_pyarrow()
+        self._pyarrow = import_pyarrow()
         self._schema = self._pyarrow.schema(list(types.items()))
 
     def __enter__(self) -> Self:

@@ -46,7 +46,7 @@ def open_dask(address: str, jobs: int | None = None) -> Iterator[tuple[Executor,
         import distributed
     except ImportError:
         raise InvalidInputError(
-            "dask needs dask[distributed]; pip install 'vehicle-detection[batch]', or omit it"
+            "dask needs dask[distributed]; pip install 'dask[distributed]', or omit it"
         ) from None
     with contextlib.ExitStack() as stack:
         stack.enter_context(

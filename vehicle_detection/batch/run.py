@@ -27,6 +27,7 @@ from vehicle_detection._common import (
     check_type,
     describe,
     hide_credentials,
+    import_pyarrow,
     pluralize,
     progress_bar,
 )
@@ -190,7 +191,7 @@ def run_batch(
     Raises
     ------
     InvalidInputError
-        If an argument is invalid, or a source does not exist.
+        If an argument is invalid, a source does not exist, or pyarrow is missing.
     TransientVideoError, OutputError
         If remote sources, or the storage of `out`, do not answer when the batch starts.
 
@@ -215,6 +216,8 @@ def run_batch(
         check_type(options, "options", Mapping, "pass a dictionary")
     workers = available_cores() if jobs is None else check_integer(jobs, "jobs", low=1, high=1024)
     check_choice(preset, "preset", PRESETS)
+    if executor is None and not dry_run:
+        import_pyarrow()  # an error now, not after the first trip
     settings = _settings(model, options, tracks_only=tracks_only, audio=audio, preset=preset)
     single = isinstance(sources, (str, os.PathLike))
     given = (sources,) if single else check_sequence(sources, "sources", "files, folders, patterns or URLs")

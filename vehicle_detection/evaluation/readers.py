@@ -189,7 +189,7 @@ def _read_parquet(source: Path, classes: Collection[str] | None) -> Rows:
         import pyarrow.parquet
     except ImportError:
         raise InvalidInputError(
-            "a .parquet file needs pyarrow; pip install 'vehicle-detection[parquet]', or convert it to .csv"
+            "a .parquet file needs pyarrow; pip install pyarrow, or convert it to .csv"
         ) from None
     check_regular_file(source, str(source), Limit.TEXT_BYTES, error=DatasetError)
     try:

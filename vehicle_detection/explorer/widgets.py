@@ -94,8 +94,7 @@ def build_widgets(values: Mapping[str, Any], options: Mapping[str, Sequence[Any]
         widgets: Any = importlib.import_module("ipywidgets")
     except ImportError:
         raise InvalidInputError(
-            "the explorer's sliders need ipywidgets; pip install 'vehicle-detection[notebooks]', or use "
-            "its methods without them"
+            "the explorer's sliders need ipywidgets; pip install ipywidgets, or use its methods without them"
         ) from None
     controls = {}
     for name, value in values.items():

@@ -89,7 +89,7 @@ def open_filesystem(url: str, name: str = "source") -> tuple[Any, str]:
         import fsspec
     except ImportError:
         raise InvalidInputError(
-            f"{name} {shown} needs fsspec; pip install 'vehicle-detection[batch]', or use a local path"
+            f"{name} {shown} needs fsspec; pip install fsspec, or use a local path"
         ) from None
     try:
         filesystem, path = fsspec.core.url_to_fs(url)
