@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import logging
 import os
 import signal
 import subprocess
@@ -34,6 +35,11 @@ def note_start(path):
         file.flush()
         time.sleep(0.3)
         file.write(f"{time.monotonic()}\n")
+
+
+def warn(*texts):
+    for text in texts:
+        logging.getLogger("vehicle_detection.video").warning("%s is damaged", text)
 
 
 def process_id(*_):
@@ -97,7 +103,7 @@ def test_a_call_right_after_an_answer_ends_with_the_parent_process():
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as worker:
         worker.stdin.write('{"call": "builtins:abs", "args": [-1]}\n')
         worker.stdin.flush()
-        assert worker.stdout.readline() == '{"result": 1}\n'
+        assert worker.stdout.readline() == '{"result": 1, "warnings": []}\n'
         worker.stdin.write('{"call": "time:sleep", "args": [600]}\n')
         worker.stdin.flush()
         time.sleep(1.0)  # until the call has begun
@@ -106,6 +112,17 @@ def test_a_call_right_after_an_answer_ends_with_the_parent_process():
             assert worker.wait(60) == 1
         finally:
             worker.kill()
+
+
+def test_warnings_of_a_worker_are_logged_by_its_parent(caplog, capfd):
+    with WorkerPool(1, (warn, ("first",))) as pool:
+        pool.submit(warn, "a", "b").result(300)
+        with pytest.raises(RuntimeError, match="no model"):
+            pool.submit(fail).result(300)
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{text} is damaged" for text in ("first", "a", "b")
+    ]
+    assert capfd.readouterr().err == ""
 
 
 def test_files_in_the_current_folder_are_no_modules_of_a_worker(monkeypatch, tmp_path):

@@ -95,8 +95,14 @@ def test_segments_with_different_sound_become_a_video_without(tmp_path, caplog):
     segments = [write_beep(tmp_path / f"{n}.mp4") for n in range(2)]
     other = tmp_path / "other.mp4"
     ffmpeg("-i", segments[0], "-c:v", "copy", "-ar", 22050, other)
-    with open_source([*segments, other]) as source:
+    mixed = [*segments, other]
+    with open_source(mixed) as source:
         assert not source.info.has_audio
+    process_video(mixed, None, StubDetector())
+    process_video(mixed, tmp_path / "silent.mp4", StubDetector(), audio=False)
+    assert caplog.text == ""  # nobody asked for the sound
+    process_video(mixed, tmp_path / "trip.mp4", StubDetector())
+    assert not probe_video(tmp_path / "trip.mp4").has_audio
     assert "have sound of another format, or none; the video has none" in caplog.text
     with open_source(segments) as source:
         assert source.info.has_audio

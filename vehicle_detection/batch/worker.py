@@ -7,6 +7,7 @@ import contextlib
 import gc
 import importlib
 import json
+import logging
 import os
 import queue
 import signal
@@ -22,7 +23,10 @@ _GRACE = 15.0
 
 
 def main() -> None:
-    """Answer each line ``{"call": "module:function", "args": [...]}`` with a line of JSON."""
+    """Answer each line ``{"call": "module:function", "args": [...]}`` with a line of JSON.
+
+    An answer holds ``"warnings"``, the texts that the call has logged, and ``"result"`` or ``"error"``.
+    """
     signal.signal(signal.SIGINT, _interrupt)
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # whatever a library prints must not be taken for an answer
@@ -65,10 +69,26 @@ def _receive(calls: queue.SimpleQueue[str | None], idle: threading.Event) -> Non
         timer.start()
 
 
+class _Collector(logging.Handler):
+    """Keeps the texts of warnings, which the parent process logs."""
+
+    def __init__(self, texts: list[str]) -> None:
+        super().__init__(logging.WARNING)
+        self._texts = texts
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._texts.append(record.getMessage())
+
+
 def _call(message: dict[str, Any]) -> dict[str, Any]:
     module, name = message["call"].split(":")
+    warnings: list[str] = []
+    logger, collector = logging.getLogger("vehicle_detection"), _Collector(warnings)
+    logger.addHandler(collector)
     try:
         function = getattr(importlib.import_module(module), name)
-        return {"result": function(*message["args"])}
+        return {"result": function(*message["args"]), "warnings": warnings}
     except Exception as error:
-        return {"error": f"{type(error).__name__}: {error}"}
+        return {"error": f"{type(error).__name__}: {error}", "warnings": warnings}
+    finally:
+        logger.removeHandler(collector)

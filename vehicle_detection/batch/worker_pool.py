@@ -189,7 +189,7 @@ def _message(function: Callable[..., Any], args: tuple[Any, ...]) -> str:
 
 
 def _ask(process: subprocess.Popen[str], message: str) -> dict[str, Any]:
-    """Send a call and wait for its answer."""
+    """Send a call and wait for its answer; log the warnings of the worker as those of this process."""
     assert process.stdin is not None
     assert process.stdout is not None
     line = ""
@@ -202,4 +202,6 @@ def _ask(process: subprocess.Popen[str], message: str) -> dict[str, Any]:
         reason = f"signal {-code}" if code < 0 else f"exit code {code}"
         raise WorkerLost(f"the worker process ended ({reason})")
     answer: dict[str, Any] = json.loads(line)
+    for text in answer["warnings"]:
+        _LOGGER.warning("%s", text)
     return answer

@@ -95,7 +95,8 @@ class _LogPrinter(logging.Handler):
         message, kind = record.getMessage(), "warning" if record.levelno >= logging.WARNING else "note"
         if message not in self._printed:
             self._printed.add(message)
-            print_error(f"{kind}: {message}")
+            with contextlib.suppress(OSError, ValueError):  # what cannot be printed does not end the work
+                print_error(f"{kind}: {message}")
 
 
 @contextlib.contextmanager

@@ -45,10 +45,7 @@ class VideoSegments(FrameSource):
             for info, length in zip(infos, lengths, strict=True)
         ]
         sound = all(info.has_audio and info.audio_format == first.audio_format for info in infos)
-        if first.has_audio and not sound:
-            _LOGGER.warning(
-                "the segments after %s have sound of another format, or none; the video has none", paths[0]
-            )
+        self._sound_differs = first.has_audio and not sound
         super().__init__(
             f"{paths[0]} to {paths[-1].name}",
             replace(
@@ -69,6 +66,11 @@ class VideoSegments(FrameSource):
 
     def audio(self, first: int = 0, length: float | None = None) -> AudioSource | None:
         """Join the sound of the segments; None if one of them has none."""
+        if self._sound_differs:
+            _LOGGER.warning(
+                "the segments after %s have sound of another format, or none; the video has none",
+                self.files[0],
+            )
         if not self.info.has_audio:
             return None
         parent = Path(tempfile.gettempdir())
