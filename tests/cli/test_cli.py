@@ -1323,7 +1323,7 @@ def test_train_frames(drawn_roads, small_training, tmp_path):
     words = ["train-frames", drawn_roads, "-o", model, "--curves", curves, "--seed", 5, "--no-drawn"]
     words += ["--patches", drawn_roads / "patches"]
     out = succeed(*words)
-    assert "town: evaluated a model trained without this source" in out
+    assert "step 2 of 3: train without town\nvehicles per template: " in out
     assert "on sources left out of training, IoU 0.5" in out
     assert out.endswith(f"wrote {model}, {curves}\n")
     trained = load_model(model)

@@ -37,7 +37,17 @@ def sources():
 
 @pytest.fixture(scope="module")
 def cross_validated(sources):
-    return cross_validate_mixture(sources, SMALL_MIXTURE, n_jobs=1)
+    lines = []
+    result = cross_validate_mixture(sources, SMALL_MIXTURE, n_jobs=1, on_step=lines.append)
+    assert [line for line in lines if line.startswith("step")] == [
+        "step 1 of 3: train without one",
+        "step 1 of 3: evaluate on one",
+        "step 2 of 3: train without two",
+        "step 2 of 3: evaluate on two",
+        "step 3 of 3: train on all sources",
+    ]
+    assert sum(line.startswith("round 1: ") for line in lines) == 3
+    return result
 
 
 def fold_of(scores, hits, *, frames=4, empty=0, source="road"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import logging
 import math
 import os
 from collections import Counter
@@ -33,6 +34,8 @@ from vehicle_detection.mixture import TemplateMixture
 from vehicle_detection.mixture_training.sources import FrameDataset, check_sources
 from vehicle_detection.mixture_training.train import train_mixture
 from vehicle_detection.params import MixtureParams
+
+log = logging.getLogger(__name__)
 
 _MIN_MARGIN = -2.0  # of an evaluated box
 _THRESHOLDS = np.arange(-2.0, 1.5, 0.02)  # to choose from
@@ -161,17 +164,19 @@ def cross_validate_mixture(
     check_integer(random_state, "random_state", low=0, high=2**32 - 1)
     options: dict[str, Any] = {"patches": patches, "random_state": random_state, "n_jobs": n_jobs}
     folds: list[FoldDetections] = []
-    for left_out in sources:
+    report, total = on_step or log.info, len(sources) + 1
+    for step, left_out in enumerate(sources, 1):
+        report(f"step {step} of {total}: train without {left_out.name}")
         rest = [source for source in sources if source is not left_out]
-        mixture = train_mixture([*rest, *extra], params, on_step=lambda line: None, **options)
+        mixture = train_mixture([*rest, *extra], params, on_step=report, **options)
+        report(f"step {step} of {total}: evaluate on {left_out.name}")
         folds += detect_in_source(mixture, left_out, n_jobs=n_jobs)
-        if on_step:
-            on_step(f"{left_out.name}: evaluated a model trained without this source")
     scores = []
     for fold in folds:
         others = [other for other in folds if other.source != fold.source]
         scores.append(score_fold(fold, best_threshold(others), fit_log_odds(others)))
-    mixture = train_mixture([*sources, *extra], params, on_step=on_step, **options)
+    report(f"step {total} of {total}: train on all sources")
+    mixture = train_mixture([*sources, *extra], params, on_step=report, **options)
     slope, offset = fit_log_odds(folds)
     threshold = slope * best_threshold(folds) + offset
     return replace(mixture, slope=slope, offset=offset, threshold=threshold), scores, folds

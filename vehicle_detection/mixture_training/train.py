@@ -77,7 +77,7 @@ def train_mixture(
     random_state, n_jobs
         Seed of the jitter and of the first negatives; threads, on which the model does not depend.
     on_step
-        Called with one line of text after each step.
+        Called with one line of text for each step. None: the lines are logged.
 
     Returns
     -------
@@ -136,6 +136,7 @@ class _Training:
             perspective_weight=params.perspective_weight,
         )
         if params.blend_weight:
+            self.report("templates trained; train the rescorer")
             with mixture.open_search(n_jobs=1) as search:
                 rescorer = train_rescorer(self.frames, search, params, self.rng, self.pool)
             mixture = replace(mixture, rescorer=rescorer)
