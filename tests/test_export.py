@@ -437,7 +437,7 @@ def test_bad_arguments(tmp_path, monkeypatch, items, options, message):
 
 def test_a_missing_pyarrow_is_reported_before_the_video(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(InvalidInputError, match="files need pyarrow; pip install pyarrow$"):
+    with pytest.raises(InvalidInputError, match=r"files need pyarrow; pip install pyarrow$"):
         TrackWriter(tmp_path / "t.parquet").__enter__()
     assert os.listdir(tmp_path) == []
 

@@ -40,13 +40,13 @@ def test_the_content_of_a_file_is_an_image(tmp_path, picture, monkeypatch):
     write_image(tmp_path / "a.png", picture)
     data = (tmp_path / "a.png").read_bytes()
     np.testing.assert_array_equal(read_image(data), picture)
-    with pytest.raises(InvalidInputError, match="^the bytes must be a complete image file"):
+    with pytest.raises(InvalidInputError, match=r"^the bytes must be a complete image file"):
         read_image(data[:100])
     for other in (io.BytesIO(data), bytearray(data)):
         with pytest.raises(InvalidInputError, match=r"path must be a file name or bytes, got .*; pass bytes"):
             read_image(other)
     monkeypatch.setenv("VEHICLE_DETECTION_MAX_PIXELS", "100")
-    with pytest.raises(InvalidInputError, match="^the bytes must have at most 100 pixels, got 60x40"):
+    with pytest.raises(InvalidInputError, match=r"^the bytes must have at most 100 pixels, got 60x40"):
         read_image(data)
 
 

@@ -52,7 +52,7 @@ def make_pictures(folder: Path, detector: VehicleDetector, scene: Mapping[str, A
     drive = render_drive(**scene)
     detector.reset(fps=drive.fps)
     images, results = [], []
-    with progress_bar(True, len(drive), unit="frame", desc="drawing", terminal_only=True) as bar:
+    with progress_bar(True, len(drive), unit="frame", desc="drawing", interactive_only=True) as bar:
         for index, rendered in enumerate(drive):
             images.append(rendered.image)
             results.append(detector.process(rendered.image, index / drive.fps))

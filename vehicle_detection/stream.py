@@ -124,7 +124,7 @@ def track(
         Show the annotated frames in a window, or in a notebook below the cell. Closing the window, or the key
         Escape, ends the results.
     progress
-        Show a progress bar if standard error is a terminal.
+        As in `process_video`.
     **options
         Further arguments of `VehicleDetector`, such as ``horizon``, ``camera`` and ``every``.
 

@@ -332,7 +332,7 @@ def _split_metadata(score: SplitScore) -> dict[str, Any]:
 def _timed_steps(show: bool, total: int, seconds: dict[str, float]) -> Iterator[Callable[..., Any]]:
     """Show a progress bar of fits; yield a context manager that times a step."""
     lock = threading.Lock()
-    with progress_bar(show, total, unit="fit", terminal_only=True) as bar:
+    with progress_bar(show, total, unit="fit", interactive_only=True) as bar:
 
         @contextmanager
         def step(name: str, fits: int = 1) -> Iterator[None]:

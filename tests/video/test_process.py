@@ -1,11 +1,13 @@
 """Annotated videos and their reports."""
 
+import contextlib
 import io
 import os
 import re
 import sys
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from moviepy import VideoFileClip
@@ -13,7 +15,7 @@ from moviepy import VideoFileClip
 from tests.helpers import StubDetector
 from tests.video.clips import NTSC, ffmpeg, ffmpeg_log, frame_numbers, sound_seconds
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.video import VideoReport, probe_video, process_video, read_frames
+from vehicle_detection.video import VideoReport, VideoRun, probe_video, process, process_video, read_frames
 
 
 def test_a_complete_video_keeps_frames_rate_and_sound(clip, tmp_path):
@@ -97,6 +99,34 @@ def test_progress_is_shown_on_a_terminal_only(clip, monkeypatch):
     process_video(clip, None, StubDetector())
     assert "20/20" in shown["terminal"]
     assert shown["off"] == file.getvalue() == ""
+
+
+def test_progress_is_shown_in_a_notebook(clip, monkeypatch, capsys):
+    shell = SimpleNamespace(kernel=object(), config={})
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+    process_video(clip, None, StubDetector())
+    assert "20/20" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("source", "progress", "expected"),
+    [
+        ("clip", True, r"0:00 of 0:00, \d+ frames/s"),
+        ("pipe", True, r"0:00, \d+ frames/s"),
+        ("clip", False, None),
+    ],
+)
+def test_progress_is_logged_in_intervals(clip, monkeypatch, caplog, source, progress, expected):
+    caplog.set_level("INFO", "vehicle_detection.video.process")
+    process_video(clip, None, StubDetector(), progress=progress)
+    assert caplog.messages == []
+    monkeypatch.setattr(process, "_LOG_INTERVAL", 0.0)
+    with contextlib.closing(VideoRun(clip, StubDetector())) as run:
+        if source == "pipe":
+            run._total = None
+        assert len(list(run.results(progress=progress))) == 20
+    assert len(caplog.messages) == (0 if expected is None else 20)
+    assert all(re.fullmatch(expected, message) for message in caplog.messages)
 
 
 def test_a_report_without_frames():

@@ -38,7 +38,7 @@ from vehicle_detection._common.image_size import image_size
 from vehicle_detection._common.limits import Limit, check_regular_file, read_regular_file
 from vehicle_detection._common.model_file import FORMAT_VERSION, ModelData, read_model, write_model
 from vehicle_detection._common.parquet import ParquetRows, import_pyarrow, write_parquet
-from vehicle_detection._common.progress import progress_bar
+from vehicle_detection._common.progress import in_notebook, progress_bar
 from vehicle_detection._common.text import encodable, natural_key, pluralize
 from vehicle_detection._common.threads import (
     CALLING_THREAD,
@@ -95,6 +95,7 @@ __all__ = [
     "hide_credentials",
     "image_size",
     "import_pyarrow",
+    "in_notebook",
     "is_hidden",
     "is_listing",
     "is_url",

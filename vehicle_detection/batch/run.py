@@ -179,7 +179,7 @@ def run_batch(
     dry_run
         Only find out what is to be done: nothing is processed, written or removed.
     progress
-        Show a progress bar if standard error is a terminal.
+        Show a progress bar in a terminal or a notebook.
     on_record
         Function that is called with the record of each trip when it is finished.
 
@@ -240,7 +240,7 @@ def run_batch(
         if executor is None and pending:
             warm = warm_up, (settings, fingerprint_of(settings))
             executor = stack.enter_context(WorkerPool(min(workers, len(pending)), warm))
-        bar = stack.enter_context(progress_bar(progress, len(pending), unit="trip", terminal_only=True))
+        bar = stack.enter_context(progress_bar(progress, len(pending), unit="trip", interactive_only=True))
         for made in stack.enter_context(contextlib.closing(_run(executor, pending, store))):
             bar.update()
             if not made["new"]:

@@ -82,7 +82,7 @@ def draw_clip(drive: Drive, clip: Path, labels: Path, *, progress: bool = False)
     try:
         with (
             FFMPEG_VideoWriter(str(clip), (width, height), drive.fps, preset="veryfast") as writer,
-            progress_bar(progress, len(drive), unit="frame", desc="drawing", terminal_only=True) as bar,
+            progress_bar(progress, len(drive), unit="frame", desc="drawing", interactive_only=True) as bar,
         ):
             for scene in drive:
                 truth.append(scored_truth(scene.truth))

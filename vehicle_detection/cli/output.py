@@ -103,18 +103,19 @@ class _LogPrinter(logging.Handler):
 def print_warnings() -> Iterator[None]:
     """Print the warnings that the library logs in the block, one line each.
 
-    A terminal also shows that kernels are compiled, because that takes long.
+    A terminal also shows that kernels are compiled, because that takes long; elsewhere, the progress of a
+    video is printed once a minute in place of a bar.
     """
-    logger, kernels = logging.getLogger("vehicle_detection"), logging.getLogger("vehicle_detection._kernels")
-    printer, level = _LogPrinter(), kernels.level
+    logger = logging.getLogger("vehicle_detection")
+    notes = logger.getChild("_kernels" if sys.stderr.isatty() else "video.process")
+    printer, level = _LogPrinter(), notes.level
     logger.addHandler(printer)
-    if sys.stderr.isatty():
-        kernels.setLevel(logging.INFO)
+    notes.setLevel(logging.INFO)
     try:
         yield
     finally:
         logger.removeHandler(printer)
-        kernels.setLevel(level)
+        notes.setLevel(level)
 
 
 def rename_argument(message: str, options: Mapping[str, str]) -> str:

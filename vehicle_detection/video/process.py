@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import logging
 import math
 import os
 import signal
@@ -54,6 +55,11 @@ PRESETS = (
     "ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow", "placebo",
 )  # fmt: skip
 """Presets of the H.264 encoder, from the fastest to the one with the smallest files."""
+
+_LOGGER = logging.getLogger(__name__)
+
+# Seconds between log lines on the progress.
+_LOG_INTERVAL = 60.0
 
 # Maximum size of the frames that are decoded ahead of the search, unless each worker has only one.
 _LOOKAHEAD_BYTES = 256 << 20
@@ -183,7 +189,7 @@ def process_video(
         Number of frames searched in parallel, at least 1; None: one per core, at most four. The result does
         not depend on it.
     progress
-        Show a progress bar if standard error is a terminal.
+        Show a progress bar in a terminal or a notebook, and log the progress once a minute (level INFO).
     strict
         Raise an error, and write nothing, if a file of the source is damaged: frames are missing, or ffmpeg
         reports decoding errors. Otherwise a warning is logged, and ``damage`` of the result says it. Streams
@@ -304,12 +310,12 @@ class VideoRun(Closing):
     def results(self, *, progress: bool = False) -> Generator[tuple[NDArray[np.uint8] | None, Any]]:
         """Yield each frame, None unless `frames` asks for it, and its result; closing it stops everything."""
         self._detector.reset(fps=float(self.info.fps))
-        started = time.perf_counter()
+        started = logged = time.perf_counter()
         try:
             # The pipeline's threads use all cores; more threads would only compete with them.
             with (
                 single_threaded_opencv(),
-                progress_bar(progress, self._total, unit="frame", terminal_only=True) as bar,
+                progress_bar(progress, self._total, unit="frame", interactive_only=True) as bar,
                 contextlib.closing(self._pipeline.run()) as results,
             ):
                 for frame, result in results:
@@ -318,8 +324,21 @@ class VideoRun(Closing):
                     yield frame, result
                     del frame, result
                     bar.update()
+                    if progress and (now := time.perf_counter()) - logged >= _LOG_INTERVAL:
+                        logged = now
+                        self._log_progress(now - started)
         finally:
             self._seconds = time.perf_counter() - started
+
+    def _log_progress(self, seconds: float) -> None:
+        length = f" of {self._position(self._total)}" if self._total else ""
+        rate = self._frames / seconds
+        _LOGGER.info("%s%s, %.0f frames/s", self._position(self._frames), length, rate)
+
+    def _position(self, frames: int) -> str:
+        """Return the length of a number of frames in minutes and seconds."""
+        minutes, seconds = divmod(int(frames / self.info.fps), 60)
+        return f"{minutes}:{seconds:02d}"
 
     def report(self) -> VideoReport:
         """Return counts and times of the finished pass."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import sys
 import time
 from typing import Any, Protocol
 
@@ -11,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vehicle_detection._common import in_notebook
 from vehicle_detection.errors import InvalidInputError
 
 # Seconds between pictures, and largest width in a notebook, which stores and sends each of them.
@@ -35,11 +35,7 @@ class Viewer(Protocol):
 
 def open_viewer(title: str) -> Viewer:
     """Open a window, or the output of the notebook's cell in which this is called."""
-    ipython = sys.modules.get("IPython")
-    shell = None if ipython is None else ipython.get_ipython()
-    if getattr(shell, "kernel", None) is not None:
-        return NotebookViewer()
-    return WindowViewer(title)
+    return NotebookViewer() if in_notebook() else WindowViewer(title)
 
 
 class WindowViewer:
