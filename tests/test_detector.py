@@ -10,6 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import vehicle_detection
+from tests.helpers import ROOT
 from tests.video.clips import write_clip
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.camera import Camera, write_camera
@@ -30,7 +32,7 @@ from vehicle_detection.params import (
     SearchParams,
     TrackParams,
 )
-from vehicle_detection.synthetic import SceneVehicle, render_scene
+from vehicle_detection.synthetic import SceneVehicle, render_drive, render_scene
 from vehicle_detection.tracking import FrameResult, Tracker
 from vehicle_detection.video import OwnSpeed, process_video
 
@@ -595,6 +597,28 @@ def test_frames_without_times_and_frame_rate_warn_once_of_their_speeds(method):
         follow(timed, [index / 10 for index in range(12)])
         unknown.reset()
         follow(unknown, [None] * 12)
+
+
+def test_the_documented_code_for_own_frames_and_images(capsys):
+    page = (ROOT / "docs" / "sources.md").read_text()
+    sections = dict(section.split("\n", 1) for section in page.split("\n## ")[1:])
+    blocks = {
+        title: text.partition("```python\n")[2].partition("\n```")[0] for title, text in sections.items()
+    }
+    drive = render_drive(frames=3, shape=(360, 640), scenario="overtaking")
+    names = {"vd": vehicle_detection, "frames": [scene.image for scene in drive]}
+    exec(blocks["Frames of your own"], names)
+    assert names["picture"].shape == (360, 640, 3)
+    assert len(capsys.readouterr().out.splitlines()) == 3
+    exec(blocks["Images in a web service"], names)
+    data = (ROOT / "test_images" / "road1.jpg").read_bytes()
+    with ThreadPoolExecutor(2) as executor:
+        first, second = executor.map(names["find_vehicles"], [data, data])
+    assert first == second
+    assert first
+    assert set(first[0]) == {"box", "confidence"}
+    with pytest.raises(InvalidInputError, match="the bytes must be a complete image"):
+        names["find_vehicles"](data[:50])
 
 
 def test_only_single_images_are_read_from_files():
