@@ -116,7 +116,7 @@ def cut_clips(
         raise InvalidInputError(f"folder {folder} does not exist; create it")
     with (
         open_source(video) as source,
-        progress_bar(progress, len(listed), unit="clip", terminal_only=True) as bar,
+        progress_bar(progress, len(listed), unit="clip", interactive_only=True) as bar,
     ):
         for event in listed:
             start = max(event.start_frame / rate - margin, event.time_s - _MAX_EXTENT, 0.0)
