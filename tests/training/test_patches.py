@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from vehicle_detection import training
 from vehicle_detection.classifier import (
     TrainingOptions,
     fit_features,
@@ -26,6 +25,7 @@ from vehicle_detection.features import extract_features
 from vehicle_detection.params import FeatureParams
 from vehicle_detection.synthetic import render_patches
 from vehicle_detection.training import SPLITS, model_card, train_and_evaluate
+from vehicle_detection.training.patches import _error_rates
 
 SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=6, pix_per_cell=16, hog_channel=0)
 SOURCES = {True: ("GTI_Far", "KITTI_extracted"), False: ("GTI", "Extras")}
@@ -99,7 +99,7 @@ def test_the_scores_equal_training_on_the_training_part_only(patch_set, mirror, 
 
 def test_error_rates():
     predicted, labels = np.array([1, 0, 0, 1, 0, 1]), np.array([1, 1, 1, 0, 0, 0])
-    assert training._error_rates(predicted, labels) == pytest.approx((1 / 3, 2 / 3, 2 / 3))
+    assert _error_rates(predicted, labels) == pytest.approx((1 / 3, 2 / 3, 2 / 3))
 
 
 def test_the_model_is_trained_on_all_patches(trained, patch_set):
