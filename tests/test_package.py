@@ -25,7 +25,7 @@ LAYERS = [
     "params camera synthetic export images boxes units _kernels",
     "datasets regions tracking heatmap features video",
     "evaluation drawing classifier sklearn_models",
-    "windows search mixture training function_model events",
+    "windows search mixture network training function_model events",
     "confidence course detector mixture_training report",
     "tuning explorer explanation stream batch",
     "plotting",

@@ -19,6 +19,9 @@ class Limit(Enum):
     MODEL_BYTES = "VEHICLE_DETECTION_MAX_MODEL_BYTES", 256_000_000, "bytes"
     """Size of a model file."""
 
+    NETWORK_BYTES = "VEHICLE_DETECTION_MAX_NETWORK_BYTES", 1_000_000_000, "bytes"
+    """Size of a network's file, which may be that of a large detector."""
+
     TEXT_BYTES = "VEHICLE_DETECTION_MAX_TEXT_BYTES", 1_000_000_000, "bytes"
     """Size of a file of labels or predictions."""
 

@@ -11,6 +11,7 @@ from vehicle_detection.params.features import (
     FeatureParams,
 )
 from vehicle_detection.params.mixture import MixtureParams, entries
+from vehicle_detection.params.network import NetworkParams
 from vehicle_detection.params.regions import HeatParams, HeatRange, RegionParams
 from vehicle_detection.params.search import (
     REFERENCE_WIDTH,
@@ -35,6 +36,7 @@ __all__ = [
     "HeatParams",
     "HeatRange",
     "MixtureParams",
+    "NetworkParams",
     "PixelBand",
     "PyramidParams",
     "RegionParams",

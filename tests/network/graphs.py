@@ -1,0 +1,71 @@
+"""Small ONNX graphs with the outputs of each kind of detector."""
+
+import json
+
+import numpy as np
+from onnx import TensorProto, helper, numpy_helper
+
+TYPES = {"uint8": TensorProto.UINT8, "float32": TensorProto.FLOAT, "float16": TensorProto.FLOAT16}
+PARAMS = {"slope": 0.5, "offset": -0.25, "threshold": -0.5, "input_size": 640, "nms_iou": 0.6}
+
+
+def serialize(nodes, inputs, outputs, initializers=(), metadata=None, opset=17):
+    """An ONNX file of these nodes; inputs and outputs are ``(name, dtype, shape)``."""
+    ports = [
+        [helper.make_tensor_value_info(name, TYPES.get(dtype, dtype), shape) for name, dtype, shape in each]
+        for each in (inputs, outputs)
+    ]
+    arrays = [numpy_helper.from_array(np.asarray(array), name) for name, array in initializers]
+    graph = helper.make_graph(list(nodes), "network", *ports, arrays)
+    domains = {node.domain for node in nodes if node.domain}
+    opsets = [helper.make_opsetid("", opset), *(helper.make_opsetid(each, 1) for each in domains)]
+    model = helper.make_model(graph, opset_imports=opsets, ir_version=8)
+    helper.set_model_props(model, metadata or {})
+    return model.SerializeToString()
+
+
+def own_network(seed=0, *, size=("height", "width"), weights=None, params=None, version=1):
+    """A network of the library's own kind with random weights, of stride 32."""
+    rng = np.random.default_rng(seed)
+    kernel = rng.normal(0, 0.02, (5, 3, 32, 32)).astype(np.float32)
+    kernel[:4] *= 1.5
+    kernel[4] *= 2
+    bias = np.array([0, 0, 4, 4, 0.3], np.float32)
+    nodes = [
+        helper.make_node("Cast", ["image"], ["float"], to=TensorProto.FLOAT),
+        helper.make_node("Sub", ["float", "gray"], ["centered"]),
+        helper.make_node("Mul", ["centered", "factor"], ["scaled"]),
+        helper.make_node("Transpose", ["scaled"], ["planes"], perm=[0, 3, 1, 2]),
+        helper.make_node("Conv", ["planes", "kernel", "bias"], ["maps"], strides=[32, 32]),
+        helper.make_node("Reshape", ["maps", "flat"], ["columns"]),
+        helper.make_node("Split", ["columns", "parts"], ["centers", "sides", "logits"], axis=1),
+        helper.make_node("Shape", ["centers"], ["shape"]),
+        # Centers: positions spread over the input by the number of the column.
+        helper.make_node("Mul", ["centers", "spread"], ["moved"]),
+        helper.make_node("Add", ["moved", "middle"], ["xy"]),
+        helper.make_node("Exp", ["sides"], ["wh"]),
+        helper.make_node("Sigmoid", ["logits"], ["p"]),
+        helper.make_node("Concat", ["xy", "wh", "p"], ["boxes"], axis=1),
+    ]
+    header = {
+        "format_version": version,
+        "params": PARAMS if params is None else params,
+        "metadata": {"frames": 12},
+    }
+    initializers = [
+        ("gray", np.float32(115)),
+        ("factor", np.float32(1 / 64)),
+        ("kernel", kernel if weights is None else np.full_like(kernel, weights)),
+        ("bias", bias),
+        ("flat", np.array([1, 5, -1])),
+        ("parts", np.array([2, 2, 1])),
+        ("spread", np.float32(60)),
+        ("middle", np.float32(160)),
+    ]
+    return serialize(
+        [node for node in nodes if node.op_type != "Shape"],
+        [("image", "uint8", [1, *size, 3])],
+        [("boxes", "float32", [1, 5, "n"])],
+        initializers,
+        {"vehicle_detection": json.dumps(header)},
+    )

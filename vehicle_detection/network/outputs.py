@@ -1,0 +1,244 @@
+"""From the outputs of a network to boxes: which kind they are, and how to decode it."""
+
+from __future__ import annotations
+
+import ast
+import functools
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection._common import Floats
+from vehicle_detection.errors import ModelFileError
+from vehicle_detection.network.inputs import Size
+from vehicle_detection.network.runtime import Array, GraphFacts
+
+Kind = Literal["columns", "rows", "yolov5", "yolox", "final", "detr", "lists"]
+"""Kinds of outputs; `ACCEPTED` describes them."""
+
+ACCEPTED = (
+    "(1, 4 + classes, N) or (1, N, 4 + classes) of YOLOv8, YOLO11 and RT-DETR; (1, N, 5 + classes) of YOLOv5 "
+    "and YOLOX; (1, N, 6) after suppression; boxes (1, N, 4) and logits (1, N, classes) of DETR; or labels, "
+    "boxes and scores"
+)
+"""Description of the accepted outputs, for messages."""
+
+MAX_CANDIDATES = 1000
+"""Maximum number of boxes before suppression."""
+
+# Boxes of a network that predicts sets, without suppression.
+_MAX_SET = 1000
+
+# Names of COCO's 80 classes, and the numbers that its own numbering, 1 to 90, leaves out.
+_COCO = (
+    "person,bicycle,car,motorcycle,airplane,bus,train,truck,boat,traffic light,fire hydrant,stop sign,"
+    "parking meter,bench,bird,cat,dog,horse,sheep,cow,elephant,bear,zebra,giraffe,backpack,umbrella,handbag,"
+    "tie,suitcase,frisbee,skis,snowboard,sports ball,kite,baseball bat,baseball glove,skateboard,surfboard,"
+    "tennis racket,bottle,wine glass,cup,fork,knife,spoon,bowl,banana,apple,sandwich,orange,broccoli,carrot,"
+    "hot dog,pizza,donut,cake,chair,couch,potted plant,bed,dining table,toilet,tv,laptop,mouse,remote,"
+    "keyboard,cell phone,microwave,oven,toaster,sink,refrigerator,book,clock,vase,scissors,teddy bear,"
+    "hair drier,toothbrush"
+)
+_COCO_GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
+
+
+class Candidates(NamedTuple):
+    """Boxes before suppression, best first, in pixels of the network's input."""
+
+    boxes: Floats  # (N, 4) [x1, y1, x2, y2]
+    scores: Floats  # (N,) probabilities
+    class_ids: NDArray[np.intp]  # (N,)
+
+
+@dataclass(frozen=True)
+class OutputFormat:
+    """How to decode the outputs of a network.
+
+    Attributes
+    ----------
+    kind
+        Kind of the outputs.
+    n_classes
+        Number of classes, if known.
+    normalized
+        Whether boxes are fractions of the input's width and height.
+    order
+        Positions of the boxes, the scores or logits and, if there are three outputs, the labels.
+    """
+
+    kind: Kind
+    n_classes: int | None = None
+    normalized: bool = False
+    order: tuple[int, ...] = (0,)
+
+    def decode(
+        self, outputs: list[Array], size: Size, classes: NDArray[np.intp] | None, min_score: float
+    ) -> Candidates:
+        """Decode the outputs of one frame.
+
+        Parameters
+        ----------
+        outputs, size
+            What the network has computed from an input of this height and width.
+        classes
+            Numbers of the classes to keep; None: all. The class of a box is its most probable one.
+        min_score
+            Minimum probability.
+
+        Raises
+        ------
+        ModelFileError
+            If a score or the box of a candidate is not finite; the message has no name.
+        """
+        boxes, scores, objectness, labels = self._split(outputs)
+        kept = scores if classes is None or labels is not None else scores[classes[classes < len(scores)]]
+        best = kept[0] if len(kept) == 1 else kept.max(axis=0, initial=0)
+        if objectness is not None:
+            best = best * objectness
+        if not np.isfinite(best.sum(dtype=np.float64)):
+            raise ModelFileError("scores are not finite")
+        rows = np.flatnonzero(best >= min_score)
+        if labels is None:
+            class_ids = scores[:, rows].argmax(axis=0) if len(scores) > 1 else np.zeros(len(rows), np.intp)
+        else:
+            class_ids = labels[rows].astype(np.intp)
+        if classes is not None:
+            own = np.isin(class_ids, classes)
+            rows, class_ids = rows[own], class_ids[own]
+        order = np.argsort(-best[rows], kind="stable")[:MAX_CANDIDATES]
+        rows = rows[order]
+        chosen = self._corners(boxes, rows, size)
+        if not np.isfinite(chosen).all():
+            raise ModelFileError("boxes are not finite")
+        return Candidates(chosen, best[rows].astype(np.float64), class_ids[order])
+
+    def _split(self, outputs: list[Array]) -> tuple[Array, Array, Array | None, Array | None]:
+        """``(4, N)`` boxes, ``(classes, N)`` scores, and ``(N,)`` objectness and labels where they exist."""
+        if self.kind in ("detr", "lists"):
+            boxes, scores, *labels = (outputs[index] for index in self.order)
+            boxes = boxes.reshape(-1, 4).T
+            if self.kind == "lists":
+                return boxes, scores.reshape(1, -1), None, labels[0].reshape(-1)
+            with np.errstate(over="ignore"):
+                return boxes, 1 / (1 + np.exp(-scores[0].T.astype(np.float32))), None, None
+        values = outputs[0][0] if self.kind == "columns" else outputs[0][0].T
+        if self.kind in ("yolov5", "yolox"):
+            return values[:4], values[5:], values[4], None
+        if self.kind == "final":
+            return values[:4], values[4:5], None, values[5]
+        return values[:4], values[4:], None, None
+
+    def _corners(self, boxes: Array, rows: NDArray[np.intp], size: Size) -> Floats:
+        """``(N, 4)`` corners in pixels of the input, of these columns of the boxes."""
+        chosen = boxes[:, rows].T.astype(np.float64)
+        # Files with decoded boxes have centers up to the right border, others offsets of a few cells.
+        if self.kind == "yolox" and boxes[0].max(initial=0) < size[1] / 2:
+            corners, strides = _grid(size)
+            chosen[:, :2] = (chosen[:, :2] + corners[rows]) * strides[rows, None]
+            chosen[:, 2:] = np.exp(chosen[:, 2:].clip(max=20)) * strides[rows, None]
+        if self.normalized:
+            chosen *= [size[1], size[0], size[1], size[0]]
+        if self.kind not in ("final", "lists"):
+            half = chosen[:, 2:] / 2
+            chosen = np.hstack([chosen[:, :2] - half, chosen[:, :2] + half])
+        return chosen
+
+
+@functools.lru_cache(maxsize=8)
+def _grid(size: Size) -> tuple[Floats, Floats]:
+    """Corners ``(N, 2)`` in cells, and strides ``(N,)``, of all cells of an input."""
+    corners, strides = [], []
+    for stride in (8, 16, 32):
+        y, x = np.mgrid[: size[0] // stride, : size[1] // stride]
+        corners.append(np.stack([x, y], axis=-1).reshape(-1, 2))
+        strides.append(np.full(x.size, float(stride)))
+    return np.concatenate(corners).astype(np.float64), np.concatenate(strides)
+
+
+def count_cells(size: Size) -> int:
+    """Return the number of cells of strides 8, 16 and 32 in an input of this height and width."""
+    return sum((size[0] // stride) * (size[1] // stride) for stride in (8, 16, 32))
+
+
+def recognize(
+    facts: GraphFacts, shapes: list[tuple[int, ...]], size: Size, names: int | None
+) -> OutputFormat:
+    """Recognize the kind of a network's outputs.
+
+    Parameters
+    ----------
+    facts
+        Names of the outputs, and the name for messages.
+    shapes
+        Shapes of the outputs for an input of this `size`.
+    size
+        Height and width of that input.
+    names
+        Number of the class names in the file's metadata, if any.
+
+    Raises
+    ------
+    ModelFileError
+        If the outputs are of no kind in `ACCEPTED`.
+    """
+    found = None
+    if len(shapes) == 1 and len(shapes[0]) == 3 and shapes[0][0] == 1:
+        found = _recognize_one(shapes[0][1], shapes[0][2], count_cells(size), names)
+    elif len(shapes) == 2 and all(len(shape) == 3 for shape in shapes):
+        # The boxes of a network with 4 classes have the name.
+        boxes = [i for i, shape in enumerate(shapes) if shape[2] == 4]
+        named = [i for i in boxes if "box" in facts.outputs[i].name or "det" in facts.outputs[i].name]
+        index = (named or boxes or [-1])[0]
+        if index >= 0 and shapes[0][:2] == shapes[1][:2] and shapes[0][0] == 1:
+            found = OutputFormat("detr", shapes[1 - index][2], True, (index, 1 - index))
+    elif len(shapes) == 3:
+        places = {port.name.lower(): i for i, port in enumerate(facts.outputs)}
+        order = tuple(places.get(name, -1) for name in ("boxes", "scores", "labels"))
+        if min(order) >= 0 and shapes[order[0]][-1] == 4:
+            found = OutputFormat("lists", names, False, order)
+    if found is None:
+        listed = ", ".join(f"{port.name} {shape}" for port, shape in zip(facts.outputs, shapes))
+        raise ModelFileError(
+            f"{facts.name} has outputs that are not known: {listed}; accepted are {ACCEPTED}; export a "
+            "detection network, or use detector_from"
+        )
+    return found
+
+
+def _recognize_one(first: int, second: int, cells: int, names: int | None) -> OutputFormat | None:
+    """Recognize one output of shape ``(1, first, second)``."""
+    # Three anchors in each cell: YOLOv5; one: YOLOv8 and YOLOX. The names decide where they are known.
+    counts = (cells, 3 * cells)
+    by_columns = first < second if (first in counts) == (second in counts) else second in counts
+    if by_columns:
+        return OutputFormat("columns", first - 4) if first > 4 else None
+    if second == 6 and first not in counts:
+        return OutputFormat("final", names)
+    if second < 5:
+        return None
+    if names is not None and second == 4 + names:
+        return OutputFormat("rows", names, first not in counts)
+    if second > 5 and (first in counts or first > _MAX_SET):
+        return OutputFormat("yolox" if first == cells and names is None else "yolov5", second - 5)
+    return OutputFormat("rows", second - 4, True) if first <= _MAX_SET else None
+
+
+def class_names(facts: GraphFacts) -> dict[int, str] | None:
+    """Class names in the metadata of Ultralytics, the text of a dictionary or list; None without names."""
+    try:
+        names: Any = ast.literal_eval(facts.metadata.get("names", ""))
+        pairs = names.items() if isinstance(names, dict) else enumerate(names)
+        return {int(number): str(name) for number, name in pairs}
+    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+        return None
+
+
+def usual_names(n_classes: int | None) -> dict[int, str] | None:
+    """Names of COCO for 80 classes, and for 91 in its own numbering; None for other numbers."""
+    if n_classes == 80:
+        return dict(enumerate(_COCO.split(",")))
+    if n_classes == 91:
+        return dict(zip((number for number in range(1, 91) if number not in _COCO_GAPS), _COCO.split(",")))
+    return None
