@@ -10,14 +10,15 @@ from pathlib import Path
 from tools.recall_tables import VISIBILITY, WIDTHS, recall_tables
 from vehicle_detection._common import write_text
 from vehicle_detection.mixture import TemplateMixture
-from vehicle_detection.mixture_training import (
+from vehicle_detection.training import (
     FOLD_COLUMNS,
     FoldDetections,
     FoldScore,
     FrameDataset,
     format_fold,
+    markdown_table,
+    markdown_text,
 )
-from vehicle_detection.training import markdown_table, markdown_text
 
 _COMMAND = "python -m tools.train_default DATA -o {name}.safetensors --card {name}.md --seed {seed}"
 _METHOD = (
@@ -25,7 +26,9 @@ _METHOD = (
     "parameters, at an IoU of 0.5. F1, precision and recall are those at the threshold that is best for the "
     "other sources, where a false box counts 1.4 times as much as a missed vehicle; best F1 is that of the "
     "best threshold; AP is the average precision; false positives are "
-    'counted per frame, and per frame without any label. "Region F1" and "region AP" do not score a box of '
+    "counted per frame, per frame without any label, and per frame without a scored vehicle; recall is also "
+    "that of vehicles that others partly occlude, that the edge of the frame cuts, and under 32 px wide. "
+    '"Region F1" and "region AP" do not score a box of '
     "which at least half lies in an ignored box: where labels put one ignored box around a group of "
     "vehicles, the other columns count each vehicle detected there as false. The threshold and the "
     "calibration are chosen with such regions, and AP at an IoU of 0.7 is measured with them. ECE is the "

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection.boxes import box_areas, intersection_matrix
 from vehicle_detection.evaluation import FrameBoxes, match_detections
-from vehicle_detection.mixture_training import FoldDetections, FoldScore
-from vehicle_detection.mixture_training.cross_validation import fit_log_odds
+from vehicle_detection.training import FoldDetections, FoldScore, fit_log_odds
 
 WIDTHS = (0.0, 32.0, 48.0, 80.0, 160.0, np.inf)
 """Limits of the widths of labelled boxes, in pixels."""
@@ -51,8 +50,8 @@ def calibration_rows(folds: Sequence[FoldDetections]) -> list[tuple[int, float, 
     stated, right = [np.empty(0)], [np.empty(0, np.bool_)]
     for fold in folds:
         slope, offset = fit_log_odds([other for other in folds if other.source != fold.source])
-        margins, hits = fold.hits
-        stated.append(1 / (1 + np.exp(-(slope * margins + offset).clip(-500, 500))))
+        logits, hits = fold.hits
+        stated.append(1 / (1 + np.exp(-(slope * logits + offset).clip(-500, 500))))
         right.append(hits)
     values, hits = np.concatenate(stated), np.concatenate(right)
     rows = []

@@ -1338,7 +1338,7 @@ def test_train_frames(drawn_roads, small_training, tmp_path):
     assert [template.box_cells for template in trained.templates] == [(6, 5)]
     assert trained.metadata["training"] == {"random_state": 5}
     assert trained.metadata["data"] == {"coast": 4, "town": 6, "patches": 2}
-    assert curves.read_text().startswith("frames,margin,precision,recall\ncoast,")
+    assert curves.read_text().startswith("frames,logit,precision,recall\ncoast,")
     assert re.search(r"town\W+\d\.\d{3}", succeed("info", model))
     first = model.read_bytes()
     succeed(*words)

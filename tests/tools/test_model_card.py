@@ -6,7 +6,7 @@ import pytest
 from tests.helpers import drawn
 from tools.model_card import write_card
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.mixture_training import FoldScore, FrameDataset
+from vehicle_detection.training import FoldScore, FrameDataset
 
 SOURCES = [FrameDataset("one", (drawn(range(7), "first"),))]
 SCORE = FoldScore(
@@ -20,12 +20,19 @@ SCORE = FoldScore(
     mean_iou=0.82,
     false_per_frame=0.7143,
     false_per_empty_frame=math.nan,
+    false_per_vehicle_free_frame=0.25,
     threshold=-0.36,
     average_precision=0.9231,
     best_f1=0.96,
     region_f1=0.81,
     region_average_precision=0.93,
     strict_average_precision=0.61,
+    recall_occluded=0.5,
+    recall_truncated=0.75,
+    recall_narrow=math.nan,
+    occluded=2,
+    truncated=4,
+    narrow=0,
     calibration_error=0.05,
 )
 
@@ -38,8 +45,8 @@ def test_the_card_lists_the_measurements(small_mixture, tmp_path):
     assert "Templates, in cells of the vehicle's box: 6x5\n" in card
     assert f"{small_mixture.rescorer.n_weights:,} weights" in card
     row = (
-        "| first | 7 | 13 | 0.800 | 0.960 | 0.923 | 0.706 | 0.923 | 0.820 | 0.71 | - | 0.810 | 0.930 | "
-        "0.610 | 0.050 |"
+        "| first | 7 | 13 | 0.800 | 0.960 | 0.923 | 0.706 | 0.923 | 0.820 | 0.71 | - | 0.25 | 0.810 | "
+        "0.930 | 0.610 | 0.500 | 0.750 | - | 0.050 |"
     )
     assert row in card
     assert "- one: 7 frames, " in card

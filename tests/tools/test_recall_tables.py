@@ -10,8 +10,7 @@ from tools.recall_tables import (
     recall_tables,
 )
 from vehicle_detection import FrameBoxes, LabelledFrames
-from vehicle_detection.mixture_training import FoldDetections
-from vehicle_detection.mixture_training.cross_validation import score_fold
+from vehicle_detection.training import FoldDetections, score_fold
 
 IMAGE = np.zeros((200, 400, 3), np.uint8)
 # A near vehicle, one behind it, a small one, one that the frame cuts, and an ignored box.

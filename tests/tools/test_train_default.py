@@ -9,7 +9,7 @@ from vehicle_detection.errors import DatasetError
 from vehicle_detection.images import write_image
 from vehicle_detection.mixture import load_model
 from vehicle_detection.mixture_training import drawn_source
-from vehicle_detection.mixture_training.cross_validation import detect_in_source, score_fold
+from vehicle_detection.training import detect_in_source, score_fold
 
 
 @pytest.fixture
@@ -88,7 +88,7 @@ def test_the_command_writes_model_card_curves_and_pictures(
     assert (len(used["patches"]), used["random_state"]) == (2, 5)
     assert "--seed 5" in card.read_text()
     assert "- 2 vehicles on the course's patches" in card.read_text()
-    assert curves.read_text().startswith("frames,margin,precision,recall\ncamvid,")
+    assert curves.read_text().startswith("frames,logit,precision,recall\ncamvid,")
     names = {path.name for path in pictures.iterdir()}
     assert {"curves.png", "india-missed.png", "test_video-false.png"} <= names
     assert len(names) == 15

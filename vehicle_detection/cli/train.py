@@ -28,7 +28,10 @@ if TYPE_CHECKING:
     from vehicle_detection.training import TrainingReport
 
 # Columns of the model card that a terminal has no room for.
-_HIDDEN_FOLD_COLUMNS = "best_f1", "strict_average_precision", "calibration_error"
+_HIDDEN_FOLD_COLUMNS = (
+    "best_f1", "false_per_vehicle_free_frame", "strict_average_precision", "recall_occluded",
+    "recall_truncated", "recall_narrow", "calibration_error",
+)  # fmt: skip
 
 
 @option_names(random_state="--seed", patches_or_labels=PATCHES, patch_set=PATCHES)

@@ -1,17 +1,17 @@
 """Training and cross-validation of the mixture of templates."""
 
-from vehicle_detection.mixture_training.cross_validation import (
+from vehicle_detection.mixture_training.cross_validation import cross_validate_mixture, training_metadata
+from vehicle_detection.mixture_training.drawn_frames import drawn_source
+from vehicle_detection.mixture_training.sources import FrameDataset, find_sources
+from vehicle_detection.mixture_training.train import train_mixture
+from vehicle_detection.training import (
     FOLD_COLUMNS,
     FoldDetections,
     FoldScore,
-    cross_validate_mixture,
+    check_sources,
     format_fold,
-    training_metadata,
     write_curves,
 )
-from vehicle_detection.mixture_training.drawn_frames import drawn_source
-from vehicle_detection.mixture_training.sources import FrameDataset, check_sources, find_sources
-from vehicle_detection.mixture_training.train import train_mixture
 
 __all__ = [
     "FOLD_COLUMNS",

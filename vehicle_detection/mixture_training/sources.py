@@ -1,32 +1,23 @@
-"""Labelled frames to train on: data sets, the folder they are read from, and loaded frames."""
+"""Labelled frames to train the mixture on, without noise and haze."""
 
 from __future__ import annotations
 
-import glob
-import logging
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_type, describe, pluralize, store_number
-from vehicle_detection.datasets import load_frames
-from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.evaluation import FrameBoxes, FrameKey, LabelledFrames, read_labels
-from vehicle_detection.params import entries
-from vehicle_detection.video import is_video_file, probe_video, read_frames
-
-_LABEL_SUFFIXES = (".csv", ".json", ".jsonl", ".parquet")
-
-log = logging.getLogger(__name__)
+from vehicle_detection._common import store_number
+from vehicle_detection.training import FrameDataset as LabelledDataset
+from vehicle_detection.training import find_sources as find_datasets
+from vehicle_detection.training import load_training_frames as load_frames
 
 
 @dataclass(frozen=True, eq=False)
-class FrameDataset:
-    """Labelled frames of one camera or country.
+class FrameDataset(LabelledDataset):
+    """Labelled frames of one camera or country, for `train_mixture`.
 
     Attributes
     ----------
@@ -42,50 +33,18 @@ class FrameDataset:
 
     Examples
     --------
-    >>> from vehicle_detection.evaluation import FrameBoxes
+    >>> from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
     >>> labels = FrameBoxes([0], None, [[9, 9, 60, 50]])
     >>> road = LabelledFrames("road", [np.zeros((90, 120, 3), np.uint8)], labels)
     >>> FrameDataset("camera", [road], min_labelled_width=40).sets
     (LabelledFrames('road', 1 frame, 1 box),)
     """
 
-    name: str
-    sets: tuple[LabelledFrames, ...]
     min_labelled_width: float = 0.0
 
     def __post_init__(self) -> None:
-        name: object = self.name
-        if not isinstance(name, str) or not name:
-            raise InvalidInputError(f"name must be a non-empty string, got {describe(name)}")
-        sets = entries(self.sets, "sets")
-        for part in sets:
-            check_type(part, "sets", LabelledFrames, "pass the frames with their labels as LabelledFrames")
+        super().__post_init__()
         store_number(self, "min_labelled_width", low=0)
-        object.__setattr__(self, "sets", sets)
-
-
-def check_sources(sources: object, *, min_count: int = 1) -> tuple[FrameDataset, ...]:
-    """Return at least `min_count` data sets with different names."""
-    if not isinstance(sources, (tuple, list)):
-        raise InvalidInputError(f"sources must be a list of FrameDataset, got {describe(sources)}")
-    for source in sources:
-        check_type(source, "sources", FrameDataset, "wrap the frames of each camera or country in one")
-    names = [source.name for source in sources]
-    if len(names) < min_count:
-        raise InvalidInputError(
-            f"sources must hold at least {pluralize(min_count, 'data set')}, got {len(names)}; "
-            + (
-                "one at a time is left out for the evaluation: split the frames, such as a set for each drive"
-                if min_count > 1
-                else "add labelled frames"
-            )
-        )
-    twice = {name for name in names if names.count(name) > 1}
-    if twice:
-        raise InvalidInputError(
-            f"sources must have different names, got {min(twice)!r} twice; merge them into one"
-        )
-    return tuple(sources)
 
 
 def find_sources(
@@ -94,84 +53,13 @@ def find_sources(
     min_labelled_widths: Mapping[str, float] | None = None,
     clip_rate: float = 3.0,
 ) -> list[FrameDataset]:
-    """Read a folder of labelled frames, as one data set for each file ``labels/NAME.csv``.
+    """Read a folder as `vehicle_detection.training.find_sources` does.
 
-    The labels may also be .json (a COCO data set), .jsonl or .parquet.
-    Its frames are in ``frames/NAME/``, ``NAME/`` or a video ``videos/NAME.mp4`` (or another suffix), of which
-    `clip_rate` frames per second are taken. If the labels name most frames of a video, the others show no
-    vehicle; if they name fewer, only these are taken.
     `min_labelled_widths` gives the ``min_labelled_width`` of data sets by name, else 0.
     """
-    root = Path(folder)
-    if not root.is_dir():
-        raise DatasetError(f"folder {root} does not exist; pass the folder of the labelled frames")
-    files = sorted(path for path in root.glob("labels/*") if path.suffix.lower() in _LABEL_SUFFIXES)
-    if not files:
-        raise DatasetError(
-            f"folder {root} has no labels/NAME.csv (or {', '.join(_LABEL_SUFFIXES[1:])}); pass the folder of "
-            "the labelled frames; convert other labels with write_labels(read_labels(...), "
-            "'labels/NAME.csv')"
-        )
-    by_name: dict[str, Path] = {}
-    for file in files:
-        other = by_name.setdefault(file.stem, file)
-        if other != file:
-            raise DatasetError(f"{other} and {file} label the same frames; leave one in the folder")
     widths = min_labelled_widths or {}
-    sources = []
-    for file in files:
-        try:
-            frames = _read_frames(root, file, clip_rate)
-        except InvalidInputError as error:
-            raise InvalidInputError(f"{file}: {error}") from error
-        sources.append(FrameDataset(file.stem, (frames,), widths.get(file.stem, 0.0)))
-    return sources
-
-
-def _read_frames(root: Path, file: Path, clip_rate: float) -> LabelledFrames:
-    """Frames of one file of labels, from a folder of images or a video."""
-    name, labels = file.stem, read_labels(file)
-    folders = root / "frames" / name, root / name
-    for folder in folders:
-        if folder.is_dir():
-            found = LabelledFrames(name, load_frames(folder), labels)
-            named = found.labels.frame_keys  # those of the labels, by the names of the images
-            absent = sorted(set(named) - set(found.keys), key=str)
-            if absent:
-                log.warning(
-                    "%s: %d of %d labelled frames have no image in %s, such as %r; they are left out",
-                    *(file, len(absent), len(named), folder, absent[0]),
-                )
-            return found
-    videos = [path for path in (root / "videos").glob(f"{glob.escape(name)}.*") if is_video_file(path)]
-    if videos:
-        return _frames_of_video(min(videos), labels, clip_rate)
-    video = root / "videos" / f"{name}.mp4"
-    raise DatasetError(f"{file} has no frames: add {folders[0]}, {folders[1]} or {video}")
-
-
-def _frames_of_video(video: Path, labels: FrameBoxes, clip_rate: float) -> LabelledFrames:
-    """Take some frames per second of a video: all of them if most are labelled, or else labelled ones.
-
-    Where most frames are labelled, the others show no vehicle.
-    """
-    info = probe_video(video)
-    every = max(1, round(float(info.fps) / clip_rate))
-    numbers = [key for key in labels.frame_keys if isinstance(key, int)]
-    if not numbers or len(numbers) > 0.5 * info.frames:
-        return LabelledFrames.from_video(video, labels, every=every)
-    chosen = numbers[:1]
-    for number in numbers:
-        if number >= chosen[-1] + every:
-            chosen.append(number)
-    wanted = set(chosen)
-    with read_frames(video) as reader:
-        frames: dict[FrameKey, NDArray[np.uint8]] = {
-            index: frame for index, _, frame in reader if index in wanted
-        }
-    if not frames:
-        raise InvalidInputError(f"labels name no frame of {video}, but {numbers[0]}; count frames from 0")
-    return LabelledFrames(video.stem, frames, labels)
+    found = find_datasets(folder, clip_rate=clip_rate)
+    return [FrameDataset(each.name, each.sets, widths.get(each.name, 0.0)) for each in found]
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,29 +72,13 @@ class TrainingFrame:
     min_labelled_width: float  # width in pixels from which on every vehicle is labelled
 
 
-def _check_inside(boxes: NDArray[np.float64], shape: tuple[int, ...], where: str) -> None:
-    """Raise unless every box shows a part of the image."""
-    height, width = shape[:2]
-    outside = (boxes[:, :2] >= (width, height)).any(axis=1) | (boxes[:, 2:] <= 0).any(axis=1)
-    if outside.any():
-        box = boxes[int(np.argmax(outside))].tolist()
-        raise InvalidInputError(
-            f"{where}: the box {box} lies outside the {width}x{height} image; check that the labels were "
-            "drawn at this resolution"
-        )
-
-
-def load_training_frames(sources: Sequence[FrameDataset]) -> list[TrainingFrame]:
+def load_training_frames(sources: Sequence[LabelledDataset]) -> list[TrainingFrame]:
     """Load all frames of some data sets into memory."""
     # Imported here, because mypy takes the name for a module if it is the only one imported at the top.
     from vehicle_detection.mixture import prepare
 
-    loaded = []
-    for source in sources:
-        for part in source.sets:
-            for key, image in part:
-                labels = part.labels.frame(key)
-                boxes, ignored = labels.boxes[~labels.ignore], labels.boxes[labels.ignore]
-                _check_inside(boxes, image.shape, f"{part.name}, frame {key!r}")
-                loaded.append(TrainingFrame(prepare(image), boxes, ignored, source.min_labelled_width))
-    return loaded
+    widths = {each.name: getattr(each, "min_labelled_width", 0.0) for each in sources}
+    return [
+        TrainingFrame(prepare(each.image), each.boxes, each.ignored, widths[each.source])
+        for each in load_frames(sources)
+    ]

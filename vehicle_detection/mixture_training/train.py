@@ -36,12 +36,11 @@ from vehicle_detection.mixture_training.positives import (
 )
 from vehicle_detection.mixture_training.rescoring import train_rescorer
 from vehicle_detection.mixture_training.sources import (
-    FrameDataset,
     TrainingFrame,
-    check_sources,
     load_training_frames,
 )
 from vehicle_detection.params import MixtureParams
+from vehicle_detection.training import FrameDataset, check_sources
 
 Image = NDArray[np.uint8]
 Rows = NDArray[np.float32]
@@ -90,7 +89,7 @@ def train_mixture(
         If there is no source, no labelled vehicle that is wide enough, a box lies outside its image, or a
         patch is not an image.
     """
-    sources = check_sources(sources)
+    check_sources(sources)
     params = params if params is not None else MixtureParams()
     check_type(params, "params", MixtureParams, "omit it for the defaults")
     check_integer(random_state, "random_state", low=0, high=2**32 - 1)

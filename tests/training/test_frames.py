@@ -7,11 +7,15 @@ import pytest
 from tests.helpers import drawn, write_frame_set
 from tests.video.clips import gray_frames, write_clip
 from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.evaluation import read_labels, write_labels
+from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, read_labels, write_labels
 from vehicle_detection.images import write_image
-from vehicle_detection.mixture_training import find_sources
-from vehicle_detection.mixture_training.sources import load_training_frames
 from vehicle_detection.synthetic import render_drive
+from vehicle_detection.training import (
+    FrameDataset,
+    check_sources,
+    find_sources,
+    load_training_frames,
+)
 
 
 @pytest.mark.parametrize(
@@ -22,22 +26,33 @@ from vehicle_detection.synthetic import render_drive
         ({"sets": ()}, "sets must be a tuple of at least one entry"),
         ({"sets": None}, "sets must be a tuple of at least one entry; got None"),
         ({"sets": ("road",)}, "sets must be a LabelledFrames, got 'road'"),
-        ({"min_labelled_width": -1}, "min_labelled_width must be a number, at least 0"),
     ],
 )
-def test_invalid_frame_datasets(drawn_source, changes, message):
+def test_invalid_frame_datasets(changes, message):
     with pytest.raises(InvalidInputError, match=message):
-        dataclasses.replace(drawn_source, **changes)
+        dataclasses.replace(FrameDataset("road", (drawn([0]),)), **changes)
+
+
+def test_sources_differ_in_name_and_are_enough():
+    one, two = (FrameDataset(name, (drawn([0]),)) for name in ("one", "two"))
+    assert check_sources([one]) == (one,)
+    assert check_sources([one, two], min_count=2) == (one, two)
+    assert check_sources([], min_count=0) == ()
+    with pytest.raises(InvalidInputError, match="sources must hold at least 1 data set, got 0; add labelled"):
+        check_sources([])
+    with pytest.raises(InvalidInputError, match="sources must have different names, got 'one' twice"):
+        check_sources([one, one])
+    with pytest.raises(InvalidInputError, match="sources must be a list of FrameDataset"):
+        check_sources(one)
 
 
 def test_find_sources(tmp_path):
     write_frame_set(tmp_path, "town", drawn(range(3)))
     write_frame_set(tmp_path, "coast", drawn(range(2)))
     write_frame_set(tmp_path, "stills", drawn(range(4)), place=".")
-    found = find_sources(tmp_path, min_labelled_widths={"coast": 60.0, "unknown": 30.0})
+    found = find_sources(tmp_path)
     assert [source.name for source in found] == ["coast", "stills", "town"]
     assert [[len(part) for part in source.sets] for source in found] == [[2], [4], [3]]
-    assert [source.min_labelled_width for source in found] == [60.0, 0.0, 0.0]
     assert len(found[2].sets[0].labels) == len(drawn(range(3)).labels)
 
 
@@ -109,6 +124,33 @@ def test_a_source_without_vehicles(tmp_path):
     write_source(tmp_path, "empty", 3, [])
     (source,) = find_sources(tmp_path)
     assert [len(frame.boxes) for frame in load_training_frames([source])] == [0, 0, 0]
+
+
+def frames_of(height, width):
+    """A source of one frame with a vehicle and an ignored box."""
+    image = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+    labels = FrameBoxes([0, 0], None, [[10, 20, 60, 50], [0, 0, width, 10]], ignore=[False, True])
+    return FrameDataset("road", (LabelledFrames("road", [image], labels),)), image
+
+
+def test_small_frames_are_loaded_as_they_are():
+    source, image = frames_of(90, 160)
+    for limit in (None, 160, 500):
+        (frame,) = load_training_frames([source], max_side=limit)
+        np.testing.assert_array_equal(frame.image, image)
+        assert (frame.boxes.tolist(), frame.ignored.tolist()) == ([[10, 20, 60, 50]], [[0, 0, 160, 10]])
+        assert frame.source == "road"
+
+
+@pytest.mark.parametrize(("height", "width"), [(90, 160), (160, 90)])
+def test_the_longer_side_of_frames_is_limited(height, width):
+    source, image = frames_of(height, width)
+    (frame,) = load_training_frames([source], max_side=80)
+    assert frame.image.shape == (height // 2, width // 2, 3)
+    assert (frame.boxes.tolist(), frame.ignored.tolist()) == ([[5, 10, 30, 25]], [[0, 0, width / 2, 5]])
+    assert frame.image.mean() == pytest.approx(image.mean(), abs=1)
+    with pytest.raises(InvalidInputError, match="max_side must be an integer"):
+        load_training_frames([source], max_side=0)
 
 
 def test_labels_without_an_image_are_reported(tmp_path, caplog):

@@ -1,0 +1,83 @@
+import itertools
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.training import rendered_source
+from vehicle_detection.training.rendered import _LANE, _closest_truncation, _traffic
+
+
+@pytest.fixture(scope="module")
+def source():
+    return rendered_source(frames=12)
+
+
+class TruthOnly(list):
+    """A drive of which only the ground truth is needed."""
+
+    truth_of = list.__getitem__
+
+
+def test_the_closest_frame_with_a_truncated_vehicle():
+    def moment(truncated, occluded=0):
+        return [SimpleNamespace(truncated=truncated, occluded=occluded)]
+
+    drive = TruthOnly([moment(0.0)] * 40)
+    assert _closest_truncation(drive, 17) == 17
+    drive[2], drive[32], drive[22], drive[27], drive[16] = (
+        moment(0.5), moment(0.3), moment(0.9), moment(0.5, 2), moment(0.5),
+    )  # fmt: skip
+    # Vehicles of which too little shows do not count, and only every fifth frame is searched.
+    assert _closest_truncation(drive, 17) in (2, 32)
+    drive[12] = moment(0.21)
+    assert _closest_truncation(drive, 17) == 12
+
+
+def test_rendered_frames_follow_from_the_seed(source):
+    again, other = rendered_source(frames=2), rendered_source(frames=2, random_state=1)
+    (frames,) = source.sets
+    assert (source.name, frames.keys) == ("rendered", tuple(range(12)))
+    for key in range(2):
+        np.testing.assert_array_equal(again.sets[0].frames[key], frames.frames[key])
+        assert (other.sets[0].frames[key] != frames.frames[key]).any()
+
+
+def test_labels_of_rendered_frames(source):
+    (frames,) = source.sets
+    labels = frames.labels
+    sides = {max(image.shape) for _, image in frames}
+    assert sides <= {640, 1280}
+    assert labels.truncated.max() > 0.2
+    assert labels.occluded.max() > 0
+    usable = labels[~labels.ignore]
+    assert (usable.boxes[:, 2] - usable.boxes[:, 0]).min() >= 20
+    assert usable.truncated.max() <= 0.7
+    assert usable.occluded.max() < 2
+    for key, image in frames:
+        boxes = labels.frame(key).boxes
+        assert (boxes[:, 2:] <= image.shape[1::-1]).all()
+
+
+def test_the_traffic_of_single_scenes_is_varied_and_does_not_overlap():
+    rng = np.random.default_rng(0)
+    kinds, views = set(), set()
+    for _ in range(60):
+        lanes = {}
+        for vehicle in _traffic(1, rng):
+            kinds.add(vehicle.kind)
+            views.add(vehicle.view)
+            lanes.setdefault(round(vehicle.lateral_m / _LANE), []).append(vehicle)
+        for lane in lanes.values():
+            for near, far in itertools.pairwise(lane):
+                assert far.distance_m - near.distance_m >= (11 if near.kind == "truck" else 7)
+    assert {"truck", "van", "sedan"} <= kinds
+    assert views == {"rear", "front"}
+
+
+def test_bad_arguments():
+    with pytest.raises(InvalidInputError, match="frames must be an integer at least 1; got 0"):
+        rendered_source(frames=0)
+    with pytest.raises(InvalidInputError, match="random_state must be an integer"):
+        rendered_source(random_state=-1)
