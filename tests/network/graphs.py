@@ -69,3 +69,60 @@ def own_network(seed=0, *, size=("height", "width"), weights=None, params=None, 
         initializers,
         {"vehicle_detection": json.dumps(header)},
     )
+
+
+def constant_network(
+    outputs, *, size=(96, 96), dtype="float32", layout="NCHW", metadata=None, dynamic=False, sizes=False
+):
+    """A network whose outputs are these arrays by name, whatever the image.
+
+    With `sizes`, it has a second input, the size of the image to which boxes are scaled.
+    """
+    spatial = ["height", "width"] if size is None else list(size)
+    shape = [1, 3, *spatial] if layout == "NCHW" else [1, *spatial, 3]
+    inputs = [("images", dtype, shape)]
+    nodes = [
+        helper.make_node("Cast", ["images"], ["float"], to=TensorProto.FLOAT),
+        helper.make_node("ReduceMean", ["float"], ["mean"], keepdims=0),
+        helper.make_node("Mul", ["mean", "zero"], ["nothing"]),
+    ]
+    if sizes:
+        inputs.append(("orig_target_sizes", TensorProto.INT64, [1, 2]))
+        nodes.append(helper.make_node("Tile", ["orig_target_sizes", "twice"], ["four"]))
+        nodes.append(helper.make_node("Cast", ["four"], ["factors"], to=TensorProto.FLOAT))
+    initializers = [("zero", np.float32(0)), ("twice", np.array([1, 2]))]
+    ports = []
+    for name, values in outputs.items():
+        values = np.asarray(values)
+        initializers.append((f"{name} values", values))
+        if values.dtype == np.int64:
+            nodes.append(helper.make_node("Identity", [f"{name} values"], [name]))
+            kind = TensorProto.INT64
+        elif sizes and name == "boxes":
+            nodes.append(helper.make_node("Mul", [f"{name} values", "factors"], [name]))
+            kind = "float32"
+        else:
+            nodes.append(helper.make_node("Add", [f"{name} values", "nothing"], [name]))
+            kind = "float32"
+        shape = [f"{name} {axis}" for axis in range(values.ndim)] if dynamic else values.shape
+        ports.append((name, kind, shape))
+    return serialize(nodes, inputs, ports, initializers, metadata)
+
+
+def echo_network(*, dtype="float32", layout="NCHW", size=(64, 64)):
+    """A network whose only box has the mean of each channel, 0 to 1 or 0 to 255, as its coordinates."""
+    axes = [2, 3] if layout == "NCHW" else [1, 2]
+    shape = [1, 3, *size] if layout == "NCHW" else [1, *size, 3]
+    nodes = [
+        helper.make_node("Cast", ["images"], ["float"], to=TensorProto.FLOAT),
+        helper.make_node("ReduceMean", ["float"], ["means"], axes=axes, keepdims=0),
+        helper.make_node("Reshape", ["means", "column"], ["channels"]),
+        helper.make_node("Concat", ["channels", "rest"], ["one"], axis=1),
+        helper.make_node("Tile", ["one", "times"], ["output0"]),
+    ]
+    initializers = [
+        ("column", np.array([1, 3, 1])),
+        ("rest", np.float32([[[10], [0.9]]])),
+        ("times", np.array([1, 1, 84])),
+    ]
+    return serialize(nodes, [("images", dtype, shape)], [("output0", "float32", [1, 5, 84])], initializers)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -62,6 +63,23 @@ def _fit_side(exact: float, multiple: int) -> Size:
     return scaled, -(-scaled // multiple) * multiple
 
 
+def _resize(
+    frame: NDArray[np.uint8], size: Size, target: NDArray[np.uint8] | None, workspace: Workspace
+) -> NDArray[Any]:
+    """Resize a frame: by means over areas, and then linearly by less than 2.
+
+    OpenCV takes means over whole pixels in a tenth of the time of others.
+    """
+    height, width = frame.shape[:2]
+    factor = min(height // size[0], width // size[1])
+    if factor > 1 and height % factor == width % factor == 0:
+        memory = workspace.take((height // factor, width // factor, 3), np.uint8, "reduced")
+        frame = cv2.resize(frame, memory.shape[1::-1], dst=memory, interpolation=cv2.INTER_AREA)
+    by_less_than_2 = frame.shape[0] < 2 * size[0] and frame.shape[1] < 2 * size[1]
+    method = cv2.INTER_LINEAR if by_less_than_2 else cv2.INTER_AREA
+    return cv2.resize(frame, size[::-1], dst=target, interpolation=method)
+
+
 @dataclass(frozen=True)
 class InputFormat:
     """What a network expects as its input.
@@ -119,10 +137,8 @@ class InputFormat:
         scaled, padded = self.fit(frame.shape, input_size)
         image = workspace.take((*padded, 3), np.uint8, "input")
         image[scaled[0] :] = image[: scaled[0], scaled[1] :] = self.padding
-        enlarged = scaled[0] > frame.shape[0] or scaled[1] > frame.shape[1]
-        method = cv2.INTER_LINEAR if enlarged else cv2.INTER_AREA
         target = image if scaled == padded else None
-        resized = cv2.resize(frame, scaled[::-1], dst=target, interpolation=method)
+        resized = _resize(frame, scaled, target, workspace)
         if scaled != padded:
             image[: scaled[0], : scaled[1]] = resized
         return self._convert(image), scaled

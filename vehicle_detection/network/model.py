@@ -369,7 +369,7 @@ def _output_shapes(model: NetworkModel, facts: GraphFacts, size: Size) -> list[t
     if all(None not in port.shape and port.shape for port in facts.outputs) and model.input_format.size:
         return [tuple(side or 0 for side in port.shape) for port in facts.outputs]
     image, _ = model.input_format.prepare(np.full((*size, 3), 114, np.uint8), max(size))
-    session = open_session(model.graph, model.name)
+    session = open_session(model.graph, model.name, runtime="onnxruntime")
     try:
         return [output.shape for output in session.run(model.feeds(image, size))]
     finally:

@@ -211,15 +211,15 @@ def _recognize_one(first: int, second: int, cells: int, names: int | None) -> Ou
     """Recognize one output of shape ``(1, first, second)``."""
     # Three anchors in each cell: YOLOv5; one: YOLOv8 and YOLOX. The names decide where they are known.
     counts = (cells, 3 * cells)
-    by_columns = first < second if (first in counts) == (second in counts) else second in counts
+    by_columns = first <= second if (first in counts) == (second in counts) else second in counts
     if by_columns:
         return OutputFormat("columns", first - 4) if first > 4 else None
     if second == 6 and first not in counts:
         return OutputFormat("final", names)
     if second < 5:
         return None
-    if names is not None and second == 4 + names:
-        return OutputFormat("rows", names, first not in counts)
+    if first != 3 * cells and second == 4 + (80 if names is None else names):
+        return OutputFormat("rows", second - 4, first != cells)
     if second > 5 and (first in counts or first > _MAX_SET):
         return OutputFormat("yolox" if first == cells and names is None else "yolov5", second - 5)
     return OutputFormat("rows", second - 4, True) if first <= _MAX_SET else None

@@ -37,15 +37,15 @@ class NetworkSearch(FrameSearch):
     def __init__(self, model: NetworkModel, *, n_jobs: int | None = None) -> None:
         super().__init__(n_jobs)
         self.model = model
-        self.forget_session()
-        _SEARCHES.add(self)
-
-    def forget_session(self) -> None:
-        """Open a new session on the next search: a forked child lacks the threads of the last one."""
-        # A reference remains: a session without its threads cannot be closed.
-        self._forgotten = getattr(self, "_forgotten", []), getattr(self, "_session", None)
         self._session: Session | None = None
         self._lock = threading.Lock()
+        _SEARCHES.add(self)
+
+    def abandon_session(self) -> None:
+        """Open a new session on the next search: a forked child lacks the threads of the last one."""
+        if self._session is not None:
+            _ABANDONED.append(self._session)
+        self._session, self._lock = None, threading.Lock()
 
     def _search(
         self, frame: NDArray[np.uint8], params: NetworkParams, min_vehicle_score: float
@@ -101,15 +101,17 @@ class NetworkSearch(FrameSearch):
 
 
 _SEARCHES: weakref.WeakSet[NetworkSearch] = weakref.WeakSet()
+# Sessions of the parent process: closing one would wait for its threads for ever.
+_ABANDONED: list[Session] = []
 
 
-def _forget_sessions() -> None:
+def _after_fork() -> None:
     for search in list(_SEARCHES):
-        search.forget_session()
+        search.abandon_session()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_sessions)
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 def _to_frame(boxes: Floats, shape: tuple[int, ...], scaled: tuple[int, int]) -> Floats:

@@ -1,0 +1,314 @@
+import copy
+import dataclasses
+import multiprocessing
+import pickle
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.network.graphs import PARAMS, constant_network, echo_network, own_network
+from tests.network.test_runtime import NO_OPENVINO, RUNTIMES
+from vehicle_detection.boxes import iou_matrix, logit
+from vehicle_detection.errors import InvalidInputError, ModelFileError
+from vehicle_detection.network import METADATA_KEY, load_network
+from vehicle_detection.network.search import to_log_odds, to_probability
+from vehicle_detection.params import HeatParams, NetworkParams
+
+IMAGE = np.random.default_rng(0).integers(0, 256, (360, 640, 3), dtype=np.uint8)
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("network") / "own.onnx"
+    path.write_bytes(own_network())
+    return path
+
+
+@pytest.fixture(scope="module")
+def model(file):
+    return load_network(file, runtime="onnxruntime")
+
+
+def find(model, image=IMAGE, params=None, *, n_jobs=1, score=0.0):
+    with model.open_search(n_jobs=n_jobs) as search:
+        return search.find(image, params, min_vehicle_score=score)
+
+
+def check_equal(one, other):
+    for name in ("windows", "vehicles"):
+        np.testing.assert_array_equal(getattr(one, name).boxes, getattr(other, name).boxes)
+        np.testing.assert_array_equal(getattr(one, name).scores, getattr(other, name).scores)
+
+
+def test_a_file_of_the_library(model):
+    assert (model.slope, model.offset, model.threshold, model.nms_iou) == (0.5, -0.25, -0.5, 0.6)
+    assert model.metadata == {"frames": 12}
+    assert model.classes == {0: "vehicle"}
+    title, facts = model.summary()
+    assert title == "network, threshold at a probability of 0.38"
+    assert facts["input"] == "640 px"
+    assert "0.38" in repr(model)
+
+
+def test_windows_and_vehicles(model):
+    found = find(model, score=-1.0)
+    assert len(found.windows) > 10
+    assert (found.windows.scores >= 0).all()
+    assert (found.vehicles.scores >= -1).all()
+    assert (found.vehicles.scores < 0).any()
+    assert (np.diff(found.vehicles.scores) <= 0).all()
+    overlap = iou_matrix(found.vehicles, found.vehicles)
+    assert (overlap[~np.eye(len(overlap), dtype=bool)] <= model.nms_iou).all()
+    few = find(model, params=NetworkParams(min_score=0.5))
+    assert 0 < len(few.windows) < len(found.windows)
+    assert (few.windows.scores >= 0.5).all()
+    assert (few.vehicles.scores >= 0).all()
+
+
+def test_the_probability_of_a_score(model):
+    probabilities = np.array([0.2, 0.5, 0.99])
+    scores = model.scores(probabilities)
+    expected = 0.5 * np.array([logit(p) for p in probabilities]) - 0.25 + 0.5
+    np.testing.assert_allclose(scores, expected)
+    np.testing.assert_allclose([model.probability(each) for each in scores], probabilities, atol=1e-5)
+    confidences = model.calibration.probability(scores)
+    np.testing.assert_allclose(confidences, 1 / (1 + np.exp(-(expected - 0.5))))
+    assert np.isfinite(to_log_odds(np.array([0.0, 1.0]))).all()
+    assert to_probability(-1e6) == 0
+    assert to_probability(1e6) == 1
+
+
+def test_a_lower_threshold_finds_more(model):
+    low = dataclasses.replace(model, threshold=-2.0)
+    assert len(find(low).vehicles) > len(find(model).vehicles)
+
+
+def test_the_result_depends_on_nothing_but_the_frame(model):
+    one = find(model)
+    for n_jobs in (1, 2, 3):
+        check_equal(one, find(model, n_jobs=n_jobs))
+    image = IMAGE.copy()
+    check_equal(one, find(model, image[::1]))
+    np.testing.assert_array_equal(image, IMAGE)
+    with model.open_search(n_jobs=1) as search:
+        search.find(IMAGE[:100, :50])
+        check_equal(one, search.find(IMAGE))
+        search.close()
+        check_equal(one, search.find(np.asfortranarray(IMAGE)))
+
+
+@pytest.mark.skipif(NO_OPENVINO, reason="openvino is not installed")
+def test_both_libraries_find_the_same(file, model):
+    one, other = find(model), find(load_network(file, runtime="openvino"))
+    assert len(one.windows) == len(other.windows)
+    np.testing.assert_allclose(one.vehicles.boxes, other.vehicles.boxes, atol=0.5)
+    np.testing.assert_allclose(
+        model.calibration.probability(one.vehicles.scores),
+        model.calibration.probability(other.vehicles.scores),
+        atol=0.02,
+    )
+
+
+@pytest.mark.parametrize("runtime", RUNTIMES)
+def test_threads(file, runtime):
+    images = [np.roll(IMAGE, 40 * shift, axis=1)[: 300 + 20 * (shift % 4)] for shift in range(8)]
+    with load_network(file, runtime=runtime).open_search(n_jobs=2) as search, ThreadPoolExecutor(4) as pool:
+        expected = [search.find(image) for image in images]
+        for one, other in zip(expected * 3, pool.map(search.find, images * 3)):
+            check_equal(one, other)
+
+
+SEARCH = None
+
+
+def search_in_child(_):
+    return SEARCH.find(IMAGE).vehicles.boxes
+
+
+def search_model(model):
+    return find(model).vehicles.boxes
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="fork is safe on Linux only")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize("runtime", RUNTIMES)
+def test_a_forked_process(file, runtime):
+    global SEARCH
+    with load_network(file, runtime=runtime).open_search(n_jobs=2) as SEARCH:
+        expected = SEARCH.find(IMAGE).vehicles.boxes
+        with multiprocessing.get_context("fork").Pool(1) as pool:
+            (boxes,) = pool.map_async(search_in_child, [0]).get(timeout=60)
+            np.testing.assert_array_equal(boxes, expected)
+        np.testing.assert_array_equal(SEARCH.find(IMAGE).vehicles.boxes, expected)
+
+
+def test_a_spawned_process(model):
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        (boxes,) = pool.map_async(search_model, [model]).get(timeout=60)
+    np.testing.assert_array_equal(boxes, search_model(model))
+
+
+def test_copies(model, tmp_path):
+    for other in (pickle.loads(pickle.dumps(model)), copy.deepcopy(model)):
+        check_equal(find(model), find(other))
+    model.save(tmp_path / "copy.onnx")
+    check_equal(find(model), find(load_network(tmp_path / "copy.onnx")))
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [(1, 1), (1, 700), (700, 1), (20, 30), (31, 300), (1, 20_000), (33, 20_000), (360, 480), (640, 360)],
+)
+@pytest.mark.parametrize("runtime", RUNTIMES)
+def test_frames_of_any_size(file, shape, runtime):
+    image = np.random.default_rng(0).integers(0, 256, (*shape, 3), dtype=np.uint8)
+    check_inside(find(load_network(file, runtime=runtime), image, score=-9.0), shape)
+
+
+@given(st.integers(1, 400), st.integers(1, 400), st.integers(1, 10))
+def test_boxes_are_inside_the_frame(model, height, width, steps):
+    image = np.random.default_rng(height).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    check_inside(find(model, image, NetworkParams(input_size=32 * steps), score=-9.0), (height, width))
+
+
+def check_inside(found, shape):
+    for boxes in (found.windows.boxes, found.vehicles.boxes):
+        assert (boxes[:, :2] >= 0).all()
+        assert (boxes[:, 2:] <= (shape[1], shape[0])).all()
+        assert (boxes[:, 2:] > boxes[:, :2]).all()
+
+
+@pytest.mark.parametrize(
+    ("image", "remedy"),
+    [
+        (IMAGE / 255, "uint8"),
+        (IMAGE[..., 0], "GRAY2RGB"),
+        (np.dstack([IMAGE, IMAGE[..., 0]]), "alpha"),
+        (IMAGE[:0], "empty"),
+        ("image.png", "RGB array"),
+    ],
+)
+def test_malformed_frames(model, image, remedy):
+    with pytest.raises(InvalidInputError, match=remedy):
+        find(model, image)
+
+
+def test_malformed_arguments(model, tmp_path):
+    with pytest.raises(InvalidInputError, match="'highway'"):
+        model.open_search(method="windows")
+    with pytest.raises(InvalidInputError, match="n_jobs"):
+        model.open_search(n_jobs=0)
+    with pytest.raises(InvalidInputError, match="params must be a NetworkParams"):
+        find(model, params=HeatParams())
+    with pytest.raises(InvalidInputError, match="slope"):
+        dataclasses.replace(model, slope=0.0)
+    with pytest.raises(InvalidInputError, match="path must be a file name"):
+        load_network(5)
+    with pytest.raises(ModelFileError, match="does not exist"):
+        load_network(tmp_path / "missing.onnx")
+    with pytest.raises(ModelFileError, match="folder"):
+        load_network(tmp_path)
+
+
+def test_a_file_that_is_too_large(file, monkeypatch):
+    monkeypatch.setenv("VEHICLE_DETECTION_MAX_NETWORK_BYTES", "5000")
+    with pytest.raises(ModelFileError, match="set VEHICLE_DETECTION_MAX_NETWORK_BYTES"):
+        load_network(file)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"version": 2}, "format version 2, this release reads 1"),
+        ({"params": {}}, "does not fit its own parameters"),
+        ({"params": PARAMS | {"slope": -1}}, "slope"),
+        ({"params": PARAMS | {"slope": "steep"}}, "steep"),
+        ({"params": PARAMS | {"nms_iou": 2}}, "nms_iou"),
+        ({"params": PARAMS | {"input_size": 100}}, "multiple of 32"),
+        ({"params": 3}, "does not fit its own parameters"),
+        ({"size": (64, "width")}, "both sides fixed"),
+    ],
+)
+def test_a_file_that_does_not_fit_itself(tmp_path, change, message):
+    file = tmp_path / "own.onnx"
+    file.write_bytes(own_network(**change))
+    with pytest.raises(ModelFileError, match=message) as raised:
+        load_network(file)
+    assert "own.onnx" in str(raised.value)
+
+
+def test_metadata_of_another_kind(tmp_path):
+    file = tmp_path / "own.onnx"
+    outputs = {"boxes": np.zeros((1, 5, 84), np.float32)}
+    for text in ("{", "[]", '{"format_version": 1, "params": {}, "metadata": {}}'):
+        file.write_bytes(constant_network(outputs, metadata={METADATA_KEY: text}))
+        with pytest.raises(ModelFileError, match="does not fit its own parameters"):
+            load_network(file)
+
+
+@pytest.mark.parametrize("runtime", RUNTIMES)
+def test_invalid_weights(tmp_path, runtime):
+    file = tmp_path / "own.onnx"
+    file.write_bytes(own_network(weights=np.nan))
+    with pytest.raises(ModelFileError, match=r"own.onnx computes invalid values: scores are not finite"):
+        find(load_network(file, runtime=runtime))
+
+
+def test_a_fixed_size(tmp_path):
+    file = tmp_path / "own.onnx"
+    file.write_bytes(own_network(size=(192, 320)))
+    model = load_network(file)
+    check_inside(find(model, score=-9.0), IMAGE.shape)
+    find(model, params=NetworkParams(input_size=320))
+    with pytest.raises(InvalidInputError, match=r"input_size must be omitted .* fixed size 320x192; got 640"):
+        find(model, params=NetworkParams(input_size=640))
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "float32", "float16"])
+@pytest.mark.parametrize("layout", ["NCHW", "NHWC"])
+@pytest.mark.parametrize("runtime", RUNTIMES)
+def test_input_layouts(tmp_path, dtype, layout, runtime):
+    # The box has the means of red and green as its center: 0.2 and 0.4 of 255, or of 1.
+    frame = np.full((64, 64, 3), (20, 30, 24), np.uint8)
+    file = tmp_path / "echo.onnx"
+    file.write_bytes(echo_network(dtype=dtype, layout=layout))
+    model = load_network(file, runtime=runtime)
+    found = model.open_search(n_jobs=1).find(frame)
+    center = np.array([20, 30]) / (1 if dtype == "uint8" else 255)
+    sides = np.array([24 / (1 if dtype == "uint8" else 255), 10])
+    corners = np.concatenate([center - sides / 2, center + sides / 2]).clip(0, 64)
+    np.testing.assert_allclose(found.vehicles.boxes, [corners], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"metadata": {"task": "segment"}}, "'segment'; export one for detection"),
+        ({"size": (64, "width")}, "both sides fixed"),
+    ],
+)
+def test_other_networks(tmp_path, options, message):
+    file = tmp_path / "other.onnx"
+    file.write_bytes(constant_network({"output0": np.zeros((1, 84, 84), np.float32)}, **options))
+    with pytest.raises(ModelFileError, match=message):
+        load_network(file)
+
+
+def test_params():
+    assert NetworkParams.default().horizon == 0.5
+    assert NetworkParams().with_horizon(None) == NetworkParams().everywhere() == NetworkParams()
+    assert NetworkParams(input_size=320).with_horizon(0.4).horizon_tolerance == 0.06
+    assert NetworkParams().heat_range(HeatParams()).default == 0
+    for wrong in (
+        {"input_size": 100},
+        {"input_size": 16},
+        {"input_size": 64.0},
+        {"horizon": 2},
+        {"min_score": "a"},
+    ):
+        with pytest.raises(InvalidInputError, match=next(iter(wrong))):
+            NetworkParams(**wrong)
