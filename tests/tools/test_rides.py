@@ -1,0 +1,27 @@
+from tools import rides
+from tools.rides import kept_rides
+
+NAMES = [f"ride{number}.jpg" for number in range(900)]
+
+
+def test_the_kept_rides_are_two_hundred_after_the_first():
+    kept = kept_rides(NAMES)
+    assert len(set(kept)) == 200
+    assert not set(kept) & set(NAMES[:557])
+    numbers = sorted(NAMES.index(name) for name in kept)
+    assert 650 < sum(numbers) / 200 < 800  # spread over the others
+
+
+def test_the_kept_rides_follow_from_the_names():
+    assert kept_rides([name for name in NAMES for _ in range(3)]) == kept_rides(NAMES)
+    assert kept_rides([*NAMES[:557], *NAMES[:556:-1]]) == kept_rides(NAMES)
+    assert kept_rides(NAMES)[:2] == ["ride605.jpg", "ride875.jpg"]
+    assert kept_rides(NAMES[:557]) == []
+
+
+def test_the_command_prints_the_names(tmp_path, capsys):
+    (tmp_path / "labels").mkdir()
+    rows = [f"{name},1,10,10,60,50\n" for name in NAMES]
+    (tmp_path / "labels" / "bdd.csv").write_text("frame,track,x1,y1,x2,y2\n" + "".join(rows))
+    rides.main([str(tmp_path)])
+    assert capsys.readouterr().out.splitlines() == kept_rides(NAMES)
