@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from onnx import TensorProto, helper
 
-from tests.network.graphs import PARAMS, constant_network, echo_network, own_network
+from tests.network.graphs import PARAMS, constant_network, echo_network, own_network, serialize
 from tests.network.test_runtime import NO_OPENVINO, RUNTIMES
 from vehicle_detection.boxes import iou_matrix, logit
 from vehicle_detection.errors import InvalidInputError, ModelFileError
@@ -295,6 +296,27 @@ def test_other_networks(tmp_path, options, message):
     file = tmp_path / "other.onnx"
     file.write_bytes(constant_network({"output0": np.zeros((1, 84, 84), np.float32)}, **options))
     with pytest.raises(ModelFileError, match=message):
+        load_network(file)
+
+
+@pytest.mark.parametrize(
+    "inputs",
+    [
+        [],
+        [("images", "float32", [8, 3, 64, 64])],
+        [("images", "float32", [1, 1, 64, 64])],
+        [("images", "float32", [1, 3, 64])],
+        [("images", TensorProto.INT32, [1, 3, 64, 64])],
+        [("images", "float32", [1, 3, 64, 64]), ("mask", "float32", [1, 64, 64])],
+    ],
+)
+def test_other_inputs(tmp_path, inputs):
+    file = tmp_path / "other.onnx"
+    node = helper.make_node("Identity", ["values"], ["output0"])
+    values = np.zeros((1, 84, 84), np.float32)
+    output = ("output0", "float32", values.shape)
+    file.write_bytes(serialize([node], inputs, [output], [("values", values)]))
+    with pytest.raises(ModelFileError, match="other.onnx must have one input, float32, float16 or uint8"):
         load_network(file)
 
 

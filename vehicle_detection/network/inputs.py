@@ -74,7 +74,8 @@ def _resize(
     factor = min(height // size[0], width // size[1])
     if factor > 1 and height % factor == width % factor == 0:
         memory = workspace.take((height // factor, width // factor, 3), np.uint8, "reduced")
-        frame = cv2.resize(frame, memory.shape[1::-1], dst=memory, interpolation=cv2.INTER_AREA)
+        cv2.resize(frame, (width // factor, height // factor), dst=memory, interpolation=cv2.INTER_AREA)
+        frame = memory
     by_less_than_2 = frame.shape[0] < 2 * size[0] and frame.shape[1] < 2 * size[1]
     method = cv2.INTER_LINEAR if by_less_than_2 else cv2.INTER_AREA
     return cv2.resize(frame, size[::-1], dst=target, interpolation=method)

@@ -296,8 +296,8 @@ def _foreign_model(graph: bytes, facts: GraphFacts) -> NetworkModel:
         raise ModelFileError(
             f"{name} is a network for the task {metadata['task']!r}; export one for detection"
         )
-    image, *extra = facts.inputs
     _check_inputs(facts)
+    image, *extra = facts.inputs
     channels_first = image.shape[1] == 3 or image.shape[3] != 3
     size = _fixed_size(image, channels_first, name)
     names = class_names(facts)
@@ -336,11 +336,16 @@ def _foreign_model(graph: bytes, facts: GraphFacts) -> NetworkModel:
 
 def _check_inputs(facts: GraphFacts) -> None:
     """Raise unless the first input is an image, and a second one the size of the image."""
-    image, *extra = facts.inputs
-    fits = len(image.shape) == 4 and image.shape[0] in (1, None)
-    fits = fits and image.dtype in ("float32", "float16", "uint8")
-    fits = fits and (3 in (image.shape[1], image.shape[3]) or None in (image.shape[1], image.shape[3]))
-    if not fits or any("size" not in port.name for port in extra) or len(extra) > 1:
+    image, *extra = facts.inputs or (Port("none", (), ""),)
+    fits = (
+        len(image.shape) == 4
+        and image.shape[0] in (1, None)
+        and (3 in image.shape[1::2] or None in image.shape[1::2])
+        and image.dtype in ("float32", "float16", "uint8")
+        and len(extra) <= 1
+        and all("size" in port.name for port in extra)
+    )
+    if not fits:
         listed = ", ".join(f"{port.name} {port.dtype} {port.shape}" for port in facts.inputs)
         raise ModelFileError(
             f"{facts.name} must have one input, float32, float16 or uint8 of shape (1, 3, height, width) or "
