@@ -316,7 +316,7 @@ def test_other_inputs(tmp_path, inputs):
     values = np.zeros((1, 84, 84), np.float32)
     output = ("output0", "float32", values.shape)
     file.write_bytes(serialize([node], inputs, [output], [("values", values)]))
-    with pytest.raises(ModelFileError, match="other.onnx must have one input, float32, float16 or uint8"):
+    with pytest.raises(ModelFileError, match=r"other\.onnx must have one input, float32, float16 or uint8"):
         load_network(file)
 
 
