@@ -1,0 +1,183 @@
+"""Write a trained network as a model file: ONNX with 8-bit weights, and its parameters as metadata."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vehicle_detection.training.architecture import CENTER, SCALE, Deployed, Network
+from vehicle_detection.training.frames import TrainingFrame
+
+_OPSET = 17
+_CALIBRATION_SIZE = 640, 352  # px
+_CALIBRATION_FRAMES = 96
+FORMAT_VERSION = 1
+METADATA_KEY = "vehicle_detection"
+
+
+def export_network(
+    network: Network,
+    frames: Sequence[TrainingFrame],
+    params: Mapping[str, Any],
+    metadata: Mapping[str, Any],
+    *,
+    quantize: bool = True,
+) -> bytes:
+    """Return the model file of a network.
+
+    The graph takes uint8 RGB images ``(1, H, W, 3)``, sides multiples of 32, and returns ``(1, 5, cells)``:
+    center, width, height and probability of a box for each cell, as YOLOv8 does for one class.
+
+    Parameters
+    ----------
+    network
+        What `train_network` returns.
+    frames
+        Frames whose activations set the 8-bit ranges; some of them are taken, evenly spaced.
+    params, metadata
+        Numbers that the detector needs (calibration, threshold, input size), and facts for people. JSON values.
+    quantize
+        False keeps weights and activations as float32.
+
+    Returns
+    -------
+    bytes
+        The file. Weights have 7 bits, so that sums of products fit into 16 bits on processors without VNNI;
+        the output convolution stays float32.
+    """
+    import onnx
+
+    with tempfile.TemporaryDirectory() as folder:
+        plain, prepared, small = (Path(folder) / name for name in ("plain.onnx", "prepared.onnx", "int8.onnx"))
+        _export(network, plain)
+        if quantize:
+            _quantize(plain, prepared, small, frames)
+        model = onnx.load(small if quantize else plain)
+    _take_bytes(model)
+    model.producer_name, model.producer_version, model.doc_string = "vehicle_detection", "", ""
+    del model.metadata_props[:]
+    content = {"format_version": FORMAT_VERSION, "params": dict(params), "metadata": dict(metadata)}
+    for key, value in ((METADATA_KEY, json.dumps(content, sort_keys=True)), ("names", "{0: 'vehicle'}")):
+        model.metadata_props.add(key=key, value=value)
+    onnx.checker.check_model(model)
+    return bytes(model.SerializeToString(deterministic=True))
+
+
+def _export(network: Network, path: Path) -> None:
+    """Write the graph with float weights, whose input is normalized already."""
+    width, height = _CALIBRATION_SIZE
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the exporter, about sizes that are traced as constants
+        torch.onnx.export(
+            Deployed(network.cpu()).eval(),
+            (torch.zeros(1, height, width, 3),),
+            path,
+            input_names=["image"],
+            output_names=["boxes"],
+            dynamic_axes={"image": {1: "height", 2: "width"}, "boxes": {2: "cells"}},
+            opset_version=_OPSET,
+            dynamo=False,
+        )
+
+
+def _quantize(plain: Path, prepared: Path, target: Path, frames: Sequence[TrainingFrame]) -> None:
+    """Quantize weights and activations to 8 bits (static, symmetric weights per channel)."""
+    import onnx
+    from onnxruntime.quantization import (
+        CalibrationDataReader,
+        CalibrationMethod,
+        QuantFormat,
+        QuantType,
+        quantize_static,
+    )
+    from onnxruntime.quantization.shape_inference import quant_pre_process
+
+    class Images(CalibrationDataReader):  # type: ignore[misc]
+        def __init__(self) -> None:
+            self._inputs = _calibration_inputs(frames)
+
+        def get_next(self) -> dict[str, NDArray[np.float32]] | None:
+            return next(self._inputs, None)
+
+    quant_pre_process(plain, prepared, skip_symbolic_shape=True)
+    nodes = onnx.load(prepared).graph.node
+    # The output convolutions and all arithmetic of boxes stay float.
+    weights = {each.name: each.dims for each in onnx.load(prepared).graph.initializer}
+    convolutions = [node for node in nodes if node.op_type == "Conv"]
+    last = [node.name for node in convolutions if weights[node.input[1]][0] == 5]
+    others = [node.name for node in nodes if node.op_type not in ("Conv", "Relu", "Add", "Resize", "Slice")]
+    after = _names_after(nodes, last)
+    # The normalization of bytes: see `_take_bytes`.
+    image = next(node.output[0] for node in nodes if node.op_type == "Transpose")
+    normalized = {"scale": np.array(1 / SCALE, np.float32), "zero_point": np.array(CENTER, np.uint8)}
+    quantize_static(
+        prepared,
+        target,
+        Images(),
+        quant_format=QuantFormat.QDQ,
+        per_channel=True,
+        reduce_range=True,
+        activation_type=QuantType.QUInt8,
+        weight_type=QuantType.QInt8,
+        op_types_to_quantize=["Conv", "Relu", "Add", "Resize", "Slice", "Transpose"],
+        calibrate_method=CalibrationMethod.Percentile,
+        extra_options={"TensorQuantOverrides": {image: [{"quant_type": QuantType.QUInt8} | normalized]}},
+        nodes_to_exclude=[*last, *after, *(name for name in others if "Transpose" not in name)],
+    )
+
+
+def _names_after(nodes: Sequence[Any], first: Sequence[str]) -> list[str]:
+    """Names of the nodes that depend on some nodes."""
+    reached = {output for node in nodes if node.name in first for output in node.output}
+    names = []
+    for node in nodes:  # in the order of computation
+        if reached & set(node.input):
+            reached |= set(node.output)
+            names.append(node.name)
+    return names
+
+
+def _calibration_inputs(frames: Sequence[TrainingFrame]) -> Iterator[dict[str, NDArray[np.float32]]]:
+    chosen = np.linspace(0, len(frames) - 1, min(len(frames), _CALIBRATION_FRAMES)).astype(int)
+    for index in chosen:
+        image = cv2.resize(frames[index].image, _CALIBRATION_SIZE, interpolation=cv2.INTER_AREA)
+        yield {"image": ((image[None].astype(np.float32) - CENTER) / SCALE).astype(np.float32)}
+
+
+def _take_bytes(model: Any) -> None:
+    """Let the graph take uint8 images, whose normalization is a scale and a zero point."""
+    import onnx
+
+    graph = model.graph
+    graph.input[0].type.tensor_type.elem_type = onnx.TensorProto.UINT8
+    transpose = next(node for node in graph.node if graph.input[0].name in node.input)
+    image = transpose.output[0]
+    for value in graph.value_info:
+        if value.name == image:
+            value.type.tensor_type.elem_type = onnx.TensorProto.UINT8
+    readers = [node for node in graph.node if image in node.input]
+    if readers[0].op_type == "QuantizeLinear":
+        # Bytes are what this node would return.
+        graph.node.remove(readers[0])
+        following = next(node for node in graph.node if readers[0].output[0] in node.input)
+        following.input[0] = image
+        return
+    graph.initializer.extend(
+        [
+            onnx.numpy_helper.from_array(np.array(1 / SCALE, np.float32), "image_scale"),
+            onnx.numpy_helper.from_array(np.array(CENTER, np.uint8), "image_zero_point"),
+        ]
+    )
+    names = [image, "image_scale", "image_zero_point"]
+    node = onnx.helper.make_node("DequantizeLinear", names, ["image_normalized"], name="normalize")
+    readers[0].input[0] = node.output[0]
+    graph.node.insert(list(graph.node).index(readers[0]), node)

@@ -1,0 +1,275 @@
+"""Train the network on labelled frames, from random weights or from those of another network."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import math
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset
+
+from vehicle_detection._common import atomic_write, resolve_jobs, single_threaded_opencv
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.training.architecture import Network, cell_centers
+from vehicle_detection.training.frames import TrainingFrame
+from vehicle_detection.training.loss import Targets, detection_loss
+from vehicle_detection.training.samples import Sample, Sampler
+
+log = logging.getLogger(__name__)
+
+_WARM_UP = 300  # steps over which the rate rises
+_LAST_RATE = 0.02  # as a fraction of the highest
+_WEIGHT_DECAY = 0.05  # of kernels
+_MAX_GRADIENT = 5.0  # norm
+_DECAY = 0.9995  # of the moving average of the weights, at most
+_DETERMINISTIC, _FORMAT = True, torch.channels_last
+_CHECKPOINT_STEPS, _REPORT_STEPS = 250, 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkTraining:
+    """Length and course of a training.
+
+    Attributes
+    ----------
+    steps, batch
+        Number of steps, and samples of a step.
+    size
+        Width and height of the samples in pixels, multiples of 32.
+    rate
+        Highest learning rate of AdamW, reached after 300 steps; it falls as a cosine.
+    random_state
+        Seed of the samples and of the first weights.
+    """
+
+    steps: int
+    batch: int = 64
+    size: tuple[int, int] = (640, 384)
+    rate: float = 2.5e-3
+    random_state: int = 0
+
+
+def train_network(
+    frames: Sequence[TrainingFrame],
+    training: NetworkTraining,
+    *,
+    initial: Network | None = None,
+    device: str | None = None,
+    n_jobs: int | None = None,
+    checkpoint: Path | None = None,
+    on_step: Callable[[int, str], object] | None = None,
+) -> Network:
+    """Train a network.
+
+    Parameters
+    ----------
+    frames
+        Labelled frames, in memory.
+    training
+        Length and course.
+    initial
+        Network to continue from; None starts with random weights.
+    device
+        ``"cuda"`` or ``"cpu"``; None takes CUDA where PyTorch offers it.
+    n_jobs
+        Processes that draw samples, and threads of a training on the processor.
+    checkpoint
+        File that the state of the training is written to, and from which an interrupted training continues.
+    on_step
+        Called with the number of finished steps and a line of text, now and then.
+
+    Returns
+    -------
+    Network
+        The moving average of the weights, on the processor, for evaluation.
+
+    Raises
+    ------
+    InvalidInputError
+        If no frame has a vehicle.
+    """
+    if not any(len(frame.boxes) for frame in frames):
+        raise InvalidInputError("frames must show at least one vehicle; label some, and pass their labels")
+    place = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    jobs = resolve_jobs(n_jobs)
+    # On CUDA, the other algorithms add in another order each time.
+    torch.backends.cudnn.deterministic = _DETERMINISTIC
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(training.random_state)
+        network = copy.deepcopy(initial) if initial is not None else Network()
+    state = _State.start(network.to(place), training)
+    if checkpoint is not None and checkpoint.exists():
+        state.load(checkpoint)
+    report = on_step or (lambda _, line: log.info(line))
+    centers, _ = cell_centers(training.size[1], training.size[0], place)
+    dataset = _Samples(Sampler.of(frames, training.size), training, state.step)
+    # A training on the processor draws samples in one process, beside the threads of the network.
+    workers = max(1, jobs - 1) if place.type == "cuda" else int(jobs > 1)
+    batches = DataLoader(
+        dataset,
+        batch_size=None,
+        num_workers=workers,
+        pin_memory=place.type == "cuda",
+        prefetch_factor=4 if workers else None,
+        multiprocessing_context="fork" if workers and hasattr(os, "fork") else None,
+    )
+    # Forked processes cannot use the threads of OpenCV.
+    with single_threaded_opencv():
+        for images, boxes, usable, ignored in batches:
+            targets = Targets(*(each.to(place, non_blocking=True) for each in (boxes, usable, ignored)))
+            losses = state.update(images.to(place, non_blocking=True), targets, centers)
+            if state.step % _REPORT_STEPS == 0 or state.step == training.steps:
+                score, box = (each.item() for each in losses)
+                report(state.step, f"step {state.step} of {training.steps}: losses {score:.3f} + {box:.3f}")
+            if checkpoint is not None and state.step % _CHECKPOINT_STEPS == 0:
+                state.save(checkpoint)
+    return state.average.cpu().eval()
+
+
+class _Samples(Dataset[tuple[Tensor, ...]]):
+    """The batches of a training; each depends on the seed and its number alone."""
+
+    def __init__(self, sampler: Sampler, training: NetworkTraining, start: int) -> None:
+        self._sampler, self._training, self._start = sampler, training, start
+
+    def __len__(self) -> int:
+        return self._training.steps - self._start
+
+    def __iter__(self) -> Iterator[tuple[Tensor, ...]]:
+        return (self[index] for index in range(len(self)))
+
+    def __getitem__(self, index: int) -> tuple[Tensor, ...]:
+        first = (self._start + index) * self._training.batch
+        numbers = range(first, first + self._training.batch)
+        seed = self._training.random_state
+        samples = [self._sampler.draw(np.random.default_rng([seed, number])) for number in numbers]
+        return collate(samples)
+
+
+def collate(samples: Sequence[Sample]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Stack images; pad boxes, with which of them exist, and ignored boxes to the same number."""
+    n, most = len(samples), max(1, *(len(sample.boxes) for sample in samples))
+    boxes, usable = np.zeros((n, most, 4), np.float32), np.zeros((n, most), np.bool_)
+    ignored = np.zeros((n, max(1, *(len(sample.ignored) for sample in samples)), 4), np.float32)
+    for row, sample in enumerate(samples):
+        boxes[row, : len(sample.boxes)], usable[row, : len(sample.boxes)] = sample.boxes, True
+        ignored[row, : len(sample.ignored)] = sample.ignored
+    images = np.stack([sample.image for sample in samples])
+    return tuple(torch.from_numpy(each) for each in (images, boxes, usable, ignored))  # type: ignore[return-value]
+
+
+class _State:
+    """What changes during a training: weights, their moving average, optimizer, number of steps."""
+
+    def __init__(
+        self, network: Network, average: Network, optimizer: torch.optim.Optimizer, training: NetworkTraining
+    ) -> None:
+        self.network, self.average, self.optimizer, self.training = network, average, optimizer, training
+        self.step = 0
+
+    @classmethod
+    def start(cls, network: Network, training: NetworkTraining) -> _State:
+        average = copy.deepcopy(network).eval()
+        network = network.to(memory_format=_FORMAT).train()
+        kernels = [each for each in network.parameters() if each.ndim > 1]
+        others = [each for each in network.parameters() if each.ndim <= 1]
+        groups = [
+            {"params": kernels, "weight_decay": _WEIGHT_DECAY},
+            {"params": others, "weight_decay": 0.0},
+        ]
+        return cls(network, average, torch.optim.AdamW(groups, lr=training.rate, fused=True), training)
+
+    def update(self, images: Tensor, targets: Targets, centers: Tensor) -> tuple[Tensor, Tensor]:
+        """Take one step; return its losses."""
+        progress = self.step / self.training.steps
+        cosine = _LAST_RATE + (1 - _LAST_RATE) * (1 + math.cos(math.pi * progress)) / 2
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.training.rate * min(1.0, (self.step + 1) / _WARM_UP) * cosine
+        with torch.autocast(images.device.type, torch.bfloat16, enabled=_multiplies_bfloat16(images.device)):
+            logits, boxes = self.network(images)
+        losses = detection_loss(logits, boxes, centers, targets)
+        self.optimizer.zero_grad()
+        sum(losses).backward()  # type: ignore[union-attr]
+        nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT)
+        self.optimizer.step()
+        self.step += 1
+        decay = min(_DECAY, (1 + self.step) / (20 + self.step))
+        means, values = (list(each.state_dict().values()) for each in (self.average, self.network))
+        floats = [row for row, mean in enumerate(means) if mean.dtype.is_floating_point]
+        torch._foreach_lerp_([means[i] for i in floats], [values[i] for i in floats], 1 - decay)
+        return losses
+
+    def save(self, path: Path) -> None:
+        """Write the state as a safetensors file."""
+        from safetensors.torch import save
+
+        tensors = {f"network.{name}": value for name, value in self.network.state_dict().items()}
+        tensors |= {f"average.{name}": value for name, value in self.average.state_dict().items()}
+        for number, values in self.optimizer.state_dict()["state"].items():
+            tensors |= {f"optimizer.{number}.{name}": value for name, value in values.items()}
+        plain = {name: value.contiguous() for name, value in tensors.items()}
+        with atomic_write(path, "checkpoint") as part:
+            part.write_bytes(save(plain, {"step": str(self.step), "training": repr(self.training)}))
+
+    def load(self, path: Path) -> None:
+        """Continue from a file of `save`."""
+        from safetensors import SafetensorError, safe_open
+
+        try:
+            with safe_open(path, "pt") as file:
+                facts = file.metadata() or {}
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        except SafetensorError as error:
+            raise InvalidInputError(
+                f"checkpoint {path} is not a complete file of a training ({error}); remove it"
+            ) from error
+        if facts.get("training") != repr(self.training):
+            raise InvalidInputError(
+                f"checkpoint {path} belongs to another training, {facts.get('training')}; remove it, or use "
+                "the same arguments"
+            )
+        for prefix, module in ("network.", self.network), ("average.", self.average):
+            module.load_state_dict(
+                {
+                    name.removeprefix(prefix): value
+                    for name, value in tensors.items()
+                    if name.startswith(prefix)
+                }
+            )
+        state: dict[int, dict[str, Tensor]] = {}
+        for name, value in tensors.items():
+            if name.startswith("optimizer."):
+                _, number, key = name.split(".")
+                state.setdefault(int(number), {})[key] = value
+        self.optimizer.load_state_dict(self.optimizer.state_dict() | {"state": state})
+        self.step = int(facts["step"])
+
+
+def _multiplies_bfloat16(device: torch.device) -> bool:
+    """Whether the device is faster with bfloat16 than with float32."""
+    return device.type == "cuda" or bool(torch.cpu._is_amx_tile_supported())
+
+
+def save_weights(network: Network, path: Path) -> None:
+    """Write the weights of a network as a safetensors file, to continue from."""
+    from safetensors.torch import save
+
+    tensors = {name: value.contiguous() for name, value in network.state_dict().items()}
+    with atomic_write(path, "path") as part:
+        part.write_bytes(save(tensors))
+
+
+def load_weights(path: Path) -> Network:
+    """Read a network from a file of `save_weights`."""
+    from safetensors.torch import load_file
+
+    network = Network()
+    network.load_state_dict(load_file(path))
+    return network.eval()
