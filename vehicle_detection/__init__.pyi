@@ -76,15 +76,14 @@ from .features import (
 )
 from .heatmap import HeatHistory, add_heat, apply_threshold, bounding_boxes, label_boxes
 from .images import read_image, write_image
-from .mixture import TemplateMixture, load_model
-from .mixture_training import FrameDataset, cross_validate_mixture, train_mixture
+from .loading import load_model
+from .network import NetworkModel
 from .params import (
     DrawParams,
     FeatureParams,
     FunctionParams,
     HeatParams,
-    MixtureParams,
-    PyramidParams,
+    NetworkParams,
     RegionParams,
     SearchBand,
     SearchParams,
@@ -96,7 +95,7 @@ from .search import SearchResult, find_cars
 from .stream import TrackedFrame, track
 from .synthetic import render_drive, render_patches, render_scene
 from .tracking import FrameResult, Track, Tracker
-from .training import TrainingReport, train_and_evaluate
+from .training import FrameDataset, TrainingReport, train_and_evaluate
 from .tuning import (
     TrialOptions,
     compare_classifiers,
@@ -147,21 +146,20 @@ __all__ = [
     "HorizonEstimate",
     "InvalidInputError",
     "LabelledFrames",
-    "MixtureParams",
     "ModelFileError",
+    "NetworkModel",
+    "NetworkParams",
     "OutputError",
     "OwnSpeed",
     "PatchFeatures",
     "PatchSet",
     "Platt",
-    "PyramidParams",
     "RegionParams",
     "ReportWriter",
     "SearchBand",
     "SearchParams",
     "SearchResult",
     "Split",
-    "TemplateMixture",
     "Track",
     "TrackLog",
     "TrackParams",
@@ -196,7 +194,6 @@ __all__ = [
     "convert_color",
     "count_vehicles",
     "course",
-    "cross_validate_mixture",
     "cut_clips",
     "detector_from",
     "draw_boxes",
@@ -255,7 +252,6 @@ __all__ = [
     "track",
     "train_and_evaluate",
     "train_classifier",
-    "train_mixture",
     "write_boxes",
     "write_camera",
     "write_events",

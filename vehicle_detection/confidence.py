@@ -9,10 +9,10 @@ from vehicle_detection.boxes import logit
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.function_model import FunctionModel
-from vehicle_detection.mixture import TemplateMixture
+from vehicle_detection.network import NetworkModel
 from vehicle_detection.params import HeatParams, RegionParams
 
-Model = VehicleClassifier | TemplateMixture | FunctionModel
+Model = VehicleClassifier | NetworkModel | FunctionModel
 
 # Probabilities beyond these have no useful threshold.
 _MIN_CONF, _MAX_CONF = 0.001, 0.999
@@ -41,7 +41,7 @@ def with_confidence(
         # Weak groups of windows have less evidence in proportion.
         evidence = params.min_evidence * min(peak / max(params.min_peak, 1e-9), 1.0)
         return model, dataclasses.replace(params, min_peak=peak, min_evidence=evidence)
-    if isinstance(model, TemplateMixture):
+    if isinstance(model, NetworkModel):
         return dataclasses.replace(model, threshold=logit(limit)), regions
     if isinstance(model.score, tuple):
         raise InvalidInputError(

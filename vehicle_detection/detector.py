@@ -51,12 +51,13 @@ from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.function_model import DetectorFunction, FunctionModel
 from vehicle_detection.heatmap import HeatHistory, frame_heat, label_heat
 from vehicle_detection.images import is_cut, make_thumbnail, read_image
-from vehicle_detection.mixture import TemplateMixture, load_model
+from vehicle_detection.loading import load_model
+from vehicle_detection.network import Device, NetworkModel
 from vehicle_detection.params import (
     DrawParams,
     FunctionParams,
     HeatParams,
-    PyramidParams,
+    NetworkParams,
     RegionParams,
     SearchParams,
     TrackParams,
@@ -87,8 +88,12 @@ class VehicleDetector(Closing):
     Parameters
     ----------
     model
-        A name (``"default"`` for any road, ``"highway"``), the path of a model file, or a model. For a
-        detector of your own see `detector_from`.
+        A name (``"default"`` for any road, ``"highway"``), the path of a model file, such as
+        ``"own.safetensors"`` or the ``"yolo11n.onnx"`` of another library (see `load_model`), or a model. For
+        a detector of your own see `detector_from`.
+    classes
+        Names or numbers of the classes of a network that are vehicles. Default: car, truck, bus, van and
+        vehicle.
     conf
         Minimum confidence of a vehicle in a single image: its calibrated probability, 0 to 1, of which values
         outside 0.001 to 0.999 are limited to these. The search and
@@ -97,7 +102,7 @@ class VehicleDetector(Closing):
         ``"shared"``: the fast search, features shared by all windows. ``"windows"``: the reference, one patch
         per window; for classifiers of patches.
     search_params
-        Where windows are searched: `PyramidParams` for a mixture, `SearchParams` for a classifier of patches,
+        Where to search: `NetworkParams` for a network, `SearchParams` for a classifier of patches,
         `FunctionParams` for a function.
     region_params
         How windows become boxes, unless the model predicts boxes: `RegionParams` for one box per group of
@@ -121,6 +126,8 @@ class VehicleDetector(Closing):
         of `camera`.
     n_jobs
         Threads of the search of one frame.
+    device
+        Where a network runs: ``"cpu"``, or ``"cuda"`` with the package onnxruntime-gpu.
     every
         Search every n-th frame of a video, to save time. The tracks of the frames between are interpolated
         by `process_video`, which holds these frames in memory, and predicted by `process`. None:
@@ -168,9 +175,10 @@ class VehicleDetector(Closing):
         self,
         model: Path | Model = "default",
         *,
+        classes: Collection[str | int] | None = None,
         conf: float | None = None,
         method: Literal["shared", "windows"] = "shared",
-        search_params: SearchParams | PyramidParams | FunctionParams | None = None,
+        search_params: SearchParams | NetworkParams | FunctionParams | None = None,
         region_params: RegionParams | HeatParams | None = None,
         track_params: TrackParams | None = None,
         draw_params: DrawParams | None = None,
@@ -179,12 +187,13 @@ class VehicleDetector(Closing):
         camera_height_m: float | None = None,
         horizon: float | None = None,
         n_jobs: int | None = None,
+        device: Device = "cpu",
         every: int | None = None,
         own_speed: OwnSpeed | None = None,
         diagnostics: bool = False,
         blur: Literal["vehicles", "plates"] | None = None,
     ) -> None:
-        self.model = _load(model)
+        self.model = _load(model, classes, device)
         for name, value, kind in (
             ("search_params", search_params, self.model.search_params_type),
             ("region_params", region_params, (RegionParams, HeatParams)),
@@ -199,7 +208,7 @@ class VehicleDetector(Closing):
         if conf is not None:
             self.model, region_params = with_confidence(self.model, region_params, conf)
         chosen = search_params or self.model.search_params_type.default()
-        self.search_params: SearchParams | PyramidParams | FunctionParams = chosen.with_horizon(horizon)
+        self.search_params: SearchParams | NetworkParams | FunctionParams = chosen.with_horizon(horizon)
         if isinstance(region_params, HeatParams):
             region_params = region_params.for_search(self.search_params)
         self.region_params = region_params or RegionParams()
@@ -332,7 +341,7 @@ class VehicleDetector(Closing):
         assert self._calibration is not None
         return Detections(vehicles.boxes, vehicles.scores, self._calibration.probability(vehicles.scores))
 
-    def search_params_of(self, shape: tuple[int, ...]) -> SearchParams | PyramidParams | FunctionParams:
+    def search_params_of(self, shape: tuple[int, ...]) -> SearchParams | NetworkParams | FunctionParams:
         """Return the parameters of the search for frames of ``(height, width, ...)``.
 
         They are `search_params`, with the horizon that a camera file states, unless `horizon` or
@@ -340,8 +349,8 @@ class VehicleDetector(Closing):
 
         Returns
         -------
-        SearchParams, PyramidParams or FunctionParams
-            The kind depends on the model: a classifier, a mixture or a function.
+        SearchParams, NetworkParams or FunctionParams
+            The kind depends on the model: a classifier, a network or a function.
 
         Raises
         ------
@@ -911,9 +920,14 @@ def _positive(vehicles: Detections) -> Detections:
     return vehicles[vehicles.scores >= 0]
 
 
-def _load(model: object) -> Model:
+def _load(model: object, classes: Collection[str | int] | None, device: Device) -> Model:
     if isinstance(model, (str, os.PathLike)):
-        return load_model(model)
+        return load_model(model, classes=classes, device=device)
+    for name, value, default in ("classes", classes, None), ("device", device, "cpu"):
+        if value != default:
+            raise InvalidInputError(
+                f"{name} must be omitted with a model, got {describe(value)}; pass it to load_model"
+            )
     if callable(model) and not isinstance(model, type):
         raise InvalidInputError(
             f"model must not be a function, got {describe(model)}; pass it to detector_from"
@@ -925,6 +939,6 @@ def _load(model: object) -> Model:
             f"VehicleClassifier.from_pipeline({argument}, params), or use HeatmapDetector"
         )
     if not isinstance(model, FunctionModel):
-        kinds = VehicleClassifier, TemplateMixture
+        kinds = VehicleClassifier, NetworkModel
         check_type(model, "model", kinds, "pass a name, the path of a model file, or what load_model returns")
     return model  # type: ignore[return-value]

@@ -54,8 +54,8 @@ from vehicle_detection.params import (
     PATCH_SIZE,
     FeatureParams,
     FunctionParams,
+    NetworkParams,
     PixelBand,
-    PyramidParams,
     SearchParams,
 )
 from vehicle_detection.windows import band_windows, search_windows
@@ -96,7 +96,7 @@ class FrameSearch(Closing, ABC):
     Searches are thread-safe context managers.
     """
 
-    params_type: ClassVar[type[SearchParams] | type[PyramidParams] | type[FunctionParams]]
+    params_type: ClassVar[type[SearchParams] | type[NetworkParams] | type[FunctionParams]]
 
     def __init__(self, n_jobs: int | None) -> None:
         self._team = ThreadTeam(n_jobs, name="search")
@@ -112,7 +112,7 @@ class FrameSearch(Closing, ABC):
         frame
             ``(H, W, 3)`` uint8 RGB.
         params
-            `SearchParams`, `PyramidParams` or `FunctionParams`, depending on the model; the default suits any
+            `SearchParams`, `NetworkParams` or `FunctionParams`, depending on the model; the default suits any
             dash-cam.
         min_vehicle_score
             Minimum score of a vehicle. It has no effect if vehicles are derived from the windows.

@@ -22,7 +22,7 @@ FORMAT = "vehicle-detection-model"
 FORMAT_VERSION = "3"
 
 SHIPPED = ("default", "highway")
-"""Names of the models that the package ships."""
+"""Names of the models that the package ships: a network, and a classifier of patches."""
 
 _MAX_WEIGHT = 1e12
 
@@ -93,6 +93,10 @@ def read_model(path: str | os.PathLike[str], kind: str | None = None) -> ModelDa
     if not isinstance(path, (str, os.PathLike)):
         raise InvalidInputError(
             f"path must be a model file or one of {', '.join(map(repr, SHIPPED))}; got {describe(path)}"
+        )
+    if str(path) == "default":
+        raise ModelFileError(
+            "the shipped model 'default' is a network, no classifier of patches; load it with load_model"
         )
     if str(path) in SHIPPED:
         resource = resources.files("vehicle_detection") / "models" / f"{path}.safetensors"

@@ -187,7 +187,8 @@ def fingerprint_of(settings: Mapping[str, Any]) -> str:
 
 def shipped_model(model: str) -> Traversable:
     """File of a shipped model, if `model` is its name."""
-    return resources.files("vehicle_detection") / "models" / f"{model}.safetensors"
+    suffix = ".onnx" if model == "default" else ".safetensors"
+    return resources.files("vehicle_detection") / "models" / f"{model}{suffix}"
 
 
 def _shown(uri: str) -> str:

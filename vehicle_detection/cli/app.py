@@ -27,11 +27,14 @@ from vehicle_detection.cli.options import (
     DRAWING,
     OUTPUT,
     Blur,
+    Classes,
     Confidence,
+    Device,
     Horizon,
     LineWidth,
     Model,
     flag,
+    open_model,
     option,
     parse_blur,
 )
@@ -242,6 +245,8 @@ def detect(
         ),
     ] = None,
     model: Model = "default",
+    classes: Classes = None,
+    device: Device = "cpu",
     conf: Confidence = None,
     horizon: Horizon = None,
     labels: Annotated[
@@ -271,8 +276,9 @@ def detect(
             "--output must name a folder for --blur, which blurs annotated images; add it"
         )
     undecodable: list[Path] = []
+    loaded = open_model(model, classes, device)
     with (
-        VehicleDetector(model, conf=conf, horizon=horizon, blur=region) as detector,
+        VehicleDetector(loaded, conf=conf, horizon=horizon, blur=region) as detector,
         output_folder(output, "--output"),
         output_folder(why, "--why"),
     ):

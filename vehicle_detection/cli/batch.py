@@ -16,7 +16,9 @@ from vehicle_detection.cli.options import (
     Blur,
     CameraHeight,
     CameraName,
+    Classes,
     Confidence,
+    Device,
     Every,
     FieldOfView,
     Horizon,
@@ -25,6 +27,7 @@ from vehicle_detection.cli.options import (
     Preset,
     flag,
     option,
+    parse_classes,
 )
 from vehicle_detection.cli.output import (
     UNKNOWN_LENS,
@@ -61,6 +64,8 @@ def batch(
         ),
     ] = None,
     model: Model = "default",
+    classes: Classes = None,
+    device: Device = "cpu",
     conf: Confidence = None,
     jobs: Annotated[
         int | None, option("N", "Worker processes of one thread, such as 4; default: one per core.")
@@ -111,6 +116,8 @@ def batch(
     from vehicle_detection.batch import open_dask, run_batch
 
     options: dict[str, Any] = {
+        "classes": parse_classes(classes),
+        "device": None if device == "cpu" else device,
         "conf": conf,
         "horizon": horizon,
         "camera": camera,

@@ -32,9 +32,20 @@ Model = Annotated[
     str,
     option(
         "NAME|FILE",
-        '"default" (any road), "highway" (the course\'s), or a model file, such as own.safetensors.',
+        '"default" (any road), "highway" (the course\'s), or a model file, such as yolo11n.onnx.',
         panel=SEARCH,
     ),
+]
+Classes = Annotated[
+    str | None,
+    option(
+        "LIST",
+        "Classes of another library's network that are vehicles, such as car,bus,truck or 2,5,7.",
+        panel=SEARCH,
+    ),
+]
+Device = Annotated[
+    str, option("cpu|cuda", "Where a network runs; cuda needs the package onnxruntime-gpu.", panel=SEARCH)
 ]
 Confidence = Annotated[
     float | None,
@@ -121,6 +132,21 @@ def parse_time(text: str | None, name: str) -> float | None:
         raise InvalidInputError(
             f"{name} must be a time in seconds or as [H:]M:S, such as 750 or 12:30; got {describe(text)}"
         ) from None
+
+
+def parse_classes(text: str | None) -> list[str | int] | None:
+    """Read names or numbers of classes."""
+    if text is None:
+        return None
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    return [int(name) if name.isdecimal() else name for name in names]
+
+
+def open_model(name: str, classes: str | None, device: Any) -> Any:
+    """Load the model that the options name."""
+    from vehicle_detection.loading import load_model
+
+    return load_model(name, classes=parse_classes(classes), device=device)
 
 
 def parse_blur(text: str | None) -> Any:

@@ -143,11 +143,11 @@ def fetch(
 
 def info(
     model: Annotated[
-        str, Argument(metavar="MODEL", help='"default", "highway" or a model file, such as own.safetensors.')
+        str, Argument(metavar="MODEL", help='"default", "highway" or a model file, such as own.onnx.')
     ] = "default",
 ) -> None:
     """Show a model's parameters, accuracy, training data and versions."""
-    from vehicle_detection.mixture import load_model
+    from vehicle_detection.loading import load_model
 
     loaded = load_model(model)
     title, facts = loaded.summary()

@@ -21,7 +21,9 @@ from vehicle_detection.cli.options import (
     Blur,
     CameraHeight,
     CameraName,
+    Classes,
     Confidence,
+    Device,
     Every,
     FieldOfView,
     LineWidth,
@@ -29,6 +31,7 @@ from vehicle_detection.cli.options import (
     NoAudio,
     Preset,
     flag,
+    open_model,
     option,
     parse_blur,
     parse_time,
@@ -170,6 +173,8 @@ def video(
         ),
     ] = None,
     model: Model = "default",
+    classes: Classes = None,
+    device: Device = "cpu",
     conf: Confidence = None,
     every: Every = None,
     jobs: Annotated[
@@ -220,7 +225,6 @@ def video(
     from vehicle_detection.detector import VehicleDetector
     from vehicle_detection.events import TrackLog
     from vehicle_detection.export import TrackWriter
-    from vehicle_detection.mixture import load_model
     from vehicle_detection.video import VideoRun, estimate_video_horizon, open_source, process_video
 
     outputs = {
@@ -250,7 +254,7 @@ def video(
     ):
         writers: list[Callable[[Any], object]] = []
         fraction = None if horizon in (None, "auto") else parse_horizon(str(horizon))
-        loaded = load_model(model)
+        loaded = open_model(model, classes, device)
         opened = stack.enter_context(
             open_source(source, fps=fps, live=live or None, reconnect=not no_reconnect)
         )

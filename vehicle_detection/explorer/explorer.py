@@ -43,8 +43,8 @@ from vehicle_detection.explanation import Explanation, explain
 from vehicle_detection.explorer.widgets import METHOD_CONTROLS, Panel, build_widgets
 from vehicle_detection.heatmap import frame_heat, label_heat
 from vehicle_detection.images import read_image
-from vehicle_detection.mixture import TemplateMixture
-from vehicle_detection.params import HeatParams, PyramidParams, RegionParams, SearchParams
+from vehicle_detection.network import NetworkModel
+from vehicle_detection.params import HeatParams, NetworkParams, RegionParams, SearchParams
 from vehicle_detection.regions import find_vehicles
 
 Image = NDArray[np.uint8]
@@ -131,9 +131,9 @@ class Explorer:
     def __init__(
         self,
         frames: Frames,
-        model: PathLike | VehicleClassifier | TemplateMixture = "default",
+        model: PathLike | VehicleClassifier | NetworkModel = "default",
         *,
-        search_params: SearchParams | PyramidParams | None = None,
+        search_params: SearchParams | NetworkParams | None = None,
         region_params: RegionParams | HeatParams | None = None,
         camera: Camera | PathLike | None = None,
         horizon: float | None = None,
@@ -206,7 +206,7 @@ class Explorer:
         Parameters
         ----------
         min_score
-            Minimum score of positive windows. The boxes that a mixture predicts do not depend on it.
+            Minimum score of positive windows. The boxes of a network do not depend on it.
         horizon
             Row of the horizon as a fraction of the frame's height, 0-1.
         bands
@@ -396,7 +396,7 @@ class Explorer:
         if bands:
             values["bands"] = self.bands
         values["method"] = self.method
-        if bands:  # a mixture has none, and predicts the boxes itself
+        if bands:  # a network has none, and predicts the boxes itself
             values |= {name: getattr(self.group_params, name) for name in METHOD_CONTROLS["groups"]}
         values |= {name: getattr(self.heat_params, name) for name in METHOD_CONTROLS["heat"]}
         options = {"frame": self.names, "view": VIEWS, "method": METHODS, "weighting": get_args(Weighting)}

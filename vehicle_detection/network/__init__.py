@@ -9,7 +9,7 @@ from vehicle_detection.network.model import (
     load_network,
 )
 from vehicle_detection.network.outputs import Candidates, OutputFormat
-from vehicle_detection.network.runtime import GraphFacts, Session, open_session, read_facts
+from vehicle_detection.network.runtime import Device, GraphFacts, Session, open_session, read_facts
 from vehicle_detection.network.search import NetworkSearch
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "METADATA_KEY",
     "VEHICLE_CLASSES",
     "Candidates",
+    "Device",
     "GraphFacts",
     "InputFormat",
     "NetworkModel",

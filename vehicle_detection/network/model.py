@@ -269,7 +269,8 @@ def _own_model(graph: bytes, facts: GraphFacts) -> NetworkModel:
         size = int(params["input_size"])
         NetworkParams(input_size=size)
         image, boxes = facts.inputs[0], facts.outputs[0]
-        if image.dtype != "uint8" or len(image.shape) != 4 or boxes.shape[1] != 5:
+        is_image = image.dtype == "uint8" and len(image.shape) == 4
+        if not is_image or len(boxes.shape) != 3 or boxes.shape[1] not in (5, None):
             raise ValueError(f"input {image.dtype} {image.shape}, output {boxes.shape}")
         return NetworkModel(
             graph=graph,

@@ -32,7 +32,7 @@ class NetworkSearch(FrameSearch):
     The network's session is opened by the first search.
     """
 
-    params_type = NetworkParams  # type: ignore[assignment]
+    params_type = NetworkParams
 
     def __init__(self, model: NetworkModel, *, n_jobs: int | None = None) -> None:
         super().__init__(n_jobs)
