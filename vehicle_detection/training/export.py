@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,9 @@ def export_network(
     import onnx
 
     with tempfile.TemporaryDirectory() as folder:
-        plain, prepared, small = (Path(folder) / name for name in ("plain.onnx", "prepared.onnx", "int8.onnx"))
+        plain, prepared, small = (
+            Path(folder) / name for name in ("plain.onnx", "prepared.onnx", "int8.onnx")
+        )
         _export(network, plain)
         if quantize:
             _quantize(plain, prepared, small, frames)
@@ -101,9 +104,14 @@ def _quantize(plain: Path, prepared: Path, target: Path, frames: Sequence[Traini
     )
     from onnxruntime.quantization.shape_inference import quant_pre_process
 
+    chosen = np.linspace(0, len(frames) - 1, min(len(frames), _CALIBRATION_FRAMES)).astype(int)
+
     class Images(CalibrationDataReader):  # type: ignore[misc]
-        def __init__(self) -> None:
-            self._inputs = _calibration_inputs(frames)
+        def __len__(self) -> int:
+            return len(chosen)
+
+        def set_range(self, start_index: int, end_index: int) -> None:
+            self._inputs = iter([_calibration_input(frames[row]) for row in chosen[start_index:end_index]])
 
         def get_next(self) -> dict[str, NDArray[np.float32]] | None:
             return next(self._inputs, None)
@@ -119,20 +127,24 @@ def _quantize(plain: Path, prepared: Path, target: Path, frames: Sequence[Traini
     # The normalization of bytes: see `_take_bytes`.
     image = next(node.output[0] for node in nodes if node.op_type == "Transpose")
     normalized = {"scale": np.array(1 / SCALE, np.float32), "zero_point": np.array(CENTER, np.uint8)}
-    quantize_static(
-        prepared,
-        target,
-        Images(),
-        quant_format=QuantFormat.QDQ,
-        per_channel=True,
-        reduce_range=True,
-        activation_type=QuantType.QUInt8,
-        weight_type=QuantType.QInt8,
-        op_types_to_quantize=["Conv", "Relu", "Add", "Resize", "Slice", "Transpose"],
-        calibrate_method=CalibrationMethod.Percentile,
-        extra_options={"TensorQuantOverrides": {image: [{"quant_type": QuantType.QUInt8} | normalized]}},
-        nodes_to_exclude=[*last, *after, *(name for name in others if "Transpose" not in name)],
-    )
+    with contextlib.redirect_stdout(None):  # of the calibration, a line for each frame
+        quantize_static(
+            prepared,
+            target,
+            Images(),
+            quant_format=QuantFormat.QDQ,
+            per_channel=True,
+            reduce_range=True,
+            activation_type=QuantType.QUInt8,
+            weight_type=QuantType.QInt8,
+            op_types_to_quantize=["Conv", "Relu", "Add", "Resize", "Slice", "Transpose"],
+            calibrate_method=CalibrationMethod.Percentile,
+            extra_options={
+                "TensorQuantOverrides": {image: [{"quant_type": QuantType.QUInt8} | normalized]},
+                "CalibStridedMinMax": 1,  # one frame's activations in memory at a time, with any method
+            },
+            nodes_to_exclude=[*last, *after, *(name for name in others if "Transpose" not in name)],
+        )
 
 
 def _names_after(nodes: Sequence[Any], first: Sequence[str]) -> list[str]:
@@ -146,11 +158,9 @@ def _names_after(nodes: Sequence[Any], first: Sequence[str]) -> list[str]:
     return names
 
 
-def _calibration_inputs(frames: Sequence[TrainingFrame]) -> Iterator[dict[str, NDArray[np.float32]]]:
-    chosen = np.linspace(0, len(frames) - 1, min(len(frames), _CALIBRATION_FRAMES)).astype(int)
-    for index in chosen:
-        image = cv2.resize(frames[index].image, _CALIBRATION_SIZE, interpolation=cv2.INTER_AREA)
-        yield {"image": ((image[None].astype(np.float32) - CENTER) / SCALE).astype(np.float32)}
+def _calibration_input(frame: TrainingFrame) -> dict[str, NDArray[np.float32]]:
+    image = cv2.resize(frame.image, _CALIBRATION_SIZE, interpolation=cv2.INTER_AREA)
+    return {"image": ((image[None].astype(np.float32) - CENTER) / SCALE).astype(np.float32)}
 
 
 def _take_bytes(model: Any) -> None:

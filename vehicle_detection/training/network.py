@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import logging
 import math
 import os
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,13 +26,12 @@ from vehicle_detection.training.samples import Sample, Sampler
 
 log = logging.getLogger(__name__)
 
-_WARM_UP = 300  # steps over which the rate rises
 _LAST_RATE = 0.02  # as a fraction of the highest
 _WEIGHT_DECAY = 0.05  # of kernels
 _MAX_GRADIENT = 5.0  # norm
 _DECAY = 0.9995  # of the moving average of the weights, at most
 _DETERMINISTIC, _FORMAT = True, torch.channels_last
-_CHECKPOINT_STEPS, _REPORT_STEPS = 250, 100
+_CHECKPOINT_SECONDS, _REPORT_SECONDS = 30.0, 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,9 +45,14 @@ class NetworkTraining:
     size
         Width and height of the samples in pixels, multiples of 32.
     rate
-        Highest learning rate of AdamW, reached after 300 steps; it falls as a cosine.
+        Highest learning rate of AdamW, reached after `warm_up` steps; it falls as a cosine.
     random_state
         Seed of the samples and of the first weights.
+    warm_up
+        Steps over which the rate rises.
+    frozen_statistics
+        Whether batch normalization keeps its means and variances: for batches of a few samples, and for
+        networks of `read_weights`.
     """
 
     steps: int
@@ -54,6 +60,8 @@ class NetworkTraining:
     size: tuple[int, int] = (640, 384)
     rate: float = 2.5e-3
     random_state: int = 0
+    warm_up: int = 300
+    frozen_statistics: bool = False
 
 
 def train_network(
@@ -120,17 +128,59 @@ def train_network(
         prefetch_factor=4 if workers else None,
         multiprocessing_context="fork" if workers and hasattr(os, "fork") else None,
     )
+    clock = _Clock(state.step, training.steps)
     # Forked processes cannot use the threads of OpenCV.
-    with single_threaded_opencv():
+    with single_threaded_opencv(), _torch_threads(jobs):
         for images, boxes, usable, ignored in batches:
             targets = Targets(*(each.to(place, non_blocking=True) for each in (boxes, usable, ignored)))
             losses = state.update(images.to(place, non_blocking=True), targets, centers)
-            if state.step % _REPORT_STEPS == 0 or state.step == training.steps:
+            if clock.report_is_due(state.step):
                 score, box = (each.item() for each in losses)
-                report(state.step, f"step {state.step} of {training.steps}: losses {score:.3f} + {box:.3f}")
-            if checkpoint is not None and state.step % _CHECKPOINT_STEPS == 0:
+                report(state.step, f"{clock.describe(state.step)}, losses {score:.3f} + {box:.3f}")
+            if checkpoint is not None and clock.checkpoint_is_due():
                 state.save(checkpoint)
     return state.average.cpu().eval()
+
+
+class _Clock:
+    """When to report and to write a checkpoint, and how long a training takes."""
+
+    def __init__(self, first: int, steps: int) -> None:
+        self._first, self._steps = first, steps
+        self._start = self._reported = self._saved = time.monotonic()
+
+    def report_is_due(self, step: int) -> bool:
+        now = time.monotonic()
+        if now - self._reported < _REPORT_SECONDS and step != self._steps:
+            return False
+        self._reported = now
+        return True
+
+    def checkpoint_is_due(self) -> bool:
+        now = time.monotonic()
+        if now - self._saved < _CHECKPOINT_SECONDS:
+            return False
+        self._saved = now
+        return True
+
+    def describe(self, step: int) -> str:
+        passed = time.monotonic() - self._start
+        left = passed / (step - self._first) * (self._steps - step)
+        return f"step {step} of {self._steps}: {_minutes(passed)} min, {_minutes(left)} min left"
+
+
+def _minutes(seconds: float) -> str:
+    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
+
+
+@contextlib.contextmanager
+def _torch_threads(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 class _Samples(Dataset[tuple[Tensor, ...]]):
@@ -178,6 +228,10 @@ class _State:
     def start(cls, network: Network, training: NetworkTraining) -> _State:
         average = copy.deepcopy(network).eval()
         network = network.to(memory_format=_FORMAT).train()
+        if training.frozen_statistics:
+            for module in network.modules():
+                if isinstance(module, nn.BatchNorm2d):
+                    module.eval()
         kernels = [each for each in network.parameters() if each.ndim > 1]
         others = [each for each in network.parameters() if each.ndim <= 1]
         groups = [
@@ -191,7 +245,7 @@ class _State:
         progress = self.step / self.training.steps
         cosine = _LAST_RATE + (1 - _LAST_RATE) * (1 + math.cos(math.pi * progress)) / 2
         for group in self.optimizer.param_groups:
-            group["lr"] = self.training.rate * min(1.0, (self.step + 1) / _WARM_UP) * cosine
+            group["lr"] = self.training.rate * min(1.0, (self.step + 1) / self.training.warm_up) * cosine
         with torch.autocast(images.device.type, torch.bfloat16, enabled=_multiplies_bfloat16(images.device)):
             logits, boxes = self.network(images)
         losses = detection_loss(logits, boxes, centers, targets)
