@@ -1,10 +1,14 @@
 """Why a detector finds a vehicle in a box: the share of each cell in its score.
 
-A linear score is a sum, so that its explanation is exact: the weighted features of each cell, and the bias.
+The score of a linear classifier is a sum, so that its explanation is exact: the weighted features of each
+cell, and the bias. That of a network is explained by occlusion (Zeiler and Fergus, ECCV 2014): cells of the
+frame are covered one by one, and the share of a cell is what the score loses without it.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -14,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import Floats, check_boxes, check_image, check_type, describe
-from vehicle_detection.boxes import box_areas, iou_matrix
+from vehicle_detection.boxes import box_areas, clip_boxes, iou_matrix
 from vehicle_detection.camera import truncated_edges
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.detector import VehicleDetector
@@ -22,17 +26,8 @@ from vehicle_detection.drawing import blur_boxes, draw_boxes, draw_cell_shares
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events import TrackLog
 from vehicle_detection.features import extract_features, part_slices, sum_blocks
-from vehicle_detection.mixture import (
-    MIRROR_ORDER,
-    RESCORE_MIN,
-    CellGrid,
-    EdgePyramid,
-    MixtureTemplate,
-    TemplateMixture,
-    prepare,
-    window_grid,
-)
-from vehicle_detection.params import PATCH_SIZE, FeatureParams
+from vehicle_detection.network import NetworkModel, NetworkSearch
+from vehicle_detection.params import PATCH_SIZE, FeatureParams, NetworkParams
 from vehicle_detection.video import Source, borrow_source
 
 # IoU from which a found vehicle or a window belongs to a box.
@@ -42,6 +37,13 @@ _MIN_IOU = 0.5
 _AROUND, _PICTURE_HEIGHT, _BOX_COLOR = 0.2, 180, (240, 228, 66)
 # Windows of a classifier of patches are larger than the boxes of vehicles.
 _MIN_WINDOW_IOU = 0.2
+# Occlusion: rows and columns of cells, context around the box as a fraction of its sides, pixels of the input
+# around that which are searched again, and the stride to which their place is aligned. Larger surroundings are
+# reduced to about this number of pixels, to save time.
+_OCCLUDED_CELLS, _CONTEXT, _SURROUNDINGS, _STRIDE = 6, 0.1, 64, 32
+_MAX_PIXELS = 90_000
+# Lower scores than any of a network.
+_ANY_SCORE = -1e6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -56,13 +58,11 @@ class Explanation:
     window
         ``(4,)`` rectangle of the window's cells in pixels, which may extend beyond the image.
     cells
-        ``(rows, columns)`` share of each cell in the linear score, positive where it speaks for a vehicle.
+        ``(rows, columns)`` share of each cell in the score, positive where it speaks for a vehicle.
     terms
-        Named amounts whose sum is `margin`: ``"cells"``, the sum of `cells`; ``"bias"``; for classifiers of
-        patches ``"color histogram"``, which has no position; for mixtures ``"votes and size"``,
-        ``"second stage"``, ``"candidates"`` and ``"perspective"``, if there are.
-    template
-        Number of the template with the best window, from 0.
+        Named amounts whose sum is `margin`: ``"cells"``, the sum of `cells`; for classifiers of patches
+        ``"bias"`` and ``"color histogram"``, which has no position; for networks ``"rest"``, what cells share
+        and what lies outside them.
     score
         Score of the found vehicle; for classifiers of patches that of the window. None if it is not found.
 
@@ -72,8 +72,8 @@ class Explanation:
     >>> from vehicle_detection.synthetic import SceneVehicle
     >>> scene = render_scene(shape=(360, 640), vehicles=[SceneVehicle(distance_m=15.0)], random_state=1)
     >>> found = explain(VehicleDetector(), scene.image, scene.boxes[0])
-    >>> found.found, list(found.terms)
-    (True, ['cells', 'bias', 'votes and size', 'second stage', 'candidates', 'perspective'])
+    >>> found.found, list(found.terms), found.cells.shape
+    (True, ['cells', 'rest'], (6, 6))
     """
 
     box: Floats
@@ -81,18 +81,17 @@ class Explanation:
     window: Floats
     cells: Floats
     terms: Mapping[str, float]
-    template: int
     score: float | None
 
     @property
     def margin(self) -> float:
-        """Sum of the terms: margin of a mixture, decision value of a classifier."""
+        """Sum of the terms: decision value of a classifier; log-odds of a network above its threshold."""
         return float(sum(self.terms.values()))
 
     def __str__(self) -> str:
         score = "not found" if self.score is None else f"score {self.score:.2f}"
         terms = " ".join(f"{value:+.2f} {name}" for name, value in self.terms.items())
-        return f"{score}, template {self.template + 1}: margin {self.margin:.2f} = {terms}"
+        return f"{score}: margin {self.margin:.2f} = {terms}"
 
     def __repr__(self) -> str:
         return f"Explanation({self})"
@@ -104,7 +103,7 @@ def explain(detector: VehicleDetector, image: NDArray[np.uint8], box: ArrayLike)
     Parameters
     ----------
     detector
-        A `VehicleDetector` with a mixture of templates or a classifier of patches.
+        A `VehicleDetector` with a network or a classifier of patches.
     image
         ``(H, W, 3)`` uint8 RGB.
     box
@@ -113,25 +112,29 @@ def explain(detector: VehicleDetector, image: NDArray[np.uint8], box: ArrayLike)
     Returns
     -------
     Explanation
-        The share of each cell in the linear score of the best window, and what else contributes.
+        The share of each cell in the score, and what else contributes.
 
     Raises
     ------
     InvalidInputError
-        If an argument is malformed, or the model is a function, whose scores have no parts.
+        If an argument is malformed, or the model is a function.
 
     Notes
     -----
-    The terms of a mixture are sums and differences of what its search computes; its search rounds features
-    to 7 bits and weights to 8, so that ``"cells"`` differs from it by about 0.004. The window of a classifier
-    of patches is cropped and scored like a patch; the shared search, which scales the frame once, gives
-    similar scores. Shares of a classifier are relative to the mean patch of its training set.
+    The window of a classifier of patches is cropped and scored like a patch; the shared search, which scales
+    the frame once, gives similar scores. Shares of a classifier are relative to the mean patch of its
+    training set.
+
+    For a network, each of 6x6 cells over the box and a tenth of its sides around is painted gray, and the
+    surroundings of the box are searched again. Cells that replace each other have small shares, and those
+    that are useless alone large ones, so that shares need not add up to the score. The margin of a box
+    without a vehicle is that of the network's best box there.
 
     Examples
     --------
     >>> road = np.full((360, 640, 3), 90, np.uint8)
     >>> explanation = explain(VehicleDetector(), road, [300, 200, 360, 250])
-    >>> explanation.found, abs(explanation.terms["cells"]) < 0.1
+    >>> explanation.found, explanation.margin < 0
     (False, True)
     """
     check_type(detector, "detector", VehicleDetector, "pass VehicleDetector()")
@@ -140,14 +143,18 @@ def explain(detector: VehicleDetector, image: NDArray[np.uint8], box: ArrayLike)
     if boxes.shape != (1, 4) or (boxes[:, 2:] - boxes[:, :2] < 1).any():
         raise InvalidInputError(f"box must be [x1, y1, x2, y2], 1 pixel or larger; got {describe(box)}")
     model = detector.model
-    if isinstance(model, TemplateMixture):
-        return _explain_mixture(detector, model, frame, boxes[0])
-    if isinstance(model, VehicleClassifier):
-        return _explain_classifier(detector, model, frame, boxes[0])
-    raise InvalidInputError(
-        "detector must have a linear model, got a function, whose scores have no parts; "
-        "use VehicleDetector() or a model file"
-    )
+    if not isinstance(model, (NetworkModel, VehicleClassifier)):
+        raise InvalidInputError(
+            "detector must have a network or a classifier of patches, got a function, which cannot be "
+            "explained; use VehicleDetector() or a model file"
+        )
+    height, width = frame.shape[:2]
+    inside = clip_boxes(boxes, frame.shape)
+    if (inside[:, 2:] - inside[:, :2] < 1).any():
+        raise InvalidInputError(f"box must lie in the image of {width}x{height} pixels; got {describe(box)}")
+    if isinstance(model, NetworkModel):
+        return _explain_network(detector, model, frame, boxes[0])
+    return _explain_classifier(detector, model, frame, boxes[0])
 
 
 # Largest number of tracks that are explained, each of which takes a search of a frame.
@@ -178,7 +185,7 @@ def explain_tracks(detector: VehicleDetector, source: Source, log: TrackLog) -> 
     Raises
     ------
     InvalidInputError
-        If an argument is malformed, or the model is a function, whose scores have no parts.
+        If an argument is malformed, or the model is a function.
     VideoError
         If the source cannot be read.
     """
@@ -233,79 +240,66 @@ def _best_overlap(box: Floats, boxes: Floats, min_iou: float) -> int | None:
     return best if len(boxes) and overlaps[best] >= min_iou else None
 
 
-def _explain_mixture(
-    detector: VehicleDetector, model: TemplateMixture, image: NDArray[np.uint8], box: Floats
+def _explain_network(
+    detector: VehicleDetector, model: NetworkModel, image: NDArray[np.uint8], box: Floats
 ) -> Explanation:
     params: Any = detector.search_params_of(image.shape)
     vehicles = detector.search(image).vehicles
     assert vehicles is not None
     row = _best_overlap(box, vehicles.boxes, _MIN_IOU)
-    with model.open_search() as search:
-        pyramid, windows = search.score_windows(prepare(image), params)
-        every = model.detect_vehicles(pyramid, windows, min_margin=-np.inf)
-        frame_terms = {"candidates": every.shift} if model.count_weight else {}
-        proposals, margins = model.propose_boxes(pyramid, windows, min_margin=RESCORE_MIN)
-        corrected, final, proposal_rows = model.rescore_boxes(pyramid, proposals, margins)
-        place = None if row is None else _best_overlap(vehicles.boxes[row], corrected, _MIN_IOU)
-        if row is not None and place is not None:
-            proposal = int(proposal_rows[place])
-            # The windows are sorted, so that the first one that overlaps is the best.
-            near = np.flatnonzero(iou_matrix(proposals[proposal][None], windows.boxes)[0] >= _MIN_IOU)
-            if len(near):
-                best = int(near[0])
-                number = int(windows.templates[best])
-                grid, weights = _place(model.templates[number], windows.boxes[best], image.shape[1])
-                cells = _cell_shares(pyramid, grid, weights)
-                terms = {"cells": float(cells.sum()), "bias": model.templates[number].bias}
-                terms["votes and size"] = float(margins[proposal]) - sum(terms.values())
-                if model.rescorer is not None:
-                    terms["second stage"] = float(final[place] - margins[proposal])
-                terms |= frame_terms
-                if model.perspective_weight:
-                    same = _best_overlap(vehicles.boxes[row], every.boxes, _MIN_IOU)
-                    terms["perspective"] = 0.0 if same is None else float(every.perspective[same])
-                score = float(vehicles.scores[row])
-                found = vehicles.boxes[row].astype(np.float64)
-                return Explanation(found, True, _window_of(grid), cells, terms, number, score)
-    # Not found: place each template on the box itself.
-    pyramid = EdgePyramid(prepare(image))
-    placed = []
-    for number, template in enumerate(model.templates):
-        if not template.border:
-            rows, columns = template.weights.shape[:2]
-            grid = window_grid(box.tolist(), template.box_cells, (columns, rows))
-            placed.append((number, grid, _cell_shares(pyramid, grid, template.weights)))
-    if not placed:
-        raise InvalidInputError("box must be a found vehicle for a model of border templates only")
-    number, grid, cells = max(placed, key=lambda each: each[2].sum() + model.templates[each[0]].bias)
-    terms = {"cells": float(cells.sum()), "bias": model.templates[number].bias}
-    if model.rescorer is not None:
-        margin = np.array([sum(terms.values())])
-        terms["second stage"] = float((model.rescorer.apply(pyramid, box[None], margin)[1] - margin)[0])
-    terms |= frame_terms
-    return Explanation(box, False, _window_of(grid), cells, terms, number, None)
+    score = None if row is None else float(vehicles.scores[row])
+    box = box if row is None else vehicles.boxes[row].astype(np.float64)
+    context = _CONTEXT * (box[2:] - box[:2])
+    window = np.concatenate([box[:2] - context, box[2:] + context])
+    # OpenVINO would compile the graph for each size.
+    with dataclasses.replace(model, runtime="onnxruntime").open_search() as search:
+        around = _Surroundings(search, image, window, params)
+        complete = around.score(box)
+        cells = np.empty((_OCCLUDED_CELLS, _OCCLUDED_CELLS))
+        xs, ys = (np.linspace(window[axis], window[axis + 2], _OCCLUDED_CELLS + 1) for axis in (0, 1))
+        for y, x in np.ndindex(*cells.shape):
+            covered = np.array([xs[x], ys[y], xs[x + 1], ys[y + 1]])
+            cells[y, x] = complete - around.score(box, covered)
+    terms = {"cells": float(cells.sum())}
+    terms["rest"] = (complete if score is None else score) - terms["cells"]
+    return Explanation(box, score is not None, window, cells, terms, score)
 
 
-def _place(template: MixtureTemplate, box: Floats, width: int) -> tuple[CellGrid, NDArray[np.float32]]:
-    """Cells of the window whose box this is, and the weights of these cells."""
-    rows, columns = template.weights.shape[:2]
-    steps = (box[2:] - box[:2]) / template.box_cells
-    left, top = box[:2] - np.array(template.padding) * steps
-    weights = template.weights
-    if template.border and box[0] <= 0 and box[2] < width:  # the mirror image, at the left border
-        left, weights = box[0], weights[:, ::-1, MIRROR_ORDER]
-    return CellGrid(float(left), float(top), float(steps[0]), float(steps[1]), rows, columns), weights
+class _Surroundings:
+    """The part of a frame around a window, at the network's scale, which is cheap to search."""
 
+    def __init__(
+        self, search: NetworkSearch, image: NDArray[np.uint8], window: Floats, params: NetworkParams
+    ) -> None:
+        self._search = search
+        input_format = search.model.input_format
+        scaled, _ = input_format.fit(image.shape, search.model.input_size_for(params))
+        self._factors = np.array([scaled[1] / image.shape[1], scaled[0] / image.shape[0]] * 2)
+        limits = np.array(scaled[::-1])
+        low, high = np.zeros(2), limits
+        if input_format.size is None and not input_format.stretch:
+            place = window * self._factors
+            low = np.clip((place[:2] - _SURROUNDINGS) // _STRIDE * _STRIDE, 0, limits - _STRIDE).clip(0)
+            high = np.clip(-(-(place[2:] + _SURROUNDINGS) // _STRIDE) * _STRIDE, low + 1, limits)
+            side = (high - low).max() * min(1.0, math.sqrt(_MAX_PIXELS / np.prod(high - low)))
+            params = dataclasses.replace(params, input_size=int(-(-side // _STRIDE) * _STRIDE))
+        self._params, self._corner = params, np.tile(low, 2)
+        resized = np.asarray(cv2.resize(image, scaled[::-1], interpolation=cv2.INTER_AREA), np.uint8)
+        (left, top), (right, bottom) = low.astype(int).tolist(), high.astype(int).tolist()
+        self._picture = resized[top:bottom, left:right]
 
-def _cell_shares(pyramid: EdgePyramid, grid: CellGrid, weights: NDArray[np.float32]) -> Floats:
-    """Weighted channels of each cell, ``(rows, columns)``."""
-    channels = pyramid.feature_map(grid).channels
-    return np.asarray((weights.astype(np.float64) * channels.transpose(1, 2, 0)).sum(axis=2))
+    def _place(self, box: Floats) -> Floats:
+        return box * self._factors - self._corner
 
-
-def _window_of(grid: CellGrid) -> Floats:
-    right, bottom = grid.left + grid.columns * grid.step_x, grid.top + grid.rows * grid.step_y
-    return np.array([grid.left, grid.top, right, bottom])
+    def score(self, box: Floats, covered: Floats | None = None) -> float:
+        """Return the score of the network's best box there, with a part of the frame painted gray."""
+        picture, model = self._picture.copy(), self._search.model
+        if covered is not None:
+            x1, y1, x2, y2 = np.rint(self._place(covered)).clip(0).astype(int).tolist()
+            picture[y1:y2, x1:x2] = model.input_format.padding
+        candidates = self._search.find_candidates(picture, self._params, _ANY_SCORE)
+        near = iou_matrix(self._place(box)[None], candidates.boxes)[0] >= _MIN_IOU
+        return float(model.scores(np.append(candidates.scores[near], 0.0)).max())
 
 
 def _explain_classifier(
@@ -318,8 +312,7 @@ def _explain_classifier(
     window = windows.boxes[near[np.argmax(windows.scores[near])]].astype(np.float64) if found else box
     height, width = image.shape[:2]
     x1, y1, x2, y2 = np.rint(np.clip(window, 0, [width, height, width, height])).astype(int).tolist()
-    if x2 - x1 < 1 or y2 - y1 < 1:
-        raise InvalidInputError(f"box must lie in the image of {width}x{height} pixels; got {box.tolist()}")
+    x2, y2 = max(x2, x1 + 1), max(y2, y1 + 1)
     patch = cv2.resize(image[y1:y2, x1:x2], (PATCH_SIZE, PATCH_SIZE))
     features = extract_features(patch[None], model.params)[0].astype(np.float64)
     shares = [each.coef * (features - each.mean) / each.scale for each in model.templates]
@@ -331,7 +324,7 @@ def _explain_classifier(
     if histogram is not None:
         terms["color histogram"] = float(shares[number][histogram].sum())
     place = np.array([x1, y1, x2, y2], np.float64)
-    return Explanation(box, found, place, cells, terms, number, scores[number] if found else None)
+    return Explanation(box, found, place, cells, terms, scores[number] if found else None)
 
 
 def patch_cell_shares(shares: Floats, params: FeatureParams) -> Floats:
