@@ -1,13 +1,9 @@
-import dataclasses
 import os
 from pathlib import Path
 
 import matplotlib
 import pytest
 from hypothesis import settings
-
-from tests.helpers import SMALL_MIXTURE, drawn
-from vehicle_detection.mixture_training import FrameDataset, train_mixture
 
 matplotlib.use("Agg")
 settings.register_profile("steady", derandomize=True, deadline=None, max_examples=50)
@@ -23,15 +19,3 @@ def real_data() -> Path:
     path = Path(folder)
     assert path.is_dir(), f"VEHICLE_DETECTION_DATA names {path}, which is no folder"
     return path
-
-
-@pytest.fixture(scope="session")
-def drawn_source():
-    return FrameDataset("drawn", (drawn(range(12)),))
-
-
-@pytest.fixture(scope="session")
-def small_mixture(drawn_source):
-    """A mixture with a rescorer, whose training takes most of the time."""
-    params = dataclasses.replace(SMALL_MIXTURE, blend_weight=0.1)
-    return train_mixture([drawn_source], params, n_jobs=1)

@@ -3,6 +3,7 @@
 import functools
 import signal
 import subprocess
+import tempfile
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,16 +11,12 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from tests.network.graphs import own_network
 from vehicle_detection.boxes import clip_boxes
 from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
 from vehicle_detection.images import write_image
-from vehicle_detection.mixture import (
-    N_CHANNELS,
-    MixtureTemplate,
-    TemplateMixture,
-)
-from vehicle_detection.params import MixtureParams, PyramidParams
+from vehicle_detection.network import load_network
 from vehicle_detection.synthetic import render_scene
 
 ROOT = Path(__file__).parents[1]
@@ -62,35 +59,16 @@ def random_classifier(params, seed=0, *, templates=1, bias=0.0):
     )
 
 
-def mixture_template(columns=9, rows=8, seed=0, bias=0.0, padding=(1.0, 1.0), *, border=False):
-    """A template of a mixture with random weights."""
-    weights = np.random.default_rng(seed).normal(0, 0.06, (rows, columns, N_CHANNELS))
-    return MixtureTemplate(weights, bias, padding, border)
+def write_network(path, seed=0):
+    """Write a network that was never trained; some of its boxes score above 0."""
+    Path(path).write_bytes(own_network(seed))
 
 
-def random_mixture(**options):
-    """A mixture that was never trained; some of all windows score above 0."""
-    shapes = ((9, 8), (12, 8), (8, 10))
-    templates = tuple(mixture_template(*shape, seed, -0.2) for seed, shape in enumerate(shapes))
-    return TemplateMixture(templates, **options)
-
-
-SMALL_MIXTURE = MixtureParams(
-    shapes=((6, 5),),
-    mirrored=(False,),
-    border_shapes=(),
-    size_prior_weight=0.0,
-    vote_weight=0.0,
-    count_weight=0.0,
-    perspective_weight=0.0,
-    blend_weight=0.0,
-    C=5e-3,
-    border_C=5e-3,
-    positive_weight=100.0,
-    mining_schedule=(0.5, 1.0, 1.0),
-    max_per_frame=20,
-    search=PyramidParams(min_width=28),
-)
+def random_network(seed=0):
+    """A network that was never trained."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_network(f"{folder}/random.onnx", seed)
+        return load_network(f"{folder}/random.onnx")
 
 
 @functools.cache

@@ -531,7 +531,7 @@ def test_invalid_tensors(tmp_path, tensors, message):
         ({"params": None}, r"has no readable parameters \('params'\)"),
         ({"metadata": None}, r"has no readable parameters \('metadata'\)"),
         ({"metadata": "nonsense"}, "has no readable parameters"),
-        ({"kind": "mixture"}, "contains a model of kind 'mixture', not 'patches'; load it with load_model"),
+        ({"kind": "other"}, "contains a model of kind 'other', not 'patches'; train one"),
         ({"kind": None}, "contains a model of kind None, not 'patches'"),
         ({"params": '{"spatial_size": 16}'}, "does not fit its own parameters: templates must have 6156"),
     ],

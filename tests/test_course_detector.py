@@ -152,7 +152,7 @@ def test_it_finds_all_vehicles_of_the_courses_images(real_data):
         ({"scales": (0,)}, "scales must be a number"),
         ({"cells_per_step": 0}, "cells_per_step must be an integer"),
         ({"n_frames": 0}, "frames must be an integer"),
-        ({"clf": "default"}, "search_params must be a PyramidParams"),
+        ({"clf": "default"}, "search_params must be a NetworkParams"),
     ],
 )
 def test_invalid_arguments_are_rejected(arguments, message):

@@ -21,12 +21,12 @@ from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drawing import draw_tracks
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, evaluate_detections, read_labels
-from vehicle_detection.mixture import load_model
+from vehicle_detection.loading import load_model
 from vehicle_detection.params import (
     DrawParams,
     FeatureParams,
     HeatParams,
-    PyramidParams,
+    NetworkParams,
     RegionParams,
     SearchBand,
     SearchParams,
@@ -661,9 +661,7 @@ def test_parameters_of_another_kind_are_refused(name, value):
 
 
 def test_what_is_no_model_is_refused():
-    with pytest.raises(
-        InvalidInputError, match="model must be a VehicleClassifier or TemplateMixture, got 5"
-    ):
+    with pytest.raises(InvalidInputError, match="model must be a VehicleClassifier or NetworkModel, got 5"):
         VehicleDetector(5)
     with pytest.raises(ModelFileError, match=r"model file model\.safetensors does not exist"):
         VehicleDetector("model.safetensors")
@@ -799,7 +797,7 @@ def test_an_unknown_lens_gives_a_large_error(wide_scenes):
 
 def test_the_search_takes_the_horizon_of_a_camera_file(tmp_path):
     shape = (720, 1280)
-    default = PyramidParams()
+    default = NetworkParams()
     camera = Camera.for_frame(shape, horizon=0.4)
     write_camera(camera, tmp_path / "camera.json", shape)
     (tmp_path / "lens.json").write_text('{"field_of_view": 90}')
@@ -876,7 +874,7 @@ def test_a_shallow_copy_shares_the_search_and_has_its_own_tracks():
 def test_short_descriptions():
     detector = VehicleDetector()
     result = detector.process(np.full((180, 320, 3), 90, np.uint8), 0.0)
-    assert repr(detector.model) == "TemplateMixture(6 templates, threshold at a probability of 0.27)"
+    assert repr(detector.model).startswith("NetworkModel(network, threshold at a probability of 0.")
     assert repr(detector) == f"VehicleDetector({detector.model!r}, 1 frame processed)"
     assert repr(result) == "FrameResult(0 at 0.00 s: 0 detections, 0 vehicles shown)"
     assert len(repr(load_model("highway"))) < 100

@@ -61,7 +61,7 @@ def test_the_wheel_holds_the_package_and_nothing_else(source, tracked, tmp_path)
     metadata = {f"{NAME}.dist-info/{name}" for name in ("METADATA", "WHEEL", "RECORD", "entry_points.txt")}
     package = {name for name in tracked if name.startswith("vehicle_detection/")}
     assert names == package | metadata | {f"{NAME}.dist-info/licenses/LICENSE"}
-    assert {"vehicle_detection/py.typed", "vehicle_detection/models/default.safetensors"} <= names
+    assert {"vehicle_detection/py.typed", "vehicle_detection/models/default.onnx"} <= names
 
 
 def test_the_source_distribution_holds_the_sources_and_nothing_else(source, tracked, tmp_path):

@@ -1,17 +1,16 @@
 """Explanations of scores: shares of cells and other terms."""
 
-import dataclasses
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
-from tests.helpers import mixture_template, random_classifier
+from tests.helpers import random_classifier
+from tests.network.graphs import constant_network, spot_network
 from vehicle_detection import (
-    Explanation,
     FeatureParams,
-    TemplateMixture,
+    NetworkParams,
     VehicleDetector,
     explain,
     render_scene,
@@ -22,7 +21,6 @@ from vehicle_detection.events import TrackLog
 from vehicle_detection.explanation import explain_tracks, patch_cell_shares
 from vehicle_detection.features import part_slices
 from vehicle_detection.function_model import FunctionModel
-from vehicle_detection.mixture import MixtureSearch, denoise, prepare
 from vehicle_detection.synthetic import SceneVehicle
 
 CARS = [SceneVehicle(distance_m=14.0, kind="sedan"), SceneVehicle(distance_m=9.0, lateral_m=4.2, kind="suv")]
@@ -42,51 +40,12 @@ def test_each_found_vehicle_is_explained(detector):
         explanation = explain(detector, SCENE.image, box)
         assert explanation.found
         assert (explanation.box == box).all()
-        assert explanation.score == pytest.approx(score)
+        assert explanation.margin == pytest.approx(score) == explanation.score
+        assert list(explanation.terms) == ["cells", "rest"]
         assert explanation.terms["cells"] == pytest.approx(explanation.cells.sum())
-        rows, columns = detector.model.templates[explanation.template].weights.shape[:2]
-        assert explanation.cells.shape == (rows, columns)
-        assert f"score {score:.2f}" in str(explanation)
-        # The terms are those of the search: their sum gives the score.
-        assert detector.model.scores(explanation.margin) == pytest.approx(score, abs=1e-5)
-
-
-def test_a_hazy_frame_is_explained_as_it_is_searched(detector):
-    hazy = cv2.addWeighted(SCENE.image, 0.15, np.full_like(SCENE.image, 190), 0.85, 0)
-    assert (prepare(hazy) != denoise(hazy)).any()
-    found = detector.detect(hazy)
-    assert len(found)
-    for box, score in zip(found.boxes, found.scores):
-        explanation = explain(detector, hazy, box)
-        assert detector.model.scores(explanation.margin) == pytest.approx(score, abs=1e-5)
-
-
-def test_cells_and_bias_are_the_margin_of_a_window_of_the_search(detector):
-    model, image = detector.model, SCENE.image
-    explanation = explain(detector, image, detector.detect(image).boxes[0])
-    _, windows = MixtureSearch(model).score_windows(denoise(image), detector.search_params)
-    margins = windows.margins[windows.templates == explanation.template]
-    linear = explanation.terms["cells"] + explanation.terms["bias"]
-    assert np.abs(margins - linear).min() < 0.01
-
-
-def test_a_window_at_either_border_is_explained():
-    # A template that responds to any cells, at the borders only.
-    weights = np.random.default_rng(0).normal(0, 0.3, (8, 6, 20)).astype(np.float32)
-    template = dataclasses.replace(mixture_template(6, 8, bias=0.0, border=True), weights=weights)
-    with VehicleDetector(TemplateMixture((template,), slope=1.0)) as detector:
-        found = detector.detect(SCENE.image)
-        sides = set()
-        for box in found.boxes:
-            explanation = explain(detector, SCENE.image, box)
-            _, windows = MixtureSearch(detector.model).score_windows(
-                denoise(SCENE.image), detector.search_params
-            )
-            linear = explanation.terms["cells"] + explanation.terms["bias"]
-            # The search rounds these weights, which are five times as large as usual.
-            assert np.abs(windows.margins - linear).min() < 0.05
-            sides.add("left" if box[0] < 1 else "right" if box[2] > 639 else "inside")
-    assert sides == {"left", "right"}
+        assert explanation.cells.shape == (6, 6)
+        assert explanation.cells.max() > 0
+        assert f"score {score:.2f}: margin {score:.2f}" in str(explanation)
 
 
 def test_a_box_without_a_vehicle_is_explained_too(detector):
@@ -95,7 +54,41 @@ def test_a_box_without_a_vehicle_is_explained_too(detector):
     assert explanation.score is None
     assert explanation.margin < 0
     assert explanation.box.tolist() == [60, 230, 130, 290]
-    assert str(explanation).startswith("not found, template ")
+    assert str(explanation).startswith("not found: margin -")
+
+
+@pytest.fixture(scope="module")
+def spots(tmp_path_factory):
+    """A detector of spots that are brighter than the gray of the network's padding."""
+    path = tmp_path_factory.mktemp("spots") / "spots.onnx"
+    path.write_bytes(spot_network())
+    with VehicleDetector(path, search_params=NetworkParams(input_size=640)) as found:
+        yield found
+
+
+@pytest.mark.parametrize("shape", [(352, 640), (704, 1280), (700, 400)])
+def test_the_cells_of_a_network_lie_where_it_looks(spots, shape):
+    # The network looks at 32x32 pixels of its input, and says that they are the middle of a box of 64x64.
+    scale = max(shape) / 640
+    image = np.full((*shape, 3), 115, np.uint8)
+    x, y, side = (round(each * scale) for each in (160, 192, 32))
+    image[y : y + side, x : x + side] = 255
+    (box,) = spots.detect(image).boxes
+    np.testing.assert_allclose(box, np.array([144, 176, 208, 240]) * scale, atol=3 * scale)
+    explanation = explain(spots, image, box)
+    middle = explanation.cells[1:5, 1:5].sum()
+    assert middle > 3
+    assert np.abs(explanation.cells).sum() == pytest.approx(middle, abs=0.01)
+
+
+def test_a_network_of_a_fixed_size_is_explained(tmp_path):
+    boxes = np.zeros((1, 5, 189), np.float32)
+    boxes[0, :, 7] = [48, 48, 24, 24, 0.9]
+    (tmp_path / "fixed.onnx").write_bytes(constant_network({"output0": boxes}))
+    with VehicleDetector(tmp_path / "fixed.onnx") as detector:
+        explanation = explain(detector, SCENE.image, detector.detect(SCENE.image).boxes[0])
+    assert explanation.found
+    assert not explanation.cells.any()  # its boxes do not depend on the image
 
 
 @pytest.mark.parametrize(
@@ -144,8 +137,9 @@ def test_the_best_template_of_a_classifier_is_explained():
     classifier = random_classifier(FeatureParams(), templates=3)
     with VehicleDetector(classifier) as detector:
         explanation = explain(detector, SCENE.image, [200, 100, 264, 164])
-    assert explanation.template in range(3)
-    assert isinstance(explanation, Explanation)
+    x1, y1, x2, y2 = np.rint(explanation.window).astype(int)
+    patch = cv2.resize(SCENE.image[y1:y2, x1:x2], (64, 64))
+    assert explanation.margin == pytest.approx(classifier.decision_function(patch[None])[0])
 
 
 @pytest.mark.parametrize(
@@ -181,10 +175,7 @@ def test_bad_arguments_are_refused(detector):
     with pytest.raises(InvalidInputError, match="image must be"):
         explain(detector, SCENE.image[..., 0], [0, 0, 9, 9])
     function = FunctionModel(function=lambda image: ([], []), score="probability")
-    with pytest.raises(InvalidInputError, match="detector must have a linear model, got a function"):
+    with pytest.raises(InvalidInputError, match="detector must have a network or a classifier of"):
         explain(VehicleDetector(function), SCENE.image, [0, 0, 9, 9])
-    with (
-        VehicleDetector("highway") as highway,
-        pytest.raises(InvalidInputError, match="box must lie in the image of 640x360 pixels"),
-    ):
-        explain(highway, SCENE.image, [700, 0, 760, 60])
+    with pytest.raises(InvalidInputError, match="box must lie in the image of 640x360 pixels"):
+        explain(detector, SCENE.image, [700, 0, 760, 60])

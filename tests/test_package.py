@@ -25,8 +25,8 @@ LAYERS = [
     "params camera synthetic export images boxes units _kernels",
     "datasets regions tracking heatmap features video",
     "evaluation drawing classifier sklearn_models",
-    "windows search mixture network training function_model events",
-    "confidence course detector mixture_training report",
+    "windows search network training function_model events",
+    "loading confidence course detector report",
     "tuning explorer explanation stream batch",
     "plotting",
     "cli",
@@ -59,10 +59,8 @@ WITHOUT_EXAMPLE = {
     "TrackScores": "a result of evaluate_tracks",
     "TrainingReport": "a result of train_and_evaluate",
     "VehicleCounts": "a result of count_vehicles",
-    "cross_validate_mixture": "trains several models",
     "hog_image": "a picture",
     "search_windows": "its scores are the shipped model's",
-    "train_mixture": "needs labelled frames and takes time",
     "write_image": "writes a file",
 }
 

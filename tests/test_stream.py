@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from tests.helpers import random_mixture
+from tests.helpers import random_network
 from tests.video.clips import child_processes, ffmpeg, running_threads
 from vehicle_detection import FrameResult, TrackWriter, VehicleDetector, plotting, process_video, track
 from vehicle_detection.cli.demo import draw_clip
@@ -26,7 +26,7 @@ def clip(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def detector():
-    with VehicleDetector(random_mixture(), n_jobs=1, every=2) as detector:
+    with VehicleDetector(random_network(), n_jobs=1, every=2) as detector:
         yield detector
 
 
@@ -102,7 +102,7 @@ def test_closing_it_early_leaves_no_process(clip, detector, end):
 
 
 def test_options_and_ranges(clip):
-    times = [result.time for result in track(clip, random_mixture(), start=0.1, end=0.3, every=1)]
+    times = [result.time for result in track(clip, random_network(), start=0.1, end=0.3, every=1)]
     with read_frames(clip, start=0.1, end=0.3) as frames:
         assert times == [time for _, time, _ in frames]
 
@@ -119,7 +119,7 @@ def test_bad_arguments(clip, detector, tmp_path):
     with pytest.raises(InvalidInputError, match="show must be True or False; got 'yes'"):
         track(clip, detector, show="yes")
     with pytest.raises(InvalidInputError, match=r"source missing\.mp4 does not exist"):
-        track("missing.mp4", random_mixture(), stream=True)
+        track("missing.mp4", random_network(), stream=True)
     (tmp_path / "text.mp4").write_text("no video")
     with pytest.raises(VideoError, match="is a text file, not a video"):
         track(tmp_path / "text.mp4", detector, stream=True)

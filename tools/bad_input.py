@@ -39,15 +39,13 @@ NOT_CALLED = {
     "course.set_lesson_defaults": "changes later calls; tests/test_course.py",
     "open_dask": "starts a cluster",
     "fetch_patches": "downloads; its arguments are tested in tests/datasets/test_archives.py",
-    "train_mixture": "trains for minutes; tests/mixture_training/test_train.py",
     "Detections.to_supervision": "needs the package supervision; tests/test_boxes.py",
-    "cross_validate_mixture": "trains for minutes; tests/mixture_training/test_cross_validation.py",
 }
 """Public functions that are not called, and why."""
 
 RESULTS = {
     "BatchReport", "BatchStatus", "DetectionScores", "Event", "Explanation", "FrameResult", "FrameSet",
-    "FrameSource", "HorizonEstimate", "SearchResult", "Track", "TrackScores", "TrackedFrame",
+    "FrameSource", "HorizonEstimate", "NetworkModel", "SearchResult", "Track", "TrackScores", "TrackedFrame",
     "TrainingReport", "Trip", "VehicleCounts", "VideoInfo", "VideoReport", "plotting.ImageDescription",
 }  # fmt: skip
 """Classes whose instances the library makes, and whose constructors therefore check nothing."""
@@ -127,11 +125,9 @@ def _parameters(function: Callable[..., Any]) -> list[inspect.Parameter]:
 
 INTERNAL = {
     "Event.text", "FeatureParams.spatial_planes", "FrameSource.audio", "FrameSource.read",
-    "FunctionParams.heat_range", "HeatParams.for_search",
-    "PyramidParams.heat_range", "PyramidParams.rows", "PyramidParams.sizes", "PyramidParams.smallest_width",
-    "SearchBand.place", "SearchParams.heat_range", "SearchParams.place", "TemplateMixture.detect_vehicles",
-    "TemplateMixture.margin_of", "TemplateMixture.propose_boxes", "TemplateMixture.rescore_boxes",
-    "TemplateMixture.scores", "TemplateMixture.window_margin", "TemplateMixture.window_scores",
+    "FunctionParams.heat_range", "HeatParams.for_search", "NetworkModel.feeds",
+    "NetworkModel.input_size_for", "NetworkModel.probability", "NetworkModel.scores",
+    "NetworkParams.heat_range", "SearchBand.place", "SearchParams.heat_range", "SearchParams.place",
     "VehicleDetector.interpolate", "VehicleDetector.skip",
 }  # fmt: skip
 """Methods that only the library calls, with its own results."""
@@ -234,10 +230,11 @@ class _Valid:
             "Camera": camera, "Detections": windows, "Explorer": vd.Explorer([image], classifier),
             "FrameBoxes": predicted, "FunctionParams": vd.FunctionParams(), "HeatHistory": vd.HeatHistory(),
             "FrameSource": vd.open_source(clip), "HeatmapDetector": vd.HeatmapDetector(classifier),
+            "NetworkModel": vd.load_model("default"), "NetworkParams": vd.NetworkParams(),
             "OwnSpeed": own_speed, "PatchFeatures": vd.PatchFeatures(n_jobs=1), "PatchSet": patch_set,
-            "Platt": vd.Platt(-1.0, 0.0), "PyramidParams": vd.PyramidParams(),
+            "Platt": vd.Platt(-1.0, 0.0),
             "ReportWriter": vd.ReportWriter(folder / "writer.html"),
-            "SearchParams": search, "TemplateMixture": vd.load_model("default"), "TrackLog": log,
+            "SearchParams": search, "TrackLog": log,
             "Tracker": tracker, "VehicleClassifier": classifier, "VehicleDetector": detector,
         }  # fmt: skip
         self.by_name: dict[str, Any] = {
@@ -283,7 +280,6 @@ class _Valid:
             "Explorer.box_at": {"x": 1.0, "y": 1.0},
             "Explorer.set_frame": {"frame": 0},
             "Tracker": {"fps": 25.0},
-            "TemplateMixture": {"templates": vd.load_model("default").templates},
             "Split": {"train": np.arange(3), "test": np.arange(3, 5)},
             "HeatmapDetector": {"clf": classifier},
             "ReportWriter": {"path": folder / "out.html"},
@@ -294,7 +290,7 @@ class _Valid:
             "VehicleClassifier": {"params": params},
             "VehicleClassifier.from_pipeline": {"params": params},
             "VehicleClassifier.save": {"path": folder / "out.safetensors"},
-            "TemplateMixture.save": {"path": folder / "out.safetensors"},
+            "NetworkModel.save": {"path": folder / "out.onnx"},
             "VehicleDetector.track": {"found": detector.search(image)},
             "batch_status": {"out": folder},
             "bin_spatial": {"size": 16},

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 RESOLUTIONS = {"oldest": "lowest-direct", "newest": "highest"}
 TESTS = (
     "tests/features", "tests/test_search.py", "tests/test_boxes.py", "tests/test_heatmap.py",
-    "tests/test_images.py", "tests/test_classifier.py", "tests/test_detector.py", "tests/mixture",
+    "tests/test_images.py", "tests/test_classifier.py", "tests/test_detector.py", "tests/network",
     "tests/tracking", "tests/evaluation/test_readers.py", "tests/test_sklearn_models.py",
     "tests/video/test_process.py", "tests/cli/test_cli.py",
 )  # fmt: skip

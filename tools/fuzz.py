@@ -167,7 +167,7 @@ def model_cases(folder: Path, rng: random.Random) -> Iterator[Case]:
                 case _:
                     params[rng.choice((*params, "spatial_size", "other"))] = rng.choice(odd)
             write_model(
-                file, rng.choice(("patches", "patches", "mixture")), params, tensors, {"a": rng.choice(odd)}
+                file, rng.choice(("patches", "patches", "other")), params, tensors, {"a": rng.choice(odd)}
             )
         yield "model", partial(_use_model, file)
 

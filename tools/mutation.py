@@ -49,7 +49,7 @@ TARGETS = {
     "windows.py": ("tests/test_windows.py",),
     "boxes": ("tests/test_boxes.py", "tests/evaluation/test_calibration.py"),
     "tracking": ("tests/tracking",),
-    "mixture": ("tests/mixture",),
+    "network": ("tests/network",),
 }
 """Files and folders of the package that are changed, with the tests of each."""
 

@@ -37,7 +37,7 @@ SCENE: dict[str, Any] = {"scenario": "traffic", "frames": 75, "random_state": 76
 HERO, ANIMATION, GIF, RECORD = "picture.jpg", "animation.webp", "animation.gif", "pictures.json"
 FILES = (HERO, ANIMATION, GIF)
 
-MODEL = Path(vehicle_detection.__file__).parent / "models" / "default.safetensors"
+MODEL = Path(vehicle_detection.__file__).parent / "models" / "default.onnx"
 
 _HERO_FRAME = 0.5  # position in the drive
 # Width of the frames in the animations, step of the frames in the GIF, and its number of colors.

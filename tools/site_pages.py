@@ -41,7 +41,7 @@ API_PAGES = (
     ("camera", "Camera and events", "camera events"),
     ("video", "Video, batches and reports", "video batch report"),
     ("images", "Images, drawing and tables", "images drawing export"),
-    ("models", "Models and training", "mixture mixture_training classifier training"),
+    ("models", "Models and training", "loading network classifier training"),
     ("explain", "Explain and explore", "explanation explorer"),
     ("course_steps", "Features, windows and heat maps", "features windows search heatmap regions course"),
     ("evaluation", "Evaluation and tuning", "evaluation tuning"),

@@ -38,8 +38,8 @@ _AROUND, _PICTURE_HEIGHT, _BOX_COLOR = 0.2, 180, (240, 228, 66)
 # Windows of a classifier of patches are larger than the boxes of vehicles.
 _MIN_WINDOW_IOU = 0.2
 # Occlusion: rows and columns of cells, context around the box as a fraction of its sides, pixels of the input
-# around that which are searched again, and the stride to which their place is aligned. Larger surroundings are
-# reduced to about this number of pixels, to save time.
+# around that which are searched again, and the stride to which their place is aligned. Larger surroundings
+# are reduced to about this number of pixels, to save time.
 _OCCLUDED_CELLS, _CONTEXT, _SURROUNDINGS, _STRIDE = 6, 0.1, 64, 32
 _MAX_PIXELS = 90_000
 # Lower scores than any of a network.
@@ -125,10 +125,11 @@ def explain(detector: VehicleDetector, image: NDArray[np.uint8], box: ArrayLike)
     the frame once, gives similar scores. Shares of a classifier are relative to the mean patch of its
     training set.
 
-    For a network, each of 6x6 cells over the box and a tenth of its sides around is painted gray, and the
-    surroundings of the box are searched again. Cells that replace each other have small shares, and those
-    that are useless alone large ones, so that shares need not add up to the score. The margin of a box
-    without a vehicle is that of the network's best box there.
+    For a network, each of 6x6 cells over the box and a tenth of its sides around is painted gray together
+    with half a cell around it, and the surroundings of the box are searched again. The share of the cell is a
+    fourth of what the score loses, because each point is covered four times. Parts that can replace each
+    other have small shares, so that shares need not add up to the score. The margin of a box without a
+    vehicle is that of the network's best box there.
 
     Examples
     --------
@@ -257,9 +258,11 @@ def _explain_network(
         complete = around.score(box)
         cells = np.empty((_OCCLUDED_CELLS, _OCCLUDED_CELLS))
         xs, ys = (np.linspace(window[axis], window[axis + 2], _OCCLUDED_CELLS + 1) for axis in (0, 1))
+        # A cell is covered with half a cell around it, so that each point is covered four times.
+        half = (window[2:] - window[:2]) / (2 * _OCCLUDED_CELLS)
         for y, x in np.ndindex(*cells.shape):
-            covered = np.array([xs[x], ys[y], xs[x + 1], ys[y + 1]])
-            cells[y, x] = complete - around.score(box, covered)
+            covered = np.array([xs[x], ys[y], xs[x + 1], ys[y + 1]]) + np.concatenate([-half, half])
+            cells[y, x] = (complete - around.score(box, covered)) / 4
     terms = {"cells": float(cells.sum())}
     terms["rest"] = (complete if score is None else score) - terms["cells"]
     return Explanation(box, score is not None, window, cells, terms, score)

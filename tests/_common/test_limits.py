@@ -11,7 +11,7 @@ from vehicle_detection.camera import read_camera
 from vehicle_detection.datasets import load_patches
 from vehicle_detection.errors import DatasetError, InvalidInputError, ModelFileError
 from vehicle_detection.evaluation import read_labels
-from vehicle_detection.mixture import load_model
+from vehicle_detection.loading import load_model
 
 READERS = [
     (load_model, ModelFileError, "VEHICLE_DETECTION_MAX_MODEL_BYTES"),

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from tests.helpers import ROOT, random_mixture, start_interruptible
+from tests.helpers import ROOT, start_interruptible, write_network
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.synthetic import render_drive
 
@@ -26,8 +26,8 @@ def clip(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def model(tmp_path_factory):
-    path = tmp_path_factory.mktemp("model") / "small.safetensors"
-    random_mixture().save(path)
+    path = tmp_path_factory.mktemp("model") / "small.onnx"
+    write_network(path)
     return path
 
 

@@ -15,7 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.batch.helpers import check_whole, counts, files, records, run
-from tests.helpers import random_mixture
+from tests.helpers import write_network
 from tests.video.clips import damage_sizes
 from vehicle_detection import batch_status, batch_summary, process_video, run_batch
 from vehicle_detection.batch import store
@@ -369,24 +369,24 @@ def test_a_trip_whose_first_segment_is_gone(clip, model, tmp_path, changed):
 
 def test_another_model_in_the_same_file(card, tmp_path):
     """Workers that live longer than a run keep their detector."""
-    one, path = card / "20260131_093000_F.mp4", tmp_path / "own.safetensors"
+    one, path = card / "20260131_093000_F.mp4", tmp_path / "own.onnx"
     rows = []
     with ThreadPoolExecutor(1) as executor:
         for seed in (0, 1):
-            random_mixture(offset=seed / 2).save(path)
+            write_network(path, seed)
             run_batch(one, tmp_path / "out", executor, model=path, tracks_only=True, progress=False)
             rows.append(parquet.read_table(tmp_path / "out" / "tracks")["score"].to_pylist())
-    random_mixture(offset=0.5).save(path)
+    write_network(path, 1)
     run(one, tmp_path / "fresh", path, tracks_only=True)
     assert parquet.read_table(tmp_path / "fresh" / "tracks")["score"].to_pylist() == rows[1] != rows[0]
 
 
 def test_another_model_file_on_a_worker_is_an_error(card, tmp_path, monkeypatch):
-    path = tmp_path / "own.safetensors"
-    random_mixture().save(path)
+    path = tmp_path / "own.onnx"
+    write_network(path)
 
     def elsewhere(task):
-        random_mixture(offset=0.5).save(path)
+        write_network(path, 1)
         return trip_module.run_trip(task)
 
     monkeypatch.setattr("vehicle_detection.batch.run.run_trip", elsewhere)

@@ -1,6 +1,5 @@
 import csv
 import errno
-import functools
 import io
 import json
 import os
@@ -21,9 +20,10 @@ import typer
 from typer.testing import CliRunner
 
 import vehicle_detection
-from tests.helpers import SMALL_MIXTURE, drawn, start_interruptible, write_frame_set
+from tests.helpers import start_interruptible
+from tests.network.graphs import constant_network
 from tests.video.clips import damage_sizes, write_clip
-from vehicle_detection import classifier, datasets, detector, mixture_training, training, video
+from vehicle_detection import classifier, datasets, detector, training, video
 from vehicle_detection._common import files as _files
 from vehicle_detection._common import progress_bar
 from vehicle_detection.boxes import Detections
@@ -42,7 +42,7 @@ from vehicle_detection.cli.output import (
 )
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import read_image, write_image
-from vehicle_detection.mixture import load_model
+from vehicle_detection.loading import load_model
 from vehicle_detection.params import DrawParams
 from vehicle_detection.synthetic import SceneVehicle, render_drive, render_patches, render_scene
 from vehicle_detection.video import FrameSource, probe_video, read_frames
@@ -1276,22 +1276,24 @@ def test_info_of_the_shipped_models():
     out = succeed("info", "default")
     assert succeed("info") == out
     default = load_model()
-    assert out.startswith("default: 6 templates, threshold at a probability of 0.27\n")
-    assert re.search(r"box of 7x6 cells\s*\n", out)
-    assert "box of 6x6 cells at the frame's border" in out
-    assert re.search(r"rescoring +2 networks, [\d,]+ weights, blend weight 0\.\d+", out)
+    assert re.match(r"default: network, threshold at a probability of 0\.\d+\n", out)
+    assert re.search(r"input +640 px\n", out)
+    assert re.search(r"file +\d\.\d MB\n", out)
     for name, scores in default.metadata["metrics"]["left_out"].items():
         assert re.search(rf"{name} .*{scores['f1']:.3f}", out)
 
 
 def test_info_of_a_model_with_incomplete_scores(tmp_path):
-    model, path = load_model(), tmp_path / "m.safetensors"
-    model.with_metadata({"metrics": {"left_out": {"road": {"f1": 0.25}}}}).save(path)
-    assert re.search(r"road\W+0\.250", succeed("info", path))
-    model.with_metadata({"metrics": {"splits": {"random": {"accuracy": 0.5, "test": "x"}}}}).save(path)
-    assert re.search(r"accuracy\s+─+\s+random fifth +0\.5000", succeed("info", path))
-    model.with_metadata({"metrics": {"splits": {"random": {"accuracy": 10**400}}}}).save(path)
-    assert "random fifth" in succeed("info", path)
+    model, path = load_classifier(), tmp_path / "m.safetensors"
+
+    def info(metrics):
+        VehicleClassifier(model.params, model.templates, {"metrics": metrics}).save(path)
+        return succeed("info", path)
+
+    assert re.search(r"road\W+0\.250", info({"left_out": {"road": {"f1": 0.25}}}))
+    scores = info({"splits": {"random": {"accuracy": 0.5, "test": "x"}}})
+    assert re.search(r"accuracy\s+─+\s+random fifth +0\.5000", scores)
+    assert "random fifth" in info({"splits": {"random": {"accuracy": 10**400}}})
 
 
 def test_info_of_a_missing_model(material):
@@ -1305,73 +1307,23 @@ def test_models_by_name(picture):
     assert re.search(r": \d+ vehicle", succeed("detect", picture, "--model", "highway"))
 
 
-# --- train-frames ---
-
-
-@pytest.fixture
-def small_training(monkeypatch):
-    """Train with the few windows that a handful of drawn frames has."""
-    validate = functools.partial(mixture_training.cross_validate_mixture, params=SMALL_MIXTURE)
-    monkeypatch.setattr(mixture_training, "cross_validate_mixture", validate)
-
-
-@pytest.fixture(scope="module")
-def drawn_roads(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("roads")
-    write_frame_set(folder, "town", drawn(range(6)))
-    write_frame_set(folder, "coast", drawn(range(6, 10)))
-    for number, patch in enumerate(render_patches(4, random_state=0)[0][:2]):
-        (folder / "patches" / "cars").mkdir(parents=True, exist_ok=True)
-        write_image(folder / "patches" / "cars" / f"{number}.png", patch)
-    return folder
-
-
-def test_train_frames(drawn_roads, small_training, tmp_path):
-    model, curves = tmp_path / "road.safetensors", tmp_path / "curves.csv"
-    words = ["train-frames", drawn_roads, "-o", model, "--curves", curves, "--seed", 5, "--no-drawn"]
-    words += ["--patches", drawn_roads / "patches"]
-    out = succeed(*words)
-    assert "step 2 of 3: train without town\nvehicles per template: " in out
-    assert "on sources left out of training, IoU 0.5" in out
-    assert out.endswith(f"wrote {model}, {curves}\n")
-    trained = load_model(model)
-    assert [template.box_cells for template in trained.templates] == [(6, 5)]
-    assert trained.metadata["training"] == {"random_state": 5}
-    assert trained.metadata["data"] == {"coast": 4, "town": 6, "patches": 2}
-    assert curves.read_text().startswith("frames,logit,precision,recall\ncoast,")
-    assert re.search(r"town\W+\d\.\d{3}", succeed("info", model))
-    first = model.read_bytes()
-    succeed(*words)
-    assert model.read_bytes() == first
-
-
-def test_train_frames_adds_drawn_frames(drawn_roads, small_training, tmp_path, monkeypatch):
-    few = functools.partial(mixture_training.drawn_source, drives=1, frames=1)
-    monkeypatch.setattr(mixture_training, "drawn_source", few)
-    succeed("train-frames", drawn_roads, "-o", tmp_path / "m.safetensors")
-    data = load_model(tmp_path / "m.safetensors").metadata["data"]
-    assert data == {"coast": 4, "town": 6, "drawn": 1}
-
-
-def test_train_frames_refuses_bad_input_before_it_trains(drawn_roads, tmp_path, monkeypatch):
-    monkeypatch.setattr(mixture_training, "cross_validate_mixture", None)
-    one = tmp_path / "one"
-    write_frame_set(one, "town", drawn(range(2)))
-    model = tmp_path / "m.safetensors"
-    (tmp_path / "empty").mkdir()
-    cases = {
-        r"folder .+none does not exist; pass the folder of the labelled": [tmp_path / "none", "-o", model],
-        r"folder .+empty has no labels/NAME.csv": [tmp_path / "empty", "-o", model],
-        r"DATA must hold at least 2 data sets, got 1; one at a time is left out": [one, "-o", model],
-        r"--output needs an existing folder": [drawn_roads, "-o", tmp_path / "none" / "m.safetensors"],
-        r"--output must be a file, got the folder": [drawn_roads, "-o", tmp_path],
-        r"--curves .+ is also --output .+;": [drawn_roads, "-o", model, "--curves", model],
-        r"none does not exist": [drawn_roads, "-o", model, "--patches", tmp_path / "none"],
-        r"--seed must be an integer from 0": [drawn_roads, "-o", model, "--seed", -1],
-    }
-    for message, words in cases.items():
-        assert re.search(message, refuse("train-frames", *words)), message
-    assert not model.exists()
+def test_classes_of_a_network(picture, tmp_path):
+    boxes = np.zeros((1, 3, 8), np.float32)
+    boxes[0, 0], boxes[0, 1] = [48, 48, 24, 24, 0, 0, 0.9, 0], [30, 60, 20, 20, 0.8, 0, 0, 0]
+    outputs = {"output0": boxes.transpose(0, 2, 1)}
+    names = {"names": "{0: 'person', 1: 'bicycle', 2: 'car', 3: 'dog'}"}
+    path = tmp_path / "other.onnx"
+    path.write_bytes(constant_network(outputs, metadata=names))
+    assert "1 vehicle" in succeed("detect", picture, "--model", path)
+    assert "2 vehicles" in succeed("detect", picture, "--model", path, "--classes", "0,car")
+    assert "0 vehicles" in succeed("detect", picture, "--model", path, "--classes", "dog")
+    assert re.search(r"classes +car\s", succeed("info", path))
+    message = refuse("detect", picture, "--model", path, "--classes", "tram")
+    assert re.search(r"--classes must be classes of .* got 'tram'; it has person \(0\), bicycle", message)
+    message = refuse("detect", picture, "--model", "highway", "--classes", "car")
+    assert "--classes must be omitted for 'highway', which is no network" in message
+    message = refuse("detect", picture, "--model", path, "--device", "gpu")
+    assert "--device must be one of 'cpu', 'cuda'; got 'gpu'" in message
 
 
 def test_info_of_a_model_with_other_metadata(tmp_path):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.helpers import random_mixture
+from tests.helpers import random_network
 from vehicle_detection import Detections, FrameResult, Track, VehicleDetector, blur_boxes
 from vehicle_detection.errors import InvalidInputError
 
@@ -74,7 +74,7 @@ def track_at(box, **state):
 def test_every_track_is_blurred(state):
     none = Detections.empty()
     result = FrameResult(0, 0.0, none, none, (track_at([50, 30, 100, 80], **state),))
-    with VehicleDetector(random_mixture(), blur="vehicles") as detector:
+    with VehicleDetector(random_network(), blur="vehicles") as detector:
         drawn = detector.annotate(NOISE, result)
         assert drawn[40:70, 60:90].std() < 0.4 * NOISE.std()
         detected = dataclasses.replace(result, tracks=(), detections=Detections([[50, 30, 100, 80]], [1.0]))
@@ -85,6 +85,6 @@ def test_bad_arguments_are_refused():
     with pytest.raises(InvalidInputError, match="region must be one of 'vehicles', 'plates'; got 'faces'"):
         blur_boxes(NOISE, [], region="faces")
     with pytest.raises(InvalidInputError, match="blur must be one of 'vehicles', 'plates'; got 'all'"):
-        VehicleDetector(random_mixture(), blur="all")
+        VehicleDetector(random_network(), blur="all")
     with pytest.raises(InvalidInputError, match="image must be"):
         blur_boxes(NOISE[..., 0], [])

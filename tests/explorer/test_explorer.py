@@ -19,8 +19,8 @@ from vehicle_detection.explorer import explorer as module
 from vehicle_detection.explorer.explorer import METHODS, VIEWS
 from vehicle_detection.heatmap import frame_heat
 from vehicle_detection.images import write_image
-from vehicle_detection.mixture import load_model
-from vehicle_detection.params import FeatureParams, HeatParams, PyramidParams, RegionParams, SearchParams
+from vehicle_detection.loading import load_model
+from vehicle_detection.params import FeatureParams, HeatParams, NetworkParams, RegionParams, SearchParams
 from vehicle_detection.synthetic import render_scene
 
 SHAPE = (360, 640)
@@ -121,18 +121,18 @@ def test_the_given_parameters_are_used(scenes):
 
 def test_the_model_is_a_name_a_path_or_a_model(scenes, tmp_path):
     model = load_model("default")
-    model.save(tmp_path / "model.safetensors")
+    model.save(tmp_path / "model.onnx")
     expected = Explorer(scenes).boxes().boxes
-    for same in (model, tmp_path / "model.safetensors"):
+    for same in (model, tmp_path / "model.onnx"):
         np.testing.assert_array_equal(Explorer(scenes, same).boxes().boxes, expected)
 
 
-def test_the_horizon_of_a_mixture_may_be_unknown(scenes):
-    explorer = Explorer(scenes, search_params=PyramidParams(horizon=None))
+def test_the_horizon_of_a_network_may_be_unknown(scenes):
+    explorer = Explorer(scenes, search_params=NetworkParams(horizon=None))
     assert explorer.bands == ()
     image = explorer.render()
     explorer.set_search(horizon=0.56)
-    assert explorer.search_params == PyramidParams().with_horizon(0.56)
+    assert explorer.search_params == NetworkParams().with_horizon(0.56)
     assert (explorer.render() != image).any()
     with pytest.raises(InvalidInputError, match="bands must be None for this model"):
         explorer.set_search(bands=[0])
@@ -221,7 +221,7 @@ def test_only_a_new_frame_or_horizon_needs_a_search(explorer, count_searches):
     assert len(searches) == 3 * bands
 
 
-def test_a_higher_threshold_of_a_mixture_needs_no_search(scenes, count_searches):
+def test_a_higher_threshold_of_a_network_needs_no_search(scenes, count_searches):
     explorer = Explorer(scenes)
     searches = count_searches(explorer)
     counts = []
@@ -321,9 +321,9 @@ def test_the_summary_counts_windows_and_boxes(explorer, scenes):
     assert explorer.summary() == f"frame 0, 640x360: {hits:,} of {total:,} windows above 0, {found} boxes"
     explorer.set_regions("heat", threshold=1e6)
     assert explorer.summary().endswith("0 boxes")
-    mixture = Explorer(scenes)
-    hits, found = len(mixture.windows()), len(mixture.boxes())
-    assert mixture.summary() == f"frame 0, 640x360: {hits:,} windows above 0, {found} boxes"
+    network = Explorer(scenes)
+    hits, found = len(network.windows()), len(network.boxes())
+    assert network.summary() == f"frame 0, 640x360: {hits:,} windows above 0, {found} boxes"
 
 
 def test_a_horizon_at_the_border_of_the_frame(explorer):
@@ -399,9 +399,9 @@ def test_an_invalid_value_changes_nothing(explorer, method, arguments, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"model": 3}, "model must be a VehicleClassifier or TemplateMixture, got 3;"),
-        ({"search_params": "default"}, "search_params must be a PyramidParams, got 'default'"),
-        ({"model": "highway", "search_params": PyramidParams()}, "search_params must be a SearchParams, got"),
+        ({"model": 3}, "model must be a VehicleClassifier or NetworkModel, got 3;"),
+        ({"search_params": "default"}, "search_params must be a NetworkParams, got 'default'"),
+        ({"model": "highway", "search_params": NetworkParams()}, "search_params must be a SearchParams, got"),
         ({"region_params": 1}, "region_params must be a RegionParams or HeatParams"),
         ({"camera": 1}, "camera must be a Camera"),
         ({"width": 3}, "width must be an integer from 16 to 10000"),
@@ -488,8 +488,8 @@ def test_controls_without_effect_are_disabled(panel):
     assert disabled() == {"min. peak", "min. evidence"}
 
 
-def test_a_mixture_has_no_controls_for_bands_and_groups(scenes):
-    explorer = Explorer(scenes, search_params=PyramidParams(horizon=None))
+def test_a_network_has_no_controls_for_bands_and_groups(scenes):
+    explorer = Explorer(scenes, search_params=NetworkParams(horizon=None))
     controls, text, _ = open_panel(explorer)
     assert list(controls) == [
         "frame", "show", "explain box", "min. score", "horizon", "boxes from", "min. heat", "peak fraction",
@@ -497,7 +497,7 @@ def test_a_mixture_has_no_controls_for_bands_and_groups(scenes):
     ]  # fmt: skip
     controls["min. score"].value = 0.5
     # Only changed controls are applied: the horizon is still unknown.
-    assert explorer.search_params == PyramidParams(horizon=None, min_score=0.5)
+    assert explorer.search_params == NetworkParams(horizon=None, min_score=0.5)
     controls["horizon"].value = 0.56
     assert explorer.search_params.horizon == 0.56
     assert text.value == explorer.summary()

@@ -71,6 +71,40 @@ def own_network(seed=0, *, size=("height", "width"), weights=None, params=None, 
     )
 
 
+def spot_network():
+    """A network of the library's own kind that finds bright spots: boxes of 64 px around squares of 32 px."""
+    nodes = [
+        helper.make_node("Cast", ["image"], ["float"], to=TensorProto.FLOAT),
+        helper.make_node("Transpose", ["float"], ["planes"], perm=[0, 3, 1, 2]),
+        helper.make_node("Conv", ["planes", "mean", "offset"], ["logits"], strides=[32, 32]),
+        helper.make_node("Sigmoid", ["logits"], ["p"]),
+        # Positions of the cells: sums of ones along each axis.
+        helper.make_node("Mul", ["logits", "zero"], ["zeros"]),
+        helper.make_node("Add", ["zeros", "stride"], ["strides"]),
+        helper.make_node("CumSum", ["strides", "horizontal"], ["right"]),
+        helper.make_node("CumSum", ["strides", "vertical"], ["bottom"]),
+        helper.make_node("Sub", ["right", "half"], ["x"]),
+        helper.make_node("Sub", ["bottom", "half"], ["y"]),
+        helper.make_node("Add", ["strides", "stride"], ["side"]),
+        helper.make_node("Concat", ["x", "y", "side", "side", "p"], ["maps"], axis=1),
+        helper.make_node("Reshape", ["maps", "flat"], ["boxes"]),
+    ]
+    initializers = [
+        ("mean", np.full((1, 3, 32, 32), 0.1 / (3 * 32 * 32), np.float32)),
+        ("offset", np.array([-0.1 * 180], np.float32)),
+        ("zero", np.float32(0)),
+        ("stride", np.float32(32)),
+        ("half", np.float32(16)),
+        ("horizontal", np.array(3)),
+        ("vertical", np.array(2)),
+        ("flat", np.array([1, 5, -1])),
+    ]
+    params = PARAMS | {"slope": 1.0, "offset": 0.0, "threshold": 0.0}
+    header = {"format_version": 1, "params": params, "metadata": {}}
+    ports = [("image", "uint8", [1, "height", "width", 3])], [("boxes", "float32", [1, 5, "n"])]
+    return serialize(nodes, *ports, initializers, {"vehicle_detection": json.dumps(header)})
+
+
 def constant_network(
     outputs, *, size=(96, 96), dtype="float32", layout="NCHW", metadata=None, dynamic=False, sizes=False
 ):

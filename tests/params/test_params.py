@@ -1,7 +1,6 @@
 import dataclasses
 import json
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -14,8 +13,8 @@ from vehicle_detection.params import (
     FeatureParams,
     FunctionParams,
     HeatParams,
+    NetworkParams,
     PixelBand,
-    PyramidParams,
     RegionParams,
     SearchBand,
     SearchParams,
@@ -332,54 +331,6 @@ def test_the_bands_of_the_third_system():
     assert {(band.x1, band.y1, band.x2, band.y2) for band in bands} == {(0, 400, 1280, 656)}
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"camera_height_m": 1.2}, r"camera_height_m must be \(minimum, maximum\), such as .*; got 1.2"),
-        ({"camera_height_m": (1.0, 1.2, 1.4)}, r"camera_height_m must be \(minimum, maximum\)"),
-        ({"camera_height_m": (2.0, 1.0)}, r"camera_height_m must be in ascending order; got \(2.0, 1.0\)"),
-        ({"camera_height_m": (0.0, 1.0)}, "camera_height_m must be a number, greater than 0"),
-        ({"camera_height_m": (1.0, "x")}, "camera_height_m must be a number"),
-        ({"min_width": 8}, "min_width must be a number, at least 16"),
-        ({"max_height": 0}, "max_height must be a number, greater than 0"),
-        ({"per_octave": 2.5}, "per_octave must be an integer"),
-        ({"horizon": 1.5}, "horizon must be a number, at least 0 and at most 1"),
-        ({"horizon_tolerance": -0.1}, "horizon_tolerance must be a number"),
-        ({"min_score": None}, "min_score must be a number"),
-    ],
-)
-def test_invalid_pyramid_params_are_rejected(options, message):
-    with pytest.raises(InvalidInputError, match=message):
-        PyramidParams(**options)
-
-
-@given(
-    min_width=st.floats(16, 200),
-    per_octave=st.integers(1, 12),
-    cells=st.tuples(st.floats(2, 16), st.floats(2, 16)),
-    height=st.integers(1, 3000),
-)
-def test_cell_sizes_increase_from_the_minimum_width_to_the_maximum_height(
-    min_width, per_octave, cells, height
-):
-    params = PyramidParams(min_width=min_width, per_octave=per_octave)
-    sizes = params.sizes(*cells, (height, 100))
-    assert sizes[0] == min_width / cells[0]
-    assert all(after / before == pytest.approx(2 ** (1 / per_octave)) for before, after in pairwise(sizes))
-    assert len(sizes) == 1 or sizes[-1] * cells[1] <= params.max_height * height * (1 + 1e-9)
-
-
-def test_rows_of_a_flat_road():
-    everywhere = PyramidParams(horizon=None)
-    assert everywhere.rows(90, 80, (720, 1280)) == (0, 720)
-    assert everywhere.with_horizon(None) is everywhere
-    known = PyramidParams(horizon=0.5, camera_height_m=[1.0, 2.0], horizon_tolerance=0.05)
-    assert known.camera_height_m == (1.0, 2.0)
-    # 90 px are 1.8 m: the bottom of a vehicle is 50 to 100 px below the horizon, with a tolerance of 36 px.
-    assert known.rows(90, 80, (720, 1280)) == (360 + 50 - 36 - 80, 360 + 100 + 36)
-    assert everywhere.with_horizon(0.4).horizon == 0.4
-
-
 WHOLE = HeatParams(weighting="count", peak_fraction=0)
 
 
@@ -399,8 +350,6 @@ def test_heat_thresholds_scale_with_the_density_of_the_windows():
         dense, bands=tuple(dataclasses.replace(band, overlap=(0.95, 0.95)) for band in dense.bands)
     )
     assert denser.window_density == dense.window_density
-    assert HeatParams().for_search(PyramidParams()).threshold == 2.0
-    assert HeatParams().for_search(PyramidParams(per_octave=10)).threshold == 4.0
 
 
 def test_a_given_heat_threshold_is_kept_and_checked_against_the_density():
@@ -411,20 +360,16 @@ def test_a_given_heat_threshold_is_kept_and_checked_against_the_density():
         (dataclasses.replace(WHOLE, threshold=2.0), dense, "too many windows are hot.* expect 10 to 56;"),
         (dataclasses.replace(WHOLE, threshold=80.0), dense, "threshold 80 does not fit .*too few windows"),
         (
-            HeatParams(threshold=20.0),
-            PyramidParams(),
-            "expect 0 to 14; omit the threshold for the default of 2",
-        ),
-        (
-            HeatParams(threshold=20.0, weighting="count"),
-            PyramidParams(),
-            "weighting='count' and peak_fraction=0.35",
+            HeatParams(threshold=90.0, weighting="count"),
+            dense,
+            "expect 0 to 56; omit .* weighting='count' and peak_fraction=0.35",
         ),
     ]
     for params, search, message in cases:
         with pytest.warns(UserWarning, match=message):
             assert params.for_search(search) is params
-    assert FunctionParams().heat_range(WHOLE).high == np.inf
+    for search in (FunctionParams(), NetworkParams()):
+        assert search.heat_range(WHOLE).high == np.inf
 
 
 @pytest.mark.parametrize(
@@ -440,18 +385,19 @@ def test_invalid_function_params_are_rejected(options, message):
         FunctionParams(**options)
 
 
-@pytest.mark.parametrize("params", [SearchParams.default(), PyramidParams(), FunctionParams(horizon=0.4)])
+@pytest.mark.parametrize("params", [SearchParams.default(), NetworkParams(), FunctionParams(horizon=0.4)])
 def test_everywhere_searches_all_rows(params):
     everywhere = params.everywhere()
     assert type(everywhere) is type(params)
-    if isinstance(params, PyramidParams):
-        assert everywhere.rows(100, 80, (720, 1280)) == (0, 720)
-    elif isinstance(params, SearchParams):
+    if isinstance(params, SearchParams):
         assert {(band.y1, band.y2) for band in everywhere.place((720, 1280))} == {(0, 720)}
 
 
 def test_numbers_of_numpy_become_those_of_python():
-    params = [PyramidParams(per_octave=np.int64(4)), HeatParams(frames=np.int64(3), threshold=np.float64(2))]
+    params = [
+        NetworkParams(input_size=np.int64(640)),
+        HeatParams(frames=np.int64(3), threshold=np.float64(2)),
+    ]
     for each in (*params, TrackParams(confirm_hits=np.int64(3)), RegionParams(min_peak=np.float32(0.5))):
         assert {type(value) for value in dataclasses.asdict(each).values()} & {np.int64, np.float64} == set()
         json.dumps(dataclasses.asdict(each))

@@ -32,7 +32,7 @@ from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events import Event
-from vehicle_detection.mixture import load_model
+from vehicle_detection.loading import load_model
 from vehicle_detection.params import HeatParams, TrackParams
 from vehicle_detection.report import ReportWriter, TrackPicture, page
 
@@ -278,7 +278,7 @@ class TestSettingsAndModel:
         assert f"<dt>color space</dt><dd>{model.params.color_space}</dd>" in text
         assert "CC BY-NC-SA 3.0" in text
 
-    def test_of_a_mixture(self, tmp_path):
+    def test_of_a_network(self, tmp_path):
         with VehicleDetector(n_jobs=1, horizon=0.5) as detector:
             text = write_report(tmp_path, FRAMES, detector=detector)
         assert "<dt>horizon</dt><dd>0.5</dd>" in text

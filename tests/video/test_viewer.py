@@ -7,7 +7,7 @@ import types
 import numpy as np
 import pytest
 
-from tests.helpers import StubDetector, random_mixture
+from tests.helpers import StubDetector, random_network
 from tests.video.clips import (
     child_processes,
     frame_numbers,
@@ -79,7 +79,7 @@ def test_the_sound_ends_with_the_frames_when_the_window_is_closed(folder, tmp_pa
 def test_results_end_when_the_window_is_closed(clip, monkeypatch, as_stream):
     window = Recorder(last=4)
     monkeypatch.setattr(stream, "open_viewer", lambda title: window)
-    with VehicleDetector(random_mixture(), n_jobs=1, every=1) as detector:
+    with VehicleDetector(random_network(), n_jobs=1, every=1) as detector:
         results = list(track(clip, detector, stream=as_stream, show=True))
         assert [result.index for result in results] == [0, 1, 2, 3]
         if as_stream:
@@ -98,7 +98,7 @@ def test_without_a_display_or_tkinter(clip, monkeypatch):
     with pytest.raises(
         InvalidInputError, match=r"show needs tkinter, which this Python lacks; .*, or write a video$"
     ):
-        track(clip, random_mixture(), show=True)
+        track(clip, random_network(), show=True)
     assert not running_threads()
 
 

@@ -155,7 +155,7 @@ def _parse(data: bytes, name: str, kind: str | None) -> ModelData:
         )
     if kind is not None and header.get("kind") != kind:
         raise ModelFileError(
-            f"{name} contains a model of kind {header.get('kind')!r}, not {kind!r}; load it with load_model"
+            f"{name} contains a model of kind {header.get('kind')!r}, not {kind!r}; train one"
         )
     _check_tensors(tensors, name)
     try:

@@ -22,7 +22,7 @@ from typer.core import TyperArgument, TyperGroup
 
 from vehicle_detection import __version__
 from vehicle_detection.cli.batch import batch
-from vehicle_detection.cli.horizon import search_everywhere, warn_of_horizon
+from vehicle_detection.cli.horizon import is_limited, search_everywhere, warn_of_horizon
 from vehicle_detection.cli.options import (
     DRAWING,
     OUTPUT,
@@ -358,7 +358,7 @@ def _warn_if_empty(
     for name, vehicles in found:
         total += len(vehicles)
         yield name, vehicles
-    if total or horizon is None:
+    if total or horizon is None or not is_limited(detector):
         return
     boxes, shape = [np.empty((0, 4))], tuple[int, ...]()
     with search_everywhere(detector.model, None) as everywhere:

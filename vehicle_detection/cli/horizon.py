@@ -20,6 +20,11 @@ def search_everywhere(model: Any, conf: float | None) -> VehicleDetector:
     return VehicleDetector(model, conf=conf, search_params=model.search_params_type.default().everywhere())
 
 
+def is_limited(detector: VehicleDetector) -> bool:
+    """Whether the detector searches rows near the horizon only; networks and functions search all."""
+    return detector.search_params != detector.search_params.everywhere()
+
+
 def warn_of_horizon(given: str, found: HorizonEstimate | None) -> None:
     """Warn that no vehicle was found, and print what a search of all rows found; `given` set the horizon."""
     message = (

@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument
 
-from vehicle_detection.cli.horizon import find_horizon, parse_horizon, search_everywhere, warn_of_horizon
+from vehicle_detection.cli.horizon import (
+    find_horizon,
+    is_limited,
+    parse_horizon,
+    search_everywhere,
+    warn_of_horizon,
+)
 from vehicle_detection.cli.options import (
     CAMERA,
     DRAWING,
@@ -327,7 +333,7 @@ def video(
     if not quiet and done.tracks:
         if not detector.lens_is_known:
             print_error(UNKNOWN_LENS)
-    elif not quiet and opened.rereadable:
+    elif not quiet and opened.rereadable and is_limited(detector):
         given = None if horizon in (None, "auto") else f"--horizon {horizon}"
         if horizon is None and detector.search_params_of(opened.info.shape) != detector.search_params:
             given = f"the horizon of --camera {camera}"
