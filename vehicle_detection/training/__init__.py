@@ -1,5 +1,12 @@
-"""Training: patch classifiers with their evaluation, and the labelled or rendered frames of detectors."""
+"""Training of patch classifiers and of networks, their validation, and the frames that networks learn from.
 
+What needs PyTorch is imported when it is first used.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.training.frames import (
     FrameDataset,
     TrainingFrame,
@@ -32,12 +39,63 @@ from vehicle_detection.training.validation import (
     write_curves,
 )
 
+if TYPE_CHECKING:
+    from vehicle_detection.training.export import export_network, set_metadata
+    from vehicle_detection.training.fine_tune import (
+        FineTuning,
+        detect_logits,
+        file_params,
+        fine_tune_network,
+        fingerprint,
+        load_content,
+        package_versions,
+        score_logits,
+        select_frames,
+    )
+    from vehicle_detection.training.network import (
+        NetworkTraining,
+        load_weights,
+        save_weights,
+        train_network,
+    )
+    from vehicle_detection.training.weights import read_weights
+
+_MODULES = {
+    "export": ("export_network", "set_metadata"),
+    "fine_tune": (
+        "FineTuning", "detect_logits", "file_params", "fine_tune_network", "fingerprint", "load_content",
+        "package_versions", "score_logits", "select_frames",
+    ),
+    "network": ("NetworkTraining", "load_weights", "save_weights", "train_network"),
+    "weights": ("read_weights",),
+}  # fmt: skip
+_PACKAGES = ("torch", "onnx", "google")
+
+
+def __getattr__(name: str) -> Any:
+    """Import what needs PyTorch and onnx."""
+    for module, names in _MODULES.items():
+        if name in names:
+            try:
+                return getattr(importlib.import_module(f"{__name__}.{module}"), name)
+            except ModuleNotFoundError as error:
+                if (error.name or "").partition(".")[0] not in _PACKAGES:
+                    raise
+                raise InvalidInputError(
+                    f"training a network needs the package {error.name}, which is not installed; run "
+                    'pip install "vehicle-detection[train]"'
+                ) from error
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
 __all__ = [
     "FOLD_COLUMNS",
     "SPLITS",
+    "FineTuning",
     "FoldDetections",
     "FoldScore",
     "FrameDataset",
+    "NetworkTraining",
     "SearchableModel",
     "SplitScore",
     "TrainingFrame",
@@ -45,17 +103,31 @@ __all__ = [
     "best_threshold",
     "check_sources",
     "detect_in_source",
+    "detect_logits",
+    "export_network",
+    "file_params",
     "find_sources",
+    "fine_tune_network",
+    "fingerprint",
     "fit_log_odds",
     "format_fold",
+    "load_content",
     "load_training_frames",
+    "load_weights",
     "markdown_table",
     "markdown_text",
     "model_card",
+    "package_versions",
+    "read_weights",
     "rendered_source",
     "report_table",
+    "save_weights",
     "score_fold",
+    "score_logits",
+    "select_frames",
+    "set_metadata",
     "split_table",
     "train_and_evaluate",
+    "train_network",
     "write_curves",
 ]

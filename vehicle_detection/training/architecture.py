@@ -31,7 +31,7 @@ def _conv(inputs: int, outputs: int, stride: int = 1, kernel: int = 3, *, groups
 
 
 def _separable(channels: int) -> nn.Sequential:
-    """A 5x5 convolution of each channel by itself, and a 1x1 convolution."""
+    """Convolve each channel with 5x5 pixels, and then all channels at each pixel."""
     return nn.Sequential(
         _conv(channels, channels, kernel=5, groups=channels), _conv(channels, channels, kernel=1)
     )

@@ -15,14 +15,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from vehicle_detection.network import FORMAT_VERSION, METADATA_KEY
 from vehicle_detection.training.architecture import CENTER, SCALE, Deployed, Network
 from vehicle_detection.training.frames import TrainingFrame
 
 _OPSET = 17
 _CALIBRATION_SIZE = 640, 352  # px
 _CALIBRATION_FRAMES = 96
-FORMAT_VERSION = 1
-METADATA_KEY = "vehicle_detection"
 
 
 def export_network(
@@ -45,7 +44,8 @@ def export_network(
     frames
         Frames whose activations set the 8-bit ranges; some of them are taken, evenly spaced.
     params, metadata
-        Numbers that the detector needs (calibration, threshold, input size), and facts for people. JSON values.
+        Numbers that the detector needs (calibration, threshold, input size), and facts for people, as values
+        of JSON.
     quantize
         False keeps weights and activations as float32.
 
@@ -67,11 +67,19 @@ def export_network(
         model = onnx.load(small if quantize else plain)
     _take_bytes(model)
     model.producer_name, model.producer_version, model.doc_string = "vehicle_detection", "", ""
-    del model.metadata_props[:]
-    content = {"format_version": FORMAT_VERSION, "params": dict(params), "metadata": dict(metadata)}
-    for key, value in ((METADATA_KEY, json.dumps(content, sort_keys=True)), ("names", "{0: 'vehicle'}")):
-        model.metadata_props.add(key=key, value=value)
     onnx.checker.check_model(model)
+    return set_metadata(model.SerializeToString(), params, metadata)
+
+
+def set_metadata(content: bytes, params: Mapping[str, Any], metadata: Mapping[str, Any]) -> bytes:
+    """Return a model file with other parameters and facts, see `export_network`."""
+    import onnx
+
+    model = onnx.load_model_from_string(content)
+    del model.metadata_props[:]
+    header = {"format_version": FORMAT_VERSION, "params": dict(params), "metadata": dict(metadata)}
+    for key, value in ((METADATA_KEY, json.dumps(header, sort_keys=True)), ("names", "{0: 'vehicle'}")):
+        model.metadata_props.add(key=key, value=value)
     return bytes(model.SerializeToString(deterministic=True))
 
 

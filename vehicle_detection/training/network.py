@@ -53,6 +53,8 @@ class NetworkTraining:
     frozen_statistics
         Whether batch normalization keeps its means and variances: for batches of a few samples, and for
         networks of `read_weights`.
+    data
+        Fingerprint of frames and initial weights; a checkpoint with another one is not continued.
     """
 
     steps: int
@@ -62,6 +64,7 @@ class NetworkTraining:
     random_state: int = 0
     warm_up: int = 300
     frozen_statistics: bool = False
+    data: str = ""
 
 
 def train_network(
@@ -139,7 +142,8 @@ def train_network(
                 report(state.step, f"{clock.describe(state.step)}, losses {score:.3f} + {box:.3f}")
             if checkpoint is not None and clock.checkpoint_is_due():
                 state.save(checkpoint)
-    return state.average.cpu().eval()
+    average: Network = state.average.cpu().eval()
+    return average
 
 
 class _Clock:
@@ -212,7 +216,7 @@ def collate(samples: Sequence[Sample]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         boxes[row, : len(sample.boxes)], usable[row, : len(sample.boxes)] = sample.boxes, True
         ignored[row, : len(sample.ignored)] = sample.ignored
     images = np.stack([sample.image for sample in samples])
-    return tuple(torch.from_numpy(each) for each in (images, boxes, usable, ignored))  # type: ignore[return-value]
+    return tuple(torch.from_numpy(each) for each in (images, boxes, usable, ignored))
 
 
 class _State:
@@ -250,7 +254,7 @@ class _State:
             logits, boxes = self.network(images)
         losses = detection_loss(logits, boxes, centers, targets)
         self.optimizer.zero_grad()
-        sum(losses).backward()  # type: ignore[union-attr]
+        sum(losses).backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT)
         self.optimizer.step()
         self.step += 1
@@ -286,8 +290,8 @@ class _State:
             ) from error
         if facts.get("training") != repr(self.training):
             raise InvalidInputError(
-                f"checkpoint {path} belongs to another training, {facts.get('training')}; remove it, or use "
-                "the same arguments"
+                f"checkpoint {path} is of an interrupted training with other frames or options; repeat "
+                "those, or remove it to start again"
             )
         for prefix, module in ("network.", self.network), ("average.", self.average):
             module.load_state_dict(
@@ -326,4 +330,5 @@ def load_weights(path: Path) -> Network:
 
     network = Network()
     network.load_state_dict(load_file(path))
-    return network.eval()
+    network.eval()
+    return network

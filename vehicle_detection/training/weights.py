@@ -8,13 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
 from vehicle_detection.errors import ModelFileError
 from vehicle_detection.training.architecture import STRIDES, Network
-
-Array = NDArray[Any]
 
 
 def read_weights(graph: bytes, name: str) -> Network:
@@ -58,11 +55,12 @@ def read_weights(graph: bytes, name: str) -> Network:
             f"{name} is not a network of this library's architecture ({error}); train from the model "
             "'default', or from a file of train-frames"
         ) from error
-    return network.eval()
+    network.eval()
+    return network
 
 
 class _Constants:
-    """The nodes of a graph by their outputs, and the arrays that they are computed from."""
+    """The nodes of a graph by their outputs, and the values of its constants."""
 
     def __init__(self, graph: Any) -> None:
         import onnx
@@ -73,7 +71,7 @@ class _Constants:
             if node.op_type == "Constant":
                 self._arrays[node.output[0]] = onnx.numpy_helper.to_array(node.attribute[0].t)
 
-    def array(self, name: str) -> Array:
+    def array(self, name: str) -> Any:
         """Value of a constant; 8-bit and 32-bit integers are converted to what they stand for."""
         if name in self._arrays:
             return self._arrays[name]
@@ -85,7 +83,7 @@ class _Constants:
         value, scale, zero_point = (self.array(each) for each in node.input)
         shape = (-1,) + (1,) * (value.ndim - 1)  # one scale for each output channel
         difference = value.astype(np.float32) - zero_point.astype(np.float32).reshape(shape)
-        return np.asarray(difference * scale.reshape(shape), np.float32)
+        return difference * scale.reshape(shape)
 
 
 def _set_convolutions(network: Network, constants: _Constants) -> None:
@@ -102,10 +100,9 @@ def _set_convolutions(network: Network, constants: _Constants) -> None:
             target = module
             if module.bias is None:  # batch normalization follows
                 target = network.get_submodule(f"{parent}.{int(index) + 1}")
-                assert isinstance(target, nn.BatchNorm2d)
                 nn.init.ones_(target.weight)
-                target.running_mean.zero_()  # type: ignore[union-attr]
-                target.running_var.fill_(1 - target.eps)  # type: ignore[union-attr]
+                target.running_mean.zero_()
+                target.running_var.fill_(1 - target.eps)
             _copy(target.bias, bias, name)
     if read:
         raise LookupError(f"unknown convolution {min(read)}")

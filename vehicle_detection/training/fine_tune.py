@@ -1,0 +1,303 @@
+"""Fine-tune a network on labelled frames, and evaluate it on some of them that are held out."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import math
+import os
+import tempfile
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vehicle_detection._common import check_choice, check_integer, check_path, pluralize
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import FrameKey, LabelledFrames
+from vehicle_detection.network import NetworkModel, load_network
+from vehicle_detection.training.export import export_network, set_metadata
+from vehicle_detection.training.frames import (
+    FrameDataset,
+    check_sources,
+    load_training_frames,
+)
+from vehicle_detection.training.network import NetworkTraining, train_network
+from vehicle_detection.training.validation import (
+    FoldDetections,
+    FoldScore,
+    best_threshold,
+    detect_in_source,
+    fit_log_odds,
+    score_fold,
+)
+from vehicle_detection.training.weights import read_weights
+
+# Each set is cut into so many blocks of neighboring frames; every fifth is held out.
+_BLOCKS, _EVERY, _HELD = 10, 5, 2
+# Vehicles in the held-out frames from which on they set calibration and threshold.
+_MIN_VEHICLES = 50
+# Longer side (px) to which frames are reduced in memory: about twice that of the samples.
+_MAX_SIDE = 1280
+_BATCH, _SIZE, _RATE = 8, (512, 320), 3e-4
+# Steps per frame, and their limits: 10 to 20 minutes of two cores for 200 frames.
+_STEPS_PER_FRAME, _MIN_STEPS, _MAX_STEPS = 5, 200, 1200
+_PACKAGES = "torch", "onnx", "onnxruntime"
+
+
+@dataclass(frozen=True, eq=False)
+class FineTuning:
+    """A fine-tuned network, and its scores on the held-out frames.
+
+    Attributes
+    ----------
+    model
+        The network; ``model.save(path)`` writes its file.
+    before, after
+        Scores of the initial network and of the new one, each at its own threshold, for each set of held-out
+        frames; empty if there was no frame to hold out.
+    folds
+        Detections of the new network in these frames.
+    """
+
+    model: NetworkModel
+    before: list[FoldScore]
+    after: list[FoldScore]
+    folds: list[FoldDetections]
+
+
+def fine_tune_network(
+    sources: Sequence[FrameDataset],
+    *,
+    initial: str | os.PathLike[str] = "default",
+    steps: int | None = None,
+    random_state: int = 0,
+    n_jobs: int | None = None,
+    device: str | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    on_step: Callable[[int, str], object] | None = None,
+) -> FineTuning:
+    """Continue the training of a network of this library on labelled frames.
+
+    Every set of frames is cut into ten blocks of neighboring frames. Two of them are not trained on: the
+    network is evaluated on these, before and after. If they show at least 50 vehicles, calibration and
+    threshold are fitted to them, too.
+
+    Parameters
+    ----------
+    sources
+        Labelled frames.
+    initial
+        ``"default"`` or a file of this function or of the command ``train-frames``.
+    steps
+        Steps of 8 samples; None takes 5 for each frame, 200 to 1200. A step takes 0.6 s on two cores.
+    random_state
+        Seed of the samples.
+    n_jobs
+        Threads, and processes that draw samples on CUDA.
+    device
+        ``"cpu"`` or ``"cuda"``; None takes CUDA where PyTorch offers it. The same seed on the same kind of
+        device, with the same number of threads, gives the same network.
+    checkpoint
+        File to which the training is saved every 30 s, and from which an interrupted training continues;
+        removed at the end.
+    on_step
+        Called with the number of finished steps and a line with the time left, every 10 s.
+
+    Returns
+    -------
+    FineTuning
+        The network, and its scores before and after.
+
+    Raises
+    ------
+    InvalidInputError
+        If the frames show no vehicle, a box lies outside its image, the checkpoint is of another training, or
+        an argument is malformed.
+    ModelFileError
+        If `initial` is not a network of this library.
+    """
+    checked = check_sources(sources)
+    seed = check_integer(random_state, "random_state", low=0)
+    place = _check_device(device)
+    path = None if checkpoint is None else check_path(checkpoint, "checkpoint")
+    model = load_network(initial)
+    network = read_weights(model.graph, model.name)
+    kept, held_out = hold_out(checked)
+    frames = load_training_frames(kept, max_side=_MAX_SIDE)
+    if held_out:
+        load_training_frames(held_out)  # checks their boxes before the training
+    count = min(max(_STEPS_PER_FRAME * len(frames), _MIN_STEPS), _MAX_STEPS)
+    count = count if steps is None else check_integer(steps, "steps", low=1)
+    training = NetworkTraining(
+        steps=count,
+        batch=_BATCH,
+        size=_SIZE,
+        rate=_RATE,
+        random_state=seed,
+        warm_up=max(1, count // 10),
+        frozen_statistics=True,
+        data=f"{fingerprint(kept)} {hashlib.sha256(model.graph).hexdigest()}",
+    )
+    before = [score_logits(fold, model) for fold in detect_logits(model, held_out, n_jobs=n_jobs)]
+    trained = train_network(
+        frames, training, initial=network, device=place, n_jobs=n_jobs, checkpoint=path, on_step=on_step
+    )
+    tuned = load_content(export_network(trained, frames, file_params(model), {}))
+    folds = detect_logits(tuned, held_out, n_jobs=n_jobs)
+    if sum(len(fold.matches.usable) for fold in folds) >= _MIN_VEHICLES:
+        slope, offset = fit_log_odds(folds)
+        threshold = slope * best_threshold(folds) + offset
+        tuned = dataclasses.replace(tuned, slope=slope, offset=offset, threshold=threshold)
+    after = [score_logits(fold, tuned) for fold in folds]
+    metadata = _metadata(checked, held_out, training, place, (before, after))
+    content = set_metadata(tuned.graph, file_params(tuned), metadata)
+    if path is not None:
+        path.unlink(missing_ok=True)
+    return FineTuning(load_content(content), before, after, folds)
+
+
+def hold_out(sources: Sequence[FrameDataset]) -> tuple[list[FrameDataset], list[FrameDataset]]:
+    """Split every set of frames into one to train on and one to evaluate on.
+
+    Neighboring frames, which may show the same vehicles, stay together: two of ten blocks are held out. At
+    least one frame is, unless no vehicle would be left to train on.
+
+    Raises
+    ------
+    InvalidInputError
+        If no frame has a vehicle.
+    """
+    parts = [(source, part) for source in sources for part in source.sets]
+    if not any((~part.labels.ignore).any() for _, part in parts):
+        raise InvalidInputError(
+            "sources must show at least one vehicle, got labels of "
+            f"{pluralize(sum(len(part) for _, part in parts), 'frame')} without any; add frames with vehicles"
+        )
+    chosen = [set(_held_keys(part.keys)) for _, part in parts]
+    if not any(chosen):
+        chosen[-1] = {parts[-1][1].keys[-1]}
+    kept = [[key for key in part.keys if key not in held] for (_, part), held in zip(parts, chosen)]
+    if not any(
+        (~part.labels.frame(key).ignore).any() for (_, part), keys in zip(parts, kept) for key in keys
+    ):
+        return list(sources), []
+    held_out = [[key for key in part.keys if key in held] for (_, part), held in zip(parts, chosen)]
+    return [_merge(sources, parts, keys) for keys in (kept, held_out)]  # type: ignore[return-value]
+
+
+def _held_keys(keys: Sequence[FrameKey]) -> list[FrameKey]:
+    size = math.ceil(len(keys) / _BLOCKS)
+    return [key for number, key in enumerate(keys) if number // size % _EVERY == _HELD]
+
+
+def _merge(
+    sources: Sequence[FrameDataset],
+    parts: Sequence[tuple[FrameDataset, LabelledFrames]],
+    keys: Sequence[Sequence[FrameKey]],
+) -> list[FrameDataset]:
+    """Return the data sets with some frames of each set; those without any are left out."""
+    chosen = []
+    for source in sources:
+        sets = [
+            select_frames(part, kept) for (owner, part), kept in zip(parts, keys) if owner is source and kept
+        ]
+        if sets:
+            chosen.append(FrameDataset(source.name, tuple(sets)))
+    return chosen
+
+
+def select_frames(part: LabelledFrames, keys: Collection[FrameKey]) -> LabelledFrames:
+    """Return some frames of a set, which are not read."""
+    frames = part.frames
+    if isinstance(frames, Mapping):
+        chosen: Any = {key: image for key, image in frames.items() if key in keys}
+    else:
+        chosen = dataclasses.replace(frames, names=tuple(name for name in frames.names if name in keys))
+    rows = sorted(row for key in keys for row in part.labels.rows(key).tolist())
+    labels = dataclasses.replace(part.labels[rows], frame_keys=tuple(key for key in part.keys if key in keys))
+    return dataclasses.replace(part, frames=chosen, labels=labels)
+
+
+def fingerprint(sources: Sequence[FrameDataset]) -> str:
+    """SHA-256 over the names of the frames and their boxes."""
+    digest = hashlib.sha256()
+    for source in sources:
+        for part in source.sets:
+            for key in part.keys:
+                labels = part.labels.frame(key)
+                digest.update(f"{source.name}/{part.name}/{key}\n".encode())
+                digest.update(np.column_stack([labels.boxes, labels.ignore]).round(3).tobytes())
+    return digest.hexdigest()
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of the packages that a trained network depends on."""
+    names = ("vehicle_detection", *_PACKAGES)
+    return {name: importlib.metadata.version(name.replace("_", "-")) for name in names}
+
+
+def file_params(model: NetworkModel) -> dict[str, float]:
+    """Return the parameters of a network for its file."""
+    return {name: getattr(model, name) for name in ("input_size", "slope", "offset", "threshold", "nms_iou")}
+
+
+def load_content(content: bytes, name: str = "the trained network") -> NetworkModel:
+    """Load a network from the content of its file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "network.onnx"
+        path.write_bytes(content)
+        return dataclasses.replace(load_network(path), name=name)
+
+
+def detect_logits(
+    model: NetworkModel, sources: Sequence[FrameDataset], *, n_jobs: int | None = None
+) -> list[FoldDetections]:
+    """Detect vehicles in all frames; the scores are the log-odds of the network without calibration."""
+    plain = dataclasses.replace(model, slope=1.0, offset=0.0, threshold=0.0)
+    return [fold for source in sources for fold in detect_in_source(plain, source, n_jobs=n_jobs)]
+
+
+def score_logits(fold: FoldDetections, model: NetworkModel) -> FoldScore:
+    """Score detections of `detect_logits` with the threshold and the calibration of a network."""
+    threshold = (model.threshold - model.offset) / model.slope
+    return score_fold(fold, threshold, (model.slope, model.offset))
+
+
+def _check_device(device: str | None) -> str:
+    import torch
+
+    available = torch.cuda.is_available()
+    if device is None:
+        return "cuda" if available else "cpu"
+    check_choice(device, "device", ("cpu", "cuda"))
+    if device == "cuda" and not available:
+        raise InvalidInputError("device must be 'cpu', PyTorch finds no CUDA device; install its driver")
+    return device
+
+
+def _metadata(
+    sources: Sequence[FrameDataset],
+    held_out: Sequence[FrameDataset],
+    training: NetworkTraining,
+    device: str,
+    scores: tuple[Sequence[FoldScore], Sequence[FoldScore]],
+) -> dict[str, Any]:
+    before, after = ({score.name: score.to_dict() for score in each} for each in scores)
+    facts = {name: getattr(training, name) for name in ("steps", "batch", "rate", "random_state")}
+    facts |= {
+        "size": "x".join(map(str, training.size)),
+        "device": device,
+        "initial": training.data.split()[1],
+    }
+    data: dict[str, Any] = {source.name: sum(map(len, source.sets)) for source in sources}
+    data |= {"held_out": sum(len(part) for source in held_out for part in source.sets)}
+    return {
+        "metrics": {"held_out": after, "held_out_before": before},
+        "data": data | {"sha256": fingerprint(sources)},
+        "training": facts,
+        "versions": package_versions(),
+    }
