@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from typer import Argument, Option
+from typer import Argument
 
 from vehicle_detection.cli.options import PATCHES, flag, option
 from vehicle_detection.cli.output import (
@@ -161,21 +161,23 @@ def _print_metrics(metrics: object) -> bool:
     """Print a model's metrics as a table; False if they are not those of `train` or `train-frames`."""
     from vehicle_detection.training import SPLITS, split_table
 
-    splits, folds = (
-        metrics.get(key) if isinstance(metrics, dict) else None for key in ("splits", "left_out")
-    )
+    if not isinstance(metrics, dict):
+        return False
+    splits, left_out, held_out = (metrics.get(key) for key in ("splits", "left_out", "held_out"))
     if isinstance(splits, dict) and splits.keys() <= SPLITS.keys():
         print_table("metrics", *split_table(splits))
-        return True
-    if isinstance(folds, dict):
-        print_fold_scores(folds)
-        return True
-    return False
+    elif isinstance(left_out, dict):
+        print_fold_scores(left_out, "on frames of sources that training left out, IoU 0.5")
+    elif isinstance(held_out, dict):
+        _print_held_out(held_out, metrics.get("held_out_before", {}))
+    else:
+        return False
+    return True
 
 
-def print_fold_scores(scores: Mapping[str, Mapping[str, Any]]) -> None:
+def print_fold_scores(scores: Mapping[str, Mapping[str, Any]], title: str) -> None:
     """Print a table of the values of `FoldScore`, with a row per set of frames."""
-    from vehicle_detection.mixture_training import FOLD_COLUMNS, format_fold
+    from vehicle_detection.training import FOLD_COLUMNS, format_fold
 
     shown = [number for number, name in enumerate(FOLD_COLUMNS) if name not in _HIDDEN_FOLD_COLUMNS]
     titles = [title for title, _ in FOLD_COLUMNS.values()]
@@ -183,60 +185,80 @@ def print_fold_scores(scores: Mapping[str, Mapping[str, Any]]) -> None:
     for name, values in scores.items():
         cells = format_fold(values)
         rows.append((name, *(cells[number] for number in shown)))
-    heads = ("frames", *(titles[number] for number in shown))
-    print_table("on sources left out of training, IoU 0.5", heads, rows)
+    print_table(title, ("frames", *(titles[number] for number in shown)), rows)
 
 
-@option_names(random_state="--seed", sources="DATA")
+def _print_held_out(after: Mapping[str, Any], before: Mapping[str, Any]) -> None:
+    """Print the scores of a fine-tuned network and those of the initial one."""
+    if not after:
+        print_line("no frame was held out: the accuracy is unknown")
+        return
+    rows: dict[str, Mapping[str, Any]] = {}
+    for name, values in after.items():
+        rows |= {f"{name}, before": before.get(name, {}), name: values}
+    print_fold_scores(rows, "on the frames held out of training, IoU 0.5")
+
+
+@option_names(random_state="--seed", sources="DATA", initial="--model")
 def train_frames(
     data: Annotated[
         Path,
         Argument(metavar="DATA", help="Folder with labels/NAME.csv and frames/NAME/ or videos/NAME.mp4."),
     ],
-    output: Annotated[
-        Path, option("FILE", "Model file to write, such as own.safetensors.", "-o", "--output")
-    ],
-    patches: Annotated[
-        Path | None, option("PATH", "Folder or zip of patches with more vehicles, such as vehicles.zip.")
+    output: Annotated[Path, option("FILE", "Model file to write, such as own.onnx.", "-o", "--output")],
+    model: Annotated[
+        str, option("MODEL", '"default" or a file of this command to continue from, such as own.onnx.')
+    ] = "default",
+    steps: Annotated[
+        int | None,
+        option("N", "Steps of 8 samples, 0.6 s each on two cores; default: 5 per frame, 200 to 1200."),
     ] = None,
+    device: Annotated[str | None, option("cpu|cuda", "Default: cuda where PyTorch offers it.")] = None,
     curves: Annotated[
-        Path | None, option("FILE.csv", "Precision and recall on each source left out of training.")
+        Path | None, option("FILE.csv", "Precision and recall on each set of held-out frames.")
     ] = None,
-    drawn: Annotated[bool, Option("--drawn/--no-drawn", help="Also train on rendered frames.")] = True,
+    jobs: Annotated[int | None, option("N", "Threads; default: all cores.")] = None,
     seed: Annotated[int, option("N", "Random seed.")] = 0,
 ) -> None:
-    """Train a model for any road on labelled frames, and evaluate it by cross-validation over the sources."""
+    """Continue the training of the default model on labelled frames, and evaluate it on a fifth of them.
+
+    An interrupted training is continued by the same command.
+    """
     from vehicle_detection._common import check_suffix, check_target, pluralize
-    from vehicle_detection.datasets import load_patches
-    from vehicle_detection.mixture_training import (
-        check_sources,
-        cross_validate_mixture,
-        drawn_source,
-        find_sources,
-        training_metadata,
-        write_curves,
-    )
+    from vehicle_detection.training import find_sources, fine_tune_network, write_curves
 
     named = {"--output": output, "--curves": curves}
     targets = {name: check_target(path, name) for name, path in named.items() if path is not None}
     check_distinct_paths(targets, {"DATA": data})
-    check_suffix(output, "--output", (".safetensors",))
+    check_suffix(output, "--output", (".onnx",))
     sources = find_sources(data)
-    check_sources(sources, min_count=2)
     for source in sources:
         for part in source.sets:
             empty = sum(not len(part.labels.rows(key)) for key in part.keys)
             boxes = pluralize(len(part.labels), "box", "es")
             print_line(f"{source.name}: {pluralize(len(part), 'frame')}, {boxes}, {empty} frames without any")
-    vehicles = [] if patches is None else list(load_patches(patches, label=1).patches)
-    extra = [drawn_source(random_state=seed)] if drawn else []
-    model, scores, folds = cross_validate_mixture(
-        sources, extra_sources=extra, patches=vehicles, random_state=seed, on_step=print_line
-    )
-    metadata = training_metadata(scores, [*sources, *extra], seed, len(vehicles))
+    checkpoint = output.with_name(f"{output.name}.checkpoint")
+    if checkpoint.exists():
+        print_line(f"continuing the training of {checkpoint}")
+    try:
+        tuned = fine_tune_network(
+            sources,
+            initial=model,
+            steps=steps,
+            random_state=seed,
+            n_jobs=jobs,
+            device=device,
+            checkpoint=checkpoint,
+            on_step=lambda _, line: print_line(line),
+        )
+    except KeyboardInterrupt as error:
+        if checkpoint.exists():
+            error.args = (f"; the same command continues from {checkpoint}",)
+        raise
     with name_kept_files(targets.values()):
-        model.with_metadata(metadata).save(output)
+        tuned.model.save(output)
         if curves is not None:
-            write_curves(curves, folds)
-    print_fold_scores({score.name: score.to_dict() for score in scores})
+            write_curves(curves, tuned.folds)
+    metrics = tuned.model.metadata["metrics"]
+    _print_held_out(metrics["held_out"], metrics["held_out_before"])
     print_line(f"wrote {', '.join(map(str, targets.values()))}")
