@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection import VehicleDetector
 from vehicle_detection._common import check_target, write_text
 from vehicle_detection.errors import DatasetError, VehicleDetectionError
-from vehicle_detection.evaluation import FrameKey, LabelledFrames
+from vehicle_detection.loading import load_model
 from vehicle_detection.training import (
     FoldDetections,
     FrameDataset,
@@ -25,6 +25,7 @@ from vehicle_detection.training import (
     find_sources,
     markdown_table,
     score_fold,
+    select_frames,
 )
 
 SOURCES = ("bdd", "camvid", "dawn", "dhaka", "india", "indonesia", "us_side")
@@ -52,10 +53,14 @@ def light_of(image: NDArray[np.uint8]) -> str:
 
 
 def choose_sources(
-    folder: Path, names: Sequence[str], rides: Collection[str] | None = None
+    folder: str | os.PathLike[str],
+    names: Sequence[str],
+    rides: Collection[str] | None = None,
+    *,
+    clip_rate: float = 3.0,
 ) -> list[FrameDataset]:
     """Read the named sets of a data folder, in this order; of `RIDES` only those in `rides`, if given."""
-    found = {source.name: source for source in find_sources(folder)}
+    found = {source.name: source for source in find_sources(folder, clip_rate=clip_rate)}
     missing = [name for name in names if name not in found]
     if missing:
         raise DatasetError(f"folder {folder} lacks {', '.join(f'labels/{name}.csv' for name in missing)}")
@@ -66,15 +71,11 @@ def choose_sources(
 
 
 def _only(source: FrameDataset, rides: Collection[str]) -> FrameDataset:
-    """Frames of a set by their names, read into memory."""
+    """Frames of a set by their names."""
     absent = set(rides) - {key for part in source.sets for key in part.keys}
     if absent:
         raise DatasetError(f"{source.name} has no frame {min(absent)!r}; list the names of its images")
-    parts = []
-    for part in source.sets:
-        images: dict[FrameKey, NDArray[np.uint8]] = {key: image for key, image in part if key in rides}
-        parts.append(LabelledFrames(part.name, images, part.labels))
-    return FrameDataset(source.name, tuple(parts))
+    return FrameDataset(source.name, tuple(select_frames(part, rides) for part in source.sets))
 
 
 def measure(
@@ -93,12 +94,13 @@ def measure(
     rows = []
     for source in sources:
         for fold in detect_in_source(model, source, n_jobs=n_jobs):
-            parts = [fold, *(_by_light(fold) if source.name == RIDES else ())]
+            parts = [fold, *(by_light(fold) if source.name == RIDES else ())]
             rows += [score_fold(part, 0.0, log_odds).to_dict() for part in parts]
     return rows
 
 
-def _by_light(fold: FoldDetections) -> list[FoldDetections]:
+def by_light(fold: FoldDetections) -> list[FoldDetections]:
+    """Split the detections by `LIGHTS`; lights without a frame are left out."""
     lights = {key: light_of(image) for key, image in fold.frames}
     return [
         fold.select([key for key in lights if lights[key] == name], f"{fold.frames.name} {name}")
@@ -142,7 +144,7 @@ def _measure(options: argparse.Namespace) -> None:
     rides = None if options.rides is None else options.rides.read_text(encoding="utf-8").split()
     names = [name for name in options.sources.split(",") if name]
     sources = choose_sources(options.data, names, rides)
-    model = VehicleDetector(model=options.model).model
+    model = load_model(options.model)
     rows = measure(model, sources, n_jobs=options.jobs)
     print(format_rows(rows))
     if options.output is not None:

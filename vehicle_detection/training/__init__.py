@@ -13,6 +13,7 @@ from vehicle_detection.training.frames import (
     check_sources,
     find_sources,
     load_training_frames,
+    select_frames,
 )
 from vehicle_detection.training.patches import (
     SPLITS,
@@ -50,7 +51,6 @@ if TYPE_CHECKING:
         load_content,
         package_versions,
         score_logits,
-        select_frames,
     )
     from vehicle_detection.training.network import (
         NetworkTraining,
@@ -64,7 +64,7 @@ _MODULES = {
     "export": ("export_network", "set_metadata"),
     "fine_tune": (
         "FineTuning", "detect_logits", "file_params", "fine_tune_network", "fingerprint", "load_content",
-        "package_versions", "score_logits", "select_frames",
+        "package_versions", "score_logits",
     ),
     "network": ("NetworkTraining", "load_weights", "save_weights", "train_network"),
     "weights": ("read_weights",),

@@ -8,7 +8,7 @@ import importlib.metadata
 import math
 import os
 import tempfile
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from vehicle_detection.training.frames import (
     FrameDataset,
     check_sources,
     load_training_frames,
+    select_frames,
 )
 from vehicle_detection.training.network import NetworkTraining, train_network
 from vehicle_detection.training.validation import (
@@ -208,18 +209,6 @@ def _merge(
         if sets:
             chosen.append(FrameDataset(source.name, tuple(sets)))
     return chosen
-
-
-def select_frames(part: LabelledFrames, keys: Collection[FrameKey]) -> LabelledFrames:
-    """Return some frames of a set, which are not read."""
-    frames = part.frames
-    if isinstance(frames, Mapping):
-        chosen: Any = {key: image for key, image in frames.items() if key in keys}
-    else:
-        chosen = dataclasses.replace(frames, names=tuple(name for name in frames.names if name in keys))
-    rows = sorted(row for key in keys for row in part.labels.rows(key).tolist())
-    labels = dataclasses.replace(part.labels[rows], frame_keys=tuple(key for key in part.keys if key in keys))
-    return dataclasses.replace(part, frames=chosen, labels=labels)
 
 
 def fingerprint(sources: Sequence[FrameDataset]) -> str:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import glob
 import logging
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -83,6 +84,18 @@ def check_sources(sources: object, *, min_count: int = 1) -> tuple[FrameDataset,
             f"sources must have different names, got {min(twice)!r} twice; merge them into one"
         )
     return tuple(sources)
+
+
+def select_frames(part: LabelledFrames, keys: Collection[FrameKey]) -> LabelledFrames:
+    """Return some frames of a set, in its order; images of a folder are not read."""
+    frames = part.frames
+    if isinstance(frames, Mapping):
+        chosen: Any = {key: image for key, image in frames.items() if key in keys}
+    else:
+        chosen = replace(frames, names=tuple(name for name in frames.names if name in keys))
+    rows = sorted(row for key in keys for row in part.labels.rows(key).tolist())
+    labels = replace(part.labels[rows], frame_keys=tuple(key for key in part.keys if key in keys))
+    return replace(part, frames=chosen, labels=labels)
 
 
 def find_sources(folder: str | os.PathLike[str], *, clip_rate: float = 3.0) -> list[FrameDataset]:
