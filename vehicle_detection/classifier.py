@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 import vehicle_detection
 from vehicle_detection._common import (
-    ModelData,
     blur_patches,
     check_array,
     check_bool,
@@ -607,11 +606,7 @@ def load_classifier(path: str | os.PathLike[str] | None = None) -> VehicleClassi
     >>> load_classifier().params.color_space
     'LAB'
     """
-    return build_classifier(read_model("highway" if path is None else path, KIND))
-
-
-def build_classifier(model: ModelData) -> VehicleClassifier:
-    """Build a classifier from the contents of a model file."""
+    model = read_model("highway" if path is None else path, KIND)
     try:
         templates = []
         for index in range(len({key.split(".")[0] for key in model.tensors})):

@@ -292,7 +292,7 @@ class _Surroundings:
         self._picture = resized[top:bottom, left:right]
 
     def _place(self, box: Floats) -> Floats:
-        return box * self._factors - self._corner
+        return np.asarray(box * self._factors - self._corner)
 
     def score(self, box: Floats, covered: Floats | None = None) -> float:
         """Return the score of the network's best box there, with a part of the frame painted gray."""

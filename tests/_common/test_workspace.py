@@ -5,7 +5,7 @@ import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 
 from vehicle_detection._common import NEW_ARRAYS, SPARE, Workspace, with_spare
-from vehicle_detection._kernels.vector import byte_block, float_block
+from vehicle_detection._kernels.vector import float_block
 
 
 def test_arrays_of_one_name_share_the_memory_of_the_largest():
@@ -69,7 +69,7 @@ def test_memory_with_an_unknown_end_is_copied():
 
 
 def test_the_spare_memory_is_enough_for_every_processor():
-    assert max(float_block().columns, byte_block().columns) <= SPARE
+    assert float_block().columns <= SPARE
 
 
 def test_threads_do_not_share_arrays():

@@ -9,13 +9,13 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import vehicle_detection
-from vehicle_detection._kernels import group
+from vehicle_detection._kernels.histogram import value_counts
 from vehicle_detection._kernels.jit import _Compilation, _save
 
 
 def test_compiling_kernels_is_logged_once_and_other_functions_are_not(caplog):
     compilation = _Compilation()
-    functions = logging.getLogger, group, group
+    functions = logging.getLogger, value_counts, value_counts
     with caplog.at_level(logging.INFO, "vehicle_detection._kernels"):
         for function in functions:
             dispatcher = SimpleNamespace(py_func=getattr(function, "py_func", function))
@@ -27,7 +27,7 @@ def test_compiling_kernels_is_logged_once_and_other_functions_are_not(caplog):
 
 def test_the_garbage_collector_pauses_while_kernels_are_compiled():
     compilation = _Compilation()
-    started = SimpleNamespace(data={"dispatcher": SimpleNamespace(py_func=group.py_func)})
+    started = SimpleNamespace(data={"dispatcher": SimpleNamespace(py_func=value_counts.py_func)})
     assert gc.isenabled()
     compilation.on_start(started)
     compilation.on_start(started)
@@ -51,7 +51,7 @@ def test_a_kernel_that_cannot_be_kept_is_used(caplog):
     with caplog.at_level(logging.INFO, "vehicle_detection._kernels"):
         _save(save, None, None)
     assert "compiled kernels are not kept: [Errno 28] No space left on device" in caplog.text
-    assert group._cache.save_overload.func is _save
+    assert value_counts._cache.save_overload.func is _save
 
 
 def test_a_change_of_another_kernel_file_is_noticed(tmp_path):
@@ -59,9 +59,9 @@ def test_a_change_of_another_kernel_file_is_noticed(tmp_path):
     copy = tmp_path / "vehicle_detection"
     shutil.copytree(package, copy, ignore=shutil.ignore_patterns("__pycache__", "*.safetensors"))
     code = (
-        "import numpy as np; from vehicle_detection._kernels import group;"
-        "group(np.zeros((4, 1)), np.zeros(1, int), 0.5, 0.5, 1, *map(np.zeros, (1, (0, 4), 0)));"
-        "print(sum(group.stats.cache_hits.values()))"
+        "import numpy as np; from vehicle_detection._kernels.histogram import value_counts;"
+        "value_counts(np.zeros((4, 4, 3), np.uint8), np.zeros((3, 256), int));"
+        "print(sum(value_counts.stats.cache_hits.values()))"
     )
 
     def hits():

@@ -1,6 +1,6 @@
 """Helpers for all packages: argument checks, files, threads, progress bars, model files, augmentation."""
 
-from vehicle_detection._common.augment import blur_patches, degrade_patches, mirror_patches, relight
+from vehicle_detection._common.augment import blur_patches, degrade_patches, mirror_patches
 from vehicle_detection._common.checks import (
     Floats,
     check_array,
@@ -18,7 +18,6 @@ from vehicle_detection._common.checks import (
     check_shape,
     check_type,
     describe,
-    finite_array,
     is_listing,
     shorten,
     store_integer,
@@ -36,12 +35,11 @@ from vehicle_detection._common.files import (
 )
 from vehicle_detection._common.image_size import image_size
 from vehicle_detection._common.limits import Limit, check_regular_file, read_regular_file
-from vehicle_detection._common.model_file import FORMAT_VERSION, ModelData, read_model, write_model
+from vehicle_detection._common.model_file import FORMAT_VERSION, read_model, write_model
 from vehicle_detection._common.parquet import ParquetRows, import_pyarrow, write_parquet
 from vehicle_detection._common.progress import in_notebook, progress_bar
 from vehicle_detection._common.text import encodable, natural_key, pluralize
 from vehicle_detection._common.threads import (
-    CALLING_THREAD,
     JOBS_VARIABLE,
     ThreadTeam,
     available_cores,
@@ -55,7 +53,6 @@ from vehicle_detection._common.workspace import NEW_ARRAYS, SPARE, Workspace, wi
 check_environment()
 
 __all__ = [
-    "CALLING_THREAD",
     "FORMAT_VERSION",
     "JOBS_VARIABLE",
     "NEW_ARRAYS",
@@ -63,7 +60,6 @@ __all__ = [
     "Closing",
     "Floats",
     "Limit",
-    "ModelData",
     "ParquetRows",
     "ThreadTeam",
     "Workspace",
@@ -91,7 +87,6 @@ __all__ = [
     "degrade_patches",
     "describe",
     "encodable",
-    "finite_array",
     "hide_credentials",
     "image_size",
     "import_pyarrow",
@@ -106,7 +101,6 @@ __all__ = [
     "progress_bar",
     "read_model",
     "read_regular_file",
-    "relight",
     "resolve_jobs",
     "shorten",
     "single_threaded_opencv",

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 # Ranges of degraded patches: log of the downscaling factor, log of the saturation factor, JPEG quality.
 _LOG_SHRINK, _LOG_SATURATION, _JPEG_QUALITY = (0.0, 1.6), (-1.5, 0.2), (20.0, 90.0)
-# Ranges of `relight`: log of the gamma exponent, and contrast as a fraction of the original.
-_LOG_EXPONENT, _CONTRAST = (-0.7, 0.7), (0.5, 1.0)
 
 
 def mirror_patches(images: NDArray[np.uint8], *, gamma: float = 0.0) -> NDArray[np.uint8]:
@@ -58,17 +56,6 @@ def degrade_patches(images: NDArray[np.uint8], *, mirror: bool = True) -> NDArra
         decoded = np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), np.uint8)
         out[:] = cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
     return degraded
-
-
-def relight(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Change the exposure of an image and reduce its contrast, in a new array.
-
-    A value `v` becomes ``255 * (c * (v / 255)**e + b)``, with one contrast `c`, exponent `e` and offset `b`
-    for the whole image.
-    """
-    exponent, contrast = float(np.exp(rng.uniform(*_LOG_EXPONENT))), rng.uniform(*_CONTRAST)
-    values = contrast * (np.arange(256) / 255) ** exponent + rng.uniform(0, 1 - contrast)
-    return np.asarray(cv2.LUT(image, np.round(255 * values).astype(np.uint8)), np.uint8)
 
 
 def _seeded_generator(image: NDArray[np.uint8], kind: int) -> np.random.Generator:

@@ -284,19 +284,3 @@ def check_choice(value: object, name: str, choices: Collection[object]) -> None:
     if not (value is None or isinstance(value, (str, int, np.integer))) or value not in choices:
         listed = ", ".join(repr(choice) for choice in choices)
         raise InvalidInputError(f"{name} must be one of {listed}; got {describe(value)}")
-
-
-def finite_array(values: object, name: str, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
-    """Return a read-only float32 copy; None in `shape` stands for any number of entries."""
-    expected = ", ".join("any" if side is None else str(side) for side in shape)
-    try:
-        array = np.array(values, np.float32, order="C")
-    except (TypeError, ValueError):
-        array = np.array(np.nan, np.float32)
-    fits = array.ndim == len(shape) and all(side in (None, n) for side, n in zip(shape, array.shape))
-    if not fits or not array.size or not np.isfinite(array).all():
-        raise InvalidInputError(
-            f"{name} must be finite numbers of shape ({expected}), got {describe(values)}; train again"
-        )
-    array.setflags(write=False)
-    return array

@@ -88,8 +88,8 @@ def checksum(header: Mapping[str, str], tensors: Tensors) -> str:
     return digest.hexdigest()
 
 
-def read_model(path: str | os.PathLike[str], kind: str | None = None) -> ModelData:
-    """Read and verify a model file, or a shipped model by its name; `kind` None accepts every kind."""
+def read_model(path: str | os.PathLike[str], kind: str) -> ModelData:
+    """Read and verify a model file, or a shipped model by its name."""
     if not isinstance(path, (str, os.PathLike)):
         raise InvalidInputError(
             f"path must be a model file or one of {', '.join(map(repr, SHIPPED))}; got {describe(path)}"
@@ -124,7 +124,7 @@ def _check_tensors(tensors: Tensors, name: str) -> None:
         raise ModelFileError(f"{name} does not fit its own parameters: {problem}; train again")
 
 
-def _parse(data: bytes, name: str, kind: str | None) -> ModelData:
+def _parse(data: bytes, name: str, kind: str) -> ModelData:
     """Verify and decode the bytes of a model file."""
     from safetensors import SafetensorError
     from safetensors.numpy import load
@@ -153,7 +153,7 @@ def _parse(data: bytes, name: str, kind: str | None) -> ModelData:
         raise ModelFileError(
             f"{name} was changed after it was written (checksum differs); restore it from a copy"
         )
-    if kind is not None and header.get("kind") != kind:
+    if header.get("kind") != kind:
         raise ModelFileError(
             f"{name} contains a model of kind {header.get('kind')!r}, not {kind!r}; train one"
         )

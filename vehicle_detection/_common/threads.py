@@ -197,7 +197,3 @@ class ThreadTeam:
             pool, self._pool = self._pool, None
         if pool is not None:
             pool.shutdown()
-
-
-CALLING_THREAD = ThreadTeam(1, name="")
-"""A team of the calling thread alone."""

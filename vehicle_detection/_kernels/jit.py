@@ -50,10 +50,6 @@ def _save(save: Callable[..., None], *overload: Any) -> None:
         log.info("compiled kernels are not kept: %s", error)
 
 
-inlined = functools.partial(numba.njit, inline="always")
-"""Compile a function as a part of each kernel that calls it, instead of by itself."""
-
-
 def compiles(kernel: Callable[..., Any], *types: Any) -> bool:
     """Compile a kernel for arguments of these types; log a warning and return False if that fails."""
     try:

@@ -109,40 +109,6 @@ def _add(step, row, center, squares, weights):
         weights[index] += step * ((row[index] - center[index]) * squares[index])
 
 
-def hinge_loss(
-    features: NDArray[np.float32],
-    weights: NDArray[np.float32],
-    intercept: float,
-    sign: float,
-    gradient: Floats,
-) -> float:
-    """Sum of the squared hinge losses of rows of one class; adds the loss's gradient to `gradient`.
-
-    `features` is ``(N, length)``, `weights` ``(length,)``, `sign` the class, 1 or -1, and `gradient`
-    ``(length + 1,)``, that of the intercept last. Each row is read once.
-    """
-    return float(_hinge_loss(features, weights, intercept, sign, gradient))
-
-
-@_reordered
-def _hinge_loss(features, weights, intercept, sign, gradient):
-    total = 0.0
-    slope = gradient[:-1]
-    for index in range(features.shape[0]):
-        row = features[index]
-        score = np.float32(0)
-        for column in range(row.shape[0]):
-            score += row[column] * weights[column]
-        slack = 1.0 - sign * (score + intercept)
-        if slack > 0.0:
-            total += slack * slack
-            factor = -2.0 * sign * slack
-            gradient[-1] += factor
-            for column in range(row.shape[0]):
-                slope[column] += factor * row[column]
-    return total
-
-
 @jit
 def _descend(features, rows, signs, ridge, center, squares, weights, tolerance, max_sweeps, rng):
     """Solve the dual problem: update `weights`, those of centered rows, in place and return the intercept."""

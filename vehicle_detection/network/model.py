@@ -82,6 +82,12 @@ class NetworkModel:
         Arguments of `load_network`.
     metadata
         Training facts stored in the file, or its ONNX metadata.
+
+    Examples
+    --------
+    >>> model = load_network("default")
+    >>> model.input_size, model.classes
+    (640, {0: 'vehicle'})
     """
 
     search_params_type: ClassVar[type[NetworkParams]] = NetworkParams

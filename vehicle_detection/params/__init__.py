@@ -10,16 +10,15 @@ from vehicle_detection.params.features import (
     SPATIAL_ORDERS,
     FeatureParams,
 )
-from vehicle_detection.params.mixture import MixtureParams, entries
 from vehicle_detection.params.network import NetworkParams
 from vehicle_detection.params.regions import HeatParams, HeatRange, RegionParams
 from vehicle_detection.params.search import (
     REFERENCE_WIDTH,
     FunctionParams,
     PixelBand,
-    PyramidParams,
     SearchBand,
     SearchParams,
+    entries,
 )
 from vehicle_detection.params.tracking import TrackParams
 
@@ -35,10 +34,8 @@ __all__ = [
     "FunctionParams",
     "HeatParams",
     "HeatRange",
-    "MixtureParams",
     "NetworkParams",
     "PixelBand",
-    "PyramidParams",
     "RegionParams",
     "SearchBand",
     "SearchParams",

@@ -1,17 +1,16 @@
-"""Search parameters: bands of windows below the horizon, and the pyramid of a mixture of templates."""
+"""Search parameters: bands of windows below the horizon, and those of functions."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from vehicle_detection._common import (
     check_choice,
     check_number,
     describe,
-    store_integer,
     store_number,
 )
 from vehicle_detection.errors import InvalidInputError
@@ -21,15 +20,13 @@ REFERENCE_WIDTH = 1280
 """Search windows are given in pixels of a frame whose longer side has this length."""
 
 # Heat thresholds by weighting, and whether regions are reduced to their peak, chosen on single frames of the
-# labelled clips: the default has the best F1, or close to it, and beyond the limits F1 is
-# about 0.5 and lower. First for the classifier's default search, then for the mixture's.
+# labelled clips: the default has the best F1, or close to it, and beyond the limits F1 is about 0.5 or lower.
 _BAND_HEAT = {
     ("score", True): HeatRange(2.0, 0.0, 40.0),
     ("count", True): HeatRange(8.0, 0.0, 56.0),
     ("score", False): HeatRange(12.0, 4.0, 40.0),
     ("count", False): HeatRange(16.0, 10.0, 56.0),
 }
-_PYRAMID_HEAT = {"score": HeatRange(2.0, 0.0, 14.0), "count": HeatRange(4.0, 0.0, 16.0)}
 # Factor of the default thresholds of whole regions if all windows are of similar size.
 _SIMILAR_SIZES_FACTOR = 0.6
 # Windows of sides that differ by at most this factor fire on the same vehicle.
@@ -311,133 +308,8 @@ class FunctionParams:
         return HeatRange(0.0, 0.0, math.inf)
 
 
-@dataclass(frozen=True, kw_only=True)
-class PyramidParams:
-    """Sizes and positions of the windows of a mixture of templates, for frames of any size.
-
-    Attributes
-    ----------
-    min_width, max_height
-        Minimum width of a vehicle in pixels, and maximum height as a fraction of the frame's height. Without
-        a width: a fortieth of the frame's width, at least 24 and at most 32 pixels.
-    per_octave
-        Number of sizes per doubling.
-    horizon
-        Row of the horizon as a fraction of the frame's height; vehicles of each size are searched where they
-        are possible on a flat road. None: everywhere.
-    camera_height_m
-        Minimum and maximum height of the camera above the road in meters, if the horizon is given.
-    horizon_tolerance
-        Maximum error of the horizon as a fraction of the frame's height; the default suits any dash-cam.
-    min_score
-        Minimum score of the windows that a search returns, in log-odds above those of a fixed margin. It does
-        not depend on the model's threshold, which is one for boxes.
-
-    Examples
-    --------
-    >>> [round(size, 2) for size in PyramidParams(min_width=70).sizes(7, 8, (720, 1280))[:6]]
-    [10.0, 11.49, 13.2, 15.16, 17.41, 20.0]
-    """
-
-    min_width: float | None = None
-    max_height: float = 0.8
-    per_octave: int = 5
-    horizon: float | None = 0.5
-    camera_height_m: tuple[float, float] = (0.9, 2.6)
-    horizon_tolerance: float = 0.15
-    min_score: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.min_width is not None:
-            store_number(self, "min_width", low=16, high=10_000)
-        store_number(self, "max_height", above=0, high=2)
-        store_integer(self, "per_octave", low=1, high=32)
-        if self.horizon is not None:
-            store_number(self, "horizon", low=0, high=1)
-        heights: object = self.camera_height_m
-        if not isinstance(heights, (tuple, list)) or len(heights) != 2:
-            raise InvalidInputError(
-                f"camera_height_m must be (minimum, maximum), such as (0.9, 2.6); got {describe(heights)}"
-            )
-        low, high = (check_number(each, "camera_height_m", above=0, high=1000) for each in heights)
-        if low > high:
-            raise InvalidInputError(f"camera_height_m must be in ascending order; got {describe(heights)}")
-        object.__setattr__(self, "camera_height_m", (low, high))
-        store_number(self, "horizon_tolerance", low=0, high=1)
-        store_number(self, "min_score")
-
-    @classmethod
-    def default(cls) -> PyramidParams:
-        """Return the default parameters."""
-        return cls()
-
-    def with_horizon(self, horizon: float | None) -> PyramidParams:
-        """Return the same parameters with a known horizon and a lower tolerance; None changes nothing."""
-        if horizon is None:
-            return self
-        return dataclasses.replace(self, horizon=horizon, horizon_tolerance=0.06)
-
-    def everywhere(self) -> PyramidParams:
-        """Return the same parameters for a search of all rows, whatever the horizon."""
-        return dataclasses.replace(self, horizon=None)
-
-    def heat_range(self, heat: HeatParams) -> HeatRange:
-        """Heat thresholds for the windows of this search, which are few: two to six on a vehicle."""
-        return HeatRange(*(self.per_octave / 5 * value for value in _PYRAMID_HEAT[heat.weighting]))
-
-    def smallest_width(self, shape: tuple[int, ...]) -> float:
-        """Minimum width of a vehicle in pixels in a frame of `shape`.
-
-        >>> [PyramidParams().smallest_width(shape) for shape in [(360, 480), (720, 1280)]]
-        [24.0, 32.0]
-        """
-        if self.min_width is not None:
-            return self.min_width
-        return min(max(shape[1] / 40, 24.0), 32.0)
-
-    def sizes(self, columns: float, rows: float, shape: tuple[int, ...]) -> list[float]:
-        """Sizes of the cells of a search, in pixels of the frame.
-
-        Parameters
-        ----------
-        columns, rows
-            Width and height of a vehicle's box in cells.
-        shape
-            ``(height, width, ...)`` of the frame.
-
-        Returns
-        -------
-        list of float
-            In ascending order, `per_octave` per doubling. At the first one, a box has the minimum width.
-        """
-        smallest = self.smallest_width(shape) / columns
-        largest = max(self.max_height * shape[0] / rows, smallest)
-        count = math.floor(self.per_octave * math.log2(largest / smallest)) + 1
-        return [smallest * 2 ** (step / self.per_octave) for step in range(count)]
-
-    def rows(self, width: float, height: float, shape: tuple[int, ...]) -> tuple[int, int]:
-        """Range of rows that boxes of one size can cover.
-
-        On a flat road, the bottom of a vehicle is below the horizon by its width in pixels times the ratio of
-        the camera's height and the vehicle's width.
-
-        Parameters
-        ----------
-        width, height
-            Size of the boxes in pixels.
-        shape
-            ``(height, width, ...)`` of the frame.
-
-        Returns
-        -------
-        tuple of int
-            First row, and the row after the last one; all rows if `horizon` is None.
-        """
-        if self.horizon is None:
-            return 0, shape[0]
-        # Vehicles are typically 1.8 m wide.
-        low, high = (camera_height * width / 1.8 for camera_height in self.camera_height_m)
-        slack = self.horizon_tolerance * shape[0]
-        top = (self.horizon * shape[0]) + low - slack - height
-        bottom = (self.horizon * shape[0]) + high + slack
-        return max(0, math.floor(top)), min(shape[0], math.ceil(bottom))
+def entries(values: object, name: str) -> tuple[Any, ...]:
+    """Return the values of a tuple or list with at least one entry."""
+    if not isinstance(values, (tuple, list)) or not values:
+        raise InvalidInputError(f"{name} must be a tuple of at least one entry; got {describe(values)}")
+    return tuple(values)
