@@ -697,10 +697,10 @@ def test_heat_thresholds_depend_on_the_model():
         model: VehicleDetector(model, region_params=HeatParams()).region_params.threshold
         for model in ("default", "highway")
     }
-    assert thresholds == {"default": 2.0, "highway": 2.0}
+    assert thresholds == {"default": 0.0, "highway": 2.0}
     assert make(region_params=HeatParams(threshold=7.0)).region_params.threshold == 7
-    with pytest.warns(UserWarning, match="the heat threshold 20 does not fit the density") as caught:
-        VehicleDetector(region_params=HeatParams(threshold=20.0))
+    with pytest.warns(UserWarning, match="the heat threshold 50 does not fit the density") as caught:
+        VehicleDetector("highway", region_params=HeatParams(threshold=50.0))
     assert caught[0].filename == __file__
 
 

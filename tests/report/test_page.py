@@ -1,6 +1,7 @@
 """The content of the page."""
 
 import base64
+import dataclasses
 import hashlib
 import html
 import json
@@ -326,7 +327,7 @@ class TestSettingsAndModel:
         if isinstance(shipped, type(load_classifier())):
             model = type(shipped)(shipped.params, shipped.templates, metadata)
         else:
-            model = shipped.with_metadata(metadata)
+            model = dataclasses.replace(shipped, metadata=metadata)
         text = write_report(tmp_path, FRAMES, detector=SimpleNamespace(model=model))
         StrictParser(text)
         assert "License: the model inherits the terms of the data it was trained on." in text
