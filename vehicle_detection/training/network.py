@@ -128,6 +128,7 @@ def train_network(
         batch_size=None,
         num_workers=workers,
         pin_memory=place.type == "cuda",
+        generator=torch.Generator(),  # not the global one
         prefetch_factor=4 if workers else None,
         multiprocessing_context="fork" if workers and hasattr(os, "fork") else None,
     )
@@ -301,10 +302,13 @@ class _State:
                     if name.startswith(prefix)
                 }
             )
+        parameters = [each for group in self.optimizer.param_groups for each in group["params"]]
         state: dict[int, dict[str, Tensor]] = {}
         for name, value in tensors.items():
             if name.startswith("optimizer."):
                 _, number, key = name.split(".")
+                if key != "step":  # the fused optimizer needs the memory layout of the parameter
+                    value = torch.empty_like(parameters[int(number)]).copy_(value)
                 state.setdefault(int(number), {})[key] = value
         self.optimizer.load_state_dict(self.optimizer.state_dict() | {"state": state})
         self.step = int(facts["step"])
