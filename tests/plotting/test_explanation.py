@@ -14,8 +14,8 @@ CELLS = np.array([[0.5, -1.0, 0.0], [0.25, 0.0, 1.0]])
 
 def explanation(**options):
     values = {"box": np.array([20.0, 30, 60, 60]), "found": True, "window": np.array([10.0, 20, 70, 60])}
-    values |= {"cells": CELLS, "terms": {"cells": 0.75, "bias": -0.5, "second stage": 0.2}}
-    return Explanation(**(values | {"template": 1, "score": 1.25} | options))
+    values |= {"cells": CELLS, "terms": {"cells": 0.75, "bias": -0.5, "color histogram": 0.2}}
+    return Explanation(**(values | {"score": 1.25} | options))
 
 
 def test_cells_and_terms_are_drawn():
@@ -31,7 +31,7 @@ def test_cells_and_terms_are_drawn():
     assert [label.get_text() for label in figure.axes[2].get_yticklabels()] == [
         "cells",
         "bias",
-        "second stage",
+        "color histogram",
     ]
     # The line of the margin is behind the numbers.
     (line, *_), numbers = figure.axes[2].lines, figure.axes[2].texts

@@ -304,7 +304,7 @@ class TestSettingsAndModel:
         assert f"<dt>focal px</dt><dd>{focal}</dd>" in text
 
     def test_of_the_heat_map_of_the_course(self, tmp_path):
-        with VehicleDetector(n_jobs=1, region_params=HeatParams(), horizon=0.5) as detector:
+        with VehicleDetector(n_jobs=1, region_params=HeatParams(threshold=2), horizon=0.5) as detector:
             text = write_report(tmp_path, FRAMES, detector=detector)
         assert "<summary>Regions (heat map)</summary>" in text
         assert "<dt>threshold</dt><dd>2</dd>" in text
