@@ -6,6 +6,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="training needs PyTorch, the extra [train]")
 onnx = pytest.importorskip("onnx", reason="export needs onnx, the extra [train]")
 
+from tests.training.networks import random_network  # noqa: E402
 from vehicle_detection.errors import ModelFileError  # noqa: E402
 from vehicle_detection.network import METADATA_KEY, load_network, open_session  # noqa: E402
 from vehicle_detection.training import (  # noqa: E402
@@ -26,15 +27,7 @@ IMAGE = np.random.default_rng(0).integers(0, 256, (96, 160, 3), np.uint8)
 
 @pytest.fixture(scope="module")
 def network():
-    """Random weights, with statistics and factors that are not those of the start."""
-    torch.manual_seed(0)
-    network = Network()
-    with torch.no_grad():
-        network.scale.copy_(torch.tensor([1.1, 0.9, 1.2, 0.8]))
-        for name, value in network.named_buffers():
-            if name.endswith(("running_mean", "running_var")):
-                value.add_(torch.rand_like(value) * 0.3)
-    return network.eval()
+    return random_network()
 
 
 @pytest.fixture(scope="module")

@@ -38,7 +38,7 @@ def assert_equal(one, other):
         assert torch.equal(value, other[name]), name
 
 
-class Stop(Exception):
+class StopError(Exception):
     pass
 
 
@@ -48,9 +48,9 @@ def test_a_resumed_training_equals_an_uninterrupted_one(frames, tmp_path):
     def interrupt(step, line):
         steps.append(step)
         if len(steps) == 3:
-            raise Stop
+            raise StopError
 
-    with pytest.raises(Stop):
+    with pytest.raises(StopError):
         train(frames, checkpoint=checkpoint, on_step=interrupt)
     resumed = train(frames, checkpoint=checkpoint, on_step=interrupt)
     assert steps == [1, 2, 3, 3, 4]  # the third step was interrupted before its checkpoint
@@ -92,7 +92,7 @@ def test_checkpoints_of_other_trainings_and_damaged_ones_are_refused(frames, tmp
     with pytest.raises(InvalidInputError, match="of an interrupted training with other frames or options"):
         train(frames, checkpoint=checkpoint)
     checkpoint.write_bytes(checkpoint.read_bytes()[:2000])
-    with pytest.raises(InvalidInputError, match="is not a complete file of a training .+; remove it"):
+    with pytest.raises(InvalidInputError, match=r"is not a complete file of a training .+; remove it"):
         train(frames, checkpoint=checkpoint)
 
 

@@ -1,0 +1,121 @@
+import functools
+import re
+import sys
+
+import pytest
+from typer.testing import CliRunner
+
+from tests.helpers import drawn, write_frame_set
+from vehicle_detection.cli.app import app
+
+
+def run(*words):
+    return CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
+
+
+def refuse(*words):
+    """Run a command that must fail with one line on standard error; return the line."""
+    result = run(*words)
+    assert result.exit_code == 2, result.output
+    assert re.fullmatch(r"error: [^\n]+\n", result.stderr), result.stderr
+    return result.stderr
+
+
+@pytest.fixture(scope="module")
+def roads(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("roads")
+    write_frame_set(folder, "town", drawn(range(4)))
+    write_frame_set(folder, "coast", drawn(range(4, 6)))
+    return folder
+
+
+def test_without_pytorch_the_command_names_the_extra(roads, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    for name in "fine_tune", "export", "architecture", "network", "loss", "weights":
+        monkeypatch.delitem(sys.modules, f"vehicle_detection.training.{name}", raising=False)
+    message = refuse("train-frames", roads, "-o", tmp_path / "own.onnx")
+    assert "needs the package torch, which is not installed" in message
+    assert 'pip install "vehicle-detection[train]"' in message
+
+
+@pytest.fixture
+def initial(tmp_path, monkeypatch):
+    """A network that was never trained; trainings of it have small samples."""
+    pytest.importorskip("torch", reason="training needs PyTorch, the extra [train]")
+    pytest.importorskip("onnx", reason="export needs onnx, the extra [train]")
+    from tests.training.networks import random_network
+    from vehicle_detection.training import export_network, fine_tune, network
+
+    monkeypatch.setattr(fine_tune, "_SIZE", (96, 64))
+    monkeypatch.setattr(fine_tune, "_BATCH", 2)
+    monkeypatch.setattr(fine_tune, "export_network", functools.partial(export_network, quantize=False))
+    monkeypatch.setattr(network, "_CHECKPOINT_SECONDS", 0)
+    monkeypatch.setattr(network, "_REPORT_SECONDS", 0)
+    path = tmp_path / "initial.onnx"
+    params = {"input_size": 160, "slope": 1.0, "offset": 0.0, "threshold": -9.0, "nms_iou": 0.6}
+    path.write_bytes(export_network(random_network(), [], params, {}, quantize=False))
+    return path
+
+
+def test_train_continue_and_show(roads, initial, tmp_path, monkeypatch):
+    from vehicle_detection.training import fine_tune
+
+    own, curves, checkpoint = (tmp_path / name for name in ("own.onnx", "c.csv", "own.onnx.checkpoint"))
+    words = [
+        "train-frames",
+        roads,
+        "-o",
+        own,
+        "--model",
+        initial,
+        "--steps",
+        2,
+        "--jobs",
+        1,
+        "--device",
+        "cpu",
+    ]
+    words += ["--curves", curves]
+    with monkeypatch.context() as patch:
+
+        def interrupt(*arguments, **options):
+            raise KeyboardInterrupt
+
+        patch.setattr(fine_tune, "export_network", interrupt)
+        result = run(*words)
+    assert result.exit_code == 130
+    assert result.stderr == f"interrupted; the same command continues from {checkpoint}\n"
+    assert not own.exists()
+
+    result = run(*words)
+    assert result.exit_code == 0, result.output
+    assert f"continuing the training of {checkpoint}\n" in result.stdout
+    assert re.search(r"town: 4 frames, \d+ boxes, 0 frames without any\n", result.stdout)
+    assert "on the frames held out of training, IoU 0.5" in result.stdout
+    assert result.stdout.endswith(f"wrote {own}, {curves}\n")
+    assert curves.read_text().startswith("frames,logit,precision,recall\n")
+    assert not checkpoint.exists()
+
+    shown = run("info", own).stdout
+    for line in r"town, before +\d\.\d{3} ", r"town +\d\.\d{3} ", r"held_out +1\n", r"steps +2\n":
+        assert re.search(line, shown), line
+
+
+def test_bad_input_is_refused_before_the_training(roads, tmp_path):
+    pytest.importorskip("torch", reason="training needs PyTorch, the extra [train]")
+    (tmp_path / "empty").mkdir()
+    own = tmp_path / "own.onnx"
+    cases = {
+        r"folder .+none does not exist; pass the folder of the labelled": [tmp_path / "none", "-o", own],
+        r"folder .+empty has no labels/NAME.csv": [tmp_path / "empty", "-o", own],
+        r"--output needs an existing folder": [roads, "-o", tmp_path / "none" / "own.onnx"],
+        r"--output must end in \.onnx": [roads, "-o", tmp_path / "own.safetensors"],
+        r"--curves .+ is also --output .+;": [roads, "-o", own, "--curves", own],
+        r"--seed must be an integer at least 0": [roads, "-o", own, "--seed", -1],
+        r"--steps must be an integer at least 1": [roads, "-o", own, "--steps", 0],
+        r"--device must be one of 'cpu', 'cuda'": [roads, "-o", own, "--device", "tpu"],
+        r"none\.onnx": [roads, "-o", own, "--model", tmp_path / "none.onnx"],
+    }
+    for message, words in cases.items():
+        assert re.search(message, refuse("train-frames", *words)), message
+    assert not own.exists()

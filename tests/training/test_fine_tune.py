@@ -1,0 +1,171 @@
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="training needs PyTorch, the extra [train]")
+pytest.importorskip("onnx", reason="export needs onnx, the extra [train]")
+
+from tests.helpers import drawn  # noqa: E402
+from tests.training.networks import random_network  # noqa: E402
+from vehicle_detection.errors import InvalidInputError, ModelFileError  # noqa: E402
+from vehicle_detection.evaluation import FrameBoxes, LabelledFrames  # noqa: E402
+from vehicle_detection.training import (  # noqa: E402
+    FrameDataset,
+    export_network,
+    fine_tune,
+    fine_tune_network,
+    fingerprint,
+    network,
+)
+from vehicle_detection.training.fine_tune import hold_out  # noqa: E402
+
+SOURCES = [FrameDataset("road", (drawn(range(5)),)), FrameDataset("coast", (drawn(range(5, 8), "coast"),))]
+
+
+@pytest.fixture(scope="module")
+def initial(tmp_path_factory):
+    """A file of a network that was never trained, whose boxes all count."""
+    path = tmp_path_factory.mktemp("initial") / "initial.onnx"
+    params = {"input_size": 160, "slope": 1.0, "offset": 0.0, "threshold": -9.0, "nms_iou": 0.6}
+    path.write_bytes(export_network(random_network(), [], params, {}, quantize=False))
+    return path
+
+
+@pytest.fixture(autouse=True)
+def small_samples(monkeypatch):
+    monkeypatch.setattr(fine_tune, "_SIZE", (96, 64))
+    monkeypatch.setattr(fine_tune, "_BATCH", 2)
+    plain = functools.partial(export_network, quantize=False)  # in a fifth of the time
+    monkeypatch.setattr(fine_tune, "export_network", plain)
+    monkeypatch.setattr(network, "_REPORT_SECONDS", 0)
+    monkeypatch.setattr(network, "_CHECKPOINT_SECONDS", 0)
+
+
+def tune(initial, sources=SOURCES, **options):
+    options = {"steps": 3, "n_jobs": 1, "device": "cpu"} | options
+    return fine_tune_network(sources, initial=initial, **options)
+
+
+def test_an_interrupted_training_continues_and_writes_the_same_file(initial, tmp_path):
+    steps, checkpoint = [], tmp_path / "own.onnx.checkpoint"
+
+    def interrupt(step, line):
+        steps.append(step)
+        if len(steps) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        tune(initial, checkpoint=checkpoint, on_step=interrupt)
+    assert checkpoint.exists()
+    resumed = tune(initial, checkpoint=checkpoint, on_step=interrupt)
+    assert steps == [1, 2, 2, 3]
+    assert not checkpoint.exists()
+    whole = tune(initial)
+    assert whole.model.graph == resumed.model.graph
+
+    assert [score.name for score in whole.after] == ["road", "coast"]
+    assert [score.frames for score in whole.after] == [score.frames for score in whole.before] == [1, 1]
+    facts = whole.model.metadata
+    assert facts["metrics"]["held_out"]["road"] == whole.after[0].to_dict()
+    assert facts["metrics"]["held_out_before"]["coast"] == whole.before[1].to_dict()
+    assert facts["data"] == {"road": 5, "coast": 3, "held_out": 2, "sha256": fingerprint(SOURCES)}
+    assert facts["training"].items() >= {"steps": 3, "random_state": 0, "device": "cpu"}.items()
+    assert facts["versions"].keys() == {"vehicle_detection", "torch", "onnx", "onnxruntime"}
+    # So few vehicles do not set the threshold.
+    assert (whole.model.threshold, whole.model.slope, whole.model.input_size) == (-9.0, 1.0, 160)
+    whole.model.save(tmp_path / "own.onnx")
+    assert (tmp_path / "own.onnx").read_bytes() == whole.model.graph
+
+
+def test_many_held_out_vehicles_set_calibration_and_threshold(initial, monkeypatch):
+    monkeypatch.setattr(fine_tune, "_MIN_VEHICLES", 1)
+    monkeypatch.setattr(fine_tune, "fit_log_odds", lambda folds: (2.0, 0.5))
+    monkeypatch.setattr(fine_tune, "best_threshold", lambda folds: -1.0)
+    model = tune(initial, steps=1).model
+    assert (model.slope, model.offset, model.threshold) == (2.0, 0.5, -1.5)
+
+
+def test_one_frame_is_trained_on_and_not_evaluated(initial):
+    tuned = tune(initial, [FrameDataset("road", (drawn([0]),))], steps=1)
+    assert (tuned.before, tuned.after, tuned.folds) == ([], [], [])
+    assert tuned.model.metadata["metrics"] == {"held_out": {}, "held_out_before": {}}
+    assert tuned.model.metadata["data"]["held_out"] == 0
+
+
+def test_steps_follow_from_the_number_of_frames():
+    assert [fine_tune.default_steps(count) for count in (1, 40, 160, 5000)] == [200, 200, 800, 1200]
+
+
+# --- hold_out ---
+
+
+def numbered(count, vehicles=None, name="road"):
+    """Frames of which those in `vehicles`, by default all, show one."""
+    keys = list(range(count) if vehicles is None else vehicles)
+    labels = FrameBoxes(keys, None, [[10, 10, 50, 40]] * len(keys), frame_keys=list(range(count)))
+    return LabelledFrames(name, [np.zeros((60, 80, 3), np.uint8)] * count, labels)
+
+
+def keys(sources):
+    return [list(part.keys) for source in sources for part in source.sets]
+
+
+def test_blocks_of_neighboring_frames_are_held_out():
+    kept, held_out = hold_out([FrameDataset("road", (numbered(100),))])
+    assert keys(held_out) == [[*range(20, 30), *range(70, 80)]]
+    assert keys(kept) == [[key for key in range(100) if key not in keys(held_out)[0]]]
+    assert len(held_out[0].sets[0].labels) == 20
+
+
+def test_at_least_one_frame_is_held_out():
+    assert keys(hold_out([FrameDataset("road", (numbered(2),))])[1]) == [[1]]
+    many = [FrameDataset(name, (numbered(1, name=name),)) for name in "abc"]
+    kept, held_out = hold_out(many)
+    assert ([source.name for source in kept], [source.name for source in held_out]) == (["a", "b"], ["c"])
+
+
+def test_frames_without_vehicles_stay_in_their_part():
+    _, held_out = hold_out([FrameDataset("road", (numbered(10, vehicles=[0, 5]),))])
+    assert keys(held_out) == [[2, 7]]
+    assert len(held_out[0].sets[0].labels) == 0
+
+
+def test_the_only_vehicle_is_trained_on():
+    source = FrameDataset("road", (numbered(10, vehicles=[2]),))
+    assert hold_out([source]) == ([source], [])
+
+
+# --- bad input ---
+
+
+def test_bad_input_is_refused_before_the_training(initial, tmp_path, monkeypatch):
+    monkeypatch.setattr(fine_tune, "train_network", None)
+    outside = FrameBoxes([1], None, [[300, 10, 350, 40]])
+    beside = dataclasses.replace(numbered(2), labels=outside)
+    for sources, message in (
+        ([FrameDataset("road", (numbered(3, vehicles=[]),))], "sources must show at least one vehicle, got"),
+        (
+            [FrameDataset("road", (beside,))],
+            r"road, frame 1: the box \[300.0, 10.0, .+ lies outside the 80x60",
+        ),
+        ([], "sources must hold at least 1 data set"),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            tune(initial, sources)
+    for options, message in (
+        ({"steps": 0}, "steps must be an integer at least 1"),
+        ({"random_state": -1}, "random_state must be an integer at least 0"),
+        ({"device": "tpu"}, "device must be one of 'cpu', 'cuda'"),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            tune(initial, **options)
+    with pytest.raises(ModelFileError, match=r"none\.onnx"):
+        tune(tmp_path / "none.onnx")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="has a CUDA device")
+def test_cuda_needs_a_device(initial):
+    with pytest.raises(InvalidInputError, match="device must be 'cpu', PyTorch finds no CUDA device"):
+        tune(initial, device="cuda")
