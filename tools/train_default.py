@@ -149,8 +149,9 @@ def _train(options: argparse.Namespace) -> None:
             check_target(getattr(options, name), f"--{name.replace('_', '-')}")
     if options.pictures is not None:
         options.pictures.mkdir(parents=True, exist_ok=True)
+    sources = load_sources(options.data, held_out=True)
     rendered = rendered_source(random_state=options.seed)
-    parts = [*load_sources(options.data, held_out=True), rendered]
+    parts = [*sources, rendered]
     frames = load_training_frames(parts, max_side=_MAX_SIDE)
     measured = _network(options, options.held_out_weights, frames, "held-out")
     folds = evaluate_held_out(load_content(make_file(measured, frames)), options.data, n_jobs=options.jobs)

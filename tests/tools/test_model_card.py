@@ -1,68 +1,69 @@
-import dataclasses
-import math
-
+import numpy as np
 import pytest
 
 from tests.helpers import drawn
-from tools.model_card import write_card
+from tools.model_card import calibration_rows, write_card
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.training import FoldScore, FrameDataset
+from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
+from vehicle_detection.network import NetworkModel
+from vehicle_detection.network.inputs import InputFormat
+from vehicle_detection.network.outputs import OutputFormat
+from vehicle_detection.training import FoldDetections, FrameDataset
 
-SOURCES = [FrameDataset("one", (drawn(range(7), "first"),))]
-SCORE = FoldScore(
-    name="first",
-    source="one",
-    frames=7,
-    vehicles=13,
-    f1=0.8,
-    precision=0.7059,
-    recall=0.9231,
-    mean_iou=0.82,
-    false_per_frame=0.7143,
-    false_per_empty_frame=math.nan,
-    false_per_vehicle_free_frame=0.25,
-    threshold=-0.36,
-    average_precision=0.9231,
-    best_f1=0.96,
-    region_f1=0.81,
-    region_average_precision=0.93,
-    strict_average_precision=0.61,
-    recall_occluded=0.5,
-    recall_truncated=0.75,
-    recall_narrow=math.nan,
-    occluded=2,
-    truncated=4,
-    narrow=0,
-    calibration_error=0.05,
+SOURCES = [FrameDataset("us_side", (drawn(range(3), "us_side"),)), FrameDataset("own", (drawn([4]),))]
+MODEL = NetworkModel(
+    graph=b"\0" * 1_900_000,
+    name="small",
+    input_format=InputFormat(None, "uint8", False),
+    output_format=OutputFormat("columns", 1),
+    slope=2.0,
+    threshold=0.5,
+    metadata={"training": {"steps": 40, "batch": 64, "size": "640x384", "random_state": 3}},
 )
+BOXES = [[100, 80, 200, 180], [170, 60, 260, 150], [300, 100, 330, 125], [0, 90, 60, 170], [340, 20, 400, 60]]
 
 
-def test_the_card_lists_the_measurements(small_mixture, tmp_path):
-    write_card(tmp_path / "small.md", small_mixture, [SCORE], SOURCES, seed=3, patches=5)
-    card = (tmp_path / "small.md").read_text()
-    assert card.startswith("# Model card: small\n\nA mixture of 1 linear SVM templates")
-    assert "python -m tools.train_default DATA -o small.safetensors --card small.md --seed 3" in card
-    assert "Templates, in cells of the vehicle's box: 6x5\n" in card
-    assert f"{small_mixture.rescorer.n_weights:,} weights" in card
-    row = (
-        "| first | 7 | 13 | 0.800 | 0.960 | 0.923 | 0.706 | 0.923 | 0.820 | 0.71 | - | 0.25 | 0.810 | "
-        "0.930 | 0.610 | 0.500 | 0.750 | - | 0.050 |"
+def fold(source, shown, scores, gray=90):
+    """Detections of the boxes `shown` in one frame, and of one that is false."""
+    labels = FrameBoxes(
+        [0] * 5,
+        np.arange(5),
+        BOXES,
+        truncated=np.array([0, 0, 0, 0.4, 0]),
+        ignore=np.array([0, 0, 0, 0, 1], np.bool_),
     )
-    assert row in card
-    assert "- one: 7 frames, " in card
-    assert "- 5 vehicles on the course's patches" in card
+    boxes = [*(BOXES[row] for row in shown), [10, 10, 40, 30]]
+    found = FrameBoxes([0] * len(boxes), None, boxes, scores=np.array(scores, float))
+    images = {0: np.full((200, 400, 3), gray, np.uint8)}
+    return FoldDetections(source, LabelledFrames(source, images, labels), found)
+
+
+def test_probabilities_are_fitted_to_the_other_sources():
+    folds = [fold(name, [0, 1, 2, 3], [2.0, 1.5, 1.0, -0.5, -1.5]) for name in ("one", "two")]
+    rows = calibration_rows(folds)
+    assert sum(count for count, _, _ in rows) <= 10
+    assert rows[-1][2] == 1.0
+    assert [probability for _, probability, _ in rows] == sorted(probability for _, probability, _ in rows)
+    assert calibration_rows([]) == []
+
+
+def test_the_card_lists_the_measurements(tmp_path):
+    folds = [fold("us_side", [0, 1, 3], [1.0, 0.5, 0.1, -1.5]), fold("bdd", [0], [1.0, -1.5], gray=20)]
+    write_card(tmp_path / "small.md", MODEL, folds, SOURCES, seed=3, trained_on="a GPU, 5 minutes")
+    card = (tmp_path / "small.md").read_text()
+    assert card.startswith("# Model card: small\n\nA small network that detects vehicles")
+    assert "python -m tools.train_default DATA -o small.onnx --card small.md --seed 3\n" in card
+    assert "- Training: 40 steps of 64 samples of 640x384 px, seed 3\n" in card
+    assert "- Hardware and time: a GPU, 5 minutes\n" in card
+    assert "- Threshold: a confidence of 0.62\n" in card
+    # The threshold is 0.25 in the log-odds of the network: two of four vehicles, no false box.
+    assert "| us_side | 1 | 4 | 0.667 | 1.000 | 0.500 | " in card
+    assert "| bdd night | 1 | 4 | " in card
+    assert "- us_side, 3 frames, " in card
     assert "nan" not in card
     assert max(len(line) for line in card.splitlines() if not line.startswith("|")) <= 110
 
 
-def test_the_card_of_a_model_without_rescorer_and_patches(small_mixture, tmp_path):
-    plain = dataclasses.replace(small_mixture, rescorer=None)
-    write_card(tmp_path / "m.md", plain, [], SOURCES, seed=0)
-    card = (tmp_path / "m.md").read_text()
-    assert "Rescoring" not in card
-    assert "the course's patches" not in card
-
-
-def test_the_card_needs_a_folder(small_mixture, tmp_path):
+def test_the_card_needs_a_folder(tmp_path):
     with pytest.raises(InvalidInputError, match="path needs an existing folder"):
-        write_card(tmp_path / "none" / "m.md", small_mixture, [SCORE], SOURCES, seed=0)
+        write_card(tmp_path / "none" / "m.md", MODEL, [], SOURCES, seed=0)

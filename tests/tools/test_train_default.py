@@ -1,113 +1,101 @@
-import shutil
+import functools
 
 import numpy as np
 import pytest
 
+pytest.importorskip("torch", reason="training needs PyTorch, the extra [train]")
+pytest.importorskip("onnx", reason="export needs onnx, the extra [train]")
+
 from tests.helpers import drawn, write_frame_set
-from tools import train_default
+from tests.training.networks import random_network
+from tools import rides, train_default
 from vehicle_detection.errors import DatasetError
-from vehicle_detection.images import write_image
-from vehicle_detection.mixture import load_model
-from vehicle_detection.mixture_training import drawn_source
-from vehicle_detection.training import detect_in_source, score_fold
+from vehicle_detection.network import load_network
+from vehicle_detection.training import (
+    NetworkTraining,
+    export_network,
+    rendered_source,
+    save_weights,
+)
 
 
 @pytest.fixture
-def data(tmp_path):
+def data(tmp_path, monkeypatch):
+    """A data folder; the last two of three rides are kept out."""
+    monkeypatch.setattr(rides, "_FIRST", 1)
     folder = tmp_path / "data"
-    for number, name in enumerate((*train_default.ROADS, "other")):
+    write_frame_set(folder, "bdd", drawn(range(3)))
+    for number, name in enumerate((*train_default.LEFT_OUT, "other")):
         write_frame_set(folder, name, drawn([number]))
     for number, name in enumerate(train_default.COURSE_SETS):
         write_frame_set(folder, name, drawn([number, number + 1]), place=".")
     return folder
 
 
-def write_patches(folder, count):
-    (folder / "vehicles" / "GTI_Far").mkdir(parents=True)
-    for number in range(count):
-        patch = np.full((64, 64, 3), number, np.uint8)
-        write_image(folder / "vehicles" / "GTI_Far" / f"{number}.png", patch)
-
-
 def test_sources_of_the_data_folder(data):
     found = train_default.load_sources(data)
-    assert [source.name for source in found] == ["camvid", "dawn", "india", "indonesia", "course"]
-    assert [[len(part) for part in source.sets] for source in found] == [[1], [1], [1], [1], [2, 2, 2]]
-    assert [source.min_labelled_width for source in found] == [0.0, 0.0, 0.0, 60.0, 0.0]
-    assert [part.name for part in found[-1].sets] == ["project_clip", "test_images", "test_video"]
+    assert [source.name for source in found] == ["bdd", *train_default.LEFT_OUT, "course"]
+    assert [len(part) for part in found[-1].sets] == [2, 2, 2]
+    bdd, course = train_default.load_sources(data, held_out=True)
+    assert [part.keys for part in bdd.sets] == [("000.png",)]
+    assert course.name == "course"
     (data / "labels" / "india.csv").unlink()
     with pytest.raises(DatasetError, match=r"data lacks labels/india\.csv"):
         train_default.load_sources(data)
 
 
-@pytest.mark.parametrize("zipped", [True, False], ids=["zip", "folder"])
-def test_every_sixth_patch_is_loaded(tmp_path, zipped):
-    assert train_default.load_vehicle_patches(tmp_path) == []
-    write_patches(tmp_path, 25)
-    if zipped:
-        shutil.make_archive(str(tmp_path / "vehicles"), "zip", tmp_path, "vehicles")
-        shutil.rmtree(tmp_path / "vehicles")
-    found = train_default.load_vehicle_patches(tmp_path)
-    assert [image.shape for image in found] == [(64, 64, 3)] * 5
-    assert [image[0, 0, 0] for image in found] == [0, 6, 12, 18, 24]
-
-
-def test_the_command_writes_model_card_curves_and_pictures(
-    data, small_mixture, tmp_path, monkeypatch, capsys
-):
-    write_patches(data, 7)
-    used = {}
-
-    def cross_validate(sources, *, on_step, **options):
-        """Stand in for the training: detect in the sources with a model that is already trained."""
-        used.update(options, sources=sources)
-        folds = [fold for source in sources for fold in detect_in_source(small_mixture, source)]
-        on_step("trained")
-        return small_mixture, [score_fold(fold, 0.0) for fold in folds], folds
-
-    monkeypatch.setattr(train_default, "cross_validate_mixture", cross_validate)
+@pytest.fixture
+def quick(monkeypatch):
+    """Few rendered frames, small samples, and files with float weights."""
+    small = functools.partial(NetworkTraining, batch=2, size=(96, 64), warm_up=1)
+    monkeypatch.setattr(train_default, "NetworkTraining", small)
     monkeypatch.setattr(
-        train_default, "drawn_source", lambda **options: drawn_source(drives=1, frames=1, **options)
+        train_default, "rendered_source", lambda **options: rendered_source(frames=1, **options)
     )
-    model, card, curves, pictures = (
-        tmp_path / name for name in ("new.safetensors", "new.md", "new.csv", "pictures")
-    )
+    monkeypatch.setattr(train_default, "export_network", functools.partial(export_network, quantize=False))
+    monkeypatch.setattr(train_default, "_INPUT_SIZE", 160)
+    # The boxes of a network without training have no calibration.
+    monkeypatch.setattr(train_default, "fit_log_odds", lambda folds: (2.0, 0.5))
+
+
+def test_the_command_writes_model_card_curves_and_pictures(data, quick, tmp_path, capsys):
+    names = "new.onnx", "new.md", "new.csv", "pictures", "w.safetensors"
+    model, card, curves, pictures, weights = (tmp_path / name for name in names)
+    save_weights(random_network(), weights)
     words = [data, "-o", model, "--card", card, "--curves", curves, "--pictures", pictures, "--seed", 5]
+    words += ["--weights", weights, "--held-out-weights", weights, "--trained-on", "a GPU", "--jobs", 1]
     train_default.main(list(map(str, words)))
-    assert load_model(model).metadata["data"] == {
-        "camvid": 1,
-        "dawn": 1,
-        "india": 1,
-        "indonesia": 1,
-        "course": 6,
-        "drawn": 1,
-        "patches": 2,
-    }
-    assert load_model(model).metadata["training"] == {"random_state": 5}
-    assert [source.name for source in used["extra_sources"]] == ["drawn"]
-    assert (len(used["patches"]), used["random_state"]) == (2, 5)
-    assert "--seed 5" in card.read_text()
-    assert "- 2 vehicles on the course's patches" in card.read_text()
-    assert curves.read_text().startswith("frames,logit,precision,recall\ncamvid,")
-    names = {path.name for path in pictures.iterdir()}
-    assert {"curves.png", "india-missed.png", "test_video-false.png"} <= names
-    assert len(names) == 15
-    assert (pictures / "curves.png").read_bytes()[:4] == b"\x89PNG"
-    out = capsys.readouterr().out
-    assert out.startswith("trained\ncamvid: F1 ")
+    written = load_network(model)
+    counts = {"bdd": 3, "course": 6, "rendered": 1} | dict.fromkeys(train_default.LEFT_OUT, 1)
+    assert written.metadata["data"].items() > counts.items()
+    assert written.metadata["training"].items() >= {"hardware": "a GPU", "random_state": 5}.items()
+    assert list(written.metadata["metrics"]["left_out"]) == ["bdd", *train_default.LEFT_OUT]
+    assert written.metadata["metrics"]["left_out"]["bdd"]["frames"] == 2
+    assert np.isfinite([written.slope, written.offset, written.threshold]).all()
+    assert "- Hardware and time: a GPU\n" in card.read_text()
+    assert curves.read_text().startswith("frames,logit,precision,recall\n")
+    assert (pictures / "dhaka-missed.png").exists()
+    assert "us_side: F1 0." in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["{data}/none", "-o", "m.safetensors"], "none does not exist"),
-        (["{data}", "-o", "{data}/none/m.safetensors"], "--output needs an existing folder"),
-        (["{data}", "-o", "m.safetensors", "--card", "{data}"], "--card must be a file"),
-        (["{data}", "-o", "m.safetensors", "--seed", "-1"], "random_state must be an integer"),
-    ],
-)
-def test_bad_arguments_stop_before_the_training(data, monkeypatch, capsys, words, message):
-    monkeypatch.setattr(train_default, "cross_validate_mixture", None)
-    with pytest.raises(SystemExit):
-        train_default.main([word.format(data=data) for word in words])
-    assert message in capsys.readouterr().err
+def test_the_network_for_the_measurements_is_trained_without_the_left_out_sources(data, quick, tmp_path):
+    model, weights = tmp_path / "held.onnx", tmp_path / "held.safetensors"
+    words = [data, "-o", model, "--held-out", "--steps", 1, "--jobs", 1, "--device", "cpu"]
+    train_default.main(list(map(str, [*words, "--save-weights", weights])))
+    facts = load_network(model).metadata
+    assert facts["data"].items() >= {"bdd": 1, "course": 6, "rendered": 1}.items()
+    assert "india" not in facts["data"]
+    assert facts["training"]["steps"] == 1
+    assert weights.exists()
+    assert not list(tmp_path.glob("*.checkpoint"))
+
+
+def test_bad_input_is_one_line(data, tmp_path, capsys):
+    for words, message in (
+        (["{data}", "-o", "{data}/none/m.onnx"], "--output needs an existing folder"),
+        (["{data}/none", "-o", "{data}/m.onnx"], "does not exist"),
+    ):
+        with pytest.raises(SystemExit) as error:
+            train_default.main([word.format(data=data) for word in words])
+        assert error.value.code == 2
+        assert message in capsys.readouterr().err

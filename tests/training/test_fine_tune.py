@@ -11,8 +11,10 @@ from tests.helpers import drawn  # noqa: E402
 from tests.training.networks import random_network  # noqa: E402
 from vehicle_detection.errors import InvalidInputError, ModelFileError  # noqa: E402
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames  # noqa: E402
+from vehicle_detection.network import load_network  # noqa: E402
 from vehicle_detection.training import (  # noqa: E402
     FrameDataset,
+    detect_logits,
     export_network,
     fine_tune,
     fine_tune_network,
@@ -80,11 +82,14 @@ def test_an_interrupted_training_continues_and_writes_the_same_file(initial, tmp
 
 
 def test_many_held_out_vehicles_set_calibration_and_threshold(initial, monkeypatch):
-    monkeypatch.setattr(fine_tune, "_MIN_VEHICLES", 1)
-    monkeypatch.setattr(fine_tune, "fit_log_odds", lambda folds: (2.0, 0.5))
     monkeypatch.setattr(fine_tune, "best_threshold", lambda folds: -1.0)
-    model = tune(initial, steps=1).model
-    assert (model.slope, model.offset, model.threshold) == (2.0, 0.5, -1.5)
+    model = load_network(initial)
+    folds = detect_logits(model, SOURCES, n_jobs=1)
+    for minimum, slope, expected in (1, 2.0, (2.0, 0.5, -1.5)), (1, 99.0, None), (50, 2.0, None):
+        monkeypatch.setattr(fine_tune, "_MIN_VEHICLES", minimum)
+        monkeypatch.setattr(fine_tune, "fit_log_odds", lambda folds, slope=slope: (slope, 0.5))
+        tuned = fine_tune._calibrate(model, folds)
+        assert (tuned.slope, tuned.offset, tuned.threshold) == (expected or (1.0, 0.0, -9.0))
 
 
 def test_one_frame_is_trained_on_and_not_evaluated(initial):

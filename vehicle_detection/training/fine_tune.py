@@ -41,6 +41,8 @@ from vehicle_detection.training.weights import read_weights
 _BLOCKS, _EVERY, _HELD = 10, 5, 2
 # Vehicles in the held-out frames from which on they set calibration and threshold.
 _MIN_VEHICLES = 50
+# Slope of a calibration above which scores separate right and false boxes: it has no best value.
+_MAX_SLOPE = 10.0
 # Longer side (px) to which frames are reduced in memory: about twice that of the samples.
 _MAX_SIDE = 1280
 _BATCH, _SIZE, _RATE = 8, (512, 320), 3e-4
@@ -148,10 +150,7 @@ def fine_tune_network(
     )
     tuned = load_content(export_network(trained, frames, file_params(model), {}))
     folds = detect_logits(tuned, held_out, n_jobs=n_jobs)
-    if sum(len(fold.matches.usable) for fold in folds) >= _MIN_VEHICLES:
-        slope, offset = fit_log_odds(folds)
-        threshold = slope * best_threshold(folds) + offset
-        tuned = dataclasses.replace(tuned, slope=slope, offset=offset, threshold=threshold)
+    tuned = _calibrate(tuned, folds)
     after = [score_logits(fold, tuned) for fold in folds]
     metadata = _metadata(checked, held_out, training, place, (before, after))
     content = set_metadata(tuned.graph, file_params(tuned), metadata)
@@ -163,6 +162,17 @@ def fine_tune_network(
 def default_steps(frames: int) -> int:
     """Return the steps of a training on so many frames."""
     return min(max(_STEPS_PER_FRAME * frames, _MIN_STEPS), _MAX_STEPS)
+
+
+def _calibrate(model: NetworkModel, folds: Sequence[FoldDetections]) -> NetworkModel:
+    """Fit calibration and threshold to the held-out frames if they show enough vehicles and false boxes."""
+    if sum(len(fold.matches.usable) for fold in folds) < _MIN_VEHICLES:
+        return model
+    slope, offset = fit_log_odds(folds)
+    if slope > _MAX_SLOPE:
+        return model
+    threshold = slope * best_threshold(folds) + offset
+    return dataclasses.replace(model, slope=slope, offset=offset, threshold=threshold)
 
 
 def hold_out(sources: Sequence[FrameDataset]) -> tuple[list[FrameDataset], list[FrameDataset]]:

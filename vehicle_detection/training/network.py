@@ -30,7 +30,6 @@ _LAST_RATE = 0.02  # as a fraction of the highest
 _WEIGHT_DECAY = 0.05  # of kernels
 _MAX_GRADIENT = 5.0  # norm
 _DECAY = 0.9995  # of the moving average of the weights, at most
-_DETERMINISTIC, _FORMAT = True, torch.channels_last
 _CHECKPOINT_SECONDS, _REPORT_SECONDS = 30.0, 10.0
 
 
@@ -110,8 +109,6 @@ def train_network(
         raise InvalidInputError("frames must show at least one vehicle; label some, and pass their labels")
     place = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     jobs = resolve_jobs(n_jobs)
-    # On CUDA, the other algorithms add in another order each time.
-    torch.backends.cudnn.deterministic = _DETERMINISTIC
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(training.random_state)
         network = copy.deepcopy(initial) if initial is not None else Network()
@@ -134,7 +131,7 @@ def train_network(
     )
     clock = _Clock(state.step, training.steps)
     # Forked processes cannot use the threads of OpenCV.
-    with single_threaded_opencv(), _torch_threads(jobs):
+    with single_threaded_opencv(), _torch_settings(jobs):
         for images, boxes, usable, ignored in batches:
             targets = Targets(*(each.to(place, non_blocking=True) for each in (boxes, usable, ignored)))
             losses = state.update(images.to(place, non_blocking=True), targets, centers)
@@ -179,13 +176,17 @@ def _minutes(seconds: float) -> str:
 
 
 @contextlib.contextmanager
-def _torch_threads(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
+def _torch_settings(threads: int) -> Iterator[None]:
+    """Compute with some threads, and on CUDA with algorithms that add in the same order each time."""
+    cudnn = torch.backends.cudnn
+    before = torch.get_num_threads(), cudnn.deterministic
+    torch.set_num_threads(threads)
+    cudnn.deterministic = True
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(before[0])
+        cudnn.deterministic = before[1]
 
 
 class _Samples(Dataset[tuple[Tensor, ...]]):
@@ -232,7 +233,7 @@ class _State:
     @classmethod
     def start(cls, network: Network, training: NetworkTraining) -> _State:
         average = copy.deepcopy(network).eval()
-        network = network.to(memory_format=_FORMAT).train()
+        network = network.to(memory_format=torch.channels_last).train()
         if training.frozen_statistics:
             for module in network.modules():
                 if isinstance(module, nn.BatchNorm2d):
