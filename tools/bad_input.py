@@ -518,7 +518,7 @@ COMMANDS = {
     "evaluate": ("in/valid.csv", "in/valid.csv"),
     "batch": ("missing.mp4", "-o", "out", "--model", "highway", "-q"),
     "train": ("--vehicles", "in/patches", "--non-vehicles", "in/patches", "-o", "out.safetensors"),
-    "train-frames": ("in/patches", "-o", "out.safetensors"),
+    "train-frames": ("in/patches", "-o", "out.onnx"),
     "tune": (
         "--vehicles",
         "in/patches",
