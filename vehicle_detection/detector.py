@@ -51,7 +51,7 @@ from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.function_model import DetectorFunction, FunctionModel
 from vehicle_detection.heatmap import HeatHistory, frame_heat, label_heat
 from vehicle_detection.images import is_cut, make_thumbnail, read_image
-from vehicle_detection.loading import load_model
+from vehicle_detection.loading import load_model, refuse_network_options
 from vehicle_detection.network import Device, NetworkModel
 from vehicle_detection.params import (
     DrawParams,
@@ -923,11 +923,7 @@ def _positive(vehicles: Detections) -> Detections:
 def _load(model: object, classes: Collection[str | int] | None, device: Device) -> Model:
     if isinstance(model, (str, os.PathLike)):
         return load_model(model, classes=classes, device=device)
-    for name, value, default in ("classes", classes, None), ("device", device, "cpu"):
-        if value != default:
-            raise InvalidInputError(
-                f"{name} must be omitted with a model, got {describe(value)}; pass it to load_model"
-            )
+    refuse_network_options(classes, device, "with a model that is loaded")
     if callable(model) and not isinstance(model, type):
         raise InvalidInputError(
             f"model must not be a function, got {describe(model)}; pass it to detector_from"

@@ -6,7 +6,7 @@ import os
 from collections.abc import Collection
 from pathlib import PurePath
 
-from vehicle_detection._common import describe
+from vehicle_detection._common import check_choice, describe
 from vehicle_detection.classifier import VehicleClassifier, load_classifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.network import Device, NetworkModel, load_network
@@ -54,9 +54,13 @@ def load_model(
         )
     if str(path) == "default" or PurePath(os.fsdecode(path)).suffix.lower() in _NETWORK_SUFFIXES:
         return load_network(os.fspath(path), classes=classes, device=device)
-    for name, value, default in ("classes", classes, None), ("device", device, "cpu"):
-        if value != default:
-            raise InvalidInputError(
-                f"{name} must be omitted for {str(path)!r}, which is no network; got {describe(value)}"
-            )
+    refuse_network_options(classes, device, f"for {str(path)!r}, which is no network")
     return load_classifier(path)
+
+
+def refuse_network_options(classes: object, device: object, reason: str) -> None:
+    """Raise if options of networks are given, for the stated reason."""
+    check_choice(device, "device", ("cpu", "cuda"))
+    for name, value in ("classes", classes), ("device", None if device == "cpu" else device):
+        if value is not None:
+            raise InvalidInputError(f"{name} must be omitted {reason}; got {describe(value)}")
