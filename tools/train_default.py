@@ -60,7 +60,7 @@ COURSE_SETS = ("project_clip", "test_images", "test_video")
 _CLIP_RATE = 6.0
 # Longer side to which frames are reduced, and that of the network's input (px).
 _MAX_SIDE, _INPUT_SIZE = 720, 640
-_STEPS, _NMS_IOU = 9000, 0.6
+_STEPS, _NMS_IOU = 9000, 0.5
 
 
 def load_sources(folder: Path, *, held_out: bool = False) -> list[FrameDataset]:

@@ -5,6 +5,7 @@ Everything works on 8-bit images with OpenCV, so that a sample takes a few milli
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,11 +26,12 @@ GRAY = 115
 MIN_WIDTH, MIN_VISIBLE = 9.0, 0.3
 """A vehicle of a sample is narrower (px) or cut off further: neither vehicle nor background."""
 
-# Zoom: from this factor of the scale that shows the whole frame, to this one of the scale that fills the sample.
+# Zoom: this factor of the scale that shows the whole frame, to this one of the scale that fills the sample.
 _ZOOM_OUT, _ZOOM_IN = 0.7, 1.8
 # Largest part of a vehicle that a drawn rectangle may cover.
 _MAX_COVERED = 0.6
-_NOISE_LEVELS = (2.0, 4.0, 8.0, 14.0)
+# Standard deviations of noise in gray levels, and range of its random position in pixels.
+_NOISE_LEVELS, _NOISE_SHIFT = (2.0, 4.0, 8.0, 14.0), 64
 # How often the frames of a source are drawn, where it is not as often as others.
 _SOURCE_WEIGHTS = {"rendered": 0.4}
 
@@ -119,7 +121,8 @@ def _warp(image: Image, matrix: Floats, size: tuple[int, int]) -> Image:
     while zoom < 0.7 and min(image.shape[:2]) > 32:
         height, width = image.shape[:2]
         image = np.asarray(cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA))
-        matrix = np.column_stack([matrix[:, :2] * (width / (width // 2), height / (height // 2)), matrix[:, 2]])
+        scale = width / (width // 2), height / (height // 2)
+        matrix = np.column_stack([matrix[:, :2] * scale, matrix[:, 2]])
         zoom *= 2
     # Boxes count from the corners of pixels, OpenCV from their centers.
     shift = matrix[:, :2] @ [0.5, 0.5] - 0.5
@@ -159,6 +162,14 @@ def _cover(image: Image, boxes: Floats, rng: np.random.Generator) -> Floats:
     return covered
 
 
+@functools.cache
+def _noise_fields(height: int, width: int) -> list[NDArray[np.int16]]:
+    """Noise of each strength, drawn once because that takes longer than all other changes of an image."""
+    rng = np.random.default_rng(0)
+    shape = height, width, 3
+    return [np.rint(rng.normal(0, level, shape)).astype(np.int16) for level in _NOISE_LEVELS]
+
+
 def _change_light(image: Image, rng: np.random.Generator) -> Image:
     """Change gamma, contrast, brightness, saturation, color cast, fog, sharpness, noise and compression."""
     gamma = math.exp(rng.uniform(-0.5, 0.5))
@@ -166,10 +177,7 @@ def _change_light(image: Image, rng: np.random.Generator) -> Image:
         gamma = rng.uniform(1.5, 2.5)
     levels = np.arange(256) / 255
     image = np.asarray(cv2.LUT(image, np.rint(255 * levels**gamma).astype(np.uint8)))
-    if rng.random() < 0.12:
-        saturation = 0.0
-    else:
-        saturation = rng.uniform(0.4, 1.5)
+    saturation = 0.0 if rng.random() < 0.12 else rng.uniform(0.4, 1.5)
     contrast, brightness = rng.uniform(0.6, 1.4), rng.uniform(0.7, 1.3)
     fog = rng.uniform(0.2, 0.8) if rng.random() < 0.15 else 0.0
     mean = float(cv2.mean(cv2.resize(image, (32, 32)))[1])
@@ -184,9 +192,9 @@ def _change_light(image: Image, rng: np.random.Generator) -> Image:
         else:
             image = np.asarray(cv2.GaussianBlur(image, (0, 0), rng.uniform(0.4, 1.3)))
     if rng.random() < 0.35:
-        noise = np.empty(image.shape, np.int16)
-        cv2.setRNGSeed(int(rng.integers(2**31)))
-        cv2.randn(noise, 0, rng.choice(_NOISE_LEVELS))
+        fields = _noise_fields(image.shape[0] + _NOISE_SHIFT, image.shape[1] + _NOISE_SHIFT)
+        x, y = rng.integers(_NOISE_SHIFT, size=2)
+        noise = fields[rng.integers(len(fields))][y : y + image.shape[0], x : x + image.shape[1]]
         image = np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U))
     if rng.random() < 0.12:
         quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(25, 70))]
