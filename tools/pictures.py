@@ -31,7 +31,7 @@ from vehicle_detection.synthetic import VehicleTruth, render_drive
 
 Image = NDArray[np.uint8]
 
-SCENE: dict[str, Any] = {"scenario": "traffic", "frames": 75, "random_state": 76}
+SCENE: dict[str, Any] = {"scenario": "traffic", "frames": 75, "random_state": 23}
 """Options of `render_drive`."""
 
 HERO, ANIMATION, GIF, RECORD = "picture.jpg", "animation.webp", "animation.gif", "pictures.json"
