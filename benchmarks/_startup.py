@@ -40,13 +40,13 @@ def run(context: Context) -> list[Row]:
             "first frame after the import, kernels in the cache",
             median_of(start["first_frame"] for start in warm),
             unit="s",
-            target=at_most(1.5),
+            target=at_most(0.6),
         ),
         Row(
             "first frame after the import, no kernel in the cache",
             median_of(start["first_frame"] for start in cold),
             unit="s",
-            target=at_most(6.0),
+            target=at_most(2.5),
         ),
         *(Row(f"compile {name}", seconds, unit="s") for name, seconds in kernels.items()),
     ]

@@ -29,6 +29,9 @@ NAME = "vehicle-detection"
 EXTRAS = ("dev", "docs")
 """Extras that the lock holds; ``dev`` includes the tests."""
 
+UNLOCKED = ("openvino", "train")
+"""Extras that the lock leaves out: large packages, of which each machine needs another build."""
+
 HEADER = "# Written by: python -m tools.supply_chain --update\n"
 _PIN = re.compile(r"^([A-Za-z0-9._-]+)==([^\s;\\]+)(?:\s*;[^\\]*)?\s*\\?$")
 _HASH = re.compile(r"^\s+--hash=sha256:[0-9a-f]{64}\s*\\?$")
@@ -65,11 +68,11 @@ def read_lock(text: str) -> dict[str, list[Pin]]:
 
 
 def direct_requirements(*, extras: bool = True) -> list[Requirement]:
-    """Return what ``pyproject.toml`` requires; `extras` includes those of all extras."""
+    """Return what ``pyproject.toml`` requires; `extras` includes the extras but for `UNLOCKED`."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     lines = list(project["dependencies"])
-    for part in project["optional-dependencies"].values() if extras else ():
-        lines += part
+    for name, part in project["optional-dependencies"].items() if extras else ():
+        lines += part if name not in UNLOCKED else ()
     # Extras refer to others of the project itself.
     return [each for each in map(Requirement, lines) if canonicalize_name(each.name) != NAME]
 

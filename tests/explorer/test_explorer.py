@@ -225,7 +225,7 @@ def test_a_higher_threshold_of_a_network_needs_no_search(scenes, count_searches)
     explorer = Explorer(scenes)
     searches = count_searches(explorer)
     counts = []
-    for score in (0.0, 0.5, 2.0):
+    for score in (0.0, 3.0, 6.0):
         explorer.set_search(min_score=score)
         explorer.render()
         counts.append(len(explorer.windows()))

@@ -1,6 +1,8 @@
 import numpy as np
 import pytest
 
+pytest.importorskip("torch", reason="training needs PyTorch, the extra [train]")
+
 from tests.helpers import drawn
 from tools.model_card import calibration_rows, write_card
 from vehicle_detection.errors import InvalidInputError

@@ -217,7 +217,7 @@ def train_frames(
     curves: Annotated[
         Path | None, option("FILE.csv", "Precision and recall on each set of held-out frames.")
     ] = None,
-    jobs: Annotated[int | None, option("N", "Threads; default: all cores.")] = None,
+    jobs: Annotated[int | None, option("N", "Threads, such as 2; default: all cores.")] = None,
     seed: Annotated[int, option("N", "Random seed.")] = 0,
 ) -> None:
     """Continue the training of the default model on labelled frames, and evaluate it on a fifth of them.
