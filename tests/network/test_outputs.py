@@ -127,9 +127,14 @@ def test_all_classes_without_known_names(tmp_path):
     model = load(tmp_path, constant_network({"output0": dense(CELLS, 3).transpose(0, 2, 1)}))
     assert model.class_ids is None
     assert len(find(model).vehicles) == 2
+
+
+def test_a_network_whose_names_are_no_vehicles_needs_classes(tmp_path):
     names = {"names": "['Hund', 'Katze', 'Maus']"}
-    model = load(tmp_path, constant_network({"output0": dense(CELLS, 3).transpose(0, 2, 1)}, metadata=names))
-    assert len(find(model).vehicles) == 2
+    network = constant_network({"output0": dense(CELLS, 3).transpose(0, 2, 1)}, metadata=names)
+    with pytest.raises(InvalidInputError, match=r"classes must be given.*Hund, Katze, Maus"):
+        load(tmp_path, network)
+    assert len(find(load(tmp_path, network, classes=["Hund", "Katze", "Maus"])).vehicles) == 2
 
 
 def test_the_class_of_a_box_is_the_most_probable_one(tmp_path):

@@ -215,8 +215,8 @@ def load_network(
     path
         The file, or ``"default"`` for the shipped network.
     classes
-        Names or numbers of the classes to keep. Default: car, truck, bus, van and vehicle, in any case; all
-        classes if the network has none of these names, or its names are unknown.
+        Names or numbers of the classes to keep. Default: those named car, truck, bus, van or vehicle, in any
+        case; all classes if their names are unknown.
     device
         ``"cpu"``, or ``"cuda"`` with the package onnxruntime-gpu.
     runtime
@@ -233,7 +233,8 @@ def load_network(
     ModelFileError
         If the file is missing, damaged, too large, or no network that finds boxes.
     InvalidInputError
-        If an argument is malformed, a class is unknown, or the device or the library is not available.
+        If an argument is malformed, a class is unknown, none has the name of a vehicle and `classes` is
+        omitted, or the device or the library is not available.
     """
     check_device(device, runtime)
     graph, name = _read(path)
@@ -396,7 +397,13 @@ def _class_ids(
     numbers = {text.lower(): number for number, text in known.items()}
     if classes is None:
         ids = [numbers[text] for text in VEHICLE_CLASSES if text in numbers]
-        return np.array(sorted(ids), np.intp) if ids else None
+        if known and not ids:
+            listed = ", ".join(known.values())
+            raise InvalidInputError(
+                f"classes must be given for {name}, which has none of {', '.join(VEHICLE_CLASSES)}; name "
+                f"those of its classes that are vehicles: {listed}"
+            )
+        return np.array(sorted(ids), np.intp) if known else None
     ids = []
     count = model.output_format.n_classes or 1 << 31
     for each in check_sequence(classes, "classes", "names or numbers of classes"):
