@@ -13,17 +13,16 @@ import pytest
 import vehicle_detection
 from tests.helpers import ROOT
 from tests.video.clips import write_clip
+from vehicle_detection.annotator import DrawParams, draw_tracks
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.camera import Camera, write_camera
 from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.drawing import draw_tracks
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, evaluate_detections, read_labels
 from vehicle_detection.loading import load_model
 from vehicle_detection.params import (
-    DrawParams,
     FeatureParams,
     HeatParams,
     NetworkParams,

@@ -134,7 +134,7 @@ def test_imports_are_acyclic():
 
 
 def test_the_root_is_small():
-    assert len(list(FOLDER.glob("*.py"))) <= 20
+    assert len(list(FOLDER.glob("*.py"))) <= 24
 
 
 @pytest.mark.parametrize("name", sorted(FILES))

@@ -23,10 +23,9 @@ from PIL import Image as PillowImage
 import vehicle_detection
 from vehicle_detection import DetectorError, FrameResult, VehicleDetectionError, VehicleDetector, iou_matrix
 from vehicle_detection._common import atomic_write, progress_bar, write_text
+from vehicle_detection.annotator import DrawParams, TrackDrawer
 from vehicle_detection.camera import Camera
-from vehicle_detection.drawing import TrackDrawer
 from vehicle_detection.images import write_image
-from vehicle_detection.params import DrawParams
 from vehicle_detection.synthetic import VehicleTruth, render_drive
 
 Image = NDArray[np.uint8]

@@ -1,4 +1,9 @@
 from . import course, plotting
+from .annotator import (
+    DrawParams,
+    draw_diagnostics,
+    draw_tracks,
+)
 from .batch import BatchReport, BatchStatus, batch_status, batch_summary, open_dask, run_batch
 from .boxes import Detections, Platt, clip_boxes, iou_matrix, non_max_suppression
 from .camera import Camera, HorizonEstimate, estimate_horizon, read_camera, write_camera
@@ -24,9 +29,7 @@ from .drawing import (
     blur_boxes,
     draw_boxes,
     draw_detections,
-    draw_diagnostics,
     draw_labeled_bboxes,
-    draw_tracks,
 )
 from .errors import (
     DatasetError,
@@ -79,7 +82,6 @@ from .images import read_image, write_image
 from .loading import load_model
 from .network import NetworkModel
 from .params import (
-    DrawParams,
     FeatureParams,
     FunctionParams,
     HeatParams,

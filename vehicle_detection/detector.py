@@ -29,6 +29,11 @@ from vehicle_detection._common import (
     describe,
     pluralize,
 )
+from vehicle_detection.annotator import (
+    DrawParams,
+    TrackDrawer,
+    draw_diagnostics,
+)
 from vehicle_detection.boxes import Detections, ScoreScale
 from vehicle_detection.camera import (
     GIVEN_LENS_STD,
@@ -42,10 +47,8 @@ from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.confidence import Model, with_confidence
 from vehicle_detection.drawing import (
     BLUR_REGIONS,
-    TrackDrawer,
     blur_boxes,
     draw_boxes,
-    draw_diagnostics,
 )
 from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.function_model import DetectorFunction, FunctionModel
@@ -54,7 +57,6 @@ from vehicle_detection.images import is_cut, make_thumbnail, read_image
 from vehicle_detection.loading import load_model, refuse_network_options
 from vehicle_detection.network import Device, NetworkModel
 from vehicle_detection.params import (
-    DrawParams,
     FunctionParams,
     HeatParams,
     NetworkParams,

@@ -22,7 +22,11 @@ from vehicle_detection.boxes import box_areas, clip_boxes, iou_matrix
 from vehicle_detection.camera import truncated_edges
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.drawing import blur_boxes, draw_boxes, draw_cell_shares
+from vehicle_detection.drawing import (
+    blur_boxes,
+    draw_boxes,
+    draw_cell_shares,
+)
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events import TrackLog
 from vehicle_detection.features import extract_features, part_slices, sum_blocks

@@ -26,6 +26,7 @@ from tests.video.clips import damage_sizes, write_clip
 from vehicle_detection import classifier, datasets, detector, training, video
 from vehicle_detection._common import files as _files
 from vehicle_detection._common import progress_bar
+from vehicle_detection.annotator import DrawParams
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import HorizonEstimate
 from vehicle_detection.classifier import VehicleClassifier, load_classifier
@@ -43,7 +44,6 @@ from vehicle_detection.cli.output import (
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.loading import load_model
-from vehicle_detection.params import DrawParams
 from vehicle_detection.synthetic import SceneVehicle, render_drive, render_patches, render_scene
 from vehicle_detection.video import FrameSource, probe_video, read_frames
 

@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 
 from tests.drawing.cases import blank, changed_box, track
+from vehicle_detection.annotator import (
+    BirdsEyePanel,
+    DrawParams,
+    TrackDrawer,
+    Trails,
+    road_position,
+)
 from vehicle_detection.camera import Camera
-from vehicle_detection.drawing import TRACK_COLORS, BirdsEyePanel, TrackDrawer, Trails, road_position
-from vehicle_detection.params import DrawParams
+from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.synthetic import SceneVehicle, render_scene
 
 SHAPE = (720, 1280, 3)

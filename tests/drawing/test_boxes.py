@@ -6,7 +6,12 @@ from scipy import ndimage
 
 from tests.drawing.cases import blank, changed_box
 from vehicle_detection.boxes import Detections
-from vehicle_detection.drawing import blend, draw_boxes, draw_detections, draw_labeled_bboxes
+from vehicle_detection.drawing import (
+    blend,
+    draw_boxes,
+    draw_detections,
+    draw_labeled_bboxes,
+)
 from vehicle_detection.errors import InvalidInputError
 
 BLUE = [0, 0, 255]

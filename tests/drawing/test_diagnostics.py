@@ -2,8 +2,12 @@ import numpy as np
 import pytest
 
 from tests.drawing.cases import blank, track
+from vehicle_detection.annotator import draw_diagnostics
 from vehicle_detection.boxes import Detections
-from vehicle_detection.drawing import TRACK_COLORS, draw_cell_shares, draw_diagnostics
+from vehicle_detection.drawing import (
+    TRACK_COLORS,
+    draw_cell_shares,
+)
 from vehicle_detection.errors import InvalidInputError
 
 

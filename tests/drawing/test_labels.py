@@ -7,9 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vehicle_detection.drawing import TRACK_COLORS
-from vehicle_detection.drawing.labels import LabelPlacer, LabelRequest
-from vehicle_detection.drawing.primitives import BLACK, WHITE, ink_on
+from vehicle_detection.drawing import (
+    BLACK,
+    TRACK_COLORS,
+    WHITE,
+    LabelPlacer,
+    LabelRequest,
+    ink_on,
+)
 
 SHAPE = (720, 1280, 3)
 FIELDS = ("#3", "24 m", "-1.2 m/s")

@@ -6,11 +6,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.drawing.cases import blank, changed_box, track
-from vehicle_detection.drawing import TRACK_COLORS, TrackDrawer, draw_tracks, track_color
-from vehicle_detection.drawing.primitives import draw_text, text_size
-from vehicle_detection.drawing.tracks import track_fields
+from vehicle_detection.annotator import (
+    LABEL_FIELDS,
+    DrawParams,
+    TrackDrawer,
+    draw_tracks,
+    track_color,
+    track_fields,
+)
+from vehicle_detection.drawing import (
+    TRACK_COLORS,
+    draw_text,
+    text_size,
+)
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.params import LABEL_FIELDS, DrawParams
 
 SIZES = [(360, 480), (720, 1280), (1920, 1080), (2160, 3840)]
 

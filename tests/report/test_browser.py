@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from tools.browser import PHONE, Browser
+from vehicle_detection.annotator import draw_tracks
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.detector import VehicleDetector
-from vehicle_detection.drawing import draw_tracks
 from vehicle_detection.report import ReportWriter
 from vehicle_detection.synthetic import render_drive
 from vehicle_detection.tracking import Track

@@ -412,7 +412,11 @@ def _detect_each(
     import cv2
 
     from vehicle_detection._common import pluralize
-    from vehicle_detection.drawing import blur_boxes, draw_detections, score_texts
+    from vehicle_detection.drawing import (
+        blur_boxes,
+        draw_detections,
+        score_texts,
+    )
     from vehicle_detection.images import write_image
 
     searched, reasons = False, list[str]()

@@ -55,7 +55,7 @@ from vehicle_detection.cli.output import (
 from vehicle_detection.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from vehicle_detection.params import DrawParams
+    from vehicle_detection.annotator import DrawParams
     from vehicle_detection.report import TrackPicture
 
 DAMAGED = 3  # exit code
@@ -376,7 +376,7 @@ def _check_outputs(outputs: Mapping[str, Path | None], clips: Path | None, *, sh
 
 def _draw_params(labels: str, **options: Any) -> DrawParams:
     """Parameters of the annotations, with labels given as a comma-separated list or "none"."""
-    from vehicle_detection.params import DrawParams
+    from vehicle_detection.annotator import DrawParams
 
     fields = [field.strip() for field in labels.split(",")]
     return DrawParams(labels=() if fields == ["none"] else fields, **options)

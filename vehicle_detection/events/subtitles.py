@@ -20,7 +20,7 @@ from vehicle_detection._common import (
     check_type,
     pluralize,
 )
-from vehicle_detection.drawing import MAX_SPEED_STD
+from vehicle_detection.annotator import MAX_SPEED_STD
 from vehicle_detection.events.find import Event, check_events
 from vehicle_detection.events.history import TrackHistory, TrackLog
 from vehicle_detection.units import UNITS, Units

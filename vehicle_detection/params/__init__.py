@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from vehicle_detection.params.drawing import LABEL_FIELDS, DrawParams
 from vehicle_detection.params.features import (
     COLOR_SPACES,
     HOG_CHANNELS,
@@ -25,11 +24,9 @@ from vehicle_detection.params.tracking import TrackParams
 __all__ = [
     "COLOR_SPACES",
     "HOG_CHANNELS",
-    "LABEL_FIELDS",
     "PATCH_SIZE",
     "REFERENCE_WIDTH",
     "SPATIAL_ORDERS",
-    "DrawParams",
     "FeatureParams",
     "FunctionParams",
     "HeatParams",

@@ -12,8 +12,7 @@ from vehicle_detection._common import (
     check_shape,
     check_type,
 )
-from vehicle_detection.camera import Camera
-from vehicle_detection.drawing import (
+from vehicle_detection.annotator import (
     LANE_WIDTH_M,
     MAX_SPEED_STD,
     TRAIL_SECONDS,
@@ -21,6 +20,7 @@ from vehicle_detection.drawing import (
     road_position,
     track_color,
 )
+from vehicle_detection.camera import Camera
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.plotting import style
 from vehicle_detection.tracking import FrameResult, Track

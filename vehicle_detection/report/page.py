@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 import vehicle_detection
 from vehicle_detection._common import Floats, pluralize
-from vehicle_detection.drawing import MAX_SPEED_STD
+from vehicle_detection.annotator import MAX_SPEED_STD
 from vehicle_detection.events import (
     KINDS,
     Event,

@@ -1,7 +1,10 @@
 import pytest
 
+from vehicle_detection.annotator import (
+    LABEL_FIELDS,
+    DrawParams,
+)
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.params import LABEL_FIELDS, DrawParams
 
 
 def test_labels_become_a_tuple():

@@ -1,0 +1,617 @@
+"""Annotating the frames of a video: tracks with labels, bird's-eye view, diagnostics."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections import deque
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vehicle_detection._common import (
+    check_boxes,
+    check_choice,
+    check_image,
+    check_type,
+    describe,
+    is_listing,
+    store_integer,
+)
+from vehicle_detection.boxes import Detections
+from vehicle_detection.camera import Camera, truncated_edges
+from vehicle_detection.drawing import (
+    BLACK,
+    TRACK_COLORS,
+    WHITE,
+    Color,
+    Image,
+    LabelPlacer,
+    LabelRequest,
+    Rectangle,
+    cap_height,
+    color_index,
+    draw_boxes,
+    draw_labels,
+    draw_outline,
+    draw_text,
+    fill_rectangle,
+    heat_image,
+    line_width_for,
+    round_box,
+    text_scale,
+    text_size,
+)
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.tracking import Track
+from vehicle_detection.units import UNITS
+
+_UNKNOWN_COLOR: Color = (160, 160, 160)
+# Distances (m) and their colors; between them, colors are interpolated over the logarithm of the distance.
+_DISTANCES = (10.0, 20.0, 35.0, 60.0)
+_DISTANCE_COLORS = ((213, 94, 0), (230, 159, 0), (240, 228, 66), (86, 180, 233))
+
+LABEL_FIELDS = ("id", "score", "distance", "speed", "std")
+"""Fields of a track's label; ``"std"`` adds standard errors to distance and speed."""
+
+COLORINGS = ("id", "distance")
+"""What the color of a track can stand for."""
+
+PANELS = ("none", "corner", "side")
+"""Where the bird's-eye view of a video can be drawn."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrawParams:
+    """How tracks are drawn.
+
+    Attributes
+    ----------
+    labels
+        Fields of a label: ``"id"``, ``"score"`` (the confidence, if known), ``"distance"`` (``~`` where its
+        standard error exceeds 20%), ``"speed"`` (relative to the camera, positive when moving away) and
+        ``"std"`` (adds standard errors). Unknown values are omitted; without a field there is no label.
+    line_width
+        Width of the boxes' lines in pixels; None: chosen for the size of the image.
+    color_by
+        ``"id"``: each track has a color of its own. ``"distance"``: from vermilion (10 m and nearer) over
+        orange (20 m) and yellow (35 m) to blue (60 m and farther), gray where the distance is unknown.
+    panel
+        Bird's-eye view of the tracks in a video: ``"corner"``, in the frame's upper right corner; ``"side"``,
+        to the right of the frame, which makes the video wider; or ``"none"``.
+    units
+        Units of labels and bird's-eye view: ``"metric"`` (m and km/h) or ``"imperial"`` (ft and mph).
+
+    Examples
+    --------
+    >>> DrawParams(labels=("id", "distance"), color_by="distance").panel
+    'none'
+    """
+
+    labels: Collection[str] = ("id", "distance", "speed")
+    line_width: int | None = None
+    color_by: Literal["id", "distance"] = "id"
+    panel: Literal["none", "corner", "side"] = "none"
+    units: Literal["metric", "imperial"] = "metric"
+
+    def __post_init__(self) -> None:
+        given: object = self.labels
+        if not isinstance(given, Collection) or getattr(given, "ndim", 1) == 0:
+            raise InvalidInputError(
+                f"labels must be a list of fields, got {describe(given)}; pass some of {LABEL_FIELDS}"
+            )
+        fields = (self.labels,) if isinstance(self.labels, str) else tuple(self.labels)
+        for field in fields:
+            check_choice(field, "labels", LABEL_FIELDS)
+        object.__setattr__(self, "labels", fields)
+        if self.line_width is not None:
+            store_integer(self, "line_width", low=1, high=1000)
+        check_choice(self.color_by, "color_by", COLORINGS)
+        check_choice(self.panel, "panel", PANELS)
+        check_choice(self.units, "units", UNITS)
+
+
+Point = tuple[int, int]
+Trail = deque[tuple[float, Point]]
+"""Times in seconds, and positions in pixels, of a track in the last frames."""
+
+LANE_WIDTH_M = 3.6
+"""Distance between the lines of the grid, where the camera is in the middle of its lane."""
+
+MAX_SPEED_STD = 3.0
+"""Speeds with a larger standard error, in m/s, are not shown."""
+
+TRAIL_SECONDS = 1.5
+"""Time that a trail covers."""
+
+# Distances with a line and a number, by units; and distance (m) that the view covers ahead of the camera and
+# behind it.
+_RANGES = {"metric": (20, 40, 60), "imperial": (75, 150, 225)}
+_AHEAD_M, _BEHIND_M = 80.0, 6.0
+_OWN_COLOR, _GRID_COLOR, _TEXT_COLOR = (235, 235, 235), (72, 78, 86), (170, 176, 184)
+_BACKGROUND, _BACKGROUND_ALPHA, _ELLIPSE_ALPHA = (26, 29, 33), 0.78, 0.4
+# Sides of the view as fractions of the frame's height, and of its own height.
+_CORNER_HEIGHT, _SIDE_WIDTH, _ASPECT = 0.42, 0.3, 0.42
+# Lookup table of the frame's brightness behind the view.
+_DIMMED = np.rint(np.arange(256) * (1 - _BACKGROUND_ALPHA)).astype(np.uint8)
+_MIN_TEXT_HEIGHT = 140  # pixels of a view that has room for numbers
+_LINE_HEIGHT = 500  # pixels of a view for each pixel of the width of its lines
+_TRAIL_STEP = 0.08  # s
+_SHIFT = 4  # fractional bits of coordinates in OpenCV
+_FAR = 1e6  # limit of such coordinates
+
+
+class RoadPosition(NamedTuple):
+    """Position of a vehicle on the road; the camera is at the origin."""
+
+    lateral_m: float  # middle of the near end, positive to the right
+    distance_m: float  # along the road to the near end
+    radial_std_m: float  # standard error along the ray from the camera
+    tangential_std_m: float  # and across it
+
+
+def road_position(track: Track, camera: Camera, shape: tuple[int, ...]) -> RoadPosition | None:
+    """Position of a track on the road, for frames of ``(height, width, ...)``; None if it is unknown.
+
+    The box of a vehicle in another lane also shows its side, at the edge towards the middle of the frame, so
+    the near end is at the outer part of the box. Where the frame truncates that part, the far end of the side
+    gives the position.
+    """
+    distance, std = track.distance_m, track.distance_std_m
+    if distance is None or std is None:
+        return None
+    left, _, right, _ = camera.rectify_boxes(track.box[None], shape)[0].tolist()
+    middle, focal = shape[1] / 2, camera.focal_px
+    to_right = left + right > 2 * middle
+    # Mirrored, if necessary, so that the vehicle is on the right.
+    inner, outer = (left - middle, right - middle) if to_right else (middle - right, middle - left)
+    width = outer - inner
+    if inner > 0 and truncated_edges(track.box[None], (shape[0], shape[1]))[0, 2 if to_right else 0]:
+        lateral = inner * (distance + camera.vehicle_length_m) / focal + camera.vehicle_width_m / 2
+    else:
+        side_px = min(camera.vehicle_length_m * max(inner, 0.0) / distance, 0.6 * width)
+        lateral = (inner + outer + side_px) / 2 * distance / focal
+    edge_px = math.hypot(camera.bottom_std_px * camera.pixel_scale, camera.box_std * width)
+    slant = math.hypot(1.0, lateral / distance)
+    return RoadPosition(
+        lateral if to_right else -lateral, distance, std * slant, edge_px * distance / focal * slant
+    )
+
+
+class Trails:
+    """Positions of tracks in the last frames."""
+
+    def __init__(self) -> None:
+        self._trails: dict[int, Trail] = {}
+
+    def update(self, time: float, points: Mapping[int, Point | None]) -> dict[int, Trail]:
+        """Add the points of a frame by track id, at most one per 0.08 s; return all trails."""
+        trails = {key: self._trails.get(key) or deque() for key in points}
+        for key, trail in trails.items():
+            point = points[key]
+            if point is not None and not (trail and time < trail[-1][0] + _TRAIL_STEP):
+                trail.append((time, point))
+            while trail and trail[0][0] < time - TRAIL_SECONDS:
+                trail.popleft()
+        self._trails = trails
+        return trails
+
+
+class BirdsEyePanel:
+    """Draws a bird's-eye view into a video: in a corner of the frame, or beside it.
+
+    Parameters
+    ----------
+    shape, place
+        ``(height, width, ...)`` of the frames, and where to draw.
+    units
+        Units of the distances, ``"metric"`` or ``"imperial"``.
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, ...],
+        place: Literal["corner", "side"],
+        units: Literal["metric", "imperial"] = "metric",
+    ) -> None:
+        self._shape, self._place = shape[:2], place
+        height, width = self.side_size(shape) if place == "side" else self.corner_size(shape)
+        self._width = width
+        self._scale = height / (_AHEAD_M + _BEHIND_M)  # pixels per meter
+        # Large frames are shown smaller than small ones.
+        enlarged = math.sqrt(max(shape[0] / 1080, 1.0))
+        self._text_scale = max(0.3, min(0.4 * math.sqrt(height / 300) * enlarged, 4.0))
+        self._line = max(1, round(height / _LINE_HEIGHT))
+        self._has_text = height >= _MIN_TEXT_HEIGHT
+        self._grid = self._draw_grid(height, width, units)
+        self._dark = (self._grid * _BACKGROUND_ALPHA).astype(np.uint8)
+        self._trails = Trails()
+
+    @staticmethod
+    def side_size(shape: tuple[int, ...]) -> tuple[int, int]:
+        """Height and width of a view beside frames of this shape, which makes the whole width even."""
+        width = max(32, round(_SIDE_WIDTH * shape[0]))
+        return shape[0], width + (shape[1] + width) % 2
+
+    @staticmethod
+    def corner_size(shape: tuple[int, ...]) -> tuple[int, int]:
+        """Height and width of a view in the corner of frames of this shape."""
+        height = max(32, round(_CORNER_HEIGHT * shape[0]))
+        return min(height, shape[0]), min(max(16, round(_ASPECT * height)), shape[1])
+
+    def fits(self, shape: tuple[int, ...]) -> bool:
+        """Whether the view was made for frames of this shape."""
+        return self._shape == shape[:2]
+
+    def draw(
+        self,
+        canvas: Image,
+        tracks: Sequence[Track],
+        colors: Sequence[Color],
+        camera: Camera,
+        shape: tuple[int, ...],
+        time: float,
+    ) -> Rectangle:
+        """Draw tracks into a canvas, which is wider than the frame for a view beside it; return the place."""
+        height, width = self._grid.shape[:2]
+        left = shape[1] if self._place == "side" else shape[1] - width
+        view = canvas[:height, left : left + width]
+        view[:] = self._grid if self._place == "side" else cv2.add(cv2.LUT(view, _DIMMED), self._dark)
+        positions = {track.id: road_position(track, camera, shape) for track in tracks}
+        points = {key: position and self._point(*position[:2]) for key, position in positions.items()}
+        trails = self._trails.update(time, points)
+        shown = [
+            (position, track, color)
+            for track, color in zip(tracks, colors, strict=True)
+            if (position := positions[track.id]) is not None and position.distance_m < _AHEAD_M
+        ]
+        # Far to near, and all ellipses below all vehicles.
+        shown.sort(key=lambda entry: -entry[0].distance_m)
+        for position, _, color in shown:
+            self._draw_ellipse(view, position, color)
+        for position, track, color in shown:
+            trail = [*(point for _, point in trails[track.id]), points[track.id]]
+            cv2.polylines(view, [np.array(trail, np.int32)], False, color, self._line, cv2.LINE_AA, _SHIFT)
+            self._draw_vehicle(view, track, position, color, camera)
+        if self._has_text:
+            for position, track, _ in shown:
+                self._write_number(view, track, position)
+        return left, 0, left + width, height
+
+    def _draw_grid(self, height: int, width: int, units: str) -> Image:
+        """Draw lanes, lines across the road with their distances, and the own car."""
+        grid = np.full((height, width, 3), _BACKGROUND, np.uint8)
+        lanes = int(width / 2 / self._scale / LANE_WIDTH_M + 0.5)
+        for number in range(-lanes, lanes):
+            x = self._column((number + 0.5) * LANE_WIDTH_M)
+            cv2.line(grid, (x, 0), (x, height), _GRID_COLOR, self._line)
+        chosen = UNITS[units]
+        for distance in _RANGES[units]:
+            y = self._row(distance / chosen.distance)
+            cv2.line(grid, (0, y), (width, y), _GRID_COLOR, self._line)
+            scale = self._text_scale
+            text = f"{distance} {chosen.distance_symbol}"
+            if self._has_text:
+                draw_text(grid, [text], 0, y - cap_height(scale) - 6, scale, _TEXT_COLOR)
+        length, half = 4.2, 0.9
+        corners = [(-half, -length), (half, -length), (half, -1.2), (0.0, 0.3), (-half, -1.2)]
+        cv2.fillPoly(grid, [self._pixels(corners)], _OWN_COLOR, cv2.LINE_AA, _SHIFT)
+        return grid
+
+    def _draw_ellipse(self, panel: Image, position: RoadPosition, color: Color) -> None:
+        """Fill the area within one standard error of a position, in a dark shade."""
+        x, z = position.lateral_m, position.distance_m
+        shade = tuple(
+            round(_ELLIPSE_ALPHA * value + (1 - _ELLIPSE_ALPHA) * dark)
+            for value, dark in zip(color, _BACKGROUND, strict=True)
+        )
+        center = self._point(x, z)
+        unit = self._scale * (1 << _SHIFT)
+        axes = [max(1, round(min(std * unit, 1e6))) for std in position[2:]]
+        angle = math.degrees(math.atan2(-z, x))
+        cv2.ellipse(panel, center, axes, angle, 0, 360, shade, cv2.FILLED, cv2.LINE_AA, _SHIFT)
+
+    def _draw_vehicle(
+        self, panel: Image, track: Track, position: RoadPosition, color: Color, camera: Camera
+    ) -> None:
+        """Draw a vehicle, filled unless it is coasting, and an arrow to where it is in a second."""
+        x, z = position.lateral_m, position.distance_m
+        half, length = camera.vehicle_width_m / 2, camera.vehicle_length_m
+        corners = self._pixels([(x - half, z), (x + half, z), (x + half, z + length), (x - half, z + length)])
+        if track.state == "coasting":
+            cv2.polylines(panel, [corners], True, color, self._line, cv2.LINE_AA, _SHIFT)
+        else:
+            cv2.fillPoly(panel, [corners], color, cv2.LINE_AA, _SHIFT)
+        speed = track.speed_mps
+        if speed is not None and abs(speed) > 1.0 and (track.speed_std_mps or 0.0) <= MAX_SPEED_STD:
+            start = z + length if speed > 0 else z
+            first, last = (self._column(x), self._row(start)), (self._column(x), self._row(start + speed))
+            tip = min(0.4, max(3.0, self._scale) / max(abs(last[1] - first[1]), 1))
+            cv2.arrowedLine(panel, first, last, _OWN_COLOR, self._line, cv2.LINE_AA, 0, tip)
+
+    def _write_number(self, panel: Image, track: Track, position: RoadPosition) -> None:
+        """Write the number of a track beside its vehicle."""
+        text = [f"{track.id}"]
+        width, height = text_size(text, self._text_scale)
+        x = min(max(self._column(position.lateral_m + 1.2), 0), self._width - width)
+        y = min(max(self._row(position.distance_m) - height, 0), len(panel) - height)
+        draw_text(panel, text, x, y, self._text_scale, _OWN_COLOR)
+
+    def _column(self, lateral_m: float) -> int:
+        return round(self._width / 2 + lateral_m * self._scale)
+
+    def _row(self, distance_m: float) -> int:
+        return round((_AHEAD_M - distance_m) * self._scale)
+
+    def _point(self, lateral_m: float, distance_m: float) -> Point:
+        """Fixed-point pixel of a position in meters."""
+        unit, middle = self._scale * (1 << _SHIFT), self._width / 2 * (1 << _SHIFT)
+        column, row = middle + lateral_m * unit, (_AHEAD_M - distance_m) * unit
+        return round(min(max(column, -_FAR), _FAR)), round(min(max(row, -_FAR), _FAR))
+
+    def _pixels(self, points: Iterable[tuple[float, float]]) -> NDArray[np.int32]:
+        """``(N, 2)`` fixed-point pixels of points given by lateral position and distance in meters."""
+        return np.array([self._point(*point) for point in points], np.int32)
+
+
+def draw_tracks(
+    image: Image,
+    tracks: Iterable[Track],
+    *,
+    labels: Collection[str] = ("id", "distance", "speed"),
+    line_width: int | None = None,
+    color_by: Literal["id", "distance"] = "id",
+) -> Image:
+    """Draw tracks on a copy of an image, each with a box and a label, sized to the image.
+
+    Only tracks with ``track.shown`` are drawn; those without a detection in this frame have dashed boxes.
+    Labels are placed where they hide neither other labels nor other vehicles, if necessary on leader lines or
+    without their last fields.
+
+    Parameters
+    ----------
+    image, tracks
+        ``(H, W, 3)`` uint8 RGB, and what `Tracker.update` returned for it.
+    labels, line_width, color_by
+        Fields of the labels, width of the lines in pixels, and meaning of the colors; see `DrawParams`.
+
+    Returns
+    -------
+    numpy.ndarray
+        A new image of the same shape.
+
+    Raises
+    ------
+    InvalidInputError
+        If the image is malformed, `tracks` holds something else, or an option has an unknown value.
+
+    Notes
+    -----
+    In a video, `VehicleDetector.annotate` also keeps each label in its place from frame to frame. Short lines
+    are wrapped, so that a label is not much wider than its box.
+    """
+    params = DrawParams(labels=labels, line_width=line_width, color_by=color_by)
+    return TrackDrawer(params).draw(image, tracks)
+
+
+class TrackDrawer:
+    """Draws the tracks of a video's frames, and remembers the places of the labels and the recent positions.
+
+    Parameters
+    ----------
+    params
+        Labels, lines, colors and bird's-eye view.
+
+    Notes
+    -----
+    The frames of a video are drawn in their order. A frame drawn again is drawn alike; an earlier frame
+    starts anew.
+    """
+
+    def __init__(self, params: DrawParams | None = None) -> None:
+        self.params = params or DrawParams()
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget all frames, before the first frame of another video."""
+        self._placer = LabelPlacer()
+        self._panel: BirdsEyePanel | None = None
+        self._time = -math.inf
+        self._coasting: set[int] = set()  # in the last searched frame
+
+    def output_shape(self, shape: tuple[int, ...]) -> tuple[int, int, int]:
+        """Shape of what `draw` returns for an image of this shape."""
+        height, width = shape[:2]
+        beside = self.params.panel == "side"
+        return height, width + (BirdsEyePanel.side_size(shape)[1] if beside else 0), 3
+
+    def draw(
+        self,
+        image: Image,
+        tracks: Iterable[Track],
+        *,
+        time: float | None = None,
+        searched: bool = True,
+        camera: Camera | None = None,
+        own_mps: float | None = None,
+    ) -> Image:
+        """Draw tracks on a copy of the next frame.
+
+        Parameters
+        ----------
+        image, tracks
+            ``(H, W, 3)`` uint8 RGB, and its tracks.
+        time
+            Time of the frame in seconds; None: the frame follows no other one.
+        searched
+            Whether the frame was searched; in a frame that was not, the boxes are dashed that were not
+            detected in the last searched one.
+        camera
+            The camera, for the bird's-eye view; by default a typical dash-cam.
+        own_mps
+            Speed of the camera's vehicle in m/s: labels then state speeds over ground. None: unknown.
+        """
+        shape = check_image(image).shape
+        shown = sorted((track for track in check_tracks(tracks) if track.shown), key=lambda track: track.id)
+        if time is None or time < self._time:
+            self.forget()
+        self._time = -math.inf if time is None else time
+        coasting = {track.id for track in shown if track.state == "coasting"}
+        if searched:
+            self._coasting = coasting
+        params = self.params
+        colors = [track_color(track, params.color_by) for track in shown]
+        result = self._canvas(image)
+        blocked: list[Rectangle] = []
+        if params.panel != "none":
+            if self._panel is None or not self._panel.fits(shape):
+                self._panel = BirdsEyePanel(shape, params.panel, params.units)
+            view = Camera.for_frame(shape) if camera is None else camera.for_shape(shape)
+            blocked.append(self._panel.draw(result, shown, colors, view, shape, self._time))
+        frame = result[:, : shape[1]]
+        width = params.line_width or line_width_for(shape)
+        dashed = coasting & self._coasting
+        # Far to near: the boxes of near vehicles cover those behind them.
+        for track, color in sorted(zip(shown, colors), key=lambda pair: float(pair[0].box[3])):
+            draw_outline(frame, round_box(track.box), color, width, dashed=track.id in dashed)
+        requests = [
+            LabelRequest(
+                track.id,
+                tuple(track_fields(track, params.labels, params.units, own_mps)),
+                round_box(track.box),
+            )
+            for track in shown
+        ]
+        draw_labels(frame, self._placer.place(requests, shape, blocked), colors, width)
+        return result
+
+    def _canvas(self, image: Image) -> Image:
+        """Copy of an image, with room for a bird's-eye view beside it."""
+        shape = self.output_shape(image.shape)
+        if shape == image.shape:
+            return image.copy()
+        canvas = np.empty(shape, np.uint8)
+        canvas[:, : image.shape[1]] = image
+        return canvas
+
+
+def track_color(track: Track, color_by: Literal["id", "distance"] = "id") -> Color:
+    """RGB color of a track, chosen by its id or its distance; gray for a tentative track."""
+    if color_by == "distance":
+        return _distance_color(track.distance_m)
+    return TRACK_COLORS[color_index(track.id)] if track.id > 0 else _UNKNOWN_COLOR
+
+
+def _distance_color(distance_m: float | None) -> Color:
+    if distance_m is None:
+        return _UNKNOWN_COLOR
+    value = math.log(max(distance_m, _DISTANCES[0]))
+    known = [math.log(distance) for distance in _DISTANCES]
+    for (low, high), (first, second) in zip(
+        itertools.pairwise(known), itertools.pairwise(_DISTANCE_COLORS), strict=True
+    ):
+        if value <= high:
+            share = (value - low) / (high - low)
+            red, green, blue = (round(a + share * (b - a)) for a, b in zip(first, second))
+            return red, green, blue
+    return _DISTANCE_COLORS[-1]
+
+
+def track_fields(
+    track: Track, fields: Collection[str], units: str = "metric", own_mps: float | None = None
+) -> list[str]:
+    """Texts of the known fields of a track's label, such as ["#3", "24 m", "-6 km/h"].
+
+    With the own speed the speed is that over ground, such as "94 km/h".
+    """
+    with_std, chosen = "std" in fields, UNITS[units]
+    parts = [f"#{track.id}"] if "id" in fields else []
+    if "score" in fields:
+        parts.append(f"{track.score:.1f}" if track.confidence is None else f"{track.confidence:.0%}")
+    if "distance" in fields and track.distance_m is not None and track.distance_std_m is not None:
+        parts.append(chosen.distance_text(track.distance_m, track.distance_std_m, with_std=with_std))
+    if "speed" in fields and track.speed_mps is not None and (track.speed_std_mps or 0) <= MAX_SPEED_STD:
+        relative = own_mps is None
+        speed = track.speed_mps if own_mps is None else abs(own_mps + track.speed_mps)
+        parts.append(chosen.speed_text(speed, track.speed_std_mps, with_std=with_std, signed=relative))
+    return parts
+
+
+def check_tracks(tracks: object) -> list[Track]:
+    """Return tracks as a list."""
+    listed: list[Any] = list(tracks) if is_listing(tracks) else [None]
+    if not all(isinstance(track, Track) for track in listed):
+        raise InvalidInputError(
+            f"tracks must be Track objects, got {describe(tracks)}; pass what update returns"
+        )
+    return listed
+
+
+def draw_diagnostics(
+    frame: Image,
+    windows: Detections | ArrayLike,
+    heat: NDArray[Any],
+    tracks: Iterable[Track],
+    *,
+    params: DrawParams | None = None,
+) -> Image:
+    """Draw a 2x2 mosaic: the frame, its positive windows, the heat map, the tracks.
+
+    Parameters
+    ----------
+    frame, tracks
+        ``(H, W, 3)`` uint8 RGB, and its tracks.
+    windows
+        Positive windows, as `Detections` or boxes in any form that `draw_boxes` accepts.
+    heat
+        ``(h, w)`` finite numbers, of the frame's size or smaller; drawn from black (0) to yellow (maximum).
+    params
+        Labels, units, lines and colors of the tracks; a bird's-eye view is not drawn.
+
+    Returns
+    -------
+    numpy.ndarray
+        An image of the frame's shape; an odd side ends with a black line.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is malformed, or the frame is smaller than 4x4 pixels.
+    """
+    if params is not None:
+        check_type(params, "params", DrawParams, "omit it for the defaults")
+    checked = check_image(frame, "frame")
+    height, width = (side // 2 for side in checked.shape[:2])
+    if min(height, width) < 2:
+        raise InvalidInputError(
+            f"frame must be at least 4x4 pixels, got {describe(frame)}; pass a larger image"
+        )
+    # Draw at the panels' size, so that lines and text stay sharp.
+    small = np.asarray(cv2.resize(checked, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    scale = np.array([width, height, width, height]) / np.array(checked.shape[:2] * 2)[[1, 0, 1, 0]]
+    boxes = check_boxes(windows)
+    scaled = [dataclasses.replace(track, box=track.box * scale) for track in check_tracks(tracks)]
+    panels = [
+        ("frame", small),
+        ("windows", draw_boxes(small, boxes * scale, color=TRACK_COLORS[1], thickness=1)),
+        ("heat", np.asarray(cv2.resize(heat_image(heat), (width, height)), np.uint8)),
+        (
+            "tracks",
+            TrackDrawer(dataclasses.replace(params or DrawParams(), panel="none")).draw(small, scaled),
+        ),
+    ]
+    mosaic = np.zeros(checked.shape, np.uint8)  # not zeros_like: OpenCV needs rows in C order
+    for index, (title, panel) in enumerate(panels):
+        top, left = index // 2 * height, index % 2 * width
+        view = mosaic[top : top + height, left : left + width]
+        view[:] = panel
+        scale = text_scale(view.shape)
+        title_width, title_height = text_size([title], scale)
+        fill_rectangle(view, (0, 0, title_width, title_height), BLACK, 0.6)
+        draw_text(view, [title], 0, 0, scale, WHITE)
+    return mosaic
