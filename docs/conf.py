@@ -45,7 +45,7 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_show_sourcelink = False
 # Pages without pages below them.
-_SINGLE = ("start", "gallery", "concepts", "course", "cli", "files", "limits", "changelog", "contributing")
+_SINGLE = ("start", "gallery", "concepts", "course", "cli", "files", "limits", "changelog")
 html_sidebars: dict[str, list[str]] = {name: [] for name in _SINGLE}
 html_theme_options = {
     "show_prev_next": True,

@@ -33,7 +33,7 @@ COPIES |= {
 PLACES = COPIES | {"README.md": "docs/index.md"}
 
 # Sections of the README that pages of the site include.
-README_SECTIONS = ("Start", "Your own video", "In a notebook", "Numbers", "Limits")
+README_SECTIONS = ("Start", "Your own video", "In a notebook")
 
 # Pages of the API reference: name, title, and modules of the package whose public names they describe.
 API_PAGES = (
