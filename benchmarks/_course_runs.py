@@ -18,7 +18,7 @@ from vehicle_detection.classifier import Template, TrainingOptions, VehicleClass
 from vehicle_detection.datasets import PatchSet, Split, make_split, split_leakage
 from vehicle_detection.features import extract_features
 from vehicle_detection.params import FeatureParams, SearchParams
-from vehicle_detection.synthetic import render_scene
+from vehicle_detection.scenes import render_scene
 from vehicle_detection.tuning import (
     FeatureCache,
     RowStore,

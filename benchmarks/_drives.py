@@ -23,7 +23,7 @@ from vehicle_detection import (
     render_drive,
 )
 from vehicle_detection.evaluation import FrameBoxes, TrackScores
-from vehicle_detection.synthetic import Drive, VehicleTruth
+from vehicle_detection.scenes import Drive, VehicleTruth
 
 FRAMES = 200
 

@@ -28,7 +28,7 @@ from vehicle_detection import (
 )
 from vehicle_detection._common import FORMAT_VERSION
 from vehicle_detection.datasets import PatchSet
-from vehicle_detection.synthetic import Drive
+from vehicle_detection.scenes import Drive
 
 DATA_VARIABLE = "VEHICLE_DETECTION_DATA"
 

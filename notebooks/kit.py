@@ -18,7 +18,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 import vehicle_detection as vd
-from vehicle_detection.synthetic import SceneVehicle
+from vehicle_detection.scenes import SceneVehicle
 
 Image = NDArray[np.uint8]
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import cv2
 
-from vehicle_detection.synthetic import Scene, SceneVehicle, render_scene, write_labels
+from vehicle_detection.scenes import Scene, SceneVehicle, render_scene, write_labels
 
 JPEG_QUALITY = 88
 FOLDER = Path(__file__).parent

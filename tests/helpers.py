@@ -17,7 +17,7 @@ from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
 from vehicle_detection.images import write_image
 from vehicle_detection.network import load_network
-from vehicle_detection.synthetic import render_scene
+from vehicle_detection.scenes import render_scene
 
 ROOT = Path(__file__).parents[1]
 """Root of the repository."""

@@ -19,7 +19,7 @@ from tests.video.clips import write_clip
 from vehicle_detection.annotator import DrawParams
 from vehicle_detection.detector import VehicleDetector, detector_from
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.synthetic import render_drive
+from vehicle_detection.scenes import render_drive
 from vehicle_detection.video import probe_video
 
 SHAPE = (120, 200)

@@ -16,7 +16,7 @@ from vehicle_detection import (
     render_scene,
 )
 from vehicle_detection.confidence import with_confidence
-from vehicle_detection.synthetic import SceneVehicle
+from vehicle_detection.scenes import SceneVehicle
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from tests import lesson_reference as reference
 from vehicle_detection import Detections, read_image, write_image
 from vehicle_detection.course import windows as windows_module
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.synthetic import render_patches, render_scene
+from vehicle_detection.scenes import render_patches, render_scene
 
 # The kernels compute HOG in float32, scikit-image in float64: values up to 1.
 HOG_TOLERANCE = 5e-6

@@ -12,7 +12,7 @@ from vehicle_detection.course import HeatmapDetector, extract_features, find_car
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, evaluate_detections, read_labels
-from vehicle_detection.synthetic import render_patches, render_scene
+from vehicle_detection.scenes import render_patches, render_scene
 from vehicle_detection.video import process_video
 
 FEATURES = {"spatial_size": (16, 16), "hist_bins": 16, "divide_by": 1}

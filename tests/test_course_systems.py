@@ -20,7 +20,7 @@ from sklearn.tree import DecisionTreeClassifier
 import vehicle_detection.course
 from tests import lesson_reference
 from vehicle_detection import write_image
-from vehicle_detection.synthetic import render_patches, render_scene
+from vehicle_detection.scenes import render_patches, render_scene
 
 # The kernels compute HOG in float32, scikit-image in float64: values up to 1.
 FEATURE_TOLERANCE = 5e-6

@@ -31,7 +31,7 @@ from vehicle_detection.params import (
     SearchParams,
     TrackParams,
 )
-from vehicle_detection.synthetic import SceneVehicle, render_drive, render_scene
+from vehicle_detection.scenes import SceneVehicle, render_drive, render_scene
 from vehicle_detection.tracking import FrameResult, Tracker
 from vehicle_detection.video import OwnSpeed, process_video
 

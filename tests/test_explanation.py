@@ -21,7 +21,7 @@ from vehicle_detection.events import TrackLog
 from vehicle_detection.explanation import explain_tracks, patch_cell_shares
 from vehicle_detection.features import part_slices
 from vehicle_detection.function_model import FunctionModel
-from vehicle_detection.synthetic import SceneVehicle
+from vehicle_detection.scenes import SceneVehicle
 
 CARS = [SceneVehicle(distance_m=14.0, kind="sedan"), SceneVehicle(distance_m=9.0, lateral_m=4.2, kind="suv")]
 SCENE = render_scene(shape=(360, 640), vehicles=CARS, lane=1, random_state=1)

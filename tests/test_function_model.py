@@ -15,8 +15,8 @@ from vehicle_detection.boxes import Detections
 from vehicle_detection.detector import VehicleDetector, detector_from
 from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.evaluation import FrameBoxes, evaluate_tracks
-from vehicle_detection.explorer import Explorer
 from vehicle_detection.function_model import FunctionModel
+from vehicle_detection.notebook import Explorer
 from vehicle_detection.params import FunctionParams, HeatParams, TrackParams
 from vehicle_detection.video import process_video
 

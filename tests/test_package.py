@@ -33,12 +33,9 @@ MOVING = {
     "batch": "drive",
     "events": "drive",
     "report": "drive",
-    "plotting": "notebook",
-    "explorer": "notebook",
-    "synthetic": "scenes",
     "tuning": "training",
 }
-KNOWN_UPWARD = {("explanation", "drive"), ("plotting", "scenes"), ("stream", "drive"), ("detector", "drive")}
+KNOWN_UPWARD = {("explanation", "drive"), ("notebook", "scenes"), ("stream", "drive"), ("detector", "drive")}
 
 HEAVY = {"matplotlib", "moviepy", "sklearn", "pandas", "pooch", "jinja2", "dask", "pyarrow", "motmetrics"}
 HEAVY |= {"ipywidgets", "IPython"}
@@ -78,7 +75,7 @@ def imports(name, *, at_import=False):
             if isinstance(child, ast.Import):
                 yield from (alias.name for alias in child.names)
             elif isinstance(child, ast.ImportFrom):
-                # Inside plotting, `from vehicle_detection.plotting import style` imports another file.
+                # Inside notebook, `from vehicle_detection.notebook import style` imports another file.
                 own_package = child.module == f"vehicle_detection.{package_of(name)}"
                 for alias in child.names:
                     is_file = own_package and f"{package_of(name)}.{alias.name}" in FILES

@@ -17,8 +17,8 @@ from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PatchFeatures, extract_features
 from vehicle_detection.params import FeatureParams, PixelBand
+from vehicle_detection.scenes import render_patches
 from vehicle_detection.search import BandSearch
-from vehicle_detection.synthetic import render_patches
 
 SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
 

@@ -9,10 +9,10 @@ import pytest
 
 from tests.helpers import random_network
 from tests.video.clips import child_processes, ffmpeg, running_threads
-from vehicle_detection import FrameResult, TrackWriter, VehicleDetector, plotting, process_video, track
+from vehicle_detection import FrameResult, TrackWriter, VehicleDetector, notebook, process_video, track
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.errors import InvalidInputError, VideoError
-from vehicle_detection.synthetic import render_drive
+from vehicle_detection.scenes import render_drive
 from vehicle_detection.video import open_source, read_frames
 
 
@@ -127,9 +127,9 @@ def test_bad_arguments(clip, detector, tmp_path):
 
 def test_functions_of_results_take_tracked_frames(clip, detector):
     found = list(track(clip, detector, stream=True, end=0.2))
-    plotting.plot_tracks(found)
-    plotting.plot_birds_eye(found)
-    plotting.plot_stage_times(found)
+    notebook.plot_tracks(found)
+    notebook.plot_birds_eye(found)
+    notebook.plot_stage_times(found)
     np.testing.assert_array_equal(detector.annotate(found[1].frame, found[1]), found[1].picture)
     assert [each.index for each in detector.backfill(found)] == [each.index for each in found]
     assert found[0].windows is found[0].result.windows

@@ -1,7 +1,7 @@
 """Call every public function with bad values of every argument: only the library's errors may come back.
 
 The functions are found by introspection: those of `vehicle_detection`, `vehicle_detection.course` and
-`vehicle_detection.plotting`, with the constructors and methods of their classes. A new one is covered as
+`vehicle_detection.notebook`, with the constructors and methods of their classes. A new one is covered as
 soon as `_Valid` knows valid values for its arguments. ``python -m tools.bad_input`` tries one value of each
 kind for each argument, also of the commands' options; ``--every`` tries all values. The tests try a few
 kinds for each argument. `tools.bad_input_page` writes the outcomes as a page of the documentation.
@@ -46,7 +46,7 @@ NOT_CALLED = {
 RESULTS = {
     "BatchReport", "BatchStatus", "DetectionScores", "Event", "Explanation", "FrameResult", "FrameSet",
     "FrameSource", "HorizonEstimate", "NetworkModel", "SearchResult", "Track", "TrackScores", "TrackedFrame",
-    "TrainingReport", "Trip", "VehicleCounts", "VideoInfo", "VideoReport", "plotting.ImageDescription",
+    "TrainingReport", "Trip", "VehicleCounts", "VideoInfo", "VideoReport", "notebook.ImageDescription",
 }  # fmt: skip
 """Classes whose instances the library makes, and whose constructors therefore check nothing."""
 
@@ -86,7 +86,7 @@ def bad_values(folder: Path) -> dict[str, tuple[Any, ...]]:
 def public_callables() -> dict[str, Callable[..., Any]]:
     """Return the public functions, the constructors of public classes and their methods, by name."""
     found: dict[str, Callable[..., Any]] = {}
-    for module in (vd, vd.course, vd.plotting):
+    for module in (vd, vd.course, vd.notebook):
         prefix = "" if module is vd else module.__name__.rpartition(".")[2] + "."
         for name in module.__all__:
             value = getattr(module, name)
@@ -156,7 +156,7 @@ def targets(folder: Path) -> dict[str, Target]:
     for name, function in public_callables().items():
         if name in INTERNAL:
             continue
-        owner, _, method = name.removeprefix("course.").removeprefix("plotting.").rpartition(".")
+        owner, _, method = name.removeprefix("course.").removeprefix("notebook.").rpartition(".")
         call = (
             function if not owner or inspect.ismethod(function) else getattr(valid.instances[owner], method)
         )
@@ -352,13 +352,13 @@ class _Valid:
             "write_labels": {"labels": truth},
             "write_subtitles": {"path": folder / "out.srt"},
             "write_tracks": {"results": [(0, 1, 10, 20, 30, 40, 1.5)]},
-            "plotting.plot_errors": {"frames": frames},
-            "plotting.plot_explanation": {"explanation": vd.explain(detector, image, boxes[0])},
-            "plotting.plot_f1": {"scores": {"a": scores_of}},
-            "plotting.plot_features": {"model": classifier},
-            "plotting.plot_scores": {"labels": [0, 1]},
-            "plotting.plot_tracks": {"results": predicted},
-            "plotting.plot_weights": {"classifier": vd.load_classifier("highway")},
+            "notebook.plot_errors": {"frames": frames},
+            "notebook.plot_explanation": {"explanation": vd.explain(detector, image, boxes[0])},
+            "notebook.plot_f1": {"scores": {"a": scores_of}},
+            "notebook.plot_features": {"model": classifier},
+            "notebook.plot_scores": {"labels": [0, 1]},
+            "notebook.plot_tracks": {"results": predicted},
+            "notebook.plot_weights": {"classifier": vd.load_classifier("highway")},
         }
 
 

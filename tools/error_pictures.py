@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from vehicle_detection._common import atomic_write
 from vehicle_detection.evaluation import precision_recall_curve
-from vehicle_detection.plotting import plot_errors, plot_precision_recall
+from vehicle_detection.notebook import plot_errors, plot_precision_recall
 from vehicle_detection.training import FoldDetections, FoldScore
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ from vehicle_detection._common import atomic_write, progress_bar, write_text
 from vehicle_detection.annotator import DrawParams, TrackDrawer
 from vehicle_detection.camera import Camera
 from vehicle_detection.images import write_image
-from vehicle_detection.synthetic import VehicleTruth, render_drive
+from vehicle_detection.scenes import VehicleTruth, render_drive
 
 Image = NDArray[np.uint8]
 

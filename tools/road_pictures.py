@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from vehicle_detection import VehicleDetector
 from vehicle_detection._common import atomic_write
-from vehicle_detection.plotting import plot_methods
+from vehicle_detection.notebook import plot_methods
 from vehicle_detection.training import rendered_source
 
 SEED = 99

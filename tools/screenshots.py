@@ -28,7 +28,7 @@ from vehicle_detection._common import atomic_write, write_text
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.events import find_events
 from vehicle_detection.report import ReportWriter
-from vehicle_detection.synthetic import render_drive
+from vehicle_detection.scenes import render_drive
 from vehicle_detection.video import process_video
 
 SCENE: dict[str, Any] = {"scenario": "passing", "frames": 200, "random_state": 0, "shape": (540, 960)}

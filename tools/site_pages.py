@@ -42,14 +42,14 @@ API_PAGES = (
     ("video", "Video, batches and reports", "video batch report"),
     ("images", "Images, drawing and tables", "images drawing export"),
     ("models", "Models and training", "loading network classifier training"),
-    ("explain", "Explain and explore", "explanation explorer"),
+    ("explain", "Explain and explore", "explanation notebook"),
     ("course_steps", "Features, windows and heat maps", "features windows search heatmap regions course"),
     ("evaluation", "Evaluation and tuning", "evaluation tuning"),
-    ("datasets", "Data sets and rendered scenes", "datasets synthetic"),
+    ("datasets", "Data sets and rendered scenes", "datasets scenes"),
     ("params", "Parameters", "params"),
     ("errors", "Errors", "errors"),
 )
-API_MODULES = ("plotting", "course")  # public names that are modules; each has a page
+API_MODULES = ("notebook", "course")  # public names that are modules; each has a page
 
 _LINK = re.compile(r"""(?P<start>\]\(|src=\\?")(?P<path>[^)"\\#\s:]+)(?P<end>#[^)"\\\s]*)?(?=[)"\\])""")
 

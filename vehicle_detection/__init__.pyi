@@ -1,4 +1,4 @@
-from . import course, plotting
+from . import course, notebook
 from .annotator import (
     DrawParams,
     draw_diagnostics,
@@ -65,7 +65,6 @@ from .events import (
     write_subtitles,
 )
 from .explanation import Explanation, explain
-from .explorer import Explorer
 from .export import TrackWriter, write_boxes, write_tracks
 from .features import (
     PatchFeatures,
@@ -81,6 +80,7 @@ from .heatmap import HeatHistory, add_heat, apply_threshold, bounding_boxes, lab
 from .images import read_image, write_image
 from .loading import load_model
 from .network import NetworkModel
+from .notebook import Explorer
 from .params import (
     FeatureParams,
     FunctionParams,
@@ -93,9 +93,9 @@ from .params import (
 )
 from .regions import find_vehicles
 from .report import ReportWriter
+from .scenes import render_drive, render_patches, render_scene
 from .search import SearchResult, find_cars
 from .stream import TrackedFrame, track
-from .synthetic import render_drive, render_patches, render_scene
 from .tracking import FrameResult, Track, Tracker
 from .training import FrameDataset, TrainingReport, train_and_evaluate
 from .tuning import (
@@ -225,10 +225,10 @@ __all__ = [
     "load_training_patches",
     "mine_negatives",
     "non_max_suppression",
+    "notebook",
     "open_dask",
     "open_source",
     "pareto_front",
-    "plotting",
     "precision_recall_curve",
     "probe_video",
     "process_video",

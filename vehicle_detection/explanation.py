@@ -73,7 +73,7 @@ class Explanation:
     Examples
     --------
     >>> from vehicle_detection import render_scene
-    >>> from vehicle_detection.synthetic import SceneVehicle
+    >>> from vehicle_detection.scenes import SceneVehicle
     >>> scene = render_scene(shape=(360, 640), vehicles=[SceneVehicle(distance_m=15.0)], random_state=1)
     >>> found = explain(VehicleDetector(), scene.image, scene.boxes[0])
     >>> found.found, list(found.terms), found.cells.shape

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from vehicle_detection._common import blur_patches, degrade_patches
-from vehicle_detection.synthetic import render_patches
+from vehicle_detection.scenes import render_patches
 
 
 @pytest.fixture(scope="module")

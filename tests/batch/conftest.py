@@ -10,7 +10,7 @@ import pytest
 
 from tests.helpers import ROOT, start_interruptible, write_network
 from vehicle_detection.cli.demo import draw_clip
-from vehicle_detection.synthetic import render_drive
+from vehicle_detection.scenes import render_drive
 
 TRIPS = 10
 CUT = 4  # the trip with a damaged file

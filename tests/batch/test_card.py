@@ -5,7 +5,7 @@ import numpy as np
 from tests.batch.helpers import check_whole, counts, run
 from tests.video.clips import write_clip
 from vehicle_detection import FrameBoxes, evaluate_tracks, find_trips, read_labels
-from vehicle_detection.synthetic import render_drive
+from vehicle_detection.scenes import render_drive
 from vehicle_detection.video import probe_video
 
 FRAMES, SEGMENTS = 25, 12

@@ -44,7 +44,7 @@ from vehicle_detection.cli.output import (
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.loading import load_model
-from vehicle_detection.synthetic import SceneVehicle, render_drive, render_patches, render_scene
+from vehicle_detection.scenes import SceneVehicle, render_drive, render_patches, render_scene
 from vehicle_detection.video import FrameSource, probe_video, read_frames
 
 COMMANDS = ("demo", "detect", "video", "batch", "evaluate", "train", "train-frames", "tune", "fetch", "info")

@@ -26,7 +26,7 @@ from vehicle_detection.cli.app import app
 from vehicle_detection.cli.signals import raise_on_signals
 from vehicle_detection.errors import OutputError
 from vehicle_detection.images import write_image
-from vehicle_detection.synthetic import render_patches, render_scene
+from vehicle_detection.scenes import render_patches, render_scene
 from vehicle_detection.video import probe_video
 
 FULL = OSError(errno.ENOSPC, "No space left on device")

@@ -6,7 +6,7 @@ from typer.testing import CliRunner
 
 from vehicle_detection.cli.app import app
 from vehicle_detection.images import read_image, write_image
-from vehicle_detection.synthetic import render_patches, render_scene, write_labels
+from vehicle_detection.scenes import render_patches, render_scene, write_labels
 from vehicle_detection.tuning import read_results, trials
 
 SMALL = "spatial_size=8 hist_bins=8 pix_per_cell=16 hog_channel=0 mirror=no"

@@ -15,7 +15,7 @@ from vehicle_detection.annotator import (
 )
 from vehicle_detection.camera import Camera
 from vehicle_detection.drawing import TRACK_COLORS
-from vehicle_detection.synthetic import SceneVehicle, render_scene
+from vehicle_detection.scenes import SceneVehicle, render_scene
 
 SHAPE = (720, 1280, 3)
 CAMERA = Camera(focal_px=1000.0, horizon_px=400.0)

@@ -4,7 +4,7 @@ import pytest
 
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
-from vehicle_detection.synthetic import render_drive
+from vehicle_detection.scenes import render_drive
 
 LABELS = FrameBoxes([0, 1, 1], None, [[10, 10, 60, 50], [20, 10, 70, 50], [100, 0, 150, 40]], frame_keys=[2])
 IMAGES = [np.full((60, 160, 3), value, np.uint8) for value in (10, 20)]

@@ -4,7 +4,7 @@ import numpy as np
 
 from vehicle_detection import Camera, Detections, Tracker
 from vehicle_detection.events import TrackLog
-from vehicle_detection.synthetic.drive import make_traffic
+from vehicle_detection.scenes.drive import make_traffic
 
 FPS, SHAPE = 12.5, (720, 1280)
 CAMERA = Camera.for_frame(SHAPE)

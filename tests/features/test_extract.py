@@ -23,7 +23,7 @@ from vehicle_detection.features import (
 from vehicle_detection.features.extract import hog_blocks
 from vehicle_detection.images import decode_image, write_image
 from vehicle_detection.params import COLOR_SPACES, HOG_CHANNELS, SPATIAL_ORDERS, FeatureParams
-from vehicle_detection.synthetic import render_patches
+from vehicle_detection.scenes import render_patches
 
 PRESETS = sorted(FeatureParams.PRESETS)
 # The kernels work in float32, the reference in float64; HOG values lie in 0-1.

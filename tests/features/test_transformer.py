@@ -13,7 +13,7 @@ from tests.features.cases import PATCHES
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import PatchFeatures, extract_features
 from vehicle_detection.params import FeatureParams
-from vehicle_detection.synthetic import render_patches
+from vehicle_detection.scenes import render_patches
 
 
 def test_the_transformer_equals_extract_features():

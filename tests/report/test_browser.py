@@ -13,7 +13,7 @@ from vehicle_detection.annotator import draw_tracks
 from vehicle_detection.cli.demo import draw_clip
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.report import ReportWriter
-from vehicle_detection.synthetic import render_drive
+from vehicle_detection.scenes import render_drive
 from vehicle_detection.tracking import Track
 from vehicle_detection.video import process_video
 

@@ -9,7 +9,7 @@ from PIL import Image
 
 from tools import pictures
 from vehicle_detection import DetectorError, VehicleDetector, detector_from
-from vehicle_detection.synthetic import render_drive
+from vehicle_detection.scenes import render_drive
 
 DOCS = Path(__file__).parents[2] / "docs"
 RECORD = json.loads((DOCS / pictures.RECORD).read_text())

@@ -11,7 +11,7 @@ from vehicle_detection.camera import Camera
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import FrameBoxes, evaluate_tracks
 from vehicle_detection.params import TrackParams
-from vehicle_detection.synthetic import render_drive
+from vehicle_detection.scenes import render_drive
 from vehicle_detection.tracking import Track, Tracker
 
 SHAPE = (720, 1280, 3)

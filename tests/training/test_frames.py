@@ -9,7 +9,7 @@ from tests.video.clips import gray_frames, write_clip
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, read_labels, write_labels
 from vehicle_detection.images import write_image
-from vehicle_detection.synthetic import render_drive
+from vehicle_detection.scenes import render_drive
 from vehicle_detection.training import (
     FrameDataset,
     check_sources,

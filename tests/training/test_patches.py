@@ -23,7 +23,7 @@ from vehicle_detection.datasets import (
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import extract_features
 from vehicle_detection.params import FeatureParams
-from vehicle_detection.synthetic import render_patches
+from vehicle_detection.scenes import render_patches
 from vehicle_detection.training import SPLITS, model_card, train_and_evaluate
 from vehicle_detection.training.patches import _error_rates
 

@@ -6,7 +6,7 @@ from tests.tuning.cases import SMALL
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
 from vehicle_detection.params import FeatureParams
-from vehicle_detection.synthetic import render_patches, render_scene
+from vehicle_detection.scenes import render_patches, render_scene
 
 
 @pytest.fixture(scope="package")

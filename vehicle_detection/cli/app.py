@@ -455,7 +455,7 @@ def _write_explanations(
     """Write a picture for each box of an image that says why it was found; it shows the image `shown`."""
     from vehicle_detection._common import atomic_write
     from vehicle_detection.explanation import explain
-    from vehicle_detection.plotting import plot_explanation
+    from vehicle_detection.notebook import plot_explanation
 
     for number, box in enumerate(found.boxes, start=1):
         explanation = explain(detector, image, box)

@@ -19,7 +19,7 @@ from vehicle_detection.evaluation import TrackScores, evaluate_tracks, read_labe
 from vehicle_detection.export import TrackWriter
 from vehicle_detection.images import write_image
 from vehicle_detection.report import ReportWriter
-from vehicle_detection.synthetic import Drive, VehicleTruth, render_drive, write_labels
+from vehicle_detection.scenes import Drive, VehicleTruth, render_drive, write_labels
 from vehicle_detection.video import VideoReport, process_video, read_frames
 
 FILES = ("clip.mp4", "annotated.mp4", "tracks.csv", "labels.csv", "contact_sheet.png")

@@ -163,7 +163,7 @@ def _draw(table: DataFrame, path: Path) -> None:
     from matplotlib.figure import Figure
 
     from vehicle_detection._common import atomic_write
-    from vehicle_detection.plotting import plot_tradeoff
+    from vehicle_detection.notebook import plot_tradeoff
 
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     plot_tradeoff(table, ax=figure.subplots())

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import check_integer
 from vehicle_detection.evaluation import FrameBoxes, FrameKey, LabelledFrames
-from vehicle_detection.synthetic import (
+from vehicle_detection.scenes import (
     Drive,
     Scene,
     SceneVehicle,

@@ -1,0 +1,53 @@
+"""Figures of explanations."""
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from tests.notebook.helpers import gray_image, titles
+from vehicle_detection import Explanation
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.notebook import plot_explanation
+
+CELLS = np.array([[0.5, -1.0, 0.0], [0.25, 0.0, 1.0]])
+
+
+def explanation(**options):
+    values = {"box": np.array([20.0, 30, 60, 60]), "found": True, "window": np.array([10.0, 20, 70, 60])}
+    values |= {"cells": CELLS, "terms": {"cells": 0.75, "bias": -0.5, "color histogram": 0.2}}
+    return Explanation(**(values | {"score": 1.25} | options))
+
+
+def test_cells_and_terms_are_drawn():
+    figure = plot_explanation(gray_image(), explanation())
+    assert titles(figure) == ["score 1.25", "share of each cell, orange: for a vehicle", "margin 0.45"]
+    overlay = figure.axes[1].images[1]
+    assert overlay.get_extent() == [10, 70, 60, 20]
+    alpha = overlay.get_array()[..., 3]
+    assert np.allclose(alpha, 0.75 * np.abs(CELLS))
+    bars = figure.axes[2].patches
+    assert [bar.get_x() for bar in bars] == pytest.approx([0, 0.75, 0.25])
+    assert [bar.get_width() for bar in bars] == pytest.approx([0.75, -0.5, 0.2])
+    assert [label.get_text() for label in figure.axes[2].get_yticklabels()] == [
+        "cells",
+        "bias",
+        "color histogram",
+    ]
+    # The line of the margin is behind the numbers.
+    (line, *_), numbers = figure.axes[2].lines, figure.axes[2].texts
+    assert all(number.get_bbox_patch() and number.get_zorder() > line.get_zorder() for number in numbers)
+    low, high = figure.axes[2].get_xlim()
+    assert low < 0
+    assert high > 0.75
+
+
+def test_a_given_figure_is_used_and_nothing_found_is_said():
+    figure = Figure()
+    empty = explanation(score=None, found=False, cells=np.zeros((2, 3)), terms={"cells": 0.0})
+    assert plot_explanation(gray_image(), empty, figure=figure) is figure
+    assert titles(figure)[0] == "not found"
+
+
+def test_bad_arguments_are_refused():
+    with pytest.raises(InvalidInputError, match="explanation must be an Explanation, got 1"):
+        plot_explanation(gray_image(), 1)

@@ -1,0 +1,595 @@
+import dataclasses
+import sys
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.helpers import random_classifier
+from vehicle_detection.boxes import Detections, iou_matrix
+from vehicle_detection.camera import Camera
+from vehicle_detection.datasets import load_frames
+from vehicle_detection.detector import VehicleDetector
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.heatmap import frame_heat
+from vehicle_detection.images import write_image
+from vehicle_detection.loading import load_model
+from vehicle_detection.notebook import Explorer
+from vehicle_detection.notebook import explorer as module
+from vehicle_detection.notebook.explorer import METHODS, VIEWS
+from vehicle_detection.params import FeatureParams, HeatParams, NetworkParams, RegionParams, SearchParams
+from vehicle_detection.scenes import render_scene
+
+SHAPE = (360, 640)
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return [render_scene(shape=SHAPE, vehicles=3, random_state=seed).image for seed in (1, 2)]
+
+
+def explore(frames, **options):
+    """Explore with the classifier of patches: its search has bands, and its windows are grouped."""
+    return Explorer(frames, "highway", **options)
+
+
+@pytest.fixture
+def explorer(scenes):
+    return explore(scenes, horizon=0.56)
+
+
+@pytest.fixture
+def count_searches(monkeypatch):
+    """Make an explorer count the searches of its model."""
+
+    def count(explorer):
+        searches = []
+        find = explorer._search.find
+        monkeypatch.setattr(explorer._search, "find", lambda *args: searches.append(args) or find(*args))
+        return searches
+
+    return count
+
+
+# Windows and boxes
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("min_score", [-0.5, 0.0, 0.6])
+@pytest.mark.parametrize("model", ["default", "highway"])
+def test_windows_and_boxes_equal_those_of_the_detector(scenes, model, method, min_score):
+    explorer = Explorer(scenes, model)
+    explorer.set_search(min_score=min_score, horizon=0.56)
+    explorer.set_regions(method, threshold=0.5)
+    kind = type(explorer.search_params)
+    search_params = dataclasses.replace(kind.default().with_horizon(0.56), min_score=min_score)
+    region_params = HeatParams(threshold=0.5) if method == "heat" else RegionParams()
+    expected = VehicleDetector(model, region_params=region_params, search_params=search_params, n_jobs=1)
+    for number, scene in enumerate(scenes):
+        explorer.set_frame(number)
+        windows, found = expected.search(scene).windows, expected.detect(scene)
+        assert len(windows)
+        assert len(found)
+        for actual, wanted in (
+            (explorer.windows(), windows),
+            (explorer.boxes(), found),
+            (explorer.detector(n_jobs=1).detect(scene), found),
+        ):
+            np.testing.assert_array_equal(actual.boxes, wanted.boxes)
+            np.testing.assert_array_equal(actual.scores, wanted.scores)
+        if method == "groups":
+            np.testing.assert_array_equal(explorer.boxes().confidences, found.confidences)
+
+
+@pytest.mark.parametrize("model", ["default", "highway"])
+def test_a_camera_is_that_of_the_detector(scenes, model, tmp_path):
+    file = tmp_path / "camera.json"
+    file.write_text('{"field_of_view": 90, "horizon": 0.56}')
+    for camera in (file, "wide-90"):
+        explorer = Explorer(scenes, model, camera=camera)
+        with VehicleDetector(model, camera=camera, n_jobs=1) as detector:
+            assert explorer.search_params == detector.search_params_of(SHAPE)
+            np.testing.assert_array_equal(explorer.boxes().boxes, detector.detect(scenes[0]).boxes)
+
+
+def test_the_given_parameters_are_used(scenes):
+    camera = Camera.for_frame(SHAPE, horizon=0.56, height_m=2.0)
+    params = SearchParams.preset("three-scales")
+    counted = HeatParams(weighting="count")
+    heated = explore(scenes, search_params=params, region_params=counted, camera=camera)
+    assert heated.method == "heat"
+    np.testing.assert_array_equal(heated.heat_map(), frame_heat(SHAPE, heated.windows(), counted))
+    detector = heated.detector(n_jobs=1)
+    assert detector.camera is camera
+    assert detector.region_params == counted.for_search(params)
+    assert detector.search_params == params
+    heated.set_regions(
+        "groups", threshold=4.0, peak_fraction=0.1, weighting="score", min_peak=0.2, min_evidence=0.3
+    )
+    assert heated.heat_params == HeatParams(threshold=4.0, peak_fraction=0.1)
+    assert heated.group_params == heated.region_params == RegionParams(min_peak=0.2, min_evidence=0.3)
+    assert heated.detector(n_jobs=1).region_params == heated.group_params
+    assert heated.method == "groups"
+    heated.set_regions(threshold=0.0)
+    assert (heated.heat_params.threshold, heated.method) == (0.0, "groups")
+    grouped = explore(scenes, region_params=RegionParams(min_peak=1.0))
+    assert (grouped.method, grouped.group_params.min_peak) == ("groups", 1.0)
+
+
+def test_the_model_is_a_name_a_path_or_a_model(scenes, tmp_path):
+    model = load_model("default")
+    model.save(tmp_path / "model.onnx")
+    expected = Explorer(scenes).boxes().boxes
+    for same in (model, tmp_path / "model.onnx"):
+        np.testing.assert_array_equal(Explorer(scenes, same).boxes().boxes, expected)
+
+
+def test_the_horizon_of_a_network_may_be_unknown(scenes):
+    explorer = Explorer(scenes, search_params=NetworkParams(horizon=None))
+    assert explorer.bands == ()
+    image = explorer.render()
+    explorer.set_search(horizon=0.56)
+    assert explorer.search_params == NetworkParams().with_horizon(0.56)
+    assert (explorer.render() != image).any()
+    with pytest.raises(InvalidInputError, match="bands must be None for this model"):
+        explorer.set_search(bands=[0])
+
+
+def test_higher_thresholds_leave_fewer_boxes(explorer):
+    explorer.set_regions("heat", threshold=0.0)
+    many = len(explorer.boxes())
+    explorer.set_regions(threshold=1e6)
+    assert many > len(explorer.boxes()) == 0
+    explorer.set_regions("groups")
+    assert len(explorer.boxes()) > 0
+    explorer.set_regions(min_peak=100.0)
+    assert len(explorer.boxes()) == 0
+
+
+def test_bands_are_selected(explorer):
+    explorer.set_search(min_score=-100.0)
+    everything = explorer.windows()
+    parts = []
+    for band in range(len(explorer.search_params.bands)):
+        explorer.set_search(bands=[band])
+        part = explorer.windows()
+        assert len(set((part.boxes[:, 2] - part.boxes[:, 0]).round().tolist())) <= 1
+        parts.append(part.boxes)
+    np.testing.assert_array_equal(np.concatenate(parts), everything.boxes)
+    explorer.set_search(bands=(3, 1, 3))
+    assert explorer.bands == (1, 3)
+    assert len(explorer.windows()) == len(parts[1]) + len(parts[3])
+    assert len(explorer.detector(n_jobs=1).search_params.bands) == 2
+    explorer.set_search(bands=())
+    assert len(explorer.windows()) == 0
+    assert explorer.render().shape == (*SHAPE, 3)
+    with pytest.raises(InvalidInputError, match="bands must be a tuple of SearchBand, at least one"):
+        explorer.detector()
+
+
+@pytest.fixture(scope="module")
+def shared_explorer(scenes):
+    """One explorer for all examples: the cache must not change results."""
+    return explore(scenes)
+
+
+@settings(max_examples=20)
+@given(thresholds=st.lists(st.floats(-3, 3), min_size=2, max_size=5))
+def test_windows_are_those_above_the_threshold(shared_explorer, thresholds):
+    explorer = shared_explorer
+    explorer.set_search(min_score=-100.0)
+    everything = explorer.windows()
+    counts = []
+    for threshold in sorted(thresholds):
+        explorer.set_search(min_score=threshold)
+        windows = explorer.windows()
+        assert (windows.scores > threshold).all()
+        assert len(windows) == (everything.scores > threshold).sum()
+        counts.append(len(windows))
+    assert counts == sorted(counts, reverse=True)
+
+
+# The cache
+
+
+def test_only_a_new_frame_or_horizon_needs_a_search(explorer, count_searches):
+    searches = count_searches(explorer)
+    explorer.render()
+    bands = len(searches)
+    assert bands == len(SearchParams.preset().place(SHAPE))
+    for score in (-1.0, 0.0, 0.7):
+        explorer.set_search(min_score=score, bands=[0, 1])
+        for method in METHODS:
+            explorer.set_regions(method, threshold=1.0 + score**2, peak_fraction=0.2, min_peak=0.3)
+            for view in VIEWS:
+                explorer.set_view(view)
+                explorer.render()
+                explorer.summary()
+    assert len(searches) == bands
+    explorer.set_search(horizon=0.5)
+    explorer.render()
+    assert len(searches) == 2 * bands
+    explorer.set_frame(1)
+    explorer.render()
+    assert len(searches) == 3 * bands
+    explorer.set_frame(0)
+    explorer.set_search(horizon=0.56)
+    explorer.render()
+    assert len(searches) == 3 * bands
+
+
+def test_a_higher_threshold_of_a_network_needs_no_search(scenes, count_searches):
+    explorer = Explorer(scenes)
+    searches = count_searches(explorer)
+    counts = []
+    for score in (0.0, 3.0, 6.0):
+        explorer.set_search(min_score=score)
+        explorer.render()
+        counts.append(len(explorer.windows()))
+    assert len(searches) == 1
+    assert counts[0] > counts[1] > counts[2]
+
+
+def test_the_cache_is_limited(scenes, monkeypatch, count_searches):
+    monkeypatch.setattr(module, "_CACHED_SEARCHES", 2)
+    monkeypatch.setattr(module, "_CACHED_FRAMES", 1)
+    explorer = explore(scenes)
+    searches = count_searches(explorer)
+    for horizon in (0.5, 0.52, 0.54):
+        explorer.set_search(horizon=horizon)
+        explorer.windows()
+    explorer.set_frame(1)
+    explorer.windows()
+    assert explorer._search_frame.cache_info().currsize == 2
+    assert explorer._read_frame.cache_info().currsize == 1
+    before = len(searches)
+    explorer.set_frame(0)
+    explorer.windows()  # horizon 0.54 is still cached
+    assert len(searches) == before
+
+
+def test_a_result_is_computed_once(explorer, monkeypatch):
+    explorer.set_regions("heat")
+    calls = []
+    monkeypatch.setattr(module, "frame_heat", lambda *args: calls.append(1) or frame_heat(*args))
+    explorer.set_view("heat")
+    explorer.render()
+    explorer.summary()
+    assert len(calls) == 1
+
+
+def test_parameters_may_be_assigned(explorer):
+    before = len(explorer.windows())
+    bands = explorer.search_params.bands
+    explorer.search_params = SearchParams(bands=bands, horizon=0.56, min_score=1.5, horizontal_padding=0.5)
+    fewer = len(explorer.windows())
+    assert fewer < before
+    explorer.search_params = SearchParams(bands=bands[1:], horizon=0.56, min_score=1.5)
+    assert len(explorer.windows()) < fewer
+
+
+# Images
+
+
+def test_each_view_shows_another_image(explorer, scenes):
+    pictures = {}
+    for view in VIEWS:
+        explorer.set_view(view)
+        pictures[view] = explorer.render()
+        assert pictures[view].shape == (*SHAPE, 3)
+        assert pictures[view].dtype == np.uint8
+    different = {picture.tobytes() for picture in pictures.values()}
+    assert len(different) == 3
+    boxes = explorer.boxes().boxes
+    x1, y1, x2, _ = boxes[0].round().astype(int)
+    assert (pictures["boxes"][y1, x1 + 2 : x2 - 2] == module._BOX_COLOR).all()
+    horizon = pictures["boxes"][round(0.56 * SHAPE[0])]
+    assert (horizon[::4] == 255).all(axis=1).mean() > 0.5
+    # pixels without drawings are unchanged, and so are the frames
+    np.testing.assert_array_equal(pictures["boxes"][:100], scenes[0][:100])
+    np.testing.assert_array_equal(scenes[0], render_scene(shape=SHAPE, vehicles=3, random_state=1).image)
+
+
+def test_boxes_have_their_numbers(explorer, monkeypatch):
+    given = []
+    monkeypatch.setattr(module, "draw_texts", lambda image, *texts: given.append(texts))
+    plain = explorer.render()
+    ((boxes, texts, *_),) = given
+    assert texts == [str(number + 1) for number in range(len(explorer.boxes()))]
+    np.testing.assert_array_equal(boxes, explorer.boxes().boxes[explorer._best_first()])
+    monkeypatch.undo()
+    assert (explorer.render() != plain).any()
+
+
+def test_wide_frames_are_reduced(scenes):
+    large = cv2.resize(scenes[0], (1280, 720))
+    explorer = explore([large], width=320)
+    for view in VIEWS:
+        explorer.set_view(view)
+        assert explorer.render().shape == (180, 320, 3)
+    x1, y1, x2, _ = (explorer.boxes().boxes[0] / 4).round().astype(int)
+    explorer.set_view("boxes")
+    assert (explorer.render()[y1, x1 + 3 : x2 - 3] == module._BOX_COLOR).all()
+
+
+def test_the_summary_counts_windows_and_boxes(explorer, scenes):
+    hits, found = len(explorer.windows()), len(explorer.boxes())
+    total = len(explorer._find().windows)
+    assert explorer.summary() == f"frame 0, 640x360: {hits:,} of {total:,} windows above 0, {found} boxes"
+    explorer.set_regions("heat", threshold=1e6)
+    assert explorer.summary().endswith("0 boxes")
+    network = Explorer(scenes)
+    hits, found = len(network.windows()), len(network.boxes())
+    assert network.summary() == f"frame 0, 640x360: {hits:,} windows above 0, {found} boxes"
+
+
+def test_a_horizon_at_the_border_of_the_frame(explorer):
+    explorer.set_search(horizon=1.0)
+    with pytest.raises(InvalidInputError, match="search window below the horizon at 1"):
+        explorer.render()
+    explorer.set_search(horizon=0.0)
+    assert explorer.render().shape == (*SHAPE, 3)
+
+
+# Frames
+
+
+def test_frames_are_arrays_or_files(scenes, tmp_path):
+    (tmp_path / "more").mkdir()
+    for path, scene in zip(("a.png", "more/a.png"), scenes):
+        write_image(tmp_path / path, scene)
+    first, second = tmp_path / "a.png", tmp_path / "more" / "a.png"
+    assert explore(scenes).names == ("frame 0", "frame 1")
+    assert explore([str(first), scenes[1]]).names == ("a.png", "frame 1")
+    assert explore([first, second]).names == (str(first), str(second))
+    named = explore({"one": scenes[0], 2: second})
+    assert named.names == ("one", "2")
+    named.set_frame("2")
+    folder = explore(load_frames(tmp_path / "more"))
+    assert folder.names == ("a.png",)
+    for explorer in (named, folder):
+        np.testing.assert_array_equal(explorer.windows().boxes, explore([scenes[1]]).windows().boxes)
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        ([], "frames must hold at least one image; got none"),
+        ({}, "frames must hold at least one image; got none"),
+        ("a.png", "frames must be a list of images or paths.*got 'a.png'.*wrap a single one in a list"),
+        (np.zeros((9, 9, 3), np.uint8), "frames must be a list of images or paths"),
+        ([np.zeros((9, 9))], r"frames\['frame 0'\] must be an \(H, W, 3\) uint8 RGB array"),
+    ],
+)
+def test_malformed_frames_are_rejected(frames, message):
+    with pytest.raises(InvalidInputError, match=message):
+        Explorer(frames)
+
+
+@pytest.mark.parametrize(
+    ("method", "arguments", "message"),
+    [
+        ("set_frame", {"frame": 2}, "frame must be an integer from 0 to 1; got 2"),
+        ("set_frame", {"frame": "x"}, "frame must be one of 'frame 0', 'frame 1'; got 'x'"),
+        ("set_view", {"view": "all"}, "view must be one of 'boxes', 'windows', 'heat'; got 'all'"),
+        ("set_search", {"horizon": 2.0}, "horizon must be a number, at least 0 and at most 1"),
+        ("set_search", {"min_score": "high"}, "min_score must be a number"),
+        ("set_search", {"bands": [8]}, "bands must be an integer from 0 to 7; got 8"),
+        ("set_regions", {"method": "both"}, "method must be one of 'groups', 'heat'; got 'both'"),
+        ("set_regions", {"peak_fraction": 1.5}, "peak_fraction must be a number, at least 0 and at most"),
+        ("set_regions", {"min_peak": -1.0}, "min_peak must be a number, at least 0"),
+        ("set_search", {"bands": [1], "horizon": 7}, "horizon must be a number"),
+        ("set_search", {"bands": [9], "horizon": 0.4}, "bands must be an integer"),
+        ("set_regions", {"method": "heat", "threshold": 9.0, "min_peak": -1.0}, "min_peak must be a number"),
+    ],
+)
+def test_an_invalid_value_changes_nothing(explorer, method, arguments, message):
+    def state():
+        return explorer.frame, explorer.view, explorer.search_params, explorer.bands, explorer.region_params
+
+    before = state()
+    with pytest.raises(InvalidInputError, match=message):
+        getattr(explorer, method)(**arguments)
+    assert state() == before
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"model": 3}, "model must be a VehicleClassifier or NetworkModel, got 3;"),
+        ({"search_params": "default"}, "search_params must be a NetworkParams, got 'default'"),
+        ({"model": "highway", "search_params": NetworkParams()}, "search_params must be a SearchParams, got"),
+        ({"region_params": 1}, "region_params must be a RegionParams or HeatParams"),
+        ({"camera": 1}, "camera must be a Camera"),
+        ({"width": 3}, "width must be an integer from 16 to 10000"),
+        (
+            {"model": random_classifier(FeatureParams(pix_per_cell=10))},
+            "find_cars needs whole HOG cells in a",
+        ),
+    ],
+)
+def test_malformed_options_are_rejected(scenes, options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        Explorer(scenes, **options)
+
+
+# The widgets
+
+
+def open_panel(explorer):
+    """Controls by label, the text and the image of an explorer's widget."""
+    left, right = explorer.widget().children
+    return {control.description: control for control in left.children}, *right.children
+
+
+@pytest.fixture
+def panel(explorer):
+    return open_panel(explorer)
+
+
+def decode(picture):
+    return cv2.imdecode(np.frombuffer(picture.value, np.uint8), cv2.IMREAD_COLOR_RGB)
+
+
+def test_the_controls_start_with_the_parameters(explorer, panel):
+    controls, text, image = panel
+    groups, heat = RegionParams(), HeatParams().for_search(SearchParams.preset())
+    assert {name: control.value for name, control in controls.items()} == {
+        "frame": "frame 0", "show": "windows", "explain box": 0, "min. score": 0.0, "horizon": 0.56,
+        "windows (px)": tuple(range(8)), "boxes from": "groups", "min. peak": groups.min_peak,
+        "min. evidence": groups.min_evidence, "min. heat": heat.threshold,
+        "peak fraction": heat.peak_fraction, "heat is": "score",
+    }  # fmt: skip
+    assert text.value == explorer.summary()
+    difference = decode(image).astype(int) - explorer.render()
+    assert np.abs(difference).mean() < 8  # JPEG
+
+
+def test_each_control_sets_its_parameter(explorer, panel, count_searches):
+    searches = count_searches(explorer)
+    controls, text, image = panel
+    before = image.value
+    controls["min. score"].value = 1.0
+    assert explorer.search_params.min_score == 1.0
+    assert "windows above 1," in text.value
+    assert image.value != before
+    controls["windows (px)"].value = (0, 2)
+    assert explorer.bands == (0, 2)
+    controls["min. peak"].value = 0.25
+    controls["min. evidence"].value = 0.5
+    assert explorer.region_params == RegionParams(min_peak=0.25, min_evidence=0.5)
+    controls["show"].value = "heat"
+    assert explorer.view == "heat"
+    controls["boxes from"].value = "heat"
+    controls["min. heat"].value = 5.0
+    controls["peak fraction"].value = 0.5
+    controls["heat is"].value = "count"
+    assert explorer.region_params == HeatParams(threshold=5.0, peak_fraction=0.5, weighting="count")
+    assert not searches
+    controls["horizon"].value = 0.5
+    assert explorer.search_params.horizon == 0.5
+    assert searches
+    controls["frame"].value = "frame 1"
+    assert explorer.frame == "frame 1"
+    assert text.value == explorer.summary()
+
+
+def test_controls_without_effect_are_disabled(panel):
+    controls, *_ = panel
+
+    def disabled():
+        return {name for name, control in controls.items() if control.disabled}
+
+    assert disabled() == {"min. heat", "peak fraction", "heat is"}
+    controls["boxes from"].value = "heat"
+    assert disabled() == {"min. peak", "min. evidence"}
+
+
+def test_a_network_has_no_controls_for_bands_and_groups(scenes):
+    explorer = Explorer(scenes, search_params=NetworkParams(horizon=None))
+    controls, text, _ = open_panel(explorer)
+    assert list(controls) == [
+        "frame", "show", "explain box", "min. score", "horizon", "boxes from", "min. heat", "peak fraction",
+        "heat is",
+    ]  # fmt: skip
+    controls["min. score"].value = 0.5
+    # Only changed controls are applied: the horizon is still unknown.
+    assert explorer.search_params == NetworkParams(horizon=None, min_score=0.5)
+    controls["horizon"].value = 0.56
+    assert explorer.search_params.horizon == 0.56
+    assert text.value == explorer.summary()
+
+
+def test_an_error_is_shown_and_the_image_stays(scenes, tmp_path):
+    explorer = explore([scenes[0], tmp_path / "gone & lost.png"])
+    controls, text, image = open_panel(explorer)
+    before = image.value
+    controls["frame"].value = "gone & lost.png"
+    assert text.value.startswith("<b>image file")
+    assert "gone &amp; lost.png does not exist" in text.value
+    assert image.value == before
+    controls["frame"].value = "frame 0"
+    assert text.value == explorer.summary()
+
+
+@pytest.mark.parametrize("model", ["default", "highway"])
+def test_a_box_is_explained(scenes, model):
+    explorer = Explorer(scenes, model, width=SHAPE[1] // 2)
+    controls, text, _ = open_panel(explorer)
+    assert explorer.explanation() is None
+    plain = explorer.render()
+    controls["explain box"].value = 1
+    explanation = explorer.explanation()
+    best = explorer.boxes().boxes[explorer.boxes().scores.argmax()]
+    overlap = iou_matrix(best[None], explanation.box[None])[0, 0]
+    assert overlap > 0.5
+    assert text.value == explorer.summary()
+    assert f"; box 1: score {explanation.score:.2f}" in text.value
+    changed = np.argwhere((explorer.render() != plain).any(axis=2))[:, ::-1]
+    left, top, right, bottom = explanation.window / 2
+    assert (changed >= (left - 1, top - 1)).all()
+    assert (changed <= (right + 1, bottom + 1)).all()
+    controls["explain box"].value = 99
+    assert explorer.explanation() is None
+    with pytest.raises(InvalidInputError, match="number must be an integer at least 0"):
+        explorer.set_box(-1)
+
+
+def test_a_click_explains_the_box(scenes, monkeypatch):
+    handlers = []
+
+    class Event:
+        def __init__(self, source, watched_events):
+            assert watched_events == ["click"]
+
+        def on_dom_event(self, handler):
+            handlers.append(handler)
+
+    monkeypatch.setitem(sys.modules, "ipyevents", SimpleNamespace(Event=Event))
+    explorer = Explorer(scenes, width=SHAPE[1] // 2)
+    controls, *_ = open_panel(explorer)
+    (click,) = handlers
+    for row in range(len(explorer.boxes())):
+        x1, y1, x2, y2 = explorer.boxes().boxes[row] / 2
+        click({"dataX": (x1 + x2) / 2, "dataY": (y1 + y2) / 2})
+        number = controls["explain box"].value
+        order = np.argsort(-explorer.boxes().scores, kind="stable")
+        assert order[number - 1] == row
+        assert explorer.explanation() is not None
+    click({"dataX": 0, "dataY": 0})
+    assert (explorer.box, explorer.explanation()) == (0, None)
+
+
+def test_values_outside_the_usual_range_widen_the_slider(scenes):
+    search = SearchParams(bands=SearchParams.preset().bands, min_score=-7.0)
+    controls, *_ = open_panel(explore(scenes, search_params=search, region_params=HeatParams(threshold=39.0)))
+    assert (controls["min. score"].value, controls["min. score"].min) == (-7.0, -7.0)
+    assert (controls["min. heat"].value, controls["min. heat"].max) == (39.0, 39.0)
+
+
+def test_only_the_sliders_need_ipywidgets(explorer, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ipywidgets", None)
+    assert explorer.render().shape == (*SHAPE, 3)
+    with pytest.raises(InvalidInputError, match="sliders need ipywidgets; pip install ipywidgets,"):
+        explorer.widget()
+
+
+def test_a_notebook_displays_the_widgets(explorer, monkeypatch):
+    import IPython.display
+
+    shown = []
+    monkeypatch.setattr(IPython.display, "display", shown.append)
+    explorer._ipython_display_()
+    assert [type(widget).__name__ for widget in shown] == ["HBox"]
+
+
+@pytest.mark.realdata
+def test_real_images(real_data):
+    explorer = explore(load_frames(real_data / "test_images"))
+    explorer.set_frame("test1.jpg")
+    assert isinstance(explorer.boxes(), Detections)
+    assert len(explorer.boxes()) >= 2
+    assert explorer.render().shape == (540, 960, 3)

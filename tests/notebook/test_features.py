@@ -1,0 +1,245 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from tests.helpers import random_classifier
+from tests.notebook.helpers import SMALL, gray_image, legend, new_axes, texts, titles
+from vehicle_detection import notebook
+from vehicle_detection.classifier import Template, VehicleClassifier
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.features import extract_features, hog_image, sum_blocks
+from vehicle_detection.notebook.features import add_glyphs
+from vehicle_detection.notebook.style import OTHER, VEHICLE
+from vehicle_detection.params import FeatureParams
+from vehicle_detection.scenes import render_patches
+
+
+def test_channels_of_an_image_are_plotted_in_the_colors_of_its_pixels():
+    image = np.zeros((10, 10, 3), np.uint8)
+    image[:5] = (255, 0, 0)
+    figure = notebook.plot_channels(image, "RGB")
+    red = figure.axes[0].patches[0]
+    assert red.get_data().values.sum() == pytest.approx(100)
+    assert red.get_data().values[[0, 127]].tolist() == [50, 50]
+    assert figure.axes[0].get_ylabel() == "pixels (%)"
+    points = figure.axes[3].collections[0]
+    colors = points.get_facecolors()[:, :3]
+    # each point has the color of its pixel
+    np.testing.assert_array_equal(colors[:, 0] * 255, points.get_offsets()[:, 0])
+    assert figure.axes[0].get_legend() is None
+
+
+def test_channels_of_two_classes_are_plotted_separately(patch_set):
+    figure = notebook.plot_channels(patch_set, "LAB", points=50)
+    assert legend(figure.axes[0]) == ["vehicle", "other"]
+    assert [axes.get_xlabel() for axes in figure.axes[:3]] == ["L", "a", "b"]
+    for axes in figure.axes[:3]:
+        assert [stairs.get_data().values.sum() for stairs in axes.patches] == pytest.approx([100, 100])
+    assert [len(points.get_offsets()) for points in figure.axes[4].collections] == [50, 50]
+    again, other = (
+        notebook.plot_channels(patch_set, "LAB", points=50, random_state=seed).axes[4].collections[0]
+        for seed in (0, 1)
+    )
+    offsets = figure.axes[4].collections[0].get_offsets()
+    np.testing.assert_array_equal(again.get_offsets(), offsets)
+    assert (other.get_offsets() != offsets).any()
+
+
+@pytest.mark.parametrize(
+    ("images", "options", "message"),
+    [
+        (gray_image(), {"color_space": "XYZ"}, "color_space must be one of 'RGB', 'HSV'"),
+        ([gray_image()], {"labels": [1, 0]}, "labels must be one number for each of 1 images"),
+        ([], {}, "images must be a list of images, at least one"),
+        ([gray_image()[..., 0]], {}, r"images\[0\] must be an \(H, W, 3\) uint8 RGB array"),
+        (gray_image(), {"points": 0}, "points must be an integer from 1"),
+    ],
+)
+def test_malformed_options_of_the_channels_are_rejected(images, options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        notebook.plot_channels(images, **options)
+
+
+def test_hog_has_a_panel_per_channel_and_cell_size():
+    patches, _ = render_patches(2, random_state=1)
+    figure = notebook.plot_hog({"car": patches[0], "road": patches[1]}, SMALL, pix_per_cell=[8, 16, 32])
+    assert len(figure.axes) == 4 * 6
+    assert titles(figure)[:6] == [
+        "car: Y", "car: Cr", "car: Cb", "road: Y", "road: Cr", "road: Cb",
+    ]  # fmt: skip
+    assert [figure.axes[row * 6].get_ylabel() for row in (1, 2, 3)] == [
+        "8 px cells", "16 px cells", "32 px cells",
+    ]  # fmt: skip
+    for axes in figure.axes[6:]:
+        assert len(axes.collections) == 1
+        assert (*axes.get_xlim(), *axes.get_ylim()) == (0, 64, 64, 0)
+    gray = notebook.plot_hog(patches[0], FeatureParams(hog_channel="GRAY"), pix_per_cell=[8])
+    assert titles(gray) == ["gray", ""]
+    single = notebook.plot_hog({"x": patches[0]}, FeatureParams(hog_channel=2), pix_per_cell=[8])
+    assert single.axes[0].get_title() == "x: Cb"
+
+
+@pytest.mark.parametrize(
+    ("ahead", "slope"),
+    [((0, 1), (0, 1)), ((1, 0), (1, 0)), ((1, -1), (1, 1)), ((1, 1), (1, -1))],
+)
+def test_a_glyph_is_parallel_to_the_edge(ahead, slope):
+    """The image is dark on one side of a line through its center, and bright in the direction `ahead`."""
+    rows, columns = np.mgrid[-32:32, -32:32] + 0.5
+    bright = rows * ahead[0] + columns * ahead[1] > 0
+    image = np.repeat((bright * 200).astype(np.uint8)[..., None], 3, axis=2)
+    params = FeatureParams(hog_channel="GRAY", orient=18, cell_per_block=2)
+    lines = notebook.plot_hog(image, params, pix_per_cell=[16]).axes[1].collections[0]
+    start, stop = lines.get_segments()[int(lines.get_array().argmax())]
+    along = (stop - start) / np.linalg.norm(stop - start)
+    # direction of the line, of either sign; a bin is 10 degrees wide
+    expected = np.array(slope) if ahead[0] and ahead[1] else np.array(ahead)
+    expected = expected / np.linalg.norm(expected)
+    assert abs(along @ expected) == pytest.approx(1, abs=0.02)
+    # the brightest pixels of scikit-image's rendering are on the same line
+    picture = hog_image(image[..., 0], 18, 16)
+    y, x = np.nonzero(picture[16:48, 16:48] > 0.8 * picture.max())
+    if ahead[0] and ahead[1]:
+        assert np.sign(np.corrcoef(x, y)[0, 1]) == np.sign(along[0] * along[1])
+
+
+def test_malformed_options_of_hog_are_rejected():
+    with pytest.raises(InvalidInputError, match="img must have at least the size of a block"):
+        notebook.plot_hog(gray_image(30, 30), pix_per_cell=[16])
+    with pytest.raises(InvalidInputError, match="pix_per_cell must be an integer at least 2"):
+        notebook.plot_hog(gray_image(), pix_per_cell=[1])
+
+
+@settings(max_examples=25)
+@given(
+    blocks=st.tuples(st.integers(1, 5), st.integers(1, 5), st.integers(1, 3), st.integers(1, 4)).flatmap(
+        lambda n: hnp.arrays(np.float64, (n[0], n[1], n[2], n[2], n[3]), elements=st.floats(-9, 9))
+    )
+)
+def test_sums_over_blocks_keep_the_total(blocks):
+    sums, counts = sum_blocks(blocks), sum_blocks(np.ones_like(blocks))[..., 0]
+    side = blocks.shape[2]
+    assert sums.shape == (blocks.shape[0] + side - 1, blocks.shape[1] + side - 1, blocks.shape[4])
+    assert sums.sum() == pytest.approx(blocks.sum(), abs=1e-9)
+    assert counts.sum() == blocks.shape[0] * blocks.shape[1] * side**2
+    assert counts.min() >= 1
+
+
+def test_glyphs_of_zeros_are_empty():
+    axes = new_axes()
+    assert not len(add_glyphs(axes, np.zeros((2, 3, 9))).get_segments())
+    assert (axes.get_xlim(), axes.get_ylim()) == ((0, 3), (2, 0))
+
+
+def test_vectors_are_plotted_before_and_after_scaling(patch_set):
+    classifier = random_classifier(SMALL)
+    figure = notebook.plot_features(patch_set, classifier, rows=[3, 30], names=["car", "road"])
+    above, below = figure.axes
+    raw = extract_features(patch_set.patches[[3, 30]], SMALL)
+    template = classifier.templates[0]
+    for line, scaled, values in zip(above.lines, below.lines, raw):
+        np.testing.assert_array_equal(line.get_ydata(), values)
+        np.testing.assert_allclose(scaled.get_ydata(), (values - template.mean) / template.scale)
+    assert legend(above) == ["car", "road"]
+    classes = patch_set.labels[[3, 30]].tolist()
+    for rows in ([3, 30], [30, 3]):
+        lines = notebook.plot_features(patch_set, classifier, rows=rows).axes[0].lines
+        colors = [VEHICLE if patch_set.labels[row] else OTHER for row in rows]
+        assert [line.get_color() for line in lines] == colors
+    assert sorted(classes) == [False, True]
+    parts = ["spatial bins (192)", "color histogram (24)", "HOG (648)"]
+    assert texts(above.texts) == parts
+    assert below.get_ylabel() == "value (standard deviations)"
+
+
+def test_without_a_classifier_the_scaler_is_fitted_to_the_patches(patch_set):
+    rows = range(len(patch_set))
+    figure = notebook.plot_features(patch_set, SMALL, rows=rows)
+    scaled = np.array([line.get_ydata() for line in figure.axes[1].lines])
+    np.testing.assert_allclose(scaled.mean(axis=0), 0, atol=1e-6)
+    deviation = scaled.std(axis=0)
+    assert np.allclose(deviation[deviation > 0], 1)
+    assert figure.axes[0].get_legend() is None
+    # only used parts are shaded
+    params = FeatureParams(spatial_feat=False, hist_feat=False)
+    assert len(notebook.plot_features(patch_set, params).axes[0].texts) == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rows": [40]}, "rows must be an integer from 0 to 39; got 40"),
+        ({"rows": []}, "rows must be a list of row numbers, at least one"),
+        ({"names": ["a", "b"]}, "names must have one value for each of the 1 rows, got 2"),
+        ({"template": 1}, "template must be an integer from 0 to 0"),
+    ],
+)
+def test_malformed_options_of_the_features_are_rejected(patch_set, options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        notebook.plot_features(patch_set, random_classifier(SMALL), **options)
+
+
+def test_features_need_a_classifier_or_parameters(patch_set):
+    with pytest.raises(
+        InvalidInputError, match="model must be a VehicleClassifier or FeatureParams, got 'm'"
+    ):
+        notebook.plot_features(patch_set, "m")
+
+
+def classifier_with_mean(params):
+    """A classifier whose mean patch is random too."""
+    rng = np.random.default_rng(0)
+    mean, scale = rng.uniform(50, 150, params.length), rng.uniform(1, 9, params.length)
+    return VehicleClassifier(params, (Template(mean, scale, rng.normal(size=params.length), 0.1),))
+
+
+def test_weights_are_arranged_as_in_the_window():
+    classifier = classifier_with_mean(SMALL)
+    coef = classifier.templates[0].coef
+    figure = notebook.plot_weights(classifier)
+    grid = np.array(figure.axes[:15]).reshape(3, 5)
+    assert [axes.get_title() for axes in grid[0]] == [
+        "HOG, positive", "HOG, negative", "spatial bins", "histogram", "in color",
+    ]  # fmt: skip
+    for channel, row in enumerate(grid):
+        np.testing.assert_array_equal(
+            row[2].images[0].get_array().ravel(), coef[channel * 64 : (channel + 1) * 64]
+        )
+        start = 192 + 8 * channel
+        np.testing.assert_array_equal(row[3].patches[0].get_data().values, coef[start : start + 8])
+        # each orientation of each cell is either positive or negative
+        lines = [len(axes.collections[0].get_segments()) for axes in row[:2]]
+        assert sum(lines) == 4 * 4 * 6
+    mean = classifier.templates[0].mean[:192].reshape(3, 8, 8).transpose(1, 2, 0).round().astype(np.uint8)
+    shown = grid[1, 4].images[0].get_array()
+    assert shown.shape == (8, 8, 3)
+    assert (shown != grid[0, 4].images[0].get_array()).any()
+    rgb = FeatureParams(**{**SMALL.__dict__, "color_space": "RGB"})
+    plain = notebook.plot_weights(classifier_with_mean(rgb))
+    np.testing.assert_array_equal(np.array(plain.axes[:15]).reshape(3, 5)[1, 4].images[0].get_array(), mean)
+
+
+def test_hog_weights_are_the_sums_over_the_blocks():
+    params = FeatureParams(spatial_feat=False, hist_feat=False, orient=4, pix_per_cell=32, hog_channel=0)
+    weights = np.arange(16.0) - 7.5
+    template = Template(np.zeros(16), np.ones(16), weights, 0.0)
+    figure = notebook.plot_weights(VehicleClassifier(params, (template,)))
+    assert len(figure.axes) == 2  # one channel, no other parts
+    found = [sorted(axes.collections[0].get_array().tolist()) for axes in figure.axes]
+    assert found == [sorted(weights[weights > 0].tolist()), sorted((-weights[weights < 0]).tolist())]
+    assert {axes.collections[0].get_clim() for axes in figure.axes} == {(0, 7.5)}
+
+
+@pytest.mark.parametrize("space", ["RGB", "HSV", "LUV", "HLS", "YUV", "YCrCb", "LAB"])
+def test_weights_in_every_color_space(space):
+    params = FeatureParams(hog_feat=False, spatial_size=4, hist_bins=4, color_space=space)
+    assert len(notebook.plot_weights(classifier_with_mean(params)).axes) == 3 * 3 + 3
+
+
+def test_malformed_options_of_the_weights_are_rejected():
+    with pytest.raises(InvalidInputError, match="classifier must be a VehicleClassifier, got 'm'"):
+        notebook.plot_weights("m")
+    with pytest.raises(InvalidInputError, match="template must be an integer from 0 to 0; got 1"):
+        notebook.plot_weights(classifier_with_mean(SMALL), template=1)

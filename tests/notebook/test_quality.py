@@ -1,0 +1,295 @@
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.notebook.helpers import drawn_boxes, gray_image, legend, new_axes, texts
+from vehicle_detection import notebook
+from vehicle_detection.boxes import Detections
+from vehicle_detection.datasets import load_frames
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import (
+    FrameBoxes,
+    LabelledFrames,
+    evaluate_detections,
+    precision_recall_curve,
+)
+from vehicle_detection.images import write_image
+from vehicle_detection.notebook.style import VERMILION
+
+
+def labelled():
+    """Three frames with a detected and two missed vehicles, two false positives and an ignored detection."""
+    image = np.random.default_rng(0).integers(0, 256, (120, 200, 3), np.uint8)
+    labels = FrameBoxes(
+        ["a.png", "a.png", "b.png", "b.png"],
+        None,
+        [[10, 10, 60, 50], [100, 10, 130, 40], [20, 20, 110, 100], [150, 0, 200, 60]],
+        ignore=[False, False, False, True],
+    )
+    found = FrameBoxes(
+        ["a.png", "b.png", "b.png", "c.png"],
+        None,
+        [[11, 10, 60, 50], [160, 5, 190, 50], [60, 60, 110, 100], [5, 5, 45, 45]],
+        scores=[2.0, 3.0, 0.5, 1.0],
+    )
+    return LabelledFrames("road", dict.fromkeys(("a.png", "b.png", "c.png"), image), labels), found
+
+
+def test_missed_vehicles_are_shown_largest_first():
+    frames, found = labelled()
+    scores = evaluate_detections(found, frames.labels)
+    axes = notebook.plot_errors(frames, found, ax=new_axes())
+    assert (
+        axes.get_title()
+        == f"{scores.fn} of {scores.tp + scores.fn} vehicles missed"
+        == "2 of 3 vehicles missed"
+    )
+    assert texts(axes.texts) == ["b\n90x80 px, IoU 0.28", "a\n30x30 px, IoU 0.00"]
+    assert len(axes.images) == 2
+    assert legend(axes) == ["labelled", "detected"]
+    crop = axes.images[1].get_array()
+    np.testing.assert_array_equal(crop, frames.frames["a.png"][0:52, 88:142][: crop.shape[0]])
+
+
+def test_false_positives_are_shown_by_descending_score():
+    frames, found = labelled()
+    axes = notebook.plot_errors(frames, found, kind="false", ax=new_axes())
+    assert axes.get_title() == "2 of 4 detections are false positives"
+    assert texts(axes.texts) == ["c\nscore 1.00, 40x40 px", "b\nscore 0.50, 50x40 px"]
+    reds = [
+        lines for lines in axes.collections if tuple(lines.get_colors()[0][:3]) == pytest.approx(VERMILION)
+    ]
+    assert len(reds) == 2
+    one = notebook.plot_errors(frames, found, kind="false", count=1, ax=new_axes())
+    assert len(one.images) == 1
+
+
+def test_boxes_have_the_same_position_in_the_crop_as_in_the_frame():
+    frames, found = labelled()
+    axes = notebook.plot_errors(frames, found, kind="false", count=1, ax=new_axes())
+    left, right, bottom, top = axes.images[0].get_extent()
+    height, width = axes.images[0].get_array().shape[:2]
+    x1, y1, x2, y2 = drawn_boxes(axes.collections[-1])[0]
+    pixel = (right - left) / width
+    assert (bottom - top) / height == pytest.approx(pixel)
+    # the crop starts at the frame's corner
+    assert np.array([x1 - left, y1 - top, x2 - left, y2 - top]) / pixel == pytest.approx([5, 5, 45, 45])
+
+
+def test_perfect_detections_have_no_errors_to_show(tmp_path):
+    write_image(tmp_path / "a.png", gray_image())
+    truth = FrameBoxes(["a.png"], None, [[10, 10, 60, 50]])
+    frames = LabelledFrames("road", load_frames(tmp_path), truth)
+    perfect = FrameBoxes(["a.png"], None, truth.boxes, scores=[1.0])
+    axes = notebook.plot_errors(frames, perfect, ax=new_axes())
+    assert (axes.get_title(), len(axes.images)) == ("0 of 1 vehicles missed", 0)
+    assert notebook.plot_errors(frames, perfect, kind="false", ax=new_axes()).get_title().startswith("0 of 1")
+    nothing = FrameBoxes([], None, [], scores=[])
+    assert len(notebook.plot_errors(frames, nothing, ax=new_axes()).images) == 1  # read from the folder
+
+
+def test_malformed_options_of_the_errors_are_rejected():
+    frames, found = labelled()
+    with pytest.raises(InvalidInputError, match="kind must be one of 'missed', 'false'; got 'wrong'"):
+        notebook.plot_errors(frames, found, kind="wrong")
+    with pytest.raises(InvalidInputError, match="frames must be a LabelledFrames, got"):
+        notebook.plot_errors([gray_image()], found)
+    with pytest.raises(InvalidInputError, match="predictions must be FrameBoxes, got"):
+        notebook.plot_errors(frames, Detections.empty())
+    with pytest.raises(InvalidInputError, match=r"predictions hold frame 'x.png', which is not among the 3"):
+        notebook.plot_errors(frames, found.renamed(lambda name: name.replace("c", "x")))
+
+
+def test_the_curve_marks_the_best_f1_and_the_threshold():
+    frames, found = labelled()
+    curve = precision_recall_curve(found, frames.labels)
+    axes = notebook.plot_precision_recall({"road": curve, "again": curve}, threshold=0.9, ax=new_axes())
+    lines = {line.get_label(): line for line in axes.lines}
+    precision, recall, thresholds = curve
+    name = next(label for label in lines if label.startswith("road"))
+    np.testing.assert_array_equal(lines[name].get_xydata(), np.stack([recall, precision], axis=1))
+    f1 = 2 * precision * recall / (precision + recall)
+    assert name == f"road: best F1 {f1.max():.2f} at {thresholds[f1.argmax()]:.2f}"
+    used = np.flatnonzero(thresholds > 0.9)[-1]
+    squares = [line.get_xydata()[0].tolist() for line in axes.lines if line.get_marker() == "s"]
+    assert squares == [[recall[used], precision[used]]] * 2
+    assert axes.get_xlabel().startswith("recall")
+    alone = notebook.plot_precision_recall(curve, ax=new_axes())
+    assert legend(alone)[0].startswith("best F1")
+
+
+@pytest.mark.parametrize(
+    ("curves", "message"),
+    [
+        ({}, "curves must hold at least one curve; got none"),
+        ({"a": (1, 2)}, r"curves\['a'\] must be \(precision, recall, thresholds\), got"),
+        ((np.ones(2), np.ones(3), np.ones(2)), r"curves must be \(precision, recall, thresholds\)"),
+        ({"a": (np.ones(0),) * 3}, r"curves\['a'\] must be computed from detections and labelled"),
+        (
+            (np.ones(1), np.full(1, np.nan), np.ones(1)),
+            "curves must be computed from detections and labelled vehicles",
+        ),
+    ],
+)
+def test_malformed_curves_are_rejected(curves, message):
+    with pytest.raises(InvalidInputError, match=message):
+        notebook.plot_precision_recall(curves)
+
+
+def test_metrics_are_plotted_by_source_and_detector():
+    frames, found = labelled()
+    some = evaluate_detections(found, frames.labels)
+    best = evaluate_detections(frames.labels, frames.labels)
+    axes = notebook.plot_f1({"x": some, "y": best}, ax=new_axes())
+    assert [bar.get_height() for bar in axes.patches] == [some.f1, best.f1]
+    assert texts(axes.get_xticklabels()) == ["x", "y"]
+    assert axes.get_legend() is None
+    nested = notebook.plot_f1(
+        {"old": {"x": some}, "new": {"x": best, "y": best}}, metric="recall", ax=new_axes()
+    )
+    assert legend(nested) == ["old", "new"]
+    heights = np.array([bar.get_height() for bar in nested.patches])
+    np.testing.assert_array_equal(heights, [some.recall, np.nan, 1, 1])
+    assert nested.get_ylabel() == "recall"
+    with pytest.raises(InvalidInputError, match="metric must be one of 'f1', 'precision'"):
+        notebook.plot_f1({"x": some}, metric="accuracy")
+    with pytest.raises(InvalidInputError, match=r"scores\['x'\] must be a DetectionScores, got 0.5"):
+        notebook.plot_f1({"x": 0.5})
+    with pytest.raises(InvalidInputError, match="scores must map sources to DetectionScores, got"):
+        notebook.plot_f1([some])
+    with pytest.raises(InvalidInputError, match="scores must hold at least one source"):
+        notebook.plot_f1({"old": {}})
+
+
+def test_the_tradeoff_marks_the_pareto_front():
+    table = pd.DataFrame(
+        {
+            "configuration": ["a", "b", "c", "d"],
+            "accuracy": [0.97, 0.96, 0.99, None],
+            "search_ms": [4, 5, 9, 1],
+        }
+    )
+    given = new_axes()
+    assert notebook.plot_tradeoff(table, ax=given) is given
+    assert given.lines[0].get_xydata().tolist() == [[4, 0.97], [9, 0.99]]
+    assert given.collections[0].get_offsets().tolist() == [[4, 0.97], [5, 0.96], [9, 0.99]]
+    assert texts(given.texts) == ["a", "c"]
+    assert (given.get_xlabel(), given.get_ylabel()) == ("search time (ms per frame)", "accuracy on patches")
+    other = notebook.plot_tradeoff(table, label=None)
+    assert other.figure is not given.figure
+    assert not other.texts
+    with pytest.raises(InvalidInputError, match="table has no column 'frame_f1'"):
+        notebook.plot_tradeoff(table, quality="frame_f1")
+    with pytest.raises(InvalidInputError, match="table has no column 'name'"):
+        notebook.plot_tradeoff(table, label="name")
+    with pytest.raises(InvalidInputError, match="table has no row with both accuracy and search_ms"):
+        notebook.plot_tradeoff(table[3:])
+
+
+def test_names_of_the_tradeoff_stay_in_the_axes():
+    names = ["orient=9, color_space=YCrCb, C=1"] * 4
+    columns = {"accuracy": [0.97, 0.98, 0.99, 0.999], "search_ms": [4.0, 5.0, 8.0, 9.0]}
+    axes = notebook.plot_tradeoff(pd.DataFrame({"configuration": names} | columns))
+    assert max(axes.get_yticks()) == pytest.approx(1)
+    axes.figure.canvas.draw()
+    frame = axes.get_window_extent()
+    for text in axes.texts:
+        extent = text.get_window_extent()
+        assert frame.x0 <= extent.x0 < extent.x1 <= frame.x1
+        assert frame.y0 <= extent.y0 < extent.y1 <= frame.y1
+
+
+def test_names_of_sources_do_not_overlap():
+    frames, _ = labelled()
+    scores = evaluate_detections(frames.labels, frames.labels)
+    axes = notebook.plot_f1({f"source of frames number {number}": scores for number in range(8)})
+    axes.figure.canvas.draw()
+    assert {text.get_rotation() for text in axes.get_xticklabels()} == {30}
+
+
+def test_a_parameter_is_plotted_with_the_deviation_of_its_runs():
+    table = pd.DataFrame({"C": [1e-4, 1e-4, 1.0, None], "split": ["x"] * 4, "accuracy": [0.9, 1.0, 0.8, 0.1]})
+    axes = notebook.plot_parameter(table, "C", by="split", ax=new_axes())
+    line = axes.lines[0]
+    np.testing.assert_allclose(line.get_xydata(), [[1e-4, 0.95], [1.0, 0.8]])
+    (bars,) = axes.containers
+    several, single = bars[2][0].get_segments()
+    assert np.ptp(several[:, 1]) / 2 == pytest.approx(np.std([0.9, 1.0], ddof=1))
+    assert not len(single)  # a single run has no deviation
+    assert (axes.get_xscale(), axes.get_xlabel(), axes.get_ylabel()) == ("log", "C", "accuracy on patches")
+    assert legend(axes) == ["x"]
+
+
+def test_parameters_may_be_text_or_numbers():
+    table = pd.DataFrame(
+        {"color_space": ["LUV", "YCrCb", "LUV"], "orient": [8, 9, 9], "frame_f1": [0.5, 0.75, 0.7]}
+    )
+    words = notebook.plot_parameter(table, "color_space", quality="frame_f1", ax=new_axes())
+    assert texts(words.get_xticklabels()) == ["LUV", "YCrCb"]
+    np.testing.assert_allclose(words.lines[0].get_xydata(), [[0, 0.6], [1, 0.75]])
+    assert words.get_legend() is None
+    assert words.get_ylabel() == "F1 on frames"
+    assert (
+        notebook.plot_parameter(table, "orient", quality="frame_f1", ax=new_axes()).get_xscale() == "linear"
+    )
+    with pytest.raises(InvalidInputError, match="table has no column 'gamma'"):
+        notebook.plot_parameter(table, "gamma", quality="frame_f1")
+    with pytest.raises(InvalidInputError, match="table has no row with both C and accuracy"):
+        notebook.plot_parameter(pd.DataFrame({"C": [1.0], "accuracy": [None]}), "C")
+
+
+def test_a_parameter_may_mix_numbers_and_text():
+    table = pd.DataFrame({"C": [1, "ALL"], "accuracy": [0.5, 0.6]})
+    assert texts(notebook.plot_parameter(table, "C", ax=new_axes()).get_xticklabels()) == ["1", "ALL"]
+
+
+def test_many_lines_differ_in_color_or_style():
+    table = pd.DataFrame({"C": 1.0, "seed": range(9), "accuracy": 0.9})
+    axes = notebook.plot_parameter(table, "C", by="seed", ax=new_axes())
+    styles = {(str(line[0].get_color()), line[0].get_linestyle()) for line in axes.containers}
+    assert len(styles) == 9
+
+
+def test_the_legend_counts_the_errors_of_both_classes():
+    scores, labels = [2.0, 1.0, -0.25, 0.0, -1.0, 0.5], [1, 1, 1, 1, 0, 0]
+    axes = notebook.plot_scores(scores, labels, bins=12, ax=new_axes())
+    assert legend(axes) == [
+        "vehicles: 2 of 4 missed", "other: 1 of 2 classified as vehicles", "threshold 0",
+    ]  # fmt: skip
+    assert axes.get_yscale() == "log"
+    assert axes.get_xlabel() == "score (decision value)"
+    assert axes.lines[0].get_xdata() == [0, 0]
+    strict = notebook.plot_scores(scores, labels, threshold=1.5, ax=new_axes())
+    assert legend(strict)[:2] == ["vehicles: 3 of 4 missed", "other: 0 of 2 classified as vehicles"]
+
+
+@settings(max_examples=30)
+@given(
+    scores=st.lists(st.floats(-50, 50), min_size=1, max_size=30),
+    threshold=st.floats(-60, 60),
+    bins=st.integers(1, 80),
+)
+def test_every_score_is_in_a_bin_and_the_threshold_is_an_edge(scores, threshold, bins):
+    axes = notebook.plot_scores(
+        scores, [index % 2 for index in range(len(scores))], threshold=threshold, bins=bins, ax=new_axes()
+    )
+    data = [patch.get_data() for patch in axes.patches[::2]]
+    assert sum(part.values.sum() for part in data) == len(scores)
+    assert np.abs(data[0].edges - threshold).min() == 0
+
+
+@pytest.mark.parametrize(
+    ("scores", "labels", "message"),
+    [
+        ([], [], "scores must be a list of finite numbers, at least one"),
+        ([np.nan], [1], "scores must be a list of finite numbers"),
+        ([1.0], [1, 0], "labels must be 0 or 1 for each of the 1 scores"),
+        ([1.0, 2.0], [1, -1], "labels must be 0 or 1"),
+        ([1.0, 2.0], [(0, 1), 1], "labels must be an array or a sequence of numbers of equal lengths"),
+    ],
+)
+def test_malformed_scores_are_rejected(scores, labels, message):
+    with pytest.raises(InvalidInputError, match=message):
+        notebook.plot_scores(scores, labels)

@@ -1,0 +1,183 @@
+import numpy as np
+import pytest
+
+from tests.notebook.helpers import drawn_boxes, gray_image, new_axes, texts, titles
+from vehicle_detection import notebook
+from vehicle_detection.boxes import Detections
+from vehicle_detection.classifier import load_classifier
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.heatmap import bounding_boxes, frame_heat
+from vehicle_detection.images import read_image
+from vehicle_detection.notebook.style import SKY, VERMILION, YELLOW
+from vehicle_detection.params import HeatParams, SearchBand, SearchParams
+from vehicle_detection.search import find_cars
+from vehicle_detection.windows import band_windows
+
+
+def test_windows_are_colored_by_score_best_last():
+    found = Detections([[0, 0, 64, 64], [8, 0, 72, 64], [16, 0, 80, 64]], [1.5, -0.5, 0.5])
+    axes = notebook.plot_windows(gray_image(), found, truth=[[1, 1, 60, 60]], ax=new_axes())
+    lines, true = axes.collections
+    assert lines.get_array().tolist() == [-0.5, 0.5, 1.5]
+    assert drawn_boxes(lines).tolist() == found.boxes[[1, 2, 0]].tolist()
+    assert drawn_boxes(true).tolist() == [[1, 1, 60, 60]]
+    assert (axes.get_title(), axes.get_xlabel(), axes.get_ylabel()) == ("3 windows", "x (px)", "y (px)")
+    assert axes.figure.axes[1].get_ylabel() == "score"
+    assert (axes.get_xlim(), axes.get_ylim()) == ((0, 160), (90, 0))
+
+
+def test_windows_without_scores_and_outside_the_frame():
+    axes = notebook.plot_windows(
+        gray_image(), np.array([[-32, 10, 32, 74], [130, 40, 194, 104]]), ax=new_axes()
+    )
+    assert len(axes.figure.axes) == 1
+    assert axes.collections[0].get_array() is None
+    assert (axes.get_xlim(), axes.get_ylim()) == ((-32, 194), (104, 0))
+    one = notebook.plot_windows(gray_image(), [[0, 0, 9, 9]], ax=new_axes())
+    assert one.get_title() == "1 window"
+    none = notebook.plot_windows(gray_image(), Detections.empty(), title="nothing", ax=new_axes())
+    assert none.get_title() == "nothing"
+    with pytest.raises(InvalidInputError, match=r"windows must be an \(N, 4\) number array"):
+        notebook.plot_windows(gray_image(), [1, 2, 3, 4])
+    with pytest.raises(InvalidInputError, match=r"truth must be \[x1, y1, x2, y2\] with x1 <= x2"):
+        notebook.plot_windows(gray_image(), [], truth=[[5, 0, 1, 1]])
+
+
+@pytest.mark.parametrize("preset", ["130-windows", "three-scales", "default"])
+def test_bands_are_drawn_where_they_are_searched(preset):
+    frame, search = gray_image(720, 1280), SearchParams.preset(preset)
+    figure = notebook.plot_bands(frame, search)
+    bands = search.place(frame.shape)
+    assert len(figure.axes) == len(bands)
+    total = 0
+    for axes, band in zip(figure.axes, bands):
+        windows = band_windows(band)
+        total += len(windows)
+        bound, nexts, first = axes.collections
+        assert drawn_boxes(bound).tolist() == [[band.x1, band.y1, band.x2, band.y2]]
+        assert drawn_boxes(first).tolist() == windows[:1].tolist()
+        for window in drawn_boxes(nexts):
+            assert (windows == window).all(axis=1).any()
+            assert np.abs(window - windows[0]).max() in band.step
+        assert f"{len(windows):,} windows" in axes.get_title()
+        assert axes.lines[0].get_ydata() == [search.horizon * 720] * 2
+    if preset == "130-windows":
+        assert total == 114  # of 130, those that fit into the regions
+    assert texts(figure.legends[0].get_texts())[:2] == ["band", "first window"]
+    colors = [lines.get_colors()[0][:3] for lines in figure.axes[0].collections]
+    assert colors == [pytest.approx(color) for color in (YELLOW, SKY, VERMILION)]
+
+
+def test_a_band_may_have_one_row_of_windows():
+    search = SearchParams(bands=(SearchBand(window=(640, 640), y=(-320, 320)),), horizon=0.5)
+    figure = notebook.plot_bands(gray_image(360, 360), search)
+    assert len(figure.axes[0].collections[1].get_segments()) == 1  # to the right only
+    with pytest.raises(InvalidInputError, match="image of 160x10 pixels holds no search window"):
+        notebook.plot_bands(gray_image(10))
+    with pytest.raises(InvalidInputError, match="search must be a SearchParams, got 'default'"):
+        notebook.plot_bands(gray_image(), "default")
+
+
+def test_the_comparison_shows_all_scores_and_their_maximum_difference():
+    reference = np.linspace(-3, 2, 50)
+    fast = reference + np.where(np.arange(50) == 7, -3e-6, 1e-6)
+    figure = notebook.plot_comparison(fast, reference)
+    left, right = figure.axes
+    np.testing.assert_allclose(left.collections[0].get_offsets(), np.stack([reference, fast], axis=1))
+    assert right.get_title() == "maximum difference 3e-06"
+    assert sum(bar.get_height() for bar in right.patches) == 50
+    assert notebook.plot_comparison([1.0], [1.0]).axes[1].get_title() == "maximum difference 0"
+    with pytest.raises(InvalidInputError, match="fast and reference must be scores of the same windows; got"):
+        notebook.plot_comparison([1.0], [1.0, 2.0])
+    with pytest.raises(InvalidInputError, match="reference must be a list of finite numbers"):
+        notebook.plot_comparison([1.0], [np.inf])
+
+
+@pytest.mark.parametrize("fastest", [0.01, 29.9])
+def test_texts_of_speedups_stay_in_the_axes(fastest):
+    axes = notebook.plot_speedups(
+        {"the method of the course (scaler, SVM)": 30.0, "other": fastest, "b": 29.8}
+    )
+    axes.figure.canvas.draw()
+    right = axes.get_window_extent().x1
+    assert all(text.get_window_extent().x1 <= right for text in axes.texts)
+
+
+def test_a_heat_map_without_windows_has_a_readable_scale():
+    figure = notebook.plot_heatmap(gray_image(), Detections.empty())
+    assert figure.axes[1].images[0].get_clim() == (0, 1)
+
+
+def test_speedups_over_the_slowest_or_a_chosen_method():
+    times = {"a": 2.0, "b": 0.5, "c": 0.002}
+    axes = notebook.plot_speedups(times, ax=new_axes())
+    assert texts(axes.texts) == ["2,000 ms", "500 ms, 4.0x faster", "2 ms, 1,000x faster"]
+    assert [bar.get_width() for bar in axes.patches] == [2000, 500, 2]
+    assert (axes.get_xscale(), axes.get_xlabel()) == ("log", "time (ms)")
+    other = notebook.plot_speedups(times, reference="b", ax=new_axes())
+    assert texts(other.texts) == ["2,000 ms, 4.0x slower", "500 ms", "2 ms, 250x faster"]
+    for bad, message in (
+        ({}, "seconds must map names to seconds, at least one"),
+        ({"a": 0}, r"seconds\['a'\] must be a number, greater than 0"),
+        ([1.0], "seconds must map names to seconds"),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            notebook.plot_speedups(bad)
+    with pytest.raises(InvalidInputError, match="reference must be one of a, b, c; got 'd'"):
+        notebook.plot_speedups(times, reference="d")
+
+
+def test_the_heat_map_and_its_regions():
+    windows = Detections([[10, 10, 50, 50], [20, 10, 60, 50], [100, 20, 140, 60]], [1.5, 1.0, 3.0])
+    params = HeatParams(threshold=1.0, peak_fraction=0.2)
+    figure = notebook.plot_heatmap(gray_image(), windows, params=params)
+    first, second, third, bar = figure.axes
+    assert drawn_boxes(first.collections[0]).tolist() == windows.boxes.tolist()
+    np.testing.assert_array_equal(second.images[0].get_array(), frame_heat((90, 160), windows, params))
+    expected = bounding_boxes((90, 160), windows, params=params)
+    assert drawn_boxes(third.collections[0]).tolist() == expected.boxes.tolist()
+    assert third.get_title() == "2 regions above 1"
+    assert bar.get_ylabel() == "sum of scores"
+    painted = third.images[0].get_array()
+    gray = painted[0, 0]
+    inside = (painted[30, 40], painted[40, 120])
+    assert not (inside[0] == gray).all()
+    assert not (inside[0] == inside[1]).all()  # regions have different colors
+    assert (painted[30, 90] == gray).all()
+
+
+def test_a_given_heat_map_is_used():
+    heat = np.zeros((90, 160), np.float32)
+    heat[10:20, 30:60] = 5
+    figure = notebook.plot_heatmap(
+        gray_image(), Detections.empty(), params=HeatParams(weighting="count", threshold=2), heat=heat
+    )
+    assert drawn_boxes(figure.axes[2].collections[0]).tolist() == [[30, 10, 60, 20]]
+    assert titles(figure)[:3] == ["0 windows", "heat, peak 5.0", "1 region above 2"]
+    assert figure.axes[3].get_ylabel() == "windows"
+    # no windows
+    assert notebook.plot_heatmap(gray_image(), Detections.empty()).axes[2].get_title() == "0 regions above 2"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"windows": [[0, 0, 1, 1]]}, "windows must be a Detections, got"),
+        ({"heat": np.zeros((5, 5))}, r"heat must be an array of the frame's size \(90, 160\)"),
+        ({"params": "hot"}, "params must be a HeatParams, got 'hot'"),
+        ({"image": "a.png"}, r"image must be an \(H, W, 3\) uint8 RGB array"),
+    ],
+)
+def test_malformed_options_of_the_heat_map_are_rejected(arguments, message):
+    with pytest.raises(InvalidInputError, match=message):
+        notebook.plot_heatmap(**{"image": gray_image(), "windows": Detections.empty(), **arguments})
+
+
+@pytest.mark.realdata
+def test_windows_and_heat_of_a_real_frame(real_data):
+    image = read_image(real_data / "test_images" / "test1.jpg")
+    windows = find_cars(image, load_classifier(), n_jobs=1)
+    figure = notebook.plot_heatmap(image, windows)
+    assert len(figure.axes[2].collections[0].get_segments()) >= 2
+    axes = notebook.plot_windows(image, windows, ax=new_axes())
+    assert len(axes.collections[0].get_array()) == len(windows)

@@ -1,0 +1,151 @@
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+
+from tests.notebook.helpers import legend, new_axes, texts
+from vehicle_detection import notebook
+from vehicle_detection.boxes import Detections
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import FrameBoxes
+from vehicle_detection.notebook.style import COLORS
+from vehicle_detection.scenes import render_drive
+from vehicle_detection.tracking import FrameResult, Track
+from vehicle_detection.video import VideoReport
+
+
+def track(number, x, **changes):
+    known = {
+        "id": number, "box": np.array([x, 40.0, x + 50, 80.0]), "score": 1.0, "state": "confirmed",
+        "shown": True, "age": 1.0, "misses": 0, "time_since_update": 0.0, "velocity": (0.0, 0.0),
+        "distance_m": 20.0 + x, "distance_std_m": 2.0, "speed_mps": 3.0, "speed_std_mps": 0.5,
+    }  # fmt: skip
+    return Track(**{**known, **changes})
+
+
+def result(index, *tracks, time=None, seconds=None):
+    return FrameResult(index, time, Detections.empty(), Detections.empty(), tracks, seconds or {})
+
+
+def test_tracks_are_plotted_over_time():
+    results = [
+        result(0, track(1, 10.0), track(0, 90.0, shown=False, state="tentative")),
+        result(1, track(1, 12.0), track(9, 100.0, distance_m=None, distance_std_m=None)),
+        result(2, track(9, 101.0)),
+        result(3, track(1, 16.0), track(9, 102.0)),
+    ]
+    figure = notebook.plot_tracks(results, fps=10)
+    assert [axes.get_ylabel().split("(")[-1] for axes in figure.axes] == ["px)", "px)", "m)", "m/s)"]
+    assert figure.axes[-1].get_xlabel() == "time (s)"
+    assert texts(figure.legends[0].get_texts()) == ["#1", "#9"]
+    middle, other = figure.axes[0].lines
+    # the line is interrupted where the track is missing
+    np.testing.assert_allclose(middle.get_ydata(), [35, 37, np.nan, 41])
+    np.testing.assert_allclose(middle.get_xdata(), [0, 0.1, 0.2, 0.3])
+    assert to_rgb(middle.get_color()) == COLORS[0]
+    assert to_rgb(other.get_color()) == COLORS[1]
+    assert (middle.get_linestyle(), other.get_linestyle()) == ("-", "--")
+    np.testing.assert_allclose(figure.axes[2].lines[1].get_ydata(), [np.nan, 121, 122])
+    band = figure.axes[2].collections[0].get_paths()[0].vertices[:, 1]
+    assert (band.min(), band.max()) == (28, 34)  # one standard error
+
+
+def test_the_legend_of_many_tracks_fits_into_the_figure():
+    tracks = [track(number, 10.0 * number) for number in range(1, 91)]
+    figure = notebook.plot_tracks([result(0, *tracks), result(1, *tracks)])
+    FigureCanvasAgg(figure).draw()
+    extent = figure.legends[0].get_window_extent()
+    assert extent.y0 >= 0
+    assert extent.x1 <= figure.bbox.x1
+
+
+def test_frames_may_have_times_and_short_tracks_are_left_out():
+    results = [result(0, track(1, 10.0), track(2, 50.0), time=3.0), result(1, track(1, 11.0), time=3.5)]
+    figure = notebook.plot_tracks(results, min_frames=2)
+    assert len(figure.axes[0].lines) == 1
+    assert figure.axes[0].lines[0].get_xdata().tolist() == [3.0, 3.5]
+
+
+def test_tracks_of_a_file_are_compared_with_the_truth_of_a_drive():
+    drive = render_drive(frames=30, shape=(180, 320), scenario="overtaking", random_state=3)
+    rows = [(frame, row) for frame, rows in enumerate(drive.truth) for row in rows if not row.ignore]
+    labels = FrameBoxes(
+        [frame for frame, _ in rows],
+        np.array([row.track for _, row in rows]),
+        np.array([row.box for _, row in rows]),
+        distance_m=np.array([row.distance_m for _, row in rows]),
+    )
+    figure = notebook.plot_tracks(labels, truth=drive.truth)
+    count = len(set(labels.tracks.tolist()))
+    assert len(figure.axes[0].lines) == 2 * count
+    found, true = figure.axes[2].lines[0], figure.axes[2].lines[count]
+    shown = ~np.isnan(found.get_ydata())
+    np.testing.assert_allclose(found.get_ydata()[shown], true.get_ydata())
+    assert true.get_color() == "k"
+    assert texts(figure.legends[0].get_texts())[-1] == "truth"
+    assert not figure.axes[2].collections  # a file has no standard errors
+    ignored = FrameBoxes([0, 1], [1, 2], [[0, 0, 9, 9]] * 2, ignore=[False, True])
+    both = notebook.plot_tracks(labels, truth=ignored)
+    assert len(both.axes[0].lines) == count + 1
+
+
+@pytest.mark.parametrize(
+    ("results", "options", "message"),
+    [
+        ([], {}, "results must hold at least one track to plot, got none"),
+        ([result(0, track(1, 1.0, shown=False))], {}, "results must hold at least one track to plot"),
+        ([3], {}, "results must be a FrameResult, got 3;"),
+        (3, {}, "results must be the FrameResult of each frame, or FrameBoxes; got 3"),
+        (
+            FrameBoxes(["a"], [1], [[0, 0, 9, 9]]),
+            {},
+            "results must have numbered frames, got names such as 'a'",
+        ),
+        (
+            [result(0, track(1, 1.0))],
+            {"truth": "t.csv"},
+            "truth must be FrameBoxes or the truth of a rendered drive",
+        ),
+        ([result(0, track(1, 1.0))], {"fps": 0}, "fps must be a number, greater than 0"),
+    ],
+)
+def test_malformed_tracks_are_rejected(results, options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        notebook.plot_tracks(results, **options)
+
+
+REPORT = VideoReport(
+    frames=100, fps=Fraction(25), shape=(720, 1280, 3), seconds=2.0,
+    stages={"encode": 1.0, "decode": 0.5, "search": 0.75}, tracks=1,
+)  # fmt: skip
+
+
+def test_stage_times_of_a_report_and_of_results():
+    stills = [result(index, seconds={"search": 0.01, "track": 0.002 * index}) for index in range(2)]
+    axes = notebook.plot_stage_times({"video": REPORT, "stills": stills}, ax=new_axes())
+    # in the order of processing
+    assert legend(axes) == ["decode", "search", "track", "encode"]
+    widths = np.array([bar.get_width() for bar in axes.patches]).reshape(4, 2)
+    np.testing.assert_allclose(widths, [[5, 0], [7.5, 10], [0, 1], [10, 0]])
+    starts = np.array([bar.get_x() for bar in axes.patches]).reshape(4, 2)
+    np.testing.assert_allclose(starts, np.cumsum(widths, axis=0) - widths, atol=1e-9)
+    assert texts(axes.get_yticklabels()) == ["video", "stills"]
+    assert {"  22.5 ms", "  11.0 ms"} <= set(texts(axes.texts))
+    assert axes.get_xlabel() == "work (ms per frame)"
+    assert texts(notebook.plot_stage_times(REPORT, ax=new_axes()).get_yticklabels()) == [""]
+
+
+@pytest.mark.parametrize(
+    ("runs", "message"),
+    [
+        ({}, "runs must hold at least one run; got none"),
+        ([], "runs must have at least one frame each"),
+        ("fast", "runs must be a VideoReport or a list of FrameResult"),
+        ({"a": [1]}, "runs must be a VideoReport or a list of FrameResult"),
+    ],
+)
+def test_malformed_runs_are_rejected(runs, message):
+    with pytest.raises(InvalidInputError, match=message):
+        notebook.plot_stage_times(runs)

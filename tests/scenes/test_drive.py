@@ -1,0 +1,200 @@
+import csv
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.helpers import check_truth
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.scenes import render_drive, write_labels
+from vehicle_detection.scenes.drive import LABEL_COLUMNS, SCENARIOS, make_traffic
+
+SMALL = (216, 384)
+
+
+def truth_by_track(drive):
+    """Truth by track, then by frame."""
+    tracks = {}
+    for frame, rows in enumerate(drive.truth):
+        for row in rows:
+            tracks.setdefault(row.track, {})[frame] = row
+    return tracks
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_frames_do_not_depend_on_each_other(scenario):
+    first, second = (
+        render_drive(frames=20, shape=SMALL, scenario=scenario, random_state=3) for _ in range(2)
+    )
+    late = first[14]
+    frames = list(second)
+    assert len(frames) == len(second) == 20
+    assert late.image.tobytes() == frames[14].image.tobytes()
+    assert first[-1].image.tobytes() == frames[19].image.tobytes()
+    assert (first.fps, first.shape) == (25.0, SMALL)
+    for frame in frames[::7]:
+        check_truth(frame)
+    assert tuple(frame.truth for frame in frames) == first.truth
+
+
+@given(
+    scenario=st.sampled_from([name for name in SCENARIOS if name != "empty"]),
+    seed=st.integers(0, 10_000),
+    fps=st.sampled_from([10.0, 25.0, 29.97]),
+)
+@settings(max_examples=6)
+def test_motion_is_smooth_and_tracks_are_continuous(scenario, seed, fps):
+    drive = render_drive(frames=40, fps=fps, shape=SMALL, scenario=scenario, random_state=seed)
+    for rows in drive.truth:
+        assert len({row.track for row in rows}) == len(rows)
+    for track in truth_by_track(drive).values():
+        frames = sorted(track)
+        assert frames == list(range(frames[0], frames[-1] + 1))
+        distance = np.array([track[frame].distance_m for frame in frames])
+        speed = np.array([track[frame].speed_mps for frame in frames])
+        if len(frames) > 1:
+            steps = np.diff(distance) * fps
+            np.testing.assert_allclose(steps, (speed[1:] + speed[:-1]) / 2, atol=0.05)
+            assert np.abs(np.diff(speed) * fps).max() < 3
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_vehicles_on_a_highway_do_not_overlap(seed):
+    _, vehicles = make_traffic("highway", 20.0, np.random.default_rng(seed))
+    for time in range(0, 20, 2):
+        positions = [(v.lateral(time), v.distance(time)) for v in vehicles if not v.oncoming]
+        for index, (x, z) in enumerate(positions):
+            for other_x, other_z in positions[index + 1 :]:
+                assert abs(x - other_x) > 2.0 or abs(z - other_z) > 5.5
+
+
+def test_a_highway_has_vehicles_ahead_and_ignored_oncoming_ones():
+    tracks = truth_by_track(render_drive(frames=100, shape=SMALL, random_state=1))
+    speed = {track: next(iter(rows.values())).speed_mps for track, rows in tracks.items()}
+    oncoming = {track for track in tracks if speed[track] < -40}
+    ahead = {track for track in tracks if abs(speed[track]) < 5}
+    assert len(ahead) >= 3
+    assert oncoming
+    assert ahead | oncoming == set(tracks)
+    assert all(row.ignore for track in oncoming for row in tracks[track].values())
+
+
+def test_traffic_has_only_vehicles_ahead():
+    drive = render_drive(frames=100, shape=SMALL, scenario="traffic", random_state=1)
+    rows = [row for frame in (0, 50, 99) for row in drive.truth_of(frame)]
+    assert len({row.track for row in rows}) >= 3
+    assert all(abs(row.speed_mps) < 5 for row in rows)
+
+
+def test_the_truth_of_a_frame_is_that_of_the_drive():
+    drive = render_drive(frames=3, shape=SMALL)
+    assert [drive.truth_of(frame) for frame in range(3)] == list(drive.truth)
+    assert drive.truth_of(-1) == drive.truth[2]
+    with pytest.raises(InvalidInputError, match="frame number must be an integer from -3 to 2"):
+        drive.truth_of(3)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_an_overtaking_car_enters_at_a_side_and_pulls_away(seed):
+    drive = render_drive(frames=100, shape=SMALL, scenario="overtaking", random_state=seed)
+    rows = truth_by_track(drive)[1]
+    first, last = rows[min(rows)], rows[max(rows)]
+    assert first.box[0] == 0 or first.box[2] == SMALL[1]
+    assert first.truncated > 0.3
+    assert last.truncated == 0
+    assert last.distance_m > 20
+    assert all(row.speed_mps > 0 for row in rows.values())
+
+
+@pytest.mark.parametrize("scenario", ["crossing", "occlusion"])
+@pytest.mark.parametrize("seed", range(2))
+def test_two_cars_swap_sides(scenario, seed):
+    drive = render_drive(frames=60, fps=10, shape=SMALL, scenario=scenario, random_state=seed)
+    tracks = truth_by_track(drive)
+
+    def center(row):
+        return (row.full_box[0] + row.full_box[2]) / 2
+
+    pairs = [(tracks[1][frame], tracks[2][frame]) for frame in range(60)]
+    gaps = [center(first) - center(second) for first, second in pairs]
+    assert gaps[0] * gaps[-1] < 0
+    overlaps = [first.box[0] < second.box[2] and second.box[0] < first.box[2] for first, second in pairs]
+    assert any(overlaps)
+    assert not overlaps[0]
+    assert not overlaps[-1]
+
+
+@pytest.mark.parametrize(("frames", "seed"), [(50, 0), (75, 1), (100, 2)])
+def test_occlusion_hides_a_car_for_about_a_second(frames, seed):
+    drive = render_drive(frames=frames, shape=SMALL, scenario="occlusion", random_state=seed)
+    hidden = [rows[1].occluded == 2 for rows in drive.truth]
+    assert 0.8 <= sum(hidden) / drive.fps <= 2.5
+    first = hidden.index(True)
+    assert all(hidden[first : first + sum(hidden)])
+
+
+def test_an_empty_drive_shows_a_moving_road():
+    drive = render_drive(frames=5, shape=SMALL, scenario="empty")
+    assert drive.truth == ((),) * 5
+    assert (drive[0].image != drive[4].image).any()
+
+
+def test_pitch_jitter_moves_horizon_and_boxes_together():
+    options = {"frames": 40, "shape": (360, 640), "scenario": "overtaking", "random_state": 2}
+    steady, pitching = render_drive(**options), render_drive(**options, pitch_jitter_px=4)
+    offsets = set()
+    for frame in (0, 9, 18, 39):
+        one, other = steady[frame], pitching[frame]
+        offset = int(other.camera.horizon_px - one.camera.horizon_px)
+        offsets.add(offset)
+        assert abs(offset) <= 4
+        for a, b in zip(one.truth, other.truth):
+            if a.truncated == 0:
+                assert b.box == (a.box[0], a.box[1] + offset, a.box[2], a.box[3] + offset)
+    assert len(offsets) > 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"frames": 0}, "frames must be an integer at least 1"),
+        ({"fps": 0}, "fps must be a number, at least 1"),
+        ({"scenario": "race"}, "scenario must be one of 'highway', 'overtaking', 'crossing'"),
+        ({"pitch_jitter_px": -1}, "pitch_jitter_px must be an integer from 0 to 50"),
+        ({"shape": "hd"}, "shape must be"),
+        ({"light": 3}, "light must be one of"),
+    ],
+)
+def test_invalid_options(options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        render_drive(**options)
+
+
+@pytest.mark.parametrize("index", [5, -6, 1.5, slice(0, 2)])
+def test_invalid_frame_numbers(index):
+    drive = render_drive(frames=5, shape=SMALL, scenario="empty")
+    with pytest.raises(InvalidInputError, match="frame number must be an integer from -5 to 4"):
+        drive[index]
+
+
+def test_labels_contain_the_truth(tmp_path):
+    drive = render_drive(frames=10, shape=SMALL, random_state=2)
+    drive.write_labels(tmp_path / "labels.csv")
+    with (tmp_path / "labels.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == LABEL_COLUMNS
+    truth = [(frame, row) for frame, found in enumerate(drive.truth) for row in found]
+    assert len(rows) == len(truth)
+    for row, (frame, true) in zip(rows, truth):
+        assert (int(row["frame"]), int(row["track"])) == (frame, true.track)
+        assert tuple(int(row[key]) for key in ("x1", "y1", "x2", "y2")) == true.box
+        assert (int(row["occluded"]), int(row["ignore"])) == (true.occluded, true.ignore)
+        assert float(row["truncated"]) == pytest.approx(true.truncated, abs=5e-4)
+        assert float(row["distance_m"]) == pytest.approx(true.distance_m, abs=5e-3)
+        assert float(row["speed_mps"]) == pytest.approx(true.speed_mps, abs=5e-3)
+
+
+def test_labels_need_an_existing_folder(tmp_path):
+    with pytest.raises(InvalidInputError, match="path needs an existing folder"):
+        write_labels(tmp_path / "no" / "labels.csv", [])

@@ -1,0 +1,243 @@
+import csv
+import importlib.util
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.helpers import ROOT, check_truth
+from vehicle_detection import scenes
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.images import read_image
+from vehicle_detection.scenes import SceneVehicle, render_scene
+
+SMALL = (216, 384)
+TEST_IMAGES = ROOT / "test_images"
+
+scene_vehicles = st.builds(
+    SceneVehicle,
+    distance_m=st.floats(2.5, 90.0),
+    lateral_m=st.floats(-12.0, 12.0),
+    kind=st.sampled_from(["hatchback", "estate", "sedan", "mpv", "suv", "van", "truck"]),
+    color=st.sampled_from(["white", "red", "black"]),
+    view=st.sampled_from(["rear", "front"]),
+    speed_mps=st.floats(-30.0, 30.0),
+)
+
+
+def test_the_public_names_exist():
+    assert set(scenes.__all__) <= set(dir(scenes))
+
+
+def test_the_same_seed_gives_the_same_bytes():
+    first, second = (render_scene(shape=SMALL, random_state=4) for _ in range(2))
+    assert first.image.tobytes() == second.image.tobytes()
+    assert first.truth == second.truth
+    assert render_scene(shape=SMALL, random_state=5).image.tobytes() != first.image.tobytes()
+
+
+def test_a_generator_seeds_the_scene_and_advances():
+    rng, same = np.random.default_rng(4), np.random.default_rng(4)
+    first = render_scene(shape=SMALL, random_state=rng).image.tobytes()
+    assert first == render_scene(shape=SMALL, random_state=same).image.tobytes()
+    assert first != render_scene(shape=SMALL, random_state=rng).image.tobytes()
+    assert render_scene(shape=SMALL, random_state=None).image.shape == (*SMALL, 3)
+
+
+def test_the_global_random_state_is_unchanged():
+    before = np.random.get_state()[1].copy()  # noqa: NPY002
+    render_scene(shape=SMALL)
+    assert (np.random.get_state()[1] == before).all()  # noqa: NPY002
+
+
+@pytest.mark.parametrize("shape", [(540, 960), (1080, 1920), (64, 64), (300, 200)])
+def test_shape(shape):
+    scene = render_scene(shape=shape, vehicles=2)
+    assert scene.image.shape == (*shape, 3)
+    assert scene.image.dtype == np.uint8
+    assert scene.instance_map.shape == shape
+
+
+@pytest.mark.parametrize("light", ["day", "overcast", "dusk", "night"])
+@pytest.mark.parametrize("rain", [0.0, 0.7])
+def test_light_and_rain(light, rain):
+    scene = render_scene(shape=SMALL, light=light, rain=rain, vehicles=2)
+    check_truth(scene)
+    mean = scene.image.mean()
+    assert (mean < 40) if light == "night" else (60 < mean < 200)
+    assert scene.image.std() > 3
+
+
+@given(vehicles=st.lists(scene_vehicles, max_size=4), horizon=st.floats(0.2, 0.8), seed=st.integers(0, 3))
+@settings(max_examples=20)
+def test_truth_is_consistent(vehicles, horizon, seed):
+    scene = render_scene(shape=SMALL, vehicles=vehicles, horizon=horizon, random_state=seed)
+    check_truth(scene)
+    assert scene.boxes.shape == (len(scene.truth), 4)
+    for row in scene.truth:
+        vehicle = vehicles[row.track - 1]
+        assert (row.distance_m, row.speed_mps) == (vehicle.distance_m, vehicle.speed_mps)
+
+
+@given(
+    distance=st.floats(6.0, 40.0),
+    lateral=st.floats(-1.5, 1.5),
+    horizon=st.floats(0.3, 0.6),
+    height=st.floats(1.0, 2.0),
+    focal=st.floats(900.0, 1400.0),
+    kind=st.sampled_from(["hatchback", "sedan", "suv", "van", "truck"]),
+)
+@settings(max_examples=12)
+def test_the_bottom_row_follows_from_the_distance(distance, lateral, horizon, height, focal, kind):
+    vehicle = SceneVehicle(distance_m=distance, lateral_m=lateral, kind=kind)
+    scene = render_scene(vehicles=[vehicle], horizon=horizon, camera_height_m=height, focal_px=focal)
+    camera, (row,) = scene.camera, scene.truth
+    assert (camera.focal_px, camera.horizon_px, camera.height_m) == (focal, horizon * 720, height)
+    below_horizon = row.full_box[3] - camera.horizon_px
+    expected = focal * height / distance
+    # 1% of the distance, and the rounding of the box to whole pixels.
+    assert below_horizon == pytest.approx(expected, abs=0.01 * expected + 1.0)
+    if row.box[3] < 720:
+        assert focal * height / below_horizon == pytest.approx(distance, rel=0.01 + 1.0 / below_horizon)
+
+
+@pytest.mark.parametrize("random_state", range(4))
+def test_a_vehicle_changes_only_its_box_and_its_shadow(random_state):
+    near = SceneVehicle(distance_m=14, lateral_m=-1.0)
+    far = SceneVehicle(distance_m=30, lateral_m=3.6)
+    both = render_scene(vehicles=[far, near], random_state=random_state)
+    alone = render_scene(vehicles=[far], random_state=random_state)
+    assert both.truth[0] == alone.truth[0]
+    changed = (both.image != alone.image).any(-1)
+    x1, y1, x2, y2 = both.truth[1].box
+    assert changed[y1:y2, x1:x2].mean() > 0.6
+    assert changed[both.instance_map == 2].mean() > 0.95
+    # Blur extends the change by a few pixels; the shadow lies on the road.
+    margin = 6
+    changed[y1 - margin : y2 + margin, x1 - margin : x2 + margin] = False
+    rows = np.flatnonzero(changed.any(1))
+    assert len(rows) == 0 or rows.min() >= both.camera.horizon_px
+
+
+def test_a_vehicle_touches_each_side_of_its_box():
+    car = SceneVehicle(distance_m=12, kind="sedan", color="white")
+    scene, empty = (render_scene(vehicles=v, light="overcast", random_state=2) for v in ([car], []))
+    x1, y1, x2, y2 = scene.truth[0].box
+    difference = cv2.absdiff(scene.image, empty.image).max(-1) > 25
+    # The upper half is free of the shadow.
+    columns = np.flatnonzero(difference[y1 : (y1 + y2) // 2, x1 - 30 : x2 + 30].any(0)) + x1 - 30
+    rows = np.flatnonzero(difference[: (y1 + y2) // 2, x1:x2].any(1))
+    assert (columns.min(), columns.max() + 1, rows.min()) == pytest.approx((x1, x2, y1), abs=3)
+
+
+def test_a_nearer_vehicle_occludes_a_farther_one():
+    near = SceneVehicle(distance_m=12, kind="van")
+    far, front = render_scene(vehicles=[SceneVehicle(distance_m=30), near]).truth
+    assert (far.occluded, far.ignore, front.occluded, front.ignore) == (2, 1, 0, 0)
+    assert far.occluded_fraction > 0.9
+    beside = SceneVehicle(distance_m=30, lateral_m=3.0)
+    row = render_scene(vehicles=[beside, near]).truth[0]
+    assert row.occluded in (0, 1)
+    # The box covers the whole vehicle, occluded or not.
+    assert row.box == render_scene(vehicles=[beside]).truth[0].box
+
+
+def test_truncation_grows_towards_the_border():
+    truncated = [
+        render_scene(vehicles=[SceneVehicle(distance_m=9, lateral_m=x, kind="sedan")]).truth[0].truncated
+        for x in (2.0, 4.0, 5.0, 5.6)
+    ]
+    assert truncated[0] == 0
+    assert truncated == sorted(truncated)
+    assert truncated[-1] > 0.4
+    assert render_scene(vehicles=[SceneVehicle(distance_m=9, lateral_m=20)]).truth == ()
+
+
+def test_the_width_is_inversely_proportional_to_the_distance():
+    widths = []
+    for distance in (10, 20, 40):
+        scene = render_scene(vehicles=[SceneVehicle(distance_m=distance, kind="suv")], random_state=1)
+        widths.append(scene.boxes[0, 2] - scene.boxes[0, 0])
+    assert widths[0] == pytest.approx(2 * widths[1], rel=0.06)
+    assert widths[1] == pytest.approx(2 * widths[2], rel=0.06)
+
+
+def test_jpeg_changes_the_image_slightly():
+    plain, compressed = (render_scene(shape=SMALL, jpeg_quality=quality).image for quality in (None, 60))
+    assert (plain != compressed).any()
+    assert np.abs(plain.astype(int) - compressed).mean() < 8
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"shape": (720,)}, r"shape must be \(height, width\) in pixels, got \(720,\)"),
+        ({"shape": (20, 640)}, r"shape\[0\] must be an integer from 64"),
+        ({"shape": (640.5, 640)}, r"shape\[0\] must be an integer"),
+        ({"vehicles": -1}, "vehicles must be an integer from 0 to 60"),
+        ({"vehicles": [20]}, r"vehicles\[0\] must be a SceneVehicle, got 20; make one with"),
+        ({"lane": 3}, "lane must be an integer from 0 to 2"),
+        ({"horizon": 1.2}, "horizon must be a number, at least 0.1 and at most 0.9"),
+        ({"camera_height_m": 0.0}, "camera_height_m must be a number"),
+        ({"focal_px": 10}, "focal_px must be a number"),
+        ({"light": "noon"}, "light must be one of 'day', 'overcast', 'dusk', 'night'; got 'noon'"),
+        ({"rain": 2}, "rain must be a number"),
+        ({"jpeg_quality": 0}, "jpeg_quality must be an integer from 1 to 100"),
+        ({"random_state": -1}, "random_state must be an integer at least 0"),
+        ({"random_state": "x"}, "random_state must be an integer"),
+    ],
+)
+def test_invalid_options(options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        render_scene(**options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"distance_m": 1.0}, "distance_m must be a number, at least 2"),
+        ({"distance_m": float("nan")}, "distance_m must be a number"),
+        ({"distance_m": 9, "lateral_m": 1e6}, "lateral_m must be a number"),
+        ({"distance_m": 9, "kind": "tank"}, "kind must be one of 'hatchback'"),
+        ({"distance_m": 9, "color": "pink"}, "color must be one of 'white'"),
+        ({"distance_m": 9, "view": "left"}, "view must be one of 'rear', 'front'"),
+        ({"distance_m": 9, "speed_mps": "fast"}, "speed_mps must be a number"),
+    ],
+)
+def test_invalid_vehicles(options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        SceneVehicle(**options)
+
+
+@pytest.fixture(scope="module")
+def script():
+    """The script that draws the test images."""
+    spec = importlib.util.spec_from_file_location("regenerate", TEST_IMAGES / "regenerate.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_test_images_are_those_of_the_script(script):
+    assert {path.name for path in TEST_IMAGES.glob("*.jpg")} == set(script.SCENES)
+    for name in ("road1.jpg", "road6.jpg"):
+        # JPEG and another OpenCV version change the image slightly, another drawing changes it a lot.
+        difference = np.abs(read_image(TEST_IMAGES / name).astype(int) - script.draw(name).image)
+        assert difference.mean() < 3
+
+
+def test_the_labels_of_the_test_images_are_those_of_the_script(script, tmp_path):
+    script.main(tmp_path)
+    assert (tmp_path / "labels.csv").read_text() == (TEST_IMAGES / "labels.csv").read_text()
+
+
+def test_the_test_images_are_small_and_one_is_empty():
+    with (TEST_IMAGES / "labels.csv").open(newline="") as file:
+        labelled = {row["frame"] for row in csv.DictReader(file)}
+    shapes = {path.name: read_image(path).shape for path in TEST_IMAGES.glob("*.jpg")}
+    assert len(shapes) == 6
+    assert len(set(shapes) - labelled) == 1
+    assert sorted(shape[:2] for shape in shapes.values()) == [(540, 960)] + [(720, 1280)] * 5
+    assert all(path.stat().st_size < 250_000 for path in TEST_IMAGES.glob("*.jpg"))

@@ -1,0 +1,455 @@
+"""Figures of the features: color channels, HOG, the feature vector, and the weights of a classifier."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vehicle_detection._common import (
+    check_choice,
+    check_image,
+    check_integer,
+    check_patches,
+    check_type,
+    describe,
+)
+from vehicle_detection.classifier import CLASSIFIER_REMEDY, Template, VehicleClassifier
+from vehicle_detection.datasets import PatchSet
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.features import (
+    convert_color,
+    extract_features,
+    hog_blocks,
+    hog_source,
+    part_slices,
+    sum_blocks,
+)
+from vehicle_detection.notebook import style
+from vehicle_detection.notebook.style import COLORS, LINE_COLORS, OTHER, VEHICLE, FigureLike, Image
+from vehicle_detection.params import COLOR_SPACES, PATCH_SIZE, FeatureParams
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.collections import LineCollection
+
+# Thin lines for glyphs of more cells per row than this.
+_MANY_CELLS = 24
+
+_CHANNEL_NAMES = {"YCrCb": ("Y", "Cr", "Cb"), "LAB": ("L", "a", "b")}
+_CHANNEL_PAIRS = ((0, 1), (0, 2), (1, 2))
+
+
+def channel_names(color_space: str) -> tuple[str, ...]:
+    """Names of a color space's channels."""
+    return _CHANNEL_NAMES.get(color_space, tuple(color_space))
+
+
+def hog_channel_names(params: FeatureParams) -> tuple[str, ...]:
+    """Names of the channels that HOG is computed on."""
+    if params.hog_channel == "GRAY":
+        return ("gray",)
+    names = channel_names(params.color_space)
+    return names if params.hog_channel == "ALL" else (names[int(params.hog_channel)],)
+
+
+def add_glyphs(
+    ax: Axes, cells: NDArray[Any], *, size: float = 1.0, peak: float | None = None
+) -> LineCollection:
+    """Draw a line along the edge for each cell and orientation of ``(rows, columns, orient)`` > 0.
+
+    The brightness is the value, relative to `peak` (None: the maximum). A cell has the side `size` in data
+    coordinates.
+    """
+    from matplotlib.collections import LineCollection
+
+    rows, columns, orient = cells.shape
+    angles = np.pi * (np.arange(orient) + 0.5) / orient
+    # An edge is perpendicular to its gradient, as drawn by skimage.feature.hog.
+    offsets = np.stack([np.sin(angles), -np.cos(angles)], axis=1) * (0.47 * size)
+    places = np.argwhere(cells > 0)
+    values = cells[cells > 0]
+    order = np.argsort(values, kind="stable")  # strong lines on top
+    row, column, bin_ = places[order].T
+    center = np.stack([column + 0.5, row + 0.5], axis=1) * size
+    lines = LineCollection(
+        list(np.stack([center - offsets[bin_], center + offsets[bin_]], axis=1)),
+        array=values[order],
+        cmap="gray",
+        linewidths=1.1 if columns <= _MANY_CELLS else 0.5,
+    )
+    lines.set_clim(0, peak or values.max(initial=0) or 1.0)
+    ax.add_collection(lines, autolim=False)
+    ax.set_facecolor("black")
+    ax.set(xlim=(0, columns * size), ylim=(rows * size, 0), aspect="equal", xticks=[], yticks=[])
+    return lines
+
+
+def plot_channels(
+    images: Image | PatchSet | Sequence[Image],
+    color_space: str = "YCrCb",
+    *,
+    labels: ArrayLike | None = None,
+    points: int = 4000,
+    random_state: int = 0,
+    figure: FigureLike | None = None,
+) -> FigureLike:
+    """Plot the distribution of pixels in a color space: each channel, and pairs of channels.
+
+    Parameters
+    ----------
+    images, color_space
+        One ``(H, W, 3)`` uint8 RGB image, several images, or a set of patches; and one of ``COLOR_SPACES``.
+    labels
+        ``(N,)`` 1 for a vehicle, 0 for anything else: one curve per class. None takes those of a set.
+    points, random_state
+        Number of randomly chosen pixels per class in the lower panels, and seed of the choice; without
+        labels each point has the color of its pixel.
+    figure : matplotlib.figure.Figure or SubFigure, optional
+
+    Returns
+    -------
+    matplotlib.figure.Figure or SubFigure
+        Three histograms of the channels over all pixels; below, three scatter plots of pairs of channels.
+
+    Raises
+    ------
+    InvalidInputError
+        If an image is malformed, the color space unknown, or the number of labels wrong.
+
+    Examples
+    --------
+    >>> figure = plot_channels(np.full((8, 8, 3), 90, np.uint8), "HSV")
+    >>> [panel.get_xlabel() for panel in figure.axes]
+    ['H', 'S', 'V', 'H', 'H', 'S']
+    """
+    check_choice(color_space, "color_space", COLOR_SPACES)
+    rng = np.random.default_rng(check_integer(random_state, "random_state", low=0))
+    max_points = check_integer(points, "points", low=1, high=1_000_000)
+    groups = _pixels_by_class(images, labels)
+    names = channel_names(color_space)
+    figure, (upper, lower) = style.new_panels(figure, (11, 6), 2, 3)
+    converted = [convert_color(pixels[None], color_space)[0] for _, _, pixels in groups]
+    for (label, color, pixels), values in zip(groups, converted):
+        for channel, panel in enumerate(upper):
+            fractions = np.bincount(values[:, channel] // 2, minlength=128) / len(values)
+            panel.stairs(100 * fractions, np.arange(0, 257, 2), color=color, label=label, linewidth=1.4)
+        chosen = rng.choice(len(values), min(max_points, len(values)), replace=False)
+        point_colors = pixels[chosen] / 255 if label is None else [color]
+        for panel, (first, second) in zip(lower, _CHANNEL_PAIRS):
+            x, y = values[chosen, first], values[chosen, second]
+            panel.scatter(x, y, s=3, c=point_colors, alpha=0.5, linewidths=0, label=label)
+    limits = [_axis_limits([values[:, channel] for values in converted]) for channel in range(3)]
+    for name, panel, limit in zip(names, upper, limits):
+        panel.set(xlabel=name, ylabel="pixels (%)", xlim=limit)
+    for panel, (first, second) in zip(lower, _CHANNEL_PAIRS):
+        panel.set(xlabel=names[first], ylabel=names[second], xlim=limits[first], ylim=limits[second])
+    if groups[0][0] is not None:
+        upper[0].legend(fontsize=9)
+    figure.suptitle(f"{color_space}, 8 bits per channel", fontsize=11)
+    return figure
+
+
+def _axis_limits(channel: list[NDArray[np.uint8]]) -> tuple[float, float]:
+    """Axis limits that contain all but 0.1% of each class's pixels at either end."""
+    ends = np.concatenate([np.quantile(values, (0.001, 0.999)) for values in channel])
+    margin = max(2.0, 0.04 * float(np.ptp(ends)))
+    return max(0.0, float(ends.min()) - margin), min(256.0, float(ends.max()) + margin)
+
+
+def _pixels_by_class(images: object, labels: ArrayLike | None) -> list[tuple[str | None, Any, Image]]:
+    """Name, color and ``(N, 3)`` RGB pixels of each class, or of all images without labels."""
+    if isinstance(images, np.ndarray) and images.ndim == 3:
+        images = [images]
+    elif isinstance(images, PatchSet):
+        labels = images.labels if labels is None else labels
+        images = images.patches
+    listed = style.check_list(images, "images", "images")
+    flat = [check_image(image, f"images[{index}]").reshape(-1, 3) for index, image in enumerate(listed)]
+    known = style.check_numbers(labels, "labels", len(flat), "images")
+    if known is None:
+        return [(None, "0.35", np.concatenate(flat))]
+    groups: list[tuple[str | None, Any, Image]] = []
+    for name, color, mask in (("vehicle", VEHICLE, known > 0), ("other", OTHER, known <= 0)):
+        if mask.any():
+            groups.append((name, color, np.concatenate(list(itertools.compress(flat, mask)))))
+    return groups
+
+
+def plot_hog(
+    images: Image | Sequence[Image] | Mapping[str, Image],
+    params: FeatureParams | None = None,
+    *,
+    pix_per_cell: Sequence[int] = (8, 16),
+    figure: FigureLike | None = None,
+) -> FigureLike:
+    """Draw the HOG of each channel of images at several cell sizes.
+
+    Each cell shows its block-normalized histogram, averaged over the blocks that contain the cell (Dalal and
+    Triggs, CVPR 2005). Lines are parallel to the edges, that is, perpendicular to the gradients.
+
+    Parameters
+    ----------
+    images
+        One ``(H, W, 3)`` uint8 RGB image or several, such as a vehicle and a non-vehicle; the keys of a
+        mapping are the titles.
+    params, pix_per_cell
+        Color space, channels, orientations and block, by default ``FeatureParams()``; and cell sizes in
+        pixels, one row of panels each.
+    figure : matplotlib.figure.Figure or SubFigure, optional
+
+    Returns
+    -------
+    matplotlib.figure.Figure or SubFigure
+        One column per image and channel: the channel in gray, and its HOG as a line collection per cell size.
+
+    Raises
+    ------
+    InvalidInputError
+        If an image is malformed, or smaller than a block.
+
+    Examples
+    --------
+    >>> patch = np.arange(64 * 64 * 3).reshape(64, 64, 3).astype(np.uint8)
+    >>> len(plot_hog(patch, pix_per_cell=[8]).axes)
+    6
+    """
+    params = FeatureParams() if params is None else params
+    check_type(params, "params", FeatureParams, "omit it for the default")
+    single = isinstance(images, np.ndarray) and images.ndim == 3
+    listed, names = style.split_titles([images] if single else images)
+    sizes = style.check_list(pix_per_cell, "pix_per_cell", "cell sizes")
+    cell_sizes = [check_integer(cell, "pix_per_cell", low=2) for cell in sizes]
+    columns = []
+    for index, (image, name) in enumerate(zip(listed, names)):
+        source = hog_source(check_image(image, f"images[{index}]"), params)
+        for channel, letter in enumerate(hog_channel_names(params)):
+            columns.append((source[..., channel], f"{name}: {letter}" if name else letter))
+    width = min(2.2, 12.5 / len(columns)) if len(columns) > 1 else 6.0
+    height = width * columns[0][0].shape[0] / columns[0][0].shape[1]
+    rows = 1 + len(cell_sizes)
+    size = width * len(columns), height * rows + 0.4
+    figure, grid = style.new_panels(figure, size, rows, len(columns), layout="compressed")
+    block, sqrt = params.cell_per_block, params.transform_sqrt
+    for (first, *others), (gray, title) in zip(grid.T, columns):
+        style.add_image(first, gray, title, vmin=0, vmax=255)
+        for panel, cell in zip(others, cell_sizes):
+            blocks = hog_blocks(gray, params.orient, cell, block, transform_sqrt=sqrt)
+            add_glyphs(panel, sum_blocks(blocks) / sum_blocks(np.ones_like(blocks)), size=cell)
+            panel.set(xlim=(0, gray.shape[1]), ylim=(gray.shape[0], 0))
+    for panel, cell in zip(grid[1:, 0], cell_sizes):
+        panel.set_ylabel(f"{cell} px cells", fontsize=9)
+    return figure
+
+
+def plot_features(
+    patches: PatchSet | NDArray[np.uint8] | Sequence[Image],
+    model: VehicleClassifier | FeatureParams,
+    *,
+    rows: Sequence[int] = (0,),
+    names: Sequence[str] | None = None,
+    template: int = 0,
+    figure: FigureLike | None = None,
+) -> FigureLike:
+    """Plot feature vectors before and after scaling, with their parts shaded.
+
+    Before scaling, histogram counts are much larger than HOG values; after scaling, all parts have the same
+    range.
+
+    Parameters
+    ----------
+    patches, rows, names
+        ``(N, 64, 64, 3)`` uint8 RGB, or a set; row numbers of the patches to plot; and one name per row.
+    model, template
+        A classifier and the number of the template whose scaler is used; or parameters, with the scaler
+        fitted to all of `patches`.
+    figure : matplotlib.figure.Figure or SubFigure, optional
+
+    Returns
+    -------
+    matplotlib.figure.Figure or SubFigure
+        Two panels with one line per row: the vector before and after scaling.
+
+    Raises
+    ------
+    InvalidInputError
+        If the patches are malformed, or a row or template does not exist.
+
+    Examples
+    --------
+    >>> from vehicle_detection import render_patches
+    >>> figure = plot_features(render_patches(8)[0], FeatureParams(hog_channel=0))
+    >>> len(figure.axes[1].lines[0].get_ydata())
+    2628
+    """
+    images = check_patches(patches.patches if isinstance(patches, PatchSet) else patches, PATCH_SIZE)
+    numbers = style.check_list(rows, "rows", "row numbers")
+    chosen = [check_integer(row, "rows", low=0, high=len(images) - 1) for row in numbers]
+    labels = style.check_length(names, "names", len(chosen), "rows")
+    params, mean, scale = _scaler(images, model, template)
+    raw = extract_features(images[chosen], params)
+    figure, grid = style.new_panels(figure, (11, 5.5), 2, 1, sharex=True)
+    above, below = grid.flat
+    shades = (COLORS[1], COLORS[3], "0.6", COLORS[2])
+    colors = [VEHICLE, OTHER, *LINE_COLORS[2:]]
+    classes = patches.labels[chosen].tolist() if isinstance(patches, PatchSet) else []
+    if classes and len(set(classes)) == len(classes):  # at most one row of each class
+        colors = [VEHICLE if vehicle else OTHER for vehicle in classes]
+    for panel, values in ((above, raw), (below, (raw - mean) / scale)):
+        for line, label, color in zip(values, labels, colors * len(chosen)):
+            text = None if label is None else str(label)
+            panel.plot(line, linewidth=0.6, color=color, label=text)
+        for row, (shade, (name, part)) in enumerate(zip(shades, part_slices(params).items())):
+            label, middle = f"{name} ({part.stop - part.start:,})", (part.start + part.stop) / 2
+            top = panel.get_xaxis_transform()
+            panel.axvspan(part.start, part.stop, color=shade, alpha=0.18, linewidth=0)
+            offset = 0, 3 + 10 * (row % 2)  # names of narrow parts are wider than these
+            panel.annotate(label, (middle, 1.0), offset, top, "offset points", ha="center", fontsize=8)
+    above.set(ylabel="value", xlim=(0, params.length))
+    below.set(ylabel="value (standard deviations)", xlabel="feature")
+    above.set_title("before scaling", loc="right", fontsize=10)
+    below.set_title("after scaling", loc="right", fontsize=10)
+    if any(label is not None for label in labels):
+        legend = above.legend(loc="upper right", fontsize=9)
+        for handle in legend.get_lines():
+            handle.set_linewidth(2)
+    return figure
+
+
+def _scaler(
+    images: Image, model: object, template: int
+) -> tuple[FeatureParams, NDArray[np.float64], NDArray[np.float64]]:
+    """Feature parameters, mean and scale."""
+    if isinstance(model, VehicleClassifier):
+        known = model.templates[check_integer(template, "template", low=0, high=len(model.templates) - 1)]
+        return model.params, known.mean, known.scale
+    if not isinstance(model, FeatureParams):
+        raise InvalidInputError(
+            f"model must be a VehicleClassifier or FeatureParams, got {describe(model)}; "
+            "pass load_classifier() or FeatureParams()"
+        )
+    features = extract_features(images, model).astype(np.float64)
+    scale = features.std(axis=0)
+    scale[scale == 0] = 1  # as StandardScaler does for constant features
+    return model, features.mean(axis=0), scale
+
+
+# Largest difference, in gray levels, between the mean patch and the patch shifted along the weights.
+_MAX_SHIFT = 110.0
+
+
+def plot_weights(
+    classifier: VehicleClassifier, *, template: int = 0, figure: FigureLike | None = None
+) -> FigureLike:
+    """Draw the weights of a linear SVM template, arranged as in the window.
+
+    The weights belong to the scaled features, so they are comparable. HOG weights are summed over the blocks
+    of each cell and drawn as edges, positive and negative ones separately (Dalal and Triggs, CVPR 2005,
+    figure 6).
+
+    Parameters
+    ----------
+    classifier, template
+        The trained model, and the number of its template.
+    figure : matplotlib.figure.Figure or SubFigure, optional
+
+    Returns
+    -------
+    matplotlib.figure.Figure or SubFigure
+        One row per channel. Columns: positive and negative weights of HOG and of coarse HOG, weights of the
+        spatial bins and of the histogram, as far as the model uses them. With spatial bins, the last column
+        shows the mean patch, and the mean patch shifted along the weights in both directions.
+
+    Raises
+    ------
+    InvalidInputError
+        If `classifier` is not a classifier, or does not have the template.
+
+    Examples
+    --------
+    >>> from vehicle_detection import load_classifier
+    >>> [panel.get_title() for panel in plot_weights(load_classifier()).axes[:2]]
+    ['HOG, positive', 'HOG, negative']
+    """
+    check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
+    number = check_integer(template, "template", low=0, high=len(classifier.templates) - 1)
+    chosen = classifier.templates[number]
+    params = classifier.params
+    weights = {part: chosen.coef[rows] for part, rows in part_slices(params).items()}
+    hogs = {"HOG": params.blocks, "coarse HOG": params.coarse_blocks}
+    titles = [f"{part}, {sign}" for part in hogs if part in weights for sign in ("positive", "negative")]
+    titles += ["spatial bins"] if params.spatial_feat else []
+    titles += ["histogram"] if params.hist_feat else []
+    titles += ["in color"] if params.spatial_feat else []
+    figure, grid = style.new_panels(figure, (min(2.6 * len(titles), 15), 7.2), 3, len(titles))
+    columns = dict(zip(titles, grid.T))
+    for title, column in columns.items():
+        column[0].set_title(title, fontsize=10)
+    for part, blocks in hogs.items():
+        if part in weights:
+            pair = columns[f"{part}, positive"], columns[f"{part}, negative"]
+            _add_hog_weights(np.stack(pair, axis=1), weights[part], params, blocks)
+    if params.spatial_feat:
+        _add_spatial_weights(columns["spatial bins"], weights["spatial bins"], params)
+        _add_shifted_patches(columns["in color"], chosen, params)
+    if params.hist_feat:
+        _add_histogram_weights(columns["histogram"], weights["color histogram"], params)
+    return figure
+
+
+def _add_hog_weights(
+    grid: NDArray[Any], weights: NDArray[np.float64], params: FeatureParams, blocks: int
+) -> None:
+    """Draw the HOG weights of all channels; the patch has ``(blocks, blocks)`` blocks."""
+    block = params.cell_per_block
+    shape = (params.hog_channels, blocks, blocks, block, block, params.orient)
+    cells = [sum_blocks(channel) for channel in weights.reshape(shape)]
+    peak = float(np.abs(cells).max()) or 1.0
+    for row, channel, name in zip(grid, cells, hog_channel_names(params)):
+        for panel, signed in zip(row, (channel, -channel)):
+            add_glyphs(panel, signed.clip(0), size=PATCH_SIZE / len(signed), peak=peak)
+        row[0].set_ylabel(f"channel {name}", fontsize=9)
+    for panel in grid[len(cells) :].flat:
+        panel.remove()
+
+
+def _add_spatial_weights(column: NDArray[Any], weights: NDArray[np.float64], params: FeatureParams) -> None:
+    maps = params.spatial_planes(weights)
+    top = float(np.abs(maps).max()) or 1.0
+    for panel, values, name in zip(column, maps, channel_names(params.color_space)):
+        style.add_image(panel, values, cmap="PuOr_r", vmin=-top, vmax=top)
+        panel.set_ylabel(name, fontsize=9)
+        bar = panel.figure.colorbar(panel.images[0], ax=panel, shrink=0.8)
+        bar.ax.tick_params(labelsize=6)
+
+
+def _add_histogram_weights(column: NDArray[Any], weights: NDArray[np.float64], params: FeatureParams) -> None:
+    top = 1.1 * float(np.abs(weights).max()) or 1.0
+    for panel, values, name in zip(column, weights.reshape(3, -1), channel_names(params.color_space)):
+        panel.stairs(values, np.linspace(0, 256, len(values) + 1), fill=True, color="0.45")
+        panel.axhline(0, color="black", linewidth=0.6)
+        panel.set(xlim=(0, 256), ylim=(-top, top))
+        panel.set_xlabel(f"{name} (0-255)", fontsize=8)
+        panel.set_ylabel("weight", fontsize=8)
+        panel.tick_params(labelsize=7)
+
+
+def _add_shifted_patches(column: NDArray[Any], template: Template, params: FeatureParams) -> None:
+    """Show the mean patch, and the mean patch shifted along the weights of the spatial bins."""
+    stop = params.spatial_length
+    direction = template.coef[:stop] * template.scale[:stop]
+    step = _MAX_SHIFT / (float(np.abs(direction).max()) or 1.0)
+    for panel, name, sign in zip(column, ("mean + weights", "mean patch", "mean - weights"), (1, 0, -1)):
+        values = template.mean[:stop] + sign * step * direction
+        patch = params.spatial_planes(values).transpose(1, 2, 0)
+        limits = [179 if params.spatial_space in ("HSV", "HLS") else 255, 255, 255]
+        patch = np.ascontiguousarray(patch.clip(0, limits).round().astype(np.uint8))
+        if params.spatial_space != "RGB":
+            conversion = getattr(cv2, f"COLOR_{params.spatial_space}2RGB")
+            patch = np.asarray(cv2.cvtColor(patch, conversion), np.uint8)
+        style.add_image(panel, patch)
+        panel.set_xlabel(name, fontsize=9)

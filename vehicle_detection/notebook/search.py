@@ -1,0 +1,334 @@
+"""Figures of the search: windows, bands, heat map, and the fast search compared with the reference."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from vehicle_detection._common import check_image, check_number, check_type, describe, pluralize
+from vehicle_detection.boxes import Detections
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.heatmap import frame_heat, heat_threshold, label_heat
+from vehicle_detection.notebook import style
+from vehicle_detection.notebook.style import BLUE, SKY, TRUTH, VERMILION, YELLOW, Boxes, FigureLike, Image
+from vehicle_detection.params import HeatParams, SearchParams
+from vehicle_detection.windows import band_windows
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+def plot_windows(
+    image: Image,
+    windows: Detections | ArrayLike,
+    *,
+    truth: Boxes | None = None,
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw windows on a frame, colored by score.
+
+    Parameters
+    ----------
+    image, windows
+        ``(H, W, 3)`` uint8 RGB; and `Detections`, as `find_cars` returns, or ``(N, 4)`` boxes without scores,
+        as `slide_window` returns, drawn in one color.
+    truth, title
+        Labelled boxes, drawn with dashed lines; and the title, by default the number of windows.
+    ax : matplotlib.axes.Axes, optional
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        The first collection contains the windows in ascending order of score; its array contains the scores.
+
+    Raises
+    ------
+    InvalidInputError
+        If the image or the boxes are malformed.
+
+    Examples
+    --------
+    >>> found = Detections([[0, 0, 64, 64], [8, 0, 72, 64]], [1.5, 0.5])
+    >>> axes = plot_windows(np.zeros((72, 128, 3), np.uint8), found)
+    >>> axes.collections[0].get_array().tolist(), axes.get_title()
+    ([0.5, 1.5], '2 windows')
+    """
+    height, width = check_image(image).shape[:2]
+    boxes = style.box_array(windows, "windows")
+    true = None if truth is None else style.box_array(truth, "truth")
+    axes = style.new_axes(ax, 8.5, 8.5 * height / width + 0.6)
+    style.add_image(axes, image, ticks=True)
+    linewidth = 1.4 if len(boxes) < 60 else 0.8
+    if isinstance(windows, Detections) and len(windows):
+        order = np.argsort(windows.scores, kind="stable")
+        lines = style.add_boxes(axes, boxes[order], halo=len(boxes) < 400, linewidths=linewidth)
+        lines.set_array(windows.scores[order])
+        lines.set_cmap("plasma")
+        axes.figure.colorbar(lines, ax=axes, shrink=0.75, pad=0.02).set_label("score")
+    else:
+        style.add_boxes(axes, boxes, SKY, halo=False, linewidths=linewidth)
+    if true is not None:
+        style.add_boxes(axes, true, TRUTH, linestyles="--", linewidths=2.0)
+    _expand_limits(axes, boxes, width, height)
+    axes.set(xlabel="x (px)", ylabel="y (px)")
+    axes.set_title(pluralize(len(boxes), "window") if title is None else title, fontsize=10)
+    return axes
+
+
+def _expand_limits(axes: Axes, boxes: NDArray[Any], width: int, height: int) -> None:
+    """Expand the axis limits to boxes that extend beyond the frame."""
+    left, top = boxes[:, :2].min(axis=0, initial=0)
+    right, bottom = np.maximum((width, height), boxes[:, 2:].max(axis=0, initial=0))
+    axes.set(xlim=(left, right), ylim=(bottom, top))
+
+
+def plot_bands(
+    image: Image, search: SearchParams | None = None, *, figure: FigureLike | None = None
+) -> FigureLike:
+    """Draw the search band of each window size: its bounds, the first window, and the next ones.
+
+    Parameters
+    ----------
+    image, search
+        ``(H, W, 3)`` uint8 RGB frame, and the bands, by default ``SearchParams.preset()``.
+    figure : matplotlib.figure.Figure or SubFigure, optional
+
+    Returns
+    -------
+    matplotlib.figure.Figure or SubFigure
+        One panel per band that fits into the frame. Its collections are the bounds, the windows one step
+        to the right and one step down, and the first window; the dashed line is the horizon.
+
+    Raises
+    ------
+    InvalidInputError
+        If the image is malformed, or too small for a window.
+
+    Examples
+    --------
+    >>> frame = np.zeros((720, 1280, 3), np.uint8)
+    >>> figure = plot_bands(frame, SearchParams.preset("three-scales"))
+    >>> len(figure.axes), figure.axes[1].get_title()
+    (3, '64x64 px, step 8x8, 3,825 windows')
+    """
+    height, width = check_image(image).shape[:2]
+    search = SearchParams.preset() if search is None else search
+    check_type(search, "search", SearchParams, "pass SearchParams.preset()")
+    bands = search.place(image.shape)
+    columns = 2 if len(bands) in (2, 4) else min(len(bands), 3)
+    rows = math.ceil(len(bands) / columns)
+    # All panels have the limits of the widest band.
+    bounds = np.array([[band.x1, band.y1, band.x2, band.y2] for band in bands])
+    visible = max(width, bounds[:, 2].max()) - min(0, bounds[:, 0].min())
+    panel_height = 13 / columns * height / visible + 0.3
+    size = 13, rows * panel_height + 0.4
+    figure, grid = style.new_panels(figure, size, rows, columns, count=len(bands), layout="compressed")
+    for panel, band, bound in zip(grid.flat, bands, bounds):
+        style.add_image(panel, image)
+        panel.axhline(search.horizon * height, color="white", linestyle="--", linewidth=0.8)
+        windows = band_windows(band)
+        shift = np.array([[band.step[0], 0] * 2, [0, band.step[1]] * 2])
+        # A low or narrow band may not have a second window in that direction.
+        neighbors = [row for row in windows[:1] + shift if (windows == row).all(axis=1).any()]
+        style.add_boxes(panel, bound[None], YELLOW)
+        style.add_boxes(panel, np.array(neighbors).reshape(-1, 4), SKY, linewidths=1.0)
+        style.add_boxes(panel, windows[:1], VERMILION, linewidths=1.4)
+        _expand_limits(panel, bounds, width, height)
+        side, step = (f"{x}x{y}" for x, y in (band.window, band.step))
+        panel.set_title(f"{side} px, step {step}, {pluralize(len(windows), 'window')}", fontsize=9)
+    handles = style.legend_lines(
+        ("band", YELLOW, "-"),
+        ("first window", VERMILION, "-"),
+        ("next windows to the right and down", SKY, "-"),
+        ("horizon", "0.6", "--"),
+    )
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
+    return figure
+
+
+def plot_comparison(fast: ArrayLike, reference: ArrayLike, *, figure: FigureLike | None = None) -> FigureLike:
+    """Plot the scores of the fast search against those of the reference, window by window.
+
+    Parameters
+    ----------
+    fast, reference
+        ``(N,)`` scores of the same windows in the same order, such as ``find_cars(...).scores``.
+    figure : matplotlib.figure.Figure or SubFigure, optional
+
+    Returns
+    -------
+    matplotlib.figure.Figure or SubFigure
+        A scatter plot of the scores, and a histogram of the differences, whose title states the maximum.
+
+    Raises
+    ------
+    InvalidInputError
+        If the two differ in length, are empty or contain NaN.
+
+    Examples
+    --------
+    >>> figure = plot_comparison([0.5, 1.0], [0.5, 1.25])
+    >>> figure.axes[1].get_title()
+    'maximum difference 0.25'
+    """
+    x, y = style.check_scores(reference, "reference"), style.check_scores(fast, "fast")
+    if len(x) != len(y):
+        raise InvalidInputError(
+            f"fast and reference must be scores of the same windows; got {len(y)} and {len(x)} scores"
+        )
+    figure, ((left, right),) = style.new_panels(figure, (10, 4.2), 1, 2)
+    ends = [min(x.min(), y.min()), max(x.max(), y.max())]
+    left.plot(ends, ends, color="0.3", linewidth=0.8, label="equal")
+    left.scatter(x, y, s=5, color=BLUE, alpha=0.5, linewidths=0, label=pluralize(len(x), "window"))
+    left.set(xlabel="score of the reference search", ylabel="score of the fast search")
+    left.legend(fontsize=9)
+    difference = float(np.abs(y - x).max())
+    limit = difference or 1e-12
+    right.hist(y - x, bins=60, range=(-limit, limit), color=BLUE)
+    right.set(yscale="log", xlabel="fast - reference", ylabel="windows")
+    right.set_title(f"maximum difference {difference:.2g}", fontsize=10)
+    right.ticklabel_format(axis="x", style="sci", scilimits=(-3, 3))
+    return figure
+
+
+def plot_speedups(
+    seconds: Mapping[str, float], *, reference: str | None = None, ax: Axes | None = None
+) -> Axes:
+    """Plot the times of several methods for the same work, and their speedups over one of them.
+
+    Parameters
+    ----------
+    seconds, reference
+        Time of each method; and name of the method to compare the others with, None for the slowest.
+    ax : matplotlib.axes.Axes, optional
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        Contains one bar per method, in milliseconds on a logarithmic scale.
+
+    Raises
+    ------
+    InvalidInputError
+        If `seconds` contains anything but positive numbers, or does not contain the reference.
+
+    Examples
+    --------
+    >>> axes = plot_speedups({"one by one": 4.0, "shared": 0.01})
+    >>> [text.get_text() for text in axes.texts]
+    ['4,000 ms', '10 ms, 400x faster']
+    """
+    given: object = seconds
+    if not isinstance(given, Mapping) or not given:
+        raise InvalidInputError(f"seconds must map names to seconds, at least one; got {describe(given)}")
+    times = {str(name): check_number(value, f"seconds[{name!r}]", above=0) for name, value in given.items()}
+    baseline: object = max(times, key=times.__getitem__) if reference is None else reference
+    if not isinstance(baseline, str) or baseline not in times:
+        raise InvalidInputError(f"reference must be one of {', '.join(times)}; got {describe(reference)}")
+    # Long names take width from the bars.
+    width = 7.0 + 0.07 * max(map(len, times))
+    axes = style.new_axes(ax, width, 0.8 + 0.45 * len(times))
+    values = [1000 * value for value in times.values()]
+    bars = axes.barh(list(times), values, color=["0.6" if name == baseline else BLUE for name in times])
+    texts = [_format_time(value, times[baseline] / value) for value in times.values()]
+    axes.bar_label(bars, texts, padding=3, fontsize=9)
+    left = min(values) / 3
+    # Room for the text of the longest bar.
+    right = max(values) * max(12.0, (max(values) / left) ** 0.6)
+    axes.set(xscale="log", xlim=(left, right), xlabel="time (ms)")
+    axes.invert_yaxis()
+    axes.spines[["top", "right"]].set_visible(False)
+    return axes
+
+
+def _format_time(seconds: float, speedup: float) -> str:
+    """Time in milliseconds with its speedup, such as ``10 ms, 400x faster``."""
+    value = 1000 * seconds
+    text = f"{value:,.0f} ms" if value >= 10 else f"{value:.2g} ms"
+    if speedup == 1:
+        return text
+    if speedup < 1:
+        return f"{text}, {1 / speedup:.1f}x slower"
+    return f"{text}, {speedup:,.{0 if speedup >= 10 else 1}f}x faster"
+
+
+def plot_heatmap(
+    image: Image,
+    windows: Detections,
+    *,
+    params: HeatParams | None = None,
+    heat: NDArray[Any] | None = None,
+    figure: FigureLike | None = None,
+) -> FigureLike:
+    """Show how windows become boxes: the windows, their heat map, and the regions above the threshold.
+
+    Parameters
+    ----------
+    image, windows
+        ``(H, W, 3)`` uint8 RGB frame, and its positive windows.
+    params, heat
+        Weighting, threshold and fraction of the peak, by default as in `bounding_boxes`; and ``(H, W)`` heat
+        map, such as the mean over the last frames, by default that of `windows`.
+    figure : matplotlib.figure.Figure or SubFigure, optional
+
+    Returns
+    -------
+    matplotlib.figure.Figure or SubFigure
+        Three panels: the windows; the heat map with a color bar; the regions above the threshold in
+        different colors, with the boxes of `label_boxes` as one line collection.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is malformed, or the heat map has another size than the frame.
+
+    Examples
+    --------
+    >>> frame = np.zeros((72, 128, 3), np.uint8)
+    >>> found = Detections([[10, 10, 40, 40], [20, 10, 50, 40]], [1.5, 1.5])
+    >>> figure = plot_heatmap(frame, found)
+    >>> [panel.get_title() for panel in figure.axes[:3]]
+    ['2 windows', 'heat, peak 3.0', '1 region above 2']
+    """
+    height, width = check_image(image).shape[:2]
+    check_type(windows, "windows", Detections, "pass what find_cars returns, or Detections(boxes, scores)")
+    params = HeatParams() if params is None else params
+    check_type(params, "params", HeatParams, "pass HeatParams()")
+    given: object = frame_heat(image.shape, windows, params) if heat is None else heat
+    if not isinstance(given, np.ndarray) or given.shape != (height, width):
+        raise InvalidInputError(
+            f"heat must be an array of the frame's size {(height, width)}, got {describe(given)}; "
+            "compute it with add_heat"
+        )
+    found, threshold = label_heat(given, params), heat_threshold(params)
+    size = 15, 5 * height / width + 0.5
+    figure, ((first, second, third),) = style.new_panels(figure, size, 1, 3, layout="compressed")
+    style.add_image(first, image)
+    style.add_boxes(first, windows.boxes, SKY, halo=False, linewidths=0.8)
+    first.set_title(pluralize(len(windows), "window"), fontsize=10)
+    peak = float(given.max())
+    style.add_image(second, given, cmap="inferno", vmin=0, vmax=peak if peak > 0 else 1.0)
+    bar = second.figure.colorbar(second.images[0], ax=second, shrink=0.8, pad=0.02)
+    bar.set_label("sum of scores" if params.weighting == "score" else "windows")
+    if threshold <= peak:
+        bar.ax.axhline(threshold, color=SKY, linewidth=2)
+    second.set_title(f"heat, peak {peak:.1f}", fontsize=10)
+    style.add_image(third, _color_regions(image, given, threshold))
+    style.add_boxes(third, found.boxes, YELLOW, linewidths=2.0)
+    third.set_title(f"{pluralize(len(found), 'region')} above {threshold:g}", fontsize=10)
+    return figure
+
+
+def _color_regions(image: Image, heat: NDArray[Any], threshold: float) -> Image:
+    """Blend a color over each connected region above the threshold, on a gray copy of the frame."""
+    labels, _ = ndimage.label(heat > threshold, structure=np.ones((3, 3)))
+    gray = np.repeat(image.mean(axis=2, keepdims=True) * 0.8, 3, axis=2)
+    colors = 255 * np.array(style.COLORS)[(labels - 1) % len(style.COLORS)]
+    blended = np.where(labels[..., None] > 0, 0.45 * gray + 0.55 * colors, gray)
+    return np.asarray(blended.round(), np.uint8)

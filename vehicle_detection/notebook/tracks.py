@@ -1,0 +1,265 @@
+"""Figures of a video: tracks over time, and the time of each processing stage."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vehicle_detection._common import Floats, check_number, check_type, describe
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import NO_TRACK, FrameBoxes
+from vehicle_detection.notebook import style
+from vehicle_detection.notebook.style import COLORS, LINESTYLES, YELLOW, FigureLike
+from vehicle_detection.scenes import VehicleTruth
+from vehicle_detection.tracking import FrameResult
+from vehicle_detection.video import VideoReport
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+_LABELS = (
+    "center of the box, x (px)",
+    "width of the box (px)",
+    "distance (m)",
+    "speed relative to\nthe camera (m/s)",
+)
+# A line is interrupted where consecutive rows are more than this many frames apart.
+_MAX_GAP = 1.5
+# Replaces the yellow of the video, which is hard to see on white.
+_DARK_YELLOW = (0.80, 0.73, 0.1)
+
+# Rows of the legend of the tracks that fit beside the panels.
+_LEGEND_ROWS = 38
+
+_STAGES = ("decode", "search", "regions", "track", "draw", "encode")
+
+
+# Number and time of a track in a frame, its box, distance and speed, and their standard errors.
+Row = tuple[int, float, Any, float | None, float | None, float | None, float | None]
+
+
+def plot_tracks(
+    results: Iterable[FrameResult] | FrameBoxes,
+    *,
+    truth: FrameBoxes | Sequence[Sequence[VehicleTruth]] | None = None,
+    fps: float = 25.0,
+    min_frames: int = 1,
+    figure: FigureLike | None = None,
+) -> FigureLike:
+    """Plot position, width, distance and speed of each track over time, in the colors of the video.
+
+    Parameters
+    ----------
+    results
+        The detector's result of each frame, whose shown tracks are plotted; or the boxes of a tracks file
+        with numbered frames, as `read_labels` returns.
+    truth
+        True boxes, drawn as black dots: labels, or the ``truth`` of a rendered drive, which includes
+        distances and speeds. Ignored boxes are left out.
+    fps, min_frames
+        Frame rate, for frames without a time; and number of frames below which a track is left out.
+    figure : matplotlib.figure.Figure or SubFigure, optional
+
+    Returns
+    -------
+    matplotlib.figure.Figure or SubFigure
+        Four panels over time; distances and speeds of results have bands of one standard error.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument has the wrong type, or there is no track to plot.
+
+    Examples
+    --------
+    >>> boxes = [[10.0 + frame, 20.0, 60.0 + frame, 60.0] for frame in range(5)]
+    >>> figure = plot_tracks(FrameBoxes(range(5), [1] * 5, boxes), fps=10)
+    >>> figure.axes[0].lines[0].get_xydata()[-1].tolist()
+    [0.4, 39.0]
+    """
+    rate = check_number(fps, "fps", above=0, high=1e6)
+    shortest = check_number(min_frames, "min_frames", low=1)
+    if isinstance(results, FrameBoxes):
+        tracks = _split_tracks(_rows_of_boxes(results, rate, "results"))
+    else:
+        tracks = _split_tracks(_rows_of_results(results, rate))
+    tracks = {number: columns for number, columns in tracks.items() if columns.shape[1] >= shortest}
+    if not tracks:
+        raise InvalidInputError(
+            "results must hold at least one track to plot, got none; pass results with shown tracks"
+        )
+    figure, grid = style.new_panels(figure, (10, 9), 4, 1, sharex=True)
+    for number, known in tracks.items():
+        # Color of the track as in the video; the line style differs between tracks of one color.
+        cycle, index = divmod(number - 1, len(COLORS))
+        color = _DARK_YELLOW if COLORS[index] == YELLOW else COLORS[index]
+        dash = LINESTYLES[cycle % len(LINESTYLES)]
+        time, *columns = _insert_gaps(known, rate)
+        for panel, values, stds in zip(grid.flat, columns[:4], columns[4:]):
+            panel.plot(time, values, color=color, linestyle=dash, linewidth=1.8, label=f"#{number}")
+            if not np.isnan(stds).all():
+                panel.fill_between(time, values - stds, values + stds, color=color, alpha=0.25, linewidth=0)
+    if truth is not None:
+        for index, (time, *columns) in enumerate(_split_tracks(_rows_of_truth(truth, rate)).values()):
+            for panel, values in zip(grid.flat, columns):
+                panel.plot(time, values, "k.", markersize=2, label=None if index else "truth")
+    for panel, label in zip(grid.flat, _LABELS):
+        panel.set_ylabel(label)
+        panel.grid(alpha=0.3)
+    grid[-1, 0].axhline(0, color="black", linewidth=0.6)
+    grid[-1, 0].set_xlabel("time (s)")
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    options: dict[str, Any] = {"fontsize": 9, "title": "track", "columnspacing": 1.0}
+    options["ncols"] = math.ceil(len(labels) / _LEGEND_ROWS)
+    figure.legend(handles, labels, loc="outside right upper", **options)
+    return figure
+
+
+def _rows_of_results(results: object, rate: float) -> Iterator[Row]:
+    if not isinstance(results, Iterable):
+        raise InvalidInputError(
+            f"results must be the FrameResult of each frame, or FrameBoxes; got {describe(results)}; "
+            "collect what detector.process returns"
+        )
+    for result in results:
+        check_type(result, "results", FrameResult, "collect what detector.process returns")
+        time = result.index / rate if result.time is None else result.time
+        for track in result.shown:
+            stds = track.distance_std_m, track.speed_std_mps
+            yield track.id, time, track.box, track.distance_m, track.speed_mps, *stds
+
+
+def _rows_of_boxes(labels: FrameBoxes, rate: float, name: str) -> Iterator[Row]:
+    if any(isinstance(key, str) for key in labels.frame_keys):
+        raise InvalidInputError(
+            f"{name} must have numbered frames, got names such as {labels.frame_keys[0]!r}; "
+            "convert them with FrameBoxes.renamed"
+        )
+    unknown = [None] * len(labels)
+    distances = unknown if labels.distance_m is None else labels.distance_m
+    speeds = unknown if labels.speed_mps is None else labels.speed_mps
+    times = np.array(labels.frames, np.float64) / rate
+    for row in np.argsort(times, kind="stable"):
+        if labels.tracks[row] != NO_TRACK:
+            yield labels.tracks[row], times[row], labels.boxes[row], distances[row], speeds[row], None, None
+
+
+def _rows_of_truth(truth: object, rate: float) -> Iterator[Row]:
+    """Rows of the true boxes that are not ignored, from labels or the truth of a rendered drive."""
+    if isinstance(truth, FrameBoxes):
+        yield from _rows_of_boxes(truth[~truth.ignore], rate, "truth")
+        return
+    given = isinstance(truth, Sequence) and all(isinstance(each, Sequence) for each in truth)
+    frames: Any = truth if given else [[truth]]
+    for frame, rows in enumerate(frames):
+        for row in rows:
+            if not isinstance(row, VehicleTruth):
+                raise InvalidInputError(
+                    f"truth must be FrameBoxes or the truth of a rendered drive, got {describe(truth)}; "
+                    "read a file with read_labels or pass drive.truth"
+                )
+            if not row.ignore:
+                yield row.track, frame / rate, row.box, row.distance_m, row.speed_mps, None, None
+
+
+def _split_tracks(rows: Iterable[Row]) -> dict[int, Floats]:
+    """``(9, N)`` columns of each track: time, the values of the panels, and their standard errors."""
+    table = [
+        (number, time, (box[0] + box[2]) / 2, box[2] - box[0], distance, speed, None, None, *stds)
+        for number, time, box, distance, speed, *stds in rows
+    ]
+    columns = np.array(table, np.float64).reshape(-1, 10).T  # None becomes NaN
+    return {int(number): columns[1:, columns[0] == number] for number in np.unique(columns[0])}
+
+
+def _insert_gaps(columns: Floats, rate: float) -> Floats:
+    """Insert NaN where frames are missing, so that the line is interrupted."""
+    time = columns[0]
+    steps = np.diff(time)
+    usual = max(1 / rate, steps.min(initial=math.inf))
+    after = np.flatnonzero(steps > _MAX_GAP * usual) + 1
+    result = np.insert(columns, after, math.nan, axis=1)
+    result[0] = np.insert(time, after, (time[after - 1] + time[after]) / 2)
+    return result
+
+
+Run = VideoReport | Sequence[FrameResult]
+
+
+def plot_stage_times(runs: Run | Mapping[str, Run], *, ax: Axes | None = None) -> Axes:
+    """Plot the processing time per frame of each stage, for one run or several.
+
+    Parameters
+    ----------
+    runs
+        The report of `process_video`, or the detector's result of each frame; or several of them by name.
+    ax : matplotlib.axes.Axes, optional
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        A stacked bar per run, in milliseconds per frame. Stages of a video run in parallel, so the bar may
+        be longer than the time between two frames.
+
+    Raises
+    ------
+    InvalidInputError
+        If a run has the wrong type, or no frames.
+
+    Examples
+    --------
+    >>> result = FrameResult(0, 0.0, None, None, (), {"search": 0.012, "track": 0.002})
+    >>> axes = plot_stage_times([result])
+    >>> [text.get_text() for text in axes.get_legend().get_texts()]
+    ['search', 'track']
+    """
+    named = runs if isinstance(runs, Mapping) else {"": runs}
+    if not named:
+        raise InvalidInputError("runs must hold at least one run; got none")
+    times = {str(name): _stage_milliseconds(run) for name, run in named.items()}
+    stages = list(dict.fromkeys([*_STAGES, *(stage for run in times.values() for stage in run)]))
+    stages = [stage for stage in stages if any(stage in run for run in times.values())]
+    axes = style.new_axes(ax, 9, 1.3 + 0.55 * len(times))
+    left = np.zeros(len(times))
+    longest = max(sum(run.values()) for run in times.values())
+    for number, stage in enumerate(stages):
+        values = np.array([run.get(stage, 0.0) for run in times.values()])
+        color = COLORS[number % len(COLORS)]
+        bars = axes.barh(range(len(times)), values, 0.6, left=left, color=color, label=stage)
+        # A number does not fit into a short bar.
+        texts = [f"{value:.1f}" if value > 0.05 * longest else "" for value in values]
+        axes.bar_label(bars, texts, label_type="center", fontsize=8)
+        left += values
+    for row, total in enumerate(left):
+        axes.text(total, row, f"  {total:.1f} ms", va="center", fontsize=9)
+    axes.set_yticks(range(len(times)), list(times))
+    axes.invert_yaxis()
+    axes.margins(x=0.12)
+    axes.set_xlabel("work (ms per frame)")
+    style.legend_above(axes, max(len(stages), 1))
+    axes.spines[["top", "right"]].set_visible(False)
+    return axes
+
+
+def _stage_milliseconds(run: object) -> dict[str, float]:
+    """Milliseconds per frame of each stage."""
+    if isinstance(run, VideoReport):
+        frames, parts = run.frames, [run.stages]
+    elif isinstance(run, (list, tuple)) and all(isinstance(result, FrameResult) for result in run):
+        frames, parts = len(run), [result.seconds for result in run]
+    else:
+        raise InvalidInputError(
+            "runs must be a VideoReport or a list of FrameResult, or a mapping from names to them; "
+            f"got {describe(run)}"
+        )
+    if not frames:
+        raise InvalidInputError("runs must have at least one frame each; got a run without any")
+    seconds: Counter[str] = Counter()
+    for part in parts:
+        seconds.update(part)
+    return {stage: 1000 * value / frames for stage, value in seconds.items()}

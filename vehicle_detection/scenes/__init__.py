@@ -1,0 +1,20 @@
+"""Synthetic road scenes, drives and training patches with exact ground truth.
+
+A pinhole camera looks along a flat, straight road; vehicles are painted bodies in true perspective.
+"""
+
+from vehicle_detection.scenes.drive import Drive, render_drive, write_labels
+from vehicle_detection.scenes.patches import render_patches
+from vehicle_detection.scenes.render import VehicleTruth
+from vehicle_detection.scenes.scene import Scene, SceneVehicle, render_scene
+
+__all__ = [
+    "Drive",
+    "Scene",
+    "SceneVehicle",
+    "VehicleTruth",
+    "render_drive",
+    "render_patches",
+    "render_scene",
+    "write_labels",
+]

@@ -1,0 +1,199 @@
+"""How a road scene is photographed: camera, frame size, light, lens and sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vehicle_detection.camera import Camera
+from vehicle_detection.scenes.raster import Color, Doubles, Floats, Image, Rng, tile_to, wrapped_noise
+
+_GRAIN_SIDE = 512  # side of the noise tile (px)
+
+
+@dataclass(frozen=True)
+class Light:
+    """Light and weather of a scene, in 0-255 image values."""
+
+    sky_top: Color  # color of the sky overhead
+    sky_low: Color  # color of the sky at the horizon
+    ambient: float  # gain of every surface
+    sun: float  # additional gain of a surface that faces the sun
+    to_sun: Color  # unit vector towards the sun: right, up, ahead
+    tint: Color  # gain of each color channel
+    lamps: float  # brightness of the vehicle lamps, 0-1
+    visibility: float  # distance (m) at which haze has removed 63% of the contrast
+    noise: float  # standard deviation of the sensor noise
+    dark: bool = False  # night: only headlights illuminate the road
+
+    @property
+    def haze(self) -> Floats:
+        """Color of the haze."""
+        return np.asarray(self.sky_low, np.float32) * (1.0 if self.dark else 0.92)
+
+    def transmission(self, distance: float) -> float:
+        """Fraction of the contrast that remains at a distance (m)."""
+        return float(np.exp(-max(distance, 0.0) / self.visibility))
+
+    def headlight_gain(self, distance: float) -> float:
+        """Gain of an upright surface at a distance (m): 1 by day, the camera car's headlights at night."""
+        return min(1.0, 0.26 + 0.9 * float(np.exp(-max(distance, 0.0) / 40.0))) if self.dark else 1.0
+
+    def shade(self, color: ArrayLike, distance: float = 0.0) -> Doubles:
+        """Color of a surface in this light, seen through `distance` meters of haze."""
+        gain = (self.ambient + 0.6 * self.sun) * (0.5 if self.dark else 1.0) * self.headlight_gain(distance)
+        clear = self.transmission(distance)
+        return np.asarray(color, np.float64) * (gain * clear) + self.haze * (1 - clear)
+
+
+LIGHTS = ("day", "overcast", "dusk", "night")
+
+
+def make_light(name: str, rain: float, rng: Rng) -> Light:
+    """Return one of `LIGHTS` with a random sun; rain weakens the sun and shortens the visibility."""
+    side = rng.choice([-1.0, 1.0]) * rng.uniform(0.2, 0.9)
+    dusk = name == "dusk"
+    sun = np.array([side, 0.35 if dusk else rng.uniform(0.7, 1.3), rng.uniform(-0.8, 0.3)])
+    right, up, ahead = (sun / np.linalg.norm(sun)).tolist()
+    to_sun = (right, up, ahead)
+    # Every preset draws its values, so that those of one do not depend on which is requested.
+    presets = {
+        "day": Light(
+            (74, 122, 178), (178, 202, 220), rng.uniform(0.56, 0.68), rng.uniform(0.45, 0.6), to_sun,
+            (1.02, 1.0, 0.98), lamps=0.0, visibility=900.0, noise=2.2,
+        ),
+        "overcast": Light(
+            (168, 176, 182), (206, 210, 212), rng.uniform(0.74, 0.86), 0.1, to_sun,
+            (0.98, 1.0, 1.0), lamps=0.1, visibility=500.0, noise=2.6,
+        ),
+        "dusk": Light(
+            (92, 104, 138), (222, 172, 128), rng.uniform(0.5, 0.58), 0.22, to_sun,
+            (1.06, 0.98, 0.92), lamps=0.6, visibility=500.0, noise=3.2,
+        ),
+        "night": Light(
+            (10, 12, 20), (30, 30, 36), 0.8, 0.0, to_sun,
+            (1.0, 0.96, 0.88), lamps=1.0, visibility=400.0, noise=4.0, dark=True,
+        ),
+    }  # fmt: skip
+    light = presets[name]
+    if rain == 0:
+        return light
+    gray = np.array([166.0, 172.0, 176.0]) * (0.16 if light.dark else 0.75 if dusk else 1.0)
+    top, low = (
+        tuple((np.array(sky) * (1 - 0.8 * rain) + gray * 0.8 * rain).tolist())
+        for sky in (light.sky_top, light.sky_low)
+    )
+    return replace(
+        light, sky_top=top, sky_low=low, ambient=light.ambient + 0.25 * light.sun * rain,
+        sun=light.sun * (1 - 0.9 * rain), visibility=light.visibility / (1 + 2 * rain),
+        noise=light.noise + 1.5 * rain,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """What all frames of a scene or drive have in common."""
+
+    shape: tuple[int, int]  # height and width of the frame (px)
+    camera: Camera
+    light: Light
+    rain: float = 0.0  # 0 (dry) to 1 (heavy)
+    jpeg_quality: int | None = None  # None: the images are not compressed
+    margin: int = 0  # rows drawn above and below the frame, for a camera that pitches
+    seed: int = 0
+
+    @property
+    def center_px(self) -> float:
+        """Column of the optical axis, the middle of the frame."""
+        return self.shape[1] / 2
+
+    def project(self, x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Doubles:
+        """Columns and rows ``(..., 2)`` of points `x` m right, `y` m above the road and `z` > 0 m ahead."""
+        right, up, ahead = np.broadcast_arrays(*(np.asarray(value, np.float64) for value in (x, y, z)))
+        camera = self.camera
+        columns = self.center_px + camera.focal_px * right / ahead
+        rows = camera.horizon_px + camera.focal_px * (camera.height_m - up) / ahead
+        return np.stack([columns, rows], axis=-1)
+
+    def pitched(self, offset: int) -> SceneConfig:
+        """Return the configuration with the horizon `offset` rows lower."""
+        return replace(self, camera=replace(self.camera, horizon_px=self.camera.horizon_px + offset))
+
+
+def _tone_curve() -> NDArray[np.uint8]:
+    """Lookup table of an S-shaped tone curve: darker shadows, brighter highlights."""
+    contrast = 1.3
+    power = np.log(0.5) / np.log(0.38)  # 0.38 is mapped to itself
+    bent = (np.arange(256) / 255) ** power
+    curve = bent**contrast / (bent**contrast + (1 - bent) ** contrast)
+    return np.asarray(np.rint(255 * curve ** (1 / power)), np.uint8)
+
+
+_TONE_CURVE = _tone_curve()
+
+
+class Sensor:
+    """Lens blur, vignette, rain and noise; they depend only on the image and the frame number."""
+
+    def __init__(self, config: SceneConfig) -> None:
+        self._config = config
+        rng = np.random.default_rng([config.seed, 1])
+        light, rain = config.light, config.rain
+        height, width = config.shape
+        row = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
+        column = np.linspace(-1, 1, width, dtype=np.float32)[None, :]
+        vignette = (1 - 0.13 * (row**2 + column**2)) * 128
+        # Vignette and tint are one multiplication per frame.
+        gain = vignette[..., None] * np.asarray(light.tint, np.float32)
+        self._gain = np.clip(gain, 0, 255).astype(np.uint8)
+        self._blur = 0.42 * max(1.0, max(config.shape) / 1280) + 0.35 * rain
+        luma = wrapped_noise(rng, (_GRAIN_SIDE, _GRAIN_SIDE), falloff=0.25)
+        chroma = np.tile(rng.standard_normal((_GRAIN_SIDE // 2, _GRAIN_SIDE // 2, 3), np.float32), (2, 2, 1))
+        grain = light.noise * (0.85 * luma[..., None] + 0.35 * cv2.GaussianBlur(chroma, (3, 3), 0.8) * 2)
+        tile = np.clip(np.rint(grain), -127, 127).astype(np.int16)
+        # One tile more than the frame along each axis, so that a random offset is a plain slice.
+        self._grain = tile_to(tile, height + _GRAIN_SIDE, width + _GRAIN_SIDE)
+        self._streaks = self._draw_streaks(rng) if rain > 0 else None
+
+    def _draw_streaks(self, rng: Rng) -> Image:
+        """Rain streaks, ``(2 * H, W)``."""
+        height, width = self._config.shape
+        streaks = np.zeros((height * 2, width), np.uint8)
+        unit = max(height, width) / 1280
+        for _ in range(int(2600 * self._config.rain)):
+            x, y = rng.uniform(0, width), rng.uniform(0, height * 2)
+            length = rng.uniform(5, 20) * unit
+            end = (round(x + 0.16 * length), round(y + length))
+            cv2.line(streaks, (round(x), round(y)), end, rng.uniform(10, 42), 1, cv2.LINE_AA)
+        return np.asarray(cv2.GaussianBlur(streaks, (3, 3), 0.7), np.uint8)
+
+    def expose(self, image: Image, frame: int, *, crop_blur: float | None = None) -> Image:
+        """Turn a drawn image, or with the lens blur of a crop (px) a crop, into what the camera delivers."""
+        rng = np.random.default_rng([self._config.seed, 2, frame])
+        height, width = image.shape[:2]
+        exposed = cv2.GaussianBlur(_develop(image), (0, 0), crop_blur or self._blur)
+        if crop_blur is None:
+            if self._streaks is not None:
+                top = int(rng.integers(height))
+                streaks = np.roll(self._streaks, int(rng.integers(width)), axis=1)[top : top + height]
+                exposed = cv2.add(exposed, cv2.merge([streaks] * 3))
+            exposed = cv2.multiply(exposed, self._gain, scale=1 / 128)
+        top, left = rng.integers(_GRAIN_SIDE, size=2).tolist()
+        grain = self._grain[top : top + height, left : left + width]
+        return np.asarray(cv2.add(exposed, grain, dtype=cv2.CV_8U), np.uint8)
+
+
+def _develop(image: Image) -> Image:
+    """Apply the tone curve and chromatic aberration: red is drawn larger, blue smaller."""
+    channels = list(cv2.split(cv2.LUT(image, _TONE_CURVE)))
+    height, width = image.shape[:2]
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    for channel, grow in ((0, 0.0005), (2, -0.0005)):
+        matrix = np.array([[1 - grow, 0, grow * width / 2], [0, 1 - grow, grow * height / 2]])
+        channels[channel] = cv2.warpAffine(
+            channels[channel], matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
+        )
+    return np.asarray(cv2.merge(channels), np.uint8)

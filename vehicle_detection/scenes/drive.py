@@ -1,0 +1,300 @@
+"""Drives: traffic scenarios, rendered as sequences of road scenes with ground truth."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from vehicle_detection._common import atomic_write, check_choice, check_integer, check_number
+from vehicle_detection.scenes.camera_light import SceneConfig
+from vehicle_detection.scenes.raster import Rng
+from vehicle_detection.scenes.render import VehiclePose, VehicleTruth
+from vehicle_detection.scenes.scene import RandomState, Scene, SceneRenderer, make_config, make_generator
+from vehicle_detection.scenes.scenery import LANE, Road
+from vehicle_detection.scenes.shapes import random_appearance
+from vehicle_detection.scenes.vehicles import VehicleBody
+
+SCENARIOS = (
+    "highway", "overtaking", "crossing", "occlusion", "traffic", "passing", "closing", "cut_in", "empty",
+)  # fmt: skip
+
+# Columns of a labels file; the first nine are those of manual labels.
+LABEL_COLUMNS = (
+    "frame", "track", "x1", "y1", "x2", "y2", "occluded", "truncated", "ignore", "distance_m", "speed_mps",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrafficVehicle:
+    """A vehicle's appearance, and its path relative to the camera as a function of time."""
+
+    track: int  # from 1 on
+    kind: str
+    color: str
+    view: str = "rear"  # the end that the camera sees
+    seed: int = 0
+    start: float  # distance at time 0 (m)
+    speed: float = 0.0  # mean speed away from the camera (m/s)
+    sway: float = 0.0  # amplitude (m), period (s) and phase of an oscillation of the distance
+    period: float = 10.0
+    phase: float = 0.0
+    lane_from: float = 0.0  # lateral position before and after a lane change (m)
+    lane_to: float | None = None
+    change_at: float = 0.0  # middle and duration of the lane change (s)
+    change_for: float = 5.0
+    oncoming: bool = False
+
+    def distance(self, time: float) -> float:
+        """Distance from the camera to the nearer tires (m)."""
+        swing = math.sin(2 * math.pi * time / self.period + self.phase) - math.sin(self.phase)
+        return self.start + self.speed * time + self.sway * swing
+
+    def relative_speed(self, time: float) -> float:
+        """Return the derivative of `distance` (m/s): positive when the vehicle pulls away."""
+        omega = 2 * math.pi / self.period
+        return self.speed + self.sway * omega * math.cos(omega * time + self.phase)
+
+    def lateral(self, time: float) -> float:
+        """Lateral position of its middle (m), positive to the right of the camera."""
+        drift = 0.12 * math.sin(2 * math.pi * time / (0.8 * self.period) + 2 * self.phase)
+        if self.lane_to is None:
+            return self.lane_from + drift
+        t = min(max((time - self.change_at) / self.change_for + 0.5, 0.0), 1.0)
+        return self.lane_from + (self.lane_to - self.lane_from) * t * t * (3 - 2 * t) + drift
+
+
+def make_traffic(scenario: str, duration: float, rng: Rng) -> tuple[Road, list[TrafficVehicle]]:
+    """Return road and vehicles of a scenario that lasts `duration` seconds; its event is in the middle."""
+    road = Road(own=int(rng.integers(3)) if scenario in ("highway", "traffic", "empty") else 1)
+    if scenario == "empty":
+        return road, []
+    if scenario in ("highway", "traffic"):
+        ahead = _vehicles_ahead(road, duration, rng)
+        if scenario == "traffic":
+            return road, ahead
+        return road, ahead + _oncoming_vehicles(road, duration, rng, first_track=len(ahead) + 1)
+    side = 1 if rng.random() < 0.5 else -1
+    if scenario == "passing":
+        slow = _passing_vehicles(side * LANE, -rng.uniform(6.0, 10.0), duration, rng, first_track=1)
+        speed = rng.uniform(6.0, 10.0)
+        return road, slow + _passing_vehicles(-side * LANE, speed, duration, rng, first_track=len(slow) + 1)
+    if scenario == "closing":
+        near = TrafficVehicle(  # nearest after 4 s, at 9 to 18 m
+            track=1, start=rng.uniform(30.0, 36.0), sway=-rng.uniform(9.0, 10.5), period=8.0,
+            phase=-math.pi / 2, **random_appearance(rng),
+        )  # fmt: skip
+        return road, [near]
+    if scenario == "cut_in":
+        near = TrafficVehicle(
+            track=1, start=rng.uniform(14.0, 22.0), speed=rng.uniform(0.0, 0.6), sway=0.3,
+            lane_from=side * LANE, lane_to=0.0, change_at=duration / 2, change_for=rng.uniform(2.5, 4.0),
+            **random_appearance(rng),
+        )  # fmt: skip
+        far = TrafficVehicle(track=2, start=55.0, sway=0.8, lane_from=-side * LANE, **random_appearance(rng))
+        return road, [near, far]
+    if scenario == "overtaking":
+        near = TrafficVehicle(
+            track=1, start=rng.uniform(-3.0, -1.5), lane_from=side * LANE,
+            speed=min(max(45 / max(duration, 1.0), 5.0), 9.0),
+            **random_appearance(rng, ("hatchback", "estate", "sedan", "mpv", "suv")),
+        )  # fmt: skip
+        far = TrafficVehicle(track=2, start=70.0, sway=1.0, lane_from=-side * LANE, **random_appearance(rng))
+        return road, [near, far]
+    cars = ("hatchback", "estate", "sedan")
+    crossing = scenario == "crossing"
+    near_start, far_start, change_for = (20.0, 33.0, 5.0) if crossing else (15.0, 36.0, 6.5)
+    near = TrafficVehicle(
+        track=1, start=near_start, sway=0.6, period=9.0, phase=rng.uniform(0, 6),
+        lane_from=side * LANE, lane_to=-side * LANE, change_at=duration / 2, change_for=change_for,
+        **random_appearance(rng, cars if crossing else ("suv", "mpv", "van")),
+    )  # fmt: skip
+    far = TrafficVehicle(
+        track=2, start=far_start, sway=0.8, period=11.0, phase=rng.uniform(0, 6),
+        **random_appearance(rng, cars),
+    )  # fmt: skip
+    return road, [near, far]
+
+
+def _vehicles_ahead(road: Road, duration: float, rng: Rng) -> list[TrafficVehicle]:
+    """Vehicles in every lane with gaps that their relative motion cannot close."""
+    vehicles: list[TrafficVehicle] = []
+    for lane in range(road.lanes):
+        distance = rng.uniform(20, 30) if lane == road.own else rng.uniform(14, 28)
+        for _ in range(int(rng.integers(1, 3))):
+            vehicle = TrafficVehicle(
+                track=len(vehicles) + 1, start=distance, speed=rng.uniform(-2, 2) / max(duration, 10.0),
+                sway=rng.uniform(0.3, 1.0), period=rng.uniform(7, 14), phase=rng.uniform(0, 6),
+                lane_from=road.lane(lane), **random_appearance(rng),
+            )  # fmt: skip
+            vehicles.append(vehicle)
+            distance += rng.uniform(20, 36)
+    return vehicles
+
+
+def _passing_vehicles(
+    lane: float, speed: float, duration: float, rng: Rng, first_track: int
+) -> list[TrafficVehicle]:
+    """Vehicles of a lane, one after the other, that are beside the camera during the drive."""
+    vehicles: list[TrafficVehicle] = []
+    time = rng.uniform(2.0, 3.0)
+    while time < duration - 2.0:
+        vehicle = TrafficVehicle(
+            track=first_track + len(vehicles), start=-speed * time, speed=speed, lane_from=lane,
+            **random_appearance(rng),
+        )  # fmt: skip
+        vehicles.append(vehicle)
+        time += rng.uniform(2.5, 4.0)
+    return vehicles
+
+
+def _oncoming_vehicles(road: Road, duration: float, rng: Rng, first_track: int) -> list[TrafficVehicle]:
+    """Vehicles behind the barrier, one after the other in two lanes, visible from 220 m on."""
+    vehicles: list[TrafficVehicle] = []
+    visible_from = 220.0
+    speed = -rng.uniform(48, 58)
+    for lane in (-1, -2):
+        time = -visible_from / -speed + rng.uniform(0, 1.5)
+        while time < duration:
+            vehicle = TrafficVehicle(
+                track=first_track + len(vehicles), start=visible_from - speed * time, speed=speed,
+                lane_from=road.lane(lane), view="front", oncoming=True, **random_appearance(rng),
+            )  # fmt: skip
+            vehicles.append(vehicle)
+            time += rng.uniform(1.0, 3.5)
+    return vehicles
+
+
+class Drive:
+    """A drive made by `render_drive`; ``drive[i]`` and iteration render `Scene` objects, and none is kept."""
+
+    def __init__(
+        self, config: SceneConfig, road: Road, traffic: Sequence[TrafficVehicle], *, frames: int, fps: float
+    ) -> None:
+        self.fps, self.shape = fps, config.shape
+        self._frames, self._renderer = frames, SceneRenderer(config, road)
+        self._traffic = [(v, VehicleBody(v.kind, v.color, v.seed, v.view, config.light)) for v in traffic]
+        self._pitch_phases = np.random.default_rng([config.seed, 8]).uniform(0, 2 * np.pi, 3)
+
+    def __repr__(self) -> str:
+        height, width = self.shape[:2]
+        return f"Drive({self._frames} frames of {width}x{height} at {self.fps:g} Hz)"
+
+    def __len__(self) -> int:
+        return self._frames
+
+    def __getitem__(self, index: int) -> Scene:
+        """Render frame `index`; a negative index counts from the end, a slice is an error."""
+        frame = self._check_index(index)
+        return self._renderer.scene(*self._state(frame), frame)
+
+    def _check_index(self, index: int) -> int:
+        return check_integer(index, "frame number", low=-self._frames, high=self._frames - 1) % self._frames
+
+    def __iter__(self) -> Iterator[Scene]:
+        """Render one frame after the other."""
+        return (self[index] for index in range(self._frames))
+
+    @cached_property
+    def truth(self) -> tuple[tuple[VehicleTruth, ...], ...]:
+        """Ground truth of every frame, computed without rendering the images."""
+        return tuple(self.truth_of(frame) for frame in range(self._frames))
+
+    def truth_of(self, index: int) -> tuple[VehicleTruth, ...]:
+        """Ground truth of frame `index`, computed without rendering the image."""
+        return self._renderer.truth(*self._state(self._check_index(index)))
+
+    def _state(self, frame: int) -> tuple[list[VehiclePose], float, int]:
+        """Poses of the vehicles that may be visible, distance traveled (m) and pitch offset (rows)."""
+        time = frame / self.fps
+        poses = [
+            VehiclePose(body, v.track, v.lateral(time), v.distance(time), v.relative_speed(time), v.oncoming)
+            for v, body in self._traffic
+            if -12.0 < v.distance(time) < 230.0
+        ]
+        waves = np.sin(2 * np.pi * frame / self.fps * np.array([1.3, 2.1, 3.7]) + self._pitch_phases)
+        pitch_offset = int(np.rint(self._renderer.config.margin * float(waves @ (0.5, 0.3, 0.2))))
+        return poses, 27.0 * time, pitch_offset  # the speed of the camera is 27 m/s
+
+    def write_labels(self, path: str | os.PathLike[str]) -> None:
+        """Write the ground truth of every frame as CSV; see `write_labels`."""
+        write_labels(path, enumerate(self.truth))
+
+
+def render_drive(
+    *,
+    frames: int = 250,
+    fps: float = 25.0,
+    shape: tuple[int, int] = (720, 1280),
+    scenario: str = "highway",
+    horizon: float = 0.56,
+    camera_height_m: float = 1.3,
+    focal_px: float | None = None,
+    light: str = "day",
+    rain: float = 0.0,
+    pitch_jitter_px: int = 0,
+    jpeg_quality: int | None = None,
+    random_state: RandomState = 0,
+) -> Drive:
+    """Render a drive along a highway at 97 km/h, frame by frame.
+
+    Parameters
+    ----------
+    frames, fps
+        Number of frames, and frames per second.
+    scenario
+        ``"highway"``: vehicles ahead in three lanes, oncoming ones behind a barrier. ``"overtaking"``: a car
+        enters at the left or right edge of the image and pulls away. ``"crossing"``: in the middle of the
+        drive a car crosses two lanes in front of another. ``"occlusion"``: the same, closer and slower, so
+        that the other car is hidden for about a second. ``"traffic"``: vehicles ahead in three lanes, none
+        oncoming. ``"passing"``: vehicles that the camera overtakes in one lane, and that overtake it in
+        another. ``"closing"``: the distance to the vehicle ahead shrinks fast, and grows again.
+        ``"cut_in"``: a car moves into the lane of the camera. ``"empty"``: no vehicles.
+    shape, horizon, camera_height_m, focal_px, light, rain, jpeg_quality, random_state
+        As for `render_scene`.
+    pitch_jitter_px
+        Largest number of rows by which the pitch of the camera moves the horizon up or down.
+
+    Returns
+    -------
+    Drive
+        ``len(drive)``, ``drive[i]`` and iteration; frames are rendered on demand and not kept.
+
+    Raises
+    ------
+    InvalidInputError
+        If an option is out of range.
+
+    Examples
+    --------
+    >>> drive = render_drive(frames=50, shape=(180, 320), scenario="overtaking")
+    >>> len(drive), drive[0].image.shape
+    (50, (180, 320, 3))
+    """
+    rng = make_generator(random_state)
+    frames = check_integer(frames, "frames", low=1)
+    fps = check_number(fps, "fps", low=1.0, high=1000.0)
+    check_choice(scenario, "scenario", SCENARIOS)
+    margin = check_integer(pitch_jitter_px, "pitch_jitter_px", low=0, high=50)
+    config = make_config(shape, horizon, camera_height_m, focal_px, light, rain, jpeg_quality, rng, margin)
+    return Drive(config, *make_traffic(scenario, frames / fps, rng), frames=frames, fps=fps)
+
+
+def write_labels(
+    path: str | os.PathLike[str], frames: Iterable[tuple[int | str, Sequence[VehicleTruth]]]
+) -> None:
+    """Write the ground truth of frames, given by number or file name, as CSV, one row per vehicle."""
+    with atomic_write(path, "path") as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(LABEL_COLUMNS)
+        for frame, rows in frames:
+            for row in rows:
+                writer.writerow(
+                    [frame, row.track, *row.box, row.occluded, f"{row.truncated:.3f}", row.ignore,
+                     f"{row.distance_m:.2f}", f"{row.speed_mps:.2f}"]
+                )  # fmt: skip
