@@ -274,7 +274,7 @@ def test_drawing_as_asked():
     np.testing.assert_array_equal(drawn[:, : frame.shape[1]], plain)
     mosaic = make(diagnostics=True, draw_params=DrawParams(panel="side"))
     assert mosaic.annotate(frame, mosaic.process(frame)).shape == mosaic.annotated_shape(frame.shape)
-    with pytest.raises(InvalidInputError, match="draw_params must be a DrawParams, got 3"):
+    with pytest.raises(InvalidInputError, match="style must be a DrawParams, got 3"):
         make(draw_params=3)
 
 

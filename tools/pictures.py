@@ -23,7 +23,7 @@ from PIL import Image as PillowImage
 import vehicle_detection
 from vehicle_detection import DetectorError, FrameResult, VehicleDetectionError, VehicleDetector, iou_matrix
 from vehicle_detection._common import atomic_write, progress_bar, write_text
-from vehicle_detection.annotator import DrawParams, TrackDrawer
+from vehicle_detection.annotator import Annotator, DrawParams
 from vehicle_detection.camera import Camera
 from vehicle_detection.images import write_image
 from vehicle_detection.scenes import VehicleTruth, render_drive
@@ -105,9 +105,9 @@ def _identity_errors(results: Sequence[FrameResult]) -> list[str]:
 
 def _write_hero(path: Path, images: Sequence[Image], results: Sequence[FrameResult]) -> None:
     """Write the frame at `_HERO_FRAME`, with the trails of the frames before it."""
-    drawer, last = TrackDrawer(DrawParams(panel="corner")), int(_HERO_FRAME * len(images))
+    drawer, last = Annotator(DrawParams(panel="corner")), int(_HERO_FRAME * len(images))
     for image, result in zip(images[: last + 1], results):
-        drawn = drawer.draw(image, result.tracks, time=result.time)
+        drawn = drawer.draw_tracks(image, result.tracks, time=result.time)
     write_image(path, drawn)
 
 
@@ -115,13 +115,14 @@ def _annotate_small(
     images: Sequence[Image], results: Sequence[FrameResult], width: int
 ) -> list[PillowImage.Image]:
     """Downscale frames, then draw tracks and a bird's-eye view beside them, so that text stays readable."""
-    drawer, drawn = TrackDrawer(DrawParams(panel="side")), []
     scale = width / images[0].shape[1]
     size = (width, round(scale * images[0].shape[0]))
+    camera = Camera.for_frame(size[::-1])
+    drawer, drawn = Annotator(DrawParams(panel="side"), camera=camera), []
     for image, result in zip(images, results):
         small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
         tracks = [dataclasses.replace(track, box=track.box * scale) for track in result.tracks]
-        picture = drawer.draw(small, tracks, time=result.time, camera=Camera.for_frame(small.shape))
+        picture = drawer.draw_tracks(small, tracks, time=result.time)
         drawn.append(PillowImage.fromarray(picture))
     return drawn
 

@@ -1,5 +1,6 @@
 from . import course, notebook
 from .annotator import (
+    Annotator,
     DrawParams,
     draw_diagnostics,
     draw_tracks,
@@ -124,6 +125,7 @@ from .windows import search_windows, slide_window
 
 __version__: str
 __all__ = [
+    "Annotator",
     "BatchReport",
     "BatchStatus",
     "Camera",

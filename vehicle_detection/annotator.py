@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
-import itertools
 import math
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Protocol, Self
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from vehicle_detection._common import (
     check_boxes,
     check_choice,
+    check_flags,
     check_image,
     check_type,
     describe,
@@ -27,6 +28,7 @@ from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera, truncated_edges
 from vehicle_detection.drawing import (
     BLACK,
+    BLUR_REGIONS,
     TRACK_COLORS,
     WHITE,
     Color,
@@ -34,6 +36,7 @@ from vehicle_detection.drawing import (
     LabelPlacer,
     LabelRequest,
     Rectangle,
+    blur_boxes,
     cap_height,
     color_index,
     draw_boxes,
@@ -48,9 +51,13 @@ from vehicle_detection.drawing import (
     text_size,
 )
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.tracking import Track
+from vehicle_detection.heatmap import frame_heat
+from vehicle_detection.params import HeatParams
+from vehicle_detection.tracking import FrameResult, Track
 from vehicle_detection.units import UNITS
 
+# Frame rate that is assumed for results without times.
+_USUAL_FPS = 25.0
 _UNKNOWN_COLOR: Color = (160, 160, 160)
 # Distances (m) and their colors; between them, colors are interpolated over the logarithm of the distance.
 _DISTANCES = (10.0, 20.0, 35.0, 60.0)
@@ -58,12 +65,6 @@ _DISTANCE_COLORS = ((213, 94, 0), (230, 159, 0), (240, 228, 66), (86, 180, 233))
 
 LABEL_FIELDS = ("id", "score", "distance", "speed", "std")
 """Fields of a track's label; ``"std"`` adds standard errors to distance and speed."""
-
-COLORINGS = ("id", "distance")
-"""What the color of a track can stand for."""
-
-PANELS = ("none", "corner", "side")
-"""Where the bird's-eye view of a video can be drawn."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,8 +112,8 @@ class DrawParams:
         object.__setattr__(self, "labels", fields)
         if self.line_width is not None:
             store_integer(self, "line_width", low=1, high=1000)
-        check_choice(self.color_by, "color_by", COLORINGS)
-        check_choice(self.panel, "panel", PANELS)
+        check_choice(self.color_by, "color_by", ("id", "distance"))
+        check_choice(self.panel, "panel", ("none", "corner", "side"))
         check_choice(self.units, "units", UNITS)
 
 
@@ -203,15 +204,7 @@ class Trails:
 
 
 class BirdsEyePanel:
-    """Draws a bird's-eye view into a video: in a corner of the frame, or beside it.
-
-    Parameters
-    ----------
-    shape, place
-        ``(height, width, ...)`` of the frames, and where to draw.
-    units
-        Units of the distances, ``"metric"`` or ``"imperial"``.
-    """
+    """Draws a bird's-eye view into frames of ``(height, width, ...)``: in their corner, or beside them."""
 
     def __init__(
         self,
@@ -219,7 +212,7 @@ class BirdsEyePanel:
         place: Literal["corner", "side"],
         units: Literal["metric", "imperial"] = "metric",
     ) -> None:
-        self._shape, self._place = shape[:2], place
+        self.shape, self._place = shape[:2], place
         height, width = self.side_size(shape) if place == "side" else self.corner_size(shape)
         self._width = width
         self._scale = height / (_AHEAD_M + _BEHIND_M)  # pixels per meter
@@ -243,10 +236,6 @@ class BirdsEyePanel:
         """Height and width of a view in the corner of frames of this shape."""
         height = max(32, round(_CORNER_HEIGHT * shape[0]))
         return min(height, shape[0]), min(max(16, round(_ASPECT * height)), shape[1])
-
-    def fits(self, shape: tuple[int, ...]) -> bool:
-        """Whether the view was made for frames of this shape."""
-        return self._shape == shape[:2]
 
     def draw(
         self,
@@ -359,6 +348,151 @@ class BirdsEyePanel:
         return np.array([self._point(*point) for point in points], np.int32)
 
 
+class OwnSpeed(Protocol):
+    """Speed of the camera's own vehicle."""
+
+    def at(self, times: float, /) -> Any:
+        """Speed in m/s at a time of the video in seconds; NaN if unknown."""
+
+
+class Annotator:
+    """Draws everything that an annotated video shows, and remembers what the next frame needs.
+
+    That is the places of the labels and the trails of the bird's-eye view: draw the frames of a video in
+    their order. A frame drawn again is drawn alike; an earlier frame starts anew.
+
+    Parameters
+    ----------
+    style
+        Labels, lines, colors and bird's-eye view.
+    camera
+        The camera, for the bird's-eye view; None: a typical dash-cam.
+    heat
+        How windows become the heat map of `diagnostics`.
+    own_speed
+        Speed of the camera's own vehicle over the time of the video (`read_own_speed`). Where it is known,
+        labels state speeds over ground, without a sign; otherwise speeds relative to the camera.
+    blur
+        Blur the vehicles, ``"vehicles"``, or the region of their license plates, ``"plates"``: of every
+        detection and track of the frame, also of tracks that are not detected or not shown. Vehicles that are
+        not found are not blurred: check the result before you publish it.
+    diagnostics
+        Show the frame, its positive windows, the heat map and the tracks side by side, as `draw_diagnostics`.
+
+    Examples
+    --------
+    >>> annotator = Annotator(DrawParams(panel="side"))
+    >>> annotator.output_shape((720, 1280))
+    (720, 1496, 3)
+    """
+
+    def __init__(
+        self,
+        style: DrawParams | None = None,
+        *,
+        camera: Camera | None = None,
+        heat: HeatParams | None = None,
+        own_speed: OwnSpeed | None = None,
+        blur: Literal["vehicles", "plates"] | None = None,
+        diagnostics: bool = False,
+    ) -> None:
+        for name, value, kind in (("style", style, DrawParams), ("heat", heat, HeatParams)):
+            if value is not None:
+                check_type(value, name, kind, "omit it for the default")
+        if own_speed is not None and not callable(getattr(own_speed, "at", None)):
+            raise InvalidInputError(
+                f"own_speed must have a method at, got {describe(own_speed)}; pass read_own_speed(...)"
+            )
+        if blur is not None:
+            check_choice(blur, "blur", BLUR_REGIONS)
+        check_flags(diagnostics=diagnostics)
+        self.style = style or DrawParams()
+        self.camera, self.heat, self.own_speed = camera, heat, own_speed
+        self.blur, self.diagnostics = blur, diagnostics
+        self.reset()
+
+    def with_defaults(self, *, camera: Camera, heat: HeatParams | None) -> Self:
+        """Return a copy, without memory, that has a camera and heat parameters where this has none."""
+        other = copy.copy(self)
+        other.camera, other.heat = self.camera or camera, self.heat or heat
+        other.reset()
+        return other
+
+    @property
+    def needs_every_frame(self) -> bool:
+        """Whether frames that are not searched lack something to draw: windows, or boxes to blur."""
+        return self.diagnostics or self.blur is not None
+
+    def reset(self, *, fps: float | None = None) -> None:
+        """Forget all frames, before the first frame of another video; `fps` is for results without times."""
+        self._fps = fps or _USUAL_FPS
+        self._placer = LabelPlacer()
+        self._panel: BirdsEyePanel | None = None
+        self._time = -math.inf
+        self._coasting: set[int] = set()  # in the last searched frame
+
+    def output_shape(self, shape: tuple[int, ...]) -> tuple[int, int, int]:
+        """Shape of a picture for frames of ``(height, width, ...)``; a view beside it adds columns."""
+        height, width = shape[:2]
+        beside = self.style.panel == "side" and not self.diagnostics
+        return height, width + (BirdsEyePanel.side_size(shape)[1] if beside else 0), 3
+
+    def draw(self, frame: Image, result: FrameResult) -> Image:
+        """Draw a result on a copy of its ``(H, W, 3)`` uint8 RGB frame."""
+        check_image(frame, "frame")
+        check_type(result, "result", FrameResult, "pass what process or track returns")
+        if self.blur is not None:
+            tracked = np.array([track.box for track in result.tracks]).reshape(-1, 4)
+            frame = blur_boxes(frame, np.concatenate([tracked, result.detections.boxes]), region=self.blur)
+        if self.diagnostics:
+            heat = frame_heat(frame.shape, result.windows, self.heat or HeatParams())
+            return draw_diagnostics(frame, result.windows, heat, result.tracks, params=self.style)
+        time = result.index / self._fps if result.time is None else result.time
+        return self.draw_tracks(frame, result.tracks, time=time, searched=result.searched)
+
+    def draw_tracks(
+        self, image: Image, tracks: Iterable[Track], *, time: float | None = None, searched: bool = True
+    ) -> Image:
+        """Draw the tracks of a frame at `time` seconds on a copy of it; None: it follows no other frame.
+
+        If the frame was not searched, the boxes are dashed that were not detected in the last searched one.
+        """
+        shape, style = check_image(image).shape, self.style
+        shown = sorted((track for track in _check_tracks(tracks) if track.shown), key=lambda track: track.id)
+        own_mps = math.nan if self.own_speed is None or time is None else float(self.own_speed.at(time))
+        if time is None or time < self._time:
+            self.reset(fps=self._fps)
+        self._time = -math.inf if time is None else time
+        coasting = {track.id for track in shown if track.state == "coasting"}
+        if searched:
+            self._coasting = coasting
+        colors = [track_color(track, style.color_by) for track in shown]
+        beside = BirdsEyePanel.side_size(shape)[1] if style.panel == "side" else 0
+        result = np.empty((shape[0], shape[1] + beside, 3), np.uint8)
+        frame = result[:, : shape[1]]
+        frame[:] = image
+        blocked: list[Rectangle] = []
+        if style.panel != "none":
+            if self._panel is None or self._panel.shape != shape[:2]:
+                self._panel = BirdsEyePanel(shape, style.panel, style.units)
+            view = Camera.for_frame(shape) if self.camera is None else self.camera.for_shape(shape)
+            blocked.append(self._panel.draw(result, shown, colors, view, shape, self._time))
+        width = style.line_width or line_width_for(shape)
+        dashed = coasting & self._coasting
+        # Far to near: the boxes of near vehicles cover those behind them.
+        for track, color in sorted(zip(shown, colors), key=lambda pair: float(pair[0].box[3])):
+            draw_outline(frame, round_box(track.box), color, width, dashed=track.id in dashed)
+        speed = own_mps if math.isfinite(own_mps) else None
+        requests = [
+            LabelRequest(
+                track.id, tuple(track_fields(track, style.labels, style.units, speed)), round_box(track.box)
+            )
+            for track in shown
+        ]
+        draw_labels(frame, self._placer.place(requests, shape, blocked), colors, width)
+        return result
+
+
 def draw_tracks(
     image: Image,
     tracks: Iterable[Track],
@@ -367,137 +501,16 @@ def draw_tracks(
     line_width: int | None = None,
     color_by: Literal["id", "distance"] = "id",
 ) -> Image:
-    """Draw tracks on a copy of an image, each with a box and a label, sized to the image.
+    """Draw tracks on a copy of an ``(H, W, 3)`` uint8 RGB image, each with a box and a label.
 
     Only tracks with ``track.shown`` are drawn; those without a detection in this frame have dashed boxes.
     Labels are placed where they hide neither other labels nor other vehicles, if necessary on leader lines or
-    without their last fields.
+    without their last fields. In a video, an `Annotator` also keeps each label in its place.
 
-    Parameters
-    ----------
-    image, tracks
-        ``(H, W, 3)`` uint8 RGB, and what `Tracker.update` returned for it.
-    labels, line_width, color_by
-        Fields of the labels, width of the lines in pixels, and meaning of the colors; see `DrawParams`.
-
-    Returns
-    -------
-    numpy.ndarray
-        A new image of the same shape.
-
-    Raises
-    ------
-    InvalidInputError
-        If the image is malformed, `tracks` holds something else, or an option has an unknown value.
-
-    Notes
-    -----
-    In a video, `VehicleDetector.annotate` also keeps each label in its place from frame to frame. Short lines
-    are wrapped, so that a label is not much wider than its box.
+    `labels`, `line_width` and `color_by` are those of `DrawParams`.
     """
-    params = DrawParams(labels=labels, line_width=line_width, color_by=color_by)
-    return TrackDrawer(params).draw(image, tracks)
-
-
-class TrackDrawer:
-    """Draws the tracks of a video's frames, and remembers the places of the labels and the recent positions.
-
-    Parameters
-    ----------
-    params
-        Labels, lines, colors and bird's-eye view.
-
-    Notes
-    -----
-    The frames of a video are drawn in their order. A frame drawn again is drawn alike; an earlier frame
-    starts anew.
-    """
-
-    def __init__(self, params: DrawParams | None = None) -> None:
-        self.params = params or DrawParams()
-        self.forget()
-
-    def forget(self) -> None:
-        """Forget all frames, before the first frame of another video."""
-        self._placer = LabelPlacer()
-        self._panel: BirdsEyePanel | None = None
-        self._time = -math.inf
-        self._coasting: set[int] = set()  # in the last searched frame
-
-    def output_shape(self, shape: tuple[int, ...]) -> tuple[int, int, int]:
-        """Shape of what `draw` returns for an image of this shape."""
-        height, width = shape[:2]
-        beside = self.params.panel == "side"
-        return height, width + (BirdsEyePanel.side_size(shape)[1] if beside else 0), 3
-
-    def draw(
-        self,
-        image: Image,
-        tracks: Iterable[Track],
-        *,
-        time: float | None = None,
-        searched: bool = True,
-        camera: Camera | None = None,
-        own_mps: float | None = None,
-    ) -> Image:
-        """Draw tracks on a copy of the next frame.
-
-        Parameters
-        ----------
-        image, tracks
-            ``(H, W, 3)`` uint8 RGB, and its tracks.
-        time
-            Time of the frame in seconds; None: the frame follows no other one.
-        searched
-            Whether the frame was searched; in a frame that was not, the boxes are dashed that were not
-            detected in the last searched one.
-        camera
-            The camera, for the bird's-eye view; by default a typical dash-cam.
-        own_mps
-            Speed of the camera's vehicle in m/s: labels then state speeds over ground. None: unknown.
-        """
-        shape = check_image(image).shape
-        shown = sorted((track for track in check_tracks(tracks) if track.shown), key=lambda track: track.id)
-        if time is None or time < self._time:
-            self.forget()
-        self._time = -math.inf if time is None else time
-        coasting = {track.id for track in shown if track.state == "coasting"}
-        if searched:
-            self._coasting = coasting
-        params = self.params
-        colors = [track_color(track, params.color_by) for track in shown]
-        result = self._canvas(image)
-        blocked: list[Rectangle] = []
-        if params.panel != "none":
-            if self._panel is None or not self._panel.fits(shape):
-                self._panel = BirdsEyePanel(shape, params.panel, params.units)
-            view = Camera.for_frame(shape) if camera is None else camera.for_shape(shape)
-            blocked.append(self._panel.draw(result, shown, colors, view, shape, self._time))
-        frame = result[:, : shape[1]]
-        width = params.line_width or line_width_for(shape)
-        dashed = coasting & self._coasting
-        # Far to near: the boxes of near vehicles cover those behind them.
-        for track, color in sorted(zip(shown, colors), key=lambda pair: float(pair[0].box[3])):
-            draw_outline(frame, round_box(track.box), color, width, dashed=track.id in dashed)
-        requests = [
-            LabelRequest(
-                track.id,
-                tuple(track_fields(track, params.labels, params.units, own_mps)),
-                round_box(track.box),
-            )
-            for track in shown
-        ]
-        draw_labels(frame, self._placer.place(requests, shape, blocked), colors, width)
-        return result
-
-    def _canvas(self, image: Image) -> Image:
-        """Copy of an image, with room for a bird's-eye view beside it."""
-        shape = self.output_shape(image.shape)
-        if shape == image.shape:
-            return image.copy()
-        canvas = np.empty(shape, np.uint8)
-        canvas[:, : image.shape[1]] = image
-        return canvas
+    style = DrawParams(labels=labels, line_width=line_width, color_by=color_by)
+    return Annotator(style).draw_tracks(image, tracks)
 
 
 def track_color(track: Track, color_by: Literal["id", "distance"] = "id") -> Color:
@@ -510,16 +523,11 @@ def track_color(track: Track, color_by: Literal["id", "distance"] = "id") -> Col
 def _distance_color(distance_m: float | None) -> Color:
     if distance_m is None:
         return _UNKNOWN_COLOR
-    value = math.log(max(distance_m, _DISTANCES[0]))
-    known = [math.log(distance) for distance in _DISTANCES]
-    for (low, high), (first, second) in zip(
-        itertools.pairwise(known), itertools.pairwise(_DISTANCE_COLORS), strict=True
-    ):
-        if value <= high:
-            share = (value - low) / (high - low)
-            red, green, blue = (round(a + share * (b - a)) for a, b in zip(first, second))
-            return red, green, blue
-    return _DISTANCE_COLORS[-1]
+    position = math.log(max(distance_m, _DISTANCES[0]))
+    red, green, blue = (
+        round(float(np.interp(position, np.log(_DISTANCES), values))) for values in zip(*_DISTANCE_COLORS)
+    )
+    return red, green, blue
 
 
 def track_fields(
@@ -542,7 +550,7 @@ def track_fields(
     return parts
 
 
-def check_tracks(tracks: object) -> list[Track]:
+def _check_tracks(tracks: object) -> list[Track]:
     """Return tracks as a list."""
     listed: list[Any] = list(tracks) if is_listing(tracks) else [None]
     if not all(isinstance(track, Track) for track in listed):
@@ -577,11 +585,6 @@ def draw_diagnostics(
     -------
     numpy.ndarray
         An image of the frame's shape; an odd side ends with a black line.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed, or the frame is smaller than 4x4 pixels.
     """
     if params is not None:
         check_type(params, "params", DrawParams, "omit it for the defaults")
@@ -595,14 +598,14 @@ def draw_diagnostics(
     small = np.asarray(cv2.resize(checked, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
     scale = np.array([width, height, width, height]) / np.array(checked.shape[:2] * 2)[[1, 0, 1, 0]]
     boxes = check_boxes(windows)
-    scaled = [dataclasses.replace(track, box=track.box * scale) for track in check_tracks(tracks)]
+    scaled = [dataclasses.replace(track, box=track.box * scale) for track in _check_tracks(tracks)]
     panels = [
         ("frame", small),
         ("windows", draw_boxes(small, boxes * scale, color=TRACK_COLORS[1], thickness=1)),
         ("heat", np.asarray(cv2.resize(heat_image(heat), (width, height)), np.uint8)),
         (
             "tracks",
-            TrackDrawer(dataclasses.replace(params or DrawParams(), panel="none")).draw(small, scaled),
+            Annotator(dataclasses.replace(params or DrawParams(), panel="none")).draw_tracks(small, scaled),
         ),
     ]
     mosaic = np.zeros(checked.shape, np.uint8)  # not zeros_like: OpenCV needs rows in C order

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from vehicle_detection._common import (
     Closing,
-    check_choice,
-    check_flags,
     check_image,
     check_integer,
     check_number,
@@ -29,11 +27,7 @@ from vehicle_detection._common import (
     describe,
     pluralize,
 )
-from vehicle_detection.annotator import (
-    DrawParams,
-    TrackDrawer,
-    draw_diagnostics,
-)
+from vehicle_detection.annotator import Annotator, DrawParams
 from vehicle_detection.boxes import Detections, ScoreScale
 from vehicle_detection.camera import (
     GIVEN_LENS_STD,
@@ -46,7 +40,6 @@ from vehicle_detection.camera import (
 from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.confidence import Model, with_confidence
 from vehicle_detection.drawing import (
-    BLUR_REGIONS,
     blur_boxes,
     draw_boxes,
 )
@@ -200,13 +193,15 @@ class VehicleDetector(Closing):
             ("search_params", search_params, self.model.search_params_type),
             ("region_params", region_params, (RegionParams, HeatParams)),
             ("track_params", track_params, TrackParams),
-            ("draw_params", draw_params, DrawParams),
             ("camera", camera, (Camera, str, os.PathLike)),
             ("own_speed", own_speed, OwnSpeed),
         ):
             if value is not None:
                 check_type(value, name, kind, "omit it for the default")
-        check_flags(diagnostics=diagnostics)
+        heat = region_params if isinstance(region_params, HeatParams) else None
+        self.annotator = Annotator(
+            draw_params, heat=heat, own_speed=own_speed, blur=blur, diagnostics=diagnostics
+        )
         if conf is not None:
             self.model, region_params = with_confidence(self.model, region_params, conf)
         chosen = search_params or self.model.search_params_type.default()
@@ -215,17 +210,14 @@ class VehicleDetector(Closing):
             region_params = region_params.for_search(self.search_params)
         self.region_params = region_params or RegionParams()
         self.track_params = track_params or TrackParams()
-        self.draw_params = draw_params or DrawParams()
+        self.draw_params = self.annotator.style
         self.camera = camera
         self._lens = _check_lens(camera, field_of_view, camera_height_m)
         self._cameras: dict[tuple[int, int], Camera] = {}
         self._horizon_given = horizon is not None
         self._default_horizon = horizon is None and search_params is None
         self.own_speed = own_speed
-        self.diagnostics = diagnostics
-        if blur is not None:
-            check_choice(blur, "blur", BLUR_REGIONS)
-        self.blur = blur
+        self.diagnostics, self.blur = diagnostics, blur
         self.every = None if every is None else check_integer(every, "every", low=1, high=1000)
         self._search_options = n_jobs, method
         self._search: FrameSearch = self.model.open_search(*self._search_options)
@@ -266,7 +258,7 @@ class VehicleDetector(Closing):
         other = object.__new__(type(self))
         vars(other).update(vars(self))
         other._lock = threading.RLock()
-        for name in ("_tracker", "_heat_history", "_drawer"):
+        for name in ("_tracker", "_heat_history", "annotator"):
             setattr(other, name, copy.deepcopy(getattr(self, name)))
         return other
 
@@ -293,7 +285,7 @@ class VehicleDetector(Closing):
         self._heat_history = HeatHistory((self._heat_params or HeatParams()).frames)
         self._heat: NDArray[np.float32] | None = None
         self._tracker: Tracker | None = None
-        self._drawer = TrackDrawer(self.draw_params)
+        self.annotator.reset(fps=self._fps)
 
     def search(self, frame: NDArray[np.uint8]) -> SearchResult:
         """Search one frame for windows and vehicles; needs no other frame, and is thread-safe.
@@ -652,32 +644,14 @@ class VehicleDetector(Closing):
         InvalidInputError
             If an argument is malformed.
         """
-        check_image(frame, "frame")
-        check_type(result, "result", FrameResult, "pass what process or track returns")
-        if self.blur is not None:
-            tracked = np.array([track.box for track in result.tracks]).reshape(-1, 4)
-            boxes = np.concatenate([tracked, result.detections.boxes])
-            frame = blur_boxes(frame, boxes, region=self.blur)
-        if self.diagnostics:
-            heat = frame_heat(frame.shape, result.windows, self._heat_params or HeatParams())
-            return draw_diagnostics(frame, result.windows, heat, result.tracks, params=self.draw_params)
-        time = result.index / (self._fps or _USUAL_FPS) if result.time is None else result.time
-        own_mps = math.nan if self.own_speed is None else float(self.own_speed.at(time))
-        return self._drawer.draw(
-            frame,
-            result.tracks,
-            time=time,
-            searched=result.searched,
-            camera=self.camera_of(frame.shape[:2]),
-            own_mps=own_mps if math.isfinite(own_mps) else None,
-        )
+        shape = check_image(frame, "frame").shape[:2]
+        self.annotator.camera = self.camera_of(shape)
+        return self.annotator.draw(frame, result)
 
     def annotated_shape(self, shape: tuple[int, ...]) -> tuple[int, int, int]:
         """Shape of what `annotate` returns for a frame of this shape; a view beside it adds columns."""
         height, width = check_shape(shape)
-        if self.diagnostics:
-            return height, width, 3
-        return self._drawer.output_shape(shape)
+        return self.annotator.output_shape((height, width))
 
     def __call__(self, frame: NDArray[np.uint8] | Path) -> NDArray[np.uint8]:
         """Return the next frame annotated.

@@ -1,4 +1,8 @@
-"""Drawing into one image: text, labels, boxes, detections, blurred vehicles, heat maps."""
+"""Drawing into one image: text, labels, boxes, detections, blurred vehicles, heat maps.
+
+The public functions take an ``(H, W, 3)`` uint8 RGB image and return a new one of the same shape; malformed
+arguments raise an `InvalidInputError`. The others draw into the image that they are given.
+"""
 
 from __future__ import annotations
 
@@ -115,7 +119,7 @@ def ink_on(background: Color) -> Color:
 
 def draw_text(image: Image, lines: list[str], x: int, y: int, scale: float, ink: Color) -> None:
     """Write lines of text, with the upper left corner of the block of `text_size` at ``(x, y)``."""
-    thickness, margin, pitch = text_thickness(scale), text_margin(scale), _line_pitch(scale)
+    thickness, margin, pitch = max(1, round(1.8 * scale)), text_margin(scale), _line_pitch(scale)
     for number, line in enumerate(lines):
         baseline = y + margin + cap_height(scale) + number * pitch
         # The font has no plus-minus sign: it is a plus over a line.
@@ -139,11 +143,6 @@ def text_scale(shape: tuple[int, ...]) -> float:
     return min(max(math.sqrt(shape[0] * shape[1]) / 1800, 0.36), 4.0)
 
 
-def text_thickness(scale: float) -> int:
-    """Width of the strokes in pixels."""
-    return max(1, round(1.8 * scale))
-
-
 def text_margin(scale: float) -> int:
     """Space around a block of text in pixels."""
     return max(2, round(7 * scale))
@@ -162,7 +161,7 @@ def _line_pitch(scale: float) -> int:
 def _line_width(line: str, scale: float) -> int:
     if not line:
         return 0
-    (width, _), _ = cv2.getTextSize(line.replace("±", "+"), _FONT, scale, text_thickness(scale))
+    (width, _), _ = cv2.getTextSize(line.replace("±", "+"), _FONT, scale, max(1, round(1.8 * scale)))
     return int(width)
 
 
@@ -362,12 +361,11 @@ def _leader(box: Rectangle, label: Rectangle) -> tuple[tuple[int, int], tuple[in
 
 
 def _hidden_area(label: Rectangle, obstacles: Sequence[Rectangle]) -> int:
-    areas = (
-        max(min(label[2], other[2]) - max(label[0], other[0]), 0)
-        * max(min(label[3], other[3]) - max(label[1], other[1]), 0)
+    overlaps = (
+        (min(label[2], other[2]) - max(label[0], other[0]), min(label[3], other[3]) - max(label[1], other[1]))
         for other in obstacles
     )
-    return sum(areas)
+    return sum(max(width, 0) * max(height, 0) for width, height in overlaps)
 
 
 def _intersect(first: Rectangle, second: Rectangle, space: int = 0) -> bool:
@@ -394,23 +392,11 @@ def draw_boxes(
 
     Parameters
     ----------
-    image
-        ``(H, W, 3)`` uint8 RGB.
     boxes
         ``(N, 4)`` boxes ``[x1, y1, x2, y2]``, or a list of ``((x1, y1), (x2, y2))`` as in the course; parts
         outside the image are clipped.
     color, thickness
         RGB, 0-255 each, and width in pixels of the lines, which lie inside the box.
-
-    Returns
-    -------
-    numpy.ndarray
-        A new image of the same shape.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed.
 
     Examples
     --------
@@ -446,20 +432,8 @@ def draw_labeled_bboxes(image: Image, labels: tuple[NDArray[Any], int]) -> Image
 
     Parameters
     ----------
-    image
-        ``(H, W, 3)`` uint8 RGB.
     labels
         The label array ``(H, W)`` and the number of regions, as ``scipy.ndimage.label`` returns them.
-
-    Returns
-    -------
-    numpy.ndarray
-        A new image of the same shape.
-
-    Raises
-    ------
-    InvalidInputError
-        If `labels` is not such a pair, or its array does not have the image's height and width.
 
     Examples
     --------
@@ -502,22 +476,10 @@ def draw_detections(
 
     Parameters
     ----------
-    image, detections
-        ``(H, W, 3)`` uint8 RGB, and its boxes with scores.
     color, line_width
         RGB, 0-255 each, and width of the lines in pixels; None: chosen for the size of the image.
     scores
         Whether to write them, where they hide neither other boxes nor each other.
-
-    Returns
-    -------
-    numpy.ndarray
-        A new image of the same shape.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed.
 
     Examples
     --------
@@ -548,14 +510,14 @@ def draw_texts(image: Image, boxes: Floats, texts: Sequence[str], color: Color, 
     draw_labels(image, placed, [color] * len(placed), width)
 
 
-BLUR_REGIONS = ("vehicles", "plates")
-"""What `blur_boxes` can blur."""
-
 # Margin around a box, as a fraction of its sides: boxes and predictions have errors.
 _MARGIN = 0.08
 # Cells that remain across the longer side of a vehicle and of a plate's region: a plate is 1/4 of a vehicle
 # wide, and has at most two cells.
 _CELLS = {"vehicles": 8, "plates": 6}
+BLUR_REGIONS = tuple(_CELLS)
+"""What `blur_boxes` can blur."""
+
 # Region of the plate in the box of a vehicle seen from behind or in front, as fractions of its sides. Wider
 # boxes show the side too, so that the plate may be at either end.
 _PLATE_ROWS, _PLATE_COLUMNS, _SIDE_ASPECT = (0.4, 1.0), (0.12, 0.88), 1.5
@@ -570,23 +532,11 @@ def blur_boxes(
 
     Parameters
     ----------
-    image
-        ``(H, W, 3)`` uint8 RGB.
     boxes
         ``(N, 4)`` boxes ``[x1, y1, x2, y2]`` of vehicles; parts outside the image are clipped.
     region
         ``"vehicles"``: the whole boxes and a margin of 8%. ``"plates"``: the lower part of each box, where a
         plate is; it is not searched for.
-
-    Returns
-    -------
-    numpy.ndarray
-        A new image of the same shape.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed.
 
     Examples
     --------

@@ -7,9 +7,9 @@ import pytest
 
 from tests.drawing.cases import blank, changed_box, track
 from vehicle_detection.annotator import (
+    Annotator,
     BirdsEyePanel,
     DrawParams,
-    TrackDrawer,
     Trails,
     road_position,
 )
@@ -19,6 +19,7 @@ from vehicle_detection.scenes import SceneVehicle, render_scene
 
 SHAPE = (720, 1280, 3)
 CAMERA = Camera(focal_px=1000.0, horizon_px=400.0)
+SIDE = DrawParams(panel="side", labels=())
 
 
 class TestPosition:
@@ -74,17 +75,17 @@ class TestPanel:
         "shape", [(720, 1280, 3), (1080, 1919, 3), (1920, 1080, 3), (270, 480, 3), (4, 5, 3)]
     )
     def test_beside_the_frame(self, shape):
-        drawer, image = TrackDrawer(DrawParams(panel="side")), blank(*shape[:2])
-        drawn = drawer.draw(image, [track()], camera=CAMERA)
+        drawer, image = Annotator(DrawParams(panel="side"), camera=CAMERA), blank(*shape[:2])
+        drawn = drawer.draw_tracks(image, [track()])
         assert drawn.shape == drawer.output_shape(shape)
         assert drawn.shape[0] == shape[0]
         assert drawn.shape[1] % 2 == 0
-        plain = TrackDrawer().draw(image, [track()])
+        plain = Annotator().draw_tracks(image, [track()])
         np.testing.assert_array_equal(drawn[:, : shape[1]], plain)
-        assert TrackDrawer().output_shape(shape) == shape
+        assert Annotator().output_shape(shape) == shape
 
     def test_in_the_corner(self):
-        drawn = TrackDrawer(DrawParams(panel="corner", labels=())).draw(blank(), [], camera=CAMERA)
+        drawn = Annotator(DrawParams(panel="corner", labels=()), camera=CAMERA).draw_tracks(blank(), [])
         left, top, right, bottom = changed_box(drawn, blank())
         assert (top, right) == (0, 1280)
         assert (bottom, right - left) == BirdsEyePanel.corner_size(SHAPE)
@@ -92,7 +93,7 @@ class TestPanel:
 
     def test_distances_in_feet(self):
         """Lines at 75, 150 and 225 ft instead of 20, 40 and 60 m."""
-        drawn = TrackDrawer(DrawParams(panel="side", labels=(), units="imperial")).draw(blank(), [])
+        drawn = Annotator(DrawParams(panel="side", labels=(), units="imperial")).draw_tracks(blank(), [])
         lines = [round((80 - feet * 0.3048) * 720 / 86) for feet in (75, 150, 225)]
         rows = (drawn[:, -4:] == drawn[lines[0], -4:]).all(axis=(1, 2))
         assert np.flatnonzero(rows).tolist() == sorted(lines)
@@ -102,7 +103,7 @@ class TestPanel:
         left = 1280 - width
         near_corner = track((left - 40, 320, left + 60, 400))
         drawn, empty = (
-            TrackDrawer(DrawParams(panel="corner")).draw(blank(), tracks, camera=CAMERA)
+            Annotator(DrawParams(panel="corner"), camera=CAMERA).draw_tracks(blank(), tracks)
             for tracks in ([near_corner], [])
         )
         changed = (drawn != empty).any(axis=2)
@@ -115,15 +116,15 @@ class TestPanel:
         boxes = {79.0: (600, 400, 680, 470), 20.0: (1000, 400, 1080, 470), 21.0: (200, 400, 280, 470)}
         for distance, box in boxes.items():
             tracks = [track(box, id=8, distance_m=distance, **options)]
-            drawn = TrackDrawer(DrawParams(panel="side", labels=())).draw(blank(), tracks, camera=CAMERA)
-            empty = TrackDrawer(DrawParams(panel="side", labels=())).draw(blank(), [], camera=CAMERA)
+            drawn = Annotator(SIDE, camera=CAMERA).draw_tracks(blank(), tracks)
+            empty = Annotator(SIDE, camera=CAMERA).draw_tracks(blank(), [])
             white = ((drawn == 235).all(axis=2) & (empty != 235).any(axis=2))[:, 1280:]
             rows, columns = np.nonzero(white)
             assert np.ptp(rows) >= 8
             assert np.ptp(columns) >= 4
         image = blank(240, 320)
         small = [
-            TrackDrawer(DrawParams(panel="corner", labels=())).draw(image, each) for each in (tracks, [])
+            Annotator(DrawParams(panel="corner", labels=())).draw_tracks(image, each) for each in (tracks, [])
         ]
         assert ((small[0] == 235).all(axis=2) & (small[1] != 235).any(axis=2)).sum() == 0
 
@@ -131,7 +132,7 @@ class TestPanel:
         widths = []
         for height in (720, 2160):
             image = blank(height, height)
-            drawn = TrackDrawer(DrawParams(panel="side", labels=())).draw(image, [], camera=CAMERA)
+            drawn = Annotator(SIDE, camera=CAMERA).draw_tracks(image, [])
             widths.append((drawn[height // 2, height:] == (72, 78, 86)).all(axis=1).sum())
         assert widths[1] >= 3 * widths[0]
 
@@ -140,7 +141,7 @@ class TestPanel:
         rows = []
         for distance in (10.0, 30.0, 60.0):
             ahead = track((600, 400, 680, 470), distance_m=distance, distance_std_m=0.1, speed_mps=None)
-            drawn = TrackDrawer(DrawParams(panel="side", labels=())).draw(blank(), [ahead], camera=CAMERA)
+            drawn = Annotator(SIDE, camera=CAMERA).draw_tracks(blank(), [ahead])
             y, x = np.nonzero((drawn[:, 1280:] == TRACK_COLORS[0]).all(axis=2))
             assert abs(x.mean() - (drawn.shape[1] - 1280) / 2) < 3
             rows.append(y.max())
@@ -148,21 +149,21 @@ class TestPanel:
         np.testing.assert_allclose(np.diff(rows), [-20 * scale, -30 * scale], atol=2)
 
     def test_unknown_and_far_vehicles_are_left_out(self):
-        empty = TrackDrawer(DrawParams(panel="corner")).draw(blank(), [], camera=CAMERA)
+        empty = Annotator(DrawParams(panel="corner"), camera=CAMERA).draw_tracks(blank(), [])
         for known in (track(distance_m=None, distance_std_m=None), track(distance_m=90.0)):
-            drawn = TrackDrawer(DrawParams(panel="corner")).draw(blank(), [known], camera=CAMERA)
+            drawn = Annotator(DrawParams(panel="corner"), camera=CAMERA).draw_tracks(blank(), [known])
             np.testing.assert_array_equal(drawn[:300, 1150:], empty[:300, 1150:])
 
     def test_a_coasting_vehicle_is_hollow(self):
         sums = []
         for state in ("confirmed", "coasting"):
             ahead = track((600, 400, 680, 470), distance_std_m=0.1, speed_mps=None, state=state)
-            drawn = TrackDrawer(DrawParams(panel="side", labels=())).draw(blank(), [ahead], camera=CAMERA)
+            drawn = Annotator(SIDE, camera=CAMERA).draw_tracks(blank(), [ahead])
             sums.append((drawn[:, 1280:] == TRACK_COLORS[0]).all(axis=2).sum())
         assert sums[1] < 0.6 * sums[0]
 
     def test_another_frame_size_gets_another_panel(self):
-        drawer = TrackDrawer(DrawParams(panel="corner"))
-        drawer.draw(blank(), [track()], time=0.0)
-        small = drawer.draw(blank(360, 640), [], time=1.0)
+        drawer = Annotator(DrawParams(panel="corner"))
+        drawer.draw_tracks(blank(), [track()], time=0.0)
+        small = drawer.draw_tracks(blank(360, 640), [], time=1.0)
         assert changed_box(small, blank(360, 640))[3] == BirdsEyePanel.corner_size((360, 640))[0]

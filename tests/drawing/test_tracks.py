@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from tests.drawing.cases import blank, changed_box, track
 from vehicle_detection.annotator import (
     LABEL_FIELDS,
+    Annotator,
     DrawParams,
-    TrackDrawer,
     draw_tracks,
     track_color,
     track_fields,
@@ -238,29 +238,31 @@ class TestDrawer:
 
     def test_a_frame_drawn_again_is_drawn_alike(self):
         for panel in ("none", "corner", "side"):
-            drawer = TrackDrawer(DrawParams(panel=panel))
-            drawer.draw(blank(), [track((580, 400, 680, 490), distance_m=30.0)], time=0.0)
-            first, again = (drawer.draw(blank(), [track()], time=0.04) for _ in range(2))
+            drawer = Annotator(DrawParams(panel=panel))
+            drawer.draw_tracks(blank(), [track((580, 400, 680, 490), distance_m=30.0)], time=0.0)
+            first, again = (drawer.draw_tracks(blank(), [track()], time=0.04) for _ in range(2))
             np.testing.assert_array_equal(first, again)
 
     def test_the_first_frame_is_that_of_draw_tracks(self):
         tracks = [track(), track((650, 380, 750, 470), id=2, state="coasting")]
         np.testing.assert_array_equal(
-            TrackDrawer().draw(blank(), tracks, time=3.0), draw_tracks(blank(), tracks)
+            Annotator().draw_tracks(blank(), tracks, time=3.0), draw_tracks(blank(), tracks)
         )
 
     def test_an_earlier_frame_starts_anew(self):
-        drawer = TrackDrawer(DrawParams(panel="corner"))
-        first = drawer.draw(blank(), [track()], time=1.0)
+        drawer = Annotator(DrawParams(panel="corner"))
+        first = drawer.draw_tracks(blank(), [track()], time=1.0)
         for time in (1.1, 1.3, 1.6):
-            drawer.draw(blank(), [track(distance_m=23.6 + 10 * time)], time=time)
-        np.testing.assert_array_equal(drawer.draw(blank(), [track()], time=1.0), first)
+            drawer.draw_tracks(blank(), [track(distance_m=23.6 + 10 * time)], time=time)
+        np.testing.assert_array_equal(drawer.draw_tracks(blank(), [track()], time=1.0), first)
 
     def test_frames_between_two_searches_are_dashed_like_the_last_searched_one(self):
         """A predicted box of a vehicle that the last search has found is not dashed."""
         solid, dashed = (draw_tracks(blank(), [track(state=state)]) for state in ("confirmed", "coasting"))
-        drawer = TrackDrawer()
+        drawer = Annotator()
         for state, expected in (("confirmed", solid), ("coasting", dashed)):
-            np.testing.assert_array_equal(drawer.draw(blank(), [track(state=state)], time=0.0), expected)
-            between = drawer.draw(blank(), [track(state="coasting")], time=0.0, searched=False)
+            np.testing.assert_array_equal(
+                drawer.draw_tracks(blank(), [track(state=state)], time=0.0), expected
+            )
+            between = drawer.draw_tracks(blank(), [track(state="coasting")], time=0.0, searched=False)
             np.testing.assert_array_equal(between, expected)
