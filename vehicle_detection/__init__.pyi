@@ -97,6 +97,7 @@ from .report import ReportWriter
 from .scenes import render_drive, render_patches, render_scene
 from .search import SearchResult, find_cars
 from .stream import TrackedFrame, track
+from .tables import TrackTable
 from .tracking import FrameResult, Track, Tracker
 from .training import FrameDataset, TrainingReport, train_and_evaluate
 from .tuning import (
@@ -168,6 +169,7 @@ __all__ = [
     "TrackLog",
     "TrackParams",
     "TrackScores",
+    "TrackTable",
     "TrackWriter",
     "TrackedFrame",
     "Tracker",

@@ -1,0 +1,665 @@
+"""`TrackTable`: the rows of tracks, detections or labels of several frames, as columns."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import PurePosixPath
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vehicle_detection._common import (
+    Floats,
+    check_array,
+    check_boxes,
+    check_integer,
+    check_number,
+    check_sequence,
+    check_type,
+    describe,
+    is_listing,
+    natural_key,
+    pluralize,
+    shorten,
+)
+from vehicle_detection.boxes import Detections
+from vehicle_detection.datasets import is_image
+from vehicle_detection.errors import DatasetError, InvalidInputError
+
+if TYPE_CHECKING:
+    import pandas
+
+FrameKey = int | str
+
+NO_TRACK = -1
+"""Track of a box without identity. A row with `ignore` and this track is a region, not a vehicle."""
+
+CORNERS = ("x1", "y1", "x2", "y2")
+BOX_COLUMNS = ("frame", "track_id", *CORNERS, "score")
+TRACK_COLUMNS = (*BOX_COLUMNS, "distance_m", "speed_mps", "confidence", "distance_std_m", "speed_std_mps")
+"""Columns of a table of tracks, in the order of the files."""
+LABEL_COLUMNS = ("occluded", "truncated", "ignore")
+
+VEHICLE_CLASSES = ("car", "van", "truck", "bus", "vehicle")
+LOOKALIKE_CLASSES = ("tram", "train", "misc", "trailer", "caravan", "autorickshaw", "vehicle fallback")
+"""Classes whose boxes are vehicles by default, and classes whose labels are ignored."""
+_CLASS_COLUMNS = ("class", "label", "category")
+
+FRAME_NUMBER = re.compile(r"-?(0|[1-9][0-9]*)(\.0*)?")
+"""Text of a frame that is a number. One with leading zeros is a file name."""
+_FLAGS = {"false": False, "true": True, "0": False, "1": True, "0.0": False, "1.0": True}
+# Distances and speeds beyond this are unknown.
+_ABSURD = 1e9
+_MAX_ID = 2**62
+
+
+class _Column(NamedTuple):
+    """A column: the value of a row without one, whose type is that of the column, and its range."""
+
+    missing: float
+    low: float = -math.inf
+    high: float = math.inf
+    expected: str = "a finite number"
+
+
+_COLUMNS = {
+    "track_id": _Column(NO_TRACK, NO_TRACK, expected="a number from 0, or -1 for none"),
+    "score": _Column(math.nan),
+    "distance_m": _Column(math.nan),
+    "speed_mps": _Column(math.nan),
+    "confidence": _Column(math.nan, 0, 1, "a probability from 0 to 1"),
+    "distance_std_m": _Column(math.nan, 0, expected="at least 0"),
+    "speed_std_mps": _Column(math.nan, 0, expected="at least 0"),
+    "time_since_update": _Column(math.nan, 0, expected="at least 0"),
+    "occluded": _Column(0, 0, expected="0 (visible), 1 (partly) or 2 (largely hidden)"),
+    "truncated": _Column(0.0, 0, 1, "a fraction from 0 to 1"),
+    "ignore": _Column(False),
+}
+"""All columns except ``frame`` and the corners of the boxes."""
+
+# What is taken from a `Track` when a frame is appended.
+_APPENDED = (*TRACK_COLUMNS[len(BOX_COLUMNS) - 1 :], "time_since_update")
+
+
+class TrackTable:
+    """Boxes of several frames, one row each: tracks, detections or labels.
+
+    ``table["score"]`` is a column, named as in the files; ``table[rows]`` selects rows by an index, a slice,
+    a mask or a list. Iterating yields the key and the table of each frame. A table of a video grows by
+    `append`; other tables are complete and checked when they are built.
+
+    Parameters
+    ----------
+    frame
+        Frame key of each row: all int (counted from 0) or all str (the image's file name).
+    track_id
+        ``(N,)`` numbers of the vehicles within the video, -1 for none; None if no box has one.
+    boxes
+        ``(N, 4)`` ``[x1, y1, x2, y2]`` in half-open pixels.
+    frame_keys
+        All frames in order, including those without a box; the frames of the rows are added.
+    **columns
+        Other columns, ``(N,)`` or None: ``score``, ``confidence``, ``distance_m``, ``distance_std_m``,
+        ``speed_mps`` and ``speed_std_mps`` of tracks and detections, NaN where a value is unknown; and
+        ``occluded`` (0 visible, 1 partly, 2 largely hidden), ``truncated`` (fraction outside the image) and
+        ``ignore`` (not scored; with track -1 a region) of labels. A table without ``score`` holds labels.
+
+    Attributes
+    ----------
+    first_time
+        Time of the first appended frame in the source, in seconds; None if unknown.
+
+    Raises
+    ------
+    InvalidInputError
+        If columns differ in length or hold invalid values, or a track occurs twice in a frame.
+
+    Examples
+    --------
+    >>> labels = TrackTable([0, 0, 2], [1, 2, 1], [[0, 0, 50, 40], [90, 0, 140, 40], [5, 0, 55, 40]])
+    >>> labels, labels.frame_keys, labels.frame(2).boxes
+    (TrackTable(3 boxes in 2 frames), (0, 2), array([[ 5.,  0., 55., 40.]]))
+    >>> labels["track_id"]
+    array([1, 2, 1])
+    """
+
+    def __init__(
+        self,
+        frame: Iterable[FrameKey] = (),
+        track_id: ArrayLike | None = None,
+        boxes: Detections | ArrayLike = (),
+        *,
+        frame_keys: Iterable[FrameKey] = (),
+        **columns: ArrayLike | None,
+    ) -> None:
+        unknown = next((name for name in columns if name not in _COLUMNS), None)
+        if unknown is not None:
+            raise InvalidInputError(f"column must be one of {', '.join(_COLUMNS)}; got {unknown!r}")
+        frames, corners = check_keys(frame, "frame"), check_boxes(boxes).astype(np.float64)
+        count = len(corners)
+        if len(frames) != count:
+            raise InvalidInputError(f"frame must be one key for each of the {count} boxes, got {len(frames)}")
+        columns = {"track_id": track_id, **columns}
+        if columns.get("score") is None:
+            columns |= {name: columns.get(name) for name in LABEL_COLUMNS}
+        given = {
+            name: _check_column(values, name, count)
+            for name, values in columns.items()
+            if values is not None or name in ("track_id", *LABEL_COLUMNS)
+        }
+        if not np.isfinite(given.get("score", 0)).all():
+            raise InvalidInputError("score must be finite, got NaN or infinity; drop those rows")
+        for (key, track), times in Counter(zip(frames, given["track_id"].tolist())).items():
+            if track != NO_TRACK and times > 1:
+                raise InvalidInputError(
+                    f"frame {key!r} holds track {track} twice; give each vehicle its own number"
+                )
+        keys = set(check_keys((*check_keys(frame_keys, "frame_keys"), *frames), "frame_keys"))
+        self._set({"frame": _key_array(frames), "boxes": corners, **given}, sorted(keys, key=frame_order))
+
+    def _set(self, columns: dict[str, NDArray[Any]], keys: Sequence[FrameKey]) -> Self:
+        # Columns of an appended table have room for more rows than `_size`.
+        self._columns, self._size = columns, len(columns["boxes"])
+        self._keys: list[FrameKey] = list(keys)
+        self._times: dict[int, float] = {}  # of appended frames with a known time
+        self._rows: dict[FrameKey, NDArray[np.intp]] | None = None
+        self._growing = not self._keys
+        self.first_time: float | None = None
+        return self
+
+    def _take(self, rows: NDArray[np.intp], keys: Sequence[FrameKey]) -> TrackTable:
+        taken = {name: column[: self._size][rows] for name, column in self._columns.items()}
+        table = TrackTable.__new__(TrackTable)._set(taken, keys)
+        table._times, table.first_time = self._times, self.first_time
+        return table
+
+    @classmethod
+    def from_detections(cls, detections: Mapping[FrameKey, Detections]) -> TrackTable:
+        """Collect the detections of each frame; frames without any still count as frames.
+
+        Raises
+        ------
+        InvalidInputError
+            If `detections` is not a dictionary of `Detections` by frame.
+        """
+        check_type(detections, "detections", Mapping, "pass dict(enumerate(detections)) for a list")
+        for key, found in detections.items():
+            check_type(found, f"detections[{key!r}]", Detections, "pass Detections(boxes, scores)")
+        parts = [Detections.empty(), *detections.values()]
+        confidences = [
+            np.full(len(found), np.nan) if found.confidences is None else found.confidences for found in parts
+        ]
+        return cls(
+            [key for key, found in detections.items() for _ in range(len(found))],
+            None,
+            np.concatenate([found.boxes for found in parts]),
+            score=np.concatenate([found.scores for found in parts]),
+            confidence=np.concatenate(confidences),
+            frame_keys=tuple(detections),
+        )
+
+    @classmethod
+    def from_results(cls, results: Iterable[Any]) -> TrackTable:
+        """Collect the tracks that a detector shows from the :class:`FrameResult` of each frame.
+
+        They are what `read_labels` reads from the CSV file that `write_tracks` writes, without its rounding.
+        Frames without a track still count as frames.
+        """
+        if isinstance(results, Mapping) or not is_listing(results):
+            raise InvalidInputError(f"results must be a list of FrameResult, got {describe(results)}")
+        table = cls()
+        for result in results:
+            if not is_result(result):
+                raise InvalidInputError(
+                    f"results must be FrameResult objects, got {describe(result)}; "
+                    "read a file with read_labels"
+                )
+            table.append(result)
+        return table
+
+    @classmethod
+    def from_pandas(cls, table: pandas.DataFrame, *, classes: Collection[str] | None = None) -> TrackTable:
+        """Take the boxes of a table with the columns of `to_pandas`; only frame and corners are required.
+
+        So ``pandas.read_csv`` of a file that `write_tracks` wrote is such a table. A missing track is -1, and
+        missing occlusion, truncation and `ignore` are 0. As in `read_labels`, a column ``class``, ``label``
+        or ``category`` of names selects vehicles: those of `classes`, or car, van, truck, bus and vehicle.
+
+        Raises
+        ------
+        InvalidInputError
+            If a column is missing or holds something else, or no class is that of vehicles.
+        """
+        given: object = table
+        if not hasattr(given, "iloc") or not hasattr(given, "columns"):
+            remedy = "; convert it with table.to_pandas()" if hasattr(given, "to_pandas") else ""
+            raise InvalidInputError(
+                f"table must be a pandas.DataFrame with the columns frame, {', '.join(CORNERS)}; "
+                f"got {describe(given)}{remedy}"
+            )
+        names = list(table.columns)
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise InvalidInputError(f"table must have each column once; got {twice} more than once")
+        cells = {
+            name: [None if gone else value for value, gone in zip(table[name].tolist(), table[name].isna())]
+            for name in names
+        }
+        places = [f"table row {row}" for row in range(len(table))]
+        return cls(**parse_cells(cells, "table", places, classes=classes, error=InvalidInputError)[0])
+
+    def append(self, frame: Any, time: float | None = None, tracks: Iterable[Any] = ()) -> None:
+        """Add the shown tracks of the next frame.
+
+        Parameters
+        ----------
+        frame
+            :class:`FrameResult` of the frame, or its number, counted from 0; numbers ascend, and those of
+            frames that a live source dropped are left out.
+        time
+            Time of the frame in the source in seconds; None if unknown.
+        tracks
+            `Track` objects; those that are not shown are skipped.
+
+        Raises
+        ------
+        InvalidInputError
+            If a frame is repeated, two tracks have the same id, or an argument is malformed.
+        """
+        if is_result(frame):
+            frame, time, tracks = frame.index, getattr(frame, "time", None), frame.tracks
+        check_integer(frame, "frame", low=0)
+        if not self._growing:
+            raise InvalidInputError("append needs a table that was empty at first; start with TrackTable()")
+        first = int(self._keys[-1]) + 1 if self._keys else 0
+        if frame < first:
+            raise InvalidInputError(
+                f"frame must be at least {first}, as frames are added in order; got {frame}; "
+                "use a new TrackTable for another video"
+            )
+        if time is not None:
+            time = check_number(time, "time", low=-1e12, high=1e12)
+        shown = shown_tracks(tracks)
+        self._reserve(self._size + len(shown))
+        new = slice(self._size, self._size + len(shown))
+        self._columns["frame"][new] = frame
+        self._columns["track_id"][new] = [track.id for track in shown]
+        if shown:
+            self._columns["boxes"][new] = [track.box for track in shown]
+            for name in _APPENDED:
+                # None becomes NaN.
+                values = np.array([getattr(track, name, None) for track in shown], np.float64)
+                self._columns[name][new] = np.where(np.abs(values) < _ABSURD, values, np.nan)
+        self._size += len(shown)
+        if not self._keys:
+            self.first_time = time
+        if time is not None:
+            self._times[int(frame)] = time
+        self._keys.append(int(frame))
+        self._rows = None
+
+    def _reserve(self, size: int) -> None:
+        """Make room for `size` rows; columns double, so that appending takes constant time on average."""
+        if not self._keys:
+            self._columns |= {name: np.empty(0) for name in _APPENDED}
+            for name in LABEL_COLUMNS:
+                self._columns.pop(name, None)
+        if size > len(self._columns["boxes"]):
+            for name, column in self._columns.items():
+                grown = np.empty((max(2 * size, 64), *column.shape[1:]), column.dtype)
+                grown[: self._size] = column[: self._size]
+                self._columns[name] = grown
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __repr__(self) -> str:
+        boxes, frames = pluralize(len(self), "box", "es"), pluralize(len(self._keys), "frame")
+        return f"TrackTable({boxes} in {frames})"
+
+    def _repr_html_(self) -> str:
+        return f"<p>{self!r}</p>{self.to_pandas().to_html(max_rows=20)}"
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns that the table has, in the order of the files."""
+        names = [name for name in (*TRACK_COLUMNS[6:], *LABEL_COLUMNS) if name in self._columns]
+        return ("frame", "track_id", *CORNERS, *names)
+
+    @property
+    def boxes(self) -> Floats:
+        """``(N, 4)`` boxes ``[x1, y1, x2, y2]``."""
+        return self._columns["boxes"][: self._size]
+
+    @property
+    def frame_keys(self) -> tuple[FrameKey, ...]:
+        """All frames in order, including those without a box."""
+        return tuple(self._keys)
+
+    @overload
+    def __getitem__(self, rows: str) -> NDArray[Any]: ...
+    @overload
+    def __getitem__(self, rows: int | slice | NDArray[Any] | list[int]) -> TrackTable: ...
+    def __getitem__(self, rows: str | int | slice | NDArray[Any] | list[int]) -> NDArray[Any] | TrackTable:
+        if not isinstance(rows, str):
+            taken = [rows] if isinstance(rows, (int, np.integer)) else rows
+            return self._take(np.arange(len(self))[taken], self._keys)
+        if rows in CORNERS:
+            return self.boxes[:, CORNERS.index(rows)]
+        if rows in self._columns:
+            return self._columns[rows][: self._size]
+        if rows not in _COLUMNS:
+            raise InvalidInputError(f"column must be one of {', '.join(_COLUMNS)}; got {rows!r}")
+        return np.full(len(self), _COLUMNS[rows].missing)
+
+    def rows(self, key: FrameKey) -> NDArray[np.intp]:
+        """Row numbers of a frame's boxes; empty for a frame without boxes."""
+        check_type(key, "key", (int, str, np.integer), "pass the key of one frame")
+        if self._rows is None:
+            found: dict[FrameKey, list[int]] = defaultdict(list)
+            for row, of_row in enumerate(self["frame"].tolist()):
+                found[of_row].append(row)
+            self._rows = {of_rows: np.array(rows, np.intp) for of_rows, rows in found.items()}
+        return self._rows.get(key, np.empty(0, np.intp))
+
+    def frame(self, key: FrameKey) -> TrackTable:
+        """Select the boxes of one frame; empty for a frame without boxes."""
+        return self._take(self.rows(key), (key,))
+
+    def __iter__(self) -> Iterator[tuple[FrameKey, TrackTable]]:
+        return ((key, self.frame(key)) for key in self.frame_keys)
+
+    def by_track(self) -> dict[int, TrackTable]:
+        """Rows of each track, ordered by frame; tracks are in the order of their first frames.
+
+        Boxes without a track are left out.
+        """
+        numbers = {key: number for number, key in enumerate(self._keys)}
+        frames = np.array([numbers[key] for key in self["frame"].tolist()], np.intp)
+        order = np.lexsort((frames, self["track_id"]))
+        order = order[self["track_id"][order] != NO_TRACK]
+        starts = np.flatnonzero(np.diff(self["track_id"][order])) + 1
+        parts = [part for part in np.split(order, starts) if len(part)]
+        parts.sort(key=lambda part: int(frames[part[0]]))  # stable: by id within a frame
+        return {int(self["track_id"][part[0]]): self._take(part, self._keys) for part in parts}
+
+    def counts(self) -> NDArray[np.int64]:
+        """Count the rows in each frame from 0 to the last one, of a table with numbered frames.
+
+        A frame that a live source dropped counts as the one before, which a written video shows again.
+        """
+        keys = np.array(self._keys, np.int64)
+        if not len(keys):
+            return keys
+        numbers, counts = np.unique(self["frame"].astype(np.int64), return_counts=True)
+        of_keys = np.zeros(len(keys), np.int64)
+        of_keys[np.searchsorted(keys, numbers)] = counts
+        shown = np.searchsorted(keys, np.arange(keys[-1] + 1), side="right") - 1
+        return np.where(shown >= 0, of_keys[shown], 0)
+
+    def times(self) -> Floats | None:
+        """Time (s) of each frame from 0 to the last one, interpolated where it is unknown or does not ascend.
+
+        None if that is so for most frames, for the first one or for the last one.
+        """
+        times = np.full(int(self._keys[-1]) + 1 if self._keys else 0, np.nan)
+        times[list(self._times)] = list(self._times.values())
+        known = np.isfinite(times)
+        latest = np.maximum.accumulate(np.where(known, times, -np.inf))
+        known[1:] &= times[1:] > latest[:-1]
+        rows = np.flatnonzero(known)
+        if 2 * rows.size <= times.size or not known[0] or not known[-1]:
+            return None
+        return np.asarray(np.interp(np.arange(times.size), rows, times[rows]))
+
+    def renamed(self, rename: Callable[[Any], FrameKey]) -> TrackTable:
+        """Return a copy in which ``rename(key)`` replaces every frame key."""
+        if not callable(rename):
+            raise InvalidInputError(f"rename must be a function of a frame key; got {describe(rename)}")
+        frames, keys = ([rename(key) for key in each] for each in (self["frame"].tolist(), self._keys))
+        columns = {name: self._columns[name][: self._size] for name in self._columns if name in _COLUMNS}
+        return TrackTable(frames, boxes=self.boxes, frame_keys=keys, **columns)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return a table with one row per box and the columns of the files, NaN where a value is unknown.
+
+        >>> TrackTable([0, 3], [7, 8], [[0, 0, 50, 40], [5, 0, 55, 40]]).to_pandas().iloc[1].to_dict()
+        {'frame': 3, 'track_id': 8, 'x1': 5.0, 'y1': 0.0, 'x2': 55.0, 'y2': 40.0, 'occluded': 0, \
+'truncated': 0.0, 'ignore': False}
+        """
+        import pandas
+
+        return pandas.DataFrame({name: self[name] for name in self.columns})
+
+
+def is_result(item: Any) -> bool:
+    """Whether `item` is a frame's result (a tuple has an ``index`` method, too)."""
+    return hasattr(item, "tracks") and hasattr(item, "index") and not isinstance(item, (Mapping, Sequence))
+
+
+def shown_tracks(tracks: Iterable[Any]) -> list[Any]:
+    """Tracks that are drawn and written, which have different ids."""
+    shown = []
+    for track in [tracks] if isinstance(tracks, str) or not isinstance(tracks, Iterable) else tracks:
+        if not hasattr(track, "id") or not hasattr(track, "box"):
+            raise InvalidInputError(
+                f"tracks must be Track objects, got {describe(track)}; pass result.tracks"
+            )
+        if getattr(track, "shown", True):
+            shown.append(track)
+    repeated = next((track for track, times in Counter(each.id for each in shown).items() if times > 1), None)
+    if repeated is not None:
+        raise InvalidInputError(
+            f"tracks must have unique ids, got {repeated} twice in one frame; pass result.tracks"
+        )
+    return shown
+
+
+def check_keys(values: object, name: str) -> tuple[FrameKey, ...]:
+    """Return frame keys as Python values that are all int or all str."""
+    given = check_sequence(values, name, "frame keys (int or str)")
+    keys = tuple(key.item() if isinstance(key, np.generic) else key for key in given)
+    kinds = {type(key) for key in keys}
+    if kinds - {int} and kinds - {str}:
+        listed = ", ".join(sorted(kind.__name__ for kind in kinds))
+        raise InvalidInputError(f"{name} must be all int or all str, got {listed}; convert them to one type")
+    return keys
+
+
+def frame_order(key: FrameKey) -> tuple[list[object], str]:
+    """Natural sort key: frame 2 comes before frame 10, also in file names."""
+    return ([key], "") if isinstance(key, int) else natural_key(key)
+
+
+def _key_array(keys: Sequence[FrameKey]) -> NDArray[Any]:
+    return np.array(keys, object if keys and isinstance(keys[0], str) else np.int64)
+
+
+def _check_column(values: ArrayLike | None, name: str, rows: int) -> NDArray[Any]:
+    """Check one value per row; returned with the dtype of the column."""
+    column = _COLUMNS[name]
+    filled = np.full(rows, column.missing)
+    given = filled if values is None else check_array(values, name)
+    if given.size == 0:
+        given = given.reshape(-1).astype(filled.dtype)
+    if (
+        given.shape != (rows,)
+        or given.dtype.kind not in {"b": "b", "i": "iub", "f": "iufb"}[filled.dtype.kind]
+    ):
+        raise InvalidInputError(
+            f"{name} must be one value for each of the {rows} boxes, got {describe(given)}"
+        )
+    outside = (given < column.low) | (given > column.high)
+    if outside.any():
+        raise InvalidInputError(f"{name} must be {column.expected}; got {given[outside][0]}")
+    return given.astype(filled.dtype)
+
+
+def without_suffix(name: str) -> str:
+    """Return the name of a frame without the suffix of an image."""
+    path = PurePosixPath(name)
+    return name[: -len(path.suffix)] if is_image(path.name) else name
+
+
+def match_names(table: TrackTable, keys: Sequence[FrameKey], sides: tuple[str, str]) -> TrackTable:
+    """Rename frames to `keys` where the names differ by a folder or the suffix of an image only.
+
+    Nothing is renamed if a frame is among `keys`. Names that are not unique then are an error, which names
+    `table` and `keys` by `sides`.
+    """
+    if set(table.frame_keys) & set(keys):
+        return table
+    ours, theirs = (
+        {PurePosixPath(without_suffix(key)).name: key for key in side if isinstance(key, str)}
+        for side in (table.frame_keys, keys)
+    )
+    shared = ours.keys() & theirs.keys()
+    if not shared:
+        return table
+    paths = [[f"/{without_suffix(side[name])}" for side in (ours, theirs)] for name in sorted(shared)]
+    different = [pair for pair in paths if not (pair[0].endswith(pair[1]) or pair[1].endswith(pair[0]))]
+    if different or len(ours) < len(table.frame_keys) or len(theirs) < len(keys):
+        name = min(shared)
+        raise InvalidInputError(
+            f"frame names of {sides[0]} and {sides[1]} differ: {ours[name]!r} and {theirs[name]!r}; use the "
+            "same names on both sides, for example with TrackTable.renamed"
+        )
+    names = {ours[name]: theirs[name] for name in shared}
+    return table.renamed(lambda key: names.get(key, key))
+
+
+def parse_cells(
+    cells: Mapping[str, Sequence[Any]],
+    source: object,
+    places: Sequence[str],
+    *,
+    classes: Collection[str] | None = None,
+    error: type[Exception] = DatasetError,
+) -> tuple[dict[str, Any], list[str]]:
+    """Arguments of `TrackTable` from cells, which are text or values, by the name of their column.
+
+    `places` states where each row is, for messages about `source`. Rows of other classes than vehicles are
+    left out; the places of the others are returned, too.
+    """
+    missing = [name for name in ("frame", *CORNERS) if name not in cells]
+    if missing:
+        found = shorten(", ".join(map(str, cells)), 300) or "an empty file"
+        raise error(f"{source} lacks the columns {', '.join(missing)}; found {found}")
+    keys = _parse_frames(cells["frame"], places, error)
+    predicted = not all(map(_is_missing, cells.get("score", ())))
+    vehicles, lookalike = _vehicle_rows(cells, source, classes, predicted, error)
+    rows = np.flatnonzero(vehicles).tolist()
+    where = [places[row] for row in rows]
+    columns: dict[str, Any] = {}
+    for name in (*CORNERS, *_COLUMNS):
+        used = "track" if name == "track_id" and name not in cells else name
+        if used in cells and (name != "score" or predicted):
+            columns[name] = _parse_numbers(name, [cells[used][row] for row in rows], where, error)
+    if lookalike.any():
+        columns["ignore"] = columns.get("ignore", False) | lookalike[rows]
+    columns["boxes"] = np.stack([columns.pop(name) for name in CORNERS], axis=1)
+    return {"frame": [keys[row] for row in rows], "frame_keys": keys, **columns}, where
+
+
+def _is_missing(cell: Any) -> bool:
+    """Whether a cell is empty, None or NaN."""
+    return cell is None or str(cell).strip().lower() in ("", "nan")
+
+
+def _parse_frames(cells: Sequence[Any], places: Sequence[str], error: type[Exception]) -> list[FrameKey]:
+    """Frames as numbers or names; whole numbers that a concatenation has made floats are numbers again."""
+    keys: list[FrameKey] = []
+    for cell, place in zip(cells, places, strict=True):
+        if _is_missing(cell):
+            raise error(f"{place}: frame is empty; enter its number from 0 or its file name")
+        if isinstance(cell, str):
+            keys.append(cell)
+        elif isinstance(cell, bool) or float(cell) < 0 or not float(cell).is_integer():
+            raise error(f"{place}: frame must be a whole number from 0 or a name, got {describe(cell)}")
+        else:
+            keys.append(int(cell))
+        if type(keys[-1]) is not type(keys[0]):
+            raise error(f"{place}: frame must be a number in every row, or a name in every row")
+    return keys
+
+
+def _vehicle_rows(
+    cells: Mapping[str, Sequence[Any]],
+    source: object,
+    classes: Collection[str] | None,
+    predicted: bool,
+    error: type[Exception],
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Mark the rows to keep, and the labels of lookalikes among them, by the columns of classes."""
+    count = len(cells["frame"])
+    given = [cells[name] for name in _CLASS_COLUMNS if name in cells]
+    names = [next((str(cell).lower() for cell in row if not _is_missing(cell)), "") for row in zip(*given)]
+    found = {*names} - {""}
+    # Classes that are numbers or flags have no names: all rows are vehicles.
+    if not found or any(re.fullmatch(r"[-\d.]+|true|false", name) for name in found):
+        return np.ones(count, np.bool_), np.zeros(count, np.bool_)
+    wanted = VEHICLE_CLASSES if classes is None else classes
+    check_classes(source, found, wanted, error=error)
+    vehicles = np.array([name in wanted for name in names])
+    lookalike = ~vehicles & np.isin(names, LOOKALIKE_CLASSES) & (not predicted)
+    return vehicles | lookalike, lookalike
+
+
+def check_classes(
+    source: object,
+    found: Collection[str],
+    wanted: Collection[str],
+    kind: str = "class",
+    error: type[Exception] = DatasetError,
+) -> None:
+    """Refuse a file in which no class is that of vehicles: it would have no box."""
+    if not any(name in wanted for name in found):
+        listed = shorten(", ".join(map(repr, sorted(found))), 300) or "none"
+        raise error(
+            f"{source} has no {kind} among {', '.join(sorted(wanted))}; found {listed}; "
+            "name those of vehicles with classes="
+        )
+
+
+def parse_number(cell: Any, name: str, place: str, error: type[Exception] = DatasetError) -> float:
+    """Parse a finite number, an int where it is one."""
+    try:
+        if isinstance(cell, bool) or "_" in str(cell):  # Python reads 1_0 as 10
+            raise ValueError
+        value: float = int(cell) if isinstance(cell, (int, np.integer)) else float(cell)
+    except (TypeError, ValueError, OverflowError):
+        value = math.nan
+    if not math.isfinite(value):
+        hint = "; use a decimal point" if re.fullmatch(r"\s*-?\d+,\d+\s*", str(cell)) else ""
+        raise error(f"{place}: {name} must be a finite number, got {describe(cell)}{hint}")
+    return value
+
+
+def _parse_numbers(
+    name: str, cells: Sequence[Any], places: Sequence[str], error: type[Exception]
+) -> NDArray[Any]:
+    """Numbers of a column; a missing one, except for a corner or a score, is the usual one of the column."""
+    column = _COLUMNS.get(name, _Column(math.nan))
+    kind = type(column.missing)
+    values = []
+    for cell, place in zip(cells, places, strict=True):
+        if _is_missing(cell) and name not in (*CORNERS, "score"):
+            values.append(column.missing)
+            continue
+        if kind is bool:
+            flag = _FLAGS.get(str(cell).strip().lower())
+            if flag is None:
+                raise error(f"{place}: {name} must be 0 or 1, got {describe(cell)}")
+            values.append(flag)
+            continue
+        value = parse_number(cell, name, place, error)
+        if kind is int and value != int(value):
+            raise error(f"{place}: {name} must be a whole number, got {describe(cell)}")
+        if not column.low <= value <= column.high or (kind is int and value > _MAX_ID):
+            raise error(f"{place}: {name} must be {column.expected}, got {describe(cell)}")
+        values.append(kind(value))
+    return np.array(values, {bool: np.bool_, int: np.int64, float: np.float64}[kind])
