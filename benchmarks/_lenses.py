@@ -16,7 +16,7 @@ from benchmarks import _drives
 from benchmarks._material import Context
 from benchmarks._report import Row, at_most
 from vehicle_detection import Camera, VehicleDetector, render_drive
-from vehicle_detection.units import ROUGH_DISTANCE
+from vehicle_detection._common import ROUGH_DISTANCE
 
 ANGLES, HEIGHTS = (58, 90, 120), (1.0, 1.4, 1.8)
 """Fields of view in degrees, and heights of the camera in meters."""

@@ -237,7 +237,7 @@ def test_confidences_are_probabilities():
     found = Detections(TWO, [1.0, 2.0], [0.0, 1.0])
     assert found.confidences.tolist() == [0, 1]
     for confidences in ([-0.01, 0.5], [0.5, 1.01], [0.5]):
-        with pytest.raises(InvalidInputError, match="confidences must be a probability, 0 to 1, for each of"):
+        with pytest.raises(InvalidInputError, match=r"^confidences must be "):
             Detections(TWO, [1.0, 2.0], confidences)
     assert Detections(TWO, [1.0, 2.0], [np.nan, np.nan]).confidences is None
     with pytest.raises(InvalidInputError, match="confidences must be finite"):
@@ -247,7 +247,7 @@ def test_confidences_are_probabilities():
 @pytest.mark.parametrize(
     ("boxes", "scores", "message"),
     [
-        ([[0, 0, 1, 1]], [[1]], r"scores must be one number for each of the 1 boxes, got .*\(1, 1\)"),
+        ([[0, 0, 1, 1]], [[1]], r"scores must be one number for each of the 1 boxes"),
         ([], [1], "scores must be one number for each of the 0 boxes"),
         ([[0, 0, 1, 1]], [True], "scores must be one number"),
         ([[0, 0, 1, 1]], [np.inf], "scores must be finite, got NaN or infinity"),
@@ -315,7 +315,7 @@ def test_probabilities_of_0_and_1_are_finite():
 @pytest.mark.parametrize(
     ("given_", "options", "message"),
     [
-        ([TWO], {}, "detections must have an attribute xyxy"),
+        ([TWO], {}, "detections must have the attributes xyxy"),
         (StandIn(TWO, [0.5, 3.0]), {}, r'0 to 1 with score="probability", got 0.5 to 3; pass score="logit"'),
         (StandIn(TWO, [0.5, np.nan]), {}, "scores must be finite"),
         (StandIn(TWO, [0.5]), {}, "scores must be one number for each of the 2 boxes"),
@@ -326,7 +326,7 @@ def test_probabilities_of_0_and_1_are_finite():
             {"class_ids": [1]},
             "class_ids needs an integer class for each of 2 boxes",
         ),
-        (SimpleNamespace(xyxy=TWO), {}, "detections must have an attribute confidence or conf, got"),
+        (SimpleNamespace(xyxy=TWO), {}, "detections must have the attributes xyxy, and confidence"),
         (StandIn(TWO, [0.5, 0.5], [2, 7]), {"class_ids": 2}, "class_ids must be a sequence of integers"),
         (StandIn(TWO), {"score": "percent"}, "score must be one of 'probability', 'logit'"),
         (StandIn(TWO), {"score": (1, 1)}, r"score\[1\] must be a number, greater than 1"),

@@ -22,17 +22,11 @@ from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, evaluate_detections, read_labels
 from vehicle_detection.loading import load_model
-from vehicle_detection.params import (
-    FeatureParams,
-    HeatParams,
-    NetworkParams,
-    RegionParams,
-    SearchBand,
-    SearchParams,
-    TrackParams,
-)
+from vehicle_detection.network import NetworkParams
+from vehicle_detection.params import FeatureParams, HeatParams, SearchBand, SearchParams
+from vehicle_detection.regions import RegionParams
 from vehicle_detection.scenes import SceneVehicle, render_drive, render_scene
-from vehicle_detection.tracking import FrameResult, Tracker
+from vehicle_detection.tracking import FrameResult, Tracker, TrackParams
 from vehicle_detection.video import OwnSpeed, process_video
 
 # Most of these frames come without times.

@@ -17,7 +17,8 @@ from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.evaluation import FrameBoxes, evaluate_tracks
 from vehicle_detection.function_model import FunctionModel
 from vehicle_detection.notebook import Explorer
-from vehicle_detection.params import FunctionParams, HeatParams, TrackParams
+from vehicle_detection.params import FunctionParams, HeatParams
+from vehicle_detection.tracking import TrackParams
 from vehicle_detection.video import process_video
 
 SHAPE = (120, 200)

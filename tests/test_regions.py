@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from vehicle_detection.boxes import Detections, iou_matrix
 from vehicle_detection.camera import Camera
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.params import RegionParams
-from vehicle_detection.regions import find_vehicles, fit_boxes, group_windows
+from vehicle_detection.regions import RegionParams, find_vehicles, fit_boxes, group_windows
 
 SHAPE = (720, 1280)
 CAMERA = Camera.for_frame(SHAPE)

@@ -80,25 +80,22 @@ from .features import (
 from .heatmap import HeatHistory, add_heat, apply_threshold, bounding_boxes, label_boxes
 from .images import read_image, write_image
 from .loading import load_model
-from .network import NetworkModel
+from .network import NetworkModel, NetworkParams
 from .notebook import Explorer
 from .params import (
     FeatureParams,
     FunctionParams,
     HeatParams,
-    NetworkParams,
-    RegionParams,
     SearchBand,
     SearchParams,
-    TrackParams,
 )
-from .regions import find_vehicles
+from .regions import RegionParams, find_vehicles
 from .report import ReportWriter
 from .scenes import render_drive, render_patches, render_scene
 from .search import SearchResult, find_cars
 from .stream import TrackedFrame, track
 from .tables import TrackTable
-from .tracking import FrameResult, Track, Tracker
+from .tracking import FrameResult, Track, Tracker, TrackParams
 from .training import FrameDataset, TrainingReport, train_and_evaluate
 from .tuning import (
     TrialOptions,

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import (
+    UNITS,
     check_boxes,
     check_choice,
     check_flags,
@@ -54,7 +55,6 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import frame_heat
 from vehicle_detection.params import HeatParams
 from vehicle_detection.tracking import FrameResult, Track
-from vehicle_detection.units import UNITS
 
 # Frame rate that is assumed for results without times.
 _USUAL_FPS = 25.0

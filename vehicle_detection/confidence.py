@@ -10,7 +10,8 @@ from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.function_model import FunctionModel
 from vehicle_detection.network import NetworkModel
-from vehicle_detection.params import HeatParams, RegionParams
+from vehicle_detection.params import HeatParams
+from vehicle_detection.regions import RegionParams
 
 Model = VehicleClassifier | NetworkModel | FunctionModel
 

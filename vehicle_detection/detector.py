@@ -48,18 +48,18 @@ from vehicle_detection.function_model import DetectorFunction, FunctionModel
 from vehicle_detection.heatmap import HeatHistory, frame_heat, label_heat
 from vehicle_detection.images import is_cut, make_thumbnail, read_image
 from vehicle_detection.loading import load_model, refuse_network_options
-from vehicle_detection.network import Device, NetworkModel
-from vehicle_detection.params import (
-    FunctionParams,
-    HeatParams,
-    NetworkParams,
-    RegionParams,
-    SearchParams,
-    TrackParams,
-)
-from vehicle_detection.regions import find_vehicles
+from vehicle_detection.network import Device, NetworkModel, NetworkParams
+from vehicle_detection.params import FunctionParams, HeatParams, SearchParams
+from vehicle_detection.regions import RegionParams, find_vehicles
 from vehicle_detection.search import FrameSearch, SearchResult
-from vehicle_detection.tracking import FrameResult, Track, Tracker, backfill_tracks, interpolate_tracks
+from vehicle_detection.tracking import (
+    FrameResult,
+    Track,
+    Tracker,
+    TrackParams,
+    backfill_tracks,
+    interpolate_tracks,
+)
 from vehicle_detection.video import OwnSpeed
 
 Path = str | os.PathLike[str]

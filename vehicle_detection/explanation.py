@@ -30,8 +30,8 @@ from vehicle_detection.drawing import (
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events import TrackLog
 from vehicle_detection.features import extract_features, part_slices, sum_blocks
-from vehicle_detection.network import NetworkModel, NetworkSearch
-from vehicle_detection.params import PATCH_SIZE, FeatureParams, NetworkParams
+from vehicle_detection.network import NetworkModel, NetworkParams, NetworkSearch
+from vehicle_detection.params import PATCH_SIZE, FeatureParams
 from vehicle_detection.video import Source, borrow_source
 
 # IoU from which a found vehicle or a window belongs to a box.

@@ -9,15 +9,56 @@ and with it the difference between window and box.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Floats, check_shape, check_type
+from vehicle_detection._common import Checked, Floats, check_shape, check_type, number
 from vehicle_detection.boxes import Detections, box_areas, clip_boxes, intersection_matrix, overlap_matrices
 from vehicle_detection.camera import Camera
-from vehicle_detection.params import RegionParams
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegionParams(Checked):
+    """How groups of overlapping windows become boxes; lengths are fractions of a window's side.
+
+    Attributes
+    ----------
+    min_peak, min_evidence
+        Minimum of the best score, and of the sum of positive scores in a group.
+    min_iou
+        Windows whose IoU with the best window exceeds this join its group.
+    score_power
+        The weight of a window in the group's mean is proportional to this power of its score.
+    suppression_radius
+        Windows whose center is this near to the center of a group start no group of their own.
+    face_width, face_height, face_offset_y
+        Size of the vehicle's face (front or rear) in a window, as on the training patches, and distance of
+        its center below the window's center.
+    flank_length_m, flank_shift
+        Length of the visible side of a vehicle in meters, and fraction of the visible side by which the box's
+        center moves towards the vanishing point.
+    max_coverage
+        A group is dropped if more than this fraction of its face lies inside the box of a better group.
+    flank_peak_ratio
+        A group whose face lies on the visible side of another vehicle is dropped even if it is the better
+        one, unless the other peak is at most this fraction of its own.
+    """
+
+    min_peak: float = number(0.7, low=0, high=1e9)
+    min_evidence: float = number(1.75, low=0, high=1e9)
+    min_iou: float = number(0.5, low=0, high=1)
+    score_power: float = number(2.0, low=0, high=20)
+    suppression_radius: float = number(0.6, above=0, high=2)
+    face_width: float = number(0.84, above=0, high=2)
+    face_height: float = number(0.79, above=0, high=2)
+    face_offset_y: float = number(-0.04, low=-1, high=1)
+    flank_length_m: float = number(6.0, low=0, high=100)
+    flank_shift: float = number(0.27, above=0, high=2)
+    max_coverage: float = number(0.5, low=0, high=1)
+    flank_peak_ratio: float = number(0.5, low=0, high=1)
 
 
 def find_vehicles(

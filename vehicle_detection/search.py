@@ -53,8 +53,6 @@ from vehicle_detection.images import make_thumbnail
 from vehicle_detection.params import (
     PATCH_SIZE,
     FeatureParams,
-    FunctionParams,
-    NetworkParams,
     PixelBand,
     SearchParams,
 )
@@ -96,7 +94,7 @@ class FrameSearch(Closing, ABC):
     Searches are thread-safe context managers.
     """
 
-    params_type: ClassVar[type[SearchParams] | type[NetworkParams] | type[FunctionParams]]
+    params_type: ClassVar[type[Any]]
 
     def __init__(self, n_jobs: int | None) -> None:
         self._team = ThreadTeam(n_jobs, name="search")

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from tests.events.drives import CAMERA, FPS, SHAPE, cut_in_times, log_frames, passing_times, simulate
 from vehicle_detection import Camera, Event, TrackLog, find_events
+from vehicle_detection._common import UNITS
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events import TrackHistory, estimate_motion
-from vehicle_detection.units import UNITS
 
 SEEDS = (0, 1, 2)
 simulated = functools.cache(simulate)

@@ -15,9 +15,9 @@ from tests.network.graphs import PARAMS, constant_network, echo_network, own_net
 from tests.network.test_runtime import NO_OPENVINO, RUNTIMES
 from vehicle_detection.boxes import iou_matrix, logit
 from vehicle_detection.errors import InvalidInputError, ModelFileError
-from vehicle_detection.network import METADATA_KEY, load_network
-from vehicle_detection.network.search import to_log_odds, to_probability
-from vehicle_detection.params import HeatParams, NetworkParams
+from vehicle_detection.network import METADATA_KEY, NetworkParams, load_network
+from vehicle_detection.network.model import to_log_odds, to_probability
+from vehicle_detection.params import HeatParams
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (360, 640, 3), dtype=np.uint8)
 

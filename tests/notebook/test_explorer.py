@@ -17,10 +17,12 @@ from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import frame_heat
 from vehicle_detection.images import write_image
 from vehicle_detection.loading import load_model
+from vehicle_detection.network import NetworkParams
 from vehicle_detection.notebook import Explorer
 from vehicle_detection.notebook import explorer as module
 from vehicle_detection.notebook.explorer import METHODS, VIEWS
-from vehicle_detection.params import FeatureParams, HeatParams, NetworkParams, RegionParams, SearchParams
+from vehicle_detection.params import FeatureParams, HeatParams, SearchParams
+from vehicle_detection.regions import RegionParams
 from vehicle_detection.scenes import render_scene
 
 SHAPE = (360, 640)

@@ -8,18 +8,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.network import NetworkParams
 from vehicle_detection.params import (
     PATCH_SIZE,
     FeatureParams,
     FunctionParams,
     HeatParams,
-    NetworkParams,
     PixelBand,
-    RegionParams,
     SearchBand,
     SearchParams,
-    TrackParams,
 )
+from vehicle_detection.regions import RegionParams
+from vehicle_detection.tracking import TrackParams
 from vehicle_detection.windows import band_windows
 
 BAND = SearchBand(window=(64, 64), y=(0, 256))

@@ -34,8 +34,9 @@ from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events import Event
 from vehicle_detection.loading import load_model
-from vehicle_detection.params import HeatParams, TrackParams
+from vehicle_detection.params import HeatParams
 from vehicle_detection.report import ReportWriter, TrackPicture, page
+from vehicle_detection.tracking import TrackParams
 
 UNSAFE_NAME = "\"><img src=x onerror=alert(1)>&amp;'</title><script>.mp4"
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
-from vehicle_detection.tracking.assignment import cheapest_pairs
+from vehicle_detection.tracking.association import cheapest_pairs
 
 
 @given(st.integers(0, 12), st.integers(0, 12), st.floats(0, 1), st.booleans(), st.integers(0, 2**32 - 1))
@@ -38,7 +38,7 @@ def test_tables_of_crowded_frames(shape):
 def test_the_tracker_does_not_load_scipy_optimize():
     program = (
         "import sys, numpy as np\n"
-        "from vehicle_detection.tracking.assignment import cheapest_pairs\n"
+        "from vehicle_detection.tracking.association import cheapest_pairs\n"
         "assert len(cheapest_pairs(np.eye(3), np.ones((3, 3), bool))) == 3\n"
         "assert 'scipy.optimize' not in sys.modules\n"
     )

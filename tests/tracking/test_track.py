@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from vehicle_detection.params import TrackParams
+from vehicle_detection.tracking import TrackParams
 from vehicle_detection.tracking.track import TrackState
 
 PARAMS = TrackParams()

@@ -10,9 +10,8 @@ from vehicle_detection.boxes import Detections, Platt, iou_matrix
 from vehicle_detection.camera import Camera
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import FrameBoxes, evaluate_tracks
-from vehicle_detection.params import TrackParams
 from vehicle_detection.scenes import render_drive
-from vehicle_detection.tracking import Track, Tracker
+from vehicle_detection.tracking import Track, Tracker, TrackParams
 
 SHAPE = (720, 1280, 3)
 LIMITS = np.array([1280.0, 720.0, 1280.0, 720.0])

@@ -25,6 +25,7 @@ from vehicle_detection._common.checks import (
 )
 from vehicle_detection._common.closing import Closing
 from vehicle_detection._common.environment import check_environment
+from vehicle_detection._common.fields import Checked, checked_field, choice, flag, integer, number
 from vehicle_detection._common.files import (
     atomic_write,
     check_suffix,
@@ -47,6 +48,7 @@ from vehicle_detection._common.threads import (
     resolve_jobs,
     single_threaded_opencv,
 )
+from vehicle_detection._common.units import ROUGH_DISTANCE, UNITS, Units, format_with_error
 from vehicle_detection._common.urls import hide_credentials, is_url, local_path, stable_url
 from vehicle_detection._common.workspace import NEW_ARRAYS, SPARE, Workspace, with_spare
 
@@ -56,12 +58,16 @@ __all__ = [
     "FORMAT_VERSION",
     "JOBS_VARIABLE",
     "NEW_ARRAYS",
+    "ROUGH_DISTANCE",
     "SPARE",
+    "UNITS",
+    "Checked",
     "Closing",
     "Floats",
     "Limit",
     "ParquetRows",
     "ThreadTeam",
+    "Units",
     "Workspace",
     "atomic_write",
     "available_cores",
@@ -84,19 +90,25 @@ __all__ = [
     "check_suffix",
     "check_target",
     "check_type",
+    "checked_field",
+    "choice",
     "degrade_patches",
     "describe",
     "encodable",
+    "flag",
+    "format_with_error",
     "hide_credentials",
     "image_size",
     "import_pyarrow",
     "in_notebook",
+    "integer",
     "is_hidden",
     "is_listing",
     "is_url",
     "local_path",
     "mirror_patches",
     "natural_key",
+    "number",
     "pluralize",
     "progress_bar",
     "read_model",

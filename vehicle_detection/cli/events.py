@@ -24,8 +24,7 @@ _MAX_OWN_SPEED = 500.0
 
 def read_speed(own_speed: str | None, gpx: Path | None, offset: float) -> OwnSpeed | None:
     """Speed of the own vehicle: constant (km/h, or with its unit), from a file, or unknown."""
-    from vehicle_detection._common import describe
-    from vehicle_detection.units import UNITS
+    from vehicle_detection._common import UNITS, describe
     from vehicle_detection.video import OwnSpeed, read_own_speed
 
     if gpx is not None:

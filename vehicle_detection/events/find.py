@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import (
+    UNITS,
     Floats,
+    Units,
     check_array,
     check_number,
     check_sequence,
@@ -23,7 +25,6 @@ from vehicle_detection.camera import Camera
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events.history import TrackHistory, TrackLog, split_runs
 from vehicle_detection.events.motion import LANE_HALF_WIDTH_M, Bools, Motion, estimate_motion
-from vehicle_detection.units import UNITS, Units
 
 Kind = Literal[
     "headway",
@@ -138,7 +139,7 @@ class Event:
         Parameters
         ----------
         units
-            Units of the distance, a value of ``vehicle_detection.units.UNITS``.
+            Units of the distance, a value of ``vehicle_detection._common.UNITS``.
         with_time
             Start with the time of the event.
 

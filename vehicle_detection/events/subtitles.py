@@ -12,7 +12,9 @@ from typing import Literal
 import numpy as np
 
 from vehicle_detection._common import (
+    UNITS,
     Floats,
+    Units,
     atomic_write,
     check_choice,
     check_number,
@@ -23,7 +25,6 @@ from vehicle_detection._common import (
 from vehicle_detection.annotator import MAX_SPEED_STD
 from vehicle_detection.events.find import Event, check_events
 from vehicle_detection.events.history import TrackHistory, TrackLog
-from vehicle_detection.units import UNITS, Units
 from vehicle_detection.video import OwnSpeed
 
 SUBTITLE_SUFFIXES = (".srt", ".ass")

@@ -1,58 +1,98 @@
-"""The model of a network: an ONNX file, how to run it, and the calibration of its probabilities."""
+"""A network that finds vehicles: its parameters, its model, and the search of a frame with it."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
+import math
 import os
-from collections.abc import Collection, Mapping
+import threading
+import weakref
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib import resources
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import (
+    Checked,
     Floats,
-    Limit,
     atomic_write,
     check_choice,
-    check_path,
-    check_sequence,
-    describe,
-    read_regular_file,
+    integer,
+    number,
+    single_threaded_opencv,
     store_number,
 )
-from vehicle_detection.boxes import Platt, logit
+from vehicle_detection.boxes import Detections, Platt, box_areas, greedy_nms
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.network.inputs import InputFormat, Size
-from vehicle_detection.network.outputs import OutputFormat, class_names, recognize, usual_names
-from vehicle_detection.network.runtime import (
-    Array,
-    Device,
-    GraphFacts,
-    Port,
-    Runtime,
-    check_device,
-    open_session,
-    read_facts,
-)
-from vehicle_detection.network.search import NetworkSearch, to_log_odds, to_probability
-from vehicle_detection.params import NetworkParams
+from vehicle_detection.network.outputs import Candidates, OutputFormat
+from vehicle_detection.network.runtime import Array, Device, Port, Runtime, Session, open_session
+from vehicle_detection.params import HeatParams, HeatRange
+from vehicle_detection.search import FrameSearch
 
-METADATA_KEY = "vehicle_detection"
-"""Key of the ONNX metadata with the parameters of a network of this library, as JSON."""
+INPUT_SIZE = 640
+"""Longer side of the input of a network without fixed sizes."""
 
-FORMAT_VERSION = 1
-"""Version of that JSON."""
+# Probabilities of exactly 0 and 1 have no finite log-odds.
+_MIN_PROBABILITY = 1e-4
 
-VEHICLE_CLASSES = ("car", "truck", "bus", "van", "vehicle")
-"""Names of the classes that count as vehicles by default."""
 
-# Side of the input on which a network without fixed sizes is tried once, and that it has by default.
-_PROBE_SIZE, _INPUT_SIZE = 320, 640
-_SHIPPED = "default"
+@dataclass(frozen=True, kw_only=True)
+class NetworkParams(Checked):
+    """Search parameters of a network, which always searches the whole frame.
+
+    Attributes
+    ----------
+    input_size
+        Longer side of the network's input in pixels, a multiple of 32. Larger inputs show smaller vehicles
+        and take more time. None: the size in the model file, 640 for the shipped network.
+    horizon
+        Row of the horizon as a fraction of the frame's height, for distances; None: estimated.
+    horizon_tolerance
+        Error of the horizon as a fraction of the frame's height; the default suits any dash-cam.
+    min_score
+        Minimum score of the boxes before suppression that count as positive windows, in log-odds above the
+        model's threshold.
+
+    Examples
+    --------
+    >>> NetworkParams(input_size=960).with_horizon(0.55).horizon
+    0.55
+    """
+
+    input_size: int | None = integer(None, low=32, high=8192)
+    horizon: float | None = number(0.5, low=0, high=1)
+    horizon_tolerance: float = number(0.15, low=0, high=1)
+    min_score: float = number(0.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.input_size is not None and self.input_size % 32:
+            raise InvalidInputError(
+                f"input_size must be a multiple of 32, got {self.input_size}; "
+                f"pass {-(-self.input_size // 32) * 32}"
+            )
+
+    @classmethod
+    def default(cls) -> NetworkParams:
+        """Return the default parameters."""
+        return cls()
+
+    def with_horizon(self, horizon: float | None) -> NetworkParams:
+        """Return the same parameters with a known horizon and a lower tolerance; None changes nothing."""
+        if horizon is None:
+            return self
+        return dataclasses.replace(self, horizon=horizon, horizon_tolerance=0.06)
+
+    def everywhere(self) -> NetworkParams:
+        """Return the same parameters: a network searches all rows."""
+        return self
+
+    def heat_range(self, heat: HeatParams) -> HeatRange:
+        """Heat thresholds for boxes of unknown density: any."""
+        return HeatRange(0.0, 0.0, math.inf)
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -99,7 +139,7 @@ class NetworkModel:
     output_format: OutputFormat
     extra_inputs: tuple[Port, ...] = ()
     input_name: str = "image"
-    input_size: int = _INPUT_SIZE
+    input_size: int = INPUT_SIZE
     classes: Mapping[int, str] | None = None
     class_ids: NDArray[np.intp] | None = None
     slope: float = 1.0
@@ -197,225 +237,108 @@ class NetworkModel:
             part.write_bytes(self.graph)
 
 
-def load_network(
-    path: str | os.PathLike[str] = _SHIPPED,
-    *,
-    classes: Collection[str | int] | None = None,
-    device: Device = "cpu",
-    runtime: Runtime = "auto",
-) -> NetworkModel:
-    """Load a network from an ONNX file: of this library, or of another detector.
+class NetworkSearch(FrameSearch):
+    """The search of frames with a network; vehicles lie inside the frame.
 
-    Networks of other detectors are YOLOv5, v8, v10, 11 and 26, YOLOX, RT-DETR, RF-DETR, D-FINE and others
-    with the same outputs. Their default threshold is a probability of 0.25, as usual, and 0.5 for those of
-    the DETR family, and their probabilities are not calibrated.
-
-    Parameters
-    ----------
-    path
-        The file, or ``"default"`` for the shipped network.
-    classes
-        Names or numbers of the classes to keep. Default: those named car, truck, bus, van or vehicle, in any
-        case; all classes if their names are unknown.
-    device
-        ``"cpu"``, or ``"cuda"`` with the package onnxruntime-gpu.
-    runtime
-        ``"onnxruntime"``, ``"openvino"``, or ``"auto"``: OpenVINO if it is installed and the processor
-        multiplies matrices (AMX).
-
-    Returns
-    -------
-    NetworkModel
-        A model for `VehicleDetector`.
-
-    Raises
-    ------
-    ModelFileError
-        If the file is missing, damaged, too large, or no network that finds boxes.
-    InvalidInputError
-        If an argument is malformed, a class is unknown, none has the name of a vehicle and `classes` is
-        omitted, or the device or the library is not available.
+    The network's session is opened by the first search.
     """
-    check_device(device, runtime)
-    graph, name = _read(path)
-    facts = read_facts(graph, name)
-    model = _own_model(graph, facts) if METADATA_KEY in facts.metadata else _foreign_model(graph, facts)
-    class_ids = _class_ids(classes, model, facts.name)
-    return dataclasses.replace(model, class_ids=class_ids, device=device, runtime=runtime)
 
+    params_type = NetworkParams
 
-def _read(path: str | os.PathLike[str]) -> tuple[bytes, str]:
-    """Content of a file, or of the shipped network, and its name for messages."""
-    if isinstance(path, str) and path == _SHIPPED:
-        name, resource = f"the shipped model {path!r}", resources.files("vehicle_detection") / "models"
-        if not (resource / f"{path}.onnx").is_file():
-            raise ModelFileError(f"{name} is missing; install the package again")
-        return (resource / f"{path}.onnx").read_bytes(), name
-    file = check_path(path)
-    name = f"model file {file}"
-    data = read_regular_file(file, name, Limit.NETWORK_BYTES, error=ModelFileError)
-    if data[:2] == b"PK" or data[:1] == b"\x80":
-        raise ModelFileError(
-            f"{name} is a file of PyTorch or a pickle, not ONNX; export it, such as with "
-            "yolo export model=... format=onnx"
+    def __init__(self, model: NetworkModel, *, n_jobs: int | None = None) -> None:
+        super().__init__(n_jobs)
+        self.model = model
+        self._session: Session | None = None
+        self._lock = threading.Lock()
+        _SEARCHES.add(self)
+
+    def abandon_session(self) -> None:
+        """Open a new session on the next search: a forked child lacks the threads of the last one."""
+        if self._session is not None:
+            _ABANDONED.append(self._session)
+        self._session, self._lock = None, threading.Lock()
+
+    def _search(
+        self, frame: NDArray[np.uint8], params: NetworkParams, min_vehicle_score: float
+    ) -> tuple[Detections, Detections]:
+        candidates = self.find_candidates(frame, params, min(min_vehicle_score, params.min_score))
+        boxes, scores = candidates.boxes, self.model.scores(candidates.scores)
+        kept = greedy_nms(boxes, scores, max_iou=self.model.nms_iou)
+        vehicles = Detections(boxes[kept], scores[kept])
+        return (
+            Detections(boxes, scores)[scores >= params.min_score],
+            vehicles[vehicles.scores >= min_vehicle_score],
         )
-    return data, name
 
-
-def _own_model(graph: bytes, facts: GraphFacts) -> NetworkModel:
-    """Model of a file that this library has written."""
-    name = facts.name
-    try:
-        header = json.loads(facts.metadata[METADATA_KEY])
-        if header["format_version"] != FORMAT_VERSION:
+    def find_candidates(
+        self, frame: NDArray[np.uint8], params: NetworkParams, min_score: float
+    ) -> Candidates:
+        """Boxes before suppression with at least this score, best first, in pixels of the frame."""
+        model = self.model
+        with single_threaded_opencv():
+            array, scaled = model.input_format.prepare(frame, model.input_size_for(params), self.workspace)
+        axes = (2, 3) if model.input_format.channels_first else (1, 2)
+        size = array.shape[axes[0]], array.shape[axes[1]]
+        outputs = self._open().run(model.feeds(array, size))
+        try:
+            found = model.output_format.decode(outputs, size, model.class_ids, model.probability(min_score))
+        except ModelFileError as error:
             raise ModelFileError(
-                f"{name} has format version {header['format_version']}, this release reads {FORMAT_VERSION}; "
-                "train again or install the release that wrote it"
-            )
-        params, metadata = header["params"], dict(header["metadata"])
-        size = int(params["input_size"])
-        NetworkParams(input_size=size)
-        image, boxes = facts.inputs[0], facts.outputs[0]
-        is_image = image.dtype == "uint8" and len(image.shape) == 4
-        if not is_image or len(boxes.shape) != 3 or boxes.shape[1] not in (5, None):
-            raise ValueError(f"input {image.dtype} {image.shape}, output {boxes.shape}")
-        return NetworkModel(
-            graph=graph,
-            name=name,
-            input_format=InputFormat(_fixed_size(image, False, name), "uint8", False, padding=115),
-            output_format=OutputFormat("columns", 1),
-            input_name=image.name,
-            input_size=size,
-            classes={0: "vehicle"},
-            slope=float(params["slope"]),
-            offset=float(params["offset"]),
-            threshold=float(params["threshold"]),
-            nms_iou=float(params["nms_iou"]),
-            metadata=metadata,
-        )
-    except (InvalidInputError, LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
-        raise ModelFileError(f"{name} does not fit its own parameters: {error}; train again") from error
+                f"{model.name} computes invalid values: {error}; download or export it again"
+            ) from error
+        boxes = _to_frame(found.boxes, frame.shape, scaled)
+        inside = box_areas(boxes) > 0
+        return Candidates(boxes[inside], found.scores[inside], found.class_ids[inside])
+
+    def _open(self) -> Session:
+        with self._lock:
+            if self._session is None:
+                model = self.model
+                self._session = open_session(
+                    model.graph,
+                    model.name,
+                    n_jobs=self._team.n_threads,
+                    device=model.device,
+                    runtime=model.runtime,
+                )
+            return self._session
+
+    def close(self) -> None:
+        """Close the session; the next search opens another one."""
+        super().close()
+        with self._lock:
+            # Searches in other threads may still use it; the last reference closes it.
+            self._session = None
 
 
-def _foreign_model(graph: bytes, facts: GraphFacts) -> NetworkModel:
-    """Model of a file that another library has written."""
-    name, metadata = facts.name, facts.metadata
-    if metadata.get("task", "detect") != "detect":
-        raise ModelFileError(
-            f"{name} is a network for the task {metadata['task']!r}; export one for detection"
-        )
-    _check_inputs(facts)
-    image, *extra = facts.inputs
-    channels_first = image.shape[1] == 3 or image.shape[3] != 3
-    size = _fixed_size(image, channels_first, name)
-    names = class_names(facts)
-    input_format = InputFormat(size, image.dtype, channels_first, _stride(metadata))
-    model = NetworkModel(
-        graph=graph,
-        name=name,
-        input_format=input_format,
-        output_format=OutputFormat("columns"),
-        extra_inputs=tuple(extra),
-        input_name=image.name,
-        input_size=max(size) if size else _INPUT_SIZE,
-        metadata=dict(metadata),
-    )
-    tried = size or (_PROBE_SIZE, _PROBE_SIZE)
-    output_format = recognize(
-        facts, _output_shapes(model, facts, tried), tried, None if names is None else len(names)
-    )
-    is_set = output_format.normalized or output_format.kind == "lists"
-    yolox = output_format.kind == "yolox"
-    input_format = dataclasses.replace(
-        input_format,
-        stretch=output_format.normalized or bool(extra),
-        bgr=yolox,
-        scaled=not yolox,
-        standardized=output_format.kind == "detr" and {"dets", "labels"} <= {p.name for p in facts.outputs},
-    )
-    return dataclasses.replace(
-        model,
-        input_format=input_format,
-        output_format=output_format,
-        classes=names or usual_names(output_format.n_classes),
-        threshold=0.0 if is_set else logit(0.25),
-    )
+_SEARCHES: weakref.WeakSet[NetworkSearch] = weakref.WeakSet()
+# Sessions of the parent process: closing one would wait for its threads for ever.
+_ABANDONED: list[Session] = []
 
 
-def _check_inputs(facts: GraphFacts) -> None:
-    """Raise unless the first input is an image, and a second one the size of the image."""
-    image, *extra = facts.inputs or (Port("none", (), ""),)
-    fits = (
-        len(image.shape) == 4
-        and image.shape[0] in (1, None)
-        and (3 in image.shape[1::2] or None in image.shape[1::2])
-        and image.dtype in ("float32", "float16", "uint8")
-        and len(extra) <= 1
-        and all("size" in port.name for port in extra)
-    )
-    if not fits:
-        listed = ", ".join(f"{port.name} {port.dtype} {port.shape}" for port in facts.inputs)
-        raise ModelFileError(
-            f"{facts.name} must have one input, float32, float16 or uint8 of shape (1, 3, height, width) or "
-            f"(1, height, width, 3), got {listed}; export it with a batch of 1 and three color channels"
-        )
+def _after_fork() -> None:
+    for search in list(_SEARCHES):
+        search.abandon_session()
 
 
-def _fixed_size(image: Port, channels_first: bool, name: str) -> Size | None:
-    height, width = image.shape[2:] if channels_first else image.shape[1:3]
-    if height is None and width is None:
-        return None
-    if height is None or width is None:
-        raise ModelFileError(
-            f"{name} has an input of shape {image.shape}; export it with both sides fixed, or none"
-        )
-    return height, width
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
 
 
-def _stride(metadata: Mapping[str, str]) -> int:
-    text = metadata.get("stride", "32")
-    return max(int(text), 32) if text.isdecimal() and len(text) < 4 else 32
+def _to_frame(boxes: Floats, shape: tuple[int, ...], scaled: tuple[int, int]) -> Floats:
+    """Boxes in pixels of the frame, clipped to it; `scaled` is the frame's height and width in the input."""
+    height, width = shape[:2]
+    factors = np.array([width / scaled[1], height / scaled[0]] * 2)
+    return np.asarray(np.clip(boxes * factors, 0.0, [width, height, width, height]))
 
 
-def _output_shapes(model: NetworkModel, facts: GraphFacts, size: Size) -> list[tuple[int, ...]]:
-    """Shapes of the outputs for an input of this size: as stated in the file, or tried."""
-    if all(None not in port.shape and port.shape for port in facts.outputs) and model.input_format.size:
-        return [tuple(side or 0 for side in port.shape) for port in facts.outputs]
-    image, _ = model.input_format.prepare(np.full((*size, 3), 114, np.uint8), max(size))
-    session = open_session(model.graph, model.name, runtime="onnxruntime")
-    try:
-        return [output.shape for output in session.run(model.feeds(image, size))]
-    finally:
-        session.close()
+def to_log_odds(probabilities: Floats) -> Floats:
+    """Log-odds of probabilities, at most those of 0.9999."""
+    p = probabilities.clip(_MIN_PROBABILITY, 1 - _MIN_PROBABILITY)
+    return np.asarray(np.log(p / (1 - p)))
 
 
-def _class_ids(
-    classes: Collection[str | int] | None, model: NetworkModel, name: str
-) -> NDArray[np.intp] | None:
-    """Numbers of the classes to keep; None: all."""
-    known = model.classes or {}
-    numbers = {text.lower(): number for number, text in known.items()}
-    if classes is None:
-        ids = [numbers[text] for text in VEHICLE_CLASSES if text in numbers]
-        if known and not ids:
-            listed = ", ".join(known.values())
-            raise InvalidInputError(
-                f"classes must be given for {name}, which has none of {', '.join(VEHICLE_CLASSES)}; name "
-                f"those of its classes that are vehicles: {listed}"
-            )
-        return np.array(sorted(ids), np.intp) if known else None
-    ids = []
-    count = model.output_format.n_classes or 1 << 31
-    for each in check_sequence(classes, "classes", "names or numbers of classes"):
-        number = numbers.get(each.lower(), -1) if isinstance(each, str) else each
-        is_number = isinstance(number, (int, np.integer)) and not isinstance(number, bool)
-        if not is_number or not 0 <= number < count or (known and number not in known):
-            listed = ", ".join(f"{text} ({n})" for n, text in known.items())
-            listed = listed or "numbers only" + f", below {count}" * (count < 1 << 31)
-            raise InvalidInputError(
-                f"classes must be classes of {name}, got {describe(each)}; it has {listed}"
-            )
-        ids.append(int(number))
-    if not ids:
-        raise InvalidInputError("classes must hold at least one class; omit it for all vehicles")
-    return np.array(sorted(set(ids)), np.intp)
+def to_probability(log_odds: float) -> float:
+    """Probability of log-odds; 0 where `to_log_odds` is limited."""
+    probability = 1 / (1 + math.exp(-min(max(log_odds, -700.0), 700.0)))
+    return 0.0 if probability <= _MIN_PROBABILITY else probability

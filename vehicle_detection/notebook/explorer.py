@@ -42,10 +42,10 @@ from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
 from vehicle_detection.explanation import Explanation, explain
 from vehicle_detection.heatmap import frame_heat, label_heat
 from vehicle_detection.images import read_image
-from vehicle_detection.network import NetworkModel
+from vehicle_detection.network import NetworkModel, NetworkParams
 from vehicle_detection.notebook.widgets import METHOD_CONTROLS, Panel, build_widgets
-from vehicle_detection.params import HeatParams, NetworkParams, RegionParams, SearchParams
-from vehicle_detection.regions import find_vehicles
+from vehicle_detection.params import HeatParams, SearchParams
+from vehicle_detection.regions import RegionParams, find_vehicles
 
 Image = NDArray[np.uint8]
 PathLike = str | os.PathLike[str]

@@ -9,8 +9,7 @@ from vehicle_detection.params.features import (
     SPATIAL_ORDERS,
     FeatureParams,
 )
-from vehicle_detection.params.network import NetworkParams
-from vehicle_detection.params.regions import HeatParams, HeatRange, RegionParams
+from vehicle_detection.params.regions import HeatParams, HeatRange
 from vehicle_detection.params.search import (
     REFERENCE_WIDTH,
     FunctionParams,
@@ -19,7 +18,6 @@ from vehicle_detection.params.search import (
     SearchParams,
     entries,
 )
-from vehicle_detection.params.tracking import TrackParams
 
 __all__ = [
     "COLOR_SPACES",
@@ -31,11 +29,8 @@ __all__ = [
     "FunctionParams",
     "HeatParams",
     "HeatRange",
-    "NetworkParams",
     "PixelBand",
-    "RegionParams",
     "SearchBand",
     "SearchParams",
-    "TrackParams",
     "entries",
 ]

@@ -14,11 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import Floats
+from vehicle_detection._common import Floats, Units
 from vehicle_detection.drawing import color_index
 from vehicle_detection.events import KINDS, Event, TrackHistory, bin_means, split_runs
 from vehicle_detection.report.formatting import format_time, format_value, svg_element
-from vehicle_detection.units import Units
 
 MAX_ROWS = 14
 """Largest number of tracks that get a row each in `gantt`; more tracks share rows."""

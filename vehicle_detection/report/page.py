@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import vehicle_detection
-from vehicle_detection._common import Floats, pluralize
+from vehicle_detection._common import ROUGH_DISTANCE, UNITS, Floats, Units, format_with_error, pluralize
 from vehicle_detection.annotator import MAX_SPEED_STD
 from vehicle_detection.events import (
     KINDS,
@@ -43,7 +43,6 @@ from vehicle_detection.report.charts import (
 )
 from vehicle_detection.report.formatting import format_time, format_value
 from vehicle_detection.training import split_table
-from vehicle_detection.units import ROUGH_DISTANCE, UNITS, Units, format_with_error
 from vehicle_detection.video import VideoReport
 
 _COUNT_SECONDS = (1, 2, 5, 10, 15, 30, 60, 120, 300)  # durations of a bar in the chart of counts

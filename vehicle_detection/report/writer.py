@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from vehicle_detection._common import (
+    UNITS,
     atomic_write,
     check_choice,
     check_integer,
@@ -23,7 +24,6 @@ from vehicle_detection._common import (
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events import Event, TrackLog, check_events, find_events
 from vehicle_detection.report.page import TrackPicture, VideoEmbed, render_page
-from vehicle_detection.units import UNITS
 from vehicle_detection.video import VideoReport
 
 

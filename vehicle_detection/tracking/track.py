@@ -1,16 +1,113 @@
-"""A track: what users see of it after a frame, and the state of its life cycle inside the tracker."""
+"""Tracks: their parameters, what users see of them after a frame, and the state of their life cycle."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
-from vehicle_detection._common import Floats
-from vehicle_detection.params import TrackParams
+import numpy as np
+
+from vehicle_detection._common import Checked, Floats, choice, integer, number, pluralize
+from vehicle_detection.boxes import Detections
+from vehicle_detection.errors import InvalidInputError
 
 TIME_TOLERANCE = 1e-6
 """Float tolerance in seconds when comparing summed frame times with a limit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackParams(Checked):
+    """How detections become tracks; times are in seconds of the video, sizes in fractions of a box's size.
+
+    Attributes
+    ----------
+    smoother
+        ``"kalman"``: a constant-velocity Kalman filter; ``"history"``: weighted mean of the last boxes (the
+        course's second system); ``"nearest"``: the box moves a fraction of the way to the nearest detection
+        (the course's first system).
+    score_time_constant
+        Time constant of the exponential moving average of a track's scores.
+    high_threshold, low_threshold
+        Detections from `high_threshold` on can start tracks. Detections between the two thresholds only
+        continue tracks that have no better detection, and confirmed tracks only within half of
+        `max_distance` and at an IoU of at least 0.5 (as in ByteTrack). Lower ones are dropped.
+    confirm_score
+        Average score at which a track is confirmed. A vehicle with constant score `s` reaches it after
+        ``score_time_constant * log(s / (s - confirm_score))`` seconds, and never if `s` is lower. Both
+        shipped models detect vehicles in single images from score 0 on.
+    confirm_hits, confirm_seconds
+        Minimum number of detections beyond the number of frames without one, and minimum time since the first
+        one, before a track is confirmed.
+    instant_confirm_score
+        In the first frame, and in the first one after a scene cut, a detection with this score is confirmed
+        at once, because no earlier frame could have shown it.
+    tentative_coast, max_coast, max_hidden
+        A tentative and a confirmed track end after these times without a detection. The time in which another
+        vehicle hides a confirmed one has a limit of its own, `max_hidden`.
+    show_coast, show_covered
+        A confirmed track is shown for `show_coast` without a detection, and no longer than it was detected
+        since its confirmation. While another vehicle hides it, it is shown up to `max_coast`, no longer than
+        it was detected, and for `show_covered` if nothing of it is visible. It is not shown once it must have
+        moved by half of its size.
+    backfill
+        A track is also shown for this time before its confirmation, where frames can wait: in
+        `process_video` and `track`, unless the source is live.
+    max_gap
+        A longer gap between two frames ends all tracks.
+    max_distance
+        Maximum distance between the centers of a detection and of a prediction, in box widths and heights.
+    max_iou, max_coverage
+        A detection starts no track if its IoU with a track exceeds `max_iou`, or if the two share more than
+        the fraction `max_coverage` of the smaller box.
+    measurement_noise, measurement_correlation_time
+        Standard error of a detection's edges, and time over which it is correlated, so that twice the frame
+        rate is not twice the evidence.
+    process_noise_position, process_noise_size
+        Process noise of the center and of the size: standard deviation by which their speeds change in a
+        second, in sizes per second.
+    history_seconds, nearest_weight
+        Length of the mean of the smoother ``"history"``, and fraction of the way that the smoother
+        ``"nearest"`` moves in 0.04 seconds, in (0, 1].
+
+    Examples
+    --------
+    >>> TrackParams(max_coast=0.5).show_coast
+    0.3
+    """
+
+    smoother: Literal["kalman", "history", "nearest"] = choice("kalman", ("kalman", "history", "nearest"))
+    score_time_constant: float = number(0.3, above=0, high=3600)
+    high_threshold: float = number(-0.3, low=-1e6, high=1e6)
+    low_threshold: float = number(-1.5, low=-1e6, high=1e6)
+    confirm_score: float = number(0.2, low=-1e6, high=1e6)
+    confirm_hits: int = integer(3, low=1, high=10_000)
+    confirm_seconds: float = number(0.12, low=0, high=3600)
+    instant_confirm_score: float = number(1.3, low=-1e6, high=1e6)
+    tentative_coast: float = number(0.1, low=0, high=3600)
+    show_coast: float = number(0.3, low=0, high=3600)
+    show_covered: float = number(0.4, low=0, high=3600)
+    max_coast: float = number(1.0, low=0, high=3600)
+    max_hidden: float = number(4.0, low=0, high=3600)
+    backfill: float = number(0.32, low=0, high=3600)
+    max_gap: float = number(1.0, above=0, high=3600)
+    max_distance: float = number(0.7, above=0, high=100)
+    max_iou: float = number(0.3, low=0, high=1)
+    max_coverage: float = number(0.7, low=0, high=1)
+    measurement_noise: float = number(0.07, above=0, high=1)
+    measurement_correlation_time: float = number(0.04, low=0, high=3600)
+    process_noise_position: float = number(0.18, above=0, high=100)
+    process_noise_size: float = number(0.1, above=0, high=100)
+    history_seconds: float = number(0.4, above=0, high=3600)
+    nearest_weight: float = number(0.3, above=0, high=1)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.show_coast > self.max_coast:
+            raise InvalidInputError(
+                f"show_coast must be at most max_coast, because a track that ended is not shown; "
+                f"got {self.show_coast:g} and {self.max_coast:g}; change both"
+            )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,6 +153,57 @@ class Track:
     distance_std_m: float | None = None
     speed_mps: float | None = None
     speed_std_mps: float | None = None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FrameResult:
+    """The result of one frame of a video.
+
+    Attributes
+    ----------
+    index
+        Number of the frame since the last reset, from 0.
+    time
+        Time of the frame in seconds; None if unknown.
+    windows
+        Positive windows of this frame.
+    detections
+        Boxes of this frame, before tracking.
+    tracks
+        All tracks; those with ``track.shown`` are vehicles to draw.
+    seconds
+        Time spent per stage: ``"search"``, ``"regions"``, ``"track"``.
+    searched
+        Whether the frame was searched. If not, it has neither windows nor detections, and its tracks are
+        interpolated or predicted.
+    """
+
+    index: int
+    time: float | None
+    windows: Detections
+    detections: Detections
+    tracks: tuple[Track, ...]
+    seconds: dict[str, float] = field(default_factory=dict)
+    searched: bool = True
+
+    @property
+    def shown(self) -> tuple[Track, ...]:
+        """The tracks to draw."""
+        return tuple(track for track in self.tracks if track.shown)
+
+    def __repr__(self) -> str:
+        time = "" if self.time is None else f" at {self.time:.2f} s"
+        found = pluralize(len(self.detections), "detection") if self.searched else "not searched"
+        shown = f"{pluralize(len(self.shown), 'vehicle')} shown"
+        return f"{type(self).__name__}({self.index}{time}: {found}, {shown})"
+
+    def to_supervision(self) -> Any:
+        """Convert the shown tracks to ``supervision.Detections`` with their ids as ``tracker_id``."""
+        boxes = np.array([track.box for track in self.shown]).reshape(-1, 4)
+        confidences = [track.confidence for track in self.shown]
+        known = None if None in confidences else np.array(confidences, np.float64)
+        found = Detections(boxes, np.array([track.score for track in self.shown]), known)
+        return found.to_supervision(tracker_id=[track.id for track in self.shown])
 
 
 def weight_of(dt: float, params: TrackParams) -> float:

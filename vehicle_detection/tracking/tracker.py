@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from vehicle_detection._common import Floats, check_integer, check_number, check_shape, check_type
 from vehicle_detection.boxes import Detections, Platt, box_areas, on_one_vehicle
 from vehicle_detection.camera import UNKNOWN_LENS_STD, Camera, FrameShape, truncated_edges
-from vehicle_detection.params import TrackParams
 from vehicle_detection.tracking.association import (
     covered_fractions,
     distinct_vehicles,
@@ -28,22 +27,22 @@ from vehicle_detection.tracking.association import (
     merged_detections,
     nearer_cover,
 )
-from vehicle_detection.tracking.distance_filter import (
+from vehicle_detection.tracking.distance import (
     estimate_distances,
     initiate_states,
     predict_distances,
     update_distances,
 )
-from vehicle_detection.tracking.horizon_filter import HorizonFilter
-from vehicle_detection.tracking.kalman_filter import (
+from vehicle_detection.tracking.horizon import HorizonFilter
+from vehicle_detection.tracking.kalman import (
     OUTWARD,
     KalmanStates,
     Measurements,
     coasted_distance,
     exit_times,
 )
-from vehicle_detection.tracking.simple import make_smoother
-from vehicle_detection.tracking.track import TIME_TOLERANCE, Track, TrackState, weight_of
+from vehicle_detection.tracking.smoothers import make_smoother
+from vehicle_detection.tracking.track import TIME_TOLERANCE, Track, TrackParams, TrackState, weight_of
 
 # Visible fraction of a box below which its vehicle leaves the frame if it moves outwards, and below which it
 # has left; covered fractions above which a vehicle is hidden, and above which nothing of it is visible.

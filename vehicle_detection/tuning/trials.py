@@ -31,7 +31,8 @@ from vehicle_detection.evaluation import (
     evaluate_detections,
     precision_recall_curve,
 )
-from vehicle_detection.params import FeatureParams, RegionParams, SearchParams
+from vehicle_detection.params import FeatureParams, SearchParams
+from vehicle_detection.regions import RegionParams
 from vehicle_detection.tuning.cache import FeatureCache, digest_of
 from vehicle_detection.tuning.grid import FEATURE_FIELDS, TRAINING_FIELDS, Candidate, TrialConfig
 from vehicle_detection.tuning.results import RowStore, make_table

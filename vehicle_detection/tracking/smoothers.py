@@ -12,9 +12,8 @@ import numpy as np
 
 from vehicle_detection._common import Floats
 from vehicle_detection.boxes import iou_matrix
-from vehicle_detection.params import TrackParams
 from vehicle_detection.tracking.association import center_distances, match_boxes
-from vehicle_detection.tracking.kalman_filter import (
+from vehicle_detection.tracking.kalman import (
     Bools,
     KalmanSmoother,
     KalmanStates,
@@ -22,7 +21,7 @@ from vehicle_detection.tracking.kalman_filter import (
     centers_and_sizes,
     initiate,
 )
-from vehicle_detection.tracking.track import TrackState
+from vehicle_detection.tracking.track import TrackParams, TrackState
 
 
 class HistorySmoother:

@@ -14,7 +14,7 @@ import numpy as np
 
 from vehicle_detection._common import Floats
 from vehicle_detection.camera import Camera
-from vehicle_detection.tracking.kalman_filter import KalmanStates, Measurements
+from vehicle_detection.tracking.kalman import KalmanStates, Measurements
 
 _INITIAL_DISTANCE, _INITIAL_DISTANCE_STD, _INITIAL_RANGE_SPEED_STD = 30.0, 1e3, 40.0
 _MIN_DISTANCE, _MAX_DISTANCE = 1.0, 500.0

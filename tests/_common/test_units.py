@@ -2,7 +2,7 @@
 
 import pytest
 
-from vehicle_detection.units import UNITS
+from vehicle_detection._common import UNITS
 
 
 @pytest.mark.parametrize(

@@ -16,9 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from vehicle_detection._common import Floats
 from vehicle_detection.camera import Camera, FrameShape, lateral_offsets, truncated_edges
-from vehicle_detection.params import TrackParams
 from vehicle_detection.tracking.association import match_boxes
-from vehicle_detection.tracking.track import TrackState
+from vehicle_detection.tracking.track import TrackParams, TrackState
 
 Bools = NDArray[np.bool_]
 

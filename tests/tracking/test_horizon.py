@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vehicle_detection.camera import Camera, truncated_edges
-from vehicle_detection.tracking.horizon_filter import HorizonFilter
+from vehicle_detection.tracking.horizon import HorizonFilter
 
 FRAME = (720, 1280)
 TRUE = Camera.for_frame(FRAME, horizon=0.56)

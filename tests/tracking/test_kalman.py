@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from vehicle_detection.camera import Camera
-from vehicle_detection.params import TrackParams
-from vehicle_detection.tracking.distance_filter import initiate_states
-from vehicle_detection.tracking.kalman_filter import (
+from vehicle_detection.tracking import TrackParams
+from vehicle_detection.tracking.distance import initiate_states
+from vehicle_detection.tracking.kalman import (
     UNKNOWN,
     KalmanSmoother,
     KalmanStates,

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from vehicle_detection.camera import Camera
-from vehicle_detection.tracking.distance_filter import (
+from vehicle_detection.tracking.distance import (
     estimate_distances,
     initiate_states,
     predict_distances,
     update_distances,
 )
-from vehicle_detection.tracking.kalman_filter import Measurements, initiate
+from vehicle_detection.tracking.kalman import Measurements, initiate
 
 SHAPE = (720, 1280)
 CAMERA = Camera.for_frame(SHAPE, horizon_std_px=0.0)

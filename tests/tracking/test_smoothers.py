@@ -3,14 +3,14 @@ import math
 import numpy as np
 import pytest
 
-from vehicle_detection.params import TrackParams
-from vehicle_detection.tracking.kalman_filter import (
+from vehicle_detection.tracking import TrackParams
+from vehicle_detection.tracking.kalman import (
     KalmanSmoother,
     KalmanStates,
     Measurements,
     centers_and_sizes,
 )
-from vehicle_detection.tracking.simple import HistorySmoother, NearestSmoother, make_smoother
+from vehicle_detection.tracking.smoothers import HistorySmoother, NearestSmoother, make_smoother
 from vehicle_detection.tracking.track import TrackState
 
 SHAPE = (720, 1280)

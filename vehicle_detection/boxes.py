@@ -1,0 +1,545 @@
+"""Boxes of vehicles: their arithmetic, suppression of overlapping ones, and their scores.
+
+Boxes are ``(N, 4)`` arrays ``[x1, y1, x2, y2]`` in half-open pixels: the width is ``x2 - x1``. `Detections`
+are boxes with scores; `Platt` turns scores into probabilities, and `log_odds` the scores of other detectors
+into those of this library. Functions without ``check_`` in their body are for arrays that were checked.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vehicle_detection._common import (
+    Checked,
+    Floats,
+    check_array,
+    check_boxes,
+    check_choice,
+    check_integer,
+    check_number,
+    check_sequence,
+    check_shape,
+    describe,
+    number,
+    pluralize,
+)
+from vehicle_detection.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    import pandas
+
+ScoreScale = Literal["probability", "logit"] | tuple[float, float]
+"""What the scores of another detector are: see `log_odds`."""
+
+# Log-odds of a certain detection: 95%.
+_CERTAIN_SCORE = 3.0
+# Lower bound of a divisor. An empty box shares no area with any other, so its ratios become 0.
+_TINY = np.finfo(np.float64).tiny
+# Boxes at one distance: least ratio of their heights, largest difference of their lower edges in heights. And
+# the fraction of the narrower one's width that boxes on one vehicle share.
+_ALIKE_HEIGHT, _ALIKE_BOTTOM, _PART_OVERLAP = 0.8, 0.15, 0.4
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """Boxes and their scores as columns, checked on construction.
+
+    Attributes
+    ----------
+    boxes, scores
+        ``(N, 4)`` boxes ``[x1, y1, x2, y2]``, and ``(N,)`` finite float64 scores.
+    confidences
+        ``(N,)`` calibrated probabilities of a vehicle in [0, 1]; None if they are unknown. A column of NaN,
+        as in a table, becomes None.
+
+    Raises
+    ------
+    InvalidInputError
+        If the columns differ in length or contain NaN, or a confidence is not a probability.
+
+    Examples
+    --------
+    >>> found = Detections([[0, 0, 10, 10], [5, 5, 9, 9]], [0.5, 2.0])
+    >>> found
+    Detections(2 boxes, scores 0.50 to 2.00)
+    >>> found[found.scores > 1].boxes
+    array([[5, 5, 9, 9]])
+    >>> found + found[:1]
+    Detections(3 boxes, scores 0.50 to 2.00)
+    """
+
+    boxes: NDArray[Any]
+    scores: Floats
+    confidences: Floats | None = None
+
+    if TYPE_CHECKING:  # The constructor converts its arguments.
+
+        def __init__(
+            self, boxes: Detections | ArrayLike, scores: ArrayLike, confidences: ArrayLike | None = None
+        ) -> None: ...
+
+    def __post_init__(self) -> None:
+        boxes = check_boxes(self.boxes)
+        scores = _score_column(self.scores, "scores", len(boxes))
+        object.__setattr__(self, "boxes", boxes)
+        object.__setattr__(self, "scores", scores)
+        if self.confidences is None:
+            return
+        given = check_array(self.confidences, "confidences")
+        if given.size and given.dtype.kind == "f" and np.isnan(given).all():
+            object.__setattr__(self, "confidences", None)
+            return
+        confidences = _score_column(given, "confidences", len(boxes))
+        if not ((confidences >= 0) & (confidences <= 1)).all():
+            raise InvalidInputError(
+                f"confidences must be probabilities, 0 to 1, got {describe(self.confidences)}; omit them "
+                "where they are unknown"
+            )
+        object.__setattr__(self, "confidences", confidences)
+
+    @classmethod
+    def from_columns(
+        cls, boxes: NDArray[Any], scores: Floats, confidences: Floats | None = None
+    ) -> Detections:
+        """Make detections of columns that the library has computed, without checking them."""
+        detections = object.__new__(cls)
+        vars(detections).update(boxes=boxes, scores=scores, confidences=confidences)
+        return detections
+
+    @classmethod
+    def empty(cls) -> Detections:
+        """Return detections without any box."""
+        return cls.from_columns(np.empty((0, 4)), np.empty(0))
+
+    @classmethod
+    def from_supervision(
+        cls,
+        detections: Any,
+        *,
+        score: ScoreScale = "probability",
+        threshold: float | None = None,
+        class_ids: Collection[int] | None = None,
+    ) -> Detections:
+        """Convert the detections of another library, such as ``supervision.Detections``.
+
+        Parameters
+        ----------
+        detections
+            An object with ``xyxy``, ``(N, 4)``, with ``confidence`` or ``conf``, ``(N,)`` or None if unknown,
+            and, if known, with ``class_id`` or ``cls``, ``(N,)``. The second names are those of the ``boxes``
+            of Ultralytics' results.
+        score, threshold
+            What the confidences are, as in `detector_from`.
+        class_ids
+            Keep only boxes of these classes, such as ``(2, 5, 7)`` for the cars, buses and trucks of COCO.
+
+        Returns
+        -------
+        Detections
+            Boxes with scores in log-odds above the threshold. If confidences are unknown, the score is 3.
+
+        Raises
+        ------
+        InvalidInputError
+            If an attribute is missing, a column is malformed, or classes are asked for but unknown.
+
+        Examples
+        --------
+        >>> from types import SimpleNamespace
+        >>> found = SimpleNamespace(xyxy=[[0, 0, 9, 9], [5, 5, 9, 9]], confidence=[0.5, 0.9], class_id=[2, 0])
+        >>> Detections.from_supervision(found), Detections.from_supervision(found, class_ids=[0])
+        (Detections(2 boxes, scores 0.00 to 2.20), Detections(1 box, scores 2.20 to 2.20))
+        """
+        has_confidence = hasattr(detections, "confidence") or hasattr(detections, "conf")
+        if not hasattr(detections, "xyxy") or not has_confidence:
+            raise InvalidInputError(
+                "detections must have the attributes xyxy, and confidence or conf, got "
+                f"{describe(detections)}; pass a supervision.Detections, whose confidence may be None"
+            )
+        scale = check_score_scale(score, threshold)
+        boxes, confidence = check_boxes(detections.xyxy), _first_known(detections, "confidence", "conf")
+        if confidence is None:
+            scores = np.full(len(boxes), _CERTAIN_SCORE)
+        else:
+            scores = log_odds(confidence, scale, threshold)
+        found = cls(boxes, scores)
+        if class_ids is None:
+            return found
+        return select_classes(found, _first_known(detections, "class_id", "cls"), check_class_ids(class_ids))
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return a table with a row for each box: corners, score and, if known, confidence.
+
+        >>> Detections(np.array([[0.0, 0, 50, 40]]), np.array([1.5])).to_pandas().iloc[0].to_dict()
+        {'x1': 0.0, 'y1': 0.0, 'x2': 50.0, 'y2': 40.0, 'score': 1.5}
+        """
+        import pandas
+
+        columns = {**dict(zip(("x1", "y1", "x2", "y2"), self.boxes.T)), "score": self.scores}
+        if self.confidences is not None:
+            columns["confidence"] = self.confidences
+        return pandas.DataFrame(columns)
+
+    def to_supervision(self, *, tracker_id: ArrayLike | None = None) -> Any:
+        """Convert to ``supervision.Detections``, for the drawing, counting and tracking of that library.
+
+        The confidence is that of the detection or, if unknown, ``1 / (1 + exp(-score))``: a score of 0, the
+        threshold of a vehicle, becomes 0.5. The class is 0. `tracker_id` are ``(N,)`` numbers of the tracks,
+        if known. Raises `InvalidInputError` if supervision is not installed.
+        """
+        try:
+            from supervision import Detections as SupervisionDetections
+        except ImportError as error:
+            raise InvalidInputError(
+                "to_supervision needs the package supervision, which is not installed; run "
+                "pip install supervision"
+            ) from error
+        ids = None if tracker_id is None else np.asarray(tracker_id, np.int64).reshape(-1)
+        known = self.confidences
+        confidences = LOG_ODDS.probability(self.scores) if known is None else known
+        return SupervisionDetections(
+            xyxy=self.boxes.astype(np.float32),
+            confidence=confidences.astype(np.float32),
+            class_id=np.zeros(len(self), np.int64),
+            tracker_id=ids,
+        )
+
+    def __add__(self, other: Detections) -> Detections:
+        """Join two sets of boxes, such as the windows of two searches."""
+        if not isinstance(other, Detections):
+            return NotImplemented
+        if not len(self) or not len(other):  # without boxes, confidences are not unknown
+            return self if len(self) else other
+        known = self.confidences is not None and other.confidences is not None
+        names = ("boxes", "scores", "confidences") if known else ("boxes", "scores")
+        return self.from_columns(
+            *(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names)
+        )
+
+    def __repr__(self) -> str:
+        if not len(self):
+            return "Detections(0 boxes)"
+        boxes = pluralize(len(self), "box", "es")
+        return f"Detections({boxes}, scores {self.scores.min():.2f} to {self.scores.max():.2f})"
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+    def __getitem__(self, rows: int | slice | NDArray[Any] | list[int]) -> Detections:
+        """Take one row by its index, or several by a slice, a mask or a list of indices."""
+        taken = [rows] if isinstance(rows, (int, np.integer)) else rows
+        known = self.confidences
+        return self.from_columns(
+            self.boxes[taken], self.scores[taken], None if known is None else known[taken]
+        )
+
+    def __iter__(self) -> Iterator[tuple[NDArray[Any], float]]:
+        """Yield ``(box, score)`` pairs."""
+        return zip(self.boxes, self.scores.tolist())
+
+
+def _score_column(values: ArrayLike, name: str, count: int | None = None) -> Floats:
+    """Return finite numbers as ``(N,)`` float64, one for each of `count` boxes."""
+    array = check_array(values, name)
+    if array.size == 0:
+        array = array.reshape(-1).astype(np.float64)
+    if array.ndim != 1 or array.dtype.kind not in "iuf" or (count is not None and len(array) != count):
+        each = "each box" if count is None else f"each of the {count} boxes"
+        raise InvalidInputError(f"{name} must be one number for {each}, got {describe(values)}")
+    if not np.isfinite(array).all():
+        raise InvalidInputError(f"{name} must be finite, got NaN or infinity; drop those rows")
+    return array.astype(np.float64, copy=False)
+
+
+def _first_known(detections: Any, *names: str) -> Any:
+    """Return the first of these attributes that is not None; None if there is none."""
+    values = (getattr(detections, name, None) for name in names)
+    return next((value for value in values if value is not None), None)
+
+
+def check_class_ids(class_ids: object) -> tuple[int, ...]:
+    """Return the numbers of the classes to keep."""
+    ids = check_sequence(class_ids, "class_ids", "integers, such as (2, 5, 7)")
+    return tuple(check_integer(each, "class_ids", low=0) for each in ids)
+
+
+def select_classes(found: Detections, classes: Any, class_ids: Collection[int]) -> Detections:
+    """Keep the boxes of these classes; `classes` is ``(N,)``, or None if they are unknown."""
+    if not len(found):
+        return found
+    column = check_array(classes, "classes")
+    if column.shape != (len(found),) or column.dtype.kind not in "iuf":
+        raise InvalidInputError(
+            f"class_ids needs an integer class for each of {pluralize(len(found), 'box', 'es')}, got "
+            f"{describe(classes)}; omit it, or return (boxes, scores, classes)"
+        )
+    return found[np.isin(column, list(class_ids))]
+
+
+def box_areas(boxes: NDArray[Any]) -> Floats:
+    """Area of each ``[x1, y1, x2, y2]`` box in pixels; ``(N,)`` float64."""
+    return np.asarray((boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1]), np.float64)
+
+
+def intersection_matrix(first: NDArray[Any], second: NDArray[Any]) -> Floats:
+    """Area that each box of `first` shares with each box of `second`; ``(N, M)`` float64."""
+    left = np.maximum(first[:, None, :2], second[None, :, :2])
+    right = np.minimum(first[:, None, 2:], second[None, :, 2:])
+    return np.asarray(np.clip(right - left, 0, None).prod(axis=2), np.float64)
+
+
+def _iou(shared: Floats, areas: Floats, others: Floats) -> Floats:
+    return np.asarray(shared / np.maximum(areas + others - shared, _TINY))
+
+
+def _coverage(shared: Floats, areas: Floats, others: Floats) -> Floats:
+    return np.asarray(shared / np.maximum(np.minimum(areas, others), _TINY))
+
+
+def overlap_matrices(first: Floats, second: Floats) -> tuple[Floats, Floats]:
+    """IoU of ``(N, 4)`` with ``(M, 4)`` boxes, and shared fraction of the smaller box; each ``(N, M)``."""
+    shared = intersection_matrix(first, second)
+    areas, others = box_areas(first)[:, None], box_areas(second)[None]
+    return _iou(shared, areas, others), _coverage(shared, areas, others)
+
+
+def on_one_vehicle(boxes: Floats) -> NDArray[np.bool_]:
+    """``(N, N)``: whether two boxes are at one distance and share much of the narrower one's width.
+
+    Two vehicles at one distance from the camera do not overlap in the image. The side of a near vehicle in
+    the next lane, however, looks like a vehicle of the same height.
+    """
+    left, _, right, bottom = boxes.T
+    widths, heights = right - left, bottom - boxes[:, 1]
+    higher, lower = np.maximum(heights[:, None], heights), np.minimum(heights[:, None], heights)
+    apart = np.abs(bottom[:, None] - bottom)
+    at_one_distance = (lower > _ALIKE_HEIGHT * higher) & (apart < _ALIKE_BOTTOM * higher)
+    shared = np.minimum(right[:, None], right) - np.maximum(left[:, None], left)
+    overlapping = shared > _PART_OVERLAP * np.minimum(widths[:, None], widths)
+    return np.asarray(at_one_distance & overlapping)
+
+
+def iou_matrix(first: Detections | ArrayLike, second: Detections | ArrayLike) -> Floats:
+    """Intersection over union of each box of `first` with each box of `second`.
+
+    Parameters
+    ----------
+    first, second
+        ``(N, 4)`` and ``(M, 4)`` boxes ``[x1, y1, x2, y2]``.
+
+    Returns
+    -------
+    numpy.ndarray
+        ``(N, M)`` float64 in [0, 1]. The IoU of a box without area is 0, even with itself.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is not an array of finite boxes with ``x1 <= x2`` and ``y1 <= y2``.
+
+    Examples
+    --------
+    >>> iou_matrix([[0, 0, 10, 10]], [[0, 0, 10, 10], [5, 0, 15, 10], [20, 20, 30, 30]]).round(2)
+    array([[1.  , 0.33, 0.  ]])
+    """
+    a = check_boxes(first, "first").astype(np.float64)
+    b = check_boxes(second, "second").astype(np.float64)
+    return overlap_matrices(a, b)[0]
+
+
+def clip_boxes(boxes: Detections | ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Clip boxes to an image of `shape`; a box outside the image collapses onto its border.
+
+    Parameters
+    ----------
+    boxes, shape
+        ``(N, 4)`` boxes, and ``(height, width, ...)`` of the image.
+
+    Returns
+    -------
+    numpy.ndarray
+        A new ``(N, 4)`` array of the same dtype.
+
+    Raises
+    ------
+    InvalidInputError
+        If the boxes are malformed or `shape` is not the shape of an image.
+
+    Examples
+    --------
+    >>> clip_boxes([[-5, 10, 30, 60]], (50, 20, 3))
+    array([[ 0, 10, 20, 50]])
+    """
+    array = check_boxes(boxes)
+    height, width = check_shape(shape)
+    limits = np.array([width, height, width, height])
+    return np.asarray(np.clip(array, 0, limits), array.dtype)
+
+
+def iter_nms(
+    boxes: Floats, order: NDArray[np.intp], *, max_iou: float, max_coverage: float = np.inf
+) -> Iterator[tuple[int, Floats]]:
+    """Yield the rows that greedy non-maximum suppression keeps, each with its IoU with all ``(N, 4)`` boxes.
+
+    `order` lists the candidate rows from the best one down. A candidate is dropped if its IoU with a kept
+    box exceeds `max_iou`, or if they share more than the fraction `max_coverage` of the smaller one.
+    """
+    # The areas and one row per coordinate are computed once, because this runs in every frame.
+    columns, areas = np.ascontiguousarray(boxes.T), box_areas(boxes)
+    while len(order):
+        best, order = order[0], order[1:]
+        low = np.maximum(columns[:2], columns[:2, best, None])
+        width, height = np.maximum(np.minimum(columns[2:], columns[2:, best, None]) - low, 0)
+        shared = width * height
+        iou = _iou(shared, areas, areas[best])
+        kept = iou[order] <= max_iou
+        if max_coverage < 1:
+            kept &= _coverage(shared[order], areas[order], areas[best]) <= max_coverage
+        order = order[kept]
+        yield int(best), iou
+
+
+def greedy_nms(
+    boxes: Floats,
+    scores: Floats,
+    *,
+    max_iou: float,
+    max_coverage: float = np.inf,
+    max_boxes: int | None = None,
+) -> NDArray[np.intp]:
+    """Rows that `iter_nms` keeps, best score first, at most `max_boxes`; equal scores keep their order."""
+    order = np.argsort(-scores, kind="stable")
+    kept = iter_nms(boxes, order, max_iou=max_iou, max_coverage=max_coverage)
+    return np.array([row for row, _ in islice(kept, max_boxes)], np.intp)
+
+
+def non_max_suppression(
+    boxes: Detections | ArrayLike, scores: ArrayLike, *, threshold: float = 0.5
+) -> NDArray[np.intp]:
+    """Keep the best box of each group of overlapping boxes, greedily by score.
+
+    Parameters
+    ----------
+    boxes, scores
+        ``(N, 4)`` boxes, and ``(N,)`` numbers, higher is better.
+    threshold
+        IoU in [0, 1] above which the box with the lower score is dropped.
+
+    Returns
+    -------
+    numpy.ndarray
+        Indices of the kept boxes, best score first; equal scores keep their order.
+
+    Raises
+    ------
+    InvalidInputError
+        If boxes and scores differ in number or contain NaN.
+
+    Examples
+    --------
+    >>> non_max_suppression([[0, 0, 10, 10], [1, 0, 11, 10], [50, 0, 60, 10]], [0.5, 0.9, 0.1])
+    array([1, 2])
+    """
+    detections = Detections(check_boxes(boxes), check_array(scores, "scores"))
+    max_iou = check_number(threshold, "threshold", low=0, high=1)
+    return greedy_nms(detections.boxes.astype(np.float64), detections.scores, max_iou=max_iou)
+
+
+def logit(probability: float) -> float:
+    """Return the log-odds of a probability in (0, 1)."""
+    return math.log(probability / (1 - probability))
+
+
+def log_odds(scores: ArrayLike, score: ScoreScale, threshold: float | None = None) -> Floats:
+    """Convert the scores of another detector to log-odds above its threshold, ``(N,)`` float64.
+
+    Probabilities become ``log(p / (1 - p))`` minus that of the threshold, 0.5 by default; log-odds are
+    reduced by the threshold, 0 by default; ``(low, high)`` maps low to 0 and high to 3, which is 95%.
+    """
+    values = _score_column(scores, "scores")
+    if isinstance(score, tuple):
+        low, high = score
+        return (values - low) / (high - low) * _CERTAIN_SCORE
+    if score == "logit":
+        return values - (0.0 if threshold is None else threshold)
+    if values.size and (values.min() < 0 or values.max() > 1):
+        raise InvalidInputError(
+            f'scores must be 0 to 1 with score="probability", got {values.min():g} to {values.max():g}; pass '
+            'score="logit" for log-odds, or score=(low, high)'
+        )
+    limit = 0.5 if threshold is None else threshold
+    # Probabilities of exactly 0 and 1 have no finite log-odds.
+    p = values.clip(1e-3, 1 - 1e-3)
+    return np.asarray(np.log(p / (1 - p)) - logit(limit))
+
+
+def check_score_scale(score: object, threshold: float | None) -> ScoreScale:
+    """Return the scale of `log_odds` if it and the threshold are valid."""
+    if isinstance(score, (tuple, list)) and len(score) == 2:
+        low = check_number(score[0], "score[0]")
+        if threshold is not None:
+            raise InvalidInputError(
+                f"threshold must be omitted with score=(low, high): low is the threshold; got {threshold}"
+            )
+        return low, check_number(score[1], "score[1]", above=low)
+    check_choice(score, "score", ("probability", "logit"))
+    if threshold is not None and score == "probability":
+        check_number(threshold, "threshold", above=0, high=0.999)
+    elif threshold is not None:
+        check_number(threshold, "threshold")
+    return score  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class Platt(Checked):
+    """The sigmoid that turns scores into probabilities, as `calibrate_scores` fits it.
+
+    Attributes
+    ----------
+    a, b
+        Of ``1 / (1 + exp(a * score + b))``; `a` is negative where higher scores are vehicles.
+
+    Raises
+    ------
+    InvalidInputError
+        If a number is not finite.
+
+    Examples
+    --------
+    >>> platt = Platt(-2.0, 1.0)
+    >>> platt.probability([0.0, 2.0]).round(2), platt.score(0.5)
+    (array([0.27, 0.95]), 0.5)
+    """
+
+    a: float = number()
+    b: float = number()
+
+    def probability(self, scores: ArrayLike) -> Floats:
+        """Probability of a vehicle for each score, float64 in [0, 1], of the same shape."""
+        values = check_array(scores, "scores")
+        if values.dtype.kind not in "iuf" or np.isnan(values).any():
+            raise InvalidInputError(f"scores must be numbers without NaN; got {describe(scores)}")
+        exponent = np.asarray(self.a * values.astype(np.float64) + self.b)
+        # Both branches avoid the overflow of exp, and keep small probabilities exact.
+        small = np.exp(-np.abs(exponent))
+        return np.asarray(np.where(exponent > 0, small, 1.0) / (1 + small))
+
+    def score(self, probability: float) -> float:
+        """Return the score that has this probability, in (0, 1), for use as a threshold."""
+        value = check_number(probability, "probability", above=0)
+        if value >= 1 or self.a == 0:
+            raise InvalidInputError(
+                f"probability must lie in (0, 1) and a must not be 0; got {value:g} and a={self.a:g}"
+            )
+        return (-logit(value) - self.b) / self.a
+
+
+LOG_ODDS = Platt(-1.0, 0.0)
+"""Probability of a score that is a log-odds value: 0 is 50%."""
