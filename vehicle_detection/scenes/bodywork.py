@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from vehicle_detection.scenes.raster import Color, Doubles, Floats
-from vehicle_detection.scenes.shapes import profile_at
+from vehicle_detection.scenes.shapes import BodyShape, profile_at
 from vehicle_detection.scenes.surface import Mask, SurfaceCanvas, round_corners
-
-if TYPE_CHECKING:
-    from vehicle_detection.scenes.vehicles import VehicleBody
 
 
 class BodyPainter:
     """Paints the details of one end or flank of a vehicle on a canvas in the body color."""
 
-    def __init__(self, body: VehicleBody, canvas: SurfaceCanvas, reflection: Floats) -> None:
+    def __init__(self, body: BodyShape, canvas: SurfaceCanvas, reflection: Floats) -> None:
         self.body, self.canvas = body, canvas
         self.reflection = reflection  # (H, W, 3) color of the surroundings in a mirror
         self.dims, self.look, self.light = body.dimensions, body.appearance, body.light

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vehicle_detection.scenes.camera_light import Light
 from vehicle_detection.scenes.raster import Color, Doubles, Rng
 
 Profile = Sequence[tuple[float, float]]  # contour of one end of a vehicle: height and depth (m)
@@ -97,3 +98,33 @@ class VehicleAppearance:
         tone = rng.uniform(165, 225)
         self.cargo_color = tuple(np.clip(tone + rng.normal(0, 8, 3), 0, 235).tolist())
         self.seed = int(rng.integers(2**31))
+
+
+class BodyShape:
+    """Shape, color and details of one vehicle; `view` is the end that the camera sees, rear or front."""
+
+    def __init__(self, kind: str, color: str, seed: int, view: str, light: Light) -> None:
+        rng = np.random.default_rng([seed, 7])
+        dims = VEHICLE_SHAPES[kind].scaled(rng.uniform(0.96, 1.05))
+        self.dimensions, self.view, self.light = dims, view, light
+        rear = view == "rear"
+        self.end, self.far_end = (dims.rear, dims.front) if rear else (dims.front, dims.rear)
+        self.overhang, self.far_overhang = dims.overhangs if rear else dims.overhangs[::-1]
+        self.color = np.clip(np.asarray(COLORS[color], np.float32) * rng.uniform(0.9, 1.1), 8, 240)
+        self.seed = seed
+        self.appearance = VehicleAppearance(kind, rng)
+
+    def half_width(self, y: ArrayLike) -> Doubles:
+        """Half of the body's width at heights `y`, in meters."""
+        dims = self.dimensions
+        if dims.is_box:
+            heights = [dims.clearance, dims.clearance + 0.1, dims.height - 0.03, dims.height]
+            ratios = [0.94, 1.0, 1.0, 0.98] if self.view == "rear" else [0.9, 0.97, 0.97, 0.9]
+        else:
+            cabin, roof = dims.height - dims.belt, dims.roof
+            heights = [
+                dims.clearance, dims.clearance + 0.12, 0.5 * dims.belt + 0.1, dims.belt - 0.12, dims.belt,
+                dims.belt + 0.8 * cabin, dims.height - 0.06, dims.height - 0.02, dims.height,
+            ]  # fmt: skip
+            ratios = [0.93, 0.985, 1.0, 0.99, 0.96, roof + 0.05, roof - 0.02, roof - 0.1, roof - 0.26]
+        return np.asarray(np.interp(np.asarray(y), heights, np.array(ratios) * dims.width / 2), np.float64)

@@ -6,43 +6,15 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
 
 from vehicle_detection.scenes.bodywork import BodyPainter
-from vehicle_detection.scenes.camera_light import Light
-from vehicle_detection.scenes.raster import Doubles, Floats, blend, tile_to, wrapped_noise
-from vehicle_detection.scenes.shapes import COLORS, VEHICLE_SHAPES, VehicleAppearance, profile_at
+from vehicle_detection.scenes.raster import Floats, blend, tile_to, wrapped_noise
+from vehicle_detection.scenes.shapes import BodyShape, profile_at
 from vehicle_detection.scenes.surface import PIXELS_PER_METER, Surface, SurfaceCanvas
 
 
-class VehicleBody:
-    """The surfaces of one vehicle in a light; `view` is the end that the camera sees, rear or front."""
-
-    def __init__(self, kind: str, color: str, seed: int, view: str, light: Light) -> None:
-        rng = np.random.default_rng([seed, 7])
-        dims = VEHICLE_SHAPES[kind].scaled(rng.uniform(0.96, 1.05))
-        self.dimensions, self.view, self.light = dims, view, light
-        rear = view == "rear"
-        self.end, self.far_end = (dims.rear, dims.front) if rear else (dims.front, dims.rear)
-        self.overhang, self.far_overhang = dims.overhangs if rear else dims.overhangs[::-1]
-        self.color = np.clip(np.asarray(COLORS[color], np.float32) * rng.uniform(0.9, 1.1), 8, 240)
-        self._seed = seed
-        self.appearance = VehicleAppearance(kind, rng)
-
-    def half_width(self, y: ArrayLike) -> Doubles:
-        """Half of the body's width at heights `y`, in meters."""
-        dims = self.dimensions
-        if dims.is_box:
-            heights = [dims.clearance, dims.clearance + 0.1, dims.height - 0.03, dims.height]
-            ratios = [0.94, 1.0, 1.0, 0.98] if self.view == "rear" else [0.9, 0.97, 0.97, 0.9]
-        else:
-            cabin, roof = dims.height - dims.belt, dims.roof
-            heights = [
-                dims.clearance, dims.clearance + 0.12, 0.5 * dims.belt + 0.1, dims.belt - 0.12, dims.belt,
-                dims.belt + 0.8 * cabin, dims.height - 0.06, dims.height - 0.02, dims.height,
-            ]  # fmt: skip
-            ratios = [0.93, 0.985, 1.0, 0.99, 0.96, roof + 0.05, roof - 0.02, roof - 0.1, roof - 0.26]
-        return np.asarray(np.interp(np.asarray(y), heights, np.array(ratios) * dims.width / 2), np.float64)
+class VehicleBody(BodyShape):
+    """The painted surfaces of one vehicle."""
 
     @cached_property
     def near_end(self) -> Surface:
@@ -100,7 +72,7 @@ class VehicleBody:
         dust = np.array([40, 38, 36] if self.light.dark else [96, 92, 86], np.float32)
         blend(canvas.color, dust, 0.22 * np.clip((0.75 - canvas.y) / 0.6, 0, 1)[..., None])
         # A generator of its own makes the surface independent of the order in which surfaces are painted.
-        rng = np.random.default_rng([self._seed, canvas.size[1]])
+        rng = np.random.default_rng([self.seed, canvas.size[1]])
         noise = tile_to(wrapped_noise(rng, (128, 128), falloff=0.8), *canvas.size)
         canvas.color *= (1 + 0.012 * noise)[..., None]
 
