@@ -82,8 +82,7 @@ def test_hog_has_a_panel_per_channel_and_cell_size():
 
 
 @pytest.mark.parametrize(
-    ("ahead", "slope"),
-    [((0, 1), (0, 1)), ((1, 0), (1, 0)), ((1, -1), (1, 1)), ((1, 1), (1, -1))],
+    ("ahead", "slope"), [((0, 1), (0, 1)), ((1, 0), (1, 0)), ((1, -1), (1, 1)), ((1, 1), (1, -1))]
 )
 def test_a_glyph_is_parallel_to_the_edge(ahead, slope):
     """The image is dark on one side of a line through its center, and bright in the direction `ahead`."""

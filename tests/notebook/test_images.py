@@ -110,7 +110,7 @@ def test_methods_are_shown_side_by_side():
     assert drawn_boxes(figure.axes[1].collections[0]).tolist() == [[1, 1, 8, 8]]
     with pytest.raises(InvalidInputError, match=r"methods\['count'\] must have one value for each"):
         notebook.plot_methods([gray_image()], {"count": found})
-    with pytest.raises(InvalidInputError, match="methods must map names to a list of Detections, got"):
+    with pytest.raises(InvalidInputError, match="methods must map names to a list of Detections"):
         notebook.plot_methods([gray_image()], [found])
 
 

@@ -123,7 +123,7 @@ def test_speedups_over_the_slowest_or_a_chosen_method():
     ):
         with pytest.raises(InvalidInputError, match=message):
             notebook.plot_speedups(bad)
-    with pytest.raises(InvalidInputError, match="reference must be one of a, b, c; got 'd'"):
+    with pytest.raises(InvalidInputError, match="reference must be one of 'a', 'b', 'c'; got 'd'"):
         notebook.plot_speedups(times, reference="d")
 
 

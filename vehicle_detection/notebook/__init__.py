@@ -4,6 +4,7 @@ A function that draws one panel has the parameter ``ax=None`` and returns the Ax
 figure, which ``plt.show()`` or a notebook displays. A function that draws several panels has the parameter
 ``figure=None`` (a Figure or SubFigure) and returns the figure; None creates one that pyplot does not manage:
 a notebook displays it as the value of a cell, and ``savefig`` writes it. No state is kept between calls.
+All of them raise `InvalidInputError` if an argument is malformed or there is nothing to draw.
 
 Colors are those of Okabe and Ito, which are safe for color-blind readers, and matplotlib's perceptually
 uniform colormaps.

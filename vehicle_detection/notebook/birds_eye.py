@@ -4,14 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from vehicle_detection._common import (
-    check_number,
-    check_sequence,
-    check_shape,
-    check_type,
-)
+from vehicle_detection._common import check_number, check_sequence, check_shape, check_type
 from vehicle_detection.annotator import (
     LANE_WIDTH_M,
     MAX_SPEED_STD,
@@ -44,6 +39,10 @@ def plot_birds_eye(
 ) -> Axes:
     """Plot the shown tracks of a frame from above, in meters, in the colors of the video.
 
+    The camera is at the origin, in the middle of its lane. Each vehicle has its number, an ellipse of one
+    standard error around the middle of its near end, and an arrow to where it is in a second, relative to the
+    camera. Vehicles without a known distance are left out.
+
     Parameters
     ----------
     results
@@ -53,19 +52,6 @@ def plot_birds_eye(
         The camera, by default a typical dash-cam; and ``(height, width, ...)`` of the frames.
     fps, trail_seconds
         Frame rate, for results without a time; and the time that the trails cover.
-    ax : matplotlib.axes.Axes, optional
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        The camera is at the origin, in the middle of its lane. Each vehicle has its number, an ellipse of one
-        standard error around the middle of its near end, and an arrow to where it is in a second, relative to
-        the camera. Vehicles without a known distance are left out.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument has the wrong type or value.
 
     Examples
     --------
@@ -95,20 +81,20 @@ def plot_birds_eye(
 
     axes = style.new_axes(ax, 4.5, 7.0)
     last = listed[-1]
-    end = _time(last, rate)
+    times = [result.index / rate if result.time is None else result.time for result in listed]
     trails: dict[int, list[RoadPosition]] = {}
-    for result in listed:
-        if end - seconds <= _time(result, rate) <= end:
+    for result, time in zip(listed, times):
+        if times[-1] - seconds <= time <= times[-1]:
             for track in result.shown:
                 position = road_position(track, camera, frame)
                 if position is not None:
                     trails.setdefault(track.id, []).append(position)
     farthest = _MIN_AHEAD_M
     for track in last.shown:
-        position = road_position(track, camera, frame)
-        if position is not None:
-            _add_vehicle(axes, track, position, trails[track.id], camera)
-            farthest = max(farthest, position.distance_m + camera.vehicle_length_m + position.radial_std_m)
+        if road_position(track, camera, frame) is not None:
+            trail = trails[track.id]
+            _add_vehicle(axes, track, trail, camera)
+            farthest = max(farthest, trail[-1].distance_m + camera.vehicle_length_m + trail[-1].radial_std_m)
     _add_road(axes)
     axes.set(
         xlim=(-(_LANES + 0.5) * LANE_WIDTH_M, (_LANES + 0.5) * LANE_WIDTH_M),
@@ -118,10 +104,6 @@ def plot_birds_eye(
         ylabel="distance (m)",
     )
     return axes
-
-
-def _time(result: FrameResult, rate: float) -> float:
-    return result.index / rate if result.time is None else result.time
 
 
 def _add_road(axes: Axes) -> None:
@@ -134,32 +116,20 @@ def _add_road(axes: Axes) -> None:
     axes.add_patch(Rectangle((-0.9, -_OWN_LENGTH_M), 1.8, _OWN_LENGTH_M, facecolor="0.3"))
 
 
-def _add_vehicle(
-    axes: Axes, track: Track, position: RoadPosition, trail: list[RoadPosition], camera: Camera
-) -> None:
-    """Add a vehicle with its error ellipse, trail, motion and number."""
+def _add_vehicle(axes: Axes, track: Track, trail: list[RoadPosition], camera: Camera) -> None:
+    """Add a vehicle with its error ellipse, motion, number and trail, which ends at its position."""
     from matplotlib.patches import Ellipse, Rectangle
 
-    red, green, blue = track_color(track)
-    color = (red / 255, green / 255, blue / 255)
-    x, z, radial_std, tangential_std = position
+    color = [value / 255 for value in track_color(track)]
+    x, z, radial_std, tangential_std = trail[-1]
     width, length = camera.vehicle_width_m, camera.vehicle_length_m
     angle = math.degrees(math.atan2(z, x))
     ellipse = Ellipse((x, z), 2 * radial_std, 2 * tangential_std, angle=angle, color=color, alpha=0.3, lw=0)
     axes.add_patch(ellipse)
-    coasting = track.state == "coasting"
-    face = "none" if coasting else color
-    axes.add_patch(
-        Rectangle(
-            (x - width / 2, z),
-            width,
-            length,
-            facecolor=face,
-            edgecolor=color if coasting else "black",
-            linestyle="--" if coasting else "-",
-            linewidth=1.0,
-        )
-    )
+    look: dict[str, Any] = {"facecolor": color, "edgecolor": "black"}
+    if track.state == "coasting":
+        look = {"facecolor": "none", "edgecolor": color, "linestyle": "--"}
+    axes.add_patch(Rectangle((x - width / 2, z), width, length, linewidth=1.0, **look))
     axes.plot([each.lateral_m for each in trail], [each.distance_m for each in trail], color=color, lw=1.5)
     speed = track.speed_mps
     if speed is not None and abs(speed) > 1.0 and (track.speed_std_mps or 0.0) <= MAX_SPEED_STD:

@@ -20,23 +20,14 @@ def plot_explanation(
 ) -> FigureLike:
     """Draw why a detector finds a vehicle in a box.
 
+    Three panels: the vehicle with its box; the same with the cells of the window, orange where a cell speaks
+    for a vehicle and blue where it speaks against one, the stronger the more; and the terms of the margin
+    with their sum.
+
     Parameters
     ----------
     image, explanation
         ``(H, W, 3)`` uint8 RGB, and what `explain` returned for it.
-    figure : matplotlib.figure.Figure or SubFigure, optional
-
-    Returns
-    -------
-    matplotlib.figure.Figure or SubFigure
-        Three panels: the vehicle with its box; the same with the cells of the window, orange where a cell
-        speaks for a vehicle and blue where it speaks against one, the stronger the more; and the terms of
-        the margin with their sum.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed.
 
     Examples
     --------
@@ -54,10 +45,8 @@ def plot_explanation(
     plain, shares, sums = grid.flat
     score = "not found" if explanation.score is None else f"score {explanation.score:.2f}"
     left, top, right, bottom = explanation.window.tolist()
-    first, last = (
-        np.minimum(explanation.window, explanation.box),
-        np.maximum(explanation.window, explanation.box),
-    )
+    both = explanation.window, explanation.box
+    first, last = np.minimum(*both), np.maximum(*both)
     around = _AROUND * max(right - left, bottom - top)
     for panel, title in ((plain, score), (shares, "share of each cell, orange: for a vehicle")):
         style.add_image(panel, image, title)

@@ -24,6 +24,7 @@ from vehicle_detection._common import (
     check_number,
     check_sequence,
     describe,
+    pluralize,
 )
 from vehicle_detection.boxes import Detections, box_areas
 from vehicle_detection.camera import Camera
@@ -54,11 +55,10 @@ Method = Literal["groups", "heat"]
 View = Literal["boxes", "windows", "heat"]
 Weighting = Literal["score", "count"]
 
+# How windows become boxes: groups of agreeing windows (or the model's own boxes), or a heat map.
 METHODS: tuple[Method, ...] = get_args(Method)
-"""How windows become boxes: groups of agreeing windows (or the model's own boxes), or a heat map."""
-
+# What an image shows: the boxes alone, or also the positive windows or their heat map.
 VIEWS: tuple[View, ...] = get_args(View)
-"""What an image shows: the boxes alone, or also the positive windows or their heat map."""
 
 _ALL_SCORES = -1e6
 _CACHED_SEARCHES, _CACHED_FRAMES = 64, 8
@@ -113,11 +113,6 @@ class Explorer:
     method, group_params, heat_params
         ``"groups"``: boxes from groups of agreeing windows, or those that the model predicts, with
         `RegionParams`. ``"heat"``: boxes from the heat map, with `HeatParams`.
-
-    Raises
-    ------
-    ModelFileError, InvalidInputError
-        If the model file is missing or damaged, or an argument is malformed.
 
     Examples
     --------
@@ -203,19 +198,9 @@ class Explorer:
     ) -> None:
         """Change search parameters; None keeps a value.
 
-        Parameters
-        ----------
-        min_score
-            Minimum score of positive windows. The boxes of a network do not depend on it.
-        horizon
-            Row of the horizon as a fraction of the frame's height, 0-1.
-        bands
-            Numbers of the bands of ``search_params.bands`` to search, from 0. An empty list finds nothing.
-
-        Raises
-        ------
-        InvalidInputError
-            If a value is out of range, or `bands` is given for a model whose search has none.
+        `min_score` is the minimum score of positive windows (the boxes of a network do not depend on it),
+        `horizon` a fraction of the frame's height, and `bands` are the numbers of the bands of
+        ``search_params.bands`` to search, from 0; an empty list finds nothing.
         """
         params = self.search_params.with_horizon(horizon)
         if min_score is not None:
@@ -240,19 +225,9 @@ class Explorer:
     ) -> None:
         """Change how windows become boxes; None keeps a value.
 
-        Parameters
-        ----------
-        method
-            ``"groups"`` or ``"heat"``, see the attribute.
-        threshold, peak_fraction, weighting
-            Fields of `HeatParams`, for ``"heat"``.
-        min_peak, min_evidence
-            Fields of `RegionParams`, for ``"groups"``. They have no effect if the model predicts boxes.
-
-        Raises
-        ------
-        InvalidInputError
-            If `method` is unknown, or a value is out of range.
+        `threshold`, `peak_fraction` and `weighting` are fields of `HeatParams`, for the method ``"heat"``;
+        `min_peak` and `min_evidence` are fields of `RegionParams`, for ``"groups"``, and have no effect if
+        the model predicts boxes.
         """
         method = self.method if method is None else method
         check_choice(method, "method", METHODS)
@@ -280,8 +255,7 @@ class Explorer:
         """Boxes of the vehicles, equal to those of `VehicleDetector.detect` with these parameters."""
         if self.method == "heat":
             return label_heat(self.heat_map(), self.heat_params)
-        found = self._find()
-        vehicles = found.vehicles
+        vehicles = self._find().vehicles
         if vehicles is None:
             shape = self._read_frame(self.frame).shape
             with VehicleDetector(
@@ -309,22 +283,9 @@ class Explorer:
         return list(np.argsort(-self.boxes().scores, kind="stable").tolist())
 
     def box_at(self, x: float, y: float) -> int:
-        """Return the number of the smallest box that holds a point of the frame; 0 if none does.
+        """Return the number, as in `set_box`, of the smallest box that holds a point; 0 if none does.
 
-        Parameters
-        ----------
-        x, y
-            Column and row in pixels of the frame, not of the reduced image.
-
-        Returns
-        -------
-        int
-            Number as in `set_box`, from 1 for the box with the highest score.
-
-        Raises
-        ------
-        InvalidInputError
-            If a coordinate is not a finite number.
+        `x` and `y` are in pixels of the frame, not of the reduced image.
         """
         x, y = check_number(x, "x"), check_number(y, "y")
         boxes = self.boxes().boxes
@@ -378,11 +339,10 @@ class Explorer:
         height, width = self._read_frame(self.frame).shape[:2]
         found = self._find()
         total = "" if found.bands is None else f" of {len(found.windows):,}"
-        windows, boxes = len(self.windows()), len(self.boxes())
         explanation = self.explanation()
         return (
-            f"{self.frame}, {width}x{height}: {windows:,}{total} windows above "
-            f"{self.search_params.min_score:g}, {boxes} box{'es' * (boxes != 1)}"
+            f"{self.frame}, {width}x{height}: {len(self.windows()):,}{total} windows above "
+            f"{self.search_params.min_score:g}, {pluralize(len(self.boxes()), 'box', 'es')}"
             + ("" if explanation is None else f"; box {self.box}: {explanation}")
         )
 

@@ -100,6 +100,8 @@ def plot_channels(
 ) -> FigureLike:
     """Plot the distribution of pixels in a color space: each channel, and pairs of channels.
 
+    Above are histograms of the channels over all pixels, below scatter plots of pairs of channels.
+
     Parameters
     ----------
     images, color_space
@@ -109,17 +111,6 @@ def plot_channels(
     points, random_state
         Number of randomly chosen pixels per class in the lower panels, and seed of the choice; without
         labels each point has the color of its pixel.
-    figure : matplotlib.figure.Figure or SubFigure, optional
-
-    Returns
-    -------
-    matplotlib.figure.Figure or SubFigure
-        Three histograms of the channels over all pixels; below, three scatter plots of pairs of channels.
-
-    Raises
-    ------
-    InvalidInputError
-        If an image is malformed, the color space unknown, or the number of labels wrong.
 
     Examples
     --------
@@ -200,17 +191,6 @@ def plot_hog(
     params, pix_per_cell
         Color space, channels, orientations and block, by default ``FeatureParams()``; and cell sizes in
         pixels, one row of panels each.
-    figure : matplotlib.figure.Figure or SubFigure, optional
-
-    Returns
-    -------
-    matplotlib.figure.Figure or SubFigure
-        One column per image and channel: the channel in gray, and its HOG as a line collection per cell size.
-
-    Raises
-    ------
-    InvalidInputError
-        If an image is malformed, or smaller than a block.
 
     Examples
     --------
@@ -260,6 +240,8 @@ def plot_features(
     Before scaling, histogram counts are much larger than HOG values; after scaling, all parts have the same
     range.
 
+    There are two panels with one line per row: the vector before and after scaling.
+
     Parameters
     ----------
     patches, rows, names
@@ -267,17 +249,6 @@ def plot_features(
     model, template
         A classifier and the number of the template whose scaler is used; or parameters, with the scaler
         fitted to all of `patches`.
-    figure : matplotlib.figure.Figure or SubFigure, optional
-
-    Returns
-    -------
-    matplotlib.figure.Figure or SubFigure
-        Two panels with one line per row: the vector before and after scaling.
-
-    Raises
-    ------
-    InvalidInputError
-        If the patches are malformed, or a row or template does not exist.
 
     Examples
     --------
@@ -351,23 +322,14 @@ def plot_weights(
     of each cell and drawn as edges, positive and negative ones separately (Dalal and Triggs, CVPR 2005,
     figure 6).
 
+    There is a row for each channel. Columns: positive and negative weights of HOG and of coarse HOG, weights
+    of the spatial bins and of the histogram, as far as the model uses them. With spatial bins, the last
+    column shows the mean patch, and the mean patch shifted along the weights in both directions.
+
     Parameters
     ----------
     classifier, template
         The trained model, and the number of its template.
-    figure : matplotlib.figure.Figure or SubFigure, optional
-
-    Returns
-    -------
-    matplotlib.figure.Figure or SubFigure
-        One row per channel. Columns: positive and negative weights of HOG and of coarse HOG, weights of the
-        spatial bins and of the histogram, as far as the model uses them. With spatial bins, the last column
-        shows the mean patch, and the mean patch shifted along the weights in both directions.
-
-    Raises
-    ------
-    InvalidInputError
-        If `classifier` is not a classifier, or does not have the template.
 
     Examples
     --------

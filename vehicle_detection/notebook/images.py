@@ -11,13 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_detection._common import (
-    check_array,
-    check_image,
-    check_integer,
-    check_type,
-    describe,
-)
+from vehicle_detection._common import check_array, check_image, check_integer, check_type, describe, pluralize
 from vehicle_detection.boxes import Detections
 from vehicle_detection.datasets import PatchSet, Split, make_thumbnails
 from vehicle_detection.errors import InvalidInputError
@@ -30,24 +24,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ImageDescription:
-    """The contents of an array, and whether the library accepts it as an image.
-
-    Attributes
-    ----------
-    shape, dtype, min, max
-        Shape, dtype, minimum and maximum of the array.
-    mean
-        Mean of each channel; a single value unless the array has three dimensions.
-    problem
-        Why the library rejects it as an image, and the remedy; empty if it is accepted.
-    """
+    """The contents of an array, and whether the library accepts it as an image; ``print`` shows them."""
 
     shape: tuple[int, ...]
     dtype: str
     min: float
     max: float
-    mean: tuple[float, ...]
-    problem: str
+    mean: tuple[float, ...]  # of each channel; a single value unless the array has three dimensions
+    problem: str  # why the library rejects it as an image, and the remedy; empty if it is accepted
 
     def __str__(self) -> str:
         mean = ", ".join(f"{value:.4g}" for value in self.mean)
@@ -64,16 +48,6 @@ def describe_image(image: NDArray[Any]) -> ImageDescription:
     ----------
     image
         Any array of numbers with at least one value.
-
-    Returns
-    -------
-    ImageDescription
-        ``print`` shows it in one or two lines.
-
-    Raises
-    ------
-    InvalidInputError
-        If `image` is not an array of numbers, or is empty.
 
     Examples
     --------
@@ -118,17 +92,6 @@ def show_images(
         the same form, drawn with dashed lines.
     columns
         Images per row; None for up to three.
-    figure : matplotlib.figure.Figure or SubFigure, optional
-
-    Returns
-    -------
-    matplotlib.figure.Figure or SubFigure
-        One Axes per image.
-
-    Raises
-    ------
-    InvalidInputError
-        If an image is malformed, or the number of titles or boxes differs from the number of images.
 
     Examples
     --------
@@ -175,16 +138,6 @@ def plot_methods(
         For each method, its detections in each image.
     figure : matplotlib.figure.Figure or SubFigure, optional
 
-    Returns
-    -------
-    matplotlib.figure.Figure or SubFigure
-        One Axes per image and method, row by row; each title counts the boxes.
-
-    Raises
-    ------
-    InvalidInputError
-        If an image is malformed, or a method does not have one result per image.
-
     Examples
     --------
     >>> road = np.full((72, 128, 3), 90, np.uint8)
@@ -193,12 +146,8 @@ def plot_methods(
     >>> [panel.get_title() for panel in figure.axes]
     ['count: 0 boxes', 'score: 1 box']
     """
-    given: object = methods
-    if not isinstance(given, Mapping) or not given:
-        raise InvalidInputError(
-            f"methods must map names to a list of Detections, got {describe(given)}; "
-            'pass {"default": [detector.detect(image) for image in images]}'
-        )
+    remedy = 'pass {"default": [detector.detect(image) for image in images]}'
+    style.check_mapping(methods, "methods", "names to a list of Detections", remedy)
     listed, rows = style.split_titles(images)
     true = style.check_length(truth, "truth", len(listed), "images")
     for name, found in methods.items():
@@ -208,9 +157,8 @@ def plot_methods(
         check_image(image, f"images[{index}]")
         for name, found in methods.items():
             count = len(style.box_array(found[index], f"methods[{name!r}][{index}]"))
-            prefix = "" if row is None else f"{row}, "
+            titles.append(f"{'' if row is None else f'{row}, '}{name}: {pluralize(count, 'box', 'es')}")
             shown.append(image)
-            titles.append(f"{prefix}{name}: {count} box{'es' * (count != 1)}")
             boxes.append(found[index])
     repeated = [each for each in true for _ in methods]
     return show_images(shown, titles, boxes=boxes, truth=repeated, columns=len(methods), figure=figure)
@@ -239,17 +187,6 @@ def plot_patches(
     captions, scores
         One caption per patch, by default the source of a set's patches; and ``(N,)`` numbers to add to the
         captions, such as decision values.
-    ax : matplotlib.axes.Axes, optional
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        Contains one image and one text per patch.
-
-    Raises
-    ------
-    InvalidInputError
-        If a patch is malformed, or the number of labels, captions or scores is wrong.
 
     Examples
     --------
@@ -282,38 +219,22 @@ def plot_patches(
         ax, tiles, columns=columns, inches=1.25, caption_lines=caption_lines, colors=colors
     )
     if colors:
-        _add_class_legend(axes)
+        handles = style.legend_lines(("vehicle", VEHICLE, "-"), ("other", OTHER, "-"))
+        axes.legend(
+            handles=handles, loc="lower right", bbox_to_anchor=(1, 1), ncols=2, fontsize=8, frameon=False
+        )
     return axes
-
-
-def _add_class_legend(axes: Axes) -> None:
-    from matplotlib.patches import Patch
-
-    handles = [
-        Patch(edgecolor=color, facecolor="none", linewidth=2, label=name)
-        for name, color in (("vehicle", VEHICLE), ("other", OTHER))
-    ]
-    axes.legend(handles=handles, loc="lower right", bbox_to_anchor=(1, 1), ncols=2, fontsize=8, frameon=False)
 
 
 def plot_balance(patch_set: PatchSet, *, ax: Axes | None = None) -> Axes:
     """Plot the number of patches of each source and class, and the percentage of each class.
 
+    Vehicles come first.
+
     Parameters
     ----------
     patch_set
         The patches.
-    ax : matplotlib.axes.Axes, optional
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        Contains one bar per class and source, vehicles first.
-
-    Raises
-    ------
-    InvalidInputError
-        If `patch_set` is not a `PatchSet`, or is empty.
 
     Examples
     --------
@@ -359,6 +280,9 @@ def plot_near_duplicates(
 ) -> Axes:
     """Show pairs of near duplicates: each patch, and below it the patch that is most similar.
 
+    Captions are the source, and the correlation of the two patches. The title states the percentage of (test)
+    patches that have a near duplicate (in the training part).
+
     Parameters
     ----------
     patch_set, pairs
@@ -366,18 +290,6 @@ def plot_near_duplicates(
     split, count
         With a split, only pairs of a test patch (above) and a training patch are shown; and maximum number
         of pairs, chosen at even distances if there are more.
-    ax : matplotlib.axes.Axes, optional
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        Two images and two texts per pair: the source, and the correlation of the two patches. The title
-        states the percentage of (test) patches that have a near duplicate (in the training part).
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed, or there is no pair to show.
 
     Examples
     --------

@@ -48,23 +48,14 @@ def plot_scores(
 ) -> Axes:
     """Plot histograms of the scores of both classes, on a logarithmic scale that makes errors visible.
 
+    The legend counts the errors at the threshold, which is the vertical line.
+
     Parameters
     ----------
     scores, labels
         ``(N,)`` decision values, and ``(N,)`` 1 for a vehicle, 0 for anything else.
     threshold, bins
         Score above which a patch is classified as a vehicle, and number of bins over the range of the scores.
-    ax : matplotlib.axes.Axes, optional
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        The legend counts the errors at the threshold; the vertical line is the threshold.
-
-    Raises
-    ------
-    InvalidInputError
-        If scores and labels differ in number, are empty or contain NaN.
 
     Examples
     --------
@@ -121,16 +112,6 @@ def plot_precision_recall(
         a square. A dot marks the best F1.
     ax : matplotlib.axes.Axes, optional
 
-    Returns
-    -------
-    matplotlib.axes.Axes
-        The legend states the best F1 of each curve and its threshold.
-
-    Raises
-    ------
-    InvalidInputError
-        If a curve is malformed or empty, or the frames contain no labelled vehicle.
-
     Examples
     --------
     >>> curve = np.array([1.0, 0.5]), np.array([0.5, 0.5]), np.array([2.0, 0.5])
@@ -186,23 +167,14 @@ def plot_f1(
 ) -> Axes:
     """Plot a metric on each source of frames as bars, for one detector or several.
 
+    An unknown value has no bar.
+
     Parameters
     ----------
     scores
         Results of `evaluate_detections` by source; or by detector, then by source.
     metric
         ``"f1"``, ``"precision"``, ``"recall"``, ``"average_precision"`` or ``"mean_iou"``.
-    ax : matplotlib.axes.Axes, optional
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        Contains a group of bars per source; an unknown value has no bar.
-
-    Raises
-    ------
-    InvalidInputError
-        If `scores` or `metric` is invalid.
 
     Examples
     --------
@@ -213,14 +185,13 @@ def plot_f1(
     ['1.00']
     """
     check_choice(metric, "metric", _METRICS)
-    given: object = scores
-    if not isinstance(given, Mapping) or not given:
-        raise InvalidInputError(f"scores must map sources to DetectionScores, got {describe(given)}")
-    nested = all(isinstance(value, Mapping) for value in given.values())
-    detectors: dict[str, Any] = dict(given) if nested else {"": given}
+    remedy = "pass what evaluate_detections returns"
+    style.check_mapping(scores, "scores", "sources to DetectionScores", remedy)
+    nested = all(isinstance(value, Mapping) for value in scores.values())
+    detectors: dict[str, Any] = dict(scores) if nested else {"": scores}
     for by_source in detectors.values():
         for source, value in by_source.items():
-            check_type(value, f"scores[{source!r}]", DetectionScores, "pass what evaluate_detections returns")
+            check_type(value, f"scores[{source!r}]", DetectionScores, remedy)
     sources = list(dict.fromkeys(source for by_source in detectors.values() for source in by_source))
     if not sources:
         raise InvalidInputError("scores must hold at least one source; got none")
@@ -252,6 +223,8 @@ def plot_errors(
 ) -> Axes:
     """Show crops of the worst errors: the largest missed vehicles, or the false positives of highest score.
 
+    Labelled boxes are dashed, detections solid; the title counts all errors.
+
     Parameters
     ----------
     frames, predictions
@@ -261,17 +234,6 @@ def plot_errors(
         detection. ``"false"``: detections without a labelled vehicle, highest score first.
     iou, count, columns
         Minimum IoU of a detection and its vehicle; maximum number of errors to show; and crops per row.
-    ax : matplotlib.axes.Axes, optional
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        One image per error, with dashed labelled boxes and solid detections; the title counts all errors.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed, or `evaluate_detections` rejects the boxes.
 
     Examples
     --------
@@ -370,6 +332,8 @@ def plot_tradeoff(
 ) -> Axes:
     """Plot the quality of each configuration against its cost, with the Pareto front.
 
+    The first collection of the Axes holds all points, the first line the front (see `pareto_front`).
+
     Parameters
     ----------
     table
@@ -377,17 +341,6 @@ def plot_tradeoff(
     quality, cost, label
         Columns of the y axis, where higher is better, of the x axis, where lower is better, and of the text
         beside the points of the front, None for no text.
-    ax : matplotlib.axes.Axes, optional
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        The first collection holds all points, and the first line is the front (see `pareto_front`).
-
-    Raises
-    ------
-    InvalidInputError
-        If no row has both values, or a column does not exist.
 
     Examples
     --------
@@ -434,6 +387,10 @@ def plot_parameter(
 ) -> Axes:
     """Plot the mean of a measurement against a parameter.
 
+    There is a line for each value of `by`, with the standard deviation over rows with the same `parameter`
+    and `by` as error bars. The x axis is logarithmic if its numbers span more than a factor of 20, and evenly
+    spaced if it holds text.
+
     Parameters
     ----------
     table
@@ -441,19 +398,6 @@ def plot_parameter(
     parameter, quality, by
         Columns of the x axis, such as ``"C"``, of the y axis, a measurement, and of the groups of rows that
         form lines, such as ``"split"``, None for one line.
-    ax : matplotlib.axes.Axes, optional
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        One line for each value of `by`, with the standard deviation over rows with the same `parameter` and
-        `by` as error bars. The x axis is logarithmic if its numbers span more than a factor of 20, and evenly
-        spaced if it holds text.
-
-    Raises
-    ------
-    InvalidInputError
-        If a column does not exist, or no row has a measurement.
 
     Examples
     --------

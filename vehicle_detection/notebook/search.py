@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from vehicle_detection._common import check_image, check_number, check_type, describe, pluralize
+from vehicle_detection._common import check_choice, check_image, check_number, check_type, describe, pluralize
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import frame_heat, heat_threshold, label_heat
@@ -33,6 +33,8 @@ def plot_windows(
 ) -> Axes:
     """Draw windows on a frame, colored by score.
 
+    The first collection of the Axes holds the windows in ascending order of score, and their scores.
+
     Parameters
     ----------
     image, windows
@@ -40,17 +42,6 @@ def plot_windows(
         as `slide_window` returns, drawn in one color.
     truth, title
         Labelled boxes, drawn with dashed lines; and the title, by default the number of windows.
-    ax : matplotlib.axes.Axes, optional
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        The first collection contains the windows in ascending order of score; its array contains the scores.
-
-    Raises
-    ------
-    InvalidInputError
-        If the image or the boxes are malformed.
 
     Examples
     --------
@@ -61,7 +52,7 @@ def plot_windows(
     """
     height, width = check_image(image).shape[:2]
     boxes = style.box_array(windows, "windows")
-    true = None if truth is None else style.box_array(truth, "truth")
+    true = style.box_array(() if truth is None else truth, "truth")
     axes = style.new_axes(ax, 8.5, 8.5 * height / width + 0.6)
     style.add_image(axes, image, ticks=True)
     linewidth = 1.4 if len(boxes) < 60 else 0.8
@@ -73,7 +64,7 @@ def plot_windows(
         axes.figure.colorbar(lines, ax=axes, shrink=0.75, pad=0.02).set_label("score")
     else:
         style.add_boxes(axes, boxes, SKY, halo=False, linewidths=linewidth)
-    if true is not None:
+    if len(true):
         style.add_boxes(axes, true, TRUTH, linestyles="--", linewidths=2.0)
     _expand_limits(axes, boxes, width, height)
     axes.set(xlabel="x (px)", ylabel="y (px)")
@@ -93,22 +84,13 @@ def plot_bands(
 ) -> FigureLike:
     """Draw the search band of each window size: its bounds, the first window, and the next ones.
 
+    Each band that fits into the frame has a panel. Its collections are the bounds, the windows one step to
+    the right and one step down, and the first window; the dashed line is the horizon.
+
     Parameters
     ----------
     image, search
         ``(H, W, 3)`` uint8 RGB frame, and the bands, by default ``SearchParams.preset()``.
-    figure : matplotlib.figure.Figure or SubFigure, optional
-
-    Returns
-    -------
-    matplotlib.figure.Figure or SubFigure
-        One panel per band that fits into the frame. Its collections are the bounds, the windows one step
-        to the right and one step down, and the first window; the dashed line is the horizon.
-
-    Raises
-    ------
-    InvalidInputError
-        If the image is malformed, or too small for a window.
 
     Examples
     --------
@@ -155,21 +137,12 @@ def plot_bands(
 def plot_comparison(fast: ArrayLike, reference: ArrayLike, *, figure: FigureLike | None = None) -> FigureLike:
     """Plot the scores of the fast search against those of the reference, window by window.
 
+    Beside the scatter plot is a histogram of the differences, whose title states the maximum.
+
     Parameters
     ----------
     fast, reference
         ``(N,)`` scores of the same windows in the same order, such as ``find_cars(...).scores``.
-    figure : matplotlib.figure.Figure or SubFigure, optional
-
-    Returns
-    -------
-    matplotlib.figure.Figure or SubFigure
-        A scatter plot of the scores, and a histogram of the differences, whose title states the maximum.
-
-    Raises
-    ------
-    InvalidInputError
-        If the two differ in length, are empty or contain NaN.
 
     Examples
     --------
@@ -206,17 +179,6 @@ def plot_speedups(
     ----------
     seconds, reference
         Time of each method; and name of the method to compare the others with, None for the slowest.
-    ax : matplotlib.axes.Axes, optional
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        Contains one bar per method, in milliseconds on a logarithmic scale.
-
-    Raises
-    ------
-    InvalidInputError
-        If `seconds` contains anything but positive numbers, or does not contain the reference.
 
     Examples
     --------
@@ -224,13 +186,10 @@ def plot_speedups(
     >>> [text.get_text() for text in axes.texts]
     ['4,000 ms', '10 ms, 400x faster']
     """
-    given: object = seconds
-    if not isinstance(given, Mapping) or not given:
-        raise InvalidInputError(f"seconds must map names to seconds, at least one; got {describe(given)}")
-    times = {str(name): check_number(value, f"seconds[{name!r}]", above=0) for name, value in given.items()}
-    baseline: object = max(times, key=times.__getitem__) if reference is None else reference
-    if not isinstance(baseline, str) or baseline not in times:
-        raise InvalidInputError(f"reference must be one of {', '.join(times)}; got {describe(reference)}")
+    style.check_mapping(seconds, "seconds", "names to seconds", 'pass {"one by one": 4.0, "shared": 0.01}')
+    times = {str(name): check_number(value, f"seconds[{name!r}]", above=0) for name, value in seconds.items()}
+    baseline = max(times, key=times.__getitem__) if reference is None else reference
+    check_choice(baseline, "reference", times)
     # Long names take width from the bars.
     width = 7.0 + 0.07 * max(map(len, times))
     axes = style.new_axes(ax, width, 0.8 + 0.45 * len(times))
@@ -249,13 +208,10 @@ def plot_speedups(
 
 def _format_time(seconds: float, speedup: float) -> str:
     """Time in milliseconds with its speedup, such as ``10 ms, 400x faster``."""
-    value = 1000 * seconds
-    text = f"{value:,.0f} ms" if value >= 10 else f"{value:.2g} ms"
-    if speedup == 1:
-        return text
+    text = f"{1000 * seconds:,.0f} ms" if seconds >= 0.01 else f"{1000 * seconds:.2g} ms"
     if speedup < 1:
         return f"{text}, {1 / speedup:.1f}x slower"
-    return f"{text}, {speedup:,.{0 if speedup >= 10 else 1}f}x faster"
+    return text if speedup == 1 else f"{text}, {speedup:,.{0 if speedup >= 10 else 1}f}x faster"
 
 
 def plot_heatmap(
@@ -268,6 +224,9 @@ def plot_heatmap(
 ) -> FigureLike:
     """Show how windows become boxes: the windows, their heat map, and the regions above the threshold.
 
+    The three panels are the windows; the heat map with a color bar; and the regions above the threshold in
+    different colors, with the boxes of `label_boxes` as one line collection.
+
     Parameters
     ----------
     image, windows
@@ -275,18 +234,6 @@ def plot_heatmap(
     params, heat
         Weighting, threshold and fraction of the peak, by default as in `bounding_boxes`; and ``(H, W)`` heat
         map, such as the mean over the last frames, by default that of `windows`.
-    figure : matplotlib.figure.Figure or SubFigure, optional
-
-    Returns
-    -------
-    matplotlib.figure.Figure or SubFigure
-        Three panels: the windows; the heat map with a color bar; the regions above the threshold in
-        different colors, with the boxes of `label_boxes` as one line collection.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is malformed, or the heat map has another size than the frame.
 
     Examples
     --------
@@ -300,26 +247,26 @@ def plot_heatmap(
     check_type(windows, "windows", Detections, "pass what find_cars returns, or Detections(boxes, scores)")
     params = HeatParams() if params is None else params
     check_type(params, "params", HeatParams, "pass HeatParams()")
-    given: object = frame_heat(image.shape, windows, params) if heat is None else heat
-    if not isinstance(given, np.ndarray) or given.shape != (height, width):
+    heat = frame_heat(image.shape, windows, params) if heat is None else heat
+    if np.shape(heat) != (height, width):
         raise InvalidInputError(
-            f"heat must be an array of the frame's size {(height, width)}, got {describe(given)}; "
+            f"heat must be an array of the frame's size {(height, width)}, got {describe(heat)}; "
             "compute it with add_heat"
         )
-    found, threshold = label_heat(given, params), heat_threshold(params)
+    found, threshold = label_heat(heat, params), heat_threshold(params)
     size = 15, 5 * height / width + 0.5
     figure, ((first, second, third),) = style.new_panels(figure, size, 1, 3, layout="compressed")
     style.add_image(first, image)
     style.add_boxes(first, windows.boxes, SKY, halo=False, linewidths=0.8)
     first.set_title(pluralize(len(windows), "window"), fontsize=10)
-    peak = float(given.max())
-    style.add_image(second, given, cmap="inferno", vmin=0, vmax=peak if peak > 0 else 1.0)
+    peak = float(heat.max())
+    style.add_image(second, heat, cmap="inferno", vmin=0, vmax=peak if peak > 0 else 1.0)
     bar = second.figure.colorbar(second.images[0], ax=second, shrink=0.8, pad=0.02)
     bar.set_label("sum of scores" if params.weighting == "score" else "windows")
     if threshold <= peak:
         bar.ax.axhline(threshold, color=SKY, linewidth=2)
     second.set_title(f"heat, peak {peak:.1f}", fontsize=10)
-    style.add_image(third, _color_regions(image, given, threshold))
+    style.add_image(third, _color_regions(image, heat, threshold))
     style.add_boxes(third, found.boxes, YELLOW, linewidths=2.0)
     third.set_title(f"{pluralize(len(found), 'region')} above {threshold:g}", fontsize=10)
     return figure

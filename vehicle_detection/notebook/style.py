@@ -128,6 +128,12 @@ def check_displayable(image: object, name: str) -> NDArray[Any]:
     return check_image(image, name)
 
 
+def check_mapping(values: object, name: str, contents: str, remedy: str) -> None:
+    """Check that `values` is a mapping with at least one entry."""
+    if not isinstance(values, Mapping) or not values:
+        raise InvalidInputError(f"{name} must map {contents}, at least one; got {describe(values)}; {remedy}")
+
+
 def check_list(values: object, name: str, kind: str) -> list[Any]:
     """Return `values` as a list with at least one entry; `kind` names the entries in the message."""
     single = isinstance(values, (str, bytes)) or (isinstance(values, np.ndarray) and values.ndim < 4)

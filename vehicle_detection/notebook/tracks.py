@@ -53,6 +53,8 @@ def plot_tracks(
 ) -> FigureLike:
     """Plot position, width, distance and speed of each track over time, in the colors of the video.
 
+    Distances and speeds of results have bands of one standard error.
+
     Parameters
     ----------
     results
@@ -63,17 +65,6 @@ def plot_tracks(
         distances and speeds. Ignored boxes are left out.
     fps, min_frames
         Frame rate, for frames without a time; and number of frames below which a track is left out.
-    figure : matplotlib.figure.Figure or SubFigure, optional
-
-    Returns
-    -------
-    matplotlib.figure.Figure or SubFigure
-        Four panels over time; distances and speeds of results have bands of one standard error.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument has the wrong type, or there is no track to plot.
 
     Examples
     --------
@@ -194,22 +185,12 @@ Run = VideoReport | Sequence[FrameResult]
 def plot_stage_times(runs: Run | Mapping[str, Run], *, ax: Axes | None = None) -> Axes:
     """Plot the processing time per frame of each stage, for one run or several.
 
+    Stages of a video run in parallel, so a bar may be longer than the time between two frames.
+
     Parameters
     ----------
     runs
         The report of `process_video`, or the detector's result of each frame; or several of them by name.
-    ax : matplotlib.axes.Axes, optional
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-        A stacked bar per run, in milliseconds per frame. Stages of a video run in parallel, so the bar may
-        be longer than the time between two frames.
-
-    Raises
-    ------
-    InvalidInputError
-        If a run has the wrong type, or no frames.
 
     Examples
     --------
