@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.feature import hog
 
-from vehicle_detection.params import PixelBand
+from vehicle_detection.search import PixelBand
 
 WINDOW, CELL, BLOCK, ORIENT = 64, 8, 2, 9
 SPATIAL, BINS = (32, 32), 32

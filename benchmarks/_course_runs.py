@@ -14,18 +14,20 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from vehicle_detection.classifier import Template, TrainingOptions, VehicleClassifier, fit_features
 from vehicle_detection.datasets import PatchSet, Split, make_split, split_leakage
-from vehicle_detection.features import extract_features
-from vehicle_detection.params import FeatureParams, SearchParams
+from vehicle_detection.features import FeatureParams, extract_features
 from vehicle_detection.scenes import render_scene
-from vehicle_detection.tuning import (
+from vehicle_detection.search import SearchParams
+from vehicle_detection.svm import Template, VehicleClassifier
+from vehicle_detection.training import (
     FeatureCache,
     RowStore,
+    TrainingOptions,
     TrialOptions,
     compare_classifiers,
     compare_configurations,
     digest_of,
+    fit_features,
     make_table,
 )
 

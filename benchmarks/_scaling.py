@@ -23,8 +23,7 @@ from vehicle_detection._common import available_cores
 from vehicle_detection._kernels import Filter
 from vehicle_detection._kernels import histogram as _histogram_kernels
 from vehicle_detection._kernels import hog as _hog_kernels
-from vehicle_detection.params import SearchBand
-from vehicle_detection.search import BandSearch
+from vehicle_detection.search import SearchBand
 
 SIZES = ((640, 360), (960, 540), (1280, 720), (1600, 900), (1920, 1080))
 SCALES = (1.5, 1.0, 0.8, 0.7, 0.6, 0.5)
@@ -71,7 +70,7 @@ def run(context: Context) -> list[Row]:
 def _milliseconds(
     frame: NDArray[np.uint8], classifier: VehicleClassifier, params: SearchParams, jobs: int | None
 ) -> float:
-    with BandSearch(classifier, n_jobs=jobs) as bands:
+    with classifier.open_search(jobs) as bands:
         return median_seconds(lambda: bands.find_windows(frame, params), CALLS) * 1e3
 
 
@@ -83,7 +82,7 @@ def _default_cost(frame: NDArray[np.uint8], classifier: VehicleClassifier) -> tu
 
 def count_windows(frame: NDArray[np.uint8], classifier: VehicleClassifier, params: SearchParams) -> int:
     """Count the windows of a search."""
-    with BandSearch(classifier, n_jobs=1) as bands:
+    with classifier.open_search(1) as bands:
         return len(bands.find_windows(frame, dataclasses.replace(params, min_score=-1e6)))
 
 
@@ -171,7 +170,7 @@ def stage_seconds(
 ) -> dict[str, float]:
     """Median seconds of each stage of a search on one core, and of the ``rest``."""
     runs: list[dict[str, float]] = []
-    with BandSearch(classifier, n_jobs=1) as bands:
+    with classifier.open_search(1) as bands:
         for _ in range(3):
             bands.find_windows(frame, params)
         for _ in range(calls):

@@ -45,7 +45,7 @@ def compare_searches(
     bands = params.place(frame.shape)
     course_seconds, hog_seconds = [], []
     ours: dict[int, list[float]] = {1: [], 2: []}
-    with BandSearch(classifier, n_jobs=1) as one, BandSearch(classifier, n_jobs=2) as two:
+    with classifier.open_search(1) as one, classifier.open_search(2) as two:
         searches = {1: one, 2: two}
         for search in searches.values():
             for _ in range(3):  # Compile kernels, start threads and allocate memory.

@@ -11,7 +11,6 @@ from benchmarks._material import Context, patches, searched_frame
 from benchmarks._report import Row, at_most
 from benchmarks._timing import median_of, seconds_of
 from vehicle_detection import course
-from vehicle_detection.search import BandSearch
 
 ROUNDS = 15
 _TOP, _BOTTOM, _SCALES = 400, 656, (1.5, 1.0, 0.8)
@@ -27,7 +26,7 @@ def run(context: Context) -> list[Row]:
     features = np.array(course.extract_features(some, "YCrCb", hog_channel="ALL"))
     model = vd.train_classifier(some, labels, params=params, mirror=False)
     _, scaler, svc = (step for _, step in model.to_pipeline().steps)
-    search = BandSearch(model, n_jobs=1)
+    search = model.open_search(1)
     bands = vd.SearchParams.preset("three-scales")
     windows = vd.slide_window(frame, y_start_stop=(_TOP, _BOTTOM), xy_window=(96, 96))
     pairs = course.slide_window(frame, (None, None), (_TOP, _BOTTOM), (96, 96), formula="new")

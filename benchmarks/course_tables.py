@@ -21,9 +21,9 @@ import pandas as pd
 from benchmarks._course_runs import COURSE_C, PLANS, SPLITS, Runs, summarize
 from benchmarks._report import machine_facts
 from vehicle_detection._common import atomic_write, write_text
-from vehicle_detection.classifier import load_classifier
 from vehicle_detection.datasets import load_training_patches
-from vehicle_detection.tuning import write_results
+from vehicle_detection.svm import load_classifier
+from vehicle_detection.training import write_results
 
 _HEAD = """# The course's tables, measured again
 

@@ -13,11 +13,11 @@ import numpy as np
 
 from tests.network.graphs import own_network
 from vehicle_detection.boxes import clip_boxes
-from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
 from vehicle_detection.images import write_image
 from vehicle_detection.network import load_network
 from vehicle_detection.scenes import render_scene
+from vehicle_detection.svm import Template, VehicleClassifier
 
 ROOT = Path(__file__).parents[1]
 """Root of the repository."""

@@ -24,8 +24,7 @@ from vehicle_detection import (
     render_drive,
     render_scene,
 )
-from vehicle_detection.classifier import Template
-from vehicle_detection.search import BandSearch
+from vehicle_detection.svm import Template
 
 SEARCH = SearchParams(
     bands=(
@@ -59,7 +58,7 @@ def course_search(frame, classifier):
 def test_course_and_search_agree(frame, classifier):
     course = course_search(frame, classifier)
     assert 0 < (course.scores > 0).sum() < len(course.scores)
-    with BandSearch(classifier, n_jobs=1) as ours:
+    with classifier.open_search(1) as ours:
         agreement = check_agreement(frame, ours, SEARCH, course)
     assert agreement.windows == len(course.boxes) > 200
     assert agreement.difference < 1e-4
@@ -70,7 +69,7 @@ def test_course_and_search_agree(frame, classifier):
 def test_the_comparison_detects_wrong_hits_and_boxes(frame, classifier):
     course = course_search(frame, classifier)
     best = int(course.scores.argmax())
-    with BandSearch(classifier, n_jobs=1) as ours:
+    with classifier.open_search(1) as ours:
         course.scores[best] -= 2 * course.scores[best]
         assert check_agreement(frame, ours, SEARCH, course).disputed == 1
         course.boxes[best] += 1

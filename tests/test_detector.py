@@ -16,16 +16,18 @@ from tests.video.clips import write_clip
 from vehicle_detection.annotator import DrawParams, draw_tracks
 from vehicle_detection.boxes import iou_matrix
 from vehicle_detection.camera import Camera, write_camera
-from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, evaluate_detections, read_labels
+from vehicle_detection.features import FeatureParams
+from vehicle_detection.heatmap import HeatParams
 from vehicle_detection.loading import load_model
 from vehicle_detection.network import NetworkParams
-from vehicle_detection.params import FeatureParams, HeatParams, SearchBand, SearchParams
 from vehicle_detection.regions import RegionParams
 from vehicle_detection.scenes import SceneVehicle, render_drive, render_scene
+from vehicle_detection.search import SearchBand, SearchParams
+from vehicle_detection.svm import Template, VehicleClassifier
 from vehicle_detection.tracking import FrameResult, Tracker, TrackParams
 from vehicle_detection.video import OwnSpeed, process_video
 
@@ -465,21 +467,12 @@ def test_the_horizon_overrides_the_searchs():
     assert len(low.detect(frame_with([140, 20, 180, 60]))) == 0
 
 
-def test_both_methods_find_the_same_vehicles():
-    frame = frame_with(CAR, OTHER)
-    shared = make(method="shared").detect(frame)
-    windows = make(method="windows").detect(frame)
-    assert iou_matrix(shared.boxes, windows.boxes).max(axis=1).min() > 0.7
-
-
-@pytest.mark.parametrize("method", ["shared", "windows"])
-def test_half_a_vehicle_at_the_edge(method):
+def test_half_a_vehicle_at_the_edge():
     frame = frame_with([0, 90, 32, 130])
-    found = make(method=method).detect(frame)
+    found = make().detect(frame)
     assert ((found.boxes >= 0) & (found.boxes <= (WIDTH, HEIGHT, WIDTH, HEIGHT))).all()
-    if method == "shared":
-        # Windows reach beyond the frame: what is half in the picture is found.
-        assert iou_matrix(found.boxes, [[0, 90, 32, 130]]).max(initial=0) > 0.5
+    # Windows reach beyond the frame: what is half in the picture is found.
+    assert iou_matrix(found.boxes, [[0, 90, 32, 130]]).max(initial=0) > 0.5
 
 
 def test_frames_are_left_as_they_were():
@@ -539,7 +532,6 @@ def test_a_closed_detector_starts_again():
     detector.close()
     detector.close()
     np.testing.assert_array_equal(again.boxes, first.boxes)
-    make(method="windows").close()
 
 
 GOOD = frame_with(CAR)
@@ -560,7 +552,7 @@ GOOD = frame_with(CAR)
 )
 @pytest.mark.parametrize("method", ["shared", "windows"])
 def test_bad_frames_are_refused_and_change_nothing(frame, message, method):
-    detector, plain = make(method=method), make(method=method)
+    detector, plain = make(), make()
     detector.process(GOOD)
     plain.process(GOOD)
     for take in (detector.detect, detector.process, detector.search, detector):
@@ -660,13 +652,11 @@ def test_what_is_no_model_is_refused():
         VehicleDetector("model.safetensors")
 
 
-def test_features_that_cannot_be_shared_are_searched_window_by_window():
+def test_features_that_cannot_be_shared_are_rejected():
     params = FeatureParams(color_space="RGB", spatial_size=6, hist_feat=False, hog_feat=False)
     odd = VehicleClassifier(params, (Template(np.zeros(108), np.ones(108), np.ones(108), 0.0),))
     with pytest.raises(InvalidInputError, match="got spatial_size=6; use search_windows"):
         VehicleDetector(odd, search_params=SEARCH)
-    detector = VehicleDetector(odd, method="windows", search_params=SEARCH)
-    assert len(detector.search(GOOD).windows) > 0
 
 
 def test_the_default_is_the_shipped_model():

@@ -15,9 +15,9 @@ from vehicle_detection.boxes import Detections
 from vehicle_detection.detector import VehicleDetector, detector_from
 from vehicle_detection.errors import DetectorError, InvalidInputError
 from vehicle_detection.evaluation import FrameBoxes, evaluate_tracks
-from vehicle_detection.function_model import FunctionModel
+from vehicle_detection.function_model import FunctionModel, FunctionParams
+from vehicle_detection.heatmap import HeatParams
 from vehicle_detection.notebook import Explorer
-from vehicle_detection.params import FunctionParams, HeatParams
 from vehicle_detection.tracking import TrackParams
 from vehicle_detection.video import process_video
 
@@ -244,8 +244,6 @@ def test_a_function_has_the_interface_of_a_model():
     assert model.summary() == ("function find_red", {"scores": "0 to 8", "threshold": "default"})
     detector = VehicleDetector(model, horizon=0.5)
     assert detector.search_params == FunctionParams(horizon=0.5, horizon_tolerance=0.06)
-    with pytest.raises(InvalidInputError, match="method must be 'shared' for a function, got 'windows'"):
-        VehicleDetector(model, method="windows")
     detector.warm_up()
     detector.close()
     heat = detector_from(find_red, region_params=HeatParams(weighting="count", peak_fraction=0))

@@ -9,13 +9,13 @@ from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import (
     HeatHistory,
+    HeatParams,
     add_heat,
     apply_threshold,
     bounding_boxes,
     frame_heat,
     label_boxes,
 )
-from vehicle_detection.params import HeatParams
 
 SHAPE = (12, 17)
 EIGHT = np.ones((3, 3))

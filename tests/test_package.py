@@ -33,14 +33,13 @@ MOVING = {
     "batch": "drive",
     "events": "drive",
     "report": "drive",
-    "tuning": "training",
 }
 KNOWN_UPWARD = {("explanation", "drive"), ("notebook", "scenes"), ("stream", "drive"), ("detector", "drive")}
 
 HEAVY = {"matplotlib", "moviepy", "sklearn", "pandas", "pooch", "jinja2", "dask", "pyarrow", "motmetrics"}
 HEAVY |= {"ipywidgets", "IPython"}
 # Modules about scikit-learn, themselves imported on first use.
-SKLEARN_MODULES = {"features.transformer"}
+SKLEARN_MODULES = {"transformer"}
 UNSAFE = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
 
 # Public names without an example in their docstring, and why.

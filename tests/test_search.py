@@ -10,11 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.helpers import random_classifier
-from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.params import COLOR_SPACES, FeatureParams, PixelBand, SearchBand, SearchParams
-from vehicle_detection.search import BandSearch, find_cars, resize_band, resized_shape
-from vehicle_detection.windows import search_windows, slide_window
+from vehicle_detection.features import COLOR_SPACES, FeatureParams
+from vehicle_detection.search import (
+    PixelBand,
+    SearchBand,
+    SearchParams,
+    resize_band,
+    resized_shape,
+)
+from vehicle_detection.svm import VehicleClassifier
+from vehicle_detection.windows import find_cars, search_windows, slide_window
 
 PRESETS = sorted(FeatureParams.PRESETS)
 TOLERANCE = 1e-4
@@ -48,7 +54,7 @@ def reference_map(image, band, classifier):
 
 
 def assert_equals_the_reference(image, band, classifier):
-    with BandSearch(classifier, n_jobs=1) as search:
+    with classifier.open_search(1) as search:
         scores = search.score_map(image, band)
     expected = reference_map(image, band, classifier)
     assert scores.dtype == np.float32
@@ -193,9 +199,9 @@ def test_two_templates_give_the_maximum_score(preset):
     assert_equals_the_reference(IMAGE, band, both)
     alone = []
     for template in both.templates:
-        with BandSearch(VehicleClassifier(params, (template,)), n_jobs=1) as search:
+        with VehicleClassifier(params, (template,)).open_search(1) as search:
             alone.append(search.score_map(IMAGE, band))
-    with BandSearch(both, n_jobs=1) as search:
+    with both.open_search(1) as search:
         np.testing.assert_allclose(search.score_map(IMAGE, band), np.maximum(*alone), atol=1e-6)
     assert (alone[0] > alone[1]).any()
     assert (alone[0] < alone[1]).any()
@@ -204,7 +210,7 @@ def test_two_templates_give_the_maximum_score(preset):
 def test_flat_and_extreme_images():
     classifier = random_classifier(FeatureParams())
     for image in (np.zeros_like(IMAGE), np.full_like(IMAGE, 255), np.full_like(IMAGE, (250, 3, 128))):
-        with BandSearch(classifier, n_jobs=1) as search:
+        with classifier.open_search(1) as search:
             band = band_of((64, 64), x=(0, 120), y=(0, 90))
             np.testing.assert_allclose(
                 search.score_map(image, band), reference_map(image, band, classifier), atol=TOLERANCE
@@ -215,12 +221,12 @@ def test_flat_and_extreme_images():
     ("changes", "message"),
     [
         ({"pix_per_cell": 7}, "find_cars needs whole HOG cells in a window of 64 pixels, got pix_per_cell=7"),
-        ({"pix_per_cell": 24}, "pix_per_cell=24; use search_windows, the reference search"),
+        ({"pix_per_cell": 24}, "pix_per_cell=24; use search_windows"),
         (
             {"spatial_size": 20},
             "find_cars needs whole spatial bins in a cell of 8 pixels, got spatial_size=20",
         ),
-        ({"spatial_size": 4}, "spatial_size=4; use search_windows, the reference search"),
+        ({"spatial_size": 4}, "spatial_size=4; use search_windows"),
         ({"spatial_size": 24}, "spatial_size=24"),
         ({"spatial_size": 8, "pix_per_cell": 4}, "spatial bins in a cell of 4 pixels, got spatial_size=8"),
     ],
@@ -261,7 +267,7 @@ def test_a_search_can_be_reused():
     search = small_params()
     images = [textured(220, 330, seed) for seed in range(3)] + [textured(110, 165, 9)]
     fresh = [find_cars(image, classifier, search, n_jobs=1) for image in images]
-    with BandSearch(classifier, n_jobs=2) as bands:
+    with classifier.open_search(2) as bands:
         for image, expected in zip(images * 2, fresh * 2):
             found = bands.find_windows(image, search)
             np.testing.assert_array_equal(found.boxes, expected.boxes)
@@ -272,7 +278,7 @@ def test_a_search_can_be_reused():
 
 
 def test_the_time_of_a_search():
-    with BandSearch(random_classifier(SMALL), n_jobs=1) as search:
+    with random_classifier(SMALL).open_search(1) as search:
         start = time.perf_counter()
         result = search.find(IMAGE, small_params())
         assert 0 < result.seconds <= time.perf_counter() - start
@@ -280,7 +286,7 @@ def test_the_time_of_a_search():
 
 def test_a_score_map_is_not_overwritten_by_the_next_search():
     band = band_of((64, 64))
-    with BandSearch(random_classifier(SMALL), n_jobs=1) as search:
+    with random_classifier(SMALL).open_search(1) as search:
         first = search.score_map(IMAGE, band)
         kept = first.copy()
         search.score_map(255 - IMAGE, band)
@@ -302,7 +308,7 @@ def test_many_threads_can_use_one_search(monkeypatch):
     search = small_params()
     images = [textured(220, 330, seed) for seed in range(8)]
     fresh = [find_cars(image, classifier, search, n_jobs=1) for image in images]
-    with BandSearch(classifier, n_jobs=2) as bands, ThreadPoolExecutor(8) as callers:
+    with classifier.open_search(2) as bands, ThreadPoolExecutor(8) as callers:
         together = threading.Barrier(8)
 
         def find(image):

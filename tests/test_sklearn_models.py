@@ -13,12 +13,12 @@ from sklearn.preprocessing import MaxAbsScaler, MinMaxScaler, RobustScaler, Stan
 from sklearn.svm import SVC, LinearSVC
 
 from vehicle_detection import course
-from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import PatchFeatures, extract_features
-from vehicle_detection.params import FeatureParams, PixelBand
+from vehicle_detection.features import FeatureParams, extract_features
 from vehicle_detection.scenes import render_patches
-from vehicle_detection.search import BandSearch
+from vehicle_detection.search import PixelBand
+from vehicle_detection.svm import VehicleClassifier
+from vehicle_detection.transformer import PatchFeatures
 
 SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
 
@@ -70,7 +70,7 @@ def test_a_published_model_with_interleaved_spatial_bins(patches, labels):
     expected = pipeline.decision_function(rows)
     np.testing.assert_allclose(classifier.decision_function(patches), expected, rtol=1e-4, atol=1e-4)
     # The shared search computes the same score for a frame of one window.
-    scores = BandSearch(classifier).score_map(patches[0], PixelBand(0, 0, 64, 64, (64, 64), (16, 16)))
+    scores = classifier.open_search().score_map(patches[0], PixelBand(0, 0, 64, 64, (64, 64), (16, 16)))
     assert scores[0, 0] == pytest.approx(expected[0], abs=1e-4)
     wrong = VehicleClassifier.from_pipeline(pipeline, SMALL)
     assert np.abs(wrong.decision_function(patches) - expected).max() > 0.1

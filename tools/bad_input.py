@@ -125,9 +125,9 @@ def _parameters(function: Callable[..., Any]) -> list[inspect.Parameter]:
 
 INTERNAL = {
     "Event.text", "FeatureParams.spatial_planes", "FrameSource.audio", "FrameSource.read",
-    "FunctionParams.heat_range", "HeatParams.for_search", "NetworkModel.feeds",
+    "HeatParams.for_search", "NetworkModel.feeds",
     "NetworkModel.input_size_for", "NetworkModel.probability", "NetworkModel.scores",
-    "NetworkParams.heat_range", "SearchBand.place", "SearchParams.heat_range", "SearchParams.place",
+    "SearchBand.place", "SearchParams.place",
     "VehicleDetector.interpolate", "VehicleDetector.skip",
 }  # fmt: skip
 """Methods that only the library calls, with its own results."""
@@ -183,7 +183,7 @@ class _Valid:
         import moviepy
 
         from vehicle_detection.cli.demo import draw_clip
-        from vehicle_detection.tuning import write_results
+        from vehicle_detection.training import write_results
 
         scene = vd.render_scene(shape=(180, 320), vehicles=1, random_state=0)
         image = scene.image

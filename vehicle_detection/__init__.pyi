@@ -8,7 +8,6 @@ from .annotator import (
 from .batch import BatchReport, BatchStatus, batch_status, batch_summary, open_dask, run_batch
 from .boxes import Detections, Platt, clip_boxes, iou_matrix, non_max_suppression
 from .camera import Camera, HorizonEstimate, estimate_horizon, read_camera, write_camera
-from .classifier import VehicleClassifier, load_classifier, train_classifier
 from .course import HeatmapDetector
 from .datasets import (
     FrameSet,
@@ -68,7 +67,7 @@ from .events import (
 from .explanation import Explanation, explain
 from .export import TrackWriter, write_boxes, write_tracks
 from .features import (
-    PatchFeatures,
+    FeatureParams,
     bin_spatial,
     color_hist,
     convert_color,
@@ -77,27 +76,23 @@ from .features import (
     hog_image,
     single_img_features,
 )
-from .heatmap import HeatHistory, add_heat, apply_threshold, bounding_boxes, label_boxes
+from .function_model import FunctionParams
+from .heatmap import HeatHistory, HeatParams, add_heat, apply_threshold, bounding_boxes, label_boxes
 from .images import read_image, write_image
 from .loading import load_model
 from .network import NetworkModel, NetworkParams
 from .notebook import Explorer
-from .params import (
-    FeatureParams,
-    FunctionParams,
-    HeatParams,
-    SearchBand,
-    SearchParams,
-)
 from .regions import RegionParams, find_vehicles
 from .report import ReportWriter
 from .scenes import render_drive, render_patches, render_scene
-from .search import SearchResult, find_cars
+from .search import SearchBand, SearchParams, SearchResult
 from .stream import TrackedFrame, track
+from .svm import VehicleClassifier, load_classifier
 from .tables import TrackTable
 from .tracking import FrameResult, Track, Tracker, TrackParams
-from .training import FrameDataset, TrainingReport, train_and_evaluate
-from .tuning import (
+from .training import (
+    FrameDataset,
+    TrainingReport,
     TrialOptions,
     compare_classifiers,
     compare_configurations,
@@ -105,7 +100,10 @@ from .tuning import (
     pareto_front,
     read_results,
     search_parameters,
+    train_and_evaluate,
+    train_classifier,
 )
+from .transformer import PatchFeatures
 from .video import (
     FrameSource,
     OwnSpeed,
@@ -119,7 +117,7 @@ from .video import (
     read_frames,
     read_own_speed,
 )
-from .windows import search_windows, slide_window
+from .windows import find_cars, search_windows, slide_window
 
 __version__: str
 __all__ = [

@@ -52,8 +52,7 @@ from vehicle_detection.drawing import (
     text_size,
 )
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.heatmap import frame_heat
-from vehicle_detection.params import HeatParams
+from vehicle_detection.heatmap import HeatParams, frame_heat
 from vehicle_detection.tracking import FrameResult, Track
 
 # Frame rate that is assumed for results without times.

@@ -6,12 +6,12 @@ import dataclasses
 
 from vehicle_detection._common import check_number
 from vehicle_detection.boxes import logit
-from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.function_model import FunctionModel
+from vehicle_detection.heatmap import HeatParams
 from vehicle_detection.network import NetworkModel
-from vehicle_detection.params import HeatParams
 from vehicle_detection.regions import RegionParams
+from vehicle_detection.svm import VehicleClassifier
 
 Model = VehicleClassifier | NetworkModel | FunctionModel
 

@@ -37,21 +37,20 @@ from vehicle_detection.camera import (
     check_camera_file,
     read_camera,
 )
-from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.confidence import Model, with_confidence
 from vehicle_detection.drawing import (
     blur_boxes,
     draw_boxes,
 )
 from vehicle_detection.errors import DetectorError, InvalidInputError
-from vehicle_detection.function_model import DetectorFunction, FunctionModel
-from vehicle_detection.heatmap import HeatHistory, frame_heat, label_heat
+from vehicle_detection.function_model import DetectorFunction, FunctionModel, FunctionParams
+from vehicle_detection.heatmap import HeatHistory, HeatParams, frame_heat, label_heat
 from vehicle_detection.images import is_cut, make_thumbnail, read_image
 from vehicle_detection.loading import load_model, refuse_network_options
 from vehicle_detection.network import Device, NetworkModel, NetworkParams
-from vehicle_detection.params import FunctionParams, HeatParams, SearchParams
 from vehicle_detection.regions import RegionParams, find_vehicles
-from vehicle_detection.search import FrameSearch, SearchResult
+from vehicle_detection.search import FrameSearch, SearchParams, SearchResult
+from vehicle_detection.svm import VehicleClassifier
 from vehicle_detection.tracking import (
     FrameResult,
     Track,
@@ -93,9 +92,6 @@ class VehicleDetector(Closing):
         Minimum confidence of a vehicle in a single image: its calibrated probability, 0 to 1, of which values
         outside 0.001 to 0.999 are limited to these. The search and
         the tracker follow: scores are those above this threshold. None: the model's own threshold.
-    method
-        ``"shared"``: the fast search, features shared by all windows. ``"windows"``: the reference, one patch
-        per window; for classifiers of patches.
     search_params
         Where to search: `NetworkParams` for a network, `SearchParams` for a classifier of patches,
         `FunctionParams` for a function.
@@ -151,7 +147,7 @@ class VehicleDetector(Closing):
     ModelFileError
         If the model file is missing or damaged.
     InvalidInputError
-        If an argument is malformed, or `search_params` or `method` do not fit the model.
+        If an argument is malformed, or `search_params` does not fit the model.
 
     Warns
     -----
@@ -172,7 +168,6 @@ class VehicleDetector(Closing):
         *,
         classes: Collection[str | int] | None = None,
         conf: float | None = None,
-        method: Literal["shared", "windows"] = "shared",
         search_params: SearchParams | NetworkParams | FunctionParams | None = None,
         region_params: RegionParams | HeatParams | None = None,
         track_params: TrackParams | None = None,
@@ -219,8 +214,8 @@ class VehicleDetector(Closing):
         self.own_speed = own_speed
         self.diagnostics, self.blur = diagnostics, blur
         self.every = None if every is None else check_integer(every, "every", low=1, high=1000)
-        self._search_options = n_jobs, method
-        self._search: FrameSearch = self.model.open_search(*self._search_options)
+        self._n_jobs = n_jobs
+        self._search: FrameSearch = self.model.open_search(self._n_jobs)
         self._heat_params = region_params if isinstance(region_params, HeatParams) else None
         # The heat of a region is no log-odds.
         self._calibration = self.model.calibration if self._heat_params is None else None
@@ -251,7 +246,7 @@ class VehicleDetector(Closing):
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._lock = threading.RLock()
-        self._search = self.model.open_search(*self._search_options)
+        self._search = self.model.open_search(self._n_jobs)
 
     def __copy__(self) -> Self:
         """Return a detector with the same model and search threads, and a state of its own."""

@@ -20,7 +20,6 @@ from numpy.typing import ArrayLike, NDArray
 from vehicle_detection._common import Floats, check_boxes, check_image, check_type, describe
 from vehicle_detection.boxes import box_areas, clip_boxes, iou_matrix
 from vehicle_detection.camera import truncated_edges
-from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drawing import (
     blur_boxes,
@@ -29,9 +28,9 @@ from vehicle_detection.drawing import (
 )
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events import TrackLog
-from vehicle_detection.features import extract_features, part_slices, sum_blocks
+from vehicle_detection.features import PATCH_SIZE, FeatureParams, extract_features, part_slices, sum_blocks
 from vehicle_detection.network import NetworkModel, NetworkParams, NetworkSearch
-from vehicle_detection.params import PATCH_SIZE, FeatureParams
+from vehicle_detection.svm import VehicleClassifier
 from vehicle_detection.video import Source, borrow_source
 
 # IoU from which a found vehicle or a window belongs to a box.

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import threading
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import check_bool, check_type, describe
+from vehicle_detection._common import check_bool, check_type, describe, store_number
 from vehicle_detection.boxes import (
     Detections,
     Platt,
@@ -26,10 +27,54 @@ from vehicle_detection.boxes import (
     select_classes,
 )
 from vehicle_detection.errors import DetectorError, InvalidInputError
-from vehicle_detection.params import FunctionParams
 from vehicle_detection.search import FrameSearch
 
 DetectorFunction = Callable[[NDArray[np.uint8]], Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FunctionParams:
+    """Parameters of a detector that is a function: it searches the whole frame by itself.
+
+    Attributes
+    ----------
+    horizon
+        Row of the horizon as a fraction of the frame's height, for distances; None: estimated.
+    horizon_tolerance
+        Error of the horizon as a fraction of the frame's height.
+    min_score
+        Minimum score, in log-odds, of the boxes that count as positive windows.
+
+    Examples
+    --------
+    >>> FunctionParams().with_horizon(0.55).horizon
+    0.55
+    """
+
+    horizon: float | None = None
+    horizon_tolerance: float = 0.15
+    min_score: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.horizon is not None:
+            store_number(self, "horizon", low=0, high=1)
+        store_number(self, "horizon_tolerance", low=0, high=1)
+        store_number(self, "min_score")
+
+    @classmethod
+    def default(cls) -> FunctionParams:
+        """Return the default parameters."""
+        return cls()
+
+    def with_horizon(self, horizon: float | None) -> FunctionParams:
+        """Return the same parameters with a known horizon and a lower tolerance; None changes nothing."""
+        if horizon is None:
+            return self
+        return dataclasses.replace(self, horizon=horizon, horizon_tolerance=0.06)
+
+    def everywhere(self) -> FunctionParams:
+        """Return the same parameters: a function searches all rows."""
+        return self
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -87,18 +132,8 @@ class FunctionModel:
             limit = logit(limit)
         return Platt(-1.0, -limit)
 
-    def open_search(
-        self, n_jobs: int | None = None, method: Literal["shared", "windows"] = "shared"
-    ) -> FunctionSearch:
-        """Open a search of frames that calls the function; `n_jobs` has no effect.
-
-        Raises
-        ------
-        InvalidInputError
-            If `method` is ``"windows"``.
-        """
-        if method != "shared":
-            raise InvalidInputError(f"method must be 'shared' for a function, got {method!r}; omit it")
+    def open_search(self, n_jobs: int | None = None) -> FunctionSearch:
+        """Open a search of frames that calls the function; `n_jobs` has no effect."""
         return FunctionSearch(self, n_jobs)
 
     def summary(self) -> tuple[str, dict[str, str]]:

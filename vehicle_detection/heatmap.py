@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
+import warnings
 from collections import deque
+from dataclasses import dataclass
 from itertools import islice
-from typing import Any, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -13,17 +17,103 @@ from numpy.typing import ArrayLike, NDArray
 from vehicle_detection._common import (
     check_array,
     check_boxes,
+    check_choice,
     check_integer,
     check_number,
     check_shape,
     check_type,
     describe,
+    store_integer,
+    store_number,
 )
 from vehicle_detection.boxes import Detections, clip_boxes
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.params import HeatParams, SearchParams
+from vehicle_detection.search import SearchParams
 
 Heat = TypeVar("Heat", bound=NDArray[Any])
+
+
+class HeatRange(NamedTuple):
+    """Heat thresholds that suit a search: the default, and the limits beyond which most vehicles are lost."""
+
+    default: float
+    low: float
+    high: float
+
+
+# Heat thresholds by weighting, and whether regions are reduced to their peak, chosen on single frames of the
+# labelled clips: the default has the best F1, or close to it, and beyond the limits F1 is about 0.5 or lower.
+_BAND_HEAT = {
+    ("score", True): HeatRange(2.0, 0.0, 40.0),
+    ("count", True): HeatRange(8.0, 0.0, 56.0),
+    ("score", False): HeatRange(12.0, 4.0, 40.0),
+    ("count", False): HeatRange(16.0, 10.0, 56.0),
+}
+# Factor of the default thresholds of whole regions if all windows are of similar size.
+_SIMILAR_SIZES_FACTOR = 0.6
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeatParams:
+    """How windows become boxes by a heat map, as in the course.
+
+    Attributes
+    ----------
+    weighting
+        ``"score"``: each window adds its score to the heat; ``"count"``: it adds 1, as in the course.
+    frames
+        Number of frames over which the heat is averaged.
+    threshold
+        Highest heat that is removed. None: chosen for the model and the density of its search. More
+        windows cover a vehicle in a denser search, so a threshold fits one density only.
+    peak_fraction
+        A region is reduced to the part around its peak that has at least this fraction of the peak's heat,
+        in [0, 1); 0 keeps whole regions, as in the course.
+    """
+
+    weighting: Literal["score", "count"] = "score"
+    frames: int = 5
+    threshold: float | None = None
+    peak_fraction: float = 0.35
+
+    def __post_init__(self) -> None:
+        check_choice(self.weighting, "weighting", ("score", "count"))
+        store_integer(self, "frames", low=1, high=1000)
+        if self.threshold is not None:
+            store_number(self, "threshold", low=0, high=1e9)
+        store_number(self, "peak_fraction", low=0, high=0.99)
+
+    def for_search(self, search: Any) -> HeatParams:
+        """Return the same parameters with a threshold for `search`; warn if the given one cannot fit it."""
+        expected = heat_range(search, self)
+        if self.threshold is None:
+            return dataclasses.replace(self, threshold=expected.default)
+        if not expected.low <= self.threshold <= expected.high:
+            many = "few" if self.threshold > expected.high else "many"
+            warnings.warn(
+                f"the heat threshold {self.threshold:g} does not fit the density of this search: too {many} "
+                f"windows are hot. With weighting={self.weighting!r} and peak_fraction="
+                f"{self.peak_fraction:g} expect {expected.low:.2g} to {expected.high:.2g}; omit the "
+                f"threshold for the default of {expected.default:.2g}",
+                stacklevel=3,
+            )
+        return self
+
+
+def heat_range(search: Any, params: HeatParams) -> HeatRange:
+    """Heat thresholds for the windows of a search: those of the default search, scaled by density.
+
+    The density of the boxes of a network or a function is unknown: any threshold is valid.
+    """
+    if not isinstance(search, SearchParams):
+        return HeatRange(0.0, 0.0, math.inf)
+    factor = search.window_density / SearchParams.default().window_density
+    default, low, high = (factor * value for value in _BAND_HEAT[params.weighting, params.peak_fraction > 0])
+    # Only windows much larger than a vehicle join it to others, which takes a higher threshold.
+    sides = [side for band in search.bands for side in band.window]
+    if params.peak_fraction == 0 and max(sides) <= 4 * min(sides):
+        default, low = _SIMILAR_SIZES_FACTOR * default, 0.0
+    return HeatRange(default, low, high)
 
 
 def _check_heat(heatmap: object) -> NDArray[Any]:
@@ -242,7 +332,7 @@ def bounding_boxes(shape: tuple[int, ...], windows: Any, *, params: HeatParams |
 def heat_threshold(params: HeatParams) -> float:
     """Threshold of the parameters; None means that for the windows of a classifier's default search."""
     if params.threshold is None:
-        return SearchParams.default().heat_range(params).default
+        return heat_range(SearchParams.default(), params).default
     return params.threshold
 
 

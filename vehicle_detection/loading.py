@@ -7,9 +7,9 @@ from collections.abc import Collection
 from pathlib import PurePath
 
 from vehicle_detection._common import check_choice, describe
-from vehicle_detection.classifier import VehicleClassifier, load_classifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.network import Device, NetworkModel, load_network
+from vehicle_detection.svm import VehicleClassifier, load_classifier
 
 # Files of PyTorch are refused with a message that says how to export them.
 _NETWORK_SUFFIXES = (".onnx", ".pt", ".pth")

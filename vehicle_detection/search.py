@@ -17,8 +17,11 @@ Felzenszwalb et al. (PAMI 2010), section 3, for linear templates as filters over
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -31,10 +34,13 @@ from vehicle_detection._common import (
     Closing,
     ThreadTeam,
     Workspace,
+    check_choice,
     check_image,
     check_number,
     check_type,
+    describe,
     single_threaded_opencv,
+    store_number,
 )
 from vehicle_detection._kernels import (
     Filter,
@@ -46,17 +52,225 @@ from vehicle_detection._kernels import (
 from vehicle_detection._kernels import histogram as _histogram_kernels
 from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.boxes import Detections
-from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import convert_color, hog_source, pick_hog_channels
+from vehicle_detection.features import PATCH_SIZE, FeatureParams, convert_color, hog_source, pick_hog_channels
 from vehicle_detection.images import make_thumbnail
-from vehicle_detection.params import (
-    PATCH_SIZE,
-    FeatureParams,
-    PixelBand,
-    SearchParams,
-)
-from vehicle_detection.windows import band_windows, search_windows
+
+REFERENCE_WIDTH = 1280
+"""Search windows are given in pixels of a frame whose longer side has this length."""
+
+# Windows of sides that differ by at most this factor fire on the same vehicle.
+_SIMILAR_SIDES = 1.5
+# The fast search steps by one cell, an eighth of a window, or more.
+_MIN_STEP = 1 / 8
+
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class PixelBand:
+    """A search band in integer pixels of one frame; it may extend beyond the left and right border."""
+
+    x1: int
+    y1: int
+    x2: int
+    y2: int
+    window: tuple[int, int]  # width and height
+    step: tuple[int, int]  # horizontal and vertical
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchBand:
+    """Windows of one size in a horizontal band, in pixels of a 1280-wide reference frame.
+
+    Attributes
+    ----------
+    window
+        Width and height of the windows.
+    y, x
+        Top and bottom of the band relative to the horizon, positive downwards; left and right end as
+        fractions of the frame's width, 0-1.
+    overlap
+        Horizontal and vertical overlap of neighboring windows as fractions of their size, in [0, 1).
+    """
+
+    window: Pair
+    y: Pair
+    x: Pair = (0.0, 1.0)
+    overlap: Pair = (0.875, 0.875)
+
+    def __post_init__(self) -> None:
+        _check_pair(self.window, "window", low=8, high=4096)
+        _check_pair(self.y, "y", low=-4096, high=4096)
+        _check_pair(self.x, "x", low=0, high=1)
+        _check_pair(self.overlap, "overlap", low=0, high=0.99)
+        for name, (start, stop) in (("x", self.x), ("y", self.y)):
+            if start >= stop:
+                raise InvalidInputError(
+                    f"{name} must be (start, stop) with start < stop; got {(start, stop)}"
+                )
+
+    def place(
+        self, shape: tuple[int, ...], horizon: float, horizontal_padding: float = 0.0
+    ) -> PixelBand | None:
+        """Place the band on a frame.
+
+        Parameters
+        ----------
+        shape
+            ``(height, width, ...)`` of the frame.
+        horizon
+            Row of the horizon as a fraction of the frame's height, 0 at the top.
+        horizontal_padding
+            Fraction of a window's width by which a band that ends at the frame's left or right border extends
+            beyond it.
+
+        Returns
+        -------
+        PixelBand or None
+            The band in pixels; None if no window fits, or windows are smaller than 16 pixels.
+        """
+        height, width = shape[:2]
+        scale = max(height, width) / REFERENCE_WIDTH
+        window_w, window_h = (round(side * scale) for side in self.window)
+        y1, y2 = (min(max(round(horizon * height + side * scale), 0), height) for side in self.y)
+        x1, x2 = round(self.x[0] * width), round(self.x[1] * width)
+        # Smaller windows than 16 pixels are too blurred when enlarged to a patch.
+        if min(window_w, window_h) < 16 or x2 - x1 < window_w or y2 - y1 < window_h:
+            return None
+        padding = round(horizontal_padding * window_w)
+        x1 -= padding if x1 == 0 else 0
+        x2 += padding if x2 == width else 0
+        step_x, step_y = (
+            max(1, int(side * (1 - overlap) + 1e-9))
+            for side, overlap in zip((window_w, window_h), self.overlap)
+        )
+        return PixelBand(x1, y1, x2, y2, (window_w, window_h), (step_x, step_y))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchParams:
+    """Positions and sizes of the windows that are searched.
+
+    Attributes
+    ----------
+    bands, horizon
+        Bands of windows, and row of the horizon as a fraction of the frame's height, 0 at the top.
+    min_score
+        Minimum score of a hit (exclusive).
+    horizontal_padding
+        Fraction of a window that may extend beyond the frame's left and right border, where the outermost
+        column is replicated, so that truncated vehicles are found.
+
+    Examples
+    --------
+    >>> params = SearchParams.preset("three-scales")
+    >>> params.place((720, 1280))[1]
+    PixelBand(x1=0, y1=400, x2=1280, y2=656, window=(64, 64), step=(8, 8))
+    """
+
+    horizon_tolerance: ClassVar[float] = 0.1
+    """Maximum error of the horizon that the bands allow, as a fraction of the frame's height."""
+
+    bands: tuple[SearchBand, ...]
+    horizon: float = 0.58
+    min_score: float = 0.0
+    horizontal_padding: float = 0.0
+
+    def __post_init__(self) -> None:
+        bands: object = self.bands
+        if not (isinstance(bands, (tuple, list)) and bands and all(isinstance(b, SearchBand) for b in bands)):
+            raise InvalidInputError(
+                f"bands must be a tuple of SearchBand, at least one; got {describe(bands)}"
+            )
+        object.__setattr__(self, "bands", tuple(bands))
+        store_number(self, "horizon", low=0, high=1)
+        store_number(self, "min_score", low=-1e6, high=1e6)
+        store_number(self, "horizontal_padding", low=0, high=0.9)
+
+    @classmethod
+    def default(cls) -> SearchParams:
+        """Return the preset ``"default"``."""
+        return cls.preset()
+
+    @classmethod
+    def preset(cls, name: str = "default") -> SearchParams:
+        """Return "default", or "130-windows" or "three-scales" of the course's first or third system."""
+        presets = {"three-scales": _three_scales, "130-windows": _window_list, "default": _default_bands}
+        check_choice(name, "preset", presets)
+        return presets[name]()
+
+    def with_horizon(self, horizon: float | None) -> SearchParams:
+        """Return the same parameters with another horizon; None keeps it."""
+        return self if horizon is None else dataclasses.replace(self, horizon=horizon)
+
+    def everywhere(self) -> SearchParams:
+        """Return the same parameters for a search of all rows, whatever the horizon."""
+        bands = (dataclasses.replace(band, y=(-4096.0, 4096.0)) for band in self.bands)
+        return dataclasses.replace(self, bands=tuple(bands))
+
+    @property
+    def window_density(self) -> float:
+        """Number of windows of similar size that cover a point, as the mean over the bands."""
+        sides = [math.sqrt(band.window[0] * band.window[1]) for band in self.bands]
+        covers = [
+            math.prod(1 / max(1 - overlap, _MIN_STEP) for overlap in band.overlap) for band in self.bands
+        ]
+        similar = [
+            cover
+            for side in sides
+            for other, cover in zip(sides, covers)
+            if max(side, other) <= _SIMILAR_SIDES * min(side, other)
+        ]
+        return sum(similar) / len(self.bands)
+
+    def place(self, shape: tuple[int, ...]) -> tuple[PixelBand, ...]:
+        """Bands in pixels of a frame of `shape` (height, width, ...), in which some window must fit."""
+        placed = [band.place(shape, self.horizon, self.horizontal_padding) for band in self.bands]
+        fitting = tuple(band for band in placed if band is not None)
+        if not fitting:
+            raise InvalidInputError(
+                f"image of {shape[1]}x{shape[0]} pixels holds no search window below the horizon at "
+                f"{self.horizon:g} of its height; pass a larger image, or change horizon or bands"
+            )
+        return fitting
+
+
+def _check_pair(value: object, name: str, *, low: float, high: float) -> None:
+    if not isinstance(value, tuple) or len(value) != 2:
+        raise InvalidInputError(f"{name} must be a pair of numbers, got {describe(value)}")
+    for index, number in enumerate(value):
+        check_number(number, f"{name}[{index}]", low=low, high=high)
+
+
+def _window_list() -> SearchParams:
+    bands = tuple(
+        SearchBand(window=window, y=y, x=(650 / 1280, 1.0), overlap=overlap)
+        for window, y, overlap in (
+            ((96.0, 96.0), (-5.0, 130.0), (0.9, 0.5)),
+            ((110.0, 145.0), (-20.0, 190.0), (0.7, 0.6)),
+            ((155.0, 165.0), (-30.0, 190.0), (0.6, 0.5)),
+            ((170.0, 200.0), (0.0, 300.0), (0.6, 0.5)),
+        )
+    )
+    return SearchParams(bands=bands, horizon=400 / 720)
+
+
+def _three_scales() -> SearchParams:
+    bands = tuple(SearchBand(window=(64 * s, 64 * s), y=(0.0, 256.0)) for s in (1.5, 1.0, 0.8))
+    return SearchParams(bands=bands, horizon=400 / 720)
+
+
+def _default_bands() -> SearchParams:
+    """Windows from 64 pixels up, in steps of 1.25, wherever a vehicle on a flat road may be.
+
+    With the camera `c` meters above the road, the bottom of a vehicle whose face fills 0.84 of a window of
+    side `s` is ``0.84 * s * c / 1.8`` below the horizon. For cameras at 0.9 to 2 m the window is between
+    -0.35 `s` and 0.95 `s`; the margin allows for hills and an inexact horizon.
+    """
+    sides = [64.0 * 1.25**step for step in range(8)]
+    bands = tuple(SearchBand(window=(side, side), y=(-0.35 * side - 16, 0.95 * side + 16)) for side in sides)
+    return SearchParams(bands=bands, horizontal_padding=0.5)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -140,58 +354,14 @@ class FrameSearch(Closing, ABC):
         self._team.close()
 
 
-def find_cars(
-    image: NDArray[np.uint8],
-    classifier: VehicleClassifier,
-    params: SearchParams | None = None,
-    *,
-    n_jobs: int | None = None,
-) -> Detections:
-    """Find the windows of a frame that look like vehicles.
-
-    Scores equal those of `search_windows` with ``border="image"`` on each resized band within 1e-4.
-
-    Parameters
-    ----------
-    image
-        ``(H, W, 3)`` uint8 RGB.
-    classifier
-        The trained model.
-    params
-        Bands and minimum score; the default is ``SearchParams.preset("default")``. Steps between windows
-        are rounded to whole cells, at least one.
-    n_jobs
-        Threads, each of which searches a band; the result does not depend on them.
-
-    Returns
-    -------
-    Detections
-        Float boxes in pixels of the image and scores, ordered by band and row.
-
-    Raises
-    ------
-    InvalidInputError
-        If the image is malformed or smaller than a window, or windows cannot share the features exactly.
-
-    Examples
-    --------
-    >>> from vehicle_detection import load_classifier
-    >>> len(find_cars(np.zeros((720, 1280, 3), np.uint8), load_classifier()))
-    0
-    """
-    with BandSearch(classifier, n_jobs=n_jobs) as search:
-        return search.find_windows(image, SearchParams.preset() if params is None else params)
-
-
 class BandSearch(FrameSearch):
     """The fast search with one template or a few that share the features of a band."""
 
     params_type = SearchParams
 
-    def __init__(self, classifier: VehicleClassifier, *, n_jobs: int | None = None) -> None:
-        check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
+    def __init__(self, filters: BandFilters, n_jobs: int | None = None) -> None:
         super().__init__(n_jobs)
-        self.filters = _Filters(classifier)
+        self.filters = filters
 
     def _search(
         self, frame: NDArray[np.uint8], params: SearchParams, min_vehicle_score: float
@@ -219,26 +389,6 @@ class BandSearch(FrameSearch):
         """
         workspace = self.workspace
         return self.filters.score_map(resize_band(image, band, workspace), workspace)
-
-
-class ReferenceSearch(FrameSearch):
-    """The reference search: the windows of the same bands by `search_windows`, one patch per window."""
-
-    params_type = SearchParams
-
-    def __init__(self, classifier: VehicleClassifier, *, n_jobs: int | None = None) -> None:
-        check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
-        super().__init__(n_jobs)
-        self._classifier, self._n_jobs = classifier, n_jobs
-
-    def _search(
-        self, frame: NDArray[np.uint8], params: SearchParams, min_vehicle_score: float
-    ) -> tuple[Detections, None]:
-        windows = np.concatenate([band_windows(band) for band in params.place(frame.shape)])
-        # `search_windows` needs windows inside the frame.
-        windows = windows[(windows[:, 0] >= 0) & (windows[:, 2] <= frame.shape[1])]
-        min_score, n_jobs = params.min_score, self._n_jobs
-        return search_windows(frame, windows, self._classifier, min_score=min_score, n_jobs=n_jobs), None
 
 
 def resized_shape(band: PixelBand) -> tuple[int, int]:
@@ -294,11 +444,11 @@ def _hits(
     return boxes, grid[rows, columns].astype(np.float64)
 
 
-class _Filters:
-    """The folded weights of a classifier as filters over the channels of cells."""
+class BandFilters:
+    """Affine functions of a feature vector, each ``(weights, bias)``, as filters over cells."""
 
-    def __init__(self, classifier: VehicleClassifier) -> None:
-        self.params = params = classifier.params
+    def __init__(self, params: FeatureParams, functions: Sequence[tuple[NDArray[np.float64], float]]) -> None:
+        self.params = params
         _check_shareable(params)
         self.cells = params.cells
         self.block = params.cell_per_block
@@ -309,13 +459,12 @@ class _Filters:
         self.cotangents = orientation_cotangents(params.orient)
         self.bounds = degree_bounds(params.orient)
         self.bins = bin_of_value(params.hist_bins)
-        folded = [template.fold() for template in classifier.templates]
-        self.biases = [bias for _, bias in folded]
-        self.filters = [self._build_filters(weights) for weights, _ in folded]
+        self.biases = [bias for _, bias in functions]
+        self.filters = [self._build_filters(weights) for weights, _ in functions]
         hist = slice(params.spatial_length, params.spatial_length + params.hist_length)
         # Every template has its own table of weights by pixel value, and so its own histogram channel.
-        by_bin = np.array([weights[hist] for weights, _ in folded], np.float32).reshape(len(folded), 3, -1)
-        self.weights_by_bin = by_bin
+        by_bin = np.array([weights[hist] for weights, _ in functions], np.float32)
+        self.weights_by_bin = by_bin = by_bin.reshape(len(functions), 3, -1)
         self.tables = by_bin[:, :, self.bins] if self.hist_lookup else None
 
     def _build_filters(self, weights: NDArray[np.float64]) -> list[Filter]:
@@ -434,7 +583,7 @@ class _Filters:
 
 def _check_shareable(params: FeatureParams) -> None:
     """Reject features that windows cannot share exactly."""
-    remedy = "use search_windows, the reference search, or other parameters"
+    remedy = "use search_windows, or other parameters"
     if params.cells * params.pix_per_cell != PATCH_SIZE:
         raise InvalidInputError(
             f"find_cars needs whole HOG cells in a window of {PATCH_SIZE} pixels, got "

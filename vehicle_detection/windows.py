@@ -21,9 +21,10 @@ from vehicle_detection._common import (
     describe,
 )
 from vehicle_detection.boxes import Detections
-from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import (
+    PATCH_SIZE,
+    FeatureParams,
     bin_spatial,
     color_hist,
     convert_color,
@@ -31,7 +32,8 @@ from vehicle_detection.features import (
     hog_blocks,
     hog_source,
 )
-from vehicle_detection.params import PATCH_SIZE, FeatureParams, PixelBand
+from vehicle_detection.search import PixelBand, SearchParams
+from vehicle_detection.svm import CLASSIFIER_REMEDY, VehicleClassifier
 
 Range = Sequence[int | None]
 
@@ -292,3 +294,47 @@ def _coarse_blocks(channel: NDArray[np.uint8], params: FeatureParams) -> NDArray
         blocks = _hog_blocks(np.asarray(shifted, np.uint8), 2 * cell, params)[odd_y:, odd_x:]
         found[odd_y::2, odd_x::2][: len(blocks), : blocks.shape[1]] = blocks
     return found
+
+
+def find_cars(
+    image: NDArray[np.uint8],
+    classifier: VehicleClassifier,
+    params: SearchParams | None = None,
+    *,
+    n_jobs: int | None = None,
+) -> Detections:
+    """Find the windows of a frame that look like vehicles.
+
+    Scores equal those of `search_windows` with ``border="image"`` on each resized band within 1e-4.
+
+    Parameters
+    ----------
+    image
+        ``(H, W, 3)`` uint8 RGB.
+    classifier
+        The trained model.
+    params
+        Bands and minimum score; the default is ``SearchParams.preset("default")``. Steps between windows
+        are rounded to whole cells, at least one.
+    n_jobs
+        Threads, each of which searches a band; the result does not depend on them.
+
+    Returns
+    -------
+    Detections
+        Float boxes in pixels of the image and scores, ordered by band and row.
+
+    Raises
+    ------
+    InvalidInputError
+        If the image is malformed or smaller than a window, or windows cannot share the features exactly.
+
+    Examples
+    --------
+    >>> from vehicle_detection import load_classifier
+    >>> len(find_cars(np.zeros((720, 1280, 3), np.uint8), load_classifier()))
+    0
+    """
+    check_type(classifier, "classifier", VehicleClassifier, CLASSIFIER_REMEDY)
+    with classifier.open_search(n_jobs) as search:
+        return search.find_windows(image, SearchParams.preset() if params is None else params)

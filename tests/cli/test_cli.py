@@ -23,13 +23,12 @@ import vehicle_detection
 from tests.helpers import start_interruptible
 from tests.network.graphs import constant_network
 from tests.video.clips import damage_sizes, write_clip
-from vehicle_detection import classifier, datasets, detector, training, video
+from vehicle_detection import datasets, detector, training, video
 from vehicle_detection._common import files as _files
 from vehicle_detection._common import progress_bar
 from vehicle_detection.annotator import DrawParams
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import HorizonEstimate
-from vehicle_detection.classifier import VehicleClassifier, load_classifier
 from vehicle_detection.cli import output
 from vehicle_detection.cli.app import app
 from vehicle_detection.cli.demo import FILES, REPORT, SHEET, draw_clip, scored_truth
@@ -45,6 +44,7 @@ from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.loading import load_model
 from vehicle_detection.scenes import SceneVehicle, render_drive, render_patches, render_scene
+from vehicle_detection.svm import VehicleClassifier, load_classifier
 from vehicle_detection.video import FrameSource, probe_video, read_frames
 
 COMMANDS = ("demo", "detect", "video", "batch", "evaluate", "train", "train-frames", "tune", "fetch", "info")

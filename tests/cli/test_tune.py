@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 from vehicle_detection.cli.app import app
 from vehicle_detection.images import read_image, write_image
 from vehicle_detection.scenes import render_patches, render_scene, write_labels
-from vehicle_detection.tuning import read_results, trials
+from vehicle_detection.training import read_results, trials
 
 SMALL = "spatial_size=8 hist_bins=8 pix_per_cell=16 hog_channel=0 mirror=no"
 
@@ -61,7 +61,7 @@ def test_a_grid_becomes_a_table_and_a_figure(patches, tmp_path, monkeypatch):
     assert np.ptp(read_image(plot)) == 255
     # The same command finds no configuration left to measure.
     text = out.read_text()
-    monkeypatch.setattr("vehicle_detection.tuning.trials.TrialEvaluator.evaluate", None)
+    monkeypatch.setattr("vehicle_detection.training.trials.TrialEvaluator.evaluate", None)
     assert run(*words).exit_code == 0
     assert out.read_text() == text
 

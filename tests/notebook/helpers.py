@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from vehicle_detection.params import FeatureParams
+from vehicle_detection.features import FeatureParams
 
 SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=6, pix_per_cell=16)
 

@@ -14,16 +14,17 @@ from vehicle_detection.camera import Camera
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.heatmap import frame_heat
+from vehicle_detection.features import FeatureParams
+from vehicle_detection.heatmap import HeatParams, frame_heat
 from vehicle_detection.images import write_image
 from vehicle_detection.loading import load_model
 from vehicle_detection.network import NetworkParams
 from vehicle_detection.notebook import Explorer
 from vehicle_detection.notebook import explorer as module
 from vehicle_detection.notebook.explorer import METHODS, VIEWS
-from vehicle_detection.params import FeatureParams, HeatParams, SearchParams
 from vehicle_detection.regions import RegionParams
 from vehicle_detection.scenes import render_scene
+from vehicle_detection.search import SearchParams
 
 SHAPE = (360, 640)
 

@@ -6,14 +6,14 @@ from hypothesis.extra import numpy as hnp
 
 from tests.helpers import random_classifier
 from tests.notebook.helpers import SMALL, gray_image, legend, new_axes, texts, titles
+from tests.plotting.helpers import SMALL, gray_image, legend, new_axes, texts, titles
 from vehicle_detection import notebook
-from vehicle_detection.classifier import Template, VehicleClassifier
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import extract_features, hog_image, sum_blocks
+from vehicle_detection.features import FeatureParams, extract_features, hog_image, sum_blocks
 from vehicle_detection.notebook.features import add_glyphs
 from vehicle_detection.notebook.style import OTHER, VEHICLE
-from vehicle_detection.params import FeatureParams
 from vehicle_detection.scenes import render_patches
+from vehicle_detection.svm import Template, VehicleClassifier
 
 
 def test_channels_of_an_image_are_plotted_in_the_colors_of_its_pixels():

@@ -4,14 +4,13 @@ import pytest
 from tests.notebook.helpers import drawn_boxes, gray_image, new_axes, texts, titles
 from vehicle_detection import notebook
 from vehicle_detection.boxes import Detections
-from vehicle_detection.classifier import load_classifier
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.heatmap import bounding_boxes, frame_heat
+from vehicle_detection.heatmap import HeatParams, bounding_boxes, frame_heat
 from vehicle_detection.images import read_image
 from vehicle_detection.notebook.style import SKY, VERMILION, YELLOW
-from vehicle_detection.params import HeatParams, SearchBand, SearchParams
-from vehicle_detection.search import find_cars
-from vehicle_detection.windows import band_windows
+from vehicle_detection.search import SearchBand, SearchParams
+from vehicle_detection.svm import load_classifier
+from vehicle_detection.windows import band_windows, find_cars
 
 
 def test_windows_are_colored_by_score_best_last():

@@ -8,17 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.features import PATCH_SIZE, FeatureParams
+from vehicle_detection.function_model import FunctionParams
+from vehicle_detection.heatmap import HeatParams, heat_range
 from vehicle_detection.network import NetworkParams
-from vehicle_detection.params import (
-    PATCH_SIZE,
-    FeatureParams,
-    FunctionParams,
-    HeatParams,
-    PixelBand,
-    SearchBand,
-    SearchParams,
-)
 from vehicle_detection.regions import RegionParams
+from vehicle_detection.search import PixelBand, SearchBand, SearchParams
 from vehicle_detection.tracking import TrackParams
 from vehicle_detection.windows import band_windows
 
@@ -341,9 +336,9 @@ def test_heat_thresholds_scale_with_the_density_of_the_windows():
     )
     assert half.window_density == pytest.approx(dense.window_density / 4)
     for heat in (WHOLE, HeatParams(), HeatParams(weighting="count"), HeatParams(peak_fraction=0)):
-        assert half.heat_range(heat) == pytest.approx([value / 4 for value in dense.heat_range(heat)])
+        assert heat_range(half, heat) == pytest.approx([value / 4 for value in heat_range(dense, heat)])
         for search in (dense, half, SearchParams.preset("three-scales"), SearchParams.preset("130-windows")):
-            low, high = search.heat_range(heat)[1:]
+            low, high = heat_range(search, heat)[1:]
             assert low <= heat.for_search(search).threshold <= high
     # The fast search steps by a cell or more.
     denser = dataclasses.replace(
@@ -369,7 +364,7 @@ def test_a_given_heat_threshold_is_kept_and_checked_against_the_density():
         with pytest.warns(UserWarning, match=message):
             assert params.for_search(search) is params
     for search in (FunctionParams(), NetworkParams()):
-        assert search.heat_range(WHOLE).high == np.inf
+        assert heat_range(search, WHOLE).high == np.inf
 
 
 @pytest.mark.parametrize(

@@ -28,14 +28,14 @@ from tests.report.helpers import (
     write_report,
 )
 from vehicle_detection.camera import Camera
-from vehicle_detection.classifier import load_classifier
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drawing import TRACK_COLORS
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.events import Event
+from vehicle_detection.heatmap import HeatParams
 from vehicle_detection.loading import load_model
-from vehicle_detection.params import HeatParams
 from vehicle_detection.report import ReportWriter, TrackPicture, page
+from vehicle_detection.svm import load_classifier
 from vehicle_detection.tracking import TrackParams
 
 UNSAFE_NAME = "\"><img src=x onerror=alert(1)>&amp;'</title><script>.mp4"

@@ -5,13 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from vehicle_detection.classifier import (
-    TrainingOptions,
-    fit_features,
-    load_classifier,
-    patch_features,
-    train_classifier,
-)
 from vehicle_detection.datasets import (
     PatchSet,
     load_training_patches,
@@ -21,10 +14,18 @@ from vehicle_detection.datasets import (
     split_sources,
 )
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import extract_features
-from vehicle_detection.params import FeatureParams
+from vehicle_detection.features import FeatureParams, extract_features
 from vehicle_detection.scenes import render_patches
-from vehicle_detection.training import SPLITS, model_card, train_and_evaluate
+from vehicle_detection.svm import load_classifier
+from vehicle_detection.training import (
+    SPLITS,
+    TrainingOptions,
+    fit_features,
+    model_card,
+    patch_features,
+    train_and_evaluate,
+    train_classifier,
+)
 from vehicle_detection.training.patches import _error_rates
 
 SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=6, pix_per_cell=16, hog_channel=0)

@@ -69,7 +69,7 @@ def train(
     """Train a model on patches, and evaluate it on held-out patches; by default like the model "highway"."""
     from vehicle_detection._common import check_target, encodable, write_text
     from vehicle_detection.datasets import load_training_patches
-    from vehicle_detection.params import FeatureParams
+    from vehicle_detection.features import FeatureParams
     from vehicle_detection.training import model_card, train_and_evaluate
 
     named = {"--output": output, "--report": report, "--card": card}

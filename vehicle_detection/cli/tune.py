@@ -68,7 +68,7 @@ def tune(
     """Train and measure every combination of a grid of parameters, and show the best."""
     from vehicle_detection._common import check_choice, check_integer, check_target
     from vehicle_detection.datasets import load_training_patches
-    from vehicle_detection.tuning import (
+    from vehicle_detection.training import (
         TrialOptions,
         compare_configurations,
         expand_grid,
@@ -132,7 +132,7 @@ def _read_frames(frames: Path | None, labels: Path | None, horizon: float | None
 
 def _show(final: DataFrame, table: DataFrame, grid: Mapping[str, Sequence[Any]]) -> None:
     """Print the best rows, with a star on the Pareto front, and the errors of failed configurations."""
-    from vehicle_detection.tuning import pareto_front
+    from vehicle_detection.training import pareto_front
 
     measured = final[final["accuracy"].notna()].sort_values("accuracy", ascending=False, kind="stable")
     front = set(pareto_front(final)["trial"])

@@ -16,15 +16,16 @@ from vehicle_detection._common import (
     check_type,
     describe,
 )
-from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.course.defaults import or_default
 from vehicle_detection.course.heat import draw_boxes
 from vehicle_detection.course.windows import find_car_windows
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.features import PATCH_SIZE
 from vehicle_detection.function_model import FunctionModel
-from vehicle_detection.heatmap import heat_threshold
-from vehicle_detection.params import PATCH_SIZE, REFERENCE_WIDTH, HeatParams, SearchBand, SearchParams
+from vehicle_detection.heatmap import HeatParams, heat_threshold
+from vehicle_detection.search import REFERENCE_WIDTH, SearchBand, SearchParams
+from vehicle_detection.svm import VehicleClassifier
 from vehicle_detection.tracking import FrameResult
 
 _HORIZON = 400 / 720

@@ -11,12 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_detection._common import describe
-from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.course.checks import Image
 from vehicle_detection.course.vectors import FeatureOptions
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.params import PATCH_SIZE, FeatureParams
-from vehicle_detection.sklearn_models import UNIT_CHANNELS, fold_estimators, has_unit_range, n_features
+from vehicle_detection.features import PATCH_SIZE, FeatureParams
+from vehicle_detection.svm import (
+    UNIT_CHANNELS,
+    VehicleClassifier,
+    fold_estimators,
+    has_unit_range,
+    n_features,
+)
 
 # Greatest value of a channel of a 0-1 image, with a margin: V of YUV reaches 1.12.
 _MAX_UNIT = 1.2

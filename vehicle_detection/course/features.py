@@ -22,7 +22,7 @@ from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.course.checks import Image, check_lesson_image, check_range, check_size
 from vehicle_detection.course.defaults import or_default
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.params import COLOR_SPACES, SPATIAL_ORDERS
+from vehicle_detection.features import COLOR_SPACES, SPATIAL_ORDERS
 
 Size = int | Sequence[int]
 SpatialOrder = Literal["interleaved", "channels"]

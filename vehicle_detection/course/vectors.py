@@ -34,8 +34,8 @@ from vehicle_detection.course.features import (
     hog_maps,
 )
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.features import COLOR_SPACES, PATCH_SIZE, SPATIAL_ORDERS, FeatureParams
 from vehicle_detection.images import read_image
-from vehicle_detection.params import COLOR_SPACES, PATCH_SIZE, SPATIAL_ORDERS, FeatureParams
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")

@@ -17,7 +17,6 @@ from vehicle_detection._common import (
     check_number,
     describe,
 )
-from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.course.checks import Image, box_rows, check_lesson_image, corner_array
 from vehicle_detection.course.defaults import FORMULAS, Formula, or_default
 from vehicle_detection.course.estimators import check_estimators, library_classifier, predicts_car
@@ -33,8 +32,9 @@ from vehicle_detection.course.features import (
 from vehicle_detection.course.heat import draw_boxes
 from vehicle_detection.course.vectors import FeatureOptions, accept_cspace, are_uint8_patches
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.params import PATCH_SIZE
+from vehicle_detection.features import PATCH_SIZE
 from vehicle_detection.search import BandSearch
+from vehicle_detection.svm import VehicleClassifier
 
 Box = tuple[tuple[int, int], tuple[int, int]]
 ResizeOrder = Literal["after conversion", "before conversion"]
@@ -504,7 +504,7 @@ def _fast_scores(
 
 @functools.lru_cache(maxsize=1)
 def _open_search(classifier: VehicleClassifier) -> BandSearch:
-    return BandSearch(classifier, n_jobs=1)
+    return classifier.open_search(1)
 
 
 def _classify_patches(

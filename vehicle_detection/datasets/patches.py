@@ -30,7 +30,7 @@ from vehicle_detection.datasets.archives import (
     parent_folder,
 )
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.params import PATCH_SIZE
+from vehicle_detection.features import PATCH_SIZE
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -22,7 +22,7 @@ from vehicle_detection._common import (
 from vehicle_detection.datasets.archives import parent_folder
 from vehicle_detection.datasets.patches import PatchSet, check_labels
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.params import PATCH_SIZE
+from vehicle_detection.features import PATCH_SIZE
 
 _PATCH_SET_REMEDY = "read one with load_training_patches"
 

@@ -9,7 +9,7 @@ import threading
 import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,6 @@ from vehicle_detection._common import (
     Checked,
     Floats,
     atomic_write,
-    check_choice,
     integer,
     number,
     single_threaded_opencv,
@@ -29,7 +28,6 @@ from vehicle_detection.errors import InvalidInputError, ModelFileError
 from vehicle_detection.network.inputs import InputFormat, Size
 from vehicle_detection.network.outputs import Candidates, OutputFormat
 from vehicle_detection.network.runtime import Array, Device, Port, Runtime, Session, open_session
-from vehicle_detection.params import HeatParams, HeatRange
 from vehicle_detection.search import FrameSearch
 
 INPUT_SIZE = 640
@@ -89,10 +87,6 @@ class NetworkParams(Checked):
     def everywhere(self) -> NetworkParams:
         """Return the same parameters: a network searches all rows."""
         return self
-
-    def heat_range(self, heat: HeatParams) -> HeatRange:
-        """Heat thresholds for boxes of unknown density: any."""
-        return HeatRange(0.0, 0.0, math.inf)
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -161,33 +155,11 @@ class NetworkModel:
         """Probability that a box contains a vehicle, by its score: the log-odds above the threshold."""
         return Platt(-1.0, -self.threshold)
 
-    def open_search(
-        self, n_jobs: int | None = None, method: Literal["shared", "windows"] = "shared"
-    ) -> NetworkSearch:
-        """Open a search of frames with this network.
+    def open_search(self, n_jobs: int | None = None) -> NetworkSearch:
+        """Open a search of frames with this network: a thread-safe context manager, with `NetworkParams`.
 
-        Parameters
-        ----------
-        n_jobs
-            Threads that share a frame.
-        method
-            ``"shared"``, the only search of this kind of model.
-
-        Returns
-        -------
-        NetworkSearch
-            A thread-safe context manager; its parameters are `NetworkParams`.
-
-        Raises
-        ------
-        InvalidInputError
-            If `method` is ``"windows"``, or `n_jobs` is malformed.
+        `n_jobs` is the number of threads that share a frame.
         """
-        check_choice(method, "method", ("shared", "windows"))
-        if method != "shared":
-            raise InvalidInputError(
-                f"method must be 'shared' for a network, got {method!r}; use the model 'highway'"
-            )
         return NetworkSearch(self, n_jobs=n_jobs)
 
     def __repr__(self) -> str:

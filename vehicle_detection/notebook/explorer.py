@@ -28,7 +28,6 @@ from vehicle_detection._common import (
 )
 from vehicle_detection.boxes import Detections, box_areas
 from vehicle_detection.camera import Camera
-from vehicle_detection.classifier import VehicleClassifier
 from vehicle_detection.datasets import FrameSet
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.drawing import (
@@ -41,12 +40,13 @@ from vehicle_detection.drawing import (
 )
 from vehicle_detection.errors import InvalidInputError, VehicleDetectionError
 from vehicle_detection.explanation import Explanation, explain
-from vehicle_detection.heatmap import frame_heat, label_heat
+from vehicle_detection.heatmap import HeatParams, frame_heat, label_heat
 from vehicle_detection.images import read_image
 from vehicle_detection.network import NetworkModel, NetworkParams
 from vehicle_detection.notebook.widgets import METHOD_CONTROLS, Panel, build_widgets
-from vehicle_detection.params import HeatParams, SearchParams
 from vehicle_detection.regions import RegionParams, find_vehicles
+from vehicle_detection.search import SearchParams
+from vehicle_detection.svm import VehicleClassifier
 
 Image = NDArray[np.uint8]
 PathLike = str | os.PathLike[str]

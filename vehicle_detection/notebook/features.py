@@ -18,10 +18,12 @@ from vehicle_detection._common import (
     check_type,
     describe,
 )
-from vehicle_detection.classifier import CLASSIFIER_REMEDY, Template, VehicleClassifier
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import (
+    COLOR_SPACES,
+    PATCH_SIZE,
+    FeatureParams,
     convert_color,
     extract_features,
     hog_blocks,
@@ -31,7 +33,7 @@ from vehicle_detection.features import (
 )
 from vehicle_detection.notebook import style
 from vehicle_detection.notebook.style import COLORS, LINE_COLORS, OTHER, VEHICLE, FigureLike, Image
-from vehicle_detection.params import COLOR_SPACES, PATCH_SIZE, FeatureParams
+from vehicle_detection.svm import CLASSIFIER_REMEDY, Template, VehicleClassifier
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -31,7 +31,7 @@ from vehicle_detection.evaluation import (
 )
 from vehicle_detection.notebook import style
 from vehicle_detection.notebook.style import LINE_COLORS, OTHER, SKY, TRUTH, VEHICLE, VERMILION, Image
-from vehicle_detection.tuning import check_column, numeric_column, pareto_front
+from vehicle_detection.training import check_column, numeric_column, pareto_front
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

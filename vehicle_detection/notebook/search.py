@@ -13,10 +13,10 @@ from scipy import ndimage
 from vehicle_detection._common import check_choice, check_image, check_number, check_type, describe, pluralize
 from vehicle_detection.boxes import Detections
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.heatmap import frame_heat, heat_threshold, label_heat
+from vehicle_detection.heatmap import HeatParams, frame_heat, heat_threshold, label_heat
 from vehicle_detection.notebook import style
 from vehicle_detection.notebook.style import BLUE, SKY, TRUTH, VERMILION, YELLOW, Boxes, FigureLike, Image
-from vehicle_detection.params import HeatParams, SearchParams
+from vehicle_detection.search import SearchParams
 from vehicle_detection.windows import band_windows
 
 if TYPE_CHECKING:

@@ -29,7 +29,7 @@ from vehicle_detection.events import (
     bin_means,
     count_vehicles,
 )
-from vehicle_detection.params import HeatParams
+from vehicle_detection.heatmap import HeatParams
 from vehicle_detection.report.charts import (
     TimeAxis,
     ValueAxis,

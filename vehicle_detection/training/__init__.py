@@ -1,4 +1,4 @@
-"""Training of patch classifiers and of networks, their validation, and the frames that networks learn from.
+"""Training of patch classifiers and of networks, their validation, and parameter search.
 
 What needs PyTorch is imported when it is first used.
 """
@@ -7,6 +7,16 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.training.classifier import (
+    DEFAULT_C,
+    TrainingOptions,
+    check_labels,
+    fit_features,
+    patch_features,
+    train_classifier,
+)
+from vehicle_detection.training.classifiers import compare_classifiers
+from vehicle_detection.training.feature_cache import FeatureCache, digest_of
 from vehicle_detection.training.frames import (
     FrameDataset,
     TrainingFrame,
@@ -15,6 +25,8 @@ from vehicle_detection.training.frames import (
     load_training_frames,
     select_frames,
 )
+from vehicle_detection.training.grid import TrialConfig, expand_grid, parse_grid
+from vehicle_detection.training.mining import mine_negatives
 from vehicle_detection.training.patches import (
     SPLITS,
     SplitScore,
@@ -27,6 +39,17 @@ from vehicle_detection.training.patches import (
     train_and_evaluate,
 )
 from vehicle_detection.training.rendered import rendered_source
+from vehicle_detection.training.results import (
+    RowStore,
+    check_column,
+    make_table,
+    numeric_column,
+    pareto_front,
+    read_results,
+    write_results,
+)
+from vehicle_detection.training.trials import TrialOptions
+from vehicle_detection.training.tuning import compare_configurations, search_parameters
 from vehicle_detection.training.validation import (
     FOLD_COLUMNS,
     FoldDetections,
@@ -89,45 +112,68 @@ def __getattr__(name: str) -> Any:
 
 
 __all__ = [
+    "DEFAULT_C",
     "FOLD_COLUMNS",
     "SPLITS",
+    "FeatureCache",
     "FineTuning",
     "FoldDetections",
     "FoldScore",
     "FrameDataset",
     "NetworkTraining",
+    "RowStore",
     "SearchableModel",
     "SplitScore",
     "TrainingFrame",
+    "TrainingOptions",
     "TrainingReport",
+    "TrialConfig",
+    "TrialOptions",
     "best_threshold",
+    "check_column",
+    "check_labels",
     "check_sources",
+    "compare_classifiers",
+    "compare_configurations",
     "detect_in_source",
     "detect_logits",
+    "digest_of",
+    "expand_grid",
     "export_network",
     "file_params",
     "find_sources",
     "fine_tune_network",
     "fingerprint",
+    "fit_features",
     "fit_log_odds",
     "format_fold",
     "load_content",
     "load_training_frames",
     "load_weights",
+    "make_table",
     "markdown_table",
     "markdown_text",
+    "mine_negatives",
     "model_card",
+    "numeric_column",
     "package_versions",
+    "pareto_front",
+    "parse_grid",
+    "patch_features",
+    "read_results",
     "read_weights",
     "rendered_source",
     "report_table",
     "save_weights",
     "score_fold",
     "score_logits",
+    "search_parameters",
     "select_frames",
     "set_metadata",
     "split_table",
     "train_and_evaluate",
+    "train_classifier",
     "train_network",
     "write_curves",
+    "write_results",
 ]

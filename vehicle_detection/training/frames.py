@@ -18,7 +18,6 @@ from vehicle_detection._common import check_integer, check_type, describe, plura
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.errors import DatasetError, InvalidInputError
 from vehicle_detection.evaluation import FrameBoxes, FrameKey, LabelledFrames, read_labels
-from vehicle_detection.params import entries
 from vehicle_detection.video import is_video_file, probe_video, read_frames
 
 _LABEL_SUFFIXES = (".csv", ".json", ".jsonl", ".parquet")
@@ -56,7 +55,7 @@ class FrameDataset:
         name: object = self.name
         if not isinstance(name, str) or not name:
             raise InvalidInputError(f"name must be a non-empty string, got {describe(name)}")
-        sets = entries(self.sets, "sets")
+        sets = _entries(self.sets, "sets")
         for part in sets:
             check_type(part, "sets", LabelledFrames, "pass the frames with their labels as LabelledFrames")
         object.__setattr__(self, "sets", sets)
@@ -246,3 +245,10 @@ def _reduce(image: NDArray[np.uint8], max_side: int | None) -> tuple[NDArray[np.
     size = max(round(width * factor), 1), max(round(height * factor), 1)
     reduced = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     return reduced, np.tile((size[0] / width, size[1] / height), 2)
+
+
+def _entries(values: object, name: str) -> tuple[Any, ...]:
+    """Return the values of a tuple or list with at least one entry."""
+    if not isinstance(values, (tuple, list)) or not values:
+        raise InvalidInputError(f"{name} must be a tuple of at least one entry; got {describe(values)}")
+    return tuple(values)

@@ -23,18 +23,18 @@ from vehicle_detection._common import (
     progress_bar,
     resolve_jobs,
 )
-from vehicle_detection.classifier import (
+from vehicle_detection.datasets import PatchSet, Split, make_split, split_leakage, split_sequences
+from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.evaluation import calibrate_scores, calibration_error
+from vehicle_detection.features import FeatureParams
+from vehicle_detection.svm import VehicleClassifier
+from vehicle_detection.training.classifier import (
     DEFAULT_C,
     TrainingOptions,
-    VehicleClassifier,
     check_labels,
     fit_features,
     patch_features,
 )
-from vehicle_detection.datasets import PatchSet, Split, make_split, split_leakage, split_sequences
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.evaluation import calibrate_scores, calibration_error
-from vehicle_detection.params import FeatureParams
 
 SPLITS = {
     "random": "random fifth",

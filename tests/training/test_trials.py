@@ -1,21 +1,22 @@
 import numpy as np
 import pytest
 
-from tests.tuning.cases import SEARCH, SMALL, UNTIMED
-from vehicle_detection.classifier import TrainingOptions, train_classifier
+from tests.training.trial_cases import SEARCH, SMALL, UNTIMED
 from vehicle_detection.datasets import PatchSet, Split, make_split, split_sequences
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames, evaluate_detections
-from vehicle_detection.params import FeatureParams
-from vehicle_detection.tuning import (
+from vehicle_detection.features import FeatureParams
+from vehicle_detection.training import (
     FeatureCache,
+    TrainingOptions,
     TrialConfig,
     TrialOptions,
     compare_configurations,
+    train_classifier,
     trials,
 )
-from vehicle_detection.tuning.trials import TrialEvaluator
+from vehicle_detection.training.trials import TrialEvaluator
 
 PARAMS = FeatureParams(**SMALL)
 

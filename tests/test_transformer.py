@@ -9,11 +9,11 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 
-from tests.features.cases import PATCHES
+from tests.feature_cases import PATCHES
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import PatchFeatures, extract_features
-from vehicle_detection.params import FeatureParams
+from vehicle_detection.features import FeatureParams, extract_features
 from vehicle_detection.scenes import render_patches
+from vehicle_detection.transformer import PatchFeatures
 
 
 def test_the_transformer_equals_extract_features():

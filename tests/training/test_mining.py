@@ -3,15 +3,15 @@ import math
 import numpy as np
 import pytest
 
-from tests.tuning.cases import SEARCH, SMALL
-from vehicle_detection.classifier import train_classifier
+from tests.training.trial_cases import SEARCH, SMALL
 from vehicle_detection.datasets import PatchSet, load_frames
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.evaluation import FrameBoxes, read_labels
+from vehicle_detection.features import FeatureParams
 from vehicle_detection.images import write_image
-from vehicle_detection.params import FeatureParams, SearchBand, SearchParams
-from vehicle_detection.search import find_cars
-from vehicle_detection.tuning import mine_negatives
+from vehicle_detection.search import SearchBand, SearchParams
+from vehicle_detection.training import mine_negatives, train_classifier
+from vehicle_detection.windows import find_cars
 
 
 def boxes_of(mined):

@@ -7,10 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.tuning.cases import SEARCH, SMALL, SMALL_GRID, UNTIMED, count_trials, without_times
+from tests.training.trial_cases import SEARCH, SMALL, SMALL_GRID, UNTIMED, count_trials, without_times
 from vehicle_detection.datasets import PatchSet, Split
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.tuning import (
+from vehicle_detection.training import (
     TrialOptions,
     compare_configurations,
     expand_grid,
@@ -18,8 +18,8 @@ from vehicle_detection.tuning import (
     read_results,
     search_parameters,
 )
-from vehicle_detection.tuning.search import make_folds
-from vehicle_detection.tuning.trials import COLUMNS, TrialEvaluator
+from vehicle_detection.training.trials import COLUMNS, TrialEvaluator
+from vehicle_detection.training.tuning import make_folds
 
 
 def compare(patch_set, configurations, **options):
@@ -201,7 +201,7 @@ def test_a_killed_process_loses_nothing(tmp_path):
     code = f"""
 import numpy as np
 from vehicle_detection.datasets import PatchSet
-from vehicle_detection.tuning import TrialOptions, compare_configurations
+from vehicle_detection.training import TrialOptions, compare_configurations
 patches = np.random.default_rng(0).integers(0, 256, (40, 64, 64, 3), np.uint8)
 names = [f"{{row % 2}}/{{row}}.png" for row in range(40)]
 patch_set = PatchSet(patches, np.arange(40) % 2 == 0, names)

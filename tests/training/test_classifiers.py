@@ -8,12 +8,11 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import LinearSVC
 from sklearn.tree import DecisionTreeClassifier
 
-from tests.tuning.cases import SMALL
+from tests.training.trial_cases import SMALL
 from vehicle_detection.datasets import Split, make_split
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import extract_features
-from vehicle_detection.params import FeatureParams
-from vehicle_detection.tuning import FeatureCache, compare_classifiers
+from vehicle_detection.features import FeatureParams, extract_features
+from vehicle_detection.training import FeatureCache, compare_classifiers
 
 PARAMS = FeatureParams(**SMALL)
 

@@ -1,10 +1,10 @@
 import shutil
 
 from benchmarks import _course_runs, course_tables
-from tests.tuning.cases import SMALL, count_trials
+from tests.training.trial_cases import SMALL, count_trials
+from vehicle_detection.features import FeatureParams
 from vehicle_detection.images import write_image
-from vehicle_detection.params import FeatureParams
-from vehicle_detection.tuning import read_results
+from vehicle_detection.training import read_results
 
 
 def test_the_course_tables_are_written(patch_set, tmp_path, monkeypatch):

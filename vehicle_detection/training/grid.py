@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from vehicle_detection._common import describe, is_listing
-from vehicle_detection.classifier import TrainingOptions
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.params import FeatureParams
-from vehicle_detection.tuning.results import number_or_text
+from vehicle_detection.features import FeatureParams
+from vehicle_detection.training.classifier import TrainingOptions
+from vehicle_detection.training.results import number_or_text
 
 FEATURE_FIELDS = tuple(field.name for field in dataclasses.fields(FeatureParams))
 TRAINING_FIELDS = ("C", "mirror", "positive_weight")

@@ -15,10 +15,11 @@ from vehicle_detection._common import (
     check_type,
 )
 from vehicle_detection.boxes import intersection_matrix, non_max_suppression
-from vehicle_detection.classifier import CLASSIFIER_REMEDY, VehicleClassifier
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.evaluation import FrameBoxes, Frames, LabelledFrames, keyed_frames
-from vehicle_detection.params import PATCH_SIZE, SearchParams
+from vehicle_detection.features import PATCH_SIZE
+from vehicle_detection.search import SearchParams
+from vehicle_detection.svm import CLASSIFIER_REMEDY, VehicleClassifier
 
 
 def mine_negatives(

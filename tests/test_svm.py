@@ -19,20 +19,12 @@ from tests.helpers import random_classifier, random_template
 from vehicle_detection._common import FORMAT_VERSION, blur_patches, degrade_patches, mirror_patches
 from vehicle_detection._common.model_file import FORMAT, checksum
 from vehicle_detection._kernels import fit_svm
-from vehicle_detection.classifier import (
-    KIND,
-    Template,
-    TrainingOptions,
-    VehicleClassifier,
-    load_classifier,
-    patch_features,
-    train_classifier,
-)
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError, ModelFileError
-from vehicle_detection.features import extract_features
+from vehicle_detection.features import FeatureParams, extract_features
 from vehicle_detection.images import write_image
-from vehicle_detection.params import FeatureParams
+from vehicle_detection.svm import KIND, Template, VehicleClassifier, load_classifier
+from vehicle_detection.training import TrainingOptions, patch_features, train_classifier
 
 SMALL = FeatureParams(spatial_size=8, hist_bins=8, orient=4, pix_per_cell=16, hog_channel=0)
 

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from vehicle_detection.features import part_slices, sum_blocks
-from vehicle_detection.params import FeatureParams
+from vehicle_detection.features import FeatureParams, part_slices, sum_blocks
 
 
 def test_parts_lie_one_after_another():

@@ -20,7 +20,6 @@ from vehicle_detection._common import (
     check_sequence,
     describe,
 )
-from vehicle_detection.classifier import VehicleClassifier, check_labels, fit_features
 from vehicle_detection.datasets import PatchSet, Split
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
@@ -31,11 +30,14 @@ from vehicle_detection.evaluation import (
     evaluate_detections,
     precision_recall_curve,
 )
-from vehicle_detection.params import FeatureParams, SearchParams
+from vehicle_detection.features import FeatureParams
 from vehicle_detection.regions import RegionParams
-from vehicle_detection.tuning.cache import FeatureCache, digest_of
-from vehicle_detection.tuning.grid import FEATURE_FIELDS, TRAINING_FIELDS, Candidate, TrialConfig
-from vehicle_detection.tuning.results import RowStore, make_table
+from vehicle_detection.search import SearchParams
+from vehicle_detection.svm import VehicleClassifier
+from vehicle_detection.training.classifier import check_labels, fit_features
+from vehicle_detection.training.feature_cache import FeatureCache, digest_of
+from vehicle_detection.training.grid import FEATURE_FIELDS, TRAINING_FIELDS, Candidate, TrialConfig
+from vehicle_detection.training.results import RowStore, make_table
 
 if TYPE_CHECKING:
     from pandas import DataFrame

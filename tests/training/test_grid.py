@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.tuning import expand_grid, parse_grid
+from vehicle_detection.training import expand_grid, parse_grid
 
 
 def test_parse_grid():

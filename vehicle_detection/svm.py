@@ -4,48 +4,44 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-import vehicle_detection
 from vehicle_detection._common import (
-    blur_patches,
+    Floats,
     check_array,
-    check_bool,
-    check_choice,
-    check_integer,
-    check_number,
     check_patches,
     check_sequence,
     check_type,
-    degrade_patches,
     describe,
-    mirror_patches,
     pluralize,
     read_model,
     store_number,
     write_model,
 )
-from vehicle_detection._kernels import fit_svm
 from vehicle_detection.boxes import Platt
-from vehicle_detection.datasets import PatchSet
 from vehicle_detection.errors import InvalidInputError, ModelFileError
-from vehicle_detection.features import extract_features, read_patches
-from vehicle_detection.params import PATCH_SIZE, FeatureParams, SearchParams
+from vehicle_detection.features import PATCH_SIZE, FeatureParams, extract_features
+from vehicle_detection.search import BandFilters, BandSearch, SearchParams
 
 if TYPE_CHECKING:
     from sklearn.pipeline import Pipeline
 
-    from vehicle_detection.search import FrameSearch
 
 KIND = "patches"
 """Value of ``kind`` in the model files of patch classifiers."""
 
-DEFAULT_C = 1e-4
+_SCALERS = ("StandardScaler", "RobustScaler", "MinMaxScaler", "MaxAbsScaler")
+# Channels whose values are 0-1 in float images. Those of LUV and LAB have other ranges.
+UNIT_CHANNELS = dict.fromkeys(("RGB", "YUV", "YCrCb"), (0, 1, 2)) | {"HSV": (1, 2), "HLS": (1, 2)}
+# Greatest sum of mean and scale of a spatial bin with values 0-1. For the last channel of LUV and LAB: the
+# greatest mean in float images, where gray is 0, and the least sum in uint8 images, where gray is over 127.
+_MAX_UNIT, _MAX_FLOAT_MEAN, _GRAY = 2.5, 64.0, 128.0
 
 # Fitted to the boxes of the model "highway" in labelled frames of the course's road, not to patches: most
 # windows of a frame show no vehicle.
@@ -263,13 +259,6 @@ class VehicleClassifier:
         >>> VehicleClassifier.from_pipeline(pipeline.fit(patches, labels)).score(patches, labels)
         1.0
         """
-        from vehicle_detection.sklearn_models import (
-            check_equal_scores,
-            check_uint8,
-            fold_estimators,
-            split_pipeline,
-        )
-
         known, steps = split_pipeline(pipeline)
         params = known if params is None else params
         if metadata is not None:
@@ -301,7 +290,7 @@ class VehicleClassifier:
         from sklearn.preprocessing import StandardScaler
         from sklearn.svm import LinearSVC
 
-        from vehicle_detection.features import PatchFeatures
+        from vehicle_detection.transformer import PatchFeatures
 
         if len(self.templates) > 1:
             raise InvalidInputError(
@@ -317,17 +306,18 @@ class VehicleClassifier:
         features = PatchFeatures(**asdict(self.params))
         return Pipeline([("features", features), ("scaler", scaler), ("svm", svm)])
 
-    def open_search(
-        self, n_jobs: int | None = None, method: Literal["shared", "windows"] = "shared"
-    ) -> FrameSearch:
+    @cached_property
+    def filters(self) -> BandFilters:
+        """The model as filters over the bands of a frame; an error if windows cannot share the features."""
+        return BandFilters(self.params, [template.fold() for template in self.templates])
+
+    def open_search(self, n_jobs: int | None = None) -> BandSearch:
         """Open a search of frames with this model.
 
         Parameters
         ----------
         n_jobs
             Threads; the result does not depend on them.
-        method
-            ``"shared"``: the fast search; ``"windows"``: the reference, one patch per window.
 
         Returns
         -------
@@ -337,13 +327,9 @@ class VehicleClassifier:
         Raises
         ------
         InvalidInputError
-            If `method` is unknown, or windows cannot share the features.
+            If windows cannot share the features.
         """
-        from vehicle_detection.search import BandSearch, ReferenceSearch
-
-        check_choice(method, "method", ("shared", "windows"))
-        search = BandSearch if method == "shared" else ReferenceSearch
-        return search(self, n_jobs=n_jobs)
+        return BandSearch(self.filters, n_jobs)
 
     def __repr__(self) -> str:
         return f"VehicleClassifier({self.summary()[0]})"
@@ -367,220 +353,6 @@ class VehicleClassifier:
             for name, value in vars(template).items()
         }
         write_model(path, KIND, asdict(self.params), tensors, self.metadata)
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainingOptions:
-    """Options of the training, checked; `train_classifier` documents them.
-
-    A misclassified vehicle costs `positive_weight` times a misclassified non-vehicle.
-    """
-
-    C: float = DEFAULT_C
-    solver: Literal["liblinear", "dual"] = "dual"
-    mirror: bool = True
-    gamma: float = 0.0
-    degraded: float = 0.0
-    positive_weight: float = 1.0
-    random_state: int = 0
-
-    def __post_init__(self) -> None:
-        checked = {
-            "C": check_number(self.C, "C", above=0, high=1e12),
-            "gamma": check_number(self.gamma, "gamma", low=0, high=2),
-            "degraded": check_number(self.degraded, "degraded", low=0, high=1),
-            "positive_weight": check_number(self.positive_weight, "positive_weight", above=0, high=1e6),
-            "random_state": check_integer(self.random_state, "random_state", low=0, high=2**32 - 1),
-        }
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
-        check_choice(self.solver, "solver", ("liblinear", "dual"))
-        object.__setattr__(self, "mirror", check_bool(self.mirror, "mirror"))
-        if self.gamma and not self.mirror:
-            raise InvalidInputError(
-                f"gamma must be 0 without mirrored patches, whose brightness it changes; got {self.gamma:g}"
-            )
-
-    @property
-    def copy_weights(self) -> tuple[float, ...]:
-        """Training weight of each copy of the patches, in the order of `patch_features`."""
-        return (1.0, *(1.0,) * self.mirror, *(self.degraded, self.degraded) * (self.degraded > 0))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the options of `train_classifier` as JSON values."""
-        return {name: value for name, value in asdict(self).items() if name != "positive_weight"}
-
-
-def train_classifier(
-    patches: Any,
-    labels: ArrayLike | None = None,
-    *,
-    params: FeatureParams | None = None,
-    C: float = DEFAULT_C,
-    solver: Literal["liblinear", "dual"] = "liblinear",
-    estimator: Any = None,
-    mirror: bool = True,
-    gamma: float = 0.0,
-    degraded: float = 0.0,
-    random_state: int = 0,
-    n_jobs: int | None = None,
-    metadata: Mapping[str, Any] | None = None,
-) -> VehicleClassifier:
-    """Train a linear SVM behind a feature scaler on patches: scikit-learn's ``LinearSVC``, or another model.
-
-    Parameters
-    ----------
-    patches
-        ``(N, 64, 64, 3)`` uint8 RGB training patches, or a list of patches or of image files. Without
-        `labels`: a `PatchSet`, or a pair ``(cars, notcars)`` of such arrays or lists.
-    labels
-        ``(N,)``, 1 (or True) for a vehicle, 0 otherwise.
-    params
-        Features; the default is ``FeatureParams()``.
-    C
-        Inverse regularization strength. Small values generalize better to other sequences.
-    solver
-        ``"liblinear"``: ``LinearSVC`` of scikit-learn. ``"dual"``: the library's solver of the same problem,
-        for large sets: on 17,760 patches with 8,460 features it needs a fifth of the time (5 of 24 s) and 4
-        GB less memory, and its scores differ by less than 1e-4.
-    estimator
-        An unfitted scikit-learn classifier with linear scores, such as ``LogisticRegression(C=0.01)``, that
-        replaces ``LinearSVC``, `C` and `solver`.
-    mirror
-        Add the mirror image of each patch.
-    gamma
-        Brightness jitter of the mirrored patches, as exponents from ``exp(-gamma)`` to ``exp(gamma)``.
-    degraded
-        Weight, in [0, 1], of two more copies of each patch, one blurred, the other also desaturated and
-        compressed, which help on images of other cameras. 0 omits them.
-    random_state
-        Seed of the solver; the same input and seed give the same model.
-    n_jobs
-        Threads of the feature extraction.
-    metadata
-        JSON values to keep in the model file.
-
-    Returns
-    -------
-    VehicleClassifier
-        A model with one template. Its metadata also hold the training options and the versions of libraries.
-
-    Raises
-    ------
-    InvalidInputError
-        If a patch is malformed, the labels do not match the patches, a class is missing, or the estimator is
-        not linear.
-
-    Examples
-    --------
-    >>> from vehicle_detection import render_patches
-    >>> patches, labels = render_patches(20)
-    >>> train_classifier(patches, labels, params=FeatureParams(hog_channel=0)).score(patches, labels)
-    1.0
-    """
-    params = FeatureParams() if params is None else params
-    check_type(params, "params", FeatureParams, "omit it for the default")
-    options = TrainingOptions(
-        C=C, solver=solver, mirror=mirror, gamma=gamma, degraded=degraded, random_state=random_state
-    )
-    if metadata is not None:
-        check_type(metadata, "metadata", Mapping, "pass a dictionary")
-    images, targets = _read_training_set(patches, labels)
-    features = patch_features(images, params, options, n_jobs=n_jobs)
-    return fit_features(features, targets, params, options, estimator=estimator, metadata=metadata)
-
-
-def _read_training_set(patches: Any, labels: ArrayLike | None) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """Patches and labels of the forms that `train_classifier` accepts."""
-    if labels is None and isinstance(patches, PatchSet):
-        labels = patches.labels
-    if labels is None:
-        if not isinstance(patches, (tuple, list)) or len(patches) != 2:
-            raise InvalidInputError(
-                "labels must be given, unless patches is a PatchSet or a pair (cars, notcars); "
-                f"patches is {describe(patches)}"
-            )
-        cars, others = (read_patches(part, name) for part, name in zip(patches, ("cars", "notcars")))
-        patches, labels = np.concatenate([cars, others]), np.repeat([1, 0], [len(cars), len(others)])
-    images = read_patches(patches, "patches")
-    return images, check_labels(labels, len(images))
-
-
-def patch_features(
-    images: NDArray[np.uint8], params: FeatureParams, options: TrainingOptions, *, n_jobs: int | None = None
-) -> NDArray[np.float32]:
-    """Features of all patches, followed by those of their mirrored, blurred and degraded copies."""
-    features = np.empty((len(options.copy_weights), len(images), params.length), np.float32)
-    for rows, variant in zip(features, _augmented_copies(images, options)):
-        rows[:] = extract_features(variant, params, n_jobs=n_jobs)
-    return features.reshape(-1, params.length)
-
-
-def _augmented_copies(images: NDArray[np.uint8], options: TrainingOptions) -> Iterator[NDArray[np.uint8]]:
-    """Yield the patches and their copies one after the other, to save memory."""
-    yield images
-    if options.mirror:
-        yield mirror_patches(images, gamma=options.gamma)
-    if options.degraded:
-        yield blur_patches(images, mirror=options.mirror)
-        yield degrade_patches(images, mirror=options.mirror)
-
-
-def fit_features(
-    features: NDArray[np.float32],
-    labels: NDArray[np.int64],
-    params: FeatureParams,
-    options: TrainingOptions,
-    *,
-    rows: NDArray[np.intp] | None = None,
-    estimator: Any = None,
-    metadata: Mapping[str, Any] | None = None,
-) -> VehicleClassifier:
-    """Train on the `patch_features` of the same options, which are not copied.
-
-    `labels` is ``(N,)`` 0 or 1 with both classes. `rows` are the patches to train on, with all their copies.
-    """
-    from importlib.metadata import version
-
-    weights, count = options.copy_weights, len(labels)
-    chosen = np.arange(count) if rows is None else rows
-    all_labels = np.tile(labels, len(weights))
-    all_weights = np.repeat(weights, count) * np.where(all_labels == 1, options.positive_weight, 1.0)
-    all_rows = np.concatenate([chosen + copy * count for copy in range(len(weights))])
-    training, seed = options.to_dict(), options.random_state
-    if estimator is None and options.solver == "dual":
-        costs = options.C * all_weights
-        fitted = fit_svm(features, all_labels, costs, rows=all_rows, gains=params.gains, random_state=seed)
-        template, learner = Template(*fitted), "numba"
-    else:
-        from vehicle_detection.sklearn_models import fit_estimator, linear_svc
-
-        if estimator is not None:
-            training |= {"estimator": " ".join(repr(estimator).split()), "C": None, "solver": None}
-        model = linear_svc(options.C, seed) if estimator is None else estimator
-        rows_labels, rows_weights = all_labels[all_rows], all_weights[all_rows]
-        template = fit_estimator(model, features[all_rows], rows_labels, rows_weights, params.gains)
-        learner = "scikit-learn"
-    vehicles = int(labels[chosen].sum())
-    training |= {"vehicles": vehicles, "non_vehicles": len(chosen) - vehicles}
-    libraries = {name: version(name) for name in (learner, "numpy", "opencv-python-headless")}
-    versions = {"vehicle_detection": vehicle_detection.__version__, **libraries}
-    all_metadata = {"training": training, "versions": versions, **(metadata or {})}
-    return VehicleClassifier(params, (template,), all_metadata)
-
-
-def check_labels(labels: ArrayLike, count: int) -> NDArray[np.int64]:
-    """Return `labels` as `count` integers 0 or 1, both of which must occur."""
-    array = check_array(labels, "labels")
-    if array.shape != (count,) or array.dtype.kind not in "biuf":
-        raise InvalidInputError(
-            f"labels must hold one number for each of {count} patches; got {describe(array)}"
-        )
-    if not np.isin(array, (0, 1)).all():
-        raise InvalidInputError(f"labels must be 0 or 1; got {np.unique(array)[:5].tolist()}")
-    if count == 0 or array.min() == array.max():
-        raise InvalidInputError("labels must hold both classes: vehicles (1) and non-vehicles (0)")
-    return array.astype(np.int64)
 
 
 def load_classifier(path: str | os.PathLike[str] | None = None) -> VehicleClassifier:
@@ -617,3 +389,184 @@ def load_classifier(path: str | os.PathLike[str] | None = None) -> VehicleClassi
         return VehicleClassifier(FeatureParams(**model.params), tuple(templates), model.metadata)
     except (InvalidInputError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise ModelFileError(f"{model.name} does not fit its own parameters: {error}") from error
+
+
+def split_pipeline(model: Any) -> tuple[FeatureParams | None, list[Any]]:
+    """Split a fitted pipeline, search or ``(classifier, scaler)`` pair: parameters of its features, steps.
+
+    The parameters are those of a first step `PatchFeatures`, None without it. The classifier is the last
+    step.
+    """
+    steps = flatten_steps(model)
+    if isinstance(model, (tuple, list)) and len(steps) == 2 and hasattr(steps[0], "predict"):
+        steps.reverse()
+    if steps and hasattr(steps[0], "to_params"):
+        return steps[0].to_params(), steps[1:]
+    return None, steps
+
+
+def flatten_steps(model: Any) -> list[Any]:
+    """List the fitted estimators of nested pipelines and searches, in order."""
+    if isinstance(model, (tuple, list)):
+        return [step for part in model for step in flatten_steps(part)]
+    if hasattr(model, "steps"):
+        return [step for _, part in model.steps for step in flatten_steps(part)]
+    if model is None or isinstance(model, str):  # "passthrough"
+        return []
+    if hasattr(model, "estimator") and hasattr(model, "refit"):  # GridSearchCV and its relatives
+        if not hasattr(model, "best_estimator_"):
+            name = type(model).__name__
+            raise InvalidInputError(f"pipeline must be fitted, with refit=True; its {name} is not")
+        return flatten_steps(model.best_estimator_)
+    return [model]
+
+
+def fold_estimators(steps: Sequence[Any], length: int) -> Template:
+    """Fold fitted scalers and, last, a linear classifier of vectors of `length` into a template.
+
+    Raises
+    ------
+    InvalidInputError
+        If a step is of another kind, not fitted, or fitted on vectors of another length or other labels.
+    """
+    if not steps:
+        raise InvalidInputError("pipeline must end in a linear classifier; got no step")
+    *scalers, classifier = steps
+    mean, scale = np.zeros(length), np.ones(length)
+    for scaler in scalers:
+        offset, factor = _scaling(scaler, length)
+        mean, scale = mean + scale * offset, scale * factor
+    return Template(mean, scale, *_weights(classifier, length))
+
+
+def n_features(estimator: Any) -> int | None:
+    """Return the number of features that a scaler or linear classifier was fitted on; None if unknown.
+
+    Estimators that scikit-learn before 0.24 has pickled lack ``n_features_in_``.
+    """
+    found = getattr(estimator, "n_features_in_", None)
+    if found is not None:
+        return int(found)
+    if not type(estimator).__module__.startswith("sklearn."):
+        return None
+    arrays: list[Any] = [getattr(estimator, name, None) for name in ("scale_", "mean_", "center_", "coef_")]
+    return next((int(array.shape[-1]) for array in arrays if np.ndim(array)), None)
+
+
+def _scaling(scaler: Any, length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Offset and factor of a fitted scaler, which computes ``(x - offset) / factor``."""
+    name = type(scaler).__name__
+    if name not in _SCALERS:
+        raise InvalidInputError(
+            f"pipeline must hold only {', '.join(_SCALERS)} before the classifier; got {name}, which does "
+            "not scale each feature by itself. Train with one of these, or search with "
+            "vehicle_detection.course, which accepts any scikit-learn estimator"
+        )
+    fitted = n_features(scaler)
+    if fitted is None:
+        raise InvalidInputError(f"pipeline must be fitted; its {name} is not: call fit first")
+    _check_length(fitted, length, name)
+    offset, factor = np.zeros(length), np.ones(length)
+    if getattr(scaler, "clip", False):
+        raise InvalidInputError(f"pipeline must not clip; train with {name}(clip=False)")
+    if name == "MinMaxScaler":
+        return -scaler.min_ / scaler.scale_, 1 / scaler.scale_
+    center = getattr(scaler, "mean_" if name == "StandardScaler" else "center_", None)
+    if center is not None and getattr(scaler, "with_mean", True):
+        offset = np.asarray(center, np.float64)
+    if getattr(scaler, "scale_", None) is not None:
+        factor = np.asarray(scaler.scale_, np.float64)
+    return offset, factor
+
+
+def _weights(classifier: Any, length: int) -> tuple[NDArray[np.float64], float]:
+    """Weights and intercept of a fitted linear classifier of two classes."""
+    name = type(classifier).__name__
+    if not hasattr(classifier, "predict"):
+        raise InvalidInputError(f"pipeline must end in a linear classifier; got {describe(classifier)}")
+    if not hasattr(classifier, "classes_"):
+        raise InvalidInputError(f"pipeline must be fitted; its {name} is not: call fit first")
+    if not hasattr(classifier, "coef_") or not hasattr(classifier, "decision_function"):
+        raise InvalidInputError(
+            f"pipeline must end in a linear classifier, such as LinearSVC; got {name}. Search with "
+            "vehicle_detection.course, which accepts any scikit-learn estimator"
+        )
+    labels = list(classifier.classes_)
+    if labels not in ([0, 1], [-1, 1]):
+        raise InvalidInputError(
+            f"pipeline must be fitted on the labels 0 or -1 for others and 1 for vehicles; got {labels}"
+        )
+    coef = classifier.coef_
+    coef = np.asarray(coef.toarray() if hasattr(coef, "toarray") else coef, np.float64).ravel()
+    _check_length(len(coef), length, name)
+    return coef, float(np.ravel(classifier.intercept_)[0])
+
+
+def _check_length(fitted: int, length: int, name: str) -> None:
+    if fitted != length:
+        raise InvalidInputError(
+            f"pipeline must be fitted on the {length} features of its parameters; its {name} was fitted on "
+            f"{fitted}. Pass the parameters that the features were computed with"
+        )
+
+
+def check_equal_scores(template: Template, steps: Sequence[Any]) -> None:
+    """Compare the template with the estimators on random vectors: those of other libraries may differ."""
+    *scalers, classifier = steps
+    rng = np.random.default_rng(0)
+    vectors = template.mean + template.scale * rng.normal(scale=3, size=(16, len(template.mean)))
+    weights, bias = template.fold()
+    expected = vectors @ weights + bias
+    scaled = vectors
+    for scaler in scalers:
+        scaled = scaler.transform(scaled)
+    scores = np.ravel(classifier.decision_function(scaled))
+    if not np.allclose(scores, expected, rtol=1e-3, atol=1e-3 * float(np.abs(expected).max())):
+        names = " and ".join(type(step).__name__ for step in steps)
+        raise InvalidInputError(f"pipeline must score by a weighted sum of the features; {names} does not")
+
+
+def check_uint8(template: Template, params: FeatureParams) -> None:
+    """Check that scaled features are not those of images with values 0-1, as the course reads PNG files.
+
+    Such a template is useless for uint8 images. Its spatial bins can be converted, but not the HOG of a color
+    channel, whose small differences the rounding to uint8 removes.
+
+    Raises
+    ------
+    InvalidInputError
+        If the spatial bins, or the histogram where all values are in the first bins, show it.
+    """
+    if has_unit_range(template.mean, template.scale, params):
+        raise InvalidInputError(
+            "pipeline must be fitted on features of uint8 images; it was fitted on values 0-1, as which the "
+            "course reads PNG files. Pass imread=vehicle_detection.read_image to extract_features, and fit "
+            "the scaler and the classifier again"
+        )
+
+
+def has_unit_range(mean: Floats, scale: Floats, params: FeatureParams) -> bool:
+    """Whether features with this mean and scale show that the images had values 0-1; HOG does not show it."""
+    return _has_float_bins(mean, scale, params) or _has_first_bins_only(mean, scale, params)
+
+
+def _has_float_bins(mean: Floats, scale: Floats, params: FeatureParams) -> bool:
+    """Whether the spatial bins are those of float images; False for LUV and LAB if nothing is subtracted."""
+    if not params.spatial_feat:
+        return False
+    means, scales = (params.spatial_planes(values[: params.spatial_length]) for values in (mean, scale))
+    if params.spatial_space in UNIT_CHANNELS:
+        channels = UNIT_CHANNELS[params.spatial_space]
+        return bool((np.abs(means) + scales)[list(channels)].max() < _MAX_UNIT)
+    is_centered = bool(means.any())
+    return is_centered and bool(means[2].max() < _MAX_FLOAT_MEAN and (means + scales)[2].min() < _GRAY)
+
+
+def _has_first_bins_only(mean: Floats, scale: Floats, params: FeatureParams) -> bool:
+    """Whether all values of the channels with the range 0-1 are in the first bin of a histogram of 0-256."""
+    bins = slice(params.spatial_length, params.spatial_length + params.hist_length)
+    channels = list(UNIT_CHANNELS.get(params.hist_space, ()))
+    if not params.hist_feat or params.hist_bins == 1 or not channels:
+        return False
+    means, scales = (values[bins].reshape(3, -1)[channels, 1:] for values in (mean, scale))
+    return bool((means == 0).all() and (scales == 1).all())

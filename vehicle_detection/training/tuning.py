@@ -26,18 +26,18 @@ from vehicle_detection._common import (
     is_listing,
     progress_bar,
 )
-from vehicle_detection.classifier import DEFAULT_C
 from vehicle_detection.datasets import SEEDED_SPLITS, SPLIT_NAMES, PatchSet, Split, make_split
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.tuning.grid import (
+from vehicle_detection.training.classifier import DEFAULT_C
+from vehicle_detection.training.grid import (
     Configuration,
     TrialConfig,
     describe_params,
     expand_grid,
     read_configurations,
 )
-from vehicle_detection.tuning.results import RowStore
-from vehicle_detection.tuning.trials import COLUMNS, TrialEvaluator, TrialOptions, TrialRunner
+from vehicle_detection.training.results import RowStore
+from vehicle_detection.training.trials import COLUMNS, TrialEvaluator, TrialOptions, TrialRunner
 
 if TYPE_CHECKING:
     from pandas import DataFrame

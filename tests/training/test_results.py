@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vehicle_detection.errors import DatasetError, InvalidInputError
-from vehicle_detection.tuning import (
+from vehicle_detection.training import (
     RowStore,
     make_table,
     numeric_column,
@@ -15,7 +15,7 @@ from vehicle_detection.tuning import (
     read_results,
     write_results,
 )
-from vehicle_detection.tuning.trials import COLUMNS
+from vehicle_detection.training.trials import COLUMNS
 
 
 def example_row(number):

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vehicle_detection._common import check_type, describe, progress_bar
-from vehicle_detection.classifier import DEFAULT_C, check_labels
 from vehicle_detection.datasets import PatchSet, Split
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.params import FeatureParams
-from vehicle_detection.tuning.cache import FeatureCache
-from vehicle_detection.tuning.results import make_table
-from vehicle_detection.tuning.search import check_seeds, make_splits
-from vehicle_detection.tuning.trials import TrialEvaluator, TrialOptions
+from vehicle_detection.features import FeatureParams
+from vehicle_detection.training.classifier import DEFAULT_C, check_labels
+from vehicle_detection.training.feature_cache import FeatureCache
+from vehicle_detection.training.results import make_table
+from vehicle_detection.training.trials import TrialEvaluator, TrialOptions
+from vehicle_detection.training.tuning import check_seeds, make_splits
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -7,22 +7,25 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.features.cases import BLANK, PATCHES
+from tests.feature_cases import BLANK, PATCHES
 from vehicle_detection._kernels import bin_of_value, degree_bounds, orientation_cotangents, sqrt_gradients
 from vehicle_detection._kernels import hog as _hog_kernels
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import (
+    COLOR_SPACES,
+    HOG_CHANNELS,
+    SPATIAL_ORDERS,
+    FeatureParams,
     bin_spatial,
     color_hist,
     convert_color,
     extract_features,
     get_hog_features,
+    hog_blocks,
     hog_image,
     single_img_features,
 )
-from vehicle_detection.features.extract import hog_blocks
 from vehicle_detection.images import decode_image, write_image
-from vehicle_detection.params import COLOR_SPACES, HOG_CHANNELS, SPATIAL_ORDERS, FeatureParams
 from vehicle_detection.scenes import render_patches
 
 PRESETS = sorted(FeatureParams.PRESETS)

@@ -22,8 +22,7 @@ from vehicle_detection._common import (
     check_path,
 )
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import extract_features
-from vehicle_detection.params import PATCH_SIZE, FeatureParams
+from vehicle_detection.features import PATCH_SIZE, FeatureParams, extract_features
 
 _LOGGER = logging.getLogger(__name__)
 

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, TransformerMixin
 
-from vehicle_detection.features.extract import extract_features
-from vehicle_detection.params import FeatureParams
+from vehicle_detection.features import FeatureParams, extract_features
 
 
 @dataclass(eq=False, repr=False, kw_only=True)

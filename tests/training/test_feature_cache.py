@@ -3,11 +3,10 @@ import logging
 import numpy as np
 import pytest
 
-from tests.tuning.cases import SMALL
+from tests.training.trial_cases import SMALL
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import extract_features
-from vehicle_detection.params import FeatureParams
-from vehicle_detection.tuning import FeatureCache, cache
+from vehicle_detection.features import FeatureParams, extract_features
+from vehicle_detection.training import FeatureCache, feature_cache
 
 PARAMS = FeatureParams(**SMALL)
 
@@ -20,7 +19,7 @@ def test_cached_features_equal_extracted_features(patch_set, monkeypatch):
     np.testing.assert_array_equal(features.all(PARAMS), expected)
     mirrored = extract_features(np.ascontiguousarray(patch_set.patches[:, :, ::-1]), PARAMS)
     np.testing.assert_array_equal(features.all(PARAMS, mirrored=True), mirrored)
-    monkeypatch.setattr(cache, "extract_features", None)
+    monkeypatch.setattr(feature_cache, "extract_features", None)
     features.rows(PARAMS, rows)[:] = -1  # A copy.
     np.testing.assert_array_equal(features.all(PARAMS), expected)
     with pytest.raises(ValueError, match="read-only"):
@@ -47,7 +46,7 @@ def test_features_stay_on_disk(patch_set, tmp_path, monkeypatch, caplog):
         computed.append(len(patches))
         return extract_features(patches, *arguments, **options)
 
-    monkeypatch.setattr(cache, "extract_features", counted)
+    monkeypatch.setattr(feature_cache, "extract_features", counted)
     np.testing.assert_array_equal(FeatureCache(patch_set.patches, folder=folder).all(PARAMS), expected)
     assert max(computed) < 10  # Only the rows that are checked.
     FeatureCache(patch_set.patches[:50], folder=folder).all(PARAMS)

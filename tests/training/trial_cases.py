@@ -1,8 +1,8 @@
 """Small features and searches for the tests of tuning."""
 
-from vehicle_detection.params import SearchBand, SearchParams
-from vehicle_detection.tuning import TrialOptions
-from vehicle_detection.tuning.trials import TrialEvaluator
+from vehicle_detection.search import SearchBand, SearchParams
+from vehicle_detection.training import TrialOptions
+from vehicle_detection.training.trials import TrialEvaluator
 
 SMALL = {"spatial_size": 8, "hist_bins": 8, "orient": 4, "pix_per_cell": 16, "hog_channel": 0}
 SMALL_GRID = {name: [value] for name, value in SMALL.items()}

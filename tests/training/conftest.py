@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from tests.helpers import random_classifier
-from tests.tuning.cases import SMALL
+from tests.training.trial_cases import SMALL
 from vehicle_detection.datasets import PatchSet
 from vehicle_detection.evaluation import FrameBoxes, LabelledFrames
-from vehicle_detection.params import FeatureParams
+from vehicle_detection.features import FeatureParams
 from vehicle_detection.scenes import render_patches, render_scene
 
 
