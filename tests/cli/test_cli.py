@@ -1235,7 +1235,7 @@ def test_defaults_are_those_of_the_library(monkeypatch, material, tmp_path):
 
     monkeypatch.setattr(training, "train_and_evaluate", note)
     refuse("train", *patches_of(material), "-o", tmp_path / "m.safetensors")
-    assert given["C"] == classifier.DEFAULT_C
+    assert given["C"] == training.DEFAULT_C
     assert given["params"] == load_classifier().params
     assert (given["mirror"], given["random_state"], given["split"]) == (True, 0, "random")
     recipe = load_classifier().metadata["training"]
