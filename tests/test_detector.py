@@ -44,7 +44,7 @@ SEARCH = SearchParams(
 # No flanks: the red squares are flat.
 FIT = RegionParams(face_width=0.78, face_height=0.78, face_offset_y=0.0, flank_length_m=0.0)
 HEAT = HeatParams(frames=3, threshold=3.0, peak_fraction=0.5)
-MODES = [("shared", "fitted"), ("shared", "heat"), ("windows", "fitted"), ("windows", "heat")]
+REGIONS = ["fitted", "heat"]
 
 
 def red_detector():
@@ -117,9 +117,9 @@ def assert_same_drive(one, other):
         assert_same(a, b)
 
 
-@pytest.mark.parametrize(("method", "regions"), MODES)
-def test_a_still_shows_its_vehicles(method, regions):
-    detector = make(method=method, regions=regions)
+@pytest.mark.parametrize("regions", REGIONS)
+def test_a_still_shows_its_vehicles(regions):
+    detector = make(regions=regions)
     for boxes in ([CAR], [moved(CAR, -60, 5), OTHER]):
         found = detector.detect(frame_with(*boxes))
         assert len(found) == len(boxes)
@@ -128,10 +128,10 @@ def test_a_still_shows_its_vehicles(method, regions):
     assert len(detector.detect(frame_with())) == 0
 
 
-@pytest.mark.parametrize(("method", "regions"), MODES)
-def test_a_still_neither_uses_nor_changes_the_video(method, regions):
+@pytest.mark.parametrize("regions", REGIONS)
+def test_a_still_neither_uses_nor_changes_the_video(regions):
     frames = drive(6)
-    plain, interrupted = make(method=method, regions=regions), make(method=method, regions=regions)
+    plain, interrupted = make(regions=regions), make(regions=regions)
     stills = frame_with(OTHER), frame_with(light=200), frame_with(CAR, height=120, width=200)
     first = [interrupted.detect(still).boxes for still in stills]
     expected = [plain.process(frame) for frame in frames]
@@ -142,9 +142,9 @@ def test_a_still_neither_uses_nor_changes_the_video(method, regions):
     assert_same_drive(results, expected)
 
 
-@pytest.mark.parametrize(("method", "regions"), MODES)
-def test_a_vehicle_is_followed(method, regions):
-    detector = make(method=method, regions=regions)
+@pytest.mark.parametrize("regions", REGIONS)
+def test_a_vehicle_is_followed(regions):
+    detector = make(regions=regions)
     results = [detector.process(frame) for frame in drive()]
     assert [result.index for result in results] == list(range(12))
     for index, result in enumerate(results[6:], 6):
@@ -206,12 +206,12 @@ def test_search_in_any_order_and_follow_in_order_is_process(regions):
     assert_same_drive(results, expected)
 
 
-@pytest.mark.parametrize(("method", "regions"), MODES)
-def test_threads_do_not_change_anything(method, regions):
+@pytest.mark.parametrize("regions", REGIONS)
+def test_threads_do_not_change_anything(regions):
     frames = drive(7)
     drives = []
     for n_jobs in (1, 2, 3):
-        with make(method=method, regions=regions, n_jobs=n_jobs) as detector:
+        with make(regions=regions, n_jobs=n_jobs) as detector:
             drives.append([detector.process(frame) for frame in frames])
     assert_same_drive(drives[0], drives[1])
     assert_same_drive(drives[0], drives[2])
@@ -550,8 +550,7 @@ GOOD = frame_with(CAR)
         (b"\xff\xd8\xff", r"decode it with vehicle_detection.read_image\(data\)"),
     ],
 )
-@pytest.mark.parametrize("method", ["shared", "windows"])
-def test_bad_frames_are_refused_and_change_nothing(frame, message, method):
+def test_bad_frames_are_refused_and_change_nothing(frame, message):
     detector, plain = make(), make()
     detector.process(GOOD)
     plain.process(GOOD)
@@ -618,16 +617,14 @@ def test_only_single_images_are_read_from_files():
             take("frame.png")
 
 
-@pytest.mark.parametrize("method", ["shared", "windows"])
-def test_a_frame_too_small_for_a_window_is_refused(method):
+def test_a_frame_too_small_for_a_window_is_refused():
     with pytest.raises(InvalidInputError, match="image of 40x40 pixels holds no search window"):
-        VehicleDetector(CLASSIFIER, method=method).detect(GOOD[:40, :40])
+        VehicleDetector(CLASSIFIER).detect(GOOD[:40, :40])
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"method": "fast"}, "method must be one of 'shared', 'windows'; got 'fast'"),
         ({"horizon": 1.5}, "horizon must be a number, at least 0 and at most 1"),
         ({"horizon": 400}, "horizon must be a number, at least 0 and at most 1"),
         ({"n_jobs": 0}, "n_jobs must be an integer from 1"),
