@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
-from vehicle_detection.network.search import to_log_odds, to_probability
 
 from tests.network.graphs import PARAMS, constant_network, echo_network, own_network, serialize
 from tests.network.test_runtime import NO_OPENVINO, RUNTIMES

@@ -6,7 +6,6 @@ from hypothesis.extra import numpy as hnp
 
 from tests.helpers import random_classifier
 from tests.notebook.helpers import SMALL, gray_image, legend, new_axes, texts, titles
-from tests.plotting.helpers import SMALL, gray_image, legend, new_axes, texts, titles
 from vehicle_detection import notebook
 from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.features import FeatureParams, extract_features, hog_image, sum_blocks
