@@ -1467,14 +1467,14 @@ def test_times_that_cannot_be_read(text):
 
 @pytest.mark.parametrize(("text", "mps"), [("100", 100 / 3.6), ("62mph", 62 * 0.44704), ("90 km/h", 25.0)])
 def test_own_speed_in_units(text, mps):
-    from vehicle_detection.cli.events import read_speed
+    from vehicle_detection.cli.video_outputs import read_speed
 
     assert read_speed(text, None, 0.0).at([1.0]) == pytest.approx(mps)
 
 
 @pytest.mark.parametrize("text", ["fast", "-5", "501", "10 m/s"])
 def test_own_speed_that_cannot_be_read(text):
-    from vehicle_detection.cli.events import read_speed
+    from vehicle_detection.cli.video_outputs import read_speed
 
     with pytest.raises(InvalidInputError, match="--own-speed must be a speed of at most 500, such as 100"):
         read_speed(text, None, 0.0)

@@ -6,6 +6,7 @@ import contextlib
 import functools
 import sys
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,6 +29,7 @@ from vehicle_detection.cli.options import (
     flag,
     option,
     parse_classes,
+    takes,
 )
 from vehicle_detection.cli.output import (
     UNKNOWN_LENS,
@@ -39,14 +41,10 @@ from vehicle_detection.cli.output import (
 from vehicle_detection.errors import InvalidInputError
 
 
-@option_names(
-    out="--output",
-    retry_failed="--retry-failed",
-    dry_run="--dry-run",
-    field_of_view="--fov",
-    camera_height_m="--camera-height",
-)
-def batch(
+@dataclass(frozen=True, kw_only=True)
+class BatchOptions:
+    """Options of ``batch``."""
+
     output: Annotated[
         str,
         option(
@@ -55,117 +53,138 @@ def batch(
             "-o",
             "--output",
         ),
-    ],
+    ]
     sources: Annotated[
         list[str] | None,
         Argument(
             metavar="SOURCES...",
             help="Video files, folders, quoted patterns and URLs, such as CARD/ or s3://cam/*.mp4.",
         ),
-    ] = None,
-    model: Model = "default",
-    classes: Classes = None,
-    device: Device = "cpu",
-    conf: Confidence = None,
+    ] = None
+    model: Model = "default"
+    classes: Classes = None
+    device: Device = "cpu"
+    conf: Confidence = None
     jobs: Annotated[
         int | None, option("N", "Worker processes of one thread, such as 4; default: one per core.")
-    ] = None,
+    ] = None
     shard: Annotated[
         str | None, option("I/N", "Process the I-th of N parts, such as 2/8, for job arrays.")
-    ] = None,
+    ] = None
     dask: Annotated[
         str | None,
         option("ADDRESS|local", "Use a Dask cluster, such as tcp://10.0.0.5:8786, or start one here."),
-    ] = None,
-    group: Annotated[str, option("trip|file", "Make consecutive segments one trip, or each file.")] = "trip",
-    tracks_only: Annotated[bool, flag("--tracks-only", help="Write no videos.")] = False,
-    horizon: Horizon = None,
-    camera: CameraName = None,
-    fov: FieldOfView = None,
-    camera_height: CameraHeight = None,
-    every: Every = None,
-    blur: Blur = None,
-    preset: Preset = "veryfast",
-    no_audio: NoAudio = False,
+    ] = None
+    group: Annotated[str, option("trip|file", "Make consecutive segments one trip, or each file.")] = "trip"
+    tracks_only: Annotated[bool, flag("--tracks-only", "Write no videos.")] = False
+    horizon: Horizon = None
+    camera: CameraName = None
+    fov: FieldOfView = None
+    camera_height: CameraHeight = None
+    every: Every = None
+    blur: Blur = None
+    preset: Preset = "veryfast"
+    no_audio: NoAudio = False
     retry_failed: Annotated[
-        bool, flag("--retry-failed", help="Process trips again whose source could not be processed.")
-    ] = False,
-    dry_run: Annotated[bool, flag("--dry-run", help="Only list the trips that would be processed.")] = False,
-    status: Annotated[bool, flag("--status", help="Only show what has been done.")] = False,
+        bool, flag("--retry-failed", "Process trips again whose source could not be processed.")
+    ] = False
+    dry_run: Annotated[bool, flag("--dry-run", "Only list the trips that would be processed.")] = False
+    status: Annotated[bool, flag("--status", "Only show what has been done.")] = False
     summary: Annotated[
         Path | None, option("FILE.csv", "Table with a row for each trip that has been done.")
-    ] = None,
-    quiet: Annotated[bool, flag("-q", "--quiet", help="Print errors only.")] = False,
-) -> None:
+    ] = None
+    quiet: Annotated[bool, flag("-q", "Print errors only.", "--quiet")] = False
+
+    def detector_options(self) -> dict[str, Any]:
+        """Options of the detector that are given."""
+        options = {
+            "classes": parse_classes(self.classes),
+            "device": None if self.device == "cpu" else self.device,
+            "conf": self.conf,
+            "horizon": self.horizon,
+            "camera": self.camera,
+            "field_of_view": self.fov,
+            "camera_height_m": self.camera_height,
+            "every": self.every,
+            "blur": self.blur,
+        }
+        return {name: value for name, value in options.items() if value is not None}
+
+
+@option_names(
+    out="--output",
+    retry_failed="--retry-failed",
+    dry_run="--dry-run",
+    field_of_view="--fov",
+    camera_height_m="--camera-height",
+)
+@takes(BatchOptions)
+def batch(options: BatchOptions) -> None:
     """Track the vehicles of many videos in parallel; run again to do what is missing or changed."""
+    output, summary, quiet = options.output, options.summary, options.quiet
     if summary is not None:
         from vehicle_detection._common import check_suffix
 
         check_suffix(summary, "--summary", (".csv",))
-        if dry_run:
+        if options.dry_run:
             raise InvalidInputError("--dry-run has no results for --summary; omit one of them")
-    if status:
+    if options.status:
         from vehicle_detection.batch import batch_status
 
         print_line(str(batch_status(output)))
         _write_summary(output, summary)
         return
-    if not sources:
+    if not options.sources:
         raise InvalidInputError("SOURCES... must name at least one video, folder, pattern or URL")
-    from vehicle_detection._common import hide_credentials, is_url, local_path
-    from vehicle_detection.batch import open_dask, run_batch
+    from vehicle_detection._common import hide_credentials
 
-    options: dict[str, Any] = {
-        "classes": parse_classes(classes),
-        "device": None if device == "cpu" else device,
-        "conf": conf,
-        "horizon": horizon,
-        "camera": camera,
-        "field_of_view": fov,
-        "camera_height_m": camera_height,
-        "every": every,
-        "blur": blur,
-    }
-    with contextlib.ExitStack() as stack:
-        executor = None
-        if dask is not None and not dry_run:
-            executor, dashboard = stack.enter_context(open_dask(dask, jobs))
-            if not quiet:
-                print_line(f"dashboard {dashboard}")
-        folder = local_path(output)
-        if folder and not dry_run and not is_url(folder):
-            stack.enter_context(output_folder(Path(folder), "--output"))
-        done = run_batch(
-            sources,
-            output,
-            executor,
-            model=model,
-            options={name: value for name, value in options.items() if value is not None},
-            jobs=jobs,
-            shard=shard,
-            group=group,
-            tracks_only=tracks_only,
-            audio=not no_audio,
-            preset=preset,
-            retry_failed=retry_failed,
-            dry_run=dry_run,
-            progress=not quiet,
-            on_record=functools.partial(_print_record, done=not quiet and not sys.stderr.isatty()),
-        )
-    if dry_run:
+    done = _run(options, options.sources)
+    if options.dry_run:
         for trip in done.planned or ():
             _print_trip(trip)
         print_line(str(done))
         return
     _write_summary(output, summary)
-    lens_is_known = any(option is not None for option in (camera, fov))
-    if done.done and not lens_is_known and not quiet:
-        print_error(UNKNOWN_LENS)
     if not quiet:
+        if done.done and options.camera is None and options.fov is None:
+            print_error(UNKNOWN_LENS)
         print_line(str(done))
         print_line(f"wrote {hide_credentials(output)}" + (f", {summary}" if summary else ""))
     if done.errors:  # the machine's fault: a job that is started again does the rest
         raise typer.Exit(1)
+
+
+def _run(options: BatchOptions, sources: list[str]) -> Any:
+    """Process the trips of the sources, on a Dask cluster if one is named."""
+    from vehicle_detection._common import is_url, local_path
+    from vehicle_detection.batch import open_dask, run_batch
+
+    with contextlib.ExitStack() as stack:
+        executor = None
+        if options.dask is not None and not options.dry_run:
+            executor, dashboard = stack.enter_context(open_dask(options.dask, options.jobs))
+            if not options.quiet:
+                print_line(f"dashboard {dashboard}")
+        folder = local_path(options.output)
+        if folder and not options.dry_run and not is_url(folder):
+            stack.enter_context(output_folder(Path(folder), "--output"))
+        return run_batch(
+            sources,
+            options.output,
+            executor,
+            model=options.model,
+            options=options.detector_options(),
+            jobs=options.jobs,
+            shard=options.shard,
+            group=options.group,
+            tracks_only=options.tracks_only,
+            audio=not options.no_audio,
+            preset=options.preset,
+            retry_failed=options.retry_failed,
+            dry_run=options.dry_run,
+            progress=not options.quiet,
+            on_record=functools.partial(_print_record, done=not options.quiet and not sys.stderr.isatty()),
+        )
 
 
 def _print_record(record: Mapping[str, Any], *, done: bool) -> None:

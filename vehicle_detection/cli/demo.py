@@ -1,4 +1,4 @@
-"""The demo: draw a drive, track its vehicles and score the tracks against the ground truth."""
+"""The command that draws a drive, tracks its vehicles and scores the tracks against the ground truth."""
 
 from __future__ import annotations
 
@@ -6,21 +6,20 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
-from vehicle_detection._common import progress_bar, temporary_folder
-from vehicle_detection.detector import VehicleDetector
+from vehicle_detection.cli.options import flag, option
+from vehicle_detection.cli.output import option_names, output_folder, print_facts, print_line
 from vehicle_detection.errors import OutputError, VehicleDetectionError, VideoError
-from vehicle_detection.evaluation import TrackScores, evaluate_tracks, read_labels
-from vehicle_detection.export import TrackWriter
-from vehicle_detection.images import write_image
-from vehicle_detection.report import ReportWriter
-from vehicle_detection.scenes import Drive, VehicleTruth, render_drive, write_labels
-from vehicle_detection.video import VideoReport, process_video, read_frames
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from vehicle_detection.detector import VehicleDetector
+    from vehicle_detection.evaluation import TrackScores
+    from vehicle_detection.scenes import Drive, VehicleTruth
+    from vehicle_detection.video import VideoReport
 
 FILES = ("clip.mp4", "annotated.mp4", "tracks.csv", "labels.csv", "contact_sheet.png")
 """Files that the demo writes: rendered clip, annotated clip, tracks, ground truth, some annotated frames."""
@@ -34,10 +33,49 @@ SHEET = (2, 3)
 _TILE = (640, 360)
 
 
-def run_demo(
-    folder: Path, detector: VehicleDetector, *, frames: int, random_state: int, report: bool = False
+@option_names(random_state="--seed")
+def demo(
+    output: Annotated[Path, option("DIR", "Folder to write.", "-o", "--output")] = Path("demo"),
+    frames: Annotated[int, option("N", "Number of frames.")] = 120,
+    seed: Annotated[int, option("N", "Random seed of the scene.")] = 0,
+    report: Annotated[bool, flag("--report", "Write a page with the video and its tracks.")] = False,
+) -> None:
+    """Draw a drive, annotate it with the default model and score it against the ground truth.
+
+    Oncoming vehicles are scored too; boxes on vehicles that are under 40 pixels wide or largely hidden are
+    neither right nor wrong.
+    """
+    from vehicle_detection.detector import VehicleDetector
+
+    # The field of view of the rendering camera.
+    with output_folder(output, "--output"), VehicleDetector(field_of_view=58) as detector:
+        done, scores = _run(output, detector, frames=frames, random_state=seed, report=report)
+    print_facts(
+        f"{scores.frames} rendered frames of 1280x720, {scores.vehicles} vehicles, {scores.tracks} tracks",
+        {
+            "F1": f"{scores.f1:.3f}",
+            "mean IoU": f"{scores.mean_iou:.3f}",
+            "MOTA": f"{scores.mota:.3f}",
+            "boxes": f"{scores.tp} on a vehicle, {scores.fn} missed, {scores.fp} false",
+            "identity switches": scores.id_switches,
+            "speed": f"{done.frames_per_second:.1f} frames/s",
+        },
+    )
+    print_line(f"wrote {', '.join((*FILES, REPORT) if report else FILES)} in {output}")
+
+
+def _run(
+    folder: Path, detector: VehicleDetector, *, frames: int, random_state: int, report: bool
 ) -> tuple[VideoReport, TrackScores]:
     """Draw a drive, annotate and score it, oncoming vehicles too; an error leaves no file in the folder."""
+    from vehicle_detection._common import temporary_folder
+    from vehicle_detection.evaluation import evaluate_tracks, read_labels
+    from vehicle_detection.export import TrackWriter
+    from vehicle_detection.images import write_image
+    from vehicle_detection.report import ReportWriter
+    from vehicle_detection.scenes import render_drive
+    from vehicle_detection.video import process_video
+
     drive = render_drive(frames=frames, random_state=random_state)
     with temporary_folder(folder, "demo") as temporary, _named_in(folder, temporary):
         clip, annotated, tracks, labels, sheet = (temporary / name for name in FILES)
@@ -70,6 +108,9 @@ def _named_in(folder: Path, temporary: Path) -> Iterator[None]:
 
 def draw_clip(drive: Drive, clip: Path, labels: Path, *, progress: bool = False) -> None:
     """Write the frames of a drive as a video, and their ground truth as a table, with oncoming vehicles."""
+    from vehicle_detection._common import progress_bar
+    from vehicle_detection.scenes import write_labels
+
     height, width = drive.shape
     truth = []
     try:
@@ -102,6 +143,11 @@ def scored_truth(rows: Sequence[VehicleTruth]) -> list[VehicleTruth]:
 
 def contact_sheet(video: Path) -> NDArray[np.uint8]:
     """Arrange evenly spaced frames of a video in one ``(H, W, 3)`` uint8 image."""
+    import cv2
+    import numpy as np
+
+    from vehicle_detection.video import read_frames
+
     rows, columns = SHEET
     with read_frames(video) as reader:
         # Downscaled at once: the full frames of a video may not fit into memory.

@@ -1,16 +1,19 @@
-"""Options that several commands share, and the panels of their help."""
+"""The options of the commands: how they are declared, and those that several commands share."""
 
 from __future__ import annotations
 
+import functools
+import inspect
 import re
-from typing import Annotated, Any
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 from typer import Option
 
 from vehicle_detection.errors import InvalidInputError
 
-INPUT, CAMERA, SEARCH, DRAWING, OUTPUT = "Input", "Camera", "Search", "Drawing", "Output"
-"""Panels of the options in ``--help``."""
+Options = TypeVar("Options")
 
 PATCHES = "--vehicles and --non-vehicles"
 """The options that name training patches, in messages about all of them."""
@@ -23,97 +26,106 @@ def option(metavar: str, help: str, *names: str, panel: str | None = None) -> An
     return Option(*names, metavar=metavar, help=help, rich_help_panel=panel)
 
 
-def flag(*names: str, panel: str | None = None, help: str) -> Any:  # noqa: A002 - as typer
+def flag(name: str, help: str, *names: str, panel: str | None = None) -> Any:  # noqa: A002 - as typer
     """Option without a value; the help shows no type for it."""
-    return option("", help, *names, panel=panel)
+    return option("", help, name, *names, panel=panel)
 
+
+def takes(options: type[Options]) -> Callable[[Callable[[Options], None]], Callable[..., None]]:
+    """Declare the options of a command by a class with a field for each.
+
+    typer reads options from the parameters of a function; the decorated function gets one for each field.
+    """
+
+    def decorate(command: Callable[[Options], None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def run(**values: Any) -> None:
+            command(options(**values))
+
+        hints = get_type_hints(options, include_extras=True)
+        required = inspect.Parameter.empty
+        parameters = [
+            inspect.Parameter(
+                each.name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=getattr(options, each.name, required),
+                annotation=hints[each.name],
+            )
+            for each in fields(options)  # type: ignore[arg-type]
+        ]
+        run.__annotations__ = hints
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        return run
+
+    return decorate
+
+
+# Options in a panel of the help.
+input_option, input_flag = (functools.partial(each, panel="Input") for each in (option, flag))
+camera_option = functools.partial(option, panel="Camera")
+search_option = functools.partial(option, panel="Search")
+drawing_option, drawing_flag = (functools.partial(each, panel="Drawing") for each in (option, flag))
+output_option, output_flag = (functools.partial(each, panel="Output") for each in (option, flag))
 
 Model = Annotated[
     str,
-    option(
-        "NAME|FILE",
-        '"default" (any road), "highway" (the course\'s), or a model file, such as yolo11n.onnx.',
-        panel=SEARCH,
+    search_option(
+        "NAME|FILE", '"default" (any road), "highway" (the course\'s), or a model file, such as yolo11n.onnx.'
     ),
 ]
 Classes = Annotated[
     str | None,
-    option(
-        "LIST",
-        "Classes of another library's network that are vehicles, such as car,bus,truck or 2,5,7.",
-        panel=SEARCH,
+    search_option(
+        "LIST", "Classes of another library's network that are vehicles, such as car,bus,truck or 2,5,7."
     ),
 ]
 Device = Annotated[
-    str, option("cpu|cuda", "Where a network runs; cuda needs the package onnxruntime-gpu.", panel=SEARCH)
+    str, search_option("cpu|cuda", "Where a network runs; cuda needs the package onnxruntime-gpu.")
 ]
 Confidence = Annotated[
     float | None,
-    option(
-        "P",
-        "Minimum confidence, a probability from 0 to 1, such as 0.5; default: the model's threshold.",
-        panel=SEARCH,
+    search_option(
+        "P", "Minimum confidence, a probability from 0 to 1, such as 0.5; default: the model's threshold."
     ),
 ]
 Every = Annotated[
     int | None,
-    option(
-        "N",
-        "Search every N-th frame, and interpolate between; 1: every frame; default: 12 a second.",
-        panel=SEARCH,
+    search_option(
+        "N", "Search every N-th frame, and interpolate between; 1: every frame; default: 12 a second."
     ),
 ]
-Horizon = Annotated[float | None, option("F", HORIZON_HELP, panel=CAMERA)]
+Horizon = Annotated[float | None, camera_option("F", HORIZON_HELP)]
 CameraName = Annotated[
     str | None,
-    option(
-        "NAME|FILE",
-        "Lens: standard-58, wide-90, fisheye-120, fisheye-140 or fisheye-170; or a JSON file.",
-        panel=CAMERA,
+    camera_option(
+        "NAME|FILE", "Lens: standard-58, wide-90, fisheye-120, fisheye-140 or fisheye-170; or a JSON file."
     ),
 ]
 FieldOfView = Annotated[
     float | None,
-    option(
-        "DEG",
-        "Field of view along the longer side in degrees, such as 90; default: 58, with a warning.",
-        "--fov",
-        panel=CAMERA,
+    camera_option(
+        "DEG", "Field of view along the longer side in degrees, such as 90; default: 58, with a warning."
     ),
 ]
 CameraHeight = Annotated[
     float | None,
-    option(
-        "M",
-        "Height of the lens above the road in meters, such as 1.5; default: 1.3.",
-        "--camera-height",
-        panel=CAMERA,
-    ),
+    camera_option("M", "Height of the lens above the road in meters, such as 1.5; default: 1.3."),
 ]
 LineWidth = Annotated[
     int | None,
-    option(
-        "N",
-        "Width of the boxes' lines in pixels, such as 3; default: by size of the frame.",
-        "--line-width",
-        panel=DRAWING,
-    ),
+    drawing_option("N", "Width of the boxes' lines in pixels, such as 3; default: by size of the frame."),
 ]
 Blur = Annotated[
     str | None,
-    option(
-        "vehicles|plates",
-        "Blur the vehicles, or the region of their plates, in what is written.",
-        panel=DRAWING,
+    drawing_option(
+        "vehicles|plates", "Blur the vehicles, or the region of their plates, in what is written."
     ),
 ]
 Preset = Annotated[
     str,
-    option(
-        "NAME", "Speed of the encoder, from ultrafast (large files) to placebo (small ones).", panel=OUTPUT
-    ),
+    output_option("NAME", "Speed of the encoder, from ultrafast (large files) to placebo (small ones)."),
 ]
-NoAudio = Annotated[bool, flag("--no-audio", panel=OUTPUT, help="Write no sound.")]
+NoAudio = Annotated[bool, output_flag("--no-audio", "Write no sound.")]
 
 
 def parse_time(text: str | None, name: str) -> float | None:
@@ -149,11 +161,10 @@ def open_model(name: str, classes: str | None, device: Any) -> Any:
     return load_model(name, classes=parse_classes(classes), device=device)
 
 
-def parse_blur(text: str | None) -> Any:
+def check_blur(region: str | None) -> None:
     """Check the region to blur before a model is loaded."""
     from vehicle_detection._common import check_choice
     from vehicle_detection.drawing import BLUR_REGIONS
 
-    if text is not None:
-        check_choice(text, "--blur", BLUR_REGIONS)
-    return text
+    if region is not None:
+        check_choice(region, "--blur", BLUR_REGIONS)

@@ -25,6 +25,9 @@ UNKNOWN_LENS = (
 )
 """Printed where distances are shown although nothing is known of the lens."""
 
+DAMAGED = 3
+"""Exit code of a command that left out what it could not decode."""
+
 Result = TypeVar("Result")
 
 # Name of a thread that `run_interruptible` has abandoned.

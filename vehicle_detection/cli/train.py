@@ -1,15 +1,11 @@
-"""The commands on models: train, download training patches, show a model."""
+"""The command that trains a classifier on patches."""
 
 from __future__ import annotations
 
 import json
 import shlex
-import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
-
-from typer import Argument
 
 from vehicle_detection.cli.options import PATCHES, flag, option
 from vehicle_detection.cli.output import (
@@ -17,8 +13,6 @@ from vehicle_detection.cli.output import (
     check_distinct_paths,
     name_kept_files,
     option_names,
-    output_folder,
-    print_facts,
     print_line,
     print_table,
     run_interruptible,
@@ -26,12 +20,6 @@ from vehicle_detection.cli.output import (
 
 if TYPE_CHECKING:
     from vehicle_detection.training import TrainingReport
-
-# Columns of the model card that a terminal has no room for.
-_HIDDEN_FOLD_COLUMNS = (
-    "best_f1", "false_per_vehicle_free_frame", "strict_average_precision", "recall_occluded",
-    "recall_truncated", "recall_narrow", "calibration_error",
-)  # fmt: skip
 
 
 @option_names(random_state="--seed", patches_or_labels=PATCHES, patch_set=PATCHES)
@@ -51,7 +39,7 @@ def train(
     ] = "random",
     C: Annotated[float, option("F", "Inverse regularization strength.", "--C")] = 1e-4,
     seed: Annotated[int, option("N", "Random seed of solver and first split.")] = 0,
-    no_mirror: Annotated[bool, flag("--no-mirror", help="Train without mirrored copies.")] = False,
+    no_mirror: Annotated[bool, flag("--no-mirror", "Train without mirrored copies.")] = False,
     gamma: Annotated[
         float | None,
         option("F", "Brightness range of mirrored copies, such as 0.3; default: 0.4, without mirroring 0."),
@@ -125,140 +113,3 @@ def _print_report(report: TrainingReport) -> None:
     for name, reason in report.skipped.items():
         print_line(f"left out {SPLITS[name]!r}: {reason}")
     print_line(", ".join(f"{name} {seconds:.1f} s" for name, seconds in report.seconds.items()))
-
-
-def fetch(
-    output: Annotated[
-        Path | None, option("DIR", "Folder, such as data; default: the user's cache.", "-o", "--output")
-    ] = None,
-) -> None:
-    """Download the course's training patches (110 MB) once."""
-    from vehicle_detection.datasets import fetch_patches
-
-    with output_folder(output, "--output"):
-        paths = fetch_patches(output, progress=sys.stderr.isatty())
-    for path in paths:
-        print_line(str(path))
-
-
-def info(
-    model: Annotated[
-        str, Argument(metavar="MODEL", help='"default", "highway" or a model file, such as own.onnx.')
-    ] = "default",
-) -> None:
-    """Show a model's parameters, accuracy, training data and versions."""
-    from vehicle_detection.loading import load_model
-
-    loaded = load_model(model)
-    title, facts = loaded.summary()
-    print_facts(f"{model}: {title}", facts)
-    for name, values in loaded.metadata.items():
-        if name != "metrics" or not _print_metrics(values):
-            print_facts(name, values if isinstance(values, dict) else {"": values})
-
-
-def _print_metrics(metrics: object) -> bool:
-    """Print a model's metrics as a table; False if they are not those of `train` or `train-frames`."""
-    from vehicle_detection.training import SPLITS, split_table
-
-    if not isinstance(metrics, dict):
-        return False
-    splits, left_out, held_out = (metrics.get(key) for key in ("splits", "left_out", "held_out"))
-    if isinstance(splits, dict) and splits.keys() <= SPLITS.keys():
-        print_table("metrics", *split_table(splits))
-    elif isinstance(left_out, dict):
-        print_fold_scores(left_out, "on frames of sources that training left out, IoU 0.5")
-    elif isinstance(held_out, dict):
-        _print_held_out(held_out, metrics.get("held_out_before", {}))
-    else:
-        return False
-    return True
-
-
-def print_fold_scores(scores: Mapping[str, Mapping[str, Any]], title: str) -> None:
-    """Print a table of the values of `FoldScore`, with a row per set of frames."""
-    from vehicle_detection.training import FOLD_COLUMNS, format_fold
-
-    shown = [number for number, name in enumerate(FOLD_COLUMNS) if name not in _HIDDEN_FOLD_COLUMNS]
-    titles = [title for title, _ in FOLD_COLUMNS.values()]
-    rows = []
-    for name, values in scores.items():
-        cells = format_fold(values)
-        rows.append((name, *(cells[number] for number in shown)))
-    print_table(title, ("frames", *(titles[number] for number in shown)), rows)
-
-
-def _print_held_out(after: Mapping[str, Any], before: Mapping[str, Any]) -> None:
-    """Print the scores of a fine-tuned network and those of the initial one."""
-    if not after:
-        print_line("no frame was held out: the accuracy is unknown")
-        return
-    rows: dict[str, Mapping[str, Any]] = {}
-    for name, values in after.items():
-        rows |= {f"{name}, before": before.get(name, {}), name: values}
-    print_fold_scores(rows, "on the frames held out of training, IoU 0.5")
-
-
-@option_names(random_state="--seed", sources="DATA", initial="--model")
-def train_frames(
-    data: Annotated[
-        Path,
-        Argument(metavar="DATA", help="Folder with labels/NAME.csv and frames/NAME/ or videos/NAME.mp4."),
-    ],
-    output: Annotated[Path, option("FILE", "Model file to write, such as own.onnx.", "-o", "--output")],
-    model: Annotated[
-        str, option("MODEL", '"default" or a file of this command to continue from, such as own.onnx.')
-    ] = "default",
-    steps: Annotated[
-        int | None,
-        option("N", "Steps of 8 samples, 0.6 s each on two cores; default: 5 per frame, 200 to 1200."),
-    ] = None,
-    device: Annotated[str | None, option("cpu|cuda", "Default: cuda where PyTorch offers it.")] = None,
-    curves: Annotated[
-        Path | None, option("FILE.csv", "Precision and recall on each set of held-out frames.")
-    ] = None,
-    jobs: Annotated[int | None, option("N", "Threads, such as 2; default: all cores.")] = None,
-    seed: Annotated[int, option("N", "Random seed.")] = 0,
-) -> None:
-    """Continue the training of the default model on labelled frames, and evaluate it on a fifth of them.
-
-    An interrupted training is continued by the same command.
-    """
-    from vehicle_detection._common import check_suffix, check_target, pluralize
-    from vehicle_detection.training import find_sources, fine_tune_network, write_curves
-
-    named = {"--output": output, "--curves": curves}
-    targets = {name: check_target(path, name) for name, path in named.items() if path is not None}
-    check_distinct_paths(targets, {"DATA": data})
-    check_suffix(output, "--output", (".onnx",))
-    sources = find_sources(data)
-    for source in sources:
-        for part in source.sets:
-            empty = sum(not len(part.labels.rows(key)) for key in part.keys)
-            boxes = pluralize(len(part.labels), "box", "es")
-            print_line(f"{source.name}: {pluralize(len(part), 'frame')}, {boxes}, {empty} frames without any")
-    checkpoint = output.with_name(f"{output.name}.checkpoint")
-    if checkpoint.exists():
-        print_line(f"continuing the training of {checkpoint}")
-    try:
-        tuned = fine_tune_network(
-            sources,
-            initial=model,
-            steps=steps,
-            random_state=seed,
-            n_jobs=jobs,
-            device=device,
-            checkpoint=checkpoint,
-            on_step=lambda _, line: print_line(line),
-        )
-    except KeyboardInterrupt as error:
-        if checkpoint.exists():
-            error.args = (f"; the same command continues from {checkpoint}",)
-        raise
-    with name_kept_files(targets.values()):
-        tuned.model.save(output)
-        if curves is not None:
-            write_curves(curves, tuned.folds)
-    metrics = tuned.model.metadata["metrics"]
-    _print_held_out(metrics["held_out"], metrics["held_out_before"])
-    print_line(f"wrote {', '.join(map(str, targets.values()))}")

@@ -54,7 +54,7 @@ def tune(
     plot: Annotated[Path | None, option("FILE.png", "Accuracy against search time.")] = None,
     split: Annotated[str, option("sequences|groups|random", "Held-out patches.")] = "sequences",
     halving: Annotated[
-        bool, flag("--halving", help="Eliminate poor configurations on few patches (successive halving).")
+        bool, flag("--halving", "Eliminate poor configurations on few patches (successive halving).")
     ] = False,
     finalists: Annotated[int, option("N", "Configurations to measure fully after --halving.")] = 3,
     frames: Annotated[

@@ -1,0 +1,269 @@
+"""The command that detects the vehicles of images."""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import itertools
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer import Argument
+
+from vehicle_detection.cli.horizon import is_limited, search_everywhere, warn_of_horizon
+from vehicle_detection.cli.options import (
+    Blur,
+    Classes,
+    Confidence,
+    Device,
+    Horizon,
+    LineWidth,
+    Model,
+    check_blur,
+    drawing_option,
+    open_model,
+    output_option,
+    takes,
+)
+from vehicle_detection.cli.output import (
+    DAMAGED,
+    announce_replaced,
+    capture_stderr,
+    option_names,
+    output_folder,
+    print_error,
+    print_line,
+)
+from vehicle_detection.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from vehicle_detection.boxes import Detections
+    from vehicle_detection.detector import VehicleDetector
+
+_CHECKED_IMAGES = 20  # images that are searched again if no vehicle was found
+
+
+@dataclass(frozen=True, kw_only=True)
+class DetectOptions:
+    """Options of ``detect``."""
+
+    images: Annotated[list[Path], Argument(metavar="IMAGE...", help="Image files, such as frames/*.jpg.")]
+    output: Annotated[
+        Path | None, output_option("DIR", "Folder for annotated images, such as found.", "-o", "--output")
+    ] = None
+    boxes: Annotated[
+        Path | None, output_option("FILE", "Boxes by file name: .csv, .jsonl, .parquet or .json (COCO).")
+    ] = None
+    why: Annotated[
+        Path | None,
+        output_option(
+            "DIR", "Folder, such as why, for pictures that explain each box: the share of each cell."
+        ),
+    ] = None
+    model: Model = "default"
+    classes: Classes = None
+    device: Device = "cpu"
+    conf: Confidence = None
+    horizon: Horizon = None
+    labels: Annotated[str, drawing_option("score|none", "Labels of the boxes in annotated images.")] = "score"
+    line_width: LineWidth = None
+    blur: Blur = None
+
+
+@takes(DetectOptions)
+def detect(options: DetectOptions) -> None:
+    """Detect the vehicles of images.
+
+    Exit code 3: some images cannot be decoded, and are left out.
+    """
+    from vehicle_detection.detector import VehicleDetector
+    from vehicle_detection.export import write_boxes
+
+    images = list(dict.fromkeys(itertools.chain.from_iterable(map(_expand, options.images))))
+    _check(options, images)
+    left_out: list[Path] = []
+    loaded = open_model(options.model, options.classes, options.device)
+    with (
+        VehicleDetector(loaded, conf=options.conf, horizon=options.horizon, blur=options.blur) as detector,
+        output_folder(options.output, "--output"),
+        output_folder(options.why, "--why"),
+    ):
+        announce_replaced([options.boxes])
+        found = _detect_each(images, detector, options, left_out)
+        if options.horizon is not None:
+            readable = (path for path in images if path not in left_out)
+            found = _warn_if_empty(found, readable, detector, options.horizon)
+        if options.boxes is None:
+            deque(found, maxlen=0)
+        else:
+            with option_names(path="--boxes"):
+                rows = write_boxes(found, options.boxes)
+            print_line(f"wrote {rows} boxes to {options.boxes}")
+    folders = [str(folder) for folder in (options.output, options.why) if folder is not None]
+    if folders:
+        print_line(f"wrote {', '.join(folders)}")
+    if left_out:
+        raise typer.Exit(DAMAGED)
+
+
+def _expand(image: Path) -> list[Path]:
+    """List the files of a pattern with ``*`` or ``?``, which the shell of Windows passes on as it is."""
+    if image.exists():
+        return [image]
+    found = map(Path, sorted(glob.glob(str(image).replace("[", "[[]"))))
+    return [path for path in found if not path.is_dir()] or [image]
+
+
+def _check(options: DetectOptions, images: list[Path]) -> None:
+    """Refuse options and images that would fail, or be overwritten, after a part of the work is done."""
+    from vehicle_detection._common import check_choice, check_integer, check_suffix
+
+    output, boxes = options.output, options.boxes
+    check_choice(options.labels, "labels", ("score", "none"))
+    if options.line_width is not None:
+        check_integer(options.line_width, "line_width", low=1, high=1000)
+    by_name: dict[str, Path] = {}
+    for image in images:
+        if image.is_dir():
+            raise InvalidInputError(
+                f"IMAGE {image} is a folder; choose files in it, such as {image / '*.jpg'}"
+            )
+        if not image.exists():
+            raise InvalidInputError(f"IMAGE {image} does not exist; check the path")
+        if boxes is not None and boxes.exists() and boxes.samefile(image):
+            raise InvalidInputError(f"--boxes {boxes} is one of the images; choose another name")
+        if output is not None and output.exists() and output.samefile(image.parent):
+            raise InvalidInputError(
+                f"--output {output} is the folder of {image.name}, which would be overwritten; choose another"
+            )
+        other = by_name.setdefault(image.name, image)
+        if other != image and (output is not None or boxes is not None):
+            raise InvalidInputError(
+                f"IMAGE {other} and {image} have the same file name, which identifies the results; "
+                "process one folder at a time"
+            )
+    if boxes is not None:
+        check_suffix(boxes, "--boxes", (".csv", ".jsonl", ".ndjson", ".parquet", ".json"))
+    check_blur(options.blur)
+    if options.blur is not None and output is None and options.why is None:
+        raise InvalidInputError(
+            "--output must name a folder for --blur, which blurs annotated images; add it"
+        )
+
+
+def _detect_each(
+    images: list[Path], detector: VehicleDetector, options: DetectOptions, left_out: list[Path]
+) -> Iterator[tuple[str, Detections]]:
+    """Detect the vehicles of each image, print them, and write what the options name.
+
+    Images that cannot be decoded or are too small are listed in `left_out`, with a warning; it is an error
+    if all of them are.
+    """
+    from vehicle_detection._common import pluralize
+    from vehicle_detection.drawing import blur_boxes, score_texts
+
+    searched, too_small = False, list[str]()
+    for path, image in _read_each(images, left_out):
+        try:
+            found = detector.detect(image)
+        except InvalidInputError as error:
+            left_out.append(path)
+            too_small.append(f"{path}: {error}")
+            continue
+        searched = True
+        listed = "".join(
+            f"  [{' '.join(f'{side:.0f}' for side in box)}] {text}"
+            for box, text in zip(found.boxes.tolist(), score_texts(found))
+        )
+        print_line(f"{path}: {pluralize(len(found), 'vehicle')}{listed}")
+        shown = image if options.blur is None else blur_boxes(image, found.boxes, region=detector.blur)
+        if options.why is not None:
+            _write_explanations(options.why, path.name, detector, image, shown, found)
+        if options.output is not None:
+            _write_annotated(options.output, path, shown, found, options)
+        yield path.name, found
+    if too_small and not searched:
+        raise InvalidInputError(too_small[0])
+    for reason in too_small:
+        print_error(f"warning: {reason}; left out")
+
+
+def _read_each(images: list[Path], left_out: list[Path]) -> Iterator[tuple[Path, Any]]:
+    """Yield the images that can be decoded, warn of others and list them; it is an error if all are such."""
+    from vehicle_detection.images import read_image
+    from vehicle_detection.video import is_video_file
+
+    for path in images:
+        try:
+            if is_video_file(path.name):
+                raise InvalidInputError(f"image file {path} is a video; use vehicle-detection video {path}")
+            with capture_stderr() as messages:
+                image = read_image(path)
+        except InvalidInputError as error:
+            left_out.append(path)
+            if len(left_out) == len(images):
+                raise
+            print_error(f"warning: {error}; left out")
+            continue
+        for message in messages:
+            print_error(f"warning: {path}: {message}")
+        yield path, image
+
+
+def _write_annotated(folder: Path, path: Path, image: Any, found: Detections, options: DetectOptions) -> None:
+    """Write an image with its boxes; as PNG if its own format cannot be written."""
+    import cv2
+
+    from vehicle_detection.drawing import draw_detections
+    from vehicle_detection.images import write_image
+
+    suffix = path.suffix if cv2.haveImageWriter(f"image{path.suffix}") else f"{path.suffix}.png"
+    drawn = draw_detections(image, found, line_width=options.line_width, scores=options.labels == "score")
+    write_image(folder / (path.stem + suffix), drawn)
+
+
+def _write_explanations(
+    folder: Path, name: str, detector: VehicleDetector, image: Any, shown: Any, found: Detections
+) -> None:
+    """Write a picture for each box of an image that says why it was found; it shows the image `shown`."""
+    from vehicle_detection._common import atomic_write
+    from vehicle_detection.explanation import explain
+    from vehicle_detection.notebook import plot_explanation
+
+    for number, box in enumerate(found.boxes, start=1):
+        explanation = explain(detector, image, box)
+        print_line(f"  {number}: {explanation}")
+        with atomic_write(folder / f"{name}_{number}.png", "--why") as part:
+            picture: Any = plot_explanation(shown, explanation)
+            picture.savefig(part)
+
+
+def _warn_if_empty(
+    found: Iterator[tuple[str, Detections]], images: Iterator[Path], detector: VehicleDetector, horizon: float
+) -> Iterator[tuple[str, Detections]]:
+    """Pass on what is found; if that is nothing, search some images without the given horizon."""
+    import numpy as np
+
+    from vehicle_detection.camera import estimate_horizon
+    from vehicle_detection.images import read_image
+
+    total = 0
+    for name, vehicles in found:
+        total += len(vehicles)
+        yield name, vehicles
+    if total or not is_limited(detector):
+        return
+    boxes, shape = [np.empty((0, 4))], tuple[int, ...]()
+    with search_everywhere(detector.model, None) as everywhere:
+        for image in map(read_image, itertools.islice(images, _CHECKED_IMAGES)):
+            shape = shape or image.shape[:2]
+            if image.shape[:2] == shape:
+                boxes.append(everywhere.detect(image).boxes)
+    estimate = None
+    with contextlib.suppress(InvalidInputError):  # too few boxes
+        estimate = estimate_horizon(np.concatenate(boxes), shape)
+    warn_of_horizon(f"--horizon {horizon}", estimate)

@@ -1,0 +1,77 @@
+"""The command that trains the default network on labelled frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from typer import Argument
+
+from vehicle_detection.cli.info import print_held_out
+from vehicle_detection.cli.options import option
+from vehicle_detection.cli.output import check_distinct_paths, name_kept_files, option_names, print_line
+
+
+@option_names(random_state="--seed", sources="DATA", initial="--model")
+def train_frames(
+    data: Annotated[
+        Path,
+        Argument(metavar="DATA", help="Folder with labels/NAME.csv and frames/NAME/ or videos/NAME.mp4."),
+    ],
+    output: Annotated[Path, option("FILE", "Model file to write, such as own.onnx.", "-o", "--output")],
+    model: Annotated[
+        str, option("MODEL", '"default" or a file of this command to continue from, such as own.onnx.')
+    ] = "default",
+    steps: Annotated[
+        int | None,
+        option("N", "Steps of 8 samples, 0.6 s each on two cores; default: 5 per frame, 200 to 1200."),
+    ] = None,
+    device: Annotated[str | None, option("cpu|cuda", "Default: cuda where PyTorch offers it.")] = None,
+    curves: Annotated[
+        Path | None, option("FILE.csv", "Precision and recall on each set of held-out frames.")
+    ] = None,
+    jobs: Annotated[int | None, option("N", "Threads, such as 2; default: all cores.")] = None,
+    seed: Annotated[int, option("N", "Random seed.")] = 0,
+) -> None:
+    """Continue the training of the default model on labelled frames, and evaluate it on a fifth of them.
+
+    An interrupted training is continued by the same command.
+    """
+    from vehicle_detection._common import check_suffix, check_target, pluralize
+    from vehicle_detection.training import find_sources, fine_tune_network, write_curves
+
+    named = {"--output": output, "--curves": curves}
+    targets = {name: check_target(path, name) for name, path in named.items() if path is not None}
+    check_distinct_paths(targets, {"DATA": data})
+    check_suffix(output, "--output", (".onnx",))
+    sources = find_sources(data)
+    for source in sources:
+        for part in source.sets:
+            empty = sum(not len(part.labels.rows(key)) for key in part.keys)
+            boxes = pluralize(len(part.labels), "box", "es")
+            print_line(f"{source.name}: {pluralize(len(part), 'frame')}, {boxes}, {empty} frames without any")
+    checkpoint = output.with_name(f"{output.name}.checkpoint")
+    if checkpoint.exists():
+        print_line(f"continuing the training of {checkpoint}")
+    try:
+        tuned = fine_tune_network(
+            sources,
+            initial=model,
+            steps=steps,
+            random_state=seed,
+            n_jobs=jobs,
+            device=device,
+            checkpoint=checkpoint,
+            on_step=lambda _, line: print_line(line),
+        )
+    except KeyboardInterrupt as error:
+        if checkpoint.exists():
+            error.args = (f"; the same command continues from {checkpoint}",)
+        raise
+    with name_kept_files(targets.values()):
+        tuned.model.save(output)
+        if curves is not None:
+            write_curves(curves, tuned.folds)
+    metrics = tuned.model.metadata["metrics"]
+    print_held_out(metrics["held_out"], metrics["held_out_before"])
+    print_line(f"wrote {', '.join(map(str, targets.values()))}")

@@ -1,0 +1,167 @@
+"""What ``video`` writes beside the annotated copy: tracks, report, events, clips and subtitles."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vehicle_detection.cli.output import option_names, print_error, print_line
+from vehicle_detection.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from vehicle_detection.cli.video_options import VideoOptions
+    from vehicle_detection.detector import VehicleDetector
+    from vehicle_detection.events import Event, TrackLog
+    from vehicle_detection.report import ReportWriter, TrackPicture
+    from vehicle_detection.video import FrameSource, OwnSpeed, VideoReport
+
+# Fraction of the frames without a known own speed from which on a warning is printed.
+_MAX_UNKNOWN = 0.05
+_MAX_OWN_SPEED = 500.0
+
+
+def read_speed(own_speed: str | None, gpx: Path | None, offset: float) -> OwnSpeed | None:
+    """Speed of the own vehicle: constant (km/h, or with its unit), from a file, or unknown."""
+    from vehicle_detection._common import UNITS, describe
+    from vehicle_detection.video import OwnSpeed, read_own_speed
+
+    if gpx is not None:
+        if own_speed is not None:
+            raise InvalidInputError("--own-speed and --gpx both state the own speed; give one of them")
+        with option_names(path="--gpx", offset="--gpx-offset"):
+            return read_own_speed(gpx, offset=offset)
+    if offset:
+        raise InvalidInputError("--gpx-offset needs --gpx; give the file, or omit the offset")
+    if own_speed is None:
+        return None
+    found = re.fullmatch(r"(\d{1,3}(?:\.\d*)?) ?(km/h|kmh|mph)?", own_speed.strip().lower())
+    if found is None or float(found[1]) > _MAX_OWN_SPEED:
+        raise InvalidInputError(
+            f"--own-speed must be a speed of at most {_MAX_OWN_SPEED:g}, such as 100 (km/h) or 62mph; got "
+            f"{describe(own_speed)}"
+        )
+    return OwnSpeed.constant(float(found[1]) / UNITS["imperial" if found[2] == "mph" else "metric"].speed)
+
+
+class SideOutputs:
+    """Files of ``video`` beside the video; their options are checked before the work starts."""
+
+    def __init__(self, options: VideoOptions) -> None:
+        from vehicle_detection._common import check_choice, check_suffix
+        from vehicle_detection.events import EVENT_SUFFIXES, KINDS, SUBTITLE_SUFFIXES
+
+        self._options = options
+        self._page: ReportWriter | None = None
+        self._log: TrackLog
+        self._events: tuple[Event, ...] = ()
+        if options.events is not None:
+            check_suffix(options.events, "--events", EVENT_SUFFIXES)
+        if options.srt is not None:
+            check_suffix(options.srt, "--srt", SUBTITLE_SUFFIXES)
+        self._clip_kinds = list(KINDS)
+        if options.clips_of is not None:
+            if options.clips is None:
+                raise InvalidInputError("--clips-of needs --clips, the folder of the clips; add it")
+            self._clip_kinds = [kind.strip() for kind in options.clips_of.split(",")]
+        for kind in self._clip_kinds:
+            check_choice(kind, "--clips-of", KINDS)
+
+    @contextlib.contextmanager
+    def collect(
+        self, source: FrameSource, detector: VehicleDetector
+    ) -> Iterator[list[Callable[[Any], object]]]:
+        """Yield functions that take each frame's result; the file of tracks is complete after the block."""
+        from vehicle_detection.events import TrackLog
+        from vehicle_detection.export import TrackWriter
+        from vehicle_detection.report import ReportWriter
+
+        options = self._options
+        writers: list[Callable[[Any], object]] = []
+        if options.report is not None and options.output is not None:
+            with option_names(path="--report"):
+                self._page = ReportWriter(
+                    options.report,
+                    video=options.output,
+                    source=options.source,
+                    detector=detector,
+                    units=detector.draw_params.units,
+                )
+        self._log = self._page.log if self._page else TrackLog()
+        # A camera that never ends would fill the memory with tracks that nobody asked for.
+        wanted = options.report, options.events, options.clips, options.srt
+        if not options.quiet or any(path is not None for path in wanted):
+            writers.append(self._page or self._log)
+        with contextlib.ExitStack() as stack:
+            if options.tracks is not None:
+                with option_names(path="--tracks"):
+                    table = TrackWriter(options.tracks, shape=source.info.shape, fps=float(source.info.fps))
+                    writers.append(stack.enter_context(table))
+            yield writers
+
+    def write(self, done: VideoReport, detector: VehicleDetector) -> None:
+        """Find the events, and write all files but that of the tracks."""
+        from vehicle_detection.events import cut_clips, write_events, write_subtitles
+
+        options, fps, log = self._options, float(done.fps), self._log
+        events = self._events = self._find_events(done, detector)
+        if options.events is not None:
+            with option_names(path="--events"):
+                write_events(events, options.events)
+        if options.srt is not None:
+            units = detector.draw_params.units
+            with option_names(path="--srt"):
+                write_subtitles(
+                    log, options.srt, fps=fps, events=events, own_speed=detector.own_speed, units=units
+                )
+        if self._page is not None:
+            pictures = self._explain(detector) if options.why else []
+            self._page.finish(done, events=events, pictures=pictures)
+        if options.clips is not None and options.output is not None:
+            # Last, because there may be thousands of clips.
+            chosen = [event for event in events if event.kind in self._clip_kinds]
+            cut_clips(chosen, options.output, options.clips, fps=fps, progress=not options.quiet)
+
+    def _find_events(self, done: VideoReport, detector: VehicleDetector) -> tuple[Event, ...]:
+        """Find the events of a processed video, and warn if the own speed is unknown for a part of it."""
+        import numpy as np
+
+        from vehicle_detection.events import find_events
+
+        log, fps, speeds = self._log, float(done.fps), None
+        if detector.own_speed is not None:
+            speeds = log.own_speeds(detector.own_speed, fps)
+            unknown = float(np.isnan(speeds).mean()) if len(speeds) else 0.0
+            if unknown > _MAX_UNKNOWN and not self._options.quiet:
+                print_error(
+                    f"warning: the own speed is known for {1 - unknown:.0%} of the video; check "
+                    "--gpx-offset, and that the file has no gaps of over 5 s"
+                )
+        camera = detector.camera_of(done.shape)
+        return find_events(log, fps=fps, shape=done.shape, camera=camera, own_speed_mps=speeds)
+
+    def _explain(self, detector: VehicleDetector) -> list[TrackPicture]:
+        """Explain a box of each vehicle, for the report."""
+        from vehicle_detection.explanation import explain_tracks
+        from vehicle_detection.report import TrackPicture
+
+        with self._options.open_source() as source:
+            return [
+                TrackPicture(track_id, found.frame, found.picture, str(found.explanation))
+                for track_id, found in explain_tracks(detector, source, self._log).items()
+            ]
+
+    def print_summary(self, done: VideoReport) -> None:
+        """Print the counts of a drive in one line, and the number of events of each other kind in another."""
+        from vehicle_detection.events import COUNTED, KINDS, count_vehicles
+
+        if not len(self._log.counts):
+            return
+        print_line(count_vehicles(self._events, self._log, fps=float(done.fps)).summary())
+        kinds = Counter(event.kind for event in self._events if event.kind not in COUNTED)
+        if kinds:
+            listed = ", ".join(f"{kinds[kind]} {KINDS[kind]}" for kind in KINDS if kinds[kind])
+            print_line(f"events: {listed}")
