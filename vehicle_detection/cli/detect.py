@@ -88,7 +88,7 @@ def detect(options: DetectOptions) -> None:
     left_out: list[Path] = []
     loaded = open_model(options.model, options.classes, options.device)
     with (
-        VehicleDetector(loaded, conf=options.conf, horizon=options.horizon, blur=options.blur) as detector,
+        VehicleDetector(loaded, conf=options.conf, horizon=options.horizon) as detector,
         output_folder(options.output, "--output"),
         output_folder(options.why, "--why"),
     ):
@@ -180,7 +180,7 @@ def _detect_each(
             for box, text in zip(found.boxes.tolist(), score_texts(found))
         )
         print_line(f"{path}: {pluralize(len(found), 'vehicle')}{listed}")
-        shown = image if options.blur is None else blur_boxes(image, found.boxes, region=detector.blur)
+        shown = image if options.blur is None else blur_boxes(image, found.boxes, region=options.blur)
         if options.why is not None:
             _write_explanations(options.why, path.name, detector, image, shown, found)
         if options.output is not None:

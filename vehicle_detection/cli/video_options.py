@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument
 
@@ -173,13 +173,8 @@ class VideoOptions:
         from vehicle_detection.annotator import DrawParams
 
         fields = [field.strip() for field in self.labels.split(",")]
-        return DrawParams(
-            labels=() if fields == ["none"] else fields,
-            line_width=self.line_width,
-            color_by=self.color_by,
-            panel=self.panel,
-            units=self.units,
-        )
+        style: dict[str, Any] = {"color_by": self.color_by, "panel": self.panel, "units": self.units}
+        return DrawParams(labels=() if fields == ["none"] else fields, line_width=self.line_width, **style)
 
     def open_source(self) -> FrameSource:
         """Open the source."""

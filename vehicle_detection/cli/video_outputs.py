@@ -62,7 +62,7 @@ class SideOutputs:
             check_suffix(options.events, "--events", EVENT_SUFFIXES)
         if options.srt is not None:
             check_suffix(options.srt, "--srt", SUBTITLE_SUFFIXES)
-        self._clip_kinds = list(KINDS)
+        self._clip_kinds: list[str] = [*KINDS]
         if options.clips_of is not None:
             if options.clips is None:
                 raise InvalidInputError("--clips-of needs --clips, the folder of the clips; add it")
