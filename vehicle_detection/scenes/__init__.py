@@ -3,6 +3,7 @@
 A pinhole camera looks along a flat, straight road; vehicles are painted bodies in true perspective.
 """
 
+from vehicle_detection.scenes.camera_light import SceneView
 from vehicle_detection.scenes.drive import Drive, render_drive, write_labels
 from vehicle_detection.scenes.patches import render_patches
 from vehicle_detection.scenes.render import VehicleTruth
@@ -12,6 +13,7 @@ __all__ = [
     "Drive",
     "Scene",
     "SceneVehicle",
+    "SceneView",
     "VehicleTruth",
     "render_drive",
     "render_patches",

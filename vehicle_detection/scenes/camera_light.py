@@ -8,7 +8,18 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vehicle_detection._common import (
+    Checked,
+    check_integer,
+    check_number,
+    checked_field,
+    choice,
+    describe,
+    integer,
+    number,
+)
 from vehicle_detection.camera import Camera
+from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.scenes.raster import Color, Doubles, Floats, Image, Rng, tile_to, wrapped_noise
 
 _GRAIN_SIDE = 512  # side of the noise tile (px)
@@ -121,6 +132,42 @@ class SceneConfig:
     def pitched(self, offset: int) -> SceneConfig:
         """Return the configuration with the horizon `offset` rows lower."""
         return replace(self, camera=replace(self.camera, horizon_px=self.camera.horizon_px + offset))
+
+
+def _check_shape(shape: object, name: str) -> tuple[int, int]:
+    if not isinstance(shape, tuple) or len(shape) != 2:
+        raise InvalidInputError(f"{name} must be (height, width) in pixels, got {describe(shape)}")
+    height, width = (
+        check_integer(size, f"{name}[{axis}]", low=64, high=4320) for axis, size in enumerate(shape)
+    )
+    return height, width
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneView(Checked):
+    """Options of a scene or drive: camera, light and weather."""
+
+    shape: tuple[int, int] = checked_field((720, 1280), _check_shape)  # height and width (px)
+    horizon: float = number(0.56, low=0.1, high=0.9)  # row as a fraction of the height
+    camera_height_m: float = number(1.3, low=0.5, high=5)
+    focal_px: float | None = None  # None: 0.9 times the longer side
+    light: str = choice("day", LIGHTS)
+    rain: float = number(0.0, low=0, high=1)  # 0 (dry) to 1 (heavy): streaks, haze, less contrast, more noise
+    jpeg_quality: int | None = integer(None, low=1, high=100)
+
+    def configure(self, rng: Rng, margin: int = 0) -> SceneConfig:
+        """Return the configuration with an exact camera, and a random sun and seed."""
+        height, width = self.shape
+        focal_px = 0.9 * max(self.shape)
+        if self.focal_px is not None:
+            focal_px = check_number(self.focal_px, "focal_px", low=0.2 * width, high=10.0 * width)
+        camera = Camera(
+            focal_px=focal_px, horizon_px=self.horizon * height, height_m=self.camera_height_m,
+            focal_std=0.0, height_std_m=0.0, shape=self.shape,
+        )  # fmt: skip
+        seed = int(rng.integers(2**62))
+        light = make_light(self.light, self.rain, np.random.default_rng([seed, 4]))
+        return SceneConfig(self.shape, camera, light, self.rain, self.jpeg_quality, margin, seed)
 
 
 def _tone_curve() -> NDArray[np.uint8]:

@@ -8,14 +8,15 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from vehicle_detection._common import atomic_write, check_choice, check_integer, check_number
-from vehicle_detection.scenes.camera_light import SceneConfig
+from vehicle_detection.scenes.camera_light import SceneConfig, SceneView
 from vehicle_detection.scenes.raster import Rng
 from vehicle_detection.scenes.render import VehiclePose, VehicleTruth
-from vehicle_detection.scenes.scene import RandomState, Scene, SceneRenderer, make_config, make_generator
+from vehicle_detection.scenes.scene import RandomState, Scene, SceneRenderer, make_generator
 from vehicle_detection.scenes.scenery import LANE, Road
 from vehicle_detection.scenes.shapes import random_appearance
 from vehicle_detection.scenes.vehicles import VehicleBody
@@ -230,16 +231,10 @@ def render_drive(
     *,
     frames: int = 250,
     fps: float = 25.0,
-    shape: tuple[int, int] = (720, 1280),
     scenario: str = "highway",
-    horizon: float = 0.56,
-    camera_height_m: float = 1.3,
-    focal_px: float | None = None,
-    light: str = "day",
-    rain: float = 0.0,
     pitch_jitter_px: int = 0,
-    jpeg_quality: int | None = None,
     random_state: RandomState = 0,
+    **view: Any,
 ) -> Drive:
     """Render a drive along a highway at 97 km/h, frame by frame.
 
@@ -255,10 +250,10 @@ def render_drive(
         oncoming. ``"passing"``: vehicles that the camera overtakes in one lane, and that overtake it in
         another. ``"closing"``: the distance to the vehicle ahead shrinks fast, and grows again.
         ``"cut_in"``: a car moves into the lane of the camera. ``"empty"``: no vehicles.
-    shape, horizon, camera_height_m, focal_px, light, rain, jpeg_quality, random_state
-        As for `render_scene`.
     pitch_jitter_px
         Largest number of rows by which the pitch of the camera moves the horizon up or down.
+    random_state, **view
+        As for `render_scene`.
 
     Returns
     -------
@@ -281,7 +276,7 @@ def render_drive(
     fps = check_number(fps, "fps", low=1.0, high=1000.0)
     check_choice(scenario, "scenario", SCENARIOS)
     margin = check_integer(pitch_jitter_px, "pitch_jitter_px", low=0, high=50)
-    config = make_config(shape, horizon, camera_height_m, focal_px, light, rain, jpeg_quality, rng, margin)
+    config = SceneView(**view).configure(rng, margin)
     return Drive(config, *make_traffic(scenario, frames / fps, rng), frames=frames, fps=fps)
 
 

@@ -11,17 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_detection._common import (
-    check_choice,
-    check_integer,
-    check_number,
-    check_sequence,
-    describe,
-    store_number,
-)
+from vehicle_detection._common import Checked, check_integer, check_sequence, choice, describe, number
 from vehicle_detection.camera import Camera
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.scenes.camera_light import LIGHTS, SceneConfig, Sensor, make_light
+from vehicle_detection.scenes.camera_light import SceneConfig, SceneView, Sensor
 from vehicle_detection.scenes.raster import Image, Rng
 from vehicle_detection.scenes.render import VehiclePose, VehicleTruth, composite
 from vehicle_detection.scenes.scenery import Road, Scenery
@@ -32,25 +25,15 @@ RandomState = int | np.random.Generator | None
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneVehicle:
+class SceneVehicle(Checked):
     """A vehicle to place in a scene; `kind` and `color` are random if they are None."""
 
-    distance_m: float  # along the road from the camera to the nearer tires
-    lateral_m: float = 0.0  # from the camera to the right to the vehicle's middle; a lane is 3.6 m wide
-    kind: str | None = None  # hatchback, estate, sedan, mpv, suv, van or truck
-    color: str | None = None  # one of `COLORS`
-    view: str = "rear"  # the end that the camera sees, rear or front
-    speed_mps: float = 0.0  # away from the camera; only for the ground truth
-
-    def __post_init__(self) -> None:
-        store_number(self, "distance_m", low=2.0, high=1000.0)
-        store_number(self, "lateral_m", low=-100.0, high=100.0)
-        if self.kind is not None:
-            check_choice(self.kind, "kind", VEHICLE_SHAPES)
-        if self.color is not None:
-            check_choice(self.color, "color", COLORS)
-        check_choice(self.view, "view", ("rear", "front"))
-        store_number(self, "speed_mps", low=-150.0, high=150.0)
+    distance_m: float = number(low=2, high=1000)  # along the road from the camera to the nearer tires
+    lateral_m: float = number(0.0, low=-100, high=100)  # of its middle, to the right; a lane is 3.6 m wide
+    kind: str | None = choice(None, VEHICLE_SHAPES)  # hatchback, estate, sedan, mpv, suv, van or truck
+    color: str | None = choice(None, COLORS)
+    view: str = choice("rear", ("rear", "front"))  # the end that the camera sees
+    speed_mps: float = number(0.0, low=-150, high=150)  # away from the camera; only for the ground truth
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,37 +49,6 @@ class Scene:
     def boxes(self) -> NDArray[np.int64]:
         """``(N, 4)`` boxes of the vehicles in `truth`, in the same order."""
         return np.array([row.box for row in self.truth], np.int64).reshape(-1, 4)
-
-
-def make_config(
-    shape: Any, horizon: float, camera_height_m: float, focal_px: float | None, light: str, rain: float,
-    jpeg_quality: int | None, rng: Rng, margin: int = 0,
-) -> SceneConfig:  # fmt: skip
-    """Check the options that scenes and drives have in common."""
-    if not isinstance(shape, tuple) or len(shape) != 2:
-        raise InvalidInputError(f"shape must be (height, width) in pixels, got {describe(shape)}")
-    height, width = (check_integer(shape[axis], f"shape[{axis}]", low=64, high=4320) for axis in (0, 1))
-    horizon_px = check_number(horizon, "horizon", low=0.1, high=0.9) * height
-    height_m = check_number(camera_height_m, "camera_height_m", low=0.5, high=5.0)
-    if focal_px is None:
-        focal_px = 0.9 * max(height, width)
-    else:
-        focal_px = check_number(focal_px, "focal_px", low=0.2 * width, high=10.0 * width)
-    check_choice(light, "light", LIGHTS)
-    rain = check_number(rain, "rain", low=0.0, high=1.0)
-    if jpeg_quality is not None:
-        jpeg_quality = check_integer(jpeg_quality, "jpeg_quality", low=1, high=100)
-    camera = Camera(
-        focal_px=focal_px,
-        horizon_px=horizon_px,
-        height_m=height_m,
-        focal_std=0.0,
-        height_std_m=0.0,
-        shape=(height, width),
-    )
-    seed = int(rng.integers(2**62))
-    lighting = make_light(light, rain, np.random.default_rng([seed, 4]))
-    return SceneConfig((height, width), camera, lighting, rain, jpeg_quality, margin, seed)
 
 
 def make_generator(random_state: RandomState) -> np.random.Generator:
@@ -146,35 +98,25 @@ class SceneRenderer:
 
 def render_scene(
     *,
-    shape: tuple[int, int] = (720, 1280),
     vehicles: Sequence[SceneVehicle] | int | None = None,
     lane: int | None = None,
-    horizon: float = 0.56,
-    camera_height_m: float = 1.3,
-    focal_px: float | None = None,
-    light: str = "day",
-    rain: float = 0.0,
-    jpeg_quality: int | None = None,
     random_state: RandomState = 0,
+    **view: Any,
 ) -> Scene:
     """Render one road scene.
 
     Parameters
     ----------
-    shape, horizon
-        ``(height, width)`` in pixels, and the row of the horizon as a fraction of the height.
     vehicles
         The vehicles to draw, or how many to place at random in the lanes ahead; None places one to five.
     lane
         The lane that the camera drives in: 0 left, 1 middle, 2 right; None chooses one at random.
-    camera_height_m, focal_px
-        Height of the camera above the road, and focal length; None means 0.9 times the longer side.
-    light, rain
-        ``"day"``, ``"overcast"``, ``"dusk"`` or ``"night"``; and 0 (dry) to 1 (heavy): streaks, haze, less
-        contrast, more noise.
-    jpeg_quality, random_state
-        Quality of a JPEG compression, None for none; and seed or generator: the same seed and options give
-        the same bytes.
+    random_state
+        Seed or generator: the same seed and options give the same bytes.
+    **view
+        Fields of `SceneView`: ``shape`` ``(height, width)``; ``horizon`` as a fraction of the height;
+        ``camera_height_m`` and ``focal_px``, by default 0.9 times the longer side; ``light``: day, overcast,
+        dusk or night; ``rain`` from 0 (dry) to 1 (heavy); and ``jpeg_quality``, None for no compression.
 
     Returns
     -------
@@ -194,7 +136,7 @@ def render_scene(
     ((360, 640, 3), 1, 20.0)
     """
     rng = make_generator(random_state)
-    config = make_config(shape, horizon, camera_height_m, focal_px, light, rain, jpeg_quality, rng)
+    config = SceneView(**view).configure(rng)
     own = int(rng.integers(3))
     road = Road(own=own if lane is None else check_integer(lane, "lane", low=0, high=2))
     if vehicles is None:
