@@ -21,11 +21,18 @@ from vehicle_detection._common.checks import check_bool, check_choice, check_int
 
 
 def number(
-    default: Any = MISSING, *, low: float = -math.inf, high: float = math.inf, above: float = -math.inf
+    default: Any = MISSING,
+    *,
+    low: float = -math.inf,
+    high: float = math.inf,
+    above: float = -math.inf,
+    optional: bool = False,
 ) -> Any:
-    """Declare a number in ``[low, high]`` that is greater than `above`."""
+    """Declare a number in ``[low, high]`` that is greater than `above`; if `optional`, it may be None."""
 
-    def check(value: Any, name: str) -> float:
+    def check(value: Any, name: str) -> float | None:
+        if optional and value is None:
+            return None
         found = check_number(value, name, low=low, high=high, above=above)
         return value if type(value) in (int, float) else found  # a number of NumPy becomes a float
 

@@ -61,7 +61,7 @@ class NetworkParams(Checked):
     """
 
     input_size: int | None = integer(None, low=32, high=8192)
-    horizon: float | None = number(0.5, low=0, high=1)
+    horizon: float | None = number(0.5, low=0, high=1, optional=True)
     horizon_tolerance: float = number(0.15, low=0, high=1)
     min_score: float = number(0.0)
 
