@@ -148,6 +148,7 @@ class Result:
     brightness: float
     time: float
     tracks: tuple = ()
+    frame: object = None
     seconds: dict = field(default_factory=lambda: {"search": 0.0, "heat": 0.001, "track": 0.002})
 
 
@@ -160,6 +161,7 @@ class StubDetector:
     def __init__(self, *, pause=0.0):
         self.index, self.pause, self.fps = 0, pause, None
         self.shapes = set()
+        self.annotator = self
 
     def reset(self, *, fps):
         self.index, self.fps = 0, fps
@@ -176,10 +178,16 @@ class StubDetector:
         self.index += 1
         return result
 
-    def annotate(self, frame, result):
+    def skip(self, thumbnail):
+        self.index += 1
+
+    def output_shape(self, shape):
+        return shape
+
+    def draw(self, frame, result):
         drawn = frame.copy()
         drawn[:6, :6] = 255
         return drawn
 
     def __call__(self, frame):
-        return self.annotate(frame, self.track(self.search(frame), time=None))
+        return self.draw(frame, self.track(self.search(frame), time=None))

@@ -52,6 +52,7 @@ WITHOUT_EXAMPLE = {
     "SearchBand": "see SearchParams",
     "SearchResult": "a result of VehicleDetector.search",
     "Track": "a result of Tracker",
+    "TrackRun": "a result of track",
     "draw_diagnostics": "a picture",
     "draw_tracks": "a picture",
     "Split": "a result of split_random",

@@ -38,6 +38,7 @@ MAX_SECONDS = 60
 NOT_CALLED = {
     "course.set_lesson_defaults": "changes later calls; tests/test_course.py",
     "open_dask": "starts a cluster",
+    "write_video": "takes what track returned; tests/video/test_writing.py",
     "fetch_patches": "downloads; its arguments are tested in tests/datasets/test_archives.py",
     "Detections.to_supervision": "needs the package supervision; tests/test_boxes.py",
 }
@@ -45,7 +46,7 @@ NOT_CALLED = {
 
 RESULTS = {
     "BatchReport", "BatchStatus", "DetectionScores", "Event", "Explanation", "FrameResult", "FrameSet",
-    "FrameSource", "HorizonEstimate", "NetworkModel", "SearchResult", "Track", "TrackScores", "TrackedFrame",
+    "FrameSource", "HorizonEstimate", "NetworkModel", "SearchResult", "Track", "TrackScores", "TrackRun",
     "TrainingReport", "Trip", "VehicleCounts", "VideoInfo", "VideoReport", "notebook.ImageDescription",
 }  # fmt: skip
 """Classes whose instances the library makes, and whose constructors therefore check nothing."""
@@ -343,7 +344,7 @@ class _Valid:
             "single_img_features": {"image": patches[0]},
             "split_random": {"patches_or_labels": labels},
             "split_sources": {"train": ("a",), "test": ("b",)},
-            "track": {"source": clip, "model": detector},
+            "track": {"source": clip, "detector": detector},
             "train_and_evaluate": {"params": params, "seeds": 1, "n_jobs": 1},
             "train_classifier": {"labels": labels, "params": params, "n_jobs": 1},
             "write_boxes": {"boxes": [("a.png", windows)]},

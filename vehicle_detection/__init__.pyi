@@ -86,7 +86,6 @@ from .regions import RegionParams, find_vehicles
 from .report import ReportWriter
 from .scenes import render_drive, render_patches, render_scene
 from .search import SearchBand, SearchParams, SearchResult
-from .stream import TrackedFrame, track
 from .svm import VehicleClassifier, load_classifier
 from .tables import TrackTable
 from .tracking import FrameResult, Track, Tracker, TrackParams
@@ -107,6 +106,7 @@ from .transformer import PatchFeatures
 from .video import (
     FrameSource,
     OwnSpeed,
+    TrackRun,
     Trip,
     VideoInfo,
     VideoReport,
@@ -116,6 +116,8 @@ from .video import (
     process_video,
     read_frames,
     read_own_speed,
+    track,
+    write_video,
 )
 from .windows import find_cars, search_windows, slide_window
 
@@ -163,10 +165,10 @@ __all__ = [
     "Track",
     "TrackLog",
     "TrackParams",
+    "TrackRun",
     "TrackScores",
     "TrackTable",
     "TrackWriter",
-    "TrackedFrame",
     "Tracker",
     "TrainingReport",
     "TransientVideoError",
@@ -260,4 +262,5 @@ __all__ = [
     "write_labels",
     "write_subtitles",
     "write_tracks",
+    "write_video",
 ]

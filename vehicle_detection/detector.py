@@ -27,7 +27,7 @@ from vehicle_detection._common import (
     describe,
     pluralize,
 )
-from vehicle_detection.annotator import Annotator, DrawParams
+from vehicle_detection.annotator import Annotator, DrawParams, OwnSpeed
 from vehicle_detection.boxes import Detections, ScoreScale
 from vehicle_detection.camera import (
     GIVEN_LENS_STD,
@@ -59,7 +59,6 @@ from vehicle_detection.tracking import (
     backfill_tracks,
     interpolate_tracks,
 )
-from vehicle_detection.video import OwnSpeed
 
 Path = str | os.PathLike[str]
 Clip = TypeVar("Clip")
@@ -189,7 +188,6 @@ class VehicleDetector(Closing):
             ("region_params", region_params, (RegionParams, HeatParams)),
             ("track_params", track_params, TrackParams),
             ("camera", camera, (Camera, str, os.PathLike)),
-            ("own_speed", own_speed, OwnSpeed),
         ):
             if value is not None:
                 check_type(value, name, kind, "omit it for the default")

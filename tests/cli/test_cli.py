@@ -633,7 +633,7 @@ def test_video_writes_an_annotated_copy_and_tracks(clip, tmp_path):
 def test_video_prints_its_progress_where_no_bar_is_shown(clip, tmp_path, monkeypatch):
     words = ["video", clip, "--tracks", tmp_path / "t.csv", "--fov", 58]
     assert "frames/s" not in run(*words).stderr  # shorter than a minute
-    monkeypatch.setattr("vehicle_detection.video.process._LOG_INTERVAL", 0.0)
+    monkeypatch.setattr("vehicle_detection.video.engine._LOG_INTERVAL", 0.0)
     assert re.search(r"^note: 0:00 of 0:00, \d+ frames/s$", run(*words).stderr, re.MULTILINE)
     assert "frames/s" not in run(*words, "--quiet").stderr
 

@@ -8,7 +8,7 @@ import pytest
 from tests.helpers import StubDetector
 from tests.video.clips import damage_frames, damage_sizes, ffmpeg, gray_frames, write_clip
 from vehicle_detection.errors import VideoError
-from vehicle_detection.video import process_video, read_frames
+from vehicle_detection.video import open_source, process_video, read_frames
 
 LOST = r"lost.mp4 is damaged: 17 of 20 frames cannot be decoded; copy or record it again"
 
@@ -36,7 +36,7 @@ def test_strict_refuses_a_damaged_video_and_keeps_the_old_file(lost, tmp_path):
     target = tmp_path / "out.mp4"
     target.write_bytes(b"old")
     with pytest.raises(VideoError, match=LOST):
-        process_video(lost, target, StubDetector(), strict=True)
+        process_video(open_source(lost, strict=True), target, StubDetector())
     assert target.read_bytes() == b"old"
     assert os.listdir(tmp_path) == ["out.mp4"]
     with pytest.raises(VideoError, match=LOST):

@@ -161,7 +161,7 @@ def test_missing_frames_of_a_segment_are_reported(card, tmp_path):
     assert report.frames == 8 + 3 + 4
     assert re.fullmatch(r".*lost.mp4 is damaged: 5 of 8 frames cannot be decoded; .*", report.damage)
     with pytest.raises(VideoError, match=r"lost.mp4 is damaged: 5 of 8 frames"):
-        process_video(segments, tmp_path / "out.mp4", StubDetector(), strict=True)
+        process_video(open_source(segments, strict=True), tmp_path / "out.mp4", StubDetector())
     assert os.listdir(tmp_path) == ["lost.mp4"]
 
 

@@ -23,7 +23,7 @@ from tests.video.clips import (
     write_clip,
 )
 from vehicle_detection.errors import VideoError
-from vehicle_detection.video import probe_video, process_video, read_frames
+from vehicle_detection.video import open_source, probe_video, process_video, read_frames
 
 
 @pytest.fixture(scope="module")
@@ -331,7 +331,7 @@ def test_the_readable_part_of_an_incomplete_file_is_processed(truncated, tmp_pat
     target.write_bytes(b"an existing file")
     message = r"is incomplete: (\d+) of about 100 frames can be decoded; copy it again"
     with pytest.raises(VideoError, match=message) as caught:
-        process_video(source, target, StubDetector(), strict=True)
+        process_video(open_source(source, strict=True), target, StubDetector())
     assert target.read_bytes() == b"an existing file"
     frames = int(re.search(message, str(caught.value))[1])
     assert 20 < frames < 90

@@ -7,7 +7,7 @@ import types
 import numpy as np
 import pytest
 
-from tests.helpers import StubDetector, random_network
+from tests.helpers import StubDetector
 from tests.video.clips import (
     child_processes,
     frame_numbers,
@@ -16,9 +16,8 @@ from tests.video.clips import (
     sound_seconds,
     write_clip,
 )
-from vehicle_detection import VehicleDetector, stream, track
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.video import process, process_video, viewer
+from vehicle_detection.video import process_video, viewer, writing
 
 
 class Recorder:
@@ -38,7 +37,7 @@ class Recorder:
 @pytest.mark.parametrize("written", [True, False])
 def test_the_shown_frames_are_those_that_are_written(clip, tmp_path, monkeypatch, written):
     window = Recorder()
-    monkeypatch.setattr(process, "open_viewer", lambda title: window)
+    monkeypatch.setattr(writing, "open_viewer", lambda title: window)
     target = tmp_path / "out.mp4" if written else None
     report = process_video(clip, target, StubDetector(), show=True)
     assert len(window.frames) == report.frames == 20
@@ -53,7 +52,7 @@ def test_closing_the_window_ends_the_run_and_completes_the_video(folder, tmp_pat
     clip = write_clip(folder / "long.mp4", gray_frames(20) * 8, sound=True)
     before = child_processes()
     window = Recorder(last=3)
-    monkeypatch.setattr(process, "open_viewer", lambda title: window)
+    monkeypatch.setattr(writing, "open_viewer", lambda title: window)
     report = process_video(clip, tmp_path / "out.mp4", StubDetector(pause=0.01), show=True, workers=1)
     assert 3 <= report.frames < 160
     assert frame_numbers(tmp_path / "out.mp4") == [number % 20 for number in range(report.frames)]
@@ -66,26 +65,13 @@ def test_closing_the_window_ends_the_run_and_completes_the_video(folder, tmp_pat
 @pytest.mark.parametrize("suffix", ["mp4", "mkv"])
 def test_the_sound_ends_with_the_frames_when_the_window_is_closed(folder, tmp_path, monkeypatch, suffix):
     source = write_clip(folder / f"long.{suffix}", [*gray_frames(20)] * 10, fps=20, sound=True)
-    monkeypatch.setattr(process, "open_viewer", lambda title: Recorder(last=3))
+    monkeypatch.setattr(writing, "open_viewer", lambda title: Recorder(last=3))
     target = tmp_path / f"out.{suffix}"
     report = process_video(source, target, StubDetector(pause=0.02), show=True, workers=1)
     assert report.frames <= 100
     assert len(frame_numbers(target)) == report.frames
     assert sound_seconds(target) == pytest.approx(report.frames / 20, abs=0.06)
     assert list(tmp_path.iterdir()) == [target]
-
-
-@pytest.mark.parametrize("as_stream", [True, False])
-def test_results_end_when_the_window_is_closed(clip, monkeypatch, as_stream):
-    window = Recorder(last=4)
-    monkeypatch.setattr(stream, "open_viewer", lambda title: window)
-    with VehicleDetector(random_network(), n_jobs=1, every=1) as detector:
-        results = list(track(clip, detector, stream=as_stream, show=True))
-        assert [result.index for result in results] == [0, 1, 2, 3]
-        if as_stream:
-            np.testing.assert_array_equal(results[2].picture, window.frames[2])
-    assert window.ended
-    assert not running_threads()
 
 
 def test_without_a_display_or_tkinter(clip, monkeypatch):
@@ -98,7 +84,7 @@ def test_without_a_display_or_tkinter(clip, monkeypatch):
     with pytest.raises(
         InvalidInputError, match=r"show needs tkinter, which this Python lacks; .*, or write a video$"
     ):
-        track(clip, random_network(), show=True)
+        process_video(clip, None, StubDetector(), show=True)
     assert not running_threads()
 
 

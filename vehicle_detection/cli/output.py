@@ -110,7 +110,7 @@ def print_warnings() -> Iterator[None]:
     video is printed once a minute in place of a bar.
     """
     logger = logging.getLogger("vehicle_detection")
-    notes = logger.getChild("_kernels" if sys.stderr.isatty() else "video.process")
+    notes = logger.getChild("_kernels" if sys.stderr.isatty() else "video.engine")
     printer, level = _LogPrinter(), notes.level
     logger.addHandler(printer)
     notes.setLevel(logging.INFO)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +40,7 @@ def video(options: VideoOptions) -> None:
     Exit code 3: the source is damaged, and the copy lacks what cannot be decoded.
     """
     from vehicle_detection.cli.video_outputs import SideOutputs
-    from vehicle_detection.video import VideoRun, process_video
+    from vehicle_detection.video import process_video
 
     _check(options)
     outputs = SideOutputs(options)
@@ -51,19 +51,18 @@ def video(options: VideoOptions) -> None:
     with (
         name_kept_files(files),
         output_folder(options.clips, "--clips"),
-        _open(options, run) as (source, detector),
+        _open(options) as (source, detector),
     ):
         with outputs.collect(source, detector) as writers:
             if not options.quiet:
                 # After the other checks: what is refused replaces nothing.
-                VideoRun(source, detector, target=options.output, **run).close()
+                _check_run(options, source, detector)
                 announce_replaced(files)
             done = process_video(
                 source,
                 options.output,
                 detector,
                 progress=not options.quiet,
-                strict=options.strict,
                 show=options.show,
                 on_result=lambda result: [write(result) for write in writers],
                 **run,
@@ -81,6 +80,15 @@ def video(options: VideoOptions) -> None:
             print_line(f"wrote {', '.join(map(str, written))}")
     if done.damage:
         raise typer.Exit(DAMAGED)
+
+
+def _check_run(options: VideoOptions, source: FrameSource, detector: VehicleDetector) -> None:
+    """Refuse what `process_video` would refuse, before anything is computed or replaced."""
+    from vehicle_detection.video import check_video_target, track
+
+    track(source, detector, workers=options.jobs, **options.span()).close()
+    if options.output is not None:
+        check_video_target(options.output, source.files, preset=options.preset)
 
 
 def _check(options: VideoOptions) -> None:
@@ -123,11 +131,10 @@ def _check(options: VideoOptions) -> None:
 
 
 @contextlib.contextmanager
-def _open(options: VideoOptions, run: Mapping[str, Any]) -> Iterator[tuple[FrameSource, VehicleDetector]]:
+def _open(options: VideoOptions) -> Iterator[tuple[FrameSource, VehicleDetector]]:
     """Open the source and the detector; its horizon is estimated first if the option says so."""
     from vehicle_detection.cli.video_outputs import read_speed
     from vehicle_detection.detector import VehicleDetector
-    from vehicle_detection.video import VideoRun
 
     settings: dict[str, Any] = {
         "conf": options.conf,
@@ -151,7 +158,7 @@ def _open(options: VideoOptions, run: Mapping[str, Any]) -> Iterator[tuple[Frame
             # The estimate takes seconds: refuse invalid options before it.
             with VehicleDetector(model, **settings) as unsure:
                 unsure.camera_of(source.info.shape)
-                VideoRun(source, unsure, target=options.output, **run).close()
+                _check_run(options, source, unsure)
             horizon = find_horizon(source, model, conf=options.conf, quiet=options.quiet, **options.span())
         with VehicleDetector(model, horizon=horizon, **settings) as detector:
             yield source, detector

@@ -180,4 +180,10 @@ class VideoOptions:
         """Open the source."""
         from vehicle_detection.video import open_source
 
-        return open_source(self.source, fps=self.fps, live=self.live or None, reconnect=not self.no_reconnect)
+        return open_source(
+            self.source,
+            fps=self.fps,
+            live=self.live or None,
+            reconnect=not self.no_reconnect,
+            strict=self.strict,
+        )

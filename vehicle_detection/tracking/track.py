@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vehicle_detection._common import Checked, Floats, choice, integer, number, pluralize
 from vehicle_detection.boxes import Detections
@@ -176,6 +177,8 @@ class FrameResult:
     searched
         Whether the frame was searched. If not, it has neither windows nor detections, and its tracks are
         interpolated or predicted.
+    frame
+        The ``(H, W, 3)`` uint8 RGB frame, if `track` was asked for frames; otherwise None.
     """
 
     index: int
@@ -185,6 +188,7 @@ class FrameResult:
     tracks: tuple[Track, ...]
     seconds: dict[str, float] = field(default_factory=dict)
     searched: bool = True
+    frame: NDArray[np.uint8] | None = field(default=None, compare=False)
 
     @property
     def shown(self) -> tuple[Track, ...]:

@@ -1,35 +1,48 @@
-"""Reading and writing video: sources, trips, own speed, ffmpeg, the pipeline and the annotated video."""
+"""Reading and writing video: sources, ffmpeg, the engine that tracks, and the annotated video."""
 
-from vehicle_detection.video.files import walk_files
-from vehicle_detection.video.frame_source import FrameSource
+from vehicle_detection.video.engine import TrackRun, VideoDetector, VideoReport, track
+from vehicle_detection.video.files import is_video_file, list_files, walk_files
 from vehicle_detection.video.horizon import estimate_video_horizon
 from vehicle_detection.video.own_speed import OwnSpeed, read_own_speed
-from vehicle_detection.video.pipeline import VideoDetector
 from vehicle_detection.video.probe import VideoInfo
-from vehicle_detection.video.process import PRESETS, VideoReport, VideoRun, cut_video, process_video
-from vehicle_detection.video.reading import probe_video, read_frames
 from vehicle_detection.video.remote import download, open_filesystem, with_retries
-from vehicle_detection.video.sources import Source, borrow_source, open_source
-from vehicle_detection.video.trips import Trip, find_trips, is_video_file
+from vehicle_detection.video.sources import (
+    FrameSource,
+    Source,
+    borrow_source,
+    open_source,
+    probe_video,
+    read_frames,
+)
+from vehicle_detection.video.trips import Trip, find_trips
 from vehicle_detection.video.viewer import Viewer, open_viewer
+from vehicle_detection.video.writing import (
+    PRESETS,
+    check_video_target,
+    cut_video,
+    process_video,
+    write_video,
+)
 
 __all__ = [
     "PRESETS",
     "FrameSource",
     "OwnSpeed",
     "Source",
+    "TrackRun",
     "Trip",
     "VideoDetector",
     "VideoInfo",
     "VideoReport",
-    "VideoRun",
     "Viewer",
     "borrow_source",
+    "check_video_target",
     "cut_video",
     "download",
     "estimate_video_horizon",
     "find_trips",
     "is_video_file",
+    "list_files",
     "open_filesystem",
     "open_source",
     "open_viewer",
@@ -37,6 +50,8 @@ __all__ = [
     "process_video",
     "read_frames",
     "read_own_speed",
+    "track",
     "walk_files",
     "with_retries",
+    "write_video",
 ]

@@ -4,42 +4,50 @@ from __future__ import annotations
 
 import glob
 import os
+import re
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PurePath
 
-from vehicle_detection._common import check_path, is_hidden, natural_key
+from vehicle_detection._common import check_path, is_hidden, is_url, natural_key
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.video.probe import probe
-from vehicle_detection.video.trips import find_trips, is_video_file
 
+VIDEO_SUFFIXES = {
+    ".mp4", ".m4v", ".mov", ".mkv", ".avi", ".webm", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".3gp",
+}  # fmt: skip
+"""Suffixes of the videos that a folder is searched for."""
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
 """Suffixes of the images that a folder is searched for."""
 
 
-def list_files(path: Path) -> list[Path]:
-    """List the files of a source: a file, or the videos of one trip or images of a folder or pattern."""
+def is_video_file(file: Path | str) -> bool:
+    """Whether the name of a file, or a URL, has the suffix of a video, and is not hidden."""
+    text = os.fspath(file)
+    name = PurePath(re.split("[?#]", text)[0] if text.startswith(("http://", "https://")) else text)
+    return name.suffix.lower() in VIDEO_SUFFIXES and not name.name.startswith(".")
+
+
+def list_files(source: str | os.PathLike[str]) -> list[Path]:
+    """List the videos of a folder or pattern in the order of their paths, or else its images by their names.
+
+    Empty if the source is anything else.
+    """
+    text = os.fsdecode(source)
+    path = check_path(text, "source", kind="the path of a video file")
+    if is_url(text):
+        return []
     if path.is_dir():
         found = sorted(each for each in walk_files(path) if each.is_file())
-    elif not path.exists() and glob.has_magic(str(path)):
-        found = sorted(Path(each) for each in glob.glob(str(path), recursive=True))
+    elif not path.exists() and glob.has_magic(text):
+        found = sorted(Path(each) for each in glob.glob(text, recursive=True))
         found = [each for each in found if each.is_file()]
     else:
-        return [check_file(path)]
-    videos = [each for each in found if is_video_file(each)]
-    if not videos:
-        images = [each for each in found if each.suffix.lower() in IMAGE_SUFFIXES]
-        if not images:
-            raise InvalidInputError(f"source {path} holds no videos and no images; check the path")
-        return sorted(images, key=lambda image: natural_key(str(image)))
-    trips = find_trips(videos, duration=lambda each: probe(each).duration)
-    if len(trips) > 1:
-        listed = "; ".join(f"{trip} from {Path(trip.files[0]).name}" for trip in trips[:4])
-        example = videos[0].parent / f"*{Path(trips[0].files[0]).name[-5:]}"
-        raise InvalidInputError(
-            f"source {path} holds {len(trips)} trips ({listed}{', ...' if len(trips) > 4 else ''}); select "
-            f"one with a pattern such as '{example}', or process all with vehicle-detection batch"
-        )
-    return [Path(file) for file in trips[0].files]
+        return []
+    images = [each for each in found if each.suffix.lower() in IMAGE_SUFFIXES]
+    files = [each for each in found if is_video_file(each)]
+    files = files or sorted(images, key=lambda image: natural_key(str(image)))
+    if not files:
+        raise InvalidInputError(f"source {path} holds no videos and no images; check the path")
+    return files
 
 
 def walk_files(folder: Path, name: str = "source") -> Iterator[Path]:

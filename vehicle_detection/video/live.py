@@ -28,7 +28,7 @@ from vehicle_detection.video.ffmpeg import (
     video_error,
 )
 from vehicle_detection.video.probe import VideoInfo
-from vehicle_detection.video.streams import Reader
+from vehicle_detection.video.reading import Reader
 from vehicle_detection.video.yuv import ColorEncoding, rgb_from_planes
 
 _LOGGER = logging.getLogger(__name__)

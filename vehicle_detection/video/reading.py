@@ -1,94 +1,318 @@
-"""Properties and frames of one video file, and ranges of time."""
+"""Reading the frames of one video file through a pipe from ffmpeg, and finding what is damaged in it.
+
+moviepy's reader copies each frame twice and rounds the frame rate to two decimals. ffmpeg skips what it
+cannot decode and ends with exit code 0, so its frames and its log must be checked.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import math
-import os
+import re
+import sys
+from dataclasses import dataclass
 from fractions import Fraction
+from pathlib import Path
+from typing import Self
 
-from vehicle_detection._common import check_number
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.video.files import check_file
-from vehicle_detection.video.probe import VideoInfo, probe
-from vehicle_detection.video.streams import FrameReader
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection._common import Closing, check_number, pluralize
+from vehicle_detection.errors import InvalidInputError, VideoError
+from vehicle_detection.video.ffmpeg import (
+    Process,
+    check_resources,
+    exit_reason,
+    input_options,
+    last_line,
+    pixel_limit,
+    seconds_of,
+    source_name,
+    video_error,
+)
+from vehicle_detection.video.probe import VideoInfo
+from vehicle_detection.video.yuv import FORMATS, rgb_from_planes
+
+_LOGGER = logging.getLogger(__name__)
+
+# Part of a frame by which reading starts early: less than half, because ffmpeg rounds to the nearest frame.
+_EARLY = Fraction(2, 5)
+# Maximum duration in seconds of one frame of a video with a varying rate, when reading starts inside it.
+_MAX_FRAME_DURATION = 5
+# More threads wait for each other, and the search needs the cores.
+_DECODER_THREADS = "2"
+_TRUNCATED = re.compile(r"partial file|ended prematurely")
+# Containers with an index of their key frames. It may hold the times of decoding, which are earlier than
+# those of display by this many seconds at most.
+_INDEXED = ("mov", "matroska")
+_REORDERING = 0.5
+# Steps in seconds by which a seek is moved back until decoding begins before the wanted time; in a network,
+# where each costs a connection, only some.
+_STEPS = (0, 1, 4, 16, 64)
+_NETWORK_STEPS = (4, 64)
+# Error of a frame rate that ffmpeg has derived from the file's times.
+_RATE_ERROR = Fraction(6, 1000)
+_REPEATED = re.compile(r"Last message repeated (\d+) times")
 
 
-def probe_video(path: str | os.PathLike[str]) -> VideoInfo:
-    """Read the properties of a video file: frame size, exact frame rate, length, sound and rotation.
+class Reader(Closing):
+    """Frames of a source, in order: an iterator of ``(index, time, frame)`` and a context manager."""
 
-    Parameters
-    ----------
-    path
-        A file that ffmpeg can read.
+    info: VideoInfo
+    damage: str = ""
+    """What is damaged in the source; known after the last frame, and empty if nothing is."""
 
-    Returns
-    -------
-    VideoInfo
-        The properties; ``frames`` is an estimate, because counting requires decoding the whole video.
+    @property
+    def cpu_seconds(self) -> float:
+        """Processor time of ffmpeg, known after it has ended."""
+        return 0.0
 
-    Raises
-    ------
-    InvalidInputError
-        If the file is missing, a folder, or not readable.
-    VideoError
-        If the file is not a video, or its first frame cannot be decoded.
+    def __iter__(self) -> Self:
+        return self
 
-    Examples
-    --------
-    >>> probe_video("missing.mp4")
-    Traceback (most recent call last):
-    ...
-    vehicle_detection.errors.InvalidInputError: source missing.mp4 does not exist; check the path
+    def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
+        raise NotImplementedError
+
+    def kill(self) -> None:
+        """End at once, from any thread; a thread that reads sees the end."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """End and release everything."""
+        self.kill()
+
+
+class FrameReader(Reader):
+    """Frames of a video file, as `read_frames` returns it.
+
+    ffmpeg ends after the last frame, on :meth:`close`, at the end of a ``with`` block, and when the reader is
+    deleted. After the last frame, `damage` says what is damaged, such as missing frames, which is also logged
+    as a warning; with `strict` it is raised as an error instead.
     """
-    return probe(check_file(path))
+
+    def __init__(
+        self,
+        path: Path | str,
+        info: VideoInfo,
+        *,
+        first: int = 0,
+        count: int | None = None,
+        strict: bool = False,
+        whole: bool = False,
+    ) -> None:
+        self.info = info
+        self.frames_read = 0
+        self._strict, self._whole = strict, whole
+        self._killed = False
+        self._path, self._first, self._count = path, first, count
+        # All frames get the probed size: a stream may change its size, and pixels may not be square.
+        filters = [f"scale={info.width}:{info.height}:flags=bicubic"]
+        early = _EARLY
+        if not info.constant_rate:  # some seconds, to decode the frame that is still shown at the start
+            early = Fraction(min(first, math.ceil(_MAX_FRAME_DURATION * info.fps)))
+        wanted = info.start_time + float((first - early) / info.fps)
+        seek = find_seek_time(path, info, wanted) if first else info.video_offset
+        begin = f"{wanted - seek:.6f}"
+        if not info.constant_rate:
+            filters = [f"fps={info.fps}:start_time={begin}", f"trim=start_frame={early}", *filters]
+        elif first:
+            filters = [f"trim=start={begin}", *filters]
+        options = ["-ss", f"{seek:.6f}"] if seek > info.video_offset else []
+        self._sought = bool(options)
+        options += ["-threads", _DECODER_THREADS, *pixel_limit(), *input_options(path)]
+        options += ["-map", "0:V:0", "-vf", ",".join(filters)]
+        if count is not None:
+            options += ["-frames:v", str(count)]
+        options += ["-fps_mode", "passthrough"]
+        height, width = info.shape[:2]
+        # Planes are read as stored and converted here, which takes half the time of reading RGB.
+        even = height % 2 == 0 and width % 2 == 0
+        self._in_planes = info.pixel_format in FORMATS and info.color_encoding.supported and even
+        pixel_format = info.pixel_format if self._in_planes else "rgb24"
+        self._buffer = np.empty((height * 3 // 2, width) if self._in_planes else info.shape, np.uint8)
+        self._channels = np.empty((3, height, width), np.uint8)
+        options += ["-pix_fmt", pixel_format, "-f", "rawvideo", "pipe:1"]
+        self._process = Process(("-nostdin", *options), stdout=True)
+
+    def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
+        if self._process.stdout.closed:
+            raise StopIteration
+        view = self._buffer.data.cast("B")
+        done = 0
+        while done < len(view):
+            size = self._process.stdout.readinto(view[done:])
+            if not size:
+                self._finish()
+                raise StopIteration
+            done += size
+        if self._in_planes:
+            frame = rgb_from_planes(self._buffer, self.info.color_encoding, self._channels)
+        else:
+            frame = self._buffer.copy()
+        index = self._first + self.frames_read
+        self.frames_read += 1
+        return index, float(index / self.info.fps), frame
+
+    def _finish(self) -> None:
+        """Close ffmpeg after its last frame; raise an error if frames are missing."""
+        code = self._process.wait()
+        log = self._process.log()
+        self.close()
+        if self._killed:
+            return
+        end, name = self._first + self.frames_read, source_name(self._path)
+        complete = self._count is not None and self.frames_read >= self._count
+        incomplete = ""
+        if not complete:
+            check_resources(name, code, log)
+        if not complete and end < self.info.frames - 1 and _TRUNCATED.search(log):
+            incomplete = f"{name} is incomplete: {end} of about {self.info.frames} frames can be decoded"
+        if incomplete and not self.frames_read:
+            start = float(self._first / self.info.fps)
+            incomplete = f"{name} is incomplete: no frame after {start:g} s can be decoded"
+        if incomplete and isinstance(self._path, str):  # the server or the network may be to blame
+            raise video_error(f"{incomplete}; try again", self._path, code, log)
+        if incomplete and self._whole:
+            raise VideoError(f"{incomplete}; copy it again, or leave it out")
+        if code and not complete and not incomplete:
+            message = (
+                f"{name} cannot be decoded after frame {end}: {exit_reason(code, log)}; "
+                "if this happens again, copy the file again"
+            )
+            raise video_error(message, self._path, code, log)
+        if not self.frames_read:
+            start = float(self._first / self.info.fps)
+            what = incomplete or f"{name} has no frame after {start:g} s"
+            raise VideoError(f"{what}; choose an earlier start")
+        # After a jump into the file, the first frames may refer to frames before it, which is no damage.
+        errors = "" if self._sought else log
+        stop = None if self._count is None else self._first + self._count
+        self.damage = (
+            f"{incomplete}; copy it again"
+            if incomplete
+            else find_damage(self._path, self.info, end, errors, stop=stop)
+        )
+        if self.damage and self._strict:
+            raise VideoError(self.damage)
+        if self.damage:
+            _LOGGER.warning("%s", self.damage)
+
+    @property
+    def cpu_seconds(self) -> float:
+        """Processor time of ffmpeg, known after it has ended."""
+        return self._process.cpu_seconds
+
+    def kill(self) -> None:
+        """End ffmpeg at once, from any thread; a thread that reads sees the end of the video."""
+        self._killed = True  # not an error in the file
+        self._process.kill()
+
+    def close(self) -> None:
+        """End ffmpeg if it is still running."""
+        self._process.close()
+
+    def __del__(self) -> None:
+        if hasattr(self, "_process"):
+            self.close()
 
 
-def read_frames(
-    source: str | os.PathLike[str],
-    *,
-    start: float | None = None,
-    end: float | None = None,
-    strict: bool = False,
-) -> FrameReader:
-    """Read the frames of a video file, one at a time; for other sources see `open_source`.
+def find_seek_time(path: Path | str, info: VideoInfo, wanted: float) -> float:
+    """Return a time in the file from which ffmpeg decodes the frame at `wanted`, in seconds.
 
-    Parameters
-    ----------
-    source
-        A file that ffmpeg can read.
-    start, end
-        Time range in seconds: frames with ``start <= time < end`` are read. None: no limit.
-    strict
-        Raise an error after the last frame if the file is damaged: frames are missing, or ffmpeg reports
-        decoding errors. Otherwise a warning is logged, and the reader's ``damage`` says it.
-
-    Returns
-    -------
-    FrameReader
-        An iterator of ``(index, time, frame)``: the frame's number in the file from 0, its time in seconds,
-        and an upright ``(H, W, 3)`` uint8 RGB array. Its ``info`` is the file's `VideoInfo`. ffmpeg ends
-        after the last frame, and at the end of a ``with`` block.
-
-    Raises
-    ------
-    InvalidInputError
-        If the file is missing, or there is no frame between `start` and `end`.
-    VideoError
-        If the file is not a video.
-
-    Examples
-    --------
-    >>> with read_frames("missing.mp4", end=2.0) as frames:  # doctest: +IGNORE_EXCEPTION_DETAIL
-    ...     means = [frame.mean() for index, time, frame in frames]
-    Traceback (most recent call last):
-    ...
-    vehicle_detection.errors.InvalidInputError: source missing.mp4 does not exist; check the path
+    In files without an index, such as MPEG-TS, ffmpeg seeks to a position near the time, and decoding begins
+    with the next key frame, which may be seconds after it. Therefore the time of the first decoded frame is
+    checked.
     """
-    path = check_file(source)
-    start, end = check_span(start, end)
-    info = probe(path)
-    first, count = frame_range(info, start, end)
-    return FrameReader(path, info, first=first, count=count, strict=strict)
+    if not info.duration:  # raw streams have no times; ffmpeg's are wrong after a seek
+        return info.video_offset
+    indexed = info.container.startswith(_INDEXED)
+    steps = _NETWORK_STEPS if isinstance(path, str) else _STEPS
+    for seconds in (_REORDERING,) if indexed else steps:
+        # A whole number of frames earlier, because ffmpeg may round times to frames.
+        seek = wanted - float(math.ceil(seconds * info.fps) / info.fps)
+        if seek <= info.video_offset:
+            break
+        if indexed or _first_time(path, seek) <= wanted - seek:
+            return seek
+    return info.video_offset
+
+
+def _first_time(path: Path | str, seek: float) -> float:
+    """Time of the first frame that is decoded after a seek, from there, in seconds.
+
+    It is infinite if the frame is no key frame: some decoders begin with others, which are gray then.
+    """
+    options = ("-noaccurate_seek", "-ss", f"{seek:.6f}", *input_options(path), "-map", "0:V:0")
+    options += ("-frames:v", "1", "-vf", "showinfo", "-f", "null", "-")
+    with contextlib.closing(Process(("-nostdin", *options), level="info")) as process:
+        check_resources(source_name(path), process.wait(), process.log())
+        found = re.search(r"n: *0 .*?pts_time:(-?[\d.]+).*? iskey:1 ", process.log())
+    return float(found[1]) if found else math.inf
+
+
+def find_damage(path: Path | str, info: VideoInfo, end: int, log: str, *, stop: int | None = None) -> str:
+    """Say what is damaged, or return an empty text.
+
+    `end` is the number of the file's frames up to the last decoded one, `stop` that up to the last one
+    wanted, which may lie after the file's end. `log` holds ffmpeg's errors.
+    """
+    parts = []
+    count, message = _decode_errors(log)
+    announced = end if end == stop else _announced_frames(path, info, end, exact=count > 0)
+    expected = min(announced, stop or sys.maxsize)
+    if expected > end:
+        parts.append(f"{expected - end} of {expected} frames cannot be decoded")
+    if count:
+        parts.append(f"ffmpeg reports {pluralize(count, 'decoding error')} ({message})")
+    return f"{source_name(path)} is damaged: {', and '.join(parts)}; copy or record it again" if parts else ""
+
+
+def _decode_errors(log: str) -> tuple[int, str]:
+    """Count the decoder's errors, and return the last one; the demuxer's concern other streams, too."""
+    count, last = 0, ""
+    for line in log.splitlines():
+        repeated = _REPEATED.search(line)
+        if repeated:
+            count += int(repeated[1]) if last else 0
+        elif line.startswith("[") and not line.startswith("[in#"):
+            count, last = count + 1, line
+    return count, last_line(last)
+
+
+def _announced_frames(path: Path | str, info: VideoInfo, end: int, *, exact: bool) -> int:
+    """Return the number of frames that a file announces; `end` if unknown, or if only rounding differs.
+
+    `exact` allows for no rounding.
+    """
+    if info.frames <= end + (0 if exact else 1):
+        return end
+    # The file's duration is that of its longest stream, which may be the sound.
+    duration = stream_duration(path, info)
+    if duration is None:
+        duration = 0.0 if info.has_audio else float(info.frames / info.fps)
+    expected = round(duration * info.fps)
+    # With a varying rate, the duration of the last frame is unknown.
+    tolerance = (0 if exact else 1) + duration * float(_RATE_ERROR)
+    tolerance += 0 if info.constant_rate else float(info.fps)
+    return expected if expected - end > math.floor(tolerance) else end
+
+
+def stream_duration(path: Path | str, info: VideoInfo) -> float | None:
+    """Duration of the video stream in seconds; None if the file does not state it."""
+    options = ("-nostdin", *input_options(path), "-map", "0:V:0", "-c", "copy", "-frames:v", "1")
+    with contextlib.closing(Process((*options, "-f", "null", "-"), level="trace")) as process:
+        code, log = process.wait(), process.log()
+    check_resources(source_name(path), code, log)
+    mapped = re.search(r"Stream #0:(\d+) -> #0:0", log)
+    index = mapped[1] if mapped else "0"
+    exact = re.search(rf"stream {index}: start_time: \S+ duration: ([\d.]+)", log)
+    if exact:
+        return float(exact[1])
+    # Matroska states the stream's end in a tag, which the log repeats for the output.
+    ends = re.findall(r"DURATION +: (\d+:\d+:[\d.]+)", log)
+    return seconds_of(ends[-1]) - info.first_timestamp if ends else None
 
 
 def check_span(start: float | None, end: float | None) -> tuple[float | None, float | None]:
@@ -122,3 +346,28 @@ def frame_range(info: VideoInfo, start: float | None, end: float | None) -> tupl
             f"got {start or 0:g} s to {end:g} s, choose a later end"
         )
     return first, None if last is None else last - first
+
+
+@dataclass(frozen=True, kw_only=True)
+class AudioSource:
+    """Sound for a written video.
+
+    Attributes
+    ----------
+    input
+        Options of ffmpeg that open it.
+    start
+        Time of the first written frame in the file in seconds.
+    audio_offset
+        Time in the file that is ffmpeg's time 0; later than `start` if the sound starts later.
+    length
+        Maximum length in seconds; None for all.
+    copyable
+        Whether it may be copied without decoding: it is the whole track of one file.
+    """
+
+    input: tuple[str, ...]
+    start: float = 0.0
+    audio_offset: float = 0.0
+    length: float | None = None
+    copyable: bool = False

@@ -1,30 +1,116 @@
-"""`open_source`: any source of frames, such as video files, images, cameras and network streams."""
+"""Sources of frames: video files, consecutive segments, images, cameras and network streams."""
 
 from __future__ import annotations
 
 import contextlib
+import logging
+import math
 import os
 import re
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
-from vehicle_detection._common import check_number, check_path, describe, local_path, temporary_folder
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection._common import (
+    Closing,
+    check_flags,
+    check_number,
+    check_path,
+    describe,
+    local_path,
+    temporary_folder,
+)
 from vehicle_detection.errors import InvalidInputError
+from vehicle_detection.images import read_image
 from vehicle_detection.video.ffmpeg import NETWORK_TIMEOUT, input_options, source_name
-from vehicle_detection.video.files import IMAGE_SUFFIXES, check_file, list_files
-from vehicle_detection.video.frame_source import FrameSource
-from vehicle_detection.video.image_sequence import ImageSequence
+from vehicle_detection.video.files import IMAGE_SUFFIXES, check_file, is_video_file, list_files
 from vehicle_detection.video.live import LiveReader, LiveStream
 from vehicle_detection.video.probe import VideoInfo, probe
+from vehicle_detection.video.reading import (
+    AudioSource,
+    FrameReader,
+    Reader,
+    check_span,
+    frame_range,
+    stream_duration,
+)
 from vehicle_detection.video.remote import download
-from vehicle_detection.video.segments import VideoSegments
-from vehicle_detection.video.streams import AudioSource, FrameReader, Reader
+from vehicle_detection.video.trips import find_trips
+
+_LOGGER = logging.getLogger(__name__)
 
 _URL = re.compile(r"^([a-zA-Z][a-zA-Z0-9+.-]+)://")
 _STREAM_SCHEMES = ("rtsp", "rtsps", "rtmp", "rtmps", "udp", "rtp", "srt", "tcp")
 _RTSP_OPTIONS = ("-rtsp_transport", "tcp", "-timeout", f"{NETWORK_TIMEOUT * 1e6:.0f}")
+
+
+class FrameSource(Closing):
+    """Frames of a file, of several files or of a stream, as `open_source` returns it.
+
+    A context manager, and an iterable of ``(index, time, frame)``: the frame's number from 0, its time in
+    seconds, and an upright ``(H, W, 3)`` uint8 RGB array.
+
+    Attributes
+    ----------
+    name
+        What was opened, for messages.
+    info
+        Properties of the video; ``frames`` and ``duration`` are 0 where the length is unknown.
+    live, rereadable
+        Whether frames that are not read in time are dropped; whether it can be read more than once.
+    strict
+        Whether a damaged file is an error after its last frame, instead of a warning.
+    files
+        Files that are read, in order; empty for streams.
+
+    Examples
+    --------
+    >>> from vehicle_detection import open_source
+    >>> with open_source("test_images/*.jpg", fps=10) as source:
+    ...     print(source.info.frames, source.live, source.rereadable)
+    6 False True
+    """
+
+    live = False
+    rereadable = True
+
+    strict = False
+
+    def __init__(self, name: str, info: VideoInfo, files: Sequence[Path] = ()) -> None:
+        self.name, self.info, self.files = name, info, tuple(files)
+        self._on_close = contextlib.ExitStack()
+
+    def __repr__(self) -> str:
+        info = self.info
+        length = f", {info.duration:g} s" if info.duration else ""
+        return f"FrameSource({self.name}, {info.width}x{info.height} at {float(info.fps):g} Hz{length})"
+
+    def read(self, first: int = 0, count: int | None = None) -> Reader:
+        """Open a reader of the frames from number `first` on, `count` or all of them."""
+        raise NotImplementedError
+
+    def audio(self, first: int = 0, end: float | None = None) -> AudioSource | None:
+        """Return the sound from a frame on, up to an end in seconds; None if there is none."""
+        length = None if end is None else float(Fraction(float(end)) - first / self.info.fps)
+        return self._audio(first, length) if self.info.has_audio else None
+
+    def _audio(self, first: int, length: float | None) -> AudioSource | None:
+        return None
+
+    def __iter__(self) -> Iterator[tuple[int, float, NDArray[np.uint8]]]:
+        with self.read() as reader:
+            yield from reader
+
+    def close(self) -> None:
+        """End its processes and remove its temporary files."""
+        self._on_close.close()
 
 
 class _VideoFile(FrameSource):
@@ -34,12 +120,10 @@ class _VideoFile(FrameSource):
         super().__init__(source_name(path), info, () if isinstance(path, str) else (path,))
         self._path = path
 
-    def read(self, first: int = 0, count: int | None = None, *, strict: bool = False) -> FrameReader:
-        return FrameReader(self._path, self.info, first=first, count=count, strict=strict)
+    def read(self, first: int = 0, count: int | None = None) -> FrameReader:
+        return FrameReader(self._path, self.info, first=first, count=count, strict=self.strict)
 
-    def audio(self, first: int = 0, length: float | None = None) -> AudioSource | None:
-        if not self.info.has_audio:
-            return None
+    def _audio(self, first: int, length: float | None) -> AudioSource:
         return AudioSource(
             input=input_options(self._path),
             start=self.info.start_time + float(first / self.info.fps),
@@ -47,6 +131,188 @@ class _VideoFile(FrameSource):
             length=length,
             copyable=not first and length is None,
         )
+
+
+class _ImageSequence(FrameSource):
+    """Image files as the frames of a video."""
+
+    def __init__(self, paths: Sequence[Path], fps: float) -> None:
+        height, width = read_image(paths[0]).shape[:2]
+        rate = (
+            Fraction(fps).limit_denominator(1001)
+            if fps > 1
+            else 1 / Fraction(1 / fps).limit_denominator(1001)
+        )
+        info = VideoInfo(
+            width=width, height=height, fps=rate, frames=len(paths), duration=float(len(paths) / rate)
+        )
+        super().__init__(f"{paths[0]} to {paths[-1].name}", info, paths)
+
+    def read(self, first: int = 0, count: int | None = None) -> Reader:
+        return _ImageReader(self.info, self.files, first, count)
+
+
+class _ImageReader(Reader):
+    """Reader of image files."""
+
+    def __init__(self, info: VideoInfo, paths: Sequence[Path], first: int, count: int | None) -> None:
+        self.info = info
+        self._paths = paths[: None if count is None else first + count]
+        self._index, self._killed = first, False
+
+    def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
+        if self._killed or self._index >= len(self._paths):
+            raise StopIteration
+        index, path = self._index, self._paths[self._index]
+        frame = read_image(path)
+        if frame.shape != self.info.shape:
+            raise InvalidInputError(
+                f"source must hold images of one size; {path} is {frame.shape[1]}x{frame.shape[0]} and "
+                f"{self._paths[0]} {self.info.width}x{self.info.height}; select the images of one camera"
+            )
+        self._index += 1
+        return index, float(index / self.info.fps), frame
+
+    def kill(self) -> None:
+        self._killed = True
+
+
+class _VideoSegments(FrameSource):
+    """Consecutive video files as one video, with the frame size and rate of the first one."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        infos = [probe(path) for path in paths]
+        first = infos[0]
+        # Sound may be longer than the frames, which would add up.
+        lengths = [
+            (stream_duration(path, info) if info.has_audio else None) or float(info.frames / info.fps)
+            for path, info in zip(paths, infos, strict=True)
+        ]
+        self._infos = [
+            replace(
+                info,
+                width=first.width,
+                height=first.height,
+                fps=first.fps,
+                frames=round(length * first.fps),
+                constant_rate=info.constant_rate and info.fps == first.fps,
+            )
+            for info, length in zip(infos, lengths, strict=True)
+        ]
+        sound = all(info.has_audio and info.audio_format == first.audio_format for info in infos)
+        self._sound_differs = first.has_audio and not sound
+        super().__init__(
+            f"{paths[0]} to {paths[-1].name}",
+            replace(
+                first,
+                frames=sum(info.frames for info in self._infos),
+                duration=sum(lengths),
+                audio_track=first.audio_track if sound else None,
+                audio_codec=first.audio_codec if sound else None,
+                start_time=0.0,
+            ),
+            paths,
+        )
+
+    def read(self, first: int = 0, count: int | None = None) -> Reader:
+        segments = list(zip(self.files, self._infos, strict=True))
+        return _SegmentReader(self.info, segments, first, count, strict=self.strict)
+
+    def audio(self, first: int = 0, end: float | None = None) -> AudioSource | None:
+        if self._sound_differs:
+            _LOGGER.warning(
+                "the segments after %s have sound of another format, or none; the video has none",
+                self.files[0],
+            )
+        return super().audio(first, end)
+
+    def _audio(self, first: int, length: float | None) -> AudioSource:
+        """Join the sound of the segments."""
+        parent = Path(tempfile.gettempdir())
+        folder = self._on_close.enter_context(temporary_folder(parent, "vehicle-segments"))
+        # A path that is not UTF-8 keeps its bytes.
+        with (folder / "segments.txt").open(
+            "w", encoding="utf-8", errors="surrogateescape", newline="\n"
+        ) as file:
+            for path, info in zip(self.files, self._infos, strict=True):
+                quoted = str(path.resolve()).replace("'", r"'\''")
+                seconds = float(info.frames / info.fps)
+                begin = info.first_timestamp
+                file.write(f"file '{quoted}'\ninpoint {begin:.6f}\n")
+                file.write(f"outpoint {begin + seconds:.6f}\nduration {seconds:.6f}\n")
+        # Times as in the list: the first sound may lie before 0, which ffmpeg would take for the start.
+        options = ("-seek_timestamp", "1", "-f", "concat", "-safe", "0", "-i", f"file:{file.name}")
+        return AudioSource(input=options, start=float(first / self.info.fps), length=length)
+
+
+class _SegmentReader(Reader):
+    """Reader of the frames of several files, one after the other."""
+
+    def __init__(
+        self,
+        info: VideoInfo,
+        segments: Sequence[tuple[Path, VideoInfo]],
+        first: int,
+        count: int | None,
+        *,
+        strict: bool,
+    ) -> None:
+        self.info = info
+        self._strict = strict
+        self._cpu_seconds = 0.0
+        self._segments = list(segments)
+        self._index = first
+        self._end = math.inf if count is None else first + count
+        self._lock = threading.Lock()
+        self._killed = False
+        self._reader: FrameReader | None = None
+        # Lengths of skipped segments are known from their headers only, if at all.
+        while len(self._segments) > 1 and first >= (self._segments[0][1].frames or math.inf):
+            first -= self._segments.pop(0)[1].frames
+        self._first = first
+
+    @property
+    def cpu_seconds(self) -> float:
+        return self._cpu_seconds
+
+    def __next__(self) -> tuple[int, float, NDArray[np.uint8]]:
+        while self._index < self._end:
+            reader = self._reader or self._open_next()
+            for _, _, frame in reader:
+                index = self._index
+                self._index += 1
+                return index, float(index / self.info.fps), frame
+            self._close_reader()
+        raise StopIteration
+
+    def _open_next(self) -> FrameReader:
+        with self._lock:
+            if self._killed or not self._segments:
+                raise StopIteration
+            path, info = self._segments.pop(0)
+            # After a segment that is cut off, times and sound of the next one would be wrong.
+            whole = bool(self._segments)
+            self._reader = FrameReader(path, info, first=self._first, strict=self._strict, whole=whole)
+            self._first = 0
+            return self._reader
+
+    def _close_reader(self) -> None:
+        with self._lock:
+            if self._reader is not None:
+                self._reader.close()
+                self._cpu_seconds += self._reader.cpu_seconds
+                self.damage = "; ".join(filter(None, (self.damage, self._reader.damage)))
+                self._reader = None
+
+    def kill(self) -> None:
+        with self._lock:
+            self._killed = True
+            if self._reader is not None:
+                self._reader.kill()
+
+    def close(self) -> None:
+        self.kill()
+        self._close_reader()
 
 
 class _Stream(FrameSource):
@@ -59,7 +325,7 @@ class _Stream(FrameSource):
         self._stream, self.live, self._read = stream, live, False
         self._on_close.callback(stream.close)
 
-    def read(self, first: int = 0, count: int | None = None, *, strict: bool = False) -> Reader:
+    def read(self, first: int = 0, count: int | None = None) -> Reader:
         if self._read:
             raise InvalidInputError(f"source {self.name} can be read only once; open it again")
         self._read = True
@@ -76,6 +342,7 @@ def open_source(
     fps: float = 25.0,
     live: bool | None = None,
     reconnect: bool = True,
+    strict: bool = False,
 ) -> FrameSource:
     """Open any source of frames.
 
@@ -83,8 +350,9 @@ def open_source(
     ----------
     source
         - a video file, or a named pipe;
-        - a folder, a glob pattern such as ``"CARD/*F.MP4"``, or a list of files: the consecutive segments of
-          one trip, which become one video, or else images, in the order of their names;
+        - a list of files: consecutive videos, which become one, or images; `open_trip` finds the files of a
+          trip in a folder;
+        - a folder or a glob pattern with images, in the order of their names, or with one video;
         - ``"-"``: a video on standard input;
         - a camera: its number (``0`` or ``"0"``) or device (``"/dev/video0"``);
         - a network stream: ``rtsp://``, ``rtmp://``, ``udp://``, ``srt://``, or ``http(s)://``, which may
@@ -99,6 +367,10 @@ def open_source(
     reconnect
         Whether to open a network stream of unknown length again when it ends or sends nothing for 10 seconds:
         six attempts within about half a minute, which start over after 10 seconds of frames.
+    strict
+        Raise an error after the last frame if a file is damaged: frames are missing, or ffmpeg reports
+        decoding errors. Otherwise a warning is logged, and ``damage`` of the reader or of the report says it.
+        Streams are not checked.
 
     Returns
     -------
@@ -109,7 +381,7 @@ def open_source(
     Raises
     ------
     InvalidInputError
-        If the source is missing, holds no video and no images, or holds several trips.
+        If the source is missing, holds no video and no images, or several videos.
     VideoError
         If it cannot be decoded.
 
@@ -124,7 +396,14 @@ def open_source(
     """
     if isinstance(source, FrameSource):
         return source
-    fps = check_number(fps, "fps", above=0, high=1000)
+    check_flags(reconnect=reconnect, strict=strict)
+    opened = _open(source, check_number(fps, "fps", above=0, high=1000), live, reconnect)
+    opened.strict = strict
+    return opened
+
+
+def _open(source: object, fps: float, live: bool | None, reconnect: bool) -> FrameSource:
+    """Open a source that is not yet open."""
     if isinstance(source, int) and not isinstance(source, bool):
         source = str(source)
     if isinstance(source, (list, tuple)):
@@ -146,7 +425,17 @@ def open_source(
         return _open_camera(text, live is not False)
     if path.is_fifo():
         return _Stream(LiveStream(text, input_options(path)), live=bool(live))
-    files = list_files(path)
+    files = list_files(path) or [check_file(path)]
+    if len(files) > 1 and is_video_file(files[0]):
+        trips = find_trips(files, duration=lambda each: probe(each).duration)
+        if len(trips) > 1:
+            listed = "; ".join(f"{trip} from {Path(trip.files[0]).name}" for trip in trips[:4])
+            example = files[0].parent / f"*{Path(trips[0].files[0]).name[-5:]}"
+            raise InvalidInputError(
+                f"source {path} holds {len(trips)} trips ({listed}{', ...' if len(trips) > 4 else ''}); "
+                f"select one with a pattern such as '{example}', or process all with vehicle-detection batch"
+            )
+        files = [Path(file) for file in trips[0].files]
     return _open_files(files, fps)
 
 
@@ -166,7 +455,7 @@ def _open_files(files: Sequence[Path], fps: float) -> FrameSource:
         raise InvalidInputError("source must name at least one file, got an empty list; add a file")
     images = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
     if len(images) == len(files):
-        return ImageSequence(files, fps)
+        return _ImageSequence(files, fps)
     if images:
         raise InvalidInputError(
             f"source must be videos or images, got both ({files[0]}, {images[0]}); select one kind"
@@ -176,7 +465,7 @@ def _open_files(files: Sequence[Path], fps: float) -> FrameSource:
     broken = next((path for path in files if "\n" in str(path) or "\r" in str(path)), None)
     if broken is not None:  # the list of files for ffmpeg has a line for each
         raise InvalidInputError(f"source {str(broken)!r} has a line break in its name; rename the file")
-    return VideoSegments(files)
+    return _VideoSegments(files)
 
 
 def _open_stdin(live: bool) -> FrameSource:
@@ -215,7 +504,7 @@ def _open_url(url: str, scheme: str, fps: float, live: bool | None, reconnect: b
             return _VideoFile(url, info)
         return _open_stream(url, ("-i", url), live, reconnect)
     if scheme == "file":
-        return open_source(local_path(url), fps=fps, live=live)
+        return _open(local_path(url), fps, live, reconnect)
     return _download(url)
 
 
@@ -234,3 +523,80 @@ def _download(url: str) -> FrameSource:
         source.name = source_name(url)
         source._on_close = on_error.pop_all()
     return source
+
+
+def probe_video(path: str | os.PathLike[str]) -> VideoInfo:
+    """Read the properties of a video file: frame size, exact frame rate, length, sound and rotation.
+
+    Parameters
+    ----------
+    path
+        A file that ffmpeg can read.
+
+    Returns
+    -------
+    VideoInfo
+        The properties; ``frames`` is an estimate, because counting requires decoding the whole video.
+
+    Raises
+    ------
+    InvalidInputError
+        If the file is missing, a folder, or not readable.
+    VideoError
+        If the file is not a video, or its first frame cannot be decoded.
+
+    Examples
+    --------
+    >>> probe_video("missing.mp4")
+    Traceback (most recent call last):
+    ...
+    vehicle_detection.errors.InvalidInputError: source missing.mp4 does not exist; check the path
+    """
+    return probe(check_file(path))
+
+
+def read_frames(
+    source: str | os.PathLike[str],
+    *,
+    start: float | None = None,
+    end: float | None = None,
+    strict: bool = False,
+) -> FrameReader:
+    """Read the frames of a video file, one at a time; for other sources see `open_source`.
+
+    Parameters
+    ----------
+    source
+        A file that ffmpeg can read.
+    start, end
+        Time range in seconds: frames with ``start <= time < end`` are read. None: no limit.
+    strict
+        Raise an error after the last frame if the file is damaged: frames are missing, or ffmpeg reports
+        decoding errors. Otherwise a warning is logged, and the reader's ``damage`` says it.
+
+    Returns
+    -------
+    FrameReader
+        An iterator of ``(index, time, frame)``: the frame's number in the file from 0, its time in seconds,
+        and an upright ``(H, W, 3)`` uint8 RGB array. Its ``info`` is the file's `VideoInfo`. ffmpeg ends
+        after the last frame, and at the end of a ``with`` block.
+
+    Raises
+    ------
+    InvalidInputError
+        If the file is missing, or there is no frame between `start` and `end`.
+    VideoError
+        If the file is not a video.
+
+    Examples
+    --------
+    >>> with read_frames("missing.mp4", end=2.0) as frames:  # doctest: +IGNORE_EXCEPTION_DETAIL
+    ...     means = [frame.mean() for index, time, frame in frames]
+    Traceback (most recent call last):
+    ...
+    vehicle_detection.errors.InvalidInputError: source missing.mp4 does not exist; check the path
+    """
+    path = check_file(source)
+    info = probe(path)
+    first, count = frame_range(info, *check_span(start, end))
+    return FrameReader(path, info, first=first, count=count, strict=strict)

@@ -1,6 +1,5 @@
 """Annotated videos and their reports."""
 
-import contextlib
 import io
 import os
 import re
@@ -15,7 +14,7 @@ from moviepy import VideoFileClip
 from tests.helpers import StubDetector
 from tests.video.clips import NTSC, ffmpeg, ffmpeg_log, frame_numbers, sound_seconds
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.video import VideoReport, VideoRun, probe_video, process, process_video, read_frames
+from vehicle_detection.video import VideoReport, engine, probe_video, process_video, read_frames, track
 
 
 def test_a_complete_video_keeps_frames_rate_and_sound(clip, tmp_path):
@@ -68,7 +67,7 @@ def test_sound_can_be_omitted(clip, tmp_path):
 def test_without_a_target_nothing_is_drawn(clip, tmp_path):
     results = []
     stub = StubDetector()
-    stub.annotate = lambda frame, result: pytest.fail("a frame was drawn")
+    stub.draw = lambda frame, result: pytest.fail("a frame was drawn")
     report = process_video(clip, None, stub, on_result=results.append)
     assert len(results) == report.frames == 20
     assert list(report.stages) == ["decode", "search", "heat", "track"]
@@ -117,14 +116,14 @@ def test_progress_is_shown_in_a_notebook(clip, monkeypatch, capsys):
     ],
 )
 def test_progress_is_logged_in_intervals(clip, monkeypatch, caplog, source, progress, expected):
-    caplog.set_level("INFO", "vehicle_detection.video.process")
+    caplog.set_level("INFO", "vehicle_detection.video.engine")
     process_video(clip, None, StubDetector(), progress=progress)
     assert caplog.messages == []
-    monkeypatch.setattr(process, "_LOG_INTERVAL", 0.0)
-    with contextlib.closing(VideoRun(clip, StubDetector())) as run:
+    monkeypatch.setattr(engine, "_LOG_INTERVAL", 0.0)
+    with track(clip, StubDetector(), progress=progress) as results:
         if source == "pipe":
-            run._total = None
-        assert len(list(run.results(progress=progress))) == 20
+            results._total = None
+        assert len(list(results)) == 20
     assert len(caplog.messages) == (0 if expected is None else 20)
     assert all(re.fullmatch(expected, message) for message in caplog.messages)
 

@@ -1,4 +1,4 @@
-"""`track`: results as a generator and as a list."""
+"""`track`: an iterator of results."""
 
 import contextlib
 import gc
@@ -9,9 +9,9 @@ import pytest
 
 from tests.helpers import random_network
 from tests.video.clips import child_processes, ffmpeg, running_threads
-from vehicle_detection import FrameResult, TrackWriter, VehicleDetector, notebook, process_video, track
+from vehicle_detection import TrackWriter, VehicleDetector, process_video, track, write_video
 from vehicle_detection.cli.demo import draw_clip
-from vehicle_detection.errors import InvalidInputError, VideoError
+from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.scenes import render_drive
 from vehicle_detection.video import open_source, read_frames
 
@@ -44,27 +44,17 @@ def test_the_frames_are_those_of_process_video(clip, detector, tmp_path):
     assert any(result.tracks for result in expected)
     found = []
     with TrackWriter(tmp_path / "found.csv") as write:
-        for result in track(clip, detector, stream=True):
+        for result in track(clip, detector, frames=True):
             write(result)
             found.append(result)
     assert boxes(found) == boxes(expected) == boxes(track(clip, detector))
     assert (tmp_path / "found.csv").read_bytes() == (tmp_path / "expected.csv").read_bytes()
     assert [result.searched for result in found] == [True, False] * 6
-    assert all(result.shown == result.result.shown for result in found)
     assert len(found[0].detections) == len(expected[0].detections)
     with read_frames(clip) as frames:
         for (_, time, frame), result in zip(frames, found, strict=True):
             assert result.time == time
             np.testing.assert_array_equal(result.frame, frame)
-            np.testing.assert_array_equal(result.picture, detector.annotate(frame, result.result))
-    assert found[0].picture is found[0].picture
-
-
-def test_the_number_of_threads_changes_nothing(clip, detector):
-    expected = boxes(track(clip, detector, workers=1))
-    assert any(tracks for _, _, tracks in expected)
-    for workers in (2, 3, 7):
-        assert boxes(track(clip, detector, workers=workers)) == expected
 
 
 def test_identities_carry_over_from_segment_to_segment(clip, detector, tmp_path):
@@ -82,7 +72,7 @@ def test_identities_carry_over_from_segment_to_segment(clip, detector, tmp_path)
 @pytest.mark.parametrize("end", ["close", "delete", "break", "error", "unused"])
 def test_closing_it_early_leaves_no_process(clip, detector, end):
     before = child_processes()
-    results = track(clip, detector, stream=True)
+    results = track(clip, detector, frames=True)
     if end != "unused":
         # The clip is so short that it may be decoded when the first of the delayed results comes.
         assert next(results).index == 0
@@ -102,35 +92,38 @@ def test_closing_it_early_leaves_no_process(clip, detector, end):
 
 
 def test_options_and_ranges(clip):
-    times = [result.time for result in track(clip, random_network(), start=0.1, end=0.3, every=1)]
+    with VehicleDetector(random_network(), n_jobs=1) as detector:
+        times = [result.time for result in track(clip, detector, start=0.1, end=0.3, every=1)]
     with read_frames(clip, start=0.1, end=0.3) as frames:
         assert times == [time for _, time, _ in frames]
 
 
 def test_a_source_that_is_opened_already(clip, detector):
     with open_source(clip) as source:
-        assert len(list(itertools.islice(track(source, detector, stream=True), 3))) == 3
-        assert len(track(source, detector)) == 12
+        assert len(list(itertools.islice(track(source, detector), 3))) == 3
+        assert len(list(track(source, detector))) == 12
 
 
-def test_bad_arguments(clip, detector, tmp_path):
-    with pytest.raises(InvalidInputError, match=r"model is a detector, .* got every in addition"):
-        track(clip, detector, every=2)
-    with pytest.raises(InvalidInputError, match="show must be True or False; got 'yes'"):
-        track(clip, detector, show="yes")
-    with pytest.raises(InvalidInputError, match=r"source missing\.mp4 does not exist"):
-        track("missing.mp4", random_network(), stream=True)
-    (tmp_path / "text.mp4").write_text("no video")
-    with pytest.raises(VideoError, match="is a text file, not a video"):
-        track(tmp_path / "text.mp4", detector, stream=True)
+def test_a_detector_may_be_a_model(clip):
+    results = track(clip, "highway", end=0.08)
+    assert [result.frame for result in results] == [None, None]
+    assert not running_threads()
 
 
-def test_functions_of_results_take_tracked_frames(clip, detector):
-    found = list(track(clip, detector, stream=True, end=0.2))
-    notebook.plot_tracks(found)
-    notebook.plot_birds_eye(found)
-    notebook.plot_stage_times(found)
-    np.testing.assert_array_equal(detector.annotate(found[1].frame, found[1]), found[1].picture)
-    assert [each.index for each in detector.backfill(found)] == [each.index for each in found]
-    assert found[0].windows is found[0].result.windows
-    assert type(found[0].result) is FrameResult
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"frames": "yes"}, "frames must be True or False; got 'yes'"),
+        ({"every": 0}, "every must be an integer from 1"),
+        ({"source": "missing.mp4"}, r"source missing\.mp4 does not exist"),
+        ({"detector": 3}, "detector must have the methods search, track and reset"),
+    ],
+)
+def test_bad_arguments(clip, detector, options, message):
+    with pytest.raises(InvalidInputError, match=message):
+        track(**{"source": clip, "detector": detector, **options})
+
+
+def test_results_without_frames_cannot_be_written(clip, detector, tmp_path):
+    with pytest.raises(InvalidInputError, match="results must hold their frames; pass frames=True to track"):
+        write_video(track(clip, detector), tmp_path / "out.mp4", detector.annotator)

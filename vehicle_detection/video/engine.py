@@ -1,0 +1,625 @@
+"""`track`: the one engine that processes a source: decode, search in parallel, track in order.
+
+The results do not depend on the number of workers. Only a few frames are in memory: those being searched, and
+those between two searched frames, which wait for their tracks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+import math
+import os
+import threading
+import time
+from collections import defaultdict, deque
+from collections.abc import Callable, Generator, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any, Generic, Protocol, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection._common import (
+    Closing,
+    available_cores,
+    call_in_thread,
+    check_flags,
+    check_integer,
+    describe,
+    pluralize,
+    progress_bar,
+    single_threaded_opencv,
+)
+from vehicle_detection.errors import DetectorError, InvalidInputError
+from vehicle_detection.images import is_cut, make_thumbnail
+from vehicle_detection.tracking import FrameResult
+from vehicle_detection.video.reading import AudioSource, Reader, check_span, frame_range
+from vehicle_detection.video.sources import FrameSource, Source, borrow_source
+
+_LOGGER = logging.getLogger(__name__)
+
+# Seconds between log lines on the progress.
+_LOG_INTERVAL = 60.0
+# Maximum size of the frames that are decoded ahead of the search, unless each worker has only one.
+_LOOKAHEAD_BYTES = 256 << 20
+
+Item = TypeVar("Item")
+Frame = NDArray[np.uint8]
+
+
+class VideoDetector(Protocol):
+    """The methods of a detector that `track` calls, such as a `VehicleDetector`."""
+
+    def search(self, frame: Frame, /) -> Any:
+        """Search one frame; called from several threads, and before earlier frames are tracked."""
+
+    def track(self, found: Any, /, *, time: float | None) -> Any:
+        """Update the tracks with a frame's search result, in frame order, and return the frame's result."""
+
+    def reset(self, *, fps: float) -> None:
+        """Forget all frames."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoReport:
+    """Counts and times of a run of `track` or `process_video`.
+
+    Attributes
+    ----------
+    frames
+        Number of frames.
+    fps
+        Exact frame rate of the video.
+    shape
+        Shape of a frame: ``(height, width, 3)``.
+    seconds
+        Elapsed time of the run.
+    stages
+        Seconds of work per stage, without waiting: ``"decode"``, ``"search"``, the detector's other stages,
+        ``"draw"`` and ``"encode"``. Decode and encode are processor time over all cores, the others elapsed
+        time. Stages run in parallel, so their sum may exceed `seconds`.
+    tracks
+        Number of different tracks shown.
+    dropped
+        Number of frames of a live source that were dropped because the search was busy.
+    damage
+        What is damaged in the source, such as missing frames; empty if nothing is.
+
+    Examples
+    --------
+    >>> stages = {"decode": 1.0, "search": 3.0, "encode": 4.0}
+    >>> report = VideoReport(
+    ...     frames=250, fps=Fraction(25), shape=(720, 1280, 3), seconds=5.0, stages=stages, tracks=2
+    ... )
+    >>> report.frames_per_second, report.stage_fractions["encode"]
+    (50.0, 0.5)
+    >>> print(report)
+    250 frames of 1280x720 in 5.0 s: 50.0 frames/s, 2.0 times real time, 2 vehicles
+    stage    ms/frame  fraction
+    decode       4.00     12.5%
+    search      12.00     37.5%
+    encode      16.00     50.0%
+    """
+
+    frames: int
+    fps: Fraction
+    shape: tuple[int, int, int]
+    seconds: float
+    stages: Mapping[str, float]
+    tracks: int
+    dropped: int = 0
+    damage: str = ""
+
+    @property
+    def frames_per_second(self) -> float:
+        """Frames processed per second."""
+        return self.frames / self.seconds if self.seconds else math.inf
+
+    @property
+    def stage_fractions(self) -> dict[str, float]:
+        """Fraction of the work per stage, in [0, 1]; the sum is 1 unless there was no work."""
+        total = sum(self.stages.values())
+        return {name: seconds / total if total else 0.0 for name, seconds in self.stages.items()}
+
+    def __str__(self) -> str:
+        height, width = self.shape[:2]
+        rate = self.frames_per_second
+        lines = [
+            f"{pluralize(self.frames, 'frame')} of {width}x{height} in {self.seconds:.1f} s: "
+            f"{rate:.1f} frames/s, {rate / self.fps:.1f} times real time, {pluralize(self.tracks, 'vehicle')}"
+            + (f", {pluralize(self.dropped, 'frame')} dropped" if self.dropped else ""),
+            "stage    ms/frame  fraction",
+        ]
+        fractions = self.stage_fractions
+        for name, seconds in self.stages.items():
+            lines.append(f"{name:<8} {seconds / max(self.frames, 1) * 1e3:>8.2f} {fractions[name]:>9.1%}")
+        return "\n".join(lines)
+
+
+class QueueClosed(Exception):  # noqa: N818 - a signal between threads, not an error
+    """The other side has closed the queue."""
+
+
+class ClosableQueue(Generic[Item]):
+    """A bounded queue between two threads that either side can close.
+
+    With ``queue.Queue`` a producer would wait forever for a consumer that has failed.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._items: deque[Item] = deque()
+        self._size = size
+        # Used instead of the condition's own __enter__, whose interrupt could leave the lock acquired.
+        self._lock = threading.RLock()
+        self._changed = threading.Condition(self._lock)
+        self._finished = self._aborted = False
+        self._error: BaseException | None = None
+
+    def put(self, item: Item) -> None:
+        """Append an item when there is space; raise the error of `abort`, or `QueueClosed`."""
+        with self._lock:
+            while len(self._items) >= self._size and not self._aborted:
+                self._changed.wait()
+            if self._aborted:
+                raise self._error or QueueClosed
+            self._items.append(item)
+            self._changed.notify_all()
+
+    def finish(self, error: BaseException | None = None) -> None:
+        """Close the queue after the last item; the consumer gets the remaining items, then the error."""
+        with self._lock:
+            self._finished = True
+            self._error = self._error or error
+            self._changed.notify_all()
+
+    def abort(self, error: BaseException | None = None) -> None:
+        """Close the queue for both sides at once; waiting items are dropped."""
+        with self._lock:
+            self._aborted = True
+            self._error = self._error or error
+            self._items.clear()
+            self._changed.notify_all()
+
+    def __iter__(self) -> Iterator[Item]:
+        while True:
+            with self._lock:
+                while not self._items and not self._finished and not self._aborted:
+                    self._changed.wait()
+                if not self._items:
+                    if self._aborted or self._error is not None:
+                        raise self._error or QueueClosed
+                    return
+                item = self._items.popleft()
+                self._changed.notify_all()
+            yield item
+
+
+@dataclass
+class _QueuedFrame:
+    time: float
+    frame: Frame | None  # None if nobody asked for it
+    thumbnail: NDArray[np.float32]
+    search: Future[tuple[Any, float]] | None  # None: the frame is not searched
+    missed: int = 0  # frames that a live source dropped before this one
+    last_thumbnail: NDArray[np.float32] | None = None  # of the frame before
+
+
+@dataclass
+class _Searched:
+    """A searched frame with its result, and the frames before it that were not searched."""
+
+    between: list[_QueuedFrame]
+    item: _QueuedFrame
+    result: Any
+
+
+class _Pipeline:
+    """The threads that process a source.
+
+    The decoding thread submits frames to the search workers and queues them in order; the tracking thread
+    takes them from the queue and tracks. The first error stops all of them. The calling thread only receives
+    results: Python raises KeyboardInterrupt in the main thread, where it must not interrupt the start of a
+    process or the removal of a file.
+
+    With an `interval` above 1, only every n-th frame and the first one of each scene are searched, and each
+    frame after a gap of a live source. The frames between wait for the next searched frame, and get
+    interpolated tracks. With a `delay` above 0, that many searched frames are held back, so that the detector
+    can still change their results. Up to `lookahead` frames are decoded before they are needed.
+    """
+
+    def __init__(
+        self,
+        open_reader: Callable[[], Reader],
+        detector: Any,
+        workers: int,
+        interval: int,
+        *,
+        delay: int,
+        lookahead: int,
+        frames: bool,
+    ) -> None:
+        self._open_reader, self._detector = open_reader, detector
+        self._workers, self._interval, self._delay, self._keeps_frames = workers, interval, delay, frames
+        self.stages: defaultdict[str, float] = defaultdict(float)
+        self.missed = 0
+        """Number of frames that a live source dropped."""
+        self.damage = ""
+        """What is damaged in the source; known after the last frame."""
+        self._searched: ClosableQueue[_QueuedFrame] = ClosableQueue(lookahead)
+        self._results: ClosableQueue[Any] = ClosableQueue(1 if frames else 4)
+        self._reader: Reader | None = None
+        self._lock = threading.Lock()
+        self._aborted = self.stopped = False
+
+    def run(self) -> Generator[Any]:
+        """Yield the result of each frame; closing the generator stops all threads."""
+        thread = threading.Thread(target=self._track_in_thread, name="vehicle-track")
+        try:
+            call_in_thread(thread.start)
+            yield from self._results
+        finally:
+            self._abort()  # no effect after a complete run
+            if thread.is_alive():
+                thread.join()
+
+    def stop(self) -> None:
+        """End the source, so that the run completes with the frames read so far."""
+        with self._lock:
+            self.stopped = True
+            if self._reader is not None:
+                self._reader.kill()
+
+    def _abort(self) -> None:
+        """Stop all threads and the reader, or prevent them from starting."""
+        with self._lock:
+            self._aborted = True
+            self._searched.abort()
+            self._results.abort()
+            if self._reader is not None:
+                self._reader.kill()
+
+    def _track_in_thread(self) -> None:
+        try:
+            with self._open_reader() as reader:
+                with self._lock:
+                    if self._aborted:
+                        return
+                    self._reader = reader
+                self._run_threads(reader)
+        except QueueClosed:
+            return
+        except BaseException as error:  # raised in the calling thread
+            self._results.finish(error)
+        else:
+            self._results.finish()
+
+    def _run_threads(self, reader: Reader) -> None:
+        """Decode in a thread, search in a pool, and track in this thread."""
+        pool = ThreadPoolExecutor(self._workers, thread_name_prefix="vehicle-search")
+        decoder = threading.Thread(target=self._decode, args=(reader, pool), name="vehicle-decode")
+        try:
+            decoder.start()
+            self._track_frames()
+        finally:
+            self._searched.abort()
+            reader.kill()
+            pool.shutdown(cancel_futures=True)
+            if decoder.ident is not None:
+                decoder.join()
+        self.damage = reader.damage
+        self.stages["decode"] += reader.cpu_seconds
+
+    def _decode(self, reader: Reader, pool: ThreadPoolExecutor) -> None:
+        try:
+            last, skipped, expected = None, 0, None
+            for index, moment, frame in reader:
+                if self.stopped:
+                    break
+                thumbnail = make_thumbnail(frame)
+                skipped += 1
+                missed = index - expected if expected is not None else 0
+                if last is None or missed or skipped >= self._interval or is_cut(last, thumbnail):
+                    search, skipped = pool.submit(self._search, frame), 0
+                else:
+                    search = None
+                kept = frame if self._keeps_frames else None
+                self._searched.put(_QueuedFrame(moment, kept, thumbnail, search, missed, last))
+                del frame, kept
+                self.missed += missed
+                last, expected = thumbnail, index + 1
+        except QueueClosed:
+            return
+        except BaseException as error:  # raised in the tracking thread
+            self._searched.finish(error)
+        else:
+            self._searched.finish()
+        finally:
+            self.stages["decode"] += time.thread_time()
+
+    def _search(self, frame: Frame) -> tuple[Any, float]:
+        start = time.perf_counter()
+        return self._detector.search(frame), time.perf_counter() - start
+
+    def _track_frames(self) -> None:
+        """Track the searched frames, and queue the results of all frames in their order."""
+        waiting: list[_QueuedFrame] = []
+        held: deque[_Searched] = deque()
+        before = None
+        for item in self._searched:
+            if item.search is None:
+                waiting.append(item)
+                continue
+            held.append(_Searched(waiting, item, self._track(item, waiting)))
+            waiting = []
+            if self._delay:
+                results = self._detector.backfill([searched.result for searched in held])
+                for searched, result in zip(held, results, strict=True):
+                    searched.result = result
+            if len(held) > self._delay:
+                before = self._emit_searched(before, held.popleft())
+            del item  # free the frame before waiting for the next one
+        while held:
+            before = self._emit_searched(before, held.popleft())
+        self._emit_between(before, None, waiting)
+
+    def _track(self, item: _QueuedFrame, waiting: list[_QueuedFrame]) -> Any:
+        """Track a searched frame after the `waiting` ones, which are not searched."""
+        assert item.search is not None
+        try:
+            found, seconds = item.search.result()
+        except DetectorError as error:
+            raise DetectorError(f"at {item.time:.2f} s: {error}") from error
+        for thumbnail in [each.thumbnail for each in waiting] + [item.last_thumbnail] * item.missed:
+            self._detector.skip(thumbnail)
+        self.stages["search"] += seconds
+        return self._detector.track(found, time=item.time)
+
+    def _emit_searched(self, before: Any, searched: _Searched) -> Any:
+        """Queue a searched frame after those before it that were not searched; return its result."""
+        self._emit_between(before, searched.result, searched.between)
+        self._emit(searched.item, searched.result)
+        return searched.result
+
+    def _emit_between(self, before: Any, after: Any, waiting: list[_QueuedFrame]) -> None:
+        """Interpolate and queue the results of the `waiting` frames; `after` is None at the end."""
+        if waiting:
+            results = self._detector.interpolate(before, after, [item.time for item in waiting])
+            for item, result in zip(waiting, results, strict=True):
+                self._emit(item, result)
+
+    def _emit(self, item: _QueuedFrame, result: Any) -> None:
+        for name, seconds in result.seconds.items():
+            if name != "search":  # measured here, because a detector may omit it
+                self.stages[name] += seconds
+        self._results.put(replace(result, frame=item.frame) if self._keeps_frames else result)
+
+
+class TrackRun(Closing):
+    """Results of a source, frame by frame, as `track` returns it: an iterator and a context manager.
+
+    Closing or deleting it ends all processes and threads; nothing is started before the first result.
+
+    Attributes
+    ----------
+    source, info
+        The source, and the properties of its video.
+    detector
+        The detector that finds the vehicles.
+    has_frames
+        Whether the results hold their frames.
+    """
+
+    def __init__(
+        self,
+        source: FrameSource,
+        detector: Any,
+        pipeline: _Pipeline,
+        *,
+        total: int | None,
+        span: tuple[int, float | None],
+        has_frames: bool,
+        progress: bool,
+        on_close: contextlib.ExitStack,
+    ) -> None:
+        self.source, self.info, self.detector, self.has_frames = source, source.info, detector, has_frames
+        self._pipeline, self._on_close, self._on_end = pipeline, on_close, contextlib.ExitStack()
+        self._entered = False
+        self._first, self._end = span  # the first frame, and the end in seconds
+        self._results = pipeline.run()
+        self._progress = progress
+        self._total = total
+        self._frames, self._track_ids = 0, set[int]()
+        self._started = self._logged = self._seconds = 0.0
+
+    def __enter__(self) -> Self:
+        self._entered = True  # the sound of the source may be read after the last result
+        return self
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> FrameResult:
+        if not self._started:
+            self._start()
+        try:
+            result = next(self._results)
+        except BaseException:
+            self._on_end.close()
+            if not self._entered:
+                self.close()
+            raise
+        self._frames += 1
+        self._track_ids.update(track.id for track in result.tracks if track.shown)
+        self._bar.update()
+        now = time.perf_counter()
+        if self._progress and now - self._logged >= _LOG_INTERVAL:
+            self._logged = now
+            self._log_progress(now - self._started)
+        return result  # type: ignore[no-any-return]
+
+    def _start(self) -> None:
+        # The pipeline's threads use all cores; more threads would only compete with them.
+        self._on_end.enter_context(single_threaded_opencv())
+        bar = progress_bar(self._progress, self._total, unit="frame", interactive_only=True)
+        self._bar = self._on_end.enter_context(bar)
+        self._on_end.callback(self._results.close)
+        self.detector.reset(fps=float(self.info.fps))
+        self._started = self._logged = time.perf_counter()
+
+    def _log_progress(self, seconds: float) -> None:
+        length = f" of {self._position(self._total)}" if self._total else ""
+        rate = self._frames / seconds
+        _LOGGER.info("%s%s, %.0f frames/s", self._position(self._frames), length, rate)
+
+    def _position(self, frames: int) -> str:
+        """Return the length of a number of frames in minutes and seconds."""
+        minutes, seconds = divmod(int(frames / self.info.fps), 60)
+        return f"{minutes}:{seconds:02d}"
+
+    @property
+    def stopped(self) -> bool:
+        """Whether `stop` has been called."""
+        return self._pipeline.stopped
+
+    def sound(self) -> AudioSource | None:
+        """Return the sound of the frames; None if there is none."""
+        return self.source.audio(self._first, self._end)
+
+    def report(self) -> VideoReport:
+        """Return counts and times so far; the time of the run is complete once it is closed."""
+        order = {"decode": -2, "search": -1, "draw": 1, "encode": 2}
+        stages = sorted(self._pipeline.stages.items(), key=lambda stage: order.get(stage[0], 0))
+        return VideoReport(
+            frames=self._frames,
+            fps=self.info.fps,
+            shape=self.info.shape,
+            seconds=self._seconds or time.perf_counter() - self._started,
+            stages=dict(stages),
+            tracks=len(self._track_ids),
+            dropped=self._pipeline.missed,
+            damage=self._pipeline.damage,
+        )
+
+    def stop(self) -> None:
+        """End the source, from any thread; the frames read so far complete the run."""
+        self._pipeline.stop()
+
+    def close(self) -> None:
+        """End all processes and threads."""
+        if self._started and not self._seconds:
+            self._seconds = time.perf_counter() - self._started
+        self._on_end.close()
+        self._on_close.close()
+
+    def __del__(self) -> None:
+        if hasattr(self, "_on_close"):
+            self.close()
+
+
+def track(
+    source: Source,
+    detector: VideoDetector | str | os.PathLike[str] = "default",
+    *,
+    start: float | None = None,
+    end: float | None = None,
+    every: int | None = None,
+    workers: int | None = None,
+    frames: bool = False,
+    progress: bool = False,
+) -> TrackRun:
+    """Track the vehicles of a video or of any other source, frame by frame.
+
+    Parameters
+    ----------
+    source
+        A video file, a folder of images, a pattern, ``"-"``, a camera, a URL, or what `open_source` returns.
+    detector
+        A `VehicleDetector`, whose state is used, or the model of one; or another object with its methods
+        ``search``, ``track`` and ``reset``.
+    start, end
+        Time range in seconds: frames with ``start <= time < end`` are processed. None: no limit.
+    every
+        Search every n-th frame; the tracks of the frames between are interpolated. None: at least 12 frames
+        per second, but every frame where the detector or what is drawn needs it.
+    workers
+        Number of frames searched in parallel; None: one per core, at most four. The results do not depend on
+        it.
+    frames
+        Whether the results hold their frames (``result.frame``), to draw or write them.
+    progress
+        Show a progress bar in a terminal or a notebook, and log the progress once a minute (level INFO).
+
+    Returns
+    -------
+    TrackRun
+        An iterator of `FrameResult`. Closing it, deleting it or leaving its ``with`` block ends all processes
+        and threads.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is invalid.
+    VideoError
+        If the source cannot be decoded; while reading, if a server sends only a part of it.
+
+    Examples
+    --------
+    >>> for result in track("test_images/*.jpg", "highway", end=0.08, frames=True):
+    ...     print(result.index, result.time, result.frame.shape, len(result.detections))
+    0 0.0 (720, 1280, 3) 2
+    1 0.04 (720, 1280, 3) 0
+    """
+    check_flags(frames=frames, progress=progress)
+    start, end = check_span(start, end)
+    n_workers = min(available_cores(), 4) if workers is None else check_integer(workers, "workers", low=1)
+    if every is not None:
+        every = check_integer(every, "every", low=1, high=1000)
+    with contextlib.ExitStack() as stack:
+        found: Any = stack.enter_context(_open_detector(detector))
+        opened = stack.enter_context(borrow_source(source))
+        info = opened.info
+        first, count = frame_range(info, start, end)
+        fps = float(info.fps)
+        interval = every or getattr(found, "search_interval", lambda fps: 1)(fps)
+        ahead = min(n_workers * interval, _LOOKAHEAD_BYTES // math.prod(info.shape))
+        pipeline = _Pipeline(
+            functools.partial(opened.read, first, count),
+            found,
+            n_workers,
+            interval,
+            delay=0 if opened.live else getattr(found, "search_delay", lambda fps: 0)(fps),
+            lookahead=max(n_workers, ahead) + 1,
+            frames=frames,
+        )
+        return TrackRun(
+            opened,
+            found,
+            pipeline,
+            total=count or max(info.frames - first, 0) or None,
+            span=(first, end),
+            has_frames=frames,
+            progress=progress,
+            on_close=stack.pop_all(),
+        )
+
+
+@contextlib.contextmanager
+def _open_detector(detector: object) -> Iterator[Any]:
+    """Yield a detector, or that of a model for the time of a block."""
+    if isinstance(detector, (str, os.PathLike)):
+        from vehicle_detection.detector import VehicleDetector
+
+        with VehicleDetector(detector) as opened:
+            yield opened
+        return
+    for method in ("search", "track", "reset"):
+        if not callable(getattr(detector, method, None)):
+            raise InvalidInputError(
+                f"detector must have the methods search, track and reset, got {describe(detector)} without "
+                f"{method}; pass a VehicleDetector()"
+            )
+    yield detector

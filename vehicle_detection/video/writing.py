@@ -1,0 +1,498 @@
+"""`write_video`, which draws and encodes the results of `track`, and `process_video`, which is both."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, Protocol, TypedDict, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_detection._common import (
+    Closing,
+    atomic_write,
+    call_in_thread,
+    check_choice,
+    check_flags,
+    check_path,
+    check_target,
+    describe,
+    temporary_folder,
+)
+from vehicle_detection.errors import InvalidInputError, TransientVideoError, VideoError
+from vehicle_detection.tracking import FrameResult
+from vehicle_detection.video.engine import (
+    ClosableQueue,
+    QueueClosed,
+    TrackRun,
+    VideoDetector,
+    VideoReport,
+    track,
+)
+from vehicle_detection.video.ffmpeg import Process, exit_reason
+from vehicle_detection.video.probe import VideoInfo
+from vehicle_detection.video.reading import AudioSource, check_span, frame_range
+from vehicle_detection.video.sources import Source, borrow_source
+from vehicle_detection.video.viewer import open_viewer
+from vehicle_detection.video.yuv import planes_from_rgb
+
+PRESETS = (
+    "ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow", "placebo",
+)  # fmt: skip
+"""Presets of the H.264 encoder, from the fastest to the one with the smallest files."""
+
+CONTAINERS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov", ".mkv": "matroska"}
+"""ffmpeg's name of the container for each suffix that can be written."""
+
+# Codecs that are copied instead of encoded again: those that every browser plays; Matroska holds any.
+_COPIED_AUDIO = {"mp4": {"aac", "mp3"}, "mov": {"aac", "mp3"}}
+_COPIED_AUDIO["matroska"] = {*_COPIED_AUDIO["mp4"], "ac3", "eac3", "flac", "opus", "vorbis"}
+# Fills and cuts the sound where its times and its samples differ by more than 20 ms.
+_SYNCHRONIZED = "aresample=async=1:min_hard_comp=0.02"
+
+
+class FrameWriter(Closing):
+    """Writer of ``(H, W, 3)`` uint8 RGB frames as H.264 at a constant rate, with the audio of another file.
+
+    H.264 that every player supports needs even sides, so odd ones are extended by one pixel, which repeats
+    the last column or row.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        info: VideoInfo,
+        *,
+        name: str,
+        preset: str,
+        audio: AudioSource | None = None,
+    ) -> None:
+        """Start ffmpeg, which writes to `path`; `name` names the video in errors."""
+        container = CONTAINERS[path.suffix.lower()]
+        self.frames_written = 0
+        self._path, self._name, self._has_sound = path, name, audio is not None
+        self._fps = info.fps
+        width, height = info.width + info.width % 2, info.height + info.height % 2
+        self._planes = np.empty((height * 3 // 2, width), np.uint8)
+        self._channels = np.empty((3, height, width), np.uint8)
+        video = ["-f", "rawvideo", "-pixel_format", "yuv420p", "-video_size", f"{width}x{height}"]
+        video += ["-framerate", str(info.fps)]
+        sound: list[str] = []
+        mapped = ["-map", "0:v:0"]
+        if audio is not None:
+            lead = audio.start - audio.audio_offset
+            sound += ["-ss", f"{audio.start:.6f}"] if lead > 0 else []
+            sound += ["-itsoffset", f"{-lead:.6f}"] if lead < 0 else []
+            sound += ["-vn", *audio.input]
+            # Matroska has no times before 0, for the part of a packet before the first frame.
+            copyable = audio.copyable and (lead <= 0 or container != "matroska")
+            copied = copyable and info.audio_codec in _COPIED_AUDIO[container]
+            mapped += ["-map", f"1:a:{info.audio_track}"]
+            end = "" if audio.length is None else f",atrim=end={audio.length:.6f}"
+            encoded = ["-c:a", "aac", "-b:a", "192k", "-af", _SYNCHRONIZED + end]
+            mapped += ["-c:a", "copy"] if copied else encoded
+        filters = "setparams=colorspace=smpte170m:color_primaries=bt709:color_trc=bt709:range=tv"
+        encoder = ["-vf", filters, "-c:v", "libx264", "-preset", preset, "-fps_mode", "passthrough"]
+        # Chapters and other metadata are those of the whole source, and its title and place may be private.
+        self._muxer = ["-map_chapters", "-1", "-map_metadata", "-1", "-f", container]
+        if container != "matroska":  # the index at the front lets a browser play while it downloads
+            self._muxer += ["-movflags", "+faststart"]
+        options = ["-y", *video, "-i", "pipe:0", *sound, *mapped, *encoder, *self._muxer, f"file:{path}"]
+        self._process = Process(options, stdin=True)
+
+    @property
+    def cpu_seconds(self) -> float:
+        """Processor time of ffmpeg, known after it has ended."""
+        return self._process.cpu_seconds
+
+    def kill(self) -> None:
+        """End ffmpeg at once, from any thread; a thread that writes sees an error."""
+        self._process.kill()
+
+    def close(self) -> None:
+        """End ffmpeg if it is still running."""
+        self._process.close()
+
+    def write(self, frame: NDArray[np.uint8]) -> None:
+        """Send one frame to ffmpeg."""
+        planes_from_rgb(frame, self._planes, self._channels)
+        self.repeat()
+
+    def repeat(self) -> None:
+        """Send the last frame once more."""
+        view = self._planes.data.cast("B")
+        done = 0
+        try:
+            while done < len(view):
+                done += self._process.stdin.write(view[done:])
+        except OSError as error:
+            raise self._error() from error
+        self.frames_written += 1
+
+    def finish(self, *, trim_sound: bool = False) -> None:
+        """Wait until ffmpeg has written the last frame, and all of the sound.
+
+        With `trim_sound`, for frames that end before the source does, the sound ends with them.
+        """
+        if not self.frames_written:
+            raise VideoError("no frame was read, so no video was written")
+        self._process.stdin.close()
+        if self._process.wait():
+            raise self._error()
+        if trim_sound and self._has_sound:
+            self._trim_sound()
+
+    def _trim_sound(self) -> None:
+        """Copy the file with the sound up to the end of the last frame."""
+        seconds = float(self.frames_written / self._fps)
+        whole = ("-i", f"file:{self._path}")
+        with temporary_folder(self._path.parent, self._path.stem) as folder:
+            trimmed = folder / self._path.name
+            options = ["-nostdin", *whole, "-t", f"{seconds:.6f}", *whole, "-map", "0:v:0", "-map", "1:a:0"]
+            self.close()
+            self._process = Process([*options, "-c", "copy", *self._muxer, f"file:{trimmed}"])
+            if self._process.wait():
+                raise self._error()
+            # Not renamed: other processes recognize a file in use by its lock.
+            shutil.copyfile(trimmed, self._path)
+
+    def _error(self) -> TransientVideoError:
+        reason = exit_reason(self._process.wait(), self._process.log())
+        return TransientVideoError(f"{self._name} cannot be written: {reason}; nothing of it was kept")
+
+
+class VideoAnnotator(Protocol):
+    """Draws the pictures of an annotated video, such as an `Annotator`."""
+
+    def draw(self, frame: NDArray[np.uint8], result: Any, /) -> NDArray[np.uint8]:
+        """Draw a result on a copy of its frame."""
+
+    def output_shape(self, shape: tuple[int, ...], /) -> tuple[int, ...]:
+        """Shape of the pictures for frames of a shape."""
+
+    def reset(self, *, fps: float) -> None:
+        """Forget all frames."""
+
+
+def write_video(
+    results: TrackRun,
+    target: str | os.PathLike[str] | None,
+    annotator: VideoAnnotator,
+    *,
+    audio: bool = True,
+    preset: str = "veryfast",
+    show: bool = False,
+    on_result: Callable[[FrameResult], object] | None = None,
+) -> VideoReport:
+    """Draw the results of `track` on their frames, and write them to a video.
+
+    The video is H.264 in yuv420p, which browsers play, with the frame rate, all frames and the sound of the
+    source. The rotation stored in the source is applied. A varying frame rate is converted to a constant one.
+    An odd width or height is extended by one pixel, which repeats the last column or row.
+
+    Parameters
+    ----------
+    results
+        What ``track(..., frames=True)`` returned. Ctrl-C ends a live source, and completes the target.
+    target
+        The file to write: .mp4, .m4v, .mov or .mkv. After an error, an existing file is unchanged. None:
+        write no video.
+    annotator
+        An `Annotator`, such as ``detector.annotator``.
+    audio
+        Keep the sound. It is copied if the whole video is processed and every player supports its codec,
+        otherwise it is encoded as AAC.
+    preset
+        Speed of the encoder: "ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow",
+        "slower", "veryslow" or "placebo".
+    show
+        Show the annotated frames in a window, or in a notebook below the cell. Closing the window, or the key
+        Escape, ends the run and completes the target.
+    on_result
+        Function that is called with each result, without its frame, in frame order, in the calling thread.
+
+    Returns
+    -------
+    VideoReport
+        Numbers of frames and vehicles, and the time of each stage.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is invalid.
+    VideoError
+        If the source is not a video, or the target cannot be written.
+
+    Examples
+    --------
+    >>> from vehicle_detection import VehicleDetector, track, write_video
+    >>> detector = VehicleDetector("highway")
+    >>> results = track("test_images/*.jpg", detector, end=0.08, frames=True)
+    >>> write_video(results, None, detector.annotator).frames
+    2
+    """
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(results)
+        check_flags(audio=audio, show=show)
+        if on_result is not None and not callable(on_result):
+            raise InvalidInputError(f"on_result must be a function of a result, got {describe(on_result)}")
+        started, drawing, sink, viewer = time.perf_counter(), None, None, None
+        if target is not None or show:
+            drawing = _Drawing(annotator, results)
+        if drawing is not None and target is not None:
+            output = check_video_target(target, results.source.files, preset=preset)
+            sound = results.sound() if audio else None
+            sink = stack.enter_context(_Sink(_open_writer(output, drawing.info, preset, sound)))
+        if show:
+            viewer = stack.enter_context(contextlib.closing(open_viewer(results.source.name)))
+        stack.enter_context(_stop_on_interrupt(results))
+        for result in results:
+            if drawing is not None:
+                picture, missed = drawing.draw(result)
+                if sink is not None:
+                    sink.put(picture, repeats=missed)
+            if on_result is not None:
+                on_result(result if result.frame is None else dataclasses.replace(result, frame=None))
+            if viewer is not None:
+                viewer.show(picture)
+                if viewer.closed:
+                    results.stop()
+            del result
+        if sink is not None:
+            sink.finish(trim_sound=results.stopped)
+    report = results.report()
+    stages = dict(report.stages)
+    if drawing is not None:
+        stages["draw"] = drawing.seconds
+    if sink is not None:
+        stages["encode"] = sink.seconds
+    return dataclasses.replace(report, seconds=time.perf_counter() - started, stages=stages)
+
+
+class TrackOptions(TypedDict, total=False):
+    """Options of `track` that `process_video` passes on."""
+
+    start: float | None
+    end: float | None
+    every: int | None
+    workers: int | None
+
+
+def process_video(
+    source: Source,
+    target: str | os.PathLike[str] | None,
+    detector: VideoDetector,
+    *,
+    audio: bool = True,
+    preset: str = "veryfast",
+    show: bool = False,
+    on_result: Callable[[FrameResult], object] | None = None,
+    progress: bool = True,
+    **options: Unpack[TrackOptions],
+) -> VideoReport:
+    """Detect and track the vehicles of a video, and write a copy with their boxes: `track` and `write_video`.
+
+    Parameters
+    ----------
+    source, progress, **options
+        As in `track`: ``start``, ``end``, ``every`` and ``workers``.
+    target, audio, preset, show, on_result
+        As in `write_video`. Without a target and `show`, nothing is drawn.
+    detector
+        A `VehicleDetector`, or another object with its methods ``search``, ``track`` and ``reset``; its
+        ``annotator`` draws.
+
+    Returns
+    -------
+    VideoReport
+        Numbers of frames and vehicles, and the time of each stage.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is invalid.
+    VideoError
+        If the source is not a video, or the target cannot be written.
+
+    Examples
+    --------
+    >>> from vehicle_detection import VehicleDetector  # doctest: +SKIP
+    >>> print(process_video("drive.mp4", "found.mp4", VehicleDetector()))  # doctest: +SKIP
+    """
+    draws = target is not None or show
+    if target is not None:
+        check_video_target(target, preset=preset)
+    results = track(source, detector, frames=draws, progress=progress, **options)
+    annotator: Any = getattr(results.detector, "annotator", None)
+    if draws and hasattr(results.detector, "camera_of"):
+        annotator.camera = results.detector.camera_of(results.info.shape)
+    return write_video(results, target, annotator, audio=audio, preset=preset, show=show, on_result=on_result)
+
+
+class _Drawing:
+    """Draws the results of a run one after the other."""
+
+    def __init__(self, annotator: VideoAnnotator, results: TrackRun) -> None:
+        if not results.has_frames:
+            raise InvalidInputError("results must hold their frames; pass frames=True to track")
+        annotator.reset(fps=float(results.info.fps))
+        self._annotator, self._expected, self.seconds = annotator, -1, 0.0
+        self._shape = annotator.output_shape(results.info.shape)
+        self.info = dataclasses.replace(results.info, height=self._shape[0], width=self._shape[1])
+
+    def draw(self, result: FrameResult) -> tuple[NDArray[np.uint8], int]:
+        """Return the picture of a result, and the number of frames that were dropped before it."""
+        assert result.frame is not None
+        start = time.perf_counter()
+        drawn = self._annotator.draw(result.frame, result)
+        if getattr(drawn, "shape", None) != self._shape or drawn.dtype != np.uint8:
+            raise InvalidInputError(
+                f"annotator.draw must return a {self._shape} uint8 array, got {describe(drawn)}; "
+                "draw on a copy of the frame"
+            )
+        missed = result.index - self._expected if self._expected >= 0 else 0
+        self._expected = result.index + 1
+        self.seconds += time.perf_counter() - start
+        return np.ascontiguousarray(drawn), missed
+
+
+class _Sink(Closing):
+    """Encodes pictures in a thread, which opens, and completes or removes, the file.
+
+    Python raises KeyboardInterrupt in the main thread, where it must not interrupt the start of a process or
+    the removal of a file. The thread starts with the first picture.
+    """
+
+    def __init__(self, writer: AbstractContextManager[FrameWriter]) -> None:
+        self._open_writer, self._writer = writer, None
+        self._pictures: ClosableQueue[tuple[NDArray[np.uint8], int]] = ClosableQueue(2)
+        self._thread = threading.Thread(target=self._encode, name="vehicle-encode")
+        self._lock = threading.Lock()
+        self._aborted = self._trim_sound = False
+        self.seconds = 0.0
+        """Processor time of the thread and of ffmpeg, known after the last picture."""
+
+    def put(self, picture: NDArray[np.uint8], *, repeats: int = 0) -> None:
+        """Append a picture after repeating the last one; raise an error of the encoder."""
+        if self._thread.ident is None:
+            call_in_thread(self._thread.start)
+        self._pictures.put((picture, repeats))
+
+    def finish(self, *, trim_sound: bool) -> None:
+        """Complete the file; with `trim_sound`, the sound ends with the frames."""
+        if self._thread.ident is None:
+            raise VideoError("no frame was read, so no video was written")
+        self._trim_sound = trim_sound
+        self._pictures.finish()
+        self._thread.join()
+        for _ in self._pictures:  # raises an error of the encoder after the last picture
+            pass
+
+    def close(self) -> None:
+        """Remove an incomplete file, and end the thread."""
+        self._pictures.abort()
+        with self._lock:
+            self._aborted = True
+            if self._writer is not None:
+                self._writer.kill()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    def _encode(self) -> None:
+        try:
+            with self._open_writer as writer:
+                with self._lock:
+                    if self._aborted:
+                        raise QueueClosed
+                    self._writer = writer
+                for picture, repeats in self._pictures:
+                    for _ in range(repeats):
+                        writer.repeat()
+                    writer.write(picture)
+                writer.finish(trim_sound=self._trim_sound)
+            self.seconds += writer.cpu_seconds
+        except QueueClosed:
+            return
+        except BaseException as error:  # raised in the calling thread at its next picture
+            self._pictures.abort(error)
+        finally:
+            self.seconds += time.thread_time()
+
+
+@contextlib.contextmanager
+def _stop_on_interrupt(results: TrackRun) -> Iterator[None]:
+    """Let the first Ctrl-C end a live source, which has no other end; a second one interrupts the run."""
+    if not results.source.live or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(*_: Any) -> None:
+        signal.signal(signal.SIGINT, before)
+        # In a thread: the handler may interrupt a thread that holds the locks which `stop` needs.
+        threading.Thread(target=results.stop, name="vehicle-stop").start()
+
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def cut_video(
+    source: Source,
+    target: str | os.PathLike[str],
+    *,
+    start: float | None = None,
+    end: float | None = None,
+    preset: str = "veryfast",
+) -> int:
+    """Copy a part of a video, with its sound, to another file; returns the number of frames.
+
+    The arguments are those of `process_video`, and so are the errors.
+    """
+    start, end = check_span(start, end)
+    with borrow_source(source) as opened:
+        output = check_video_target(target, opened.files, preset=preset)
+        first, count = frame_range(opened.info, start, end)
+        with (
+            opened.read(first, count) as frames,
+            _open_writer(output, opened.info, preset, opened.audio(first, end)) as writer,
+        ):
+            for _, _, frame in frames:
+                writer.write(frame)
+            writer.finish()
+    return writer.frames_written
+
+
+@contextlib.contextmanager
+def _open_writer(
+    target: Path, info: VideoInfo, preset: str, audio: AudioSource | None
+) -> Iterator[FrameWriter]:
+    """Open a video file that is written atomically."""
+    with (
+        atomic_write(target) as part,
+        FrameWriter(part, info, name=str(target), preset=preset, audio=audio) as writer,
+    ):
+        yield writer
+
+
+def check_video_target(target: object, sources: Sequence[Path] = (), *, preset: str = "veryfast") -> Path:
+    """Return the path of a video that can be written and is none of the sources."""
+    check_choice(preset, "preset", PRESETS)
+    path = check_target(check_path(target, "target", kind="the path of a video file"))
+    if path.suffix.lower() not in CONTAINERS:
+        raise InvalidInputError(
+            f"target must end in {', '.join(CONTAINERS)}; got {path.name!r}, use {path.stem + '.mp4'!r}"
+        )
+    if path.exists() and any(path.samefile(source) for source in sources):
+        raise InvalidInputError(f"target {path} is the source; choose another name")
+    return path
