@@ -13,24 +13,8 @@ from typing import Annotated, Any
 import typer
 from typer import Argument
 
-from vehicle_detection.cli.options import (
-    Blur,
-    CameraHeight,
-    CameraName,
-    Classes,
-    Confidence,
-    Device,
-    Every,
-    FieldOfView,
-    Horizon,
-    Model,
-    NoAudio,
-    Preset,
-    flag,
-    option,
-    parse_classes,
-    takes,
-)
+from vehicle_detection.cli import options as shared
+from vehicle_detection.cli.options import flag, option, parse_classes, takes
 from vehicle_detection.cli.output import (
     UNKNOWN_LENS,
     option_names,
@@ -61,10 +45,10 @@ class BatchOptions:
             help="Video files, folders, quoted patterns and URLs, such as CARD/ or s3://cam/*.mp4.",
         ),
     ] = None
-    model: Model = "default"
-    classes: Classes = None
-    device: Device = "cpu"
-    conf: Confidence = None
+    model: shared.Model = "default"
+    classes: shared.Classes = None
+    device: shared.Device = "cpu"
+    conf: shared.Confidence = None
     jobs: Annotated[
         int | None, option("N", "Worker processes of one thread, such as 4; default: one per core.")
     ] = None
@@ -77,14 +61,14 @@ class BatchOptions:
     ] = None
     group: Annotated[str, option("trip|file", "Make consecutive segments one trip, or each file.")] = "trip"
     tracks_only: Annotated[bool, flag("--tracks-only", "Write no videos.")] = False
-    horizon: Horizon = None
-    camera: CameraName = None
-    fov: FieldOfView = None
-    camera_height: CameraHeight = None
-    every: Every = None
-    blur: Blur = None
-    preset: Preset = "veryfast"
-    no_audio: NoAudio = False
+    horizon: shared.Horizon = None
+    camera: shared.CameraName = None
+    fov: shared.FieldOfView = None
+    camera_height: shared.CameraHeight = None
+    every: shared.Every = None
+    blur: shared.Blur = None
+    preset: shared.Preset = "veryfast"
+    no_audio: shared.NoAudio = False
     retry_failed: Annotated[
         bool, flag("--retry-failed", "Process trips again whose source could not be processed.")
     ] = False

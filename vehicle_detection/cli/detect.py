@@ -14,21 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument
 
+from vehicle_detection.cli import options as shared
 from vehicle_detection.cli.horizon import is_limited, search_everywhere, warn_of_horizon
-from vehicle_detection.cli.options import (
-    Blur,
-    Classes,
-    Confidence,
-    Device,
-    Horizon,
-    LineWidth,
-    Model,
-    check_blur,
-    drawing_option,
-    open_model,
-    output_option,
-    takes,
-)
+from vehicle_detection.cli.options import check_blur, drawing_option, open_model, output_option, takes
 from vehicle_detection.cli.output import (
     DAMAGED,
     announce_replaced,
@@ -64,14 +52,14 @@ class DetectOptions:
             "DIR", "Folder, such as why, for pictures that explain each box: the share of each cell."
         ),
     ] = None
-    model: Model = "default"
-    classes: Classes = None
-    device: Device = "cpu"
-    conf: Confidence = None
-    horizon: Horizon = None
+    model: shared.Model = "default"
+    classes: shared.Classes = None
+    device: shared.Device = "cpu"
+    conf: shared.Confidence = None
+    horizon: shared.Horizon = None
     labels: Annotated[str, drawing_option("score|none", "Labels of the boxes in annotated images.")] = "score"
-    line_width: LineWidth = None
-    blur: Blur = None
+    line_width: shared.LineWidth = None
+    blur: shared.Blur = None
 
 
 @takes(DetectOptions)

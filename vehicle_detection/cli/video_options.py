@@ -8,21 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument
 
+from vehicle_detection.cli import options as shared
 from vehicle_detection.cli.horizon import parse_horizon
 from vehicle_detection.cli.options import (
     HORIZON_HELP,
-    Blur,
-    CameraHeight,
-    CameraName,
-    Classes,
-    Confidence,
-    Device,
-    Every,
-    FieldOfView,
-    LineWidth,
-    Model,
-    NoAudio,
-    Preset,
     camera_option,
     drawing_flag,
     drawing_option,
@@ -81,8 +70,8 @@ class VideoOptions:
             "FILE", "Subtitles with vehicles, nearest distance and events, second by second: .srt or .ass."
         ),
     ] = None
-    preset: Preset = "veryfast"
-    no_audio: NoAudio = False
+    preset: shared.Preset = "veryfast"
+    no_audio: shared.NoAudio = False
     quiet: Annotated[bool, output_flag("-q", "Print errors and warnings of damage only.", "--quiet")] = False
     profile: Annotated[bool, output_flag("--profile", "Print the time of each stage.")] = False
     start: Annotated[str | None, input_option("TIME", "Start time, such as 12.5 (seconds) or 12:30.")] = None
@@ -118,18 +107,18 @@ class VideoOptions:
     strict: Annotated[bool, input_flag("--strict", "Fail, and write nothing, if the source is damaged.")] = (
         False
     )
-    camera: CameraName = None
-    fov: FieldOfView = None
-    camera_height: CameraHeight = None
+    camera: shared.CameraName = None
+    fov: shared.FieldOfView = None
+    camera_height: shared.CameraHeight = None
     horizon: Annotated[
         str | None,
         camera_option("F|auto", f'{HORIZON_HELP} "auto": estimated from vehicles in a sample of frames.'),
     ] = None
-    model: Model = "default"
-    classes: Classes = None
-    device: Device = "cpu"
-    conf: Confidence = None
-    every: Every = None
+    model: shared.Model = "default"
+    classes: shared.Classes = None
+    device: shared.Device = "cpu"
+    conf: shared.Confidence = None
+    every: shared.Every = None
     jobs: Annotated[
         int | None,
         search_option("N", "Frames searched in parallel, such as 2; default: one per core, at most 4."),
@@ -140,7 +129,7 @@ class VideoOptions:
             "LIST", "Fields of the labels: some of id,distance,speed,score,std, such as id,distance; or none."
         ),
     ] = "id,distance,speed"
-    line_width: LineWidth = None
+    line_width: shared.LineWidth = None
     color_by: Annotated[str, drawing_option("id|distance", "What the colors of the boxes stand for.")] = "id"
     panel: Annotated[
         str, drawing_option("corner|side|none", "Bird's-eye view in the frame's corner, or beside it.")
@@ -148,7 +137,7 @@ class VideoOptions:
     units: Annotated[
         str, drawing_option("metric|imperial", "Labels, subtitles and report in m and km/h, or ft and mph.")
     ] = "metric"
-    blur: Blur = None
+    blur: shared.Blur = None
     diagnostics: Annotated[
         bool, drawing_flag("--diagnostics", "Show frame, positive windows, heat map and tracks side by side.")
     ] = False
