@@ -8,7 +8,6 @@ from tests.notebook.helpers import new_axes, texts
 from vehicle_detection import notebook
 from vehicle_detection.boxes import Detections
 from vehicle_detection.camera import Camera
-from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.notebook.style import COLORS
 from vehicle_detection.tracking import FrameResult
 
@@ -55,14 +54,3 @@ def test_only_shown_tracks_with_a_distance_are_plotted():
     hidden, unknown = track(shown=False), track(id=2, distance_m=None, distance_std_m=None)
     axes = notebook.plot_birds_eye(result(0, hidden, unknown), ax=new_axes())
     assert not axes.texts
-
-
-def test_rejects_malformed_arguments():
-    with pytest.raises(InvalidInputError, match=r"results must hold at least one frame, got none"):
-        notebook.plot_birds_eye([])
-    with pytest.raises(InvalidInputError, match=r"results must be a FrameResult.*pass what detector.process"):
-        notebook.plot_birds_eye([track()])
-    with pytest.raises(InvalidInputError, match="camera must be a Camera, got 3"):
-        notebook.plot_birds_eye(result(0), 3)
-    with pytest.raises(InvalidInputError, match="trail_seconds must be a number, at least 0"):
-        notebook.plot_birds_eye(result(0), trail_seconds=-1)

@@ -5,16 +5,12 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from tests.helpers import random_classifier
 from vehicle_detection.boxes import Detections, iou_matrix
 from vehicle_detection.camera import Camera
 from vehicle_detection.datasets import load_frames
 from vehicle_detection.detector import VehicleDetector
 from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import FeatureParams
 from vehicle_detection.heatmap import HeatParams, frame_heat
 from vehicle_detection.images import write_image
 from vehicle_detection.loading import load_model
@@ -61,7 +57,7 @@ def count_searches(monkeypatch):
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("min_score", [-0.5, 0.0, 0.6])
+@pytest.mark.parametrize("min_score", [-0.5, 0.6])
 @pytest.mark.parametrize("model", ["default", "highway"])
 def test_windows_and_boxes_equal_those_of_the_detector(scenes, model, method, min_score):
     explorer = Explorer(scenes, model)
@@ -137,8 +133,17 @@ def test_the_horizon_of_a_network_may_be_unknown(scenes):
     explorer.set_search(horizon=0.56)
     assert explorer.search_params == NetworkParams().with_horizon(0.56)
     assert (explorer.render() != image).any()
-    with pytest.raises(InvalidInputError, match="bands must be None for this model"):
+    with pytest.raises(InvalidInputError, match="bands must be None"):
         explorer.set_search(bands=[0])
+
+
+def test_windows_are_those_above_the_threshold(explorer):
+    explorer.set_search(min_score=-100.0)
+    everything = explorer.windows()
+    for threshold in (-1.5, 0.0, 0.4, 3.0):
+        explorer.set_search(min_score=threshold)
+        assert (explorer.windows().scores > threshold).all()
+        assert len(explorer.windows()) == (everything.scores > threshold).sum()
 
 
 def test_higher_thresholds_leave_fewer_boxes(explorer):
@@ -171,28 +176,6 @@ def test_bands_are_selected(explorer):
     assert explorer.render().shape == (*SHAPE, 3)
     with pytest.raises(InvalidInputError, match="bands must be a tuple of SearchBand, at least one"):
         explorer.detector()
-
-
-@pytest.fixture(scope="module")
-def shared_explorer(scenes):
-    """One explorer for all examples: the cache must not change results."""
-    return explore(scenes)
-
-
-@settings(max_examples=20)
-@given(thresholds=st.lists(st.floats(-3, 3), min_size=2, max_size=5))
-def test_windows_are_those_above_the_threshold(shared_explorer, thresholds):
-    explorer = shared_explorer
-    explorer.set_search(min_score=-100.0)
-    everything = explorer.windows()
-    counts = []
-    for threshold in sorted(thresholds):
-        explorer.set_search(min_score=threshold)
-        windows = explorer.windows()
-        assert (windows.scores > threshold).all()
-        assert len(windows) == (everything.scores > threshold).sum()
-        counts.append(len(windows))
-    assert counts == sorted(counts, reverse=True)
 
 
 # The cache
@@ -254,16 +237,6 @@ def test_the_cache_is_limited(scenes, monkeypatch, count_searches):
     assert len(searches) == before
 
 
-def test_a_result_is_computed_once(explorer, monkeypatch):
-    explorer.set_regions("heat")
-    calls = []
-    monkeypatch.setattr(module, "frame_heat", lambda *args: calls.append(1) or frame_heat(*args))
-    explorer.set_view("heat")
-    explorer.render()
-    explorer.summary()
-    assert len(calls) == 1
-
-
 def test_parameters_may_be_assigned(explorer):
     before = len(explorer.windows())
     bands = explorer.search_params.bands
@@ -298,13 +271,12 @@ def test_each_view_shows_another_image(explorer, scenes):
 
 def test_boxes_have_their_numbers(explorer, monkeypatch):
     given = []
-    monkeypatch.setattr(module, "draw_texts", lambda image, *texts: given.append(texts))
-    plain = explorer.render()
-    ((boxes, texts, *_),) = given
-    assert texts == [str(number + 1) for number in range(len(explorer.boxes()))]
-    np.testing.assert_array_equal(boxes, explorer.boxes().boxes[explorer._best_first()])
-    monkeypatch.undo()
-    assert (explorer.render() != plain).any()
+    monkeypatch.setattr(module, "draw_texts", lambda image, boxes, texts, *look: given.append((boxes, texts)))
+    explorer.render()
+    ((boxes, texts),) = given
+    best_first = np.argsort(-explorer.boxes().scores, kind="stable")
+    np.testing.assert_array_equal(boxes, explorer.boxes().boxes[best_first])
+    assert texts == [str(number + 1) for number in range(len(best_first))]
 
 
 def test_wide_frames_are_reduced(scenes):
@@ -358,65 +330,40 @@ def test_frames_are_arrays_or_files(scenes, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("frames", "message"),
-    [
-        ([], "frames must hold at least one image; got none"),
-        ({}, "frames must hold at least one image; got none"),
-        ("a.png", "frames must be a list of images or paths.*got 'a.png'.*wrap a single one in a list"),
-        (np.zeros((9, 9, 3), np.uint8), "frames must be a list of images or paths"),
-        ([np.zeros((9, 9))], r"frames\['frame 0'\] must be an \(H, W, 3\) uint8 RGB array"),
-    ],
+    "frames", [[], {}, "a.png", np.zeros((9, 9, 3), np.uint8), [np.zeros((9, 9))], {"a": 3}]
 )
-def test_malformed_frames_are_rejected(frames, message):
-    with pytest.raises(InvalidInputError, match=message):
+def test_malformed_frames_are_rejected(frames):
+    with pytest.raises(InvalidInputError, match=r"^frames"):
         Explorer(frames)
 
 
 @pytest.mark.parametrize(
-    ("method", "arguments", "message"),
+    ("method", "arguments", "refused"),
     [
-        ("set_frame", {"frame": 2}, "frame must be an integer from 0 to 1; got 2"),
-        ("set_frame", {"frame": "x"}, "frame must be one of 'frame 0', 'frame 1'; got 'x'"),
-        ("set_view", {"view": "all"}, "view must be one of 'boxes', 'windows', 'heat'; got 'all'"),
-        ("set_search", {"horizon": 2.0}, "horizon must be a number, at least 0 and at most 1"),
-        ("set_search", {"min_score": "high"}, "min_score must be a number"),
-        ("set_search", {"bands": [8]}, "bands must be an integer from 0 to 7; got 8"),
-        ("set_regions", {"method": "both"}, "method must be one of 'groups', 'heat'; got 'both'"),
-        ("set_regions", {"peak_fraction": 1.5}, "peak_fraction must be a number, at least 0 and at most"),
-        ("set_regions", {"min_peak": -1.0}, "min_peak must be a number, at least 0"),
-        ("set_search", {"bands": [1], "horizon": 7}, "horizon must be a number"),
-        ("set_search", {"bands": [9], "horizon": 0.4}, "bands must be an integer"),
-        ("set_regions", {"method": "heat", "threshold": 9.0, "min_peak": -1.0}, "min_peak must be a number"),
+        ("set_frame", {"frame": 2}, "frame"),
+        ("set_frame", {"frame": "x"}, "frame must be one of 'frame 0', 'frame 1'"),
+        ("set_view", {"view": "all"}, "view"),
+        ("set_box", {"number": -1}, "number"),
+        ("set_search", {"min_score": "high"}, "min_score"),
+        ("set_search", {"bands": [1], "horizon": 7}, "horizon"),
+        ("set_search", {"bands": [9], "horizon": 0.4}, "bands must be an integer from 0 to 7"),
+        ("set_regions", {"method": "both"}, "method"),
+        ("set_regions", {"peak_fraction": 1.5}, "peak_fraction"),
+        ("set_regions", {"method": "heat", "threshold": 9.0, "min_peak": -1.0}, "min_peak"),
     ],
 )
-def test_an_invalid_value_changes_nothing(explorer, method, arguments, message):
-    def state():
-        return explorer.frame, explorer.view, explorer.search_params, explorer.bands, explorer.region_params
-
-    before = state()
-    with pytest.raises(InvalidInputError, match=message):
+def test_an_invalid_value_changes_nothing(explorer, method, arguments, refused):
+    before = explorer._state, explorer.view, explorer.box
+    with pytest.raises(InvalidInputError, match=f"^{refused}"):
         getattr(explorer, method)(**arguments)
-    assert state() == before
+    assert (explorer._state, explorer.view, explorer.box) == before
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"model": 3}, "model must be a VehicleClassifier or NetworkModel, got 3;"),
-        ({"search_params": "default"}, "search_params must be a NetworkParams, got 'default'"),
-        ({"model": "highway", "search_params": NetworkParams()}, "search_params must be a SearchParams, got"),
-        ({"region_params": 1}, "region_params must be a RegionParams or HeatParams"),
-        ({"camera": 1}, "camera must be a Camera"),
-        ({"width": 3}, "width must be an integer from 16 to 10000"),
-        (
-            {"model": random_classifier(FeatureParams(pix_per_cell=10))},
-            "find_cars needs whole HOG cells in a",
-        ),
-    ],
-)
-def test_malformed_options_are_rejected(scenes, options, message):
-    with pytest.raises(InvalidInputError, match=message):
-        Explorer(scenes, **options)
+def test_malformed_options_are_those_of_the_detector(scenes):
+    with pytest.raises(InvalidInputError, match=r"^camera"):
+        Explorer(scenes, camera=1)
+    with pytest.raises(InvalidInputError, match=r"^width"):
+        Explorer(scenes, width=3)
 
 
 # The widgets
@@ -537,8 +484,6 @@ def test_a_box_is_explained(scenes, model):
     assert (changed <= (right + 1, bottom + 1)).all()
     controls["explain box"].value = 99
     assert explorer.explanation() is None
-    with pytest.raises(InvalidInputError, match="number must be an integer at least 0"):
-        explorer.set_box(-1)
 
 
 def test_a_click_explains_the_box(scenes, monkeypatch):
@@ -576,7 +521,7 @@ def test_values_outside_the_usual_range_widen_the_slider(scenes):
 def test_only_the_sliders_need_ipywidgets(explorer, monkeypatch):
     monkeypatch.setitem(sys.modules, "ipywidgets", None)
     assert explorer.render().shape == (*SHAPE, 3)
-    with pytest.raises(InvalidInputError, match="sliders need ipywidgets; pip install ipywidgets,"):
+    with pytest.raises(InvalidInputError, match="pip install ipywidgets"):
         explorer.widget()
 
 

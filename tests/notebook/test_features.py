@@ -1,14 +1,10 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from tests.helpers import random_classifier
-from tests.notebook.helpers import SMALL, gray_image, legend, new_axes, texts, titles
+from tests.notebook.helpers import SMALL, legend, new_axes, texts, titles
 from vehicle_detection import notebook
-from vehicle_detection.errors import InvalidInputError
-from vehicle_detection.features import FeatureParams, extract_features, hog_image, sum_blocks
+from vehicle_detection.features import FeatureParams, extract_features, hog_image
 from vehicle_detection.notebook.features import add_glyphs
 from vehicle_detection.notebook.style import OTHER, VEHICLE
 from vehicle_detection.scenes import render_patches
@@ -44,21 +40,6 @@ def test_channels_of_two_classes_are_plotted_separately(patch_set):
     offsets = figure.axes[4].collections[0].get_offsets()
     np.testing.assert_array_equal(again.get_offsets(), offsets)
     assert (other.get_offsets() != offsets).any()
-
-
-@pytest.mark.parametrize(
-    ("images", "options", "message"),
-    [
-        (gray_image(), {"color_space": "XYZ"}, "color_space must be one of 'RGB', 'HSV'"),
-        ([gray_image()], {"labels": [1, 0]}, "labels must be one number for each of 1 images"),
-        ([], {}, "images must be a list of images, at least one"),
-        ([gray_image()[..., 0]], {}, r"images\[0\] must be an \(H, W, 3\) uint8 RGB array"),
-        (gray_image(), {"points": 0}, "points must be an integer from 1"),
-    ],
-)
-def test_malformed_options_of_the_channels_are_rejected(images, options, message):
-    with pytest.raises(InvalidInputError, match=message):
-        notebook.plot_channels(images, **options)
 
 
 def test_hog_has_a_panel_per_channel_and_cell_size():
@@ -103,28 +84,6 @@ def test_a_glyph_is_parallel_to_the_edge(ahead, slope):
         assert np.sign(np.corrcoef(x, y)[0, 1]) == np.sign(along[0] * along[1])
 
 
-def test_malformed_options_of_hog_are_rejected():
-    with pytest.raises(InvalidInputError, match="img must have at least the size of a block"):
-        notebook.plot_hog(gray_image(30, 30), pix_per_cell=[16])
-    with pytest.raises(InvalidInputError, match="pix_per_cell must be an integer at least 2"):
-        notebook.plot_hog(gray_image(), pix_per_cell=[1])
-
-
-@settings(max_examples=25)
-@given(
-    blocks=st.tuples(st.integers(1, 5), st.integers(1, 5), st.integers(1, 3), st.integers(1, 4)).flatmap(
-        lambda n: hnp.arrays(np.float64, (n[0], n[1], n[2], n[2], n[3]), elements=st.floats(-9, 9))
-    )
-)
-def test_sums_over_blocks_keep_the_total(blocks):
-    sums, counts = sum_blocks(blocks), sum_blocks(np.ones_like(blocks))[..., 0]
-    side = blocks.shape[2]
-    assert sums.shape == (blocks.shape[0] + side - 1, blocks.shape[1] + side - 1, blocks.shape[4])
-    assert sums.sum() == pytest.approx(blocks.sum(), abs=1e-9)
-    assert counts.sum() == blocks.shape[0] * blocks.shape[1] * side**2
-    assert counts.min() >= 1
-
-
 def test_glyphs_of_zeros_are_empty():
     axes = new_axes()
     assert not len(add_glyphs(axes, np.zeros((2, 3, 9))).get_segments())
@@ -163,27 +122,6 @@ def test_without_a_classifier_the_scaler_is_fitted_to_the_patches(patch_set):
     # only used parts are shaded
     params = FeatureParams(spatial_feat=False, hist_feat=False)
     assert len(notebook.plot_features(patch_set, params).axes[0].texts) == 1
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"rows": [40]}, "rows must be an integer from 0 to 39; got 40"),
-        ({"rows": []}, "rows must be a list of row numbers, at least one"),
-        ({"names": ["a", "b"]}, "names must have one value for each of the 1 rows, got 2"),
-        ({"template": 1}, "template must be an integer from 0 to 0"),
-    ],
-)
-def test_malformed_options_of_the_features_are_rejected(patch_set, options, message):
-    with pytest.raises(InvalidInputError, match=message):
-        notebook.plot_features(patch_set, random_classifier(SMALL), **options)
-
-
-def test_features_need_a_classifier_or_parameters(patch_set):
-    with pytest.raises(
-        InvalidInputError, match="model must be a VehicleClassifier or FeatureParams, got 'm'"
-    ):
-        notebook.plot_features(patch_set, "m")
 
 
 def classifier_with_mean(params):
@@ -234,10 +172,3 @@ def test_hog_weights_are_the_sums_over_the_blocks():
 def test_weights_in_every_color_space(space):
     params = FeatureParams(hog_feat=False, spatial_size=4, hist_bins=4, color_space=space)
     assert len(notebook.plot_weights(classifier_with_mean(params)).axes) == 3 * 3 + 3
-
-
-def test_malformed_options_of_the_weights_are_rejected():
-    with pytest.raises(InvalidInputError, match="classifier must be a VehicleClassifier, got 'm'"):
-        notebook.plot_weights("m")
-    with pytest.raises(InvalidInputError, match="template must be an integer from 0 to 0; got 1"):
-        notebook.plot_weights(classifier_with_mean(SMALL), template=1)

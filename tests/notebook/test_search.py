@@ -4,7 +4,6 @@ import pytest
 from tests.notebook.helpers import drawn_boxes, gray_image, new_axes, texts, titles
 from vehicle_detection import notebook
 from vehicle_detection.boxes import Detections
-from vehicle_detection.errors import InvalidInputError
 from vehicle_detection.heatmap import HeatParams, bounding_boxes, frame_heat
 from vehicle_detection.images import read_image
 from vehicle_detection.notebook.style import SKY, VERMILION, YELLOW
@@ -36,10 +35,6 @@ def test_windows_without_scores_and_outside_the_frame():
     assert one.get_title() == "1 window"
     none = notebook.plot_windows(gray_image(), Detections.empty(), title="nothing", ax=new_axes())
     assert none.get_title() == "nothing"
-    with pytest.raises(InvalidInputError, match=r"windows must be an \(N, 4\) number array"):
-        notebook.plot_windows(gray_image(), [1, 2, 3, 4])
-    with pytest.raises(InvalidInputError, match=r"truth must be \[x1, y1, x2, y2\] with x1 <= x2"):
-        notebook.plot_windows(gray_image(), [], truth=[[5, 0, 1, 1]])
 
 
 @pytest.mark.parametrize("preset", ["130-windows", "three-scales", "default"])
@@ -71,10 +66,6 @@ def test_a_band_may_have_one_row_of_windows():
     search = SearchParams(bands=(SearchBand(window=(640, 640), y=(-320, 320)),), horizon=0.5)
     figure = notebook.plot_bands(gray_image(360, 360), search)
     assert len(figure.axes[0].collections[1].get_segments()) == 1  # to the right only
-    with pytest.raises(InvalidInputError, match="image of 160x10 pixels holds no search window"):
-        notebook.plot_bands(gray_image(10))
-    with pytest.raises(InvalidInputError, match="search must be a SearchParams, got 'default'"):
-        notebook.plot_bands(gray_image(), "default")
 
 
 def test_the_comparison_shows_all_scores_and_their_maximum_difference():
@@ -86,10 +77,6 @@ def test_the_comparison_shows_all_scores_and_their_maximum_difference():
     assert right.get_title() == "maximum difference 3e-06"
     assert sum(bar.get_height() for bar in right.patches) == 50
     assert notebook.plot_comparison([1.0], [1.0]).axes[1].get_title() == "maximum difference 0"
-    with pytest.raises(InvalidInputError, match="fast and reference must be scores of the same windows; got"):
-        notebook.plot_comparison([1.0], [1.0, 2.0])
-    with pytest.raises(InvalidInputError, match="reference must be a list of finite numbers"):
-        notebook.plot_comparison([1.0], [np.inf])
 
 
 @pytest.mark.parametrize("fastest", [0.01, 29.9])
@@ -115,15 +102,6 @@ def test_speedups_over_the_slowest_or_a_chosen_method():
     assert (axes.get_xscale(), axes.get_xlabel()) == ("log", "time (ms)")
     other = notebook.plot_speedups(times, reference="b", ax=new_axes())
     assert texts(other.texts) == ["2,000 ms, 4.0x slower", "500 ms", "2 ms, 250x faster"]
-    for bad, message in (
-        ({}, "seconds must map names to seconds, at least one"),
-        ({"a": 0}, r"seconds\['a'\] must be a number, greater than 0"),
-        ([1.0], "seconds must map names to seconds"),
-    ):
-        with pytest.raises(InvalidInputError, match=message):
-            notebook.plot_speedups(bad)
-    with pytest.raises(InvalidInputError, match="reference must be one of 'a', 'b', 'c'; got 'd'"):
-        notebook.plot_speedups(times, reference="d")
 
 
 def test_the_heat_map_and_its_regions():
@@ -156,20 +134,6 @@ def test_a_given_heat_map_is_used():
     assert figure.axes[3].get_ylabel() == "windows"
     # no windows
     assert notebook.plot_heatmap(gray_image(), Detections.empty()).axes[2].get_title() == "0 regions above 2"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"windows": [[0, 0, 1, 1]]}, "windows must be a Detections, got"),
-        ({"heat": np.zeros((5, 5))}, r"heat must be an array of the frame's size \(90, 160\)"),
-        ({"params": "hot"}, "params must be a HeatParams, got 'hot'"),
-        ({"image": "a.png"}, r"image must be an \(H, W, 3\) uint8 RGB array"),
-    ],
-)
-def test_malformed_options_of_the_heat_map_are_rejected(arguments, message):
-    with pytest.raises(InvalidInputError, match=message):
-        notebook.plot_heatmap(**{"image": gray_image(), "windows": Detections.empty(), **arguments})
 
 
 @pytest.mark.realdata

@@ -172,44 +172,36 @@ def test_jpeg_changes_the_image_slightly():
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "refused"),
     [
-        ({"shape": (720,)}, r"shape must be \(height, width\) in pixels, got \(720,\)"),
-        ({"shape": (20, 640)}, r"shape\[0\] must be an integer from 64"),
-        ({"shape": (640.5, 640)}, r"shape\[0\] must be an integer"),
-        ({"vehicles": -1}, "vehicles must be an integer from 0 to 60"),
+        ({"shape": (720,)}, r"shape must be \(height, width\) in pixels"),
+        ({"shape": (20, 640)}, r"shape\[0\]"),
+        ({"shape": (640.5, 640)}, r"shape\[0\]"),
+        ({"vehicles": -1}, "vehicles"),
         ({"vehicles": [20]}, r"vehicles\[0\] must be a SceneVehicle, got 20; make one with"),
-        ({"lane": 3}, "lane must be an integer from 0 to 2"),
-        ({"horizon": 1.2}, "horizon must be a number, at least 0.1 and at most 0.9"),
-        ({"camera_height_m": 0.0}, "camera_height_m must be a number"),
-        ({"focal_px": 10}, "focal_px must be a number"),
-        ({"light": "noon"}, "light must be one of 'day', 'overcast', 'dusk', 'night'; got 'noon'"),
-        ({"rain": 2}, "rain must be a number"),
-        ({"jpeg_quality": 0}, "jpeg_quality must be an integer from 1 to 100"),
-        ({"random_state": -1}, "random_state must be an integer at least 0"),
-        ({"random_state": "x"}, "random_state must be an integer"),
+        ({"lane": 3}, "lane"),
+        ({"horizon": 1.2}, "horizon"),
+        ({"camera_height_m": 0.0}, "camera_height_m"),
+        ({"focal_px": 10}, "focal_px"),
+        ({"light": "noon"}, "light must be one of 'day', 'overcast', 'dusk', 'night'"),
+        ({"rain": 2}, "rain"),
+        ({"jpeg_quality": 0}, "jpeg_quality"),
+        ({"random_state": -1}, "random_state"),
     ],
 )
-def test_invalid_options(options, message):
-    with pytest.raises(InvalidInputError, match=message):
+def test_invalid_options(options, refused):
+    with pytest.raises(InvalidInputError, match=f"^{refused}"):
         render_scene(**options)
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"distance_m": 1.0}, "distance_m must be a number, at least 2"),
-        ({"distance_m": float("nan")}, "distance_m must be a number"),
-        ({"distance_m": 9, "lateral_m": 1e6}, "lateral_m must be a number"),
-        ({"distance_m": 9, "kind": "tank"}, "kind must be one of 'hatchback'"),
-        ({"distance_m": 9, "color": "pink"}, "color must be one of 'white'"),
-        ({"distance_m": 9, "view": "left"}, "view must be one of 'rear', 'front'"),
-        ({"distance_m": 9, "speed_mps": "fast"}, "speed_mps must be a number"),
-    ],
-)
-def test_invalid_vehicles(options, message):
-    with pytest.raises(InvalidInputError, match=message):
-        SceneVehicle(**options)
+    ("name", "value"),
+    [("distance_m", 1.0), ("distance_m", float("nan")), ("lateral_m", 1e6), ("kind", "tank"),
+     ("color", "pink"), ("view", "left"), ("speed_mps", "fast")],
+)  # fmt: skip
+def test_invalid_vehicles(name, value):
+    with pytest.raises(InvalidInputError, match=f"^{name}"):
+        SceneVehicle(**({"distance_m": 9} | {name: value}))
 
 
 @pytest.fixture(scope="module")
